@@ -1,0 +1,39 @@
+"""One seed, many named random generators.
+
+Every random draw of a run comes from a generator with a name; two names never share a stream, so drawing more
+from one (evaluating more often, say) leaves the others as they were.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+
+__all__ = ["derive", "generator", "seed_global", "preserved_global_rng"]
+
+
+def derive(seed: int, *names: str | int) -> int:
+    """A 63-bit seed for the stream called `names`, for example ``derive(0, "world", 3)``."""
+    text = "/".join([str(int(seed)), *map(str, names)])
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 1
+
+
+def generator(seed: int, *names: str | int, device: torch.device | str = "cpu") -> torch.Generator:
+    """A fresh `torch.Generator` for the stream called `names`."""
+    return torch.Generator(device=device).manual_seed(derive(seed, *names))
+
+
+def seed_global(seed: int) -> None:
+    """Seed torch's global generator: network initialisation and the sampling inside TorchRL's actors use it."""
+    torch.manual_seed(derive(seed, "torch"))
+
+
+@contextmanager
+def preserved_global_rng() -> Iterator[None]:
+    """Leave torch's global generators as they were, whatever is drawn inside."""
+    devices = list(range(torch.cuda.device_count())) if torch.cuda.is_available() else []
+    with torch.random.fork_rng(devices=devices):
+        yield
