@@ -1,4 +1,4 @@
-"""What a world is: a target's motion and the price of watching it."""
+"""What a tracking task is, and the world it takes place in."""
 
 from __future__ import annotations
 
@@ -12,40 +12,37 @@ from scipy import sparse
 
 from trackmdp.errors import UserError
 
-__all__ = ["Array", "BoolArray", "World"]
+__all__ = ["Array", "BoolArray", "Task", "World"]
 
 Array: TypeAlias = npt.NDArray[np.float64]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
-class World:
-    """The tracking problem (paper, Section II): target kernel, rewards, costs and the safe-sensing limit.
+class Task:
+    """What the tracker knows: the grid, the rewards, the costs and the safe-sensing limit, but not the motion.
+
+    A learner is given a `Task`, never a `World`, so that it cannot read the kernel.
 
     Attributes:
         size: N, cells along one side of the grid.
-        kernel: `[M, M]` sub-stochastic table P, M = N²; row i sums to 1 - p_exit(i).
         reward: r, earned when the target is sensed.
-        cost: `[M]`, c per cell: the price of one sensor switched on for one step.
+        cost: `[M]`, c per cell: the price of one sensor switched on for one step; M = N².
         safe_cost: D, the price of the safe action, forced after t_max + 1 misses in a row.
         t_max: T_max; the controller chooses freely at n = 0 ... t_max.
     """
 
     size: int
-    kernel: Array
     reward: float
     cost: Array
     safe_cost: float
     t_max: int
 
     def __post_init__(self) -> None:
-        m = self.size**2
-        if self.kernel.shape != (m, m):
+        if self.cost.shape != (self.num_cells,):
             raise UserError(
-                f"kernel: expected a {m}x{m} table for a {self.size}x{self.size} grid, got {self.kernel.shape}"
+                f"cost.sensor: expected one number or {self.num_cells} (one per cell), got shape {self.cost.shape}"
             )
-        if self.cost.shape != (m,):
-            raise UserError(f"cost.sensor: expected one number or {m} numbers (one per cell), got {self.cost.shape}")
 
     @property
     def num_cells(self) -> int:
@@ -56,6 +53,30 @@ class World:
     def num_choices(self) -> int:
         """T_max + 1, the free choices between two forced ones."""
         return self.t_max + 1
+
+
+@dataclass(frozen=True, eq=False)
+class World(Task):
+    """A task together with the target's motion (paper, Section II), which solvers may read and learners may not.
+
+    Attributes:
+        kernel: `[M, M]` sub-stochastic table P; row i sums to 1 - p_exit(i).
+    """
+
+    kernel: Array
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        m = self.num_cells
+        if self.kernel.shape != (m, m):
+            raise UserError(
+                f"kernel: expected a {m}x{m} table for a {self.size}x{self.size} grid, got {self.kernel.shape}"
+            )
+
+    @property
+    def task(self) -> Task:
+        """The same task without the motion."""
+        return Task(self.size, self.reward, self.cost, self.safe_cost, self.t_max)
 
     @cached_property
     def transition(self) -> sparse.csr_array:
