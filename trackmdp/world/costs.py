@@ -1,0 +1,37 @@
+"""The pseudo-reward (paper, eq. reward_func): pure, batched."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from trackmdp.world.model import Task
+
+__all__ = ["Costs"]
+
+
+class Costs:
+    """r, c and D as tensors of one device."""
+
+    def __init__(self, task: Task, device: torch.device | str = "cpu") -> None:
+        self.reward, self.safe_cost = float(task.reward), float(task.safe_cost)
+        self.sensor = torch.as_tensor(task.cost, dtype=torch.float32, device=device)
+        self._uniform = bool((self.sensor == self.sensor[0]).all())
+
+    def sensing_cost(self, action: Tensor) -> Tensor:
+        """`[B]` price of the sensors switched on in `action` `[B, M]`: c·|a|, or the sum of the cells' own c."""
+        if self._uniform:
+            return action.view(torch.uint8).sum(-1, dtype=torch.int32) * self.sensor[0]  # a bool sum converts first
+        return action.to(self.sensor.dtype) @ self.sensor
+
+    def pseudo_reward(self, action: Tensor, sensed: Tensor, forced: Tensor, in_grid: Tensor) -> Tensor:
+        """`[B]` reward of one step: r·1[sensed] - c·|a|, or r - D when the safe action is forced; 0 on the exit step.
+
+        Args:
+            action: `[B, M]` sensors on.
+            sensed: `[B]` the target stands on a cell whose sensor is on.
+            forced: `[B]` the safe action replaces `action`.
+            in_grid: `[B]` the target is still in the grid after its move.
+        """
+        chosen = self.reward * sensed - self.sensing_cost(action)
+        return torch.where(forced, self.reward - self.safe_cost, chosen) * in_grid
