@@ -1,0 +1,157 @@
+"""Schema of learning: schedules, algorithms, collectors, logs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from trackmdp.config.options import choice, option
+
+__all__ = [
+    "A2c",
+    "Algo",
+    "Collector",
+    "Csv",
+    "Dqn",
+    "Log",
+    "MultiAsync",
+    "MultiSync",
+    "Ppo",
+    "Prioritized",
+    "Schedule",
+    "Single",
+    "Tensorboard",
+]
+
+
+@dataclass(kw_only=True)
+class Schedule:
+    """A number that is `start` up to the fraction `begin` of the run, `end` from `until`, and linear between."""
+
+    start: float = option("value at the start", ge=0)
+    end: float = option("value at the end", ge=0)
+    begin: float = option("where the change begins", unit="fraction of the run", ge=0, le=1)
+    until: float = option("where the change ends, not before begin", unit="fraction of the run", ge=0, le=1)
+
+
+@dataclass(kw_only=True)
+class Algo:
+    """Base of the group `algo`: how a policy is learned."""
+
+    name: ClassVar[str]
+
+
+@choice("algo", "a2c")
+@dataclass(kw_only=True)
+class A2c(Algo):
+    """Advantage actor-critic, one Bernoulli per sensor, one joint advantage."""
+
+    gamma: float = option("discount while learning; policies are judged undiscounted", ge=0, le=1)
+    lam: float = option("λ of the generalised advantage estimate", ge=0, le=1)
+    learning_rate: Schedule
+    entropy: Schedule
+    critic_coef: float = option("weight of the value loss", ge=0)
+    max_grad_norm: float = option("gradients are clipped to this norm", gt=0)
+    hidden: int = option("units of the hidden layer, in the actor and in the critic", unit="units", ge=1, le=4096)
+    initial_logit: float = option("actor's output bias at the start", unit="logits", ge=-20, le=20)
+
+
+@choice("algo", "ppo")
+@dataclass(kw_only=True)
+class Ppo(Algo):
+    """Proximal policy optimisation, one Bernoulli per sensor, one joint advantage."""
+
+    gamma: float = option("discount while learning; policies are judged undiscounted", ge=0, le=1)
+    lam: float = option("λ of the generalised advantage estimate", ge=0, le=1)
+    learning_rate: Schedule
+    entropy: Schedule
+    clip: float = option("how far the probability ratio may leave 1", gt=0, lt=1)
+    epochs: int = option("passes over each collected batch", ge=1, le=100)
+    minibatches: int = option("parts each batch is cut into", ge=1)
+    critic_coef: float = option("weight of the value loss", ge=0)
+    max_grad_norm: float = option("gradients are clipped to this norm", gt=0)
+    hidden: int = option("units of the hidden layer, in the actor and in the critic", unit="units", ge=1, le=4096)
+    initial_logit: float = option("actor's output bias at the start", unit="logits", ge=-20, le=20)
+
+
+@dataclass(kw_only=True)
+class Prioritized:
+    """Prioritised replay: transitions are drawn in proportion to |TD error|^alpha."""
+
+    enabled: bool = option("prioritised instead of uniform replay")
+    alpha: float = option("how much priorities matter", ge=0, le=1)
+    beta: float = option("how much the draw is corrected for", ge=0, le=1)
+
+
+@choice("algo", "dqn")
+@dataclass(kw_only=True)
+class Dqn(Algo):
+    """Double DQN with a Q that adds up over the sensors."""
+
+    gamma: float = option("discount while learning; policies are judged undiscounted", ge=0, le=1)
+    learning_rate: Schedule
+    epsilon: Schedule
+    n_step: int = option("rewards summed before bootstrapping", unit="steps", ge=1, le=64)
+    buffer_size: int = option("transitions kept for replay", unit="frames", ge=1)
+    batch_size: int = option("transitions per update", unit="frames", ge=1)
+    updates: int = option("updates per collected batch", ge=1)
+    target_tau: float = option("share of the target network replaced at each update", gt=0, le=1)
+    max_grad_norm: float = option("gradients are clipped to this norm", gt=0)
+    hidden: int = option("units of the hidden layer", unit="units", ge=1, le=4096)
+    prioritized: Prioritized
+
+
+@dataclass(kw_only=True)
+class Collector:
+    """Base of the group `collector`: where the frames come from. One frame is one env step of one environment."""
+
+    name: ClassVar[str]
+    total_frames: int = option("env steps of the whole run", unit="frames", ge=1)
+    frames_per_batch: int = option(
+        "env steps per collected batch, a multiple of the number of environments", unit="frames", ge=1
+    )
+    envs: int = option("environments stepped together, in each worker", ge=1)
+    device: str = option("device the environments live on", expects="cpu, cuda, cuda:N or auto")
+    threads: int = option("torch threads of each process that collects", unit="threads", ge=1, le=256)
+
+
+@choice("collector", "single")
+@dataclass(kw_only=True)
+class Single(Collector):
+    """In the process that learns."""
+
+
+@choice("collector", "multi_sync")
+@dataclass(kw_only=True)
+class MultiSync(Collector):
+    """In worker processes; every batch waits for all of them."""
+
+    workers: int = option("worker processes", ge=1, le=256)
+
+
+@choice("collector", "multi_async")
+@dataclass(kw_only=True)
+class MultiAsync(Collector):
+    """In worker processes; a batch is what one of them has ready."""
+
+    workers: int = option("worker processes", ge=1, le=256)
+
+
+@dataclass(kw_only=True)
+class Log:
+    """Base of the group `log`: what is written of each iteration, next to `summary.json`."""
+
+    name: ClassVar[str]
+    every: int = option("iterations from one row to the next", unit="iterations", ge=1)
+
+
+@choice("log", "csv")
+@dataclass(kw_only=True)
+class Csv(Log):
+    """`metrics.csv`."""
+
+
+@choice("log", "tensorboard")
+@dataclass(kw_only=True)
+class Tensorboard(Log):
+    """`metrics.csv` and TensorBoard event files."""

@@ -1,0 +1,141 @@
+"""What an option is: a dataclass field that carries its help, unit and range, and no value.
+
+Values live in `conf/*.yaml` only; types, units and ranges live in the dataclasses of this package only.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import types
+import typing
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from trackmdp.errors import UserError
+
+__all__ = ["GROUPS", "Option", "choice", "option", "options"]
+
+T = TypeVar("T")
+
+GROUPS: dict[str, dict[str, type[Any]]] = {}
+"""Group -> option of the group -> its dataclass, for example ``GROUPS["kernel"]["drift"]``."""
+
+_KINDS: dict[Any, str] = {int: "an integer", float: "a number", bool: "true or false", str: "a text"}
+
+
+@dataclass(frozen=True)
+class Option:
+    """Help, unit and allowed values of one field; `kind` is its type, `nullable` whether null is allowed."""
+
+    help: str
+    unit: str = ""
+    ge: float | None = None
+    gt: float | None = None
+    le: float | None = None
+    lt: float | None = None
+    choices: tuple[str, ...] = ()
+    expects: str = ""
+    kind: Any = None
+    nullable: bool = False
+
+    @property
+    def expected(self) -> str:
+        """What a value must be, in words: ``an integer from 3 to 64 (cells)``."""
+        words = self.expects or (f"one of {', '.join(self.choices)}" if self.choices else self._kind_in_range())
+        words += " or null" if self.nullable else ""
+        return words + (f" ({self.unit})" if self.unit else "")
+
+    def allows(self, value: Any) -> bool:
+        """Whether `value` has the right type and lies in the range."""
+        if value is None:
+            return self.nullable
+        if self.kind is float and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        if self.kind in _KINDS and type(value) is not self.kind:
+            return False
+        if self.choices:
+            return value in self.choices
+        return not isinstance(value, (int, float)) or self._in_range(value)
+
+    def _in_range(self, value: float) -> bool:
+        return math.isfinite(value) and (
+            (self.ge is None or value >= self.ge)
+            and (self.gt is None or value > self.gt)
+            and (self.le is None or value <= self.le)
+            and (self.lt is None or value < self.lt)
+        )
+
+    def _kind_in_range(self) -> str:
+        kind = _KINDS.get(self.kind, str(self.kind))
+        if self.ge is not None and self.le is not None:
+            return f"{kind} from {self.ge:g} to {self.le:g}"
+        signs = ((">=", self.ge), (">", self.gt), ("<=", self.le), ("<", self.lt))
+        limits = [f"{sign} {limit:g}" for sign, limit in signs if limit is not None]
+        return " ".join([kind, " and ".join(limits)]).strip()
+
+
+def option(
+    help: str,
+    *,
+    unit: str = "",
+    ge: float | None = None,
+    gt: float | None = None,
+    le: float | None = None,
+    lt: float | None = None,
+    choices: tuple[str, ...] = (),
+    expects: str = "",
+) -> Any:
+    """A dataclass field without a default, described for `--help` and for `validate`.
+
+    Args:
+        help: what it is, in a few words.
+        unit: unit of the value, shown in brackets.
+        ge: smallest value allowed (`gt`: value it must exceed).
+        gt: see `ge`.
+        le: largest value allowed (`lt`: value it must stay below).
+        lt: see `le`.
+        choices: the words allowed, for a text.
+        expects: says in words what is allowed where type and range cannot.
+    """
+    return dataclasses.field(metadata={"option": Option(help, unit, ge, gt, le, lt, choices, expects)})
+
+
+def options(schema: type[Any]) -> dict[str, Option | type[Any]]:
+    """Fields of a schema in order: an `Option` for a value, the dataclass (or group base) for a nested config."""
+    hints = typing.get_type_hints(schema)
+    found: dict[str, Option | type[Any]] = {}
+    for field in dataclasses.fields(schema):
+        kind, nullable = _strip_none(hints[field.name])
+        described = field.metadata.get("option")
+        if dataclasses.is_dataclass(kind) and isinstance(kind, type):
+            found[field.name] = kind
+        elif isinstance(described, Option):
+            found[field.name] = dataclasses.replace(described, kind=kind, nullable=nullable)
+        else:
+            raise TypeError(f"{schema.__name__}.{field.name} is neither an option nor a nested config")
+    return found
+
+
+def choice(group: str, name: str) -> typing.Callable[[type[T]], type[T]]:
+    """Class decorator: make a dataclass the option `name` of a config group."""
+
+    def register(schema: type[T]) -> type[T]:
+        schema.name = name  # type: ignore[attr-defined]
+        GROUPS.setdefault(group, {})[name] = schema
+        return schema
+
+    return register
+
+
+def refuse(key: str, value: object, expected: str) -> UserError:
+    """The error for a value that is not allowed."""
+    return UserError(f"{key}={'null' if value is None else value}: expected {expected}")
+
+
+def _strip_none(hint: Any) -> tuple[Any, bool]:
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        rest = [part for part in typing.get_args(hint) if part is not type(None)]
+        if len(rest) == 1:
+            return rest[0], True
+    return hint, False

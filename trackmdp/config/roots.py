@@ -1,0 +1,123 @@
+"""Schema of each command: what can be set for train, evaluate, solve, verify and benchmark."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from trackmdp.config.baselines import Baseline
+from trackmdp.config.learning import Algo, Collector, Log
+from trackmdp.config.options import option
+from trackmdp.config.world import Cost, Grid, Kernel
+
+__all__ = [
+    "ROOTS",
+    "BenchmarkConfig",
+    "Checkpoint",
+    "EvaluateConfig",
+    "Evaluation",
+    "OptimalBound",
+    "SolveConfig",
+    "TrainConfig",
+    "VerifyConfig",
+    "WorldConfig",
+]
+
+
+@dataclass(kw_only=True)
+class WorldConfig:
+    """What every command has: a world, and how much is said."""
+
+    quiet: bool = option("say nothing at the terminal but errors")
+    grid: Grid
+    kernel: Kernel
+    cost: Cost
+
+
+@dataclass(kw_only=True)
+class Evaluation:
+    """How often and how well the policy is judged while it learns."""
+
+    every: int = option("iterations from one exact evaluation to the next", unit="iterations", ge=1)
+    episodes: int = option("episodes simulated at the end; 0 = exact figures only", unit="episodes", ge=0)
+
+
+@dataclass(kw_only=True)
+class OptimalBound:
+    """The certified optimum beside the policy's figures."""
+
+    enabled: bool = option("solve for the optimum at the end")
+    time_limit: float = option("stop solving after this long", unit="s", gt=0)
+
+
+@dataclass(kw_only=True)
+class Checkpoint:
+    """When the state of the run is saved."""
+
+    every: int = option("iterations from one checkpoint to the next; 0 = only at the end", unit="iterations", ge=0)
+    keep: int = option("newest checkpoints kept", ge=1)
+
+
+@dataclass(kw_only=True)
+class TrainConfig(WorldConfig):
+    """Learn a policy without the motion model, and judge it exactly."""
+
+    seed: int = option("every random draw of the run derives from it", ge=0)
+    device: str = option("device the networks live on", expects="cpu, cuda, cuda:N or auto")
+    threads: int = option("torch threads of the learning process", unit="threads", ge=1, le=256)
+    algo: Algo
+    collector: Collector
+    log: Log
+    evaluation: Evaluation
+    optimal: OptimalBound
+    checkpoint: Checkpoint
+
+
+@dataclass(kw_only=True)
+class EvaluateConfig(WorldConfig):
+    """Value a trained policy (run=) or a baseline (baseline=), exactly and by simulation."""
+
+    run: str | None = option("folder of a training run; its world is taken from there", expects="the folder of a run")
+    baseline: Baseline | None
+    seed: int = option("seed of the simulated episodes", ge=0)
+    device: str = option("device of the simulation", expects="cpu, cuda, cuda:N or auto")
+    threads: int = option("torch threads", unit="threads", ge=1, le=256)
+    episodes: int = option("episodes simulated; 0 = exact figures only", unit="episodes", ge=0)
+
+
+@dataclass(kw_only=True)
+class SolveConfig(WorldConfig):
+    """Solve the world with its motion model."""
+
+    solver: Baseline
+    verify: bool = option("check the paper's theorems on this world as well")
+
+
+@dataclass(kw_only=True)
+class VerifyConfig(WorldConfig):
+    """Check the paper's theorems on a world."""
+
+    tolerance: float = option("deviation that still counts as equal", unit="reward", gt=0, lt=1)
+
+
+@dataclass(kw_only=True)
+class BenchmarkConfig(WorldConfig):
+    """Measure speed and quality on this machine."""
+
+    part: str = option(
+        "what is measured", choices=("env", "collector", "train", "solver", "quality", "growth", "memory")
+    )
+    seed: int = option("every random draw derives from it", ge=0)
+    device: str = option("device of environments and networks", expects="cpu, cuda, cuda:N or auto")
+    threads: int = option("torch threads", unit="threads", ge=1, le=256)
+    seconds: float = option("least time spent on each figure", unit="s", gt=0)
+    peers: str | None = option("folder with the scripts of the peers to run beside ours", expects="a folder")
+
+
+ROOTS: dict[str, type[WorldConfig]] = {
+    "train": TrainConfig,
+    "evaluate": EvaluateConfig,
+    "solve": SolveConfig,
+    "verify": VerifyConfig,
+    "benchmark": BenchmarkConfig,
+}
+"""Command -> its schema; `conf/<command>.yaml` holds the values."""

@@ -1,0 +1,132 @@
+"""From a Hydra config to typed dataclasses, to a plain `config.yaml`, and back."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from trackmdp.config.checks import absolute_paths, validate
+from trackmdp.config.options import GROUPS, Option, options
+from trackmdp.config.roots import ROOTS, WorldConfig
+from trackmdp.errors import UserError
+
+__all__ = ["from_hydra", "load", "refuse_unknown", "register", "suggestion", "to_dict", "to_yaml"]
+
+C = TypeVar("C", bound=WorldConfig)
+
+
+def register() -> None:
+    """Make every schema known to Hydra as `base_<name>`, for the `defaults` lists in `conf/`."""
+    store = ConfigStore.instance()
+    for command, root in ROOTS.items():
+        store.store(name=f"base_{command}", node=root)
+    for group, members in GROUPS.items():
+        for name, schema in members.items():
+            store.store(group=group, name=f"base_{name}", node=schema)
+
+
+def from_hydra(cfg: DictConfig, root: type[C], folder: Path) -> C:
+    """The typed, checked config; relative paths are resolved against `folder`.
+
+    Raises:
+        UserError: an unknown key (even one added with `+`), a missing value, a wrong type, or a broken rule.
+    """
+    try:
+        typed = OmegaConf.to_object(cfg)
+        refuse_unknown(typed, root)
+    except OmegaConfBaseException as error:
+        raise UserError(_first_line(error)) from error
+    assert isinstance(typed, root)
+    validate(typed)
+    absolute_paths(typed, folder)
+    return typed
+
+
+def refuse_unknown(cfg: Any, schema: type[Any], prefix: str = "") -> None:
+    """Raise a `UserError` for a key the schema does not have, naming the known ones."""
+    known = options(schema)
+    for name, value in vars(cfg).items():
+        if name not in known:
+            raise UserError(f"{prefix}{name}: unknown key{suggestion(name, known)}")
+        if dataclasses.is_dataclass(value):
+            refuse_unknown(value, type(value), f"{prefix}{name}.")
+
+
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """`, did you mean ...? (known: ...)` for a name that is none of the known ones."""
+    names = list(known)
+    close = difflib.get_close_matches(name, names, n=1)
+    meant = f", did you mean {close[0]}?" if close else ""
+    return f"{meant} (known: {', '.join(names) or 'none'})"
+
+
+def to_dict(cfg: Any) -> dict[str, Any]:
+    """A plain copy of the config; the option chosen from a group stands under `name`."""
+    plain: dict[str, Any] = {"name": cfg.name} if hasattr(type(cfg), "name") else {}
+    for key in options(type(cfg)):
+        value = vars(cfg)[key]
+        plain[key] = to_dict(value) if dataclasses.is_dataclass(value) else value
+    return plain
+
+
+def to_yaml(cfg: Any) -> str:
+    """The text of a run's `config.yaml`."""
+    return OmegaConf.to_yaml(OmegaConf.create(to_dict(cfg)))
+
+
+def load(file: Path, root: type[C]) -> C:
+    """Read back a `config.yaml` written by `to_yaml`, with all checks.
+
+    Raises:
+        UserError: there is no such file, or it does not hold a config of this command.
+    """
+    try:
+        plain = OmegaConf.to_container(OmegaConf.load(file))
+    except FileNotFoundError:
+        raise UserError(f"{file}: no such file") from None
+    except Exception as error:
+        raise UserError(f"{file}: not a config ({_first_line(error)})") from error
+    if not isinstance(plain, Mapping):
+        raise UserError(f"{file}: not a config (expected a mapping)")
+    try:
+        typed: C = _build(plain, root, "")
+        validate(typed)
+    except UserError as error:
+        raise UserError(f"{file}: {error}") from error
+    return typed
+
+
+def _build(plain: Mapping[Any, Any], schema: type[Any], prefix: str, group: str = "") -> Any:
+    values = dict(plain)
+    if group in GROUPS and hasattr(schema, "__annotations__") and "name" in schema.__annotations__:
+        name = values.pop("name", None)
+        if name not in GROUPS[group]:
+            raise UserError(f"{prefix}name={name}: expected one of {', '.join(GROUPS[group])}")
+        schema = GROUPS[group][name]
+    known = options(schema)
+    for key in values:
+        if key not in known:
+            raise UserError(f"{prefix}{key}: unknown key{suggestion(str(key), known)}")
+    for key, described in known.items():
+        if key not in values:
+            raise UserError(f"{prefix}{key}: missing")
+        value = values[key]
+        if not isinstance(described, Option) and value is not None:
+            if not isinstance(value, Mapping):
+                raise UserError(f"{prefix}{key}={value}: expected a mapping")
+            values[key] = _build(value, described, f"{prefix}{key}.", key)
+        elif isinstance(described, Option) and described.kind is float and type(value) is int:
+            values[key] = float(value)
+    return schema(**values)
+
+
+def _first_line(error: Exception) -> str:
+    text = str(error).strip()
+    return text.splitlines()[0] if text else type(error).__name__

@@ -1,0 +1,96 @@
+"""Schema of the world: grid, motion kernel, costs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from trackmdp.config.options import choice, option
+
+__all__ = ["Cost", "Drift", "Grid", "Kernel", "RandomSupport", "RandomWalk", "Table"]
+
+BORDERS = ("renormalize", "inside", "clip", "exit")
+
+
+@dataclass(kw_only=True)
+class Grid:
+    """The grid of cells, one sensor in each, and the limits on an episode."""
+
+    size: int = option("N, cells along one side; M = N² cells and sensors", unit="cells", ge=3, le=64)
+    t_max: int = option("T_max: free choices at n = 0 ... t_max, then the safe action", unit="steps", ge=0, le=16)
+    max_steps: int | None = option(
+        "truncate an episode after so many steps; null = only the exit ends it", unit="steps", ge=1
+    )
+
+
+@dataclass(kw_only=True)
+class Kernel:
+    """Base of the group `kernel`: how the target moves."""
+
+    name: ClassVar[str]
+
+
+@choice("kernel", "random_support")
+@dataclass(kw_only=True)
+class RandomSupport(Kernel):
+    """The paper's motion: Z random positions around each cell, one of low probability, the others equal."""
+
+    support_size: int = option("Z, positions the target may move to, at most (2·radius+1)²", unit="cells", ge=1)
+    radius: int = option("how far the target moves in one step", unit="cells", ge=1, le=8)
+    low_probability: float = option("probability of the one unlikely position", unit="per step", gt=0, lt=1)
+    exit_probability: float = option("probability of leaving the grid", unit="per step", ge=0, lt=1)
+    border: str = option("what becomes of positions outside the grid", choices=BORDERS)
+    seed: int = option("seed of the random positions", ge=0)
+
+
+@choice("kernel", "random_walk")
+@dataclass(kw_only=True)
+class RandomWalk(Kernel):
+    """A lazy random walk on the 4 or 8 neighbours."""
+
+    stay: float = option("probability of staying in the cell", unit="per step", ge=0, le=1)
+    diagonal: bool = option("whether the 4 diagonal neighbours are reached as well")
+    exit_probability: float = option("probability of leaving the grid", unit="per step", ge=0, lt=1)
+    border: str = option("what becomes of positions outside the grid", choices=BORDERS)
+
+
+@choice("kernel", "drift")
+@dataclass(kw_only=True)
+class Drift(Kernel):
+    """A target that heads one way most of the time."""
+
+    direction: float = option("heading, 0 = right, 90 = up", unit="degrees", ge=0, lt=360)
+    persistence: float = option("probability of keeping to the heading", unit="per step", ge=0, le=1)
+    exit_probability: float = option("probability of leaving the grid", unit="per step", ge=0, lt=1)
+    border: str = option("what becomes of positions outside the grid", choices=BORDERS)
+
+
+@choice("kernel", "table")
+@dataclass(kw_only=True)
+class Table(Kernel):
+    """A table of your own: row i holds the probabilities of moving from cell i to each cell."""
+
+    path: str = option("file with the M x M table", expects="a path to a .npy, .npz or .csv file")
+
+
+@dataclass(kw_only=True)
+class Cost:
+    """Base of the group `cost`: what sensing earns and costs."""
+
+    name: ClassVar[str]
+
+
+@choice("cost", "paper")
+@dataclass(kw_only=True)
+class PaperCost(Cost):
+    """The paper's rewards: r for a detection, c per sensor switched on, D for the safe action."""
+
+    reward: float = option("r, earned by a detection", unit="reward", gt=0)
+    sensor: Any = option(
+        "c, price of one sensor switched on for one step, for all cells or for each",
+        unit="reward per sensor-step",
+        expects="a number >= 0, a list of one per cell, or a path to a .npy or .csv file of one per cell",
+    )
+    safe: float | None = option(
+        "D, price of the safe action; null = the sum of all sensors' prices", unit="reward", ge=0
+    )
