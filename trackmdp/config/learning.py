@@ -33,12 +33,23 @@ class Schedule:
     begin: float = option("where the change begins", unit="fraction of the run", ge=0, le=1)
     until: float = option("where the change ends, not before begin", unit="fraction of the run", ge=0, le=1)
 
+    def at(self, progress: float) -> float:
+        """The value when the fraction `progress` of the run is over."""
+        if progress >= self.until:
+            return self.end
+        if progress <= self.begin:
+            return self.start
+        return self.start + (self.end - self.start) * (progress - self.begin) / (self.until - self.begin)
+
 
 @dataclass(kw_only=True)
 class Algo:
-    """Base of the group `algo`: how a policy is learned."""
+    """Base of the group `algo`: how a policy is learned. The three budgets are what `collector` takes by default."""
 
     name: ClassVar[str]
+    total_frames: int = option("env steps the algorithm needs", unit="frames", ge=1)
+    frames_per_batch: int = option("env steps per collected batch", unit="frames", ge=1)
+    envs: int = option("environments stepped together", ge=1)
 
 
 @choice("algo", "a2c")
@@ -54,6 +65,7 @@ class A2c(Algo):
     max_grad_norm: float = option("gradients are clipped to this norm", gt=0)
     hidden: int = option("units of the hidden layer, in the actor and in the critic", unit="units", ge=1, le=4096)
     initial_logit: float = option("actor's output bias at the start", unit="logits", ge=-20, le=20)
+    reward_scale: float = option("factor on rewards while learning", gt=0)
 
 
 @choice("algo", "ppo")
@@ -72,6 +84,7 @@ class Ppo(Algo):
     max_grad_norm: float = option("gradients are clipped to this norm", gt=0)
     hidden: int = option("units of the hidden layer, in the actor and in the critic", unit="units", ge=1, le=4096)
     initial_logit: float = option("actor's output bias at the start", unit="logits", ge=-20, le=20)
+    reward_scale: float = option("factor on rewards while learning", gt=0)
 
 
 @dataclass(kw_only=True)
@@ -98,6 +111,7 @@ class Dqn(Algo):
     target_tau: float = option("share of the target network replaced at each update", gt=0, le=1)
     max_grad_norm: float = option("gradients are clipped to this norm", gt=0)
     hidden: int = option("units of the hidden layer", unit="units", ge=1, le=4096)
+    reward_scale: float = option("factor on rewards while learning", gt=0)
     prioritized: Prioritized
 
 

@@ -1,0 +1,44 @@
+"""Advantage actor-critic over subsets of sensors, the paper's learner (Section VII; Mnih et al. 2016)."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.objectives import A2CLoss
+
+from trackmdp.algos.common import Averages, clipped_step
+from trackmdp.algos.on_policy import OnPolicy
+from trackmdp.config.learning import A2c
+from trackmdp.world.model import Task
+
+__all__ = ["A2C"]
+
+
+class A2C(OnPolicy):
+    """One gradient step per batch: log-probability of the whole subset times its advantage."""
+
+    def __init__(self, task: Task, cfg: A2c, *, iterations: int, seed: int, device: torch.device) -> None:
+        super().__init__(task, cfg, iterations=iterations, device=device)
+        self.cfg = cfg
+        self.loss = A2CLoss(
+            self.policy,
+            self.critic,
+            entropy_coeff=cfg.entropy.start,
+            critic_coeff=cfg.critic_coef,
+            loss_critic_type="l2",
+        )
+
+    def step(self, batch: TensorDictBase | None) -> dict[str, float]:
+        """Learn from one batch `[B, time]` of fresh frames."""
+        data, diagnostics = self.prepare(batch)
+        losses = self.loss(data)
+        total = losses["loss_objective"] + losses["loss_entropy"] + losses["loss_critic"]
+        norm = clipped_step(total, self.optimizer, self.parameters, self.cfg.max_grad_norm)
+        averages = Averages()
+        averages.add(
+            loss_actor=losses["loss_objective"],
+            loss_critic=losses["loss_critic"],
+            entropy=losses["entropy"],
+            grad_norm=norm,
+        )
+        return diagnostics | averages.means()

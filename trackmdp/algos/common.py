@@ -1,0 +1,81 @@
+"""What the training loop asks of an algorithm, and the few pieces the algorithms share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, Protocol
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+
+__all__ = ["Algorithm", "Averages", "clipped_step", "explained_variance", "set_learning_rate"]
+
+
+class Algorithm(Protocol):
+    """One learning method. An iteration is one collected batch, if frames are left, and then some learning."""
+
+    policy: TensorDictModuleBase
+    """Acts while collecting."""
+    actor: TensorDictModuleBase
+    """The deterministic policy that is judged."""
+    iterations: int
+    """Iterations of the whole run."""
+
+    def step(self, batch: TensorDictBase | None) -> dict[str, float]:
+        """One iteration of learning on `batch` `[B, time]` (None once all frames are in); returns its diagnostics."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that a later process needs to go on as if nothing had happened."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from a `state_dict`."""
+        ...
+
+
+class Averages:
+    """Means of diagnostics over the updates of one iteration, without a device sync per update."""
+
+    def __init__(self) -> None:
+        self._values: dict[str, list[Tensor]] = {}
+
+    def add(self, **values: Tensor) -> None:
+        """Add one update's scalars."""
+        for name, value in values.items():
+            self._values.setdefault(name, []).append(value.detach())
+
+    def means(self) -> dict[str, float]:
+        """The mean of each diagnostic."""
+        return {name: torch.stack(values).mean().item() for name, values in self._values.items()}
+
+
+def set_learning_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:
+    """Use `rate` from the next update on."""
+    for group in optimizer.param_groups:
+        group["lr"] = rate
+
+
+def clipped_step(
+    loss: Tensor, optimizer: torch.optim.Optimizer, parameters: Iterable[nn.Parameter], max_norm: float
+) -> Tensor:
+    """One gradient step with the gradient's norm clipped; returns the norm before clipping.
+
+    Raises:
+        FloatingPointError: the loss is not finite; the parameters are left as they were.
+    """
+    if not torch.isfinite(loss):
+        raise FloatingPointError(f"the loss is {loss.item()}")
+    optimizer.zero_grad(set_to_none=True)
+    loss.backward()
+    norm = nn.utils.clip_grad_norm_(parameters, max_norm)
+    optimizer.step()
+    return norm
+
+
+def explained_variance(predicted: Tensor, target: Tensor) -> Tensor:
+    """1 - Var[target - predicted] / Var[target]; 0 where the target does not vary."""
+    variance = target.var()
+    return torch.where(variance > 0, 1 - (target - predicted).var() / variance, torch.zeros_like(variance))

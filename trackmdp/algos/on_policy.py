@@ -1,0 +1,78 @@
+"""What A2C and PPO have in common: actor, critic, advantage."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.objectives import LossModule
+from torchrl.objectives.value import GAE
+
+from trackmdp.algos.common import explained_variance, set_learning_rate
+from trackmdp.config.learning import A2c, Ppo
+from trackmdp.policies.actor_critic import STATE_KEYS, make_actor, make_critic
+from trackmdp.world.model import Task
+
+__all__ = ["OnPolicy"]
+
+_KEPT = [*STATE_KEYS, "action", "action_log_prob", "advantage", "value_target"]
+
+
+class OnPolicy:
+    """Actor, critic, their optimizer, and the way from a collected batch to rows with an advantage."""
+
+    loss: LossModule
+
+    def __init__(self, task: Task, cfg: A2c | Ppo, *, iterations: int, device: torch.device) -> None:
+        self._settings, self._t_max = cfg, task.t_max
+        self.iterations, self.iteration = iterations, 0
+        self.policy = make_actor(task, cfg.hidden, cfg.initial_logit).to(device)
+        self.critic = make_critic(task, cfg.hidden).to(device)
+        self.parameters = [*self.policy.parameters(), *self.critic.parameters()]
+        self.optimizer = torch.optim.Adam(self.parameters, lr=cfg.learning_rate.start, eps=1e-5, fused=True)
+        self.advantage = GAE(gamma=cfg.gamma, lmbda=cfg.lam, value_network=self.critic, deactivate_vmap=True)
+
+    @property
+    def actor(self) -> TensorDictModuleBase:
+        """The policy itself; its mode is what is judged."""
+        return self.policy
+
+    def prepare(self, batch: TensorDictBase | None) -> tuple[TensorDictBase, dict[str, float]]:
+        """Set this iteration's schedules and return the batch as `[frames]` rows with a normalised advantage.
+
+        On forced steps the safe action replaces the policy's, which therefore gets no credit for them.
+        """
+        if batch is None:
+            raise ValueError("an on-policy algorithm learns from fresh frames only")
+        progress = self.iteration / self.iterations
+        self.iteration += 1
+        rate, entropy = self._settings.learning_rate.at(progress), self._settings.entropy.at(progress)
+        set_learning_rate(self.optimizer, rate)
+        self.loss.entropy_coeff.fill_(entropy)
+        batch["next", "reward"] = batch["next", "reward"] * self._settings.reward_scale
+        with torch.no_grad():
+            self.advantage(batch)
+        fit = explained_variance(batch["state_value"], batch["value_target"]).item()
+        data = batch.select(*_KEPT).reshape(-1)
+        free = (data["steps_since_detection"] <= self._t_max).unsqueeze(-1)
+        chosen = data["advantage"][free]
+        data["advantage"] = (data["advantage"] - chosen.mean()) / (chosen.std() + 1e-8) * free
+        return data, {"learning_rate": rate, "entropy_coef": entropy, "explained_variance": fit}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Networks, optimizer and iteration."""
+        return {
+            "policy": self.policy.state_dict(),
+            "critic": self.critic.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "iteration": self.iteration,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from a `state_dict`."""
+        self.policy.load_state_dict(state["policy"])
+        self.critic.load_state_dict(state["critic"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.iteration = state["iteration"]

@@ -1,0 +1,68 @@
+"""Subset policies, one Bernoulli per sensor, and value heads."""
+
+from __future__ import annotations
+
+import torch
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torch import distributions as dist
+from torchrl.modules import ProbabilisticActor, ValueOperator
+
+from trackmdp.policies.encoder import StateNetwork
+from trackmdp.world.model import Task
+
+__all__ = ["STATE_KEYS", "SubsetDistribution", "make_actor", "make_critic"]
+
+STATE_KEYS = ["last_cell", "steps_since_detection", "action_history"]
+
+
+class SubsetDistribution(dist.Independent):
+    """Independent sensors, each on with probability sigmoid(logit); samples are `[..., M]` bool."""
+
+    def __init__(self, logits: Tensor) -> None:
+        super().__init__(dist.Bernoulli(logits=logits, validate_args=False), 1, validate_args=False)
+
+    def sample(self, sample_shape: torch.Size = torch.Size()) -> Tensor:
+        """A subset; compares uniform draws, which is three times as fast as torch.bernoulli."""
+        shape = self._extended_shape(sample_shape)
+        probability = torch.sigmoid(self.base_dist.logits.detach()).expand(shape)
+        return torch.rand(shape, device=probability.device) < probability
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """`[...]` log-probability of the subset `value` `[..., M]`: Σ_j log σ(±z_j)."""
+        logits = self.base_dist.logits
+        return nn.functional.logsigmoid(torch.where(value, logits, -logits)).sum(-1)
+
+    def entropy(self) -> Tensor:
+        """`[...]` Σ_j [softplus(z_j) - z_j σ(z_j)]."""
+        logits = self.base_dist.logits
+        return (nn.functional.softplus(logits) - logits * torch.sigmoid(logits)).sum(-1)
+
+    @property
+    def mode(self) -> Tensor:
+        """The most likely subset: sensors with a positive logit."""
+        return self.base_dist.logits > 0
+
+    deterministic_sample = mode
+
+
+def make_actor(task: Task, hidden: int, initial_logit: float) -> ProbabilisticActor:
+    """State -> `logits` `[B, M]` -> `action` `[B, M]` bool, with `action_log_prob` `[B]`."""
+    head = nn.Linear(hidden, task.num_cells)
+    nn.init.orthogonal_(head.weight, gain=0.01)
+    nn.init.constant_(head.bias, initial_logit)
+    network = StateNetwork(task, hidden, head)
+    return ProbabilisticActor(
+        TensorDictModule(network, in_keys=STATE_KEYS, out_keys=["logits"]),
+        in_keys=["logits"],
+        distribution_class=SubsetDistribution,
+        return_log_prob=True,
+    )
+
+
+def make_critic(task: Task, hidden: int) -> ValueOperator:
+    """State -> `state_value` `[B, 1]`."""
+    head = nn.Linear(hidden, 1)
+    nn.init.orthogonal_(head.weight)
+    nn.init.zeros_(head.bias)
+    return ValueOperator(StateNetwork(task, hidden, head), in_keys=STATE_KEYS)

@@ -1,0 +1,52 @@
+"""From a Track-MDP state to features: a linear layer that never multiplies by the zeros of a one-hot."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from trackmdp.world.model import Task
+
+__all__ = ["StateEncoder", "StateNetwork"]
+
+
+class StateEncoder(nn.Module):
+    """`[..., hidden]` features of (last_cell, steps_since_detection, action_history).
+
+    Equal to a linear layer on the one-hot cell, the one-hot n, their product and the history bits, followed by ReLU.
+    Embeddings stand for the one-hots, and the history is multiplied only where n > 0 (most rows have none).
+    """
+
+    def __init__(self, task: Task, hidden: int, scale: float = 0.1) -> None:
+        super().__init__()
+        self.stages = task.t_max + 2
+        self.cell = nn.Embedding(task.num_cells, hidden)
+        self.stage = nn.Embedding(self.stages, hidden)
+        self.cell_and_stage = nn.Embedding(task.num_cells * self.stages, hidden)
+        self.history = nn.Linear(task.num_choices * task.num_cells, hidden)
+        for table in (self.cell, self.stage, self.cell_and_stage):
+            nn.init.normal_(table.weight, std=scale)
+        nn.init.normal_(self.history.weight, std=scale)
+        nn.init.zeros_(self.history.bias)
+
+    def forward(self, last_cell: Tensor, steps_since_detection: Tensor, action_history: Tensor) -> Tensor:
+        """Features of a batch of any shape `[...]`; `action_history` is `[..., t_max+1, M]`."""
+        shape = last_cell.shape
+        cell, n = last_cell.reshape(-1), steps_since_detection.reshape(-1)
+        features = self.cell(cell) + self.stage(n) + self.cell_and_stage(cell * self.stages + n)
+        missed = n.nonzero().squeeze(-1)
+        bits = action_history.reshape(len(cell), -1)[missed].to(features.dtype)
+        features = features.index_add(0, missed, bits @ self.history.weight.T) + self.history.bias
+        return torch.relu(features).reshape(*shape, -1)
+
+
+class StateNetwork(nn.Module):
+    """A `StateEncoder` with a linear head on top."""
+
+    def __init__(self, task: Task, hidden: int, head: nn.Linear) -> None:
+        super().__init__()
+        self.encoder, self.head = StateEncoder(task, hidden), head
+
+    def forward(self, last_cell: Tensor, steps_since_detection: Tensor, action_history: Tensor) -> Tensor:
+        """`[..., head.out_features]` of a batch of states of shape `[...]`."""
+        return self.head(self.encoder(last_cell, steps_since_detection, action_history))
