@@ -1,0 +1,83 @@
+"""The three upper bounds, and the policies that read their sets off a threshold."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+
+from tests.solvers.worlds import (
+    PAPER_REFERENCES,
+    REFERENCES,
+    best_by_enumeration,
+    paper_world,
+    reference_world,
+    tiny_worlds,
+)
+from trackmdp.solvers import bounds, clocked, myopic, qmdp
+from trackmdp.solvers.chains import evaluate
+from trackmdp.world.model import World
+
+
+@pytest.mark.parametrize("reference", REFERENCES, ids=lambda row: row["name"])
+def test_reference_values(reference: dict) -> None:
+    world = reference_world(reference)
+    np.testing.assert_allclose(bounds.clocked(world), reference["clocked_bound"], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(bounds.valid(world), reference["paper_bound_valid"], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(bounds.paper(world), reference["paper_bound_as_printed"], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(evaluate(world, qmdp.solve(world)).value, reference["qmdp_value"], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "row", PAPER_REFERENCES, ids=lambda row: f"Z{row['support_size']}-c{row['cost']}-T{row['t_max']}"
+)
+def test_the_papers_worlds(row: dict) -> None:
+    world = paper_world(row["support_size"], row["cost"], row["t_max"])
+    assert bounds.clocked(world).mean() == pytest.approx(row["clocked_bound"], abs=1e-9)
+    assert evaluate(world, qmdp.solve(world)).aihtr == pytest.approx(row["qmdp"], abs=1e-9)
+    if row["cost"] != 0.22 or row["support_size"] != 5:
+        assert evaluate(world, clocked.solve(world)).aihtr == pytest.approx(row["best_known"], abs=1e-9)
+
+
+@given(tiny_worlds())
+def test_no_chain_beats_the_clocked_bound_and_it_beats_no_valid_one(world: World) -> None:
+    best, bound = best_by_enumeration(world), bounds.clocked(world)
+    slack = 1e-9 * (1.0 + np.abs(bound).max())
+    assert (best <= bound + slack).all()
+    assert (bound <= bounds.valid(world) + slack).all()
+
+
+@given(tiny_worlds(most_t_max=3))
+def test_the_clocked_table_solves_its_equation(world: World) -> None:
+    table = bounds.clocked_table(world).table
+    sense = world.kernel * (world.reward + table[:, 0]) - world.cost * world.stay_probability[:, None]
+    for n in range(world.num_choices):
+        expected = np.maximum(sense, world.kernel * table[:, n + 1]).sum(axis=1)
+        np.testing.assert_allclose(table[:, n], expected, rtol=1e-9, atol=1e-9)
+    forced = world.kernel @ (world.reward - world.safe_cost + table[:, 0])
+    np.testing.assert_allclose(table[:, -1], forced, rtol=1e-9, atol=1e-9)
+
+
+def test_a_probability_equal_to_the_threshold_is_sensed_whatever_its_rounding() -> None:
+    kernel = np.zeros((4, 4))
+    kernel[:, 1], kernel[:, 2] = 0.15, 0.6
+    kernel[1, 1] = np.nextafter(0.15, 0)
+    world = World(2, 1.0, np.full(4, 0.15), 0.6, 0, kernel)
+    assert qmdp.solve(world)[:, 0].tolist() == [[False, True, True, False]] * 4
+    assert myopic.solve(world, threshold=0.15)[:, 0].tolist() == [[False, True, True, False]] * 4
+    assert myopic.solve(world, threshold=0.2)[:, 0].tolist() == [[False, False, True, False]] * 4
+
+
+def test_the_in_grid_threshold_senses_what_the_printed_one_leaves() -> None:
+    """From each cell p = 0.4 and 0.1 with exit 0.5: given that it stays, a sensor at 0.5 costs half as often."""
+    kernel = np.zeros((4, 4))
+    kernel[:, 0], kernel[:, 1] = 0.4, 0.1
+    world = World(2, 1.0, np.full(4, 0.5), 2.0, 0, kernel)
+    assert qmdp.solve(world).sum() == 0
+    assert qmdp.solve(world, in_grid=True)[:, 0].tolist() == [[True, False, False, False]] * 4
+
+
+def test_costs_per_cell_set_the_threshold_per_cell() -> None:
+    kernel = np.full((4, 4), 0.2)
+    world = World(2, 1.0, np.array([0.1, 0.3, 0.19, 0.21]), 1.0, 0, kernel)
+    assert qmdp.solve(world)[:, 0].tolist() == [[True, False, True, False]] * 4

@@ -1,0 +1,103 @@
+"""Worlds with known answers, and brute force written apart from the solvers."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from hypothesis import strategies as st
+
+from trackmdp.world.kernels import random_support
+from trackmdp.world.model import Array, BoolArray, World
+
+REFERENCES: list[dict[str, Any]] = json.loads(
+    (Path(__file__).parents[1] / "data" / "values.json").read_text(encoding="utf-8")
+)
+PAPER_REFERENCES: list[dict[str, Any]] = json.loads(
+    (Path(__file__).parents[1] / "data" / "paper_pairs.json").read_text(encoding="utf-8")
+)
+
+
+def reference_world(reference: dict[str, Any]) -> World:
+    kernel = np.array(reference["kernel"])
+    m = len(kernel)
+    return World(round(m**0.5), reference["r"], np.full(m, reference["c"]), reference["D"], reference["t_max"], kernel)
+
+
+@cache
+def paper_world(support_size: int, cost: float, t_max: int, size: int = 10) -> World:
+    kernel = random_support(
+        size,
+        support_size=support_size,
+        radius=1,
+        low_probability=0.15,
+        exit_probability=0.005,
+        border="renormalize",
+        seed=support_size,
+    )
+    return World(size, 1.0, np.full(size**2, cost), size**2 * cost, t_max, kernel)
+
+
+@st.composite
+def tiny_worlds(draw: st.DrawFn, *, size: int = 2, most_t_max: int = 1) -> World:
+    """Any kernel with some zeros, per-cell costs, and a safe action cheaper or dearer than all sensors."""
+    m = size**2
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    kernel = rng.random((m, m)) ** draw(st.sampled_from([1, 4]))
+    kernel *= rng.random((m, m)) < draw(st.sampled_from([0.4, 0.7, 1.0]))
+    kernel *= (1.0 - draw(st.sampled_from([0.02, 0.2]))) / np.maximum(kernel.sum(axis=1, keepdims=True), 1e-300)
+    spread = draw(st.sampled_from([0.0, 1.0]))
+    cost = draw(st.sampled_from([0.0, 0.1, 0.25, 0.5, 1.2])) * (1.0 + spread * rng.random(m))
+    safe_cost = float(cost.sum()) * draw(st.sampled_from([0.1, 1.0, 3.0]))
+    return World(size, draw(st.sampled_from([1.0, 2.0])), cost, safe_cost, draw(st.integers(0, most_t_max)), kernel)
+
+
+def value_of(world: World, chains: BoolArray) -> Array:
+    """`[M]` the value of a policy, by stepping through each chain one set at a time."""
+    m = world.num_cells
+    located, earned = np.zeros((m, m)), np.zeros(m)
+    for x in range(m):
+        earned[x], located[x] = renewal(world, x, chains[x])
+    return np.linalg.solve(np.eye(m) - located, earned)
+
+
+def renewal(world: World, x: int, chain: BoolArray) -> tuple[float, Array]:
+    """Reward until the target is located again, and where it is then."""
+    earned, located = 0.0, np.zeros(world.num_cells)
+    mass = np.eye(world.num_cells)[x]
+    for sensors in chain:
+        mass = mass @ world.kernel
+        earned += world.reward * mass[sensors].sum() - world.cost[sensors].sum() * mass.sum()
+        located[sensors] += mass[sensors]
+        mass = np.where(sensors, 0.0, mass)
+    mass = mass @ world.kernel
+    return earned + (world.reward - world.safe_cost) * mass.sum(), located + mass
+
+
+def best_by_enumeration(world: World) -> Array:
+    """`[M]` V*, every chain of sets tried from every cell until no cell has a better one."""
+    tried = [_all_renewals(world, x) for x in range(world.num_cells)]
+    value = value_of(world, np.ones((world.num_cells, world.num_choices, world.num_cells), dtype=bool))
+    while True:
+        picks = [int(np.argmax(earned + located @ value)) for earned, located in tried]
+        located = np.stack([options[1][pick] for options, pick in zip(tried, picks, strict=True)])
+        earned = np.array([options[0][pick] for options, pick in zip(tried, picks, strict=True)])
+        better = np.linalg.solve(np.eye(world.num_cells) - located, earned)
+        if better.sum() <= value.sum() + 1e-11:
+            return value
+        value = better
+
+
+def _all_renewals(world: World, x: int) -> tuple[Array, Array]:
+    outcomes = [renewal(world, x, chain) for chain in _all_chains(world.num_choices, world.num_cells)]
+    return np.array([earned for earned, _ in outcomes]), np.stack([located for _, located in outcomes])
+
+
+def _all_chains(length: int, cells: int) -> Iterator[BoolArray]:
+    sets = [np.array(bits) for bits in itertools.product([False, True], repeat=cells)]
+    return (np.stack(chain) for chain in itertools.product(sets, repeat=length))

@@ -1,0 +1,28 @@
+"""Q_MDP (Littman, Cassandra and Kaelbling 1995): act as if the position were known after every action."""
+
+from __future__ import annotations
+
+from trackmdp.solvers.chains import Prediction, unroll
+from trackmdp.world.model import BoolArray, World
+
+__all__ = ["solve", "TIE"]
+
+TIE = 1e-12
+"""Relative slack of a threshold: probabilities equal to c/r but for rounding are sensed, the same way each time."""
+
+
+def solve(world: World, *, in_grid: bool = False) -> BoolArray:
+    """Chains of Q_MDP, eq. qmdp_policy: sense j iff p_j >= c_j / r.
+
+    p_j is the predicted probability of cell j given the misses so far, the exit being one of the possibilities.
+
+    Args:
+        world: the problem.
+        in_grid: charge sensors like the reward does, only while the target is in the grid: p_j r >= c_j p_in.
+    """
+
+    def worth_it(seen: Prediction) -> BoolArray:
+        charged = seen.inside if in_grid else seen.before
+        return seen.mass * world.reward >= world.cost[seen.cells] * charged[seen.rows] * (1.0 - TIE)
+
+    return unroll(world, worth_it)
