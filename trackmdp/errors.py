@@ -1,6 +1,11 @@
-"""The one exception that stands for a user's mistake."""
+"""The one exception that stands for a user's mistake, and the exit statuses."""
 
 from __future__ import annotations
+
+__all__ = ["BUG", "INTERRUPTED", "USER_MISTAKE", "UserError"]
+
+USER_MISTAKE, BUG, INTERRUPTED = 2, 1, 130
+"""Exit statuses of a command."""
 
 
 class UserError(ValueError):

@@ -28,6 +28,7 @@ from trackmdp.config.learning import (
     Single,
     Tensorboard,
 )
+from trackmdp.config.options import GROUPS, Option, options
 from trackmdp.config.reads import record_reads
 from trackmdp.config.roots import (
     ROOTS,
@@ -41,10 +42,11 @@ from trackmdp.config.roots import (
     VerifyConfig,
     WorldConfig,
 )
-from trackmdp.config.tree import from_hydra, load, register, to_dict, to_yaml
+from trackmdp.config.tree import conf_dir, from_hydra, load, load_run, register, suggestion, to_dict, to_yaml
 from trackmdp.config.world import Cost, Drift, Grid, Kernel, PaperCost, RandomSupport, RandomWalk, Table
 
 __all__ = [
+    "GROUPS",
     "ROOTS",
     "A2c",
     "Algo",
@@ -71,6 +73,7 @@ __all__ = [
     "NoSensors",
     "Optimal",
     "OptimalBound",
+    "Option",
     "PaperCost",
     "Ppo",
     "Prioritized",
@@ -86,10 +89,14 @@ __all__ = [
     "TrainConfig",
     "VerifyConfig",
     "WorldConfig",
+    "conf_dir",
     "from_hydra",
     "load",
+    "load_run",
+    "options",
     "record_reads",
     "register",
+    "suggestion",
     "to_dict",
     "to_yaml",
     "validate",

@@ -130,7 +130,7 @@ def _check_judged(cfg: EvaluateConfig | SolveConfig) -> None:
     if isinstance(cfg, EvaluateConfig):
         if (cfg.run is None) == (cfg.baseline is None):
             given = "neither" if cfg.run is None else "both"
-            raise UserError(f"evaluate: expected exactly one of run=FOLDER and baseline=NAME, got {given}")
+            raise UserError(f"expected exactly one of run=FOLDER and baseline=NAME, got {given}")
         if isinstance(cfg.baseline, RandomK) and cfg.baseline.k > cfg.grid.size**2:
             cells = cfg.grid.size**2
             raise refuse(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -14,16 +15,42 @@ from omegaconf.errors import OmegaConfBaseException
 
 from trackmdp.config.checks import absolute_paths, validate
 from trackmdp.config.options import GROUPS, Option, options
-from trackmdp.config.roots import ROOTS, WorldConfig
+from trackmdp.config.roots import ROOTS, TrainConfig, WorldConfig
 from trackmdp.errors import UserError
 
-__all__ = ["from_hydra", "load", "refuse_unknown", "register", "suggestion", "to_dict", "to_yaml"]
+__all__ = [
+    "conf_dir",
+    "from_hydra",
+    "load",
+    "load_run",
+    "refuse_unknown",
+    "register",
+    "suggestion",
+    "to_dict",
+    "to_yaml",
+]
 
 C = TypeVar("C", bound=WorldConfig)
 
 
+def conf_dir() -> str:
+    """The folder of the YAML files: `$TRACKMDP_CONF`, a clone's `conf/`, or the copy inside the wheel.
+
+    Raises:
+        UserError: none of them holds a `train.yaml`.
+    """
+    package, chosen = Path(__file__).resolve().parents[1], os.environ.get("TRACKMDP_CONF")
+    clone = package.parent / "conf" if (package.parent / "pyproject.toml").is_file() else None
+    for folder in [Path(chosen)] if chosen else [clone, package / "conf"]:
+        if folder is not None and (folder / "train.yaml").is_file():
+            return str(folder.resolve())
+    where = f"TRACKMDP_CONF={chosen}: expected a folder with" if chosen else "TRACKMDP_CONF is not set, and there is no"
+    raise UserError(f"{where} train.yaml")
+
+
 def register() -> None:
     """Make every schema known to Hydra as `base_<name>`, for the `defaults` lists in `conf/`."""
+    OmegaConf.register_new_resolver("first", _first_given, replace=True)
     store = ConfigStore.instance()
     for command, root in ROOTS.items():
         store.store(name=f"base_{command}", node=root)
@@ -39,6 +66,8 @@ def from_hydra(cfg: DictConfig, root: type[C], folder: Path) -> C:
         UserError: an unknown key (even one added with `+`), a missing value, a wrong type, or a broken rule.
     """
     try:
+        for key in sorted(OmegaConf.missing_keys(cfg)):
+            raise UserError(f"{key}: missing, expected {_expected(cfg, root, key)}")
         typed = OmegaConf.to_object(cfg)
         refuse_unknown(typed, root)
     except OmegaConfBaseException as error:
@@ -59,12 +88,12 @@ def refuse_unknown(cfg: Any, schema: type[Any], prefix: str = "") -> None:
             refuse_unknown(value, type(value), f"{prefix}{name}.")
 
 
-def suggestion(name: str, known: Iterable[str]) -> str:
-    """`, did you mean ...? (known: ...)` for a name that is none of the known ones."""
+def suggestion(name: str, known: Iterable[str], listed: Iterable[str] | None = None) -> str:
+    """`, did you mean ...? (known: ...)` for a name that is none of the known ones; `listed`: name only these."""
     names = list(known)
     close = difflib.get_close_matches(name, names, n=1)
     meant = f", did you mean {close[0]}?" if close else ""
-    return f"{meant} (known: {', '.join(names) or 'none'})"
+    return f"{meant} (known: {', '.join(names if listed is None else listed) or 'none'})"
 
 
 def to_dict(cfg: Any) -> dict[str, Any]:
@@ -103,6 +132,28 @@ def load(file: Path, root: type[C]) -> C:
     return typed
 
 
+def load_run(folder: str | Path) -> TrainConfig:
+    """The config of a training run.
+
+    Raises:
+        UserError: the folder is not that of a run.
+    """
+    file = Path(folder) / "config.yaml"
+    if not Path(folder).is_dir():
+        raise UserError(f"run={folder}: no such folder")
+    if not file.is_file():
+        raise UserError(f"run={folder}: not the folder of a run (it has no config.yaml)")
+    try:
+        return load(file, TrainConfig)
+    except UserError as error:
+        raise UserError(f"run={folder}: not the folder of a run ({error})") from error
+
+
+def _first_given(*values: Any) -> Any:
+    """The first value that is not null, for `${first:a,b}` in `conf/`."""
+    return next((value for value in values if value is not None), None)
+
+
 def _build(plain: Mapping[Any, Any], schema: type[Any], prefix: str, group: str = "") -> Any:
     values = dict(plain)
     if group in GROUPS and hasattr(schema, "__annotations__") and "name" in schema.__annotations__:
@@ -125,6 +176,16 @@ def _build(plain: Mapping[Any, Any], schema: type[Any], prefix: str, group: str 
         elif isinstance(described, Option) and described.kind is float and type(value) is int:
             values[key] = float(value)
     return schema(**values)
+
+
+def _expected(cfg: DictConfig, schema: type[Any], key: str) -> str:
+    """What the option `key` of a config must be."""
+    *parents, last = key.split(".")
+    for name in parents:
+        cfg = cfg[name]
+        schema = OmegaConf.get_type(cfg) or schema
+    described = options(schema)[last]
+    return described.expected if isinstance(described, Option) else f"{key}=NAME"
 
 
 def _first_line(error: Exception) -> str:

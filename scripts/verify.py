@@ -1,0 +1,8 @@
+"""The same as `trackmdp verify`."""
+
+import sys
+
+from trackmdp.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main(["verify", *sys.argv[1:]]))

@@ -1,0 +1,73 @@
+"""From config to objects, in flow order: the one place where names are looked up."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from trackmdp.config import Cost, Drift, Kernel, PaperCost, RandomSupport, RandomWalk, Table, WorldConfig
+from trackmdp.errors import UserError
+from trackmdp.world import kernels
+from trackmdp.world.model import Array, World
+
+__all__ = ["make_world"]
+
+KERNELS: dict[type[Kernel], Callable[..., Array]] = {
+    RandomSupport: kernels.random_support,
+    RandomWalk: kernels.random_walk,
+    Drift: kernels.drift,
+    Table: lambda size, *, path: kernels.load_table(path),  # noqa: ARG005  a table has its own size, checked below
+}
+
+
+def make_world(cfg: WorldConfig) -> World:
+    """The world a config describes.
+
+    Raises:
+        UserError: a file is missing or malformed, or the kernel breaks a rule (`kernels.check_table`).
+    """
+    size = cfg.grid.size
+    table = KERNELS[type(cfg.kernel)](size, **_values(cfg.kernel))
+    source = f"kernel.path={cfg.kernel.path}" if isinstance(cfg.kernel, Table) else f"kernel={cfg.kernel.name}"
+    kernel = kernels.check_table(table, size, truncates=cfg.grid.max_steps is not None, source=source)
+    reward, price, safe = _costs(cfg.cost, size**2)
+    return World(size=size, reward=reward, cost=price, safe_cost=safe, t_max=cfg.grid.t_max, kernel=kernel)
+
+
+def _values(node: Any) -> dict[str, Any]:
+    """The options of one config node as keyword arguments."""
+    return {name: getattr(node, name) for name in vars(node)}
+
+
+def _costs(cost: Cost, cells: int) -> tuple[float, Array, float]:
+    """r, c `[M]` and D of a cost config."""
+    assert isinstance(cost, PaperCost)
+    price = _price_per_cell(cost.sensor, cells)
+    return cost.reward, price, float(price.sum()) if cost.safe is None else cost.safe
+
+
+def _price_per_cell(sensor: float | list[float] | str, cells: int) -> Array:
+    if not isinstance(sensor, str):
+        return np.broadcast_to(np.asarray(sensor, dtype=np.float64), (cells,)).copy()
+    price = _read_prices(Path(sensor))
+    if price.size != cells:
+        raise UserError(f"cost.sensor={sensor}: {price.size} values, expected {cells} (one per cell)")
+    if not (np.isfinite(price) & (price >= 0)).all():
+        bad = int(np.flatnonzero(~(np.isfinite(price) & (price >= 0)))[0])
+        raise UserError(f"cost.sensor={sensor}: cell {bad} costs {price[bad]}, expected a finite number >= 0")
+    return price
+
+
+def _read_prices(file: Path) -> Array:
+    """`[K]` numbers of a .npy file or of a .csv file of any shape, row by row."""
+    if not file.is_file():
+        raise UserError(f"cost.sensor={file}: no such file")
+    try:
+        table = np.load(file, allow_pickle=False) if file.suffix == ".npy" else np.loadtxt(file, delimiter=",", ndmin=1)
+        return np.asarray(table, dtype=np.float64).ravel()
+    except (OSError, ValueError, TypeError, EOFError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise UserError(f"cost.sensor={file}: not a table of numbers ({reason})") from error

@@ -1,0 +1,135 @@
+"""Turn what Hydra says about a mistyped option into one line: key, value, and what was expected."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+
+from trackmdp.config import GROUPS, ROOTS, Option, options, suggestion
+from trackmdp.errors import UserError
+
+__all__ = ["diagnose"]
+
+Compose = Callable[[Sequence[str], RunMode], DictConfig]
+
+
+def diagnose(error: Exception, command: str, words: Sequence[str], compose: Compose) -> UserError:
+    """The `UserError` that says which of the typed `words` Hydra's `error` is about.
+
+    Args:
+        error: what composing raised.
+        command: the command.
+        words: its overrides, as typed.
+        compose: composes a config from overrides.
+    """
+    parser = OverridesParser.create()
+    parsed = []
+    for word in words:
+        try:
+            parsed.append(parser.parse_override(word))
+        except HydraException:
+            return UserError(f"{word}: expected option=value (a value with blanks or commas needs quotes)")
+    sweeps = [override.input_line for override in parsed if override.is_sweep_override()]
+    if "multirun" in str(error).lower() and sweeps:
+        return UserError(f"{sweeps[0]}: expected one value; add -m to run once for each")
+    groups = [override for override in parsed if _group(override, command) in GROUPS]
+    for override in groups:
+        if refusal := _bad_choice(override, _group(override, command), error):
+            return refusal
+    for overrides in _jobs(groups):
+        known = _known(command, overrides, compose)
+        if known is None:
+            continue
+        for override in parsed:
+            if override not in groups and (refusal := _bad_value(override, known)):
+                return refusal
+    return UserError(_plain(error))
+
+
+def _group(override: Override, command: str) -> str:
+    """The group a word chooses from, `""` if it sets a value."""
+    key = override.key_or_group
+    return key if key in GROUPS and key in options(ROOTS[command]) else ""
+
+
+def _bad_choice(override: Override, group: str, error: Exception) -> UserError | None:
+    """The refusal of a choice that Hydra did not find."""
+    for value in _values(override):
+        if f"'{group}/{value}'" in str(error) or not isinstance(value, str):
+            return UserError(f"{group}={_shown(value)}: expected one of {', '.join(GROUPS[group])}")
+    return None
+
+
+def _jobs(groups: Sequence[Override]) -> Iterator[list[str]]:
+    """Every combination of the groups' choices, as overrides."""
+    per_group = [[f"{override.key_or_group}={value}" for value in _values(override)] for override in groups]
+    yield from (list(words) for words in itertools.product(*per_group))
+
+
+def _known(command: str, overrides: Sequence[str], compose: Compose) -> dict[str, Option] | None:
+    """Dotted key -> option of the config with these choices; None where it cannot be composed."""
+    try:
+        return dict(_options_of(compose(overrides, RunMode.RUN), ROOTS[command], ""))
+    except Exception:  # the choices themselves are at fault; the caller reports Hydra's own message
+        return None
+
+
+def _options_of(node: Any, schema: type[Any], prefix: str) -> Iterator[tuple[str, Option]]:
+    for name, item in options(schema).items():
+        if isinstance(item, Option):
+            yield f"{prefix}{name}", item
+            continue
+        child = node._get_node(name)
+        kind = OmegaConf.get_type(child) if isinstance(child, DictConfig) and not child._is_none() else None
+        if kind is not None:
+            yield from _options_of(child, kind, f"{prefix}{name}.")
+
+
+def _bad_value(override: Override, known: dict[str, Option]) -> UserError | None:
+    key = override.key_or_group
+    if key.split(".")[0] == "hydra" or "@" in key:
+        return None
+    if key not in known:
+        return _unknown(override, known)
+    if override.is_delete() or override.is_add():
+        return UserError(f"{override.input_line}: expected {key}=value, without + or ~")
+    for value in _values(override):
+        if not known[key].allows(value):
+            return UserError(f"{key}={_shown(value)}: expected {known[key].expected}")
+    return None
+
+
+def _unknown(override: Override, known: dict[str, Option]) -> UserError:
+    """The refusal of a key that does not exist, naming those that stand beside it."""
+    key = override.key_or_group
+    if inner := [name for name in known if name.startswith(f"{key}.")]:
+        return UserError(f"{override.input_line}: expected {inner[0]}=value (known: {', '.join(inner)})")
+    parent = key.rpartition(".")[0]
+    beside = [name for name in known if name.startswith(f"{parent}.")] if parent else []
+    names = beside or list(dict.fromkeys(name.split(".")[0] for name in known))
+    return UserError(f"{key}: unknown option{suggestion(key, known, names)}")
+
+
+def _values(override: Override) -> list[Any]:
+    """The value, or those of a sweep."""
+    if override.is_sweep_override() and override.is_discrete_sweep():
+        return list(override.sweep_iterator())
+    return [override.value()]
+
+
+def _shown(value: Any) -> Any:
+    return "null" if value is None else value
+
+
+def _plain(error: Exception) -> str:
+    """What an error and its cause say, in one line."""
+    said = [str(each).strip() for each in (error, error.__cause__) if each is not None]
+    lines = [text.splitlines()[0] for text in said if text]
+    return ": ".join(dict.fromkeys(line.rstrip(".") for line in lines)) or type(error).__name__

@@ -1,0 +1,46 @@
+"""Output folders: made when all is checked, gone again when nothing was written."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+from trackmdp.errors import UserError
+
+__all__ = ["make_folder", "remove_if_empty"]
+
+
+def make_folder(key: str, folder: Path) -> list[Path]:
+    """Make `folder`; returns the folders that were not there before, the innermost first.
+
+    Raises:
+        UserError: it cannot be made or written to. Nothing is left behind then.
+    """
+    made = _missing(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise PermissionError(errno.EACCES, "it cannot be written to")
+    except OSError as error:
+        remove_if_empty(made)
+        raise UserError(f"{key}={folder}: expected a folder that can be written to ({error.strerror})") from error
+    return made
+
+
+def _missing(folder: Path) -> list[Path]:
+    """`folder` and those above it that do not exist yet, the innermost first."""
+    path = folder.absolute()
+    return [each for each in (path, *path.parents) if not each.exists()]
+
+
+def remove_if_empty(folders: Iterable[Path]) -> None:
+    """Remove the folders, in this order, up to the first that is not empty."""
+    for folder in folders:
+        try:
+            folder.rmdir()
+        except FileNotFoundError:
+            continue
+        except OSError:
+            return
