@@ -29,7 +29,6 @@ from trackmdp.config.learning import (
     Tensorboard,
 )
 from trackmdp.config.options import GROUPS, Option, options
-from trackmdp.config.reads import record_reads
 from trackmdp.config.roots import (
     ROOTS,
     BenchmarkConfig,
@@ -94,7 +93,6 @@ __all__ = [
     "load",
     "load_run",
     "options",
-    "record_reads",
     "register",
     "suggestion",
     "to_dict",

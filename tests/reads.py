@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
-from unittest import mock
 
 from trackmdp.config.checks import nodes
 from trackmdp.config.options import Option, options
-
-__all__ = ["record_reads"]
 
 
 @contextmanager
@@ -21,15 +18,28 @@ def record_reads(cfg: Any) -> Iterator[set[str]]:
     """
     reads: set[str] = set()
     keys = {id(node): key for key, node in nodes(cfg)}
-    with ExitStack() as stack:
-        for schema in {type(node) for _, node in nodes(cfg)}:
-            stack.enter_context(
-                mock.patch.object(schema, "__getattribute__", _recorder(schema, keys, reads), create=True)
-            )
+    schemas = {type(node) for _, node in nodes(cfg)}
+    for schema in schemas:
+        schema.__getattribute__ = _recorder(schema, keys, reads)  # type: ignore[method-assign]
+    try:
         yield reads
+    finally:
+        for schema in schemas:
+            del schema.__getattribute__
 
 
-def _recorder(schema: type[Any], keys: dict[int, str], reads: set[str]) -> Any:
+def unread(cfg: Any, reads: set[str]) -> set[str]:
+    """The options of `cfg` that are not among `reads`."""
+    everything = {
+        f"{key}.{name}".lstrip(".")
+        for key, node in nodes(cfg)
+        for name, item in options(type(node)).items()
+        if isinstance(item, Option)
+    }
+    return everything - reads
+
+
+def _recorder(schema: type[Any], keys: dict[int, str], reads: set[str]) -> Callable[[Any, str], Any]:
     values = {name for name, described in options(schema).items() if isinstance(described, Option)}
 
     def read(self: Any, name: str) -> Any:
