@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,7 +13,14 @@ from trackmdp.errors import UserError
 from trackmdp.world import kernels
 from trackmdp.world.model import Array, World
 
-__all__ = ["make_world"]
+if TYPE_CHECKING:  # the world is built, and a config checked, before anything heavy is imported
+    import torch
+    from torchrl.collectors import BaseCollector
+
+    from trackmdp.algos.common import Algorithm
+    from trackmdp.config import Baseline, TrainConfig
+
+__all__ = ["make_algorithm", "make_baseline", "make_collector", "make_device", "make_world"]
 
 KERNELS: dict[type[Kernel], Callable[..., Array]] = {
     RandomSupport: kernels.random_support,
@@ -71,3 +78,63 @@ def _read_prices(file: Path) -> Array:
     except (OSError, ValueError, TypeError, EOFError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise UserError(f"cost.sensor={file}: not a table of numbers ({reason})") from error
+
+
+def make_device(name: str, key: str = "device") -> torch.device:
+    """The torch device called `name`; `auto` is the first GPU where there is one.
+
+    Raises:
+        UserError: there is no such device here.
+    """
+    import torch
+
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if name == "auto":
+        return torch.device("cuda:0" if count else "cpu")
+    device = torch.device(name)
+    if device.type == "cuda" and (device.index or 0) >= count:
+        raise UserError(f"{key}={name}: no such device here ({count} CUDA devices found); use cpu or auto")
+    return device
+
+
+def make_algorithm(cfg: TrainConfig, world: World, device: torch.device) -> Algorithm:
+    """The learner; it is given the task, never the motion."""
+    from trackmdp.algos import a2c, dqn, ppo
+    from trackmdp.config import A2c, Dqn, Ppo
+
+    makers: dict[type[Any], Callable[..., Algorithm]] = {A2c: a2c.A2C, Ppo: ppo.PPO, Dqn: dqn.DQN}
+    iterations = -(-cfg.collector.total_frames // cfg.collector.frames_per_batch)
+    make = makers[type(cfg.algo)]
+    return make(world.task, cfg.algo, iterations=iterations, seed=cfg.seed, device=device)
+
+
+def make_collector(cfg: TrainConfig, world: World, algorithm: Algorithm, device: torch.device) -> BaseCollector:
+    """The source of frames."""
+    from trackmdp.training.collect import make_collector as make
+
+    return make(
+        world,
+        algorithm.policy,
+        cfg.collector,
+        seed=cfg.seed,
+        max_steps=cfg.grid.max_steps,
+        env_device=make_device(cfg.collector.device, "collector.device"),
+        device=device,
+    )
+
+
+def make_baseline(cfg: Baseline, world: World) -> np.ndarray:
+    """`[M, t_max+1, M]` chains of a policy that is not learned; probabilities for `random_k`, else bool."""
+    from trackmdp import config
+    from trackmdp.solvers import clocked, myopic, qmdp
+
+    shape = (world.num_cells, world.num_choices, world.num_cells)
+    makers: dict[type[Any], Callable[[Any], np.ndarray]] = {
+        config.Qmdp: lambda c: qmdp.solve(world, in_grid=c.in_grid),
+        config.AllOn: lambda c: np.ones(shape, dtype=bool),
+        config.NoSensors: lambda c: np.zeros(shape, dtype=bool),
+        config.RandomK: lambda c: np.full(shape, c.k / world.num_cells),
+        config.Myopic: lambda c: myopic.solve(world, threshold=c.threshold),
+        config.Clocked: lambda c: clocked.solve(world),
+    }
+    return makers[type(cfg)](cfg)

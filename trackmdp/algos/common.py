@@ -22,6 +22,8 @@ class Algorithm(Protocol):
     """The deterministic policy that is judged."""
     iterations: int
     """Iterations of the whole run."""
+    device: torch.device
+    """Where the networks live."""
 
     def step(self, batch: TensorDictBase | None) -> dict[str, float]:
         """One iteration of learning on `batch` `[B, time]` (None once all frames are in); returns its diagnostics."""

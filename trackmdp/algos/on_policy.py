@@ -27,7 +27,7 @@ class OnPolicy:
 
     def __init__(self, task: Task, cfg: A2c | Ppo, *, iterations: int, device: torch.device) -> None:
         self._settings, self._t_max = cfg, task.t_max
-        self.iterations, self.iteration = iterations, 0
+        self.iterations, self.iteration, self.device = iterations, 0, device
         self.policy = make_actor(task, cfg.hidden, cfg.initial_logit).to(device)
         self.critic = make_critic(task, cfg.hidden).to(device)
         self.parameters = [*self.policy.parameters(), *self.critic.parameters()]

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-
-from trackmdp.world.model import BoolArray
 
 __all__ = ["AllOn", "ChainPolicy", "RandomSubset"]
 
@@ -49,21 +49,31 @@ class RandomSubset(TensorDictModuleBase):
 
 
 class ChainPolicy(TensorDictModuleBase):
-    """A deterministic policy as a table: the sensors on at n misses after locating the target in x.
+    """A policy as a table: the sensors on at n misses after locating the target in x.
 
     Args:
-        chains: `[M, t_max+1, M]` bool.
+        chains: `[M, t_max+1, M]`, bool, or the probabilities of switching each sensor on.
+        generator: draws the sensors where `chains` are probabilities.
         device: where the table lives.
     """
 
     in_keys = ["last_cell", "steps_since_detection"]
     out_keys = ["action"]
 
-    def __init__(self, chains: BoolArray, device: torch.device | str = "cpu") -> None:
+    def __init__(
+        self,
+        chains: npt.NDArray[np.generic],
+        generator: torch.Generator | None = None,
+        device: torch.device | str = "cpu",
+    ) -> None:
         super().__init__()
-        self.register_buffer("chains", torch.as_tensor(chains, dtype=torch.bool, device=device))
+        self.generator = generator
+        self.register_buffer("chains", torch.as_tensor(chains, device=device))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action` `[B, M]`; where the safe action is forced the last set stands in, unused."""
         n = tensordict["steps_since_detection"].clamp_max(self.chains.shape[1] - 1)
-        return tensordict.set("action", self.chains[tensordict["last_cell"], n])
+        on = self.chains[tensordict["last_cell"], n]
+        if on.dtype != torch.bool:
+            on = torch.rand(on.shape, generator=self.generator, device=on.device) < on
+        return tensordict.set("action", on)

@@ -1,0 +1,158 @@
+"""Double DQN with a Q that adds up over the sensors, so that the best of 2^M subsets is a comparison per sensor.
+
+Mnih et al. 2015, van Hasselt et al. 2016; value decomposition after Sunehag et al. 2018. One joint TD target.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from torch import Tensor
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data.replay_buffers.samplers import RandomSampler
+from torchrl.objectives import LossModule, SoftUpdate
+
+from trackmdp.algos.common import Averages, clipped_step, set_learning_rate
+from trackmdp.algos.prioritized import PrioritizedSampler
+from trackmdp.config.learning import Dqn
+from trackmdp.policies.actor_critic import STATE_KEYS
+from trackmdp.policies.qvalue import EpsilonFlip, make_qvalue
+from trackmdp.seeding import generator
+from trackmdp.world.model import Task
+
+__all__ = ["DQN", "AdditiveDQNLoss", "n_step"]
+
+
+class AdditiveDQNLoss(LossModule):
+    """Squared TD error of Q(s, a) = base(s) + Σ_j a_j q_j(s).
+
+    The target is y = R + γ^n [base'(s') + Σ_j a'_j q'_j(s')] while s' is not terminal, with a' = {j : q_j(s') > 0}
+    chosen by the online network (per sensor, which for an additive Q is the joint maximum) and valued by the target
+    network. Writes `td_error` `[batch]`; weighs by `priority_weight` where there is one.
+    """
+
+    def __init__(self, qvalue: TensorDictModule) -> None:
+        super().__init__()
+        self.convert_to_functional(qvalue, "qvalue_network", create_target_params=True)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """`loss` of a batch of transitions as `n_step` makes them."""
+        chosen = _joint(self._values(tensordict, self.qvalue_network_params), tensordict["action"])
+        with torch.no_grad():
+            following = tensordict["next"]
+            best = self._values(following, self.qvalue_network_params)["sensor_value"] > 0
+            future = _joint(self._values(following, self.target_qvalue_network_params), best)
+            alive = ~following["terminated"].squeeze(-1)
+            target = following["reward"].squeeze(-1) + tensordict["discount"] * future * alive
+        error = target - chosen
+        tensordict["td_error"] = error.detach().abs()
+        weight = tensordict.get("priority_weight", torch.ones_like(error))
+        return TensorDict({"loss": (weight * error.square()).mean(), "q_value": chosen.detach().mean()})
+
+    def _values(self, tensordict: TensorDictBase, params: TensorDictBase) -> TensorDictBase:
+        with params.to_module(self.qvalue_network):
+            return self.qvalue_network(tensordict.select(*STATE_KEYS))
+
+
+class DQN:
+    """Learns off policy from a replay buffer; explores by flipping sensors; the target network is what is judged."""
+
+    def __init__(self, task: Task, cfg: Dqn, *, iterations: int, seed: int, device: torch.device) -> None:
+        self.cfg, self.iterations, self.iteration, self.device = cfg, iterations, 0, device
+        qvalue = make_qvalue(task, cfg.hidden, cfg.reward_scale).to(device)
+        self.explore = EpsilonFlip(cfg.epsilon.start).to(device)
+        self.policy = TensorDictSequential(qvalue, self.explore)
+        self.loss = AdditiveDQNLoss(qvalue)
+        self.target = SoftUpdate(self.loss, tau=cfg.target_tau)
+        self.judged = make_qvalue(task, cfg.hidden, cfg.reward_scale).to(device)
+        self.parameters = list(qvalue.parameters())
+        self.optimizer = torch.optim.Adam(self.parameters, lr=cfg.learning_rate.start, fused=True)
+        per = cfg.prioritized
+        sampler = PrioritizedSampler(cfg.buffer_size, per.alpha, per.beta, device) if per.enabled else RandomSampler()
+        self.buffer = TensorDictReplayBuffer(
+            storage=LazyTensorStorage(cfg.buffer_size, device=device), sampler=sampler, batch_size=cfg.batch_size
+        )
+        self.buffer.set_rng(generator(seed, "buffer", device=device))
+
+    @property
+    def actor(self) -> TensorDictModuleBase:
+        """Greedy in the slowly moving target network, which averages the updates' noise out."""
+        self.loss.target_qvalue_network_params.data.to_module(self.judged)
+        return TensorDictSequential(self.judged, EpsilonFlip(0.0).to(self.explore.epsilon.device))
+
+    def step(self, batch: TensorDictBase | None) -> dict[str, float]:
+        """Store one batch `[B, time]`, then update `updates` times."""
+        progress = self.iteration / self.iterations
+        self.iteration += 1
+        rate = self.cfg.learning_rate.at(progress)
+        set_learning_rate(self.optimizer, rate)
+        if batch is not None:
+            batch["next", "reward"] = batch["next", "reward"] * self.cfg.reward_scale
+            self.buffer.extend(n_step(batch, self.cfg.n_step, self.cfg.gamma))
+        averages = Averages()
+        for _ in range(self.cfg.updates):
+            rows = self.buffer.sample()
+            losses = self.loss(rows)
+            norm = clipped_step(losses["loss"], self.optimizer, self.parameters, self.cfg.max_grad_norm)
+            self.target.step()
+            if self.cfg.prioritized.enabled:
+                self.buffer.update_priority(rows["index"], rows["td_error"])
+            averages.add(loss=losses["loss"], q_value=losses["q_value"], td_error=rows["td_error"].mean(), grad_norm=norm)
+        epsilon = self.cfg.epsilon.at(progress)
+        self.explore.epsilon.fill_(epsilon)
+        return {"learning_rate": rate, "epsilon": epsilon} | averages.means()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Networks, target, optimizer, buffer and iteration."""
+        return {
+            "loss": self.loss.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "buffer": self.buffer.state_dict(),
+            "epsilon": self.explore.epsilon.clone(),
+            "iteration": self.iteration,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from a `state_dict`."""
+        self.loss.load_state_dict(state["loss"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.buffer.load_state_dict(state["buffer"])
+        self.explore.epsilon.copy_(state["epsilon"])
+        self.iteration = state["iteration"]
+
+
+def n_step(batch: TensorDictBase, steps: int, gamma: float) -> TensorDictBase:
+    """Transitions `[B · time]` that bootstrap after up to `steps` steps.
+
+    A sum stops at the end of an episode and at the end of the batch. `discount` is γ^k for the k steps taken, and
+    ("next", state and flags) are those after the k steps. (TorchRL's MultiStep leaves the flags of the first step.)
+
+    Args:
+        batch: collected frames `[B, time]`.
+        steps: n.
+        gamma: discount.
+    """
+    reward, done = batch["next", "reward"].squeeze(-1), batch["next", "done"].squeeze(-1)
+    total, taken, alive = reward.clone(), torch.ones_like(reward, dtype=torch.int64), ~done
+    for k in range(1, min(steps, batch.shape[1])):
+        alive[:, -k:] = False
+        total[:, :-k] += gamma**k * reward[:, k:] * alive[:, :-k]
+        taken += alive
+        alive[:, :-k] &= ~done[:, k:]
+    following = batch["next"].select(*STATE_KEYS, "terminated")
+    if steps > 1:
+        following = following.gather(1, torch.arange(batch.shape[1], device=taken.device) + taken - 1)
+    following["reward"] = total.unsqueeze(-1)
+    rows = batch.select(*STATE_KEYS, "action")
+    rows["discount"] = gamma ** taken.to(reward.dtype)
+    rows["next"] = following
+    return rows.reshape(-1)
+
+
+def _joint(values: TensorDictBase, action: Tensor) -> Tensor:
+    sensor = values["sensor_value"]
+    flipped = action.to(sensor.dtype) - (sensor > 0).to(sensor.dtype)
+    return values["base"].squeeze(-1) + (sensor * flipped).sum(-1)

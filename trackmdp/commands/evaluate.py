@@ -1,0 +1,107 @@
+"""`evaluate`: value a trained policy or a baseline, exactly and by simulation."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.console import Console
+
+from trackmdp.build import make_algorithm, make_baseline, make_device, make_world
+from trackmdp.config import EvaluateConfig, load_run
+from trackmdp.policies.fixed import ChainPolicy
+from trackmdp.seeding import generator
+from trackmdp.training import checkpoint
+from trackmdp.training.display import make_console, table
+from trackmdp.training.evaluate import Simulation, chains_of, simulate
+from trackmdp.training.judge import Judge, Verdict, figures
+from trackmdp.training.metrics import write_json
+from trackmdp.world.model import World
+
+__all__ = ["run"]
+
+
+def run(cfg: EvaluateConfig, folder: Path) -> float:
+    """Write `evaluation.json` and `sets.json` to `folder`; returns the exact AIHTR."""
+    console = make_console(cfg.quiet)
+    torch.set_num_threads(cfg.threads)
+    device = make_device(cfg.device)
+    world, max_steps, chains, subject = _trained(cfg, device) if cfg.run else _baseline(cfg)
+    judge = Judge(world)
+    verdict = judge.score(chains)
+    simulation = None
+    if cfg.episodes:
+        policy = ChainPolicy(chains, generator(cfg.seed, "evaluation", "policy", device=device), device)
+        simulation = simulate(
+            world, policy, episodes=cfg.episodes, seed=cfg.seed, max_steps=max_steps, device=device
+        )
+    write_json(folder / "evaluation.json", _report(subject, judge, verdict, simulation))
+    if chains.dtype == np.bool_:
+        write_json(folder / "sets.json", sets(chains))
+    _show(console, subject, judge, verdict, simulation, folder)
+    return verdict.evaluation.aihtr
+
+
+def sets(chains: np.ndarray) -> dict[str, Any]:
+    """For each located cell the list of sensed cells at n = 0 ... t_max."""
+    return {
+        "t_max": chains.shape[1] - 1,
+        "sets": {
+            str(cell): [np.flatnonzero(on).tolist() for on in chain] for cell, chain in enumerate(chains)
+        },
+    }
+
+
+def _trained(cfg: EvaluateConfig, device: torch.device) -> tuple[World, int | None, np.ndarray, str]:
+    assert cfg.run is not None
+    trained = load_run(cfg.run)
+    world = make_world(trained)
+    algorithm = make_algorithm(trained, world, device)
+    file = checkpoint.newest(Path(cfg.run))
+    algorithm.load_state_dict(checkpoint.load(file, device)["algorithm"])
+    chains = chains_of(algorithm.actor, world.task, device)
+    return world, trained.grid.max_steps, chains, f"{trained.algo.name}, {file.name}"
+
+
+def _baseline(cfg: EvaluateConfig) -> tuple[World, int | None, np.ndarray, str]:
+    assert cfg.baseline is not None
+    world = make_world(cfg)
+    return world, cfg.grid.max_steps, make_baseline(cfg.baseline, world), cfg.baseline.name
+
+
+def _report(subject: str, judge: Judge, verdict: Verdict, simulation: Simulation | None) -> dict[str, Any]:
+    return {
+        "policy": subject,
+        "exact": figures(verdict.evaluation),
+        "value": verdict.evaluation.value.tolist(),
+        "simulated": asdict(simulation) if simulation else None,
+        "qmdp": figures(judge.qmdp),
+        "bounds": judge.bounds,
+        "regret_per_step": verdict.regret_per_step,
+    }
+
+
+def _show(
+    console: Console, subject: str, judge: Judge, verdict: Verdict, simulation: Simulation | None, folder: Path
+) -> None:
+    names = {
+        "aihtr": "AIHTR",
+        "accuracy": "accuracy",
+        "sensors_per_step": "sensors per step",
+        "safe_per_episode": "safe actions per episode",
+        "expected_length": "steps per episode",
+    }
+    exact, qmdp = figures(verdict.evaluation), figures(judge.qmdp)
+    rows = []
+    for key, label in names.items():
+        estimate = getattr(simulation, key) if simulation else None
+        simulated = f"{estimate.mean:,.4f} ± {estimate.standard_error:.4f}" if estimate else ""
+        rows.append([label, f"{exact[key]:,.4f}", simulated, f"{qmdp[key]:,.4f}"])
+    title = f"simulated, {simulation.episodes} episodes ± s.e." if simulation else "simulated"
+    console.print(table(subject, ["figure", "exact", title, "Q_MDP exact"], rows))
+    console.print(
+        f"upper bound (clocked) {judge.upper:,.4f}; regret per step {verdict.regret_per_step:.4f}; results in {folder}"
+    )

@@ -1,0 +1,47 @@
+"""From a world and a policy to a stream of batches: TorchRL's collectors, set up once."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torchrl.collectors import BaseCollector, Collector, MultiAsyncCollector, MultiSyncCollector
+
+from trackmdp.config.learning import Collector as CollectorConfig
+from trackmdp.config.learning import MultiAsync, MultiSync
+from trackmdp.world.env import TrackEnv
+from trackmdp.world.model import World
+
+__all__ = ["make_collector"]
+
+
+def make_collector(
+    world: World,
+    policy: TensorDictModuleBase,
+    cfg: CollectorConfig,
+    *,
+    seed: int,
+    max_steps: int | None,
+    env_device: torch.device,
+    device: torch.device,
+) -> BaseCollector:
+    """A collector of batches `[B, time]` on `device` (the learner's); its frames are env steps.
+
+    The environment's own `_step_and_maybe_reset` and the flags below make TorchRL's collector as fast as a loop by hand.
+    """
+    env = partial(TrackEnv, world, cfg.envs, seed=seed, max_steps=max_steps, device=env_device)
+    common = {
+        "frames_per_batch": cfg.frames_per_batch,
+        "total_frames": cfg.total_frames,
+        "track_traj_ids": False,
+        "auto_register_policy_transforms": False,
+        "env_device": env_device,
+        "policy_device": device,
+        "storing_device": device,
+    }
+    if isinstance(cfg, (MultiSync, MultiAsync)):
+        workers = [partial(env, stream=f"world-{worker}") for worker in range(cfg.workers)]
+        kind = MultiSyncCollector if isinstance(cfg, MultiSync) else MultiAsyncCollector
+        return kind(workers, policy, num_threads=1, num_sub_threads=cfg.threads, **common)
+    return Collector(env(), policy, **common)

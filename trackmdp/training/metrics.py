@@ -1,0 +1,72 @@
+"""What a run writes of itself: `metrics.csv`, TensorBoard events, and JSON files that are whole or absent."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+__all__ = ["MetricsLog", "write_json", "write_text"]
+
+
+class MetricsLog:
+    """One row per logged iteration; the columns are those of the first row.
+
+    A value that is not there, or not finite, leaves its field empty. Numbers are written so that they read back exactly.
+    """
+
+    def __init__(self, folder: Path, *, tensorboard: bool) -> None:
+        self._file = (folder / "metrics.csv").open("w", newline="")
+        self._writer: csv.DictWriter[str] | None = None
+        self._events = None
+        if tensorboard:
+            from torch.utils.tensorboard import SummaryWriter  # optional dependency, a second to import
+
+            self._events = SummaryWriter(folder / "tensorboard")
+
+    def write(self, row: Mapping[str, float | int | None]) -> None:
+        """Append `row`; it must hold `frames`."""
+        if self._writer is None:
+            self._writer = csv.DictWriter(self._file, fieldnames=list(row))
+            self._writer.writeheader()
+        known = {key: value for key, value in row.items() if value is not None and math.isfinite(value)}
+        self._writer.writerow(known)
+        self._file.flush()
+        if self._events is not None:
+            for key, value in known.items():
+                self._events.add_scalar(key, value, int(row["frames"] or 0))
+
+    def close(self) -> None:
+        """End the files."""
+        self._file.close()
+        if self._events is not None:
+            self._events.close()
+
+
+def write_text(file: Path, text: str) -> None:
+    """Write a file whole or not at all."""
+    part = file.with_name(f"{file.name}.part")
+    with part.open("w") as stream:
+        stream.write(text)
+        stream.flush()
+        os.fsync(stream.fileno())
+    os.replace(part, file)
+
+
+def write_json(file: Path, content: Mapping[str, Any]) -> None:
+    """Write JSON whole or not at all; a number that is not finite is written as null."""
+    write_text(file, json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
+
+
+def _finite(content: Any) -> Any:
+    if isinstance(content, Mapping):
+        return {str(key): _finite(value) for key, value in content.items()}
+    if isinstance(content, (list, tuple)):
+        return [_finite(value) for value in content]
+    if isinstance(content, float) and not math.isfinite(content):
+        return None
+    return content
