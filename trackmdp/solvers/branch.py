@@ -1,0 +1,247 @@
+"""Best-first branch and bound for the search for a moving target, from many located cells at once.
+
+F_h(z) is the most that h more sets can earn for undetected mass z, the value V of being located given. It is a maximum
+of linear functions of z (one per chain of sets), so F_h(z) <= sum_j z_j F_h(e_j): the position may be revealed *once*,
+after any step. Two things follow for the set of the next step, with m = zP and R_h(j) = F_h(e_j):
+
+* a cell whose sensing is worth more than leaving it alone, m_j (r + V(j)) - c_j sum(m) >= m_j R_{h-1}(j), is sensed;
+* a choice N of cells to leave, among the others, is worth at most what is sensed plus min{R_{h-1} z_N, one more set
+  chosen jointly and revealed only then}.
+
+Cells are decided one by one, the likeliest first; open choices are kept best first in batches, so that all the
+arithmetic is on arrays and sparse rows.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+from trackmdp.solvers.renewal import IndexArray, per_row, row_index, row_sums
+from trackmdp.world.model import Array, BoolArray, World
+
+__all__ = ["Tree"]
+
+LARGEST_BATCH = 4096
+
+
+@dataclass(frozen=True)
+class _Frontier:
+    """B info states whose next set is to be chosen, with the K cells (padded) where leaving might pay.
+
+    Attributes:
+        start: `[B]`, located cell.
+        sets_left: sets still to be chosen, the next one included.
+        relaxed: `[B]`, earned so far plus the bound on the rest with every cell at its better choice.
+        cells, mass, regret: `[B, K]`; `regret` is what sensing costs against the bound on leaving.
+        count: `[B]`, cells that are not padding.
+        origin: the batch these states came from and `[B]` their places in it; none at the start.
+    """
+
+    start: IndexArray
+    sets_left: int
+    relaxed: Array
+    cells: IndexArray
+    mass: Array
+    regret: Array
+    count: IndexArray
+    origin: tuple[_Choices, IndexArray] | None
+
+
+@dataclass(frozen=True)
+class _Choices:
+    """P partial choices of the next set: the first `decided` cells of each state are left (`left`) or sensed."""
+
+    frontier: _Frontier
+    decided: int
+    state: IndexArray
+    left: BoolArray
+    relaxed: Array
+    bound: Array
+
+    def pick(self, kept: IndexArray | BoolArray) -> _Choices:
+        return _Choices(
+            self.frontier, self.decided, self.state[kept], self.left[kept], self.relaxed[kept], self.bound[kept]
+        )
+
+    @property
+    def start(self) -> IndexArray:
+        return self.frontier.start[self.state]
+
+
+class Tree:
+    """The open choices for F_H(e_x) from every cell x, given R_0 ... R_{H-1} (upper bounds of F_h(e_j)).
+
+    Attributes:
+        best: `[M]`, worth of the best chain found, or the `lower` it started from.
+        nodes: choices looked at so far.
+    """
+
+    def __init__(self, world: World, detected: Array, revealed: list[Array], lower: Array, slack: float) -> None:
+        """Start with nothing chosen.
+
+        Args:
+            world: the problem.
+            detected: `[M]`, worth of sensing the target in each cell, r + V.
+            revealed: R_0 ... R_{H-1}, each `[M]`; R_0 is exact (what follows the last set).
+            lower: `[M]`, worth of a known chain from each cell.
+            slack: chains better than the best known by less than this are not looked for.
+        """
+        self._world, self._detected, self._revealed, self._slack = world, detected, revealed, slack
+        self.best = lower.copy()
+        self.nodes = 0
+        self._leaves: dict[int, list[set[int]]] = {}
+        self._heap: list[tuple[float, int, _Choices]] = []
+        self._ticket = itertools.count()
+        m = world.num_cells
+        self._open(np.arange(m), np.zeros(m), sparse.eye_array(m, format="csr"), len(revealed), None)
+
+    @property
+    def closed(self) -> bool:
+        """Whether nothing is left to look at."""
+        return not self._heap
+
+    def upper(self) -> Array:
+        """`[M]` proved upper bound of F_H(e_x)."""
+        bound = self.best + self._slack
+        for _, _, choices in self._heap:
+            np.maximum.at(bound, choices.start, choices.bound)
+        return bound
+
+    def run(self, go_on: Callable[[], bool]) -> None:
+        """Look at open choices, best first, while there are some and `go_on()`."""
+        while self._heap and go_on():
+            self._decide(heapq.heappop(self._heap)[2])
+
+    def improvements(self) -> dict[int, list[set[int]]]:
+        """Per located cell with a better chain than it started from: the cells to leave unsensed at each step."""
+        return self._leaves
+
+    def _decide(self, choices: _Choices) -> None:
+        """Split every choice on its next cell; a choice without one goes on to the next step."""
+        choices = choices.pick(self._hopeful(choices.start, choices.bound))
+        frontier, k = choices.frontier, choices.decided
+        done = frontier.count[choices.state] <= k
+        if done.any():
+            self._advance(choices.pick(done))
+        split = choices.pick(~done)
+        if not len(split.state):
+            return
+        self.nodes += 2 * len(split.state)
+        sensed = split.relaxed - frontier.regret[split.state, k]
+        credit = np.maximum(split.relaxed - split.bound, 0.0)  # what leaving the cells so far together loses
+        left = split.left.copy()
+        left[:, k] = True
+        self._push(_Choices(frontier, k + 1, split.state, split.left, sensed, sensed - credit))
+        self._push(_Choices(frontier, k + 1, split.state, left, split.relaxed, self._joint(split, left)))
+
+    def _joint(self, choices: _Choices, left: BoolArray) -> Array:
+        """`[P]` bound with the cells `left` revealed one step later, if that is less."""
+        sets_left = choices.frontier.sets_left - 1
+        mass = self._left_mass(choices, left)
+        now = mass @ self._revealed[sets_left]
+        return choices.relaxed - np.maximum(now - self._one_more_set(mass, sets_left)[0], 0.0)
+
+    def _left_mass(self, choices: _Choices, left: BoolArray) -> sparse.csr_array:
+        row, place = np.nonzero(left)
+        state = choices.state[row]
+        cells, mass = choices.frontier.cells[state, place], choices.frontier.mass[state, place]
+        pointer = np.concatenate([[0], np.cumsum(left.sum(axis=1))])
+        return sparse.csr_array((mass, cells, pointer), shape=(len(left), self._world.num_cells))
+
+    def _one_more_set(self, mass: sparse.csr_array, sets_left: int) -> tuple[Array, sparse.csr_array, Array, Array]:
+        """Bound of F on each row with one more set chosen jointly; also the prediction, worth of sensing, of leaving."""
+        moved = mass @ self._world.transition
+        rows, cells = row_index(moved), moved.indices
+        sense = moved.data * self._detected[cells] - self._world.cost[cells] * row_sums(moved)[rows]
+        leave = moved.data * self._revealed[sets_left - 1][cells]
+        return per_row(rows, np.maximum(sense, leave), mass.shape[0]), moved, sense, leave
+
+    def _advance(self, choices: _Choices) -> None:
+        """The sets of `choices` are complete: go on to the next step, or value the chain if there is none."""
+        sets_left = choices.frontier.sets_left - 1
+        mass = self._left_mass(choices, choices.left)
+        earned = choices.relaxed - mass @ self._revealed[sets_left]
+        self._open(choices.start, earned, mass, sets_left, choices)
+
+    def _open(
+        self, start: IndexArray, earned: Array, mass: sparse.csr_array, sets_left: int, origin: _Choices | None
+    ) -> None:
+        """Put the info states with undetected `mass` on the heap, or close them where one set is left."""
+        future, moved, sense, leave = self._one_more_set(mass, sets_left)
+        relaxed = earned + future
+        if sets_left == 1:  # the last set is separable: this is its exact value
+            self._record(start, relaxed, moved, leave > sense, origin)
+            return
+        kept = np.flatnonzero(self._hopeful(start, relaxed))
+        frontier = _frontier(start, sets_left, relaxed, moved, leave - sense, kept, origin)
+        width = frontier.cells.shape[1]
+        left = np.zeros((len(kept), width), dtype=bool)
+        self._push(_Choices(frontier, 0, np.arange(len(kept)), left, frontier.relaxed, frontier.relaxed))
+
+    def _record(
+        self, start: IndexArray, worth: Array, moved: sparse.csr_array, left: BoolArray, origin: _Choices | None
+    ) -> None:
+        order = np.argsort(-worth, kind="stable")
+        for place in order[self._hopeful(start[order], worth[order])]:
+            x = int(start[place])
+            if worth[place] <= self.best[x] + self._slack:
+                continue
+            self.best[x] = worth[place]
+            last = slice(moved.indptr[place], moved.indptr[place + 1])
+            self._leaves[x] = [*_sets_left_out(origin, int(place)), set(moved.indices[last][left[last]].tolist())]
+
+    def _hopeful(self, start: IndexArray, bound: Array) -> BoolArray:
+        hopeful: BoolArray = bound > self.best[start] + self._slack
+        return hopeful
+
+    def _push(self, choices: _Choices) -> None:
+        choices = choices.pick(self._hopeful(choices.start, choices.bound))
+        excess = choices.bound - self.best[choices.start]
+        order = np.argsort(-excess, kind="stable")
+        for first in range(0, len(order), LARGEST_BATCH):
+            part = order[first : first + LARGEST_BATCH]
+            heapq.heappush(self._heap, (-float(excess[part[0]]), -next(self._ticket), choices.pick(part)))
+
+
+def _frontier(
+    start: IndexArray,
+    sets_left: int,
+    relaxed: Array,
+    moved: sparse.csr_array,
+    regret: Array,
+    kept: IndexArray,
+    origin: _Choices | None,
+) -> _Frontier:
+    """The states `kept`, with the entries of `moved` whose `regret` is positive, the likeliest first."""
+    place = np.full(len(start), -1)
+    place[kept] = np.arange(len(kept))
+    rows = place[row_index(moved)]
+    entry = np.flatnonzero((regret > 0) & (rows >= 0))
+    entry = entry[np.lexsort((-moved.data[entry], rows[entry]))]
+    count = np.bincount(rows[entry], minlength=len(kept))
+    column = np.arange(len(entry)) - np.repeat(np.cumsum(count) - count, count)
+    shape = (len(kept), int(count.max(initial=0)))
+    cells, mass, loss = np.zeros(shape, dtype=np.intp), np.zeros(shape), np.zeros(shape)
+    cells[rows[entry], column] = moved.indices[entry]
+    mass[rows[entry], column] = moved.data[entry]
+    loss[rows[entry], column] = regret[entry]
+    source = None if origin is None else (origin, kept)
+    return _Frontier(start[kept], sets_left, relaxed[kept], cells, mass, loss, count, source)
+
+
+def _sets_left_out(choices: _Choices | None, place: int) -> list[set[int]]:
+    """The cells left unsensed at each step so far."""
+    steps: list[set[int]] = []
+    while choices is not None:
+        frontier, state = choices.frontier, choices.state[place]
+        steps.insert(0, set(frontier.cells[state][choices.left[place]].tolist()))
+        if frontier.origin is None:
+            break
+        choices, place = frontier.origin[0], int(frontier.origin[1][state])
+    return steps

@@ -1,0 +1,210 @@
+"""The optimal policy, with a proof: policy iteration over located cells, the inner search by branch and bound.
+
+With V the value of the policy at hand and T the Bellman operator over renewals, the residual eps = T V - V >= 0
+bounds the optimum: V* <= V + (I - P)^-1 eps, because the motion does not depend on the sensing, so that eps is met at
+most once in every step of the target's path.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from trackmdp.solvers import search
+from trackmdp.solvers.bounds import clocked
+from trackmdp.solvers.branch import Tree
+from trackmdp.solvers.chains import evaluate
+from trackmdp.solvers.layers import Layer, build, chains_to_sets, sets_to_chains
+from trackmdp.solvers.renewal import accumulate, expected_steps
+from trackmdp.solvers.search import InnerProblem
+from trackmdp.world.model import Array, BoolArray, World
+
+__all__ = ["Progress", "Solution", "solve"]
+
+FIRST_SECONDS = 1.0
+"""How long the first search of a round may take before its improvements are used; later rounds may take longer."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The best policy found and what is proved about it.
+
+    Attributes:
+        chains: `[M, t_max + 1, M]`, the policy.
+        value: `[M]`, its exact value; V*(x) >= value[x].
+        bound: `[M]`, proved: V*(x) <= bound[x].
+        certified: whether the means of `value` and `bound` agree within the tolerance.
+        seconds: time spent.
+        nodes: branch-and-bound choices looked at.
+        interrupted: whether the user stopped the search (Ctrl-C).
+    """
+
+    chains: BoolArray
+    value: Array
+    bound: Array
+    certified: bool
+    seconds: float
+    nodes: int
+    interrupted: bool
+
+    @property
+    def lower(self) -> float:
+        """The policy's AIHTR."""
+        return float(self.value.mean())
+
+    @property
+    def upper(self) -> float:
+        """No policy has a higher AIHTR."""
+        return float(self.bound.mean())
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a search has come: the bracket around the optimal AIHTR, and seconds and nodes so far."""
+
+    lower: float
+    upper: float
+    seconds: float
+    nodes: int
+
+
+def solve(
+    world: World,
+    *,
+    time_limit: float = 60.0,
+    tolerance: float = 1e-6,
+    on_progress: Callable[[Progress], None] | None = None,
+) -> Solution:
+    """Search until the bracket is closed to `tolerance` of the value, or `time_limit` seconds are over.
+
+    Ctrl-C ends the search like the time limit does: the bracket reached so far is returned.
+    """
+    run = _Run(world, time_limit, tolerance, on_progress)
+    interrupted = False
+    try:
+        run.search()
+    except KeyboardInterrupt:
+        interrupted = True
+    return run.solution(interrupted)
+
+
+class _Run:
+    """One search: the policy and the bracket so far."""
+
+    def __init__(
+        self,
+        world: World,
+        time_limit: float,
+        tolerance: float,
+        on_progress: Callable[[Progress], None] | None,
+    ) -> None:
+        self.world, self.tolerance, self.on_progress = world, tolerance, on_progress
+        self.started = time.monotonic()
+        self.ends = self.started + time_limit
+        self.layers: list[Layer] = build(world, world.num_choices)
+        self.bound = clocked(world)
+        self.nodes = 0
+        self.use(search.solve(world))
+
+    def use(self, chains: BoolArray) -> None:
+        """Take `chains` as the policy at hand."""
+        self.chains, self.value = chains, evaluate(self.world, chains).value
+        scale = self.tolerance * max(1.0, abs(float(self.value.mean())))
+        self.gap_allowed = scale
+        self.slack = 0.5 * scale / float(expected_steps(self.world).max())
+
+    @property
+    def certified(self) -> bool:
+        return float((self.bound - self.value).mean()) <= self.gap_allowed
+
+    def report(self) -> None:
+        if self.on_progress is not None:
+            seconds = time.monotonic() - self.started
+            self.on_progress(Progress(float(self.value.mean()), float(self.bound.mean()), seconds, self.nodes))
+
+    def search(self) -> None:
+        patience = FIRST_SECONDS
+        self.report()
+        while not self.certified and time.monotonic() < self.ends:
+            improved = self.round(patience)
+            self.report()
+            if not improved:
+                return
+            patience *= 2.0
+
+    def round(self, patience: float) -> bool:
+        """Search the renewals of the policy at hand; whether a better policy was found."""
+        problem = InnerProblem.of(self.world, self.layers, self.value)
+        revealed = [problem.missed]
+        for length in range(1, self.world.num_choices):
+            revealed.append(self.revealed(problem, revealed, length, patience))
+        tree = Tree(self.world, problem.detected, revealed, self.value, self.slack)
+        try:
+            self.explore(tree, patience)
+        finally:
+            self.tighten(tree)
+        if not tree.improvements():
+            return False
+        chains = self.chains.copy()
+        for x, steps in tree.improvements().items():
+            chains[x] = _sets_without(self.world, x, steps)
+        sets = search.improve(self.world, self.layers, chains_to_sets(self.layers, chains))
+        before = self.value.sum()
+        self.use(sets_to_chains(self.world, self.layers, sets))
+        return bool(self.value.sum() > before)
+
+    def explore(self, tree: Tree, patience: float) -> None:
+        """Until the tree is closed or time is over; improvements, where there are some, end it after `patience`."""
+        enough = time.monotonic() + patience
+        reported = time.monotonic()
+
+        def go_on() -> bool:
+            nonlocal reported
+            now = time.monotonic()
+            if now - reported > 1.0:
+                reported = now
+                self.tighten(tree)
+                self.report()
+            return now < self.ends and (now < enough or not tree.improvements())
+
+        before = tree.nodes
+        tree.run(go_on)
+        self.nodes += tree.nodes - before
+
+    def tighten(self, tree: Tree) -> None:
+        """Use what the tree has proved so far."""
+        residual = np.maximum(tree.upper() - self.value, 0.0)
+        self.bound = np.minimum(self.bound, self.value + accumulate(self.world.transition, residual))
+
+    def revealed(self, problem: InnerProblem, known: list[Array], length: int, patience: float) -> Array:
+        """`[M]` upper bound of what `length` more sets can earn with the target known to be in each cell."""
+        layers = self.layers[:length]
+        inner = InnerProblem(self.world, layers, problem.detected, problem.missed)
+        credit = [problem.detected - known[length - 1 - t] for t in range(length)]
+        sets = [np.zeros(len(layer.rows), dtype=bool) for layer in layers]
+        for optimism in np.linspace(1.0, 0.0, 11):
+            sets = inner.ascend(sets, sweeps=3, optimism=float(optimism), credit=credit)
+        tree = Tree(self.world, problem.detected, known, inner.undetected(sets)[1], self.slack)
+        enough = min(self.ends, time.monotonic() + patience)
+        tree.run(lambda: time.monotonic() < enough)
+        self.nodes += tree.nodes
+        return tree.upper()
+
+    def solution(self, interrupted: bool) -> Solution:
+        seconds = time.monotonic() - self.started
+        return Solution(self.chains, self.value, self.bound, self.certified, seconds, self.nodes, interrupted)
+
+
+def _sets_without(world: World, x: int, steps: list[set[int]]) -> BoolArray:
+    """`[t_max + 1, M]` the chain from x that senses every possible cell but those left out at each step."""
+    chain = np.zeros((world.num_choices, world.num_cells), dtype=bool)
+    mass = np.eye(world.num_cells)[x]
+    for n, left in enumerate(steps):
+        mass = mass @ world.kernel
+        chain[n] = mass > 0
+        chain[n, sorted(left)] = False
+        mass = np.where(chain[n], 0.0, mass)
+    return chain

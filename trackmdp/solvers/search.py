@@ -1,0 +1,113 @@
+"""Forward-and-backward search (Brown 1980, Washburn 1983) for chains of sets, led by a homotopy from the clocked bound.
+
+With the value V of being located fixed, the sets after each located cell are an optimal search for a moving target:
+given the sets before, the undetected mass m_t; given the sets after, the value W_t(j) of the target going on undetected
+from j; then the best set of step t is {j : m_t(j) (r + V(j) - W_t(j)) > c_j sum(m_t)}. No single step can improve
+what the ascent ends at, but sets may have to change together. Starting from the optimistic credit of the clocked
+bound, r + U(j, 0) - U(j, n + 1), and going over to the exact one by and by finds most of those joint optima.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from trackmdp.solvers import clocked
+from trackmdp.solvers.bounds import clocked_table
+from trackmdp.solvers.chains import evaluate
+from trackmdp.solvers.layers import Layer, build, chains_to_sets, sets_to_chains
+from trackmdp.solvers.renewal import per_row
+from trackmdp.world.model import Array, BoolArray, World
+
+__all__ = ["InnerProblem", "improve", "solve"]
+
+
+@dataclass(frozen=True)
+class InnerProblem:
+    """The search for the target from each located cell, the value of locating it given.
+
+    Attributes:
+        world: the problem.
+        layers: possible positions after each of the H sets to be chosen.
+        detected: `[M]`, worth of sensing the target in each cell, r + V.
+        missed: `[M]`, worth of the target being in each cell, undetected, after the last set.
+    """
+
+    world: World
+    layers: list[Layer]
+    detected: Array
+    missed: Array
+
+    @classmethod
+    def of(cls, world: World, layers: list[Layer], value: Array) -> InnerProblem:
+        """The problem of one renewal: after the last set comes the safe action. `value`: `[M]`, V."""
+        detected = world.reward + value
+        return cls(world, layers, detected, world.transition @ (detected - world.safe_cost))
+
+    def undetected(self, sets: list[BoolArray]) -> tuple[list[Array], Array]:
+        """W_t per entry of each layer, and the worth `[M]` of the whole chain from each located cell."""
+        later = [self.missed[self.layers[-1].cells]]
+        for t in range(len(self.layers) - 1, -1, -1):
+            layer, on = self.layers[t], sets[t]
+            paid = per_row(layer.rows, on * self.world.cost[layer.cells], self.world.num_cells)
+            before = self.layers[t - 1] if t else None
+            rows = before.rows if before else np.arange(self.world.num_cells)
+            cells = before.cells if before else rows
+            gross = layer.moves @ np.where(on, self.detected[layer.cells], later[0])
+            later.insert(0, gross - paid[rows] * self.world.stay_probability[cells])
+        return later[1:], later[0]
+
+    def ascend(
+        self, sets: list[BoolArray], *, sweeps: int, optimism: float = 0.0, credit: list[Array] | None = None
+    ) -> list[BoolArray]:
+        """At most `sweeps` times, the best set at each step given the others; `sets` is left as it is.
+
+        Args:
+            sets: sensed entries of each layer.
+            sweeps: passes over the steps; ends early where nothing changes.
+            optimism: weight of `credit` against the exact credit r + V - W_t.
+            credit: per step, `[M]` optimistic credit.
+        """
+        for _ in range(sweeps):
+            later, _ = self.undetected(sets)
+            mass, chosen = np.ones(self.world.num_cells), []
+            for t, layer in enumerate(self.layers):
+                mass = mass @ layer.moves
+                inside = per_row(layer.rows, mass, self.world.num_cells)
+                gain = self.detected[layer.cells] - later[t]
+                if credit is not None:
+                    gain = optimism * credit[t][layer.cells] + (1.0 - optimism) * gain
+                chosen.append(mass * gain > self.world.cost[layer.cells] * inside[layer.rows])
+                mass = mass * ~chosen[-1]
+            if all((new == old).all() for new, old in zip(chosen, sets, strict=True)):
+                break
+            sets = chosen
+        return sets
+
+
+def solve(world: World, *, steps: int = 30, sweeps: int = 3) -> BoolArray:
+    """Chains found by the homotopy in `steps` steps of `sweeps` sweeps each, then by plain ascent."""
+    layers = build(world, world.num_choices)
+    table = clocked_table(world).table
+    credit = list((world.reward + table[:, :1] - table[:, 1:]).T)
+    chains, value = clocked.solve(world, table=table), table[:, 0]
+    sets = chains_to_sets(layers, chains)
+    for step in range(steps + 1):
+        problem = InnerProblem.of(world, layers, value)
+        sets = problem.ascend(sets, sweeps=sweeps, optimism=1.0 - step / steps, credit=credit)
+        value = evaluate(world, sets_to_chains(world, layers, sets)).value
+    ascended = improve(world, layers, sets)
+    both = [sets_to_chains(world, layers, ascended), chains]
+    return max(both, key=lambda candidate: evaluate(world, candidate).aihtr)
+
+
+def improve(world: World, layers: list[Layer], sets: list[BoolArray], *, sweeps: int = 10) -> list[BoolArray]:
+    """Policy iteration by ascent, until the mean value no longer grows."""
+    value = evaluate(world, sets_to_chains(world, layers, sets)).value
+    while True:
+        candidate = InnerProblem.of(world, layers, value).ascend(sets, sweeps=sweeps)
+        better = evaluate(world, sets_to_chains(world, layers, candidate)).value
+        if better.sum() <= value.sum() + 1e-12 * np.abs(value).sum():
+            return sets
+        sets, value = candidate, better
