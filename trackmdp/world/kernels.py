@@ -6,8 +6,10 @@ The sampler of the environment is derived from the table (`trackmdp.world.env`);
 from __future__ import annotations
 
 import math
+import warnings
+import zipfile
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Any, BinaryIO, Literal, TypeAlias
 
 import numpy as np
 
@@ -77,13 +79,16 @@ def load_table(path: str | Path) -> Array:
     if not file.is_file():
         raise UserError(f"kernel.path={path}: no such file")
     try:
-        table = _read_array(file)
-        return np.asarray(table, dtype=np.float64)
+        with warnings.catch_warnings(action="error"), file.open("rb") as stream:  # numpy only warns of an empty .csv
+            table = _read_array(file, stream)
     except UserError:
         raise
-    except (OSError, ValueError, TypeError, EOFError, KeyError) as error:
+    except (OSError, ValueError, TypeError, EOFError, KeyError, UserWarning, zipfile.BadZipFile) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise UserError(f"kernel.path={path}: not a table of numbers ({reason})") from error
+    if not isinstance(table, np.ndarray) or table.dtype.kind not in "biuf":
+        raise UserError(f"kernel.path={path}: not a table of numbers (but of {getattr(table, 'dtype', type(table))})")
+    return table.astype(np.float64)
 
 
 def check_table(table: Array, size: int, *, truncates: bool, source: str) -> Array:
@@ -158,11 +163,11 @@ def _homogeneous(size: int, window: np.ndarray, weights: Array, exit_probability
     return np.stack([_place(size, cell, window, scaled, border) for cell in range(size**2)])
 
 
-def _read_array(file: Path) -> Array:
+def _read_array(file: Path, stream: BinaryIO) -> Any:
     if file.suffix == ".npy":
-        return np.load(file, allow_pickle=False)
+        return np.load(stream, allow_pickle=False)
     if file.suffix == ".npz":
-        with np.load(file, allow_pickle=False) as archive:
+        with np.load(stream, allow_pickle=False) as archive:
             names = archive.files
             if "kernel" not in names and len(names) != 1:
                 raise UserError(f"kernel.path={file}: expected one array or one called 'kernel', found {names}")
