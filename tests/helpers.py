@@ -1,0 +1,112 @@
+"""All kernels, algorithms and baselines, so that a new one is tested by existing; small worlds built by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from hydra import compose, initialize_config_dir
+from hypothesis import strategies as st
+from tensordict import TensorDict
+
+from trackmdp.build import make_algorithm
+from trackmdp.config import GROUPS, ROOTS, EvaluateConfig, TrainConfig, conf_dir, from_hydra, register
+from trackmdp.config.world import BORDERS
+from trackmdp.world.model import Array, World
+
+KERNELS = [name for name in GROUPS["kernel"] if name != "table"]
+ALGORITHMS = list(GROUPS["algo"])
+BASELINES = list(GROUPS["baseline"])
+
+__all__ = [
+    "ALGORITHMS",
+    "BASELINES",
+    "BORDERS",
+    "KERNELS",
+    "algorithm",
+    "configured",
+    "evaluate_config",
+    "hop_world",
+    "random_kernel",
+    "random_state",
+    "small_world",
+    "train_config",
+    "worlds",
+]
+
+
+def configured(command: str, *overrides: str) -> Any:
+    """The checked config of `trackmdp command overrides...`."""
+    register()
+    with initialize_config_dir(config_dir=conf_dir(), version_base="1.3"):
+        return from_hydra(compose(command, overrides=list(overrides)), ROOTS[command], Path.cwd())
+
+
+def train_config(*overrides: str) -> TrainConfig:
+    cfg = configured("train", *overrides)
+    assert isinstance(cfg, TrainConfig)
+    return cfg
+
+
+def evaluate_config(*overrides: str) -> EvaluateConfig:
+    cfg = configured("evaluate", *overrides)
+    assert isinstance(cfg, EvaluateConfig)
+    return cfg
+
+
+def hop_world(t_max: int = 1, *, safe_cost: float = 0.9) -> World:
+    """A 2x2 grid: the target hops 0 -> 1 -> 2 -> 3 -> 0, staying in the grid with probability 3/4; r = 2."""
+    kernel = np.zeros((4, 4))
+    kernel[[0, 1, 2, 3], [1, 2, 3, 0]] = 0.75
+    return World(2, 2.0, np.array([0.1, 0.2, 0.3, 0.4]), safe_cost, t_max, kernel)
+
+
+def small_world(size: int = 3, t_max: int = 1, *, exit_probability: float = 0.1, seed: int = 0) -> World:
+    """A dense random kernel that leaves soon; the safe action costs what all sensors do."""
+    m = size**2
+    kernel = random_kernel(np.random.default_rng(seed), m, exit_probability)
+    return World(size, 1.0, np.full(m, 0.2), m * 0.2, t_max, kernel)
+
+
+def random_kernel(rng: np.random.Generator, m: int, exit_probability: float, density: float = 0.7) -> Array:
+    """`[m, m]` with empty cells in most rows, each summing to 1 - exit_probability."""
+    table = rng.random((m, m)) ** 3 * (rng.random((m, m)) < density)
+    table[np.arange(m), rng.integers(m, size=m)] += 0.2
+    return table / table.sum(axis=1, keepdims=True) * (1.0 - exit_probability)
+
+
+@st.composite
+def worlds(draw: st.DrawFn) -> World:
+    """2x2 and 3x3 worlds, T_max 0 to 3, one cost or one per cell."""
+    size, t_max = draw(st.sampled_from([2, 3])), draw(st.integers(0, 3))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    m = size**2
+    cost = rng.random(m) if draw(st.booleans()) else np.full(m, rng.random())
+    kernel = random_kernel(rng, m, draw(st.sampled_from([1e-6, 0.1, 0.5])))
+    return World(size, float(1 + rng.random()), cost, float(3 * rng.random()), t_max, kernel)
+
+
+def random_state(world: World, rows: int, seed: int) -> TensorDict:
+    """States an episode can be in: n misses, and the n actions since the detection."""
+    rng = torch.Generator().manual_seed(seed)
+    m, choices = world.num_cells, world.num_choices
+    n = torch.randint(choices + 1, (rows,), generator=rng)
+    history = torch.rand(rows, choices, m, generator=rng) < 0.4
+    history &= (torch.arange(choices) < n.unsqueeze(-1)).unsqueeze(-1)
+    state = {
+        "target": torch.randint(m, (rows,), generator=rng),
+        "last_cell": torch.randint(m, (rows,), generator=rng),
+        "steps_since_detection": n,
+        "action_history": history,
+        "action": torch.rand(rows, m, generator=rng) < 0.4,
+    }
+    return TensorDict(state, [rows])
+
+
+def algorithm(name: str, world: World, *overrides: str) -> Any:
+    """The learner `name` for `world`, with its own options as in conf/ but for `overrides`."""
+    budget = ("algo.total_frames=4096", "algo.frames_per_batch=256", "algo.envs=32")
+    cfg = train_config(f"algo={name}", *budget, *overrides)
+    return make_algorithm(cfg, world, torch.device("cpu"))

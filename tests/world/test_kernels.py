@@ -1,0 +1,343 @@
+"""Motion kernels as tables: what holds for every kernel, and rows computed by hand."""
+
+from __future__ import annotations
+
+import io
+import pickle
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.helpers import BORDERS, KERNELS, configured
+from trackmdp.build import make_world
+from trackmdp.errors import UserError
+from trackmdp.world import kernels
+from trackmdp.world.kernels import check_table, drift, load_table, random_support, random_walk
+
+
+def paper(size: int = 5, **changes: Any) -> np.ndarray:
+    options: dict[str, Any] = {
+        "support_size": 5,
+        "radius": 1,
+        "low_probability": 0.15,
+        "exit_probability": 0.005,
+        "border": "renormalize",
+        "seed": 0,
+    }
+    return random_support(size, **(options | changes))
+
+
+def window_of(size: int, cell: int, radius: int = 1) -> np.ndarray:
+    """`[M]` whether each cell lies within `radius` rows and columns of `cell`."""
+    row, column = np.divmod(np.arange(size**2), size)
+    return (abs(row - cell // size) <= radius) & (abs(column - cell % size) <= radius)
+
+
+@pytest.mark.parametrize("border", BORDERS)
+@pytest.mark.parametrize("name", KERNELS)
+def test_every_kernel_is_a_table_of_probabilities_within_reach(name: str, border: str) -> None:
+    words = ("grid.size=6", f"kernel={name}", f"kernel.border={border}", "kernel.exit_probability=0.02")
+    table = make_world(configured("train", *words)).kernel
+    assert table.shape == (36, 36)
+    assert table.dtype == np.float64
+    assert (table >= 0).all()
+    inner = [cell for cell in range(36) if 0 < cell // 6 < 5 and 0 < cell % 6 < 5]
+    np.testing.assert_allclose(table.sum(axis=1)[inner], 0.98, rtol=1e-12)
+    if border == "exit":
+        assert (table.sum(axis=1) <= 0.98 + 1e-12).all()
+        assert table.sum(axis=1).min() < 0.9
+    else:
+        np.testing.assert_allclose(table.sum(axis=1), 0.98, rtol=1e-12)
+    for cell in range(36):
+        assert not table[cell][~window_of(6, cell)].any()
+    assert check_table(table, 6, truncates=False, source="kernel") is table
+
+
+@given(
+    size=st.integers(3, 7),
+    radius=st.integers(1, 2),
+    share=st.floats(0, 1),
+    low=st.floats(0.01, 0.6),
+    exit_probability=st.sampled_from([0.0, 1e-6, 0.005, 0.3]),
+    border=st.sampled_from(BORDERS),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_random_support_keeps_its_promises(
+    size: int, radius: int, share: float, low: float, exit_probability: float, border: Any, seed: int
+) -> None:
+    count = 1 + round(share * ((2 * radius + 1) ** 2 - 1))
+    table = paper(
+        size,
+        support_size=count,
+        radius=radius,
+        low_probability=low,
+        exit_probability=exit_probability,
+        border=border,
+        seed=seed,
+    )
+    stay = 1.0 - exit_probability
+    assert (table >= 0).all()
+    for cell, row in enumerate(table):
+        reach = window_of(size, cell, radius)
+        assert not row[~reach].any()
+        assert np.count_nonzero(row) <= count
+        assert row.sum() <= stay + 1e-12
+        if border != "exit":
+            assert row.sum() == pytest.approx(stay, abs=1e-12)
+        whole = reach.sum() == (2 * radius + 1) ** 2
+        drawn = count if whole or border != "inside" else min(count, int(reach.sum()))
+        if whole or border == "inside":
+            expected = [low] + [(stay - low) / (drawn - 1)] * (drawn - 1) if drawn > 1 else [stay]
+            np.testing.assert_allclose(np.sort(row[row > 0]), np.sort(expected), rtol=1e-12)
+
+
+def test_the_kernel_seed_alone_decides_the_random_support() -> None:
+    np.random.seed(1)  # noqa: NPY002  the generator that must not be used
+    first = paper(seed=3)
+    np.random.seed(2)  # noqa: NPY002
+    assert np.array_equal(first, paper(seed=3))
+    assert not np.array_equal(first, paper(seed=4))
+    world = make_world(configured("train", "grid.size=5", "kernel.seed=3", "seed=17"))
+    assert np.array_equal(world.kernel, first)
+
+
+def test_the_low_probability_falls_on_any_of_the_positions() -> None:
+    """Over 200 inner cells of one draw each, the nine positions are all low some time and none far too often."""
+    table = paper(17, support_size=9)
+    inner = [row * 17 + column for row in range(1, 16) for column in range(1, 16)]
+    offsets = [np.flatnonzero(np.isclose(table[cell], 0.15)) - cell for cell in inner]
+    counts = np.unique(np.concatenate(offsets), return_counts=True)[1]
+    assert counts.sum() == 225
+    assert len(counts) == 9
+    assert ((counts - 25) ** 2 / 25).sum() < 26.1  # chi-square, 8 degrees, 0.1 %
+
+
+@pytest.mark.parametrize("border", BORDERS)
+def test_a_corner_row_of_the_papers_kernel(border: Any) -> None:
+    """All nine positions from cell 0: four lie in the grid, and clip folds the others onto three of them."""
+    rest = (1 - 0.15 - 0.005) / 8
+    folded = {0: 4, 1: 2, 5: 2, 6: 1}
+    seen = set()
+    for seed in range(20):
+        row = paper(support_size=9, border=border, seed=seed)[0]
+        assert set(np.flatnonzero(row)) == set(folded)
+        inner_rest = (1 - 0.15 - 0.005) / 3
+        within = {
+            "renormalize": [{c: 0.995 * (0.15 if c == j else rest) / (0.15 + 3 * rest) for c in folded} for j in folded]
+            + [dict.fromkeys(folded, 0.995 / 4)],
+            "exit": [{c: 0.15 if c == j else rest for c in folded} for j in folded] + [dict.fromkeys(folded, rest)],
+            "inside": [{c: 0.15 if c == j else inner_rest for c in folded} for j in folded],
+            "clip": [{c: folded[c] * rest + (0.15 - rest) * (c == j) for c in folded} for j in folded],
+        }[border]
+        matching = [k for k, cells in enumerate(within) if np.allclose(row[list(cells)], list(cells.values()))]
+        assert len(matching) == 1, row[list(folded)]
+        seen.add(matching[0])
+    assert len(seen) > 2
+
+
+def test_renormalize_stays_where_no_position_is_left() -> None:
+    rows = [paper(support_size=1, border="renormalize", seed=seed)[0] for seed in range(30)]
+    outside = [paper(support_size=1, border="exit", seed=seed)[0].sum() == 0 for seed in range(30)]
+    assert 10 < sum(outside) < 25
+    for row, left in zip(rows, outside, strict=True):
+        assert row.max() == pytest.approx(0.995)
+        if left:
+            assert row[0] == pytest.approx(0.995)
+
+
+@pytest.mark.parametrize(
+    ("border", "row"),
+    [
+        ("renormalize", {0: 0.3, 1: 0.3, 3: 0.3}),
+        ("inside", {0: 0.3, 1: 0.3, 3: 0.3}),
+        ("clip", {0: 0.54, 1: 0.18, 3: 0.18}),
+        ("exit", {0: 0.18, 1: 0.18, 3: 0.18}),
+    ],
+)
+def test_a_corner_row_of_the_random_walk(border: Any, row: dict[int, float]) -> None:
+    """Stay 0.2, each of four neighbours 0.2, exit 0.1; from cell 0 two neighbours lie outside."""
+    table = random_walk(3, stay=0.2, diagonal=False, exit_probability=0.1, border=border)
+    expected = np.zeros(9)
+    expected[list(row)] = list(row.values())
+    np.testing.assert_allclose(table[0], expected, atol=1e-15)
+    np.testing.assert_allclose(table[4], [0, 0.18, 0, 0.18, 0.18, 0.18, 0, 0.18, 0], atol=1e-15)
+
+
+def test_the_diagonal_random_walk_shares_among_eight() -> None:
+    table = random_walk(3, stay=0.2, diagonal=True, exit_probability=0.1, border="exit")
+    np.testing.assert_allclose(table[4], [0.09] * 4 + [0.18] + [0.09] * 4)
+    np.testing.assert_allclose(table[8], [0, 0, 0, 0, 0.09, 0.09, 0, 0.09, 0.18], atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("border", "row"),
+    [
+        ("clip", {1: 2 / 30, 2: 4 / 30 + 0.7, 4: 1 / 30, 5: 2 / 30}),
+        ("exit", {1: 1 / 30, 2: 1 / 30, 4: 1 / 30, 5: 1 / 30}),
+        ("renormalize", {1: 0.25, 2: 0.25, 4: 0.25, 5: 0.25}),
+        ("inside", {1: 0.25, 2: 0.25, 4: 0.25, 5: 0.25}),
+    ],
+)
+def test_a_corner_row_of_the_drift(border: Any, row: dict[int, float]) -> None:
+    """Heading right with 0.7 from the right end of row 0 (cell 2), each of nine cells 1/30, exit 0.1."""
+    table = drift(3, direction=0, persistence=0.7, exit_probability=0.1, border=border)
+    expected = np.zeros(9)
+    expected[list(row)] = list(row.values())
+    np.testing.assert_allclose(table[2], 0.9 * expected, atol=1e-15)
+
+
+@given(st.floats(0, 359.99))
+def test_the_drift_heads_where_it_is_told(direction: float) -> None:
+    """The heading is shared between the two nearest of the eight neighbours, in proportion to the angle."""
+    row = drift(5, direction=direction, persistence=1.0, exit_probability=0.0, border="clip")[12]
+    cells = np.flatnonzero(row)
+    assert len(cells) <= 2
+    angles = np.degrees(np.arctan2(cells // 5 - 2, cells % 5 - 2)) % 360
+    away = (angles - direction + 180) % 360 - 180
+    assert abs(away).max() <= 45.0 + 1e-9
+    assert row[cells] @ away == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".npz", ".csv"])
+def test_a_table_comes_back_from_a_file(tmp_path: Path, suffix: str) -> None:
+    table, file = paper(3), tmp_path / f"kernel{suffix}"
+    if suffix == ".npy":
+        np.save(file, table)
+    elif suffix == ".npz":
+        np.savez(file, anything=table)
+    else:
+        np.savetxt(file, table, delimiter=",", fmt="%.18e")
+    assert np.array_equal(load_table(file), table)
+    cfg = configured("train", "grid.size=3", "kernel=table", f"kernel.path={file}")
+    assert np.array_equal(make_world(cfg).kernel, table)
+
+
+def test_of_many_arrays_the_one_called_kernel_is_read(tmp_path: Path) -> None:
+    np.savez(tmp_path / "many.npz", other=np.ones(3), kernel=paper(3))
+    assert np.array_equal(load_table(tmp_path / "many.npz"), paper(3))
+
+
+def _trap(file: Path) -> None:
+    class Trap:
+        def __reduce__(self) -> tuple[Any, ...]:
+            return (file.with_name("executed").write_text, ("x",))
+
+    array = np.empty(1, dtype=object)
+    array[0] = Trap()
+    np.save(file, array, allow_pickle=True)
+    file.with_name("executed").unlink(missing_ok=True)
+
+
+def _npz(file: Path, **arrays: np.ndarray) -> None:
+    with file.open("wb") as stream:
+        np.savez(stream, **arrays)
+
+
+def _cut(file: Path) -> None:
+    _npz(file, kernel=np.eye(9))
+    file.write_bytes(file.read_bytes()[:200])
+
+
+def _broken_member(file: Path) -> None:
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("kernel.npy", b"no array")
+
+
+UNREADABLE: dict[str, tuple[str, Callable[[Path], Any], str]] = {
+    "missing": ("k.npy", lambda file: None, "no such file"),
+    "folder": ("k.npy", lambda file: file.mkdir(), "no such file"),
+    "suffix": ("k.txt", lambda file: file.write_text("1"), "expected a .npy, .npz or .csv file"),
+    "garbage": ("k.npy", lambda file: file.write_bytes(b"garbage"), "not a table of numbers"),
+    "empty": ("k.npy", lambda file: file.touch(), "not a table of numbers"),
+    "pickle": ("k.npy", lambda file: file.write_bytes(pickle.dumps([1])), "not a table of numbers"),
+    "objects": ("k.npy", _trap, "not a table of numbers"),
+    "texts": ("k.npy", lambda file: np.save(file, np.array([["a"]])), "not a table of numbers"),
+    "complex": ("k.npy", lambda file: np.save(file, np.full((9, 9), 1j)), "not a table of numbers"),
+    "no array": ("k.npz", _npz, "expected one array or one called 'kernel'"),
+    "two arrays": ("k.npz", lambda file: _npz(file, a=np.eye(9), b=np.eye(9)), "expected one array or one called"),
+    "no zip": ("k.npz", lambda file: file.write_bytes(b"garbage"), "not a table of numbers"),
+    "cut zip": ("k.npz", _cut, "not a table of numbers"),
+    "broken member": ("k.npz", _broken_member, "not a table of numbers"),
+    "one array, not a zip": ("k.npz", lambda file: _as_npy(file), "not a table of numbers"),
+    "words": ("k.csv", lambda file: file.write_text("0.1,zero\n0.2,0.3\n"), "not a table of numbers"),
+    "ragged": ("k.csv", lambda file: file.write_text("0.1,0.2\n0.3\n"), "not a table of numbers"),
+    "no rows": ("k.csv", lambda file: file.touch(), "not a table of numbers"),
+    "bytes": ("k.csv", lambda file: file.write_bytes(b"\xff\xfe\x00"), "not a table of numbers"),
+}
+
+
+def _as_npy(file: Path) -> None:
+    buffer = io.BytesIO()
+    np.save(buffer, np.eye(9))
+    file.write_bytes(buffer.getvalue())
+
+
+@pytest.mark.parametrize("case", UNREADABLE)
+def test_a_file_that_holds_no_table_is_refused_in_one_line(tmp_path: Path, case: str) -> None:
+    name, write, rule = UNREADABLE[case]
+    write(tmp_path / name)
+    with pytest.raises(UserError) as refused:
+        load_table(tmp_path / name)
+    message = str(refused.value)
+    assert "\n" not in message
+    assert message.startswith(f"kernel.path={tmp_path / name}: ")
+    assert rule in message
+    assert not (tmp_path / "executed").exists()
+
+
+def _changed(row: int, column: int, value: float) -> np.ndarray:
+    table = paper(3).copy()
+    table[row, column] = value
+    return table
+
+
+BROKEN: dict[str, tuple[np.ndarray, str]] = {
+    "a vector": (np.ones(9), r"expected a square table, got shape \(9,\)"),
+    "not square": (np.ones((9, 8)), r"expected a square table, got shape \(9, 8\)"),
+    "another grid": (np.eye(4) / 2, "4 rows, but grid.size=3 has 9 cells"),
+    "nan": (_changed(7, 2, np.nan), "row 7 holds a value that is not finite"),
+    "inf": (_changed(6, 2, np.inf), "row 6 holds a value that is not finite"),
+    "negative": (_changed(5, 8, -1e-9), "row 5 holds a negative probability"),
+    "too much": (_changed(2, 2, 1.5), "row 2 sums to .*, expected at most 1"),
+    "absorbing": (paper(3, exit_probability=0.0), "from cell 0 the target never exits"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_a_table_that_is_no_kernel_is_refused_with_row_and_rule(case: str) -> None:
+    table, rule = BROKEN[case]
+    with pytest.raises(UserError, match=rule) as refused:
+        check_table(table, 3, truncates=False, source="kernel.path=mine.npy")
+    assert str(refused.value).startswith("kernel.path=mine.npy: ")
+    assert "\n" not in str(refused.value)
+
+
+def test_a_table_that_traps_the_target_needs_a_time_limit() -> None:
+    """Cells 0 ... 2 lead to the exit, the pair (7, 8) never does; 3 may go either way."""
+    table = np.zeros((9, 9))
+    table[0, 1] = table[1, 2] = 1.0
+    table[2, 0] = table[3, 7] = table[3, 0] = 0.5
+    table[7, 8] = table[8, 7] = 1.0
+    for cell in (4, 5, 6):
+        table[cell, 0] = 1.0
+    with pytest.raises(UserError, match=r"from cell 7 .* set grid.max_steps"):
+        check_table(table, 3, truncates=False, source="kernel")
+    assert check_table(table, 3, truncates=True, source="kernel") is table
+
+
+def test_rounding_of_a_row_sum_is_forgiven() -> None:
+    table = np.full((9, 9), 1 / 9)
+    table[0] *= 0.5
+    table[4] += 1e-11
+    assert check_table(table, 3, truncates=False, source="kernel") is table
+
+
+def test_all_kernels_are_listed() -> None:
+    made = set(kernels.__all__) - {"Border", "load_table", "check_table"}
+    assert made == set(KERNELS)
