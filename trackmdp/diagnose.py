@@ -62,7 +62,7 @@ def _group(override: Override, command: str) -> str:
 def _bad_choice(override: Override, group: str, error: Exception) -> UserError | None:
     """The refusal of a choice that Hydra did not find."""
     for value in _values(override):
-        if f"'{group}/{value}'" in str(error) or not isinstance(value, str):
+        if f"Could not find '{group}/{value}'" in str(error) or not isinstance(value, str):
             return UserError(f"{group}={_shown(value)}: expected one of {', '.join(GROUPS[group])}")
     return None
 
@@ -131,5 +131,5 @@ def _shown(value: Any) -> Any:
 def _plain(error: Exception) -> str:
     """What an error and its cause say, in one line."""
     said = [str(each).strip() for each in (error, error.__cause__) if each is not None]
-    lines = [text.splitlines()[0] for text in said if text]
-    return ": ".join(dict.fromkeys(line.rstrip(".") for line in lines)) or type(error).__name__
+    lines = [line for text in said for line in text.splitlines()[:2] if line]
+    return ": ".join(dict.fromkeys(line.rstrip(".:") for line in lines)) or type(error).__name__

@@ -205,7 +205,7 @@ def _compose(command: str, args: argparse.Namespace, hydra: Hydra, mode: RunMode
     compose = _composer(command, args, hydra)
     try:
         return compose(args.overrides, mode)
-    except (HydraException, OmegaConfBaseException) as error:
+    except Exception as error:  # Hydra raises many kinds, ValueError among them; all are about what was typed
         raise diagnose(error, command, args.overrides, compose) from error
 
 

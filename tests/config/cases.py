@@ -1,0 +1,49 @@
+"""Every option there is, and configs to try them on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+
+from trackmdp.config import GROUPS, ROOTS, Option, conf_dir, from_hydra, options, register
+
+
+def composed(command: str, *overrides: str) -> Any:
+    """The checked config of a command, typed in /typed/here; `evaluate` gets a baseline if it has none."""
+    register()
+    words = list(overrides)
+    if command == "evaluate" and not any(word.startswith("baseline=") for word in words):
+        words.insert(0, "baseline=qmdp")
+    with initialize_config_dir(config_dir=conf_dir(), version_base="1.3"):
+        return from_hydra(compose(command, overrides=words), ROOTS[command], Path("/typed/here"))
+
+
+def of_command(command: str) -> list[tuple[str, Option]]:
+    """Dotted key and option of all a command has, in every choice of every group."""
+    return [(key, item) for _, key, item in _walk(ROOTS[command], "", "")]
+
+
+def _walk(schema: type[Any], choice: str, prefix: str) -> Iterator[tuple[str, str, Option]]:
+    for key, item in options(schema).items():
+        if isinstance(item, Option):
+            yield choice, f"{prefix}{key}", item
+        elif key in GROUPS and not prefix:
+            for name, member in GROUPS[key].items():
+                yield from _walk(member, f"{key}={name}", f"{key}.")
+        else:
+            yield from _walk(item, choice, f"{prefix}{key}.")
+
+
+def distinct() -> list[tuple[str, list[str], str, Option]]:
+    """(command, words it needs, dotted key, option) of every option; one that several places share comes once."""
+    found: dict[tuple[str, Option], tuple[str, list[str], str, Option]] = {}
+    for command, root in ROOTS.items():
+        for choice, key, item in _walk(root, "", ""):
+            words = [choice] if choice else ["baseline=qmdp"] if command == "evaluate" else []
+            if choice == "kernel=table" and key != "kernel.path":
+                words.append("kernel.path=no.npy")
+            found.setdefault((key, item), (command, words, key, item))
+    return list(found.values())

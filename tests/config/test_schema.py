@@ -1,0 +1,189 @@
+"""The schema and conf/ say the same things once each."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+from omegaconf import OmegaConf
+
+from tests.config.cases import composed
+from tests.reads import record_reads, unread
+from trackmdp.config import GROUPS, ROOTS, Option, TrainConfig, conf_dir, load, options, to_yaml
+from trackmdp.errors import UserError
+
+CONF = Path(conf_dir())
+CHOICES = [(group, name) for group, names in GROUPS.items() for name in names]
+
+
+def read(file: Path) -> dict[str, Any]:
+    plain = OmegaConf.to_container(OmegaConf.load(file))
+    assert isinstance(plain, dict)
+    return {str(key): value for key, value in plain.items()}
+
+
+def keys(values: dict[str, Any]) -> set[str]:
+    return set(values) - {"defaults", "hydra"}
+
+
+@pytest.mark.parametrize(("group", "name"), CHOICES)
+def test_yaml_of_a_choice_holds_exactly_the_options_of_its_schema(group: str, name: str) -> None:
+    values = read(CONF / group / f"{name}.yaml")
+    if group == "solver":
+        assert values == {"defaults": [{"/baseline@_here_": name}]}
+        return
+    schema = GROUPS[group][name]
+    assert values["defaults"] == [f"base_{name}"]
+    assert keys(values) == set(options(schema))
+    for key, item in options(schema).items():
+        if not isinstance(item, Option):
+            assert set(values[key]) == set(options(item))
+
+
+@pytest.mark.parametrize("command", ROOTS)
+def test_yaml_of_a_command_holds_exactly_the_options_of_its_schema(command: str) -> None:
+    values = read(CONF / f"{command}.yaml")
+    schema = options(ROOTS[command])
+    groups = {name for name, item in schema.items() if name in GROUPS and not isinstance(item, Option)}
+    chosen = {key for entry in values["defaults"] if isinstance(entry, dict) for key in entry}
+    assert groups <= chosen
+    assert keys(values) - groups == set(schema) - groups
+    for key in set(schema) - groups:
+        if not isinstance(item := schema[key], Option):
+            assert set(values[key]) == set(options(item))
+
+
+def test_every_yaml_file_belongs_to_a_schema() -> None:
+    found = {str(file.relative_to(CONF)) for file in CONF.rglob("*.yaml")}
+    expected = {f"{group}/{name}.yaml" for group, name in CHOICES} | {f"{command}.yaml" for command in ROOTS}
+    assert found - {"hydra/folders.yaml"} == expected
+
+
+def test_schemas_hold_no_values() -> None:
+    for schema in [*ROOTS.values(), *(GROUPS[group][name] for group, name in CHOICES)]:
+        for field in dataclasses.fields(schema):
+            assert field.default is dataclasses.MISSING
+            assert field.default_factory is dataclasses.MISSING
+
+
+def every_option() -> list[tuple[str, Option]]:
+    found: list[tuple[str, Option]] = []
+
+    def walk(schema: type[Any], where: str) -> None:
+        for key, item in options(schema).items():
+            if isinstance(item, Option):
+                found.append((f"{where}.{key}", item))
+            else:
+                walk(item, f"{where}.{key}")
+
+    for schema in [*ROOTS.values(), *(GROUPS[group][name] for group, name in CHOICES)]:
+        walk(schema, schema.__name__)
+    return found
+
+
+@pytest.mark.parametrize(("where", "item"), every_option())
+def test_every_option_says_what_it_is_and_what_it_may_be(where: str, item: Option) -> None:
+    assert item.help, where
+    if item.kind in (int, float):
+        assert item.ge is not None or item.gt is not None, where
+        assert not item.allows(math.nan)
+        assert not item.allows(math.inf)
+    if item.kind is str:
+        assert item.choices or item.expects, where
+
+
+COMBINATIONS = [
+    (command, f"{group}={name}")
+    for command, root in ROOTS.items()
+    for group, item in options(root).items()
+    if group in GROUPS and not isinstance(item, Option)
+    for name in GROUPS[group]
+]
+
+
+@pytest.mark.parametrize(("command", "choice"), COMBINATIONS)
+def test_every_choice_composes_and_survives_config_yaml(command: str, choice: str, tmp_path: Path) -> None:
+    extra = ["kernel.path=a.npy"] if choice == "kernel=table" else []
+    cfg = composed(command, choice, *extra)
+    group, name = choice.split("=")
+    assert getattr(cfg, group).name == name
+    file = tmp_path / "config.yaml"
+    file.write_text(to_yaml(cfg), encoding="utf-8")
+    assert load(file, ROOTS[command]) == cfg
+
+
+def test_paths_are_resolved_where_the_command_was_typed() -> None:
+    cfg = composed("train", "kernel=table", "kernel.path=sub/my.npy", "cost.sensor=/abs/c.csv")
+    assert (cfg.kernel.path, cfg.cost.sensor) == ("/typed/here/sub/my.npy", "/abs/c.csv")
+
+
+def test_kernel_seed_follows_the_support_size() -> None:
+    assert composed("train", "kernel.support_size=3").kernel.seed == 3
+    assert composed("train", "kernel.support_size=3", "kernel.seed=7").kernel.seed == 7
+
+
+RULES = [
+    ("train", "kernel.support_size=10", "kernel.support_size=10: expected an integer from 1 to 9"),
+    ("train", "kernel.low_probability=0.995", "kernel.low_probability=0.995: expected less than"),
+    ("train", "cost.sensor=[1,2,3]", "cost.sensor: 3 values, expected one number or 100"),
+    ("train", "cost.sensor=-0.1", "cost.sensor=-0.1: expected a number >= 0"),
+    ("train", "cost.sensor=true", "cost.sensor=True: expected a number >= 0"),
+    ("train", "cost.sensor=prices.txt", "cost.sensor=prices.txt: expected a number >= 0"),
+    ("train", "collector.envs=100", "collector.frames_per_batch=4096: expected a multiple of 100"),
+    ("train", "collector.total_frames=4095", "collector.total_frames=4095: expected at least"),
+    ("train", "algo=ppo algo.minibatches=3", "algo.minibatches=3: expected a divisor"),
+    ("train", "algo=dqn algo.buffer_size=1000", "algo.buffer_size=1000: expected at least"),
+    (
+        "train",
+        "algo=ppo algo.entropy.begin=0.6 algo.entropy.until=0.5",
+        "algo.entropy.until=0.5: expected not less than",
+    ),
+    ("train", "device=cuda:x", "device=cuda:x: expected cpu, cuda, cuda:N or auto"),
+    ("evaluate", "baseline=random_k baseline.k=101", "baseline.k=101: expected at most 100"),
+    ("evaluate", "run=a baseline=qmdp", "expected exactly one of run=FOLDER and baseline=NAME, got both"),
+]
+
+
+@pytest.mark.parametrize(("command", "words", "message"), RULES)
+def test_rules_between_options(command: str, words: str, message: str) -> None:
+    with pytest.raises(UserError) as caught:
+        composed(command, *words.split())
+    assert str(caught.value).startswith(message)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("size: 10", "grid.size: missing"),
+        ("name: random_support", "kernel.name=None: expected one of random_support"),
+    ],
+)
+def test_a_config_file_with_a_missing_key_is_refused(change: str, message: str, tmp_path: Path) -> None:
+    file = tmp_path / "config.yaml"
+    file.write_text(to_yaml(composed("train")).replace(f"  {change}\n", "", 1), encoding="utf-8")
+    with pytest.raises(UserError, match="config\\.yaml: ") as caught:
+        load(file, TrainConfig)
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["[1, 2]", "just words", "a: [", "seed: 3", ""])
+def test_a_file_that_is_no_config_is_refused(text: str, tmp_path: Path) -> None:
+    file = tmp_path / "config.yaml"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(UserError):
+        load(file, TrainConfig)
+
+
+def test_recorded_reads_are_those_that_happened() -> None:
+    cfg = composed("train")
+    with record_reads(cfg) as reads:
+        assert cfg.algo.learning_rate.start > cfg.algo.learning_rate.end
+        to_yaml(cfg)
+    assert reads == {"algo.learning_rate.start", "algo.learning_rate.end"}
+    assert "seed" in unread(cfg, reads)
+    assert "algo.learning_rate.end" not in unread(cfg, reads)
+    assert cfg.seed == 0
+    assert reads == {"algo.learning_rate.start", "algo.learning_rate.end"}

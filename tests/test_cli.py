@@ -1,0 +1,321 @@
+"""The command line as a user types it: bad input, help, sweeps, interrupts."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.config.cases import composed, of_command
+from tests.typed import refused, stub
+from trackmdp.cli import COMMANDS, main
+from trackmdp.config import GROUPS, ROOTS, options
+from trackmdp.errors import UserError
+
+ROOT = Path(__file__).parents[1]
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
+
+
+@pytest.fixture(autouse=True)
+def empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    folder = tmp_path / "here"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    return folder
+
+
+def typed(*words: str, **kwargs: Any) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "trackmdp.cli", *words],
+        capture_output=True,
+        text=True,
+        env=ENVIRONMENT,
+        check=False,
+        **kwargs,
+    )
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_unknown_choices_are_refused_naming_the_known_ones(group: str, capsys: pytest.CaptureFixture[str]) -> None:
+    command = next(command for command, root in ROOTS.items() if group in options(root))
+    for bad in ("nothing_of_the_kind", "null", "3"):
+        assert (
+            refused(capsys, command, f"{group}={bad}") == f"{group}={bad}: expected one of {', '.join(GROUPS[group])}"
+        )
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("train grid.sise=5", "grid.sise: unknown option, did you mean grid.size?"),
+        ("train +sead=5", "sead: unknown key, did you mean seed?"),
+        ("train grid=5", "grid=5: expected grid.size=value"),
+        ("train ~grid.size", "~grid.size: expected grid.size=value, without + or ~"),
+        ("train size", "size: expected option=value"),
+        ("train grid.size=[", "grid.size=[: expected option=value"),
+        ("train seed=0,1", "seed=0,1: expected one value; add -m"),
+        ("train --sizzle", "unrecognized arguments: --sizzle"),
+        ("train --config-dir nowhere", "--config-dir nowhere: no such folder"),
+        ("train --experimental-rerun x", "--experimental-rerun: not offered"),
+        ("train kernel=table", "kernel.path: missing, expected a path"),
+        ("train kernel=table kernel.path=no.npy", "kernel.path="),
+        ("train kernel.exit_probability=0", "kernel=random_support: from cell 0 the target never exits"),
+        ("train cost.sensor=no.csv", "cost.sensor="),
+        ("train hydra.sizzle=1", "Could not override 'hydra.sizzle': Key 'sizzle' not in 'HydraConf'"),
+        ("evaluate", "expected exactly one of run=FOLDER and baseline=NAME, got neither"),
+        ("evaluate run=nowhere", "run="),
+        ("evaluate run=. baseline=qmdp", "expected exactly one of"),
+        ("evaluate run=nowhere grid.size=5", "grid.size=5: not together with run="),
+        ("evaluate run=nowhere kernel=drift", "kernel=drift: not together with run="),
+    ],
+)
+def test_mistakes_end_in_one_line(words: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert refused(capsys, *words.split()).startswith(message)
+
+
+def test_kernel_files_are_checked_before_a_folder_is_made(
+    tmp_path: Path, empty_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    np.save(tmp_path / "wrong.npy", np.eye(9) * 0.9)
+    (tmp_path / "broken.npy").write_bytes(b"nothing")
+    np.save(tmp_path / "objects.npy", np.array([{}], dtype=object), allow_pickle=True)
+    for name, message in (
+        ("wrong.npy", "9 rows, but grid.size=10 has 100 cells"),
+        ("broken.npy", "not a table of numbers"),
+        ("objects.npy", "not a table of numbers"),
+    ):
+        assert message in refused(capsys, "train", "kernel=table", f"kernel.path=../{name}")
+
+
+def test_price_files_are_checked_before_a_folder_is_made(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "short.csv").write_text("1,2,3\n")
+    (tmp_path / "negative.csv").write_text("\n".join(["1,1,1", "1,-2,1", "1,1,1"]))
+    (tmp_path / "broken.csv").write_text("a,b\n")
+    for name, message in (
+        ("short.csv", "3 values, expected 9"),
+        ("negative.csv", "cell 4 costs -2.0"),
+        ("broken.csv", "not a table of numbers"),
+    ):
+        assert message in refused(capsys, "train", "grid.size=3", f"cost.sensor=../{name}")
+
+
+def test_a_folder_that_cannot_be_made_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").touch()
+    for option, flags in (("hydra.run.dir", []), ("hydra.sweep.dir", ["-m"])):
+        line = refused(capsys, "train", *flags, f"{option}=../file/run")
+        assert line == f"{option}=../file/run: expected a folder that can be written to (Not a directory)"
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_a_folder_without_permission_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "locked").mkdir(mode=0o500)
+    assert "expected a folder that can be written to" in refused(capsys, "train", "hydra.run.dir=../locked/run")
+
+
+def test_a_mistake_found_by_the_command_leaves_no_folder(
+    monkeypatch: pytest.MonkeyPatch, empty_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(cfg: Any, folder: Path) -> None:
+        raise UserError("device=cuda: no such device")
+
+    stub(monkeypatch, "train", run)
+    assert refused(capsys, "train", "quiet=true") == "device=cuda: no such device"
+
+
+def test_a_bug_shows_its_traceback_and_ends_with_1(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(cfg: Any, folder: Path) -> None:
+        raise ZeroDivisionError("a bug")
+
+    stub(monkeypatch, "train", run)
+    assert main(["train"]) == 1
+    assert "Traceback" in (said := capsys.readouterr().err)
+    assert "ZeroDivisionError: a bug" in said
+
+
+def test_full_error_shows_the_traceback_of_a_mistake(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    assert main(["train", "grid.size=2"]) == 2
+    said = capsys.readouterr().err.splitlines()
+    assert said[0].startswith("Traceback")
+    assert said[-1] == "trackmdp train: grid.size=2: expected an integer from 3 to 64 (cells)"
+
+
+def test_a_run_gets_its_config_and_its_folder(
+    monkeypatch: pytest.MonkeyPatch, empty_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    calls = []
+    stub(monkeypatch, "train", lambda cfg, folder: calls.append((cfg, folder)))
+    assert main(["train", "grid.size=5", "seed=3", "hydra.run.dir=runs/a b"]) == 0
+    assert capsys.readouterr().out == "train ppo on a 5x5 grid, T_max 1, kernel random_support, seed 3 -> runs/a b\n"
+    assert calls == [(composed("train", "grid.size=5", "seed=3"), empty_folder / "runs/a b")]
+    assert main(["train", "quiet=true"]) == 0
+    assert capsys.readouterr().out == ""
+    assert re.fullmatch(r"runs/\d{4}-\d\d-\d\d/\d\d-\d\d-\d\d-\d{6}", str(calls[1][1].relative_to(empty_folder)))
+
+
+def test_a_bad_job_does_not_stop_a_sweep_and_is_named_at_the_end(
+    monkeypatch: pytest.MonkeyPatch, empty_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(cfg: Any, folder: Path) -> None:
+        (folder / "size").write_text(str(cfg.grid.size))
+
+    stub(monkeypatch, "train", run)
+    assert main(["train", "-m", "grid.size=5,2,4,99", "hydra.sweep.dir=all", "quiet=true"]) == 2
+    assert {file.read_text() for file in empty_folder.glob("all/*/size")} == {"5", "4"}
+    assert sorted(path.name for path in empty_folder.glob("all/*")) == ["0", "2", "multirun.yaml"]
+    said = capsys.readouterr().err.splitlines()
+    reason = "grid.size=2: expected an integer from 3 to 64 (cells)"
+    assert said[0] == f"trackmdp train: job 1 (grid.size=2, quiet=True): {reason}"
+    assert said[-1].startswith("trackmdp train: 2 of 4 jobs failed: job 1 ")
+    assert "job 3 (grid.size=99, quiet=True)" in said[-1]
+
+
+def test_a_bug_in_a_sweep_shows_its_traceback(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(cfg: Any, folder: Path) -> None:
+        if cfg.seed == 0:
+            raise ZeroDivisionError("a bug")
+
+    stub(monkeypatch, "train", run)
+    assert main(["train", "-m", "seed=0,1"]) == 1
+    said = capsys.readouterr()
+    assert "ZeroDivisionError: a bug" in said.err
+    assert "1 of 2 jobs failed" in said.err
+    assert "seed 1" in said.out
+
+
+def test_a_sweep_with_a_wrong_type_or_choice_starts_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    assert refused(capsys, "train", "-m", "quiet=true", "seed=0,abc") == "seed=abc: expected an integer >= 0"
+    assert refused(capsys, "train", "-m", "quiet=true", "algo=ppo,sac").startswith("algo=sac: expected one of ")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_names_every_option_with_range_unit_and_default(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([command, "--help"]) == 0
+    text = capsys.readouterr().out
+    flat = " ".join(text.split())
+    for key, item in of_command(command):
+        assert f" {key}=" in text, key
+        assert f"{item.help}; {item.expected}" in flat, key
+    for group in set(options(ROOTS[command])) & set(GROUPS):
+        for name in GROUPS[group]:
+            assert f"  {group}={name}: " in text
+
+
+def test_help_shows_the_values_of_conf(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["train", "-h"])
+    text = capsys.readouterr().out
+    for expected in (
+        "grid.size=10 ",
+        "grid.max_steps=null ",
+        "kernel.low_probability=0.15 ",
+        "quiet=false ",
+        "seed=0 ",
+    ):
+        assert f" {expected}" in text
+    assert "cost.sensor=0.16 " in text
+    assert "(default: random_support)" in text
+
+
+def test_overview_and_unknown_commands(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == main(["--help"]) == 0
+    text = capsys.readouterr().out
+    assert all(f"  {command} " in text for command in COMMANDS)
+    assert main(["trian"]) == 2
+    assert capsys.readouterr().err.startswith("trackmdp: unknown command 'trian': expected one of train, ")
+
+
+@pytest.mark.parametrize("words", [["-c", "job", "-p", "grid"], ["--info", "searchpath"], ["--hydra-help"]])
+def test_questions_to_hydra_run_nothing(words: list[str], empty_folder: Path) -> None:
+    result = typed("train", *words)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert result.stdout
+    assert not list(empty_folder.iterdir())
+
+
+def test_a_config_folder_of_ones_own_adds_choices(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine/kernel").mkdir(parents=True)
+    (tmp_path / "mine/kernel/slow.yaml").write_text("defaults: [random_walk]\nstay: 0.9\n")
+    (tmp_path / "mine/kernel/typo.yaml").write_text("defaults: [random_walk]\nstai: 0.9\n")
+    calls = []
+    stub(monkeypatch, "train", lambda cfg, folder: calls.append(cfg))
+    assert main(["train", "--config-dir", "../mine", "kernel=slow", "hydra.run.dir=../out"]) == 0
+    assert (calls[0].kernel.name, calls[0].kernel.stay) == ("random_walk", 0.9)
+    capsys.readouterr()
+    assert "stai" in refused(capsys, "train", "--config-dir", "../mine", "kernel=typo")
+
+
+def test_mistakes_typed_in_a_shell(empty_folder: Path) -> None:
+    for words, message in ((["grid.size=2"], "grid.size=2: expected"), (["algo=sac"], "algo=sac: expected one of")):
+        result = typed("train", *words)
+        assert result.returncode == 2
+        assert result.stdout == ""
+        assert result.stderr.startswith(f"trackmdp train: {message}")
+        assert result.stderr.count("\n") == 1
+    assert not list(empty_folder.iterdir())
+
+
+def test_scripts_are_the_commands() -> None:
+    for command in COMMANDS:
+        result = subprocess.run(
+            [sys.executable, ROOT / "scripts" / f"{command}.py", "grid.size=2"],
+            capture_output=True,
+            text=True,
+            env=ENVIRONMENT,
+            check=False,
+        )
+        assert result.returncode == 2
+        assert result.stderr.startswith(f"trackmdp {command}: grid.size=2: expected an integer from 3 to 64")
+
+
+def test_help_and_first_line_import_nothing_heavy() -> None:
+    code = """
+import sys
+from trackmdp.cli import main
+import trackmdp.launch
+def say(line):
+    sys.exit(str(sorted({"torch", "torchrl", "scipy"} & set(sys.modules))))
+trackmdp.launch._say = say
+main(["train", "--help"])
+main(["train"])
+"""
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=ENVIRONMENT, check=False)
+    assert result.stderr == "[]\n"
+
+
+def test_ctrl_c_ends_in_one_line_and_130(empty_folder: Path) -> None:
+    code = """
+import sys, types, threading
+module = types.ModuleType("trackmdp.commands.train")
+module.run = lambda cfg, folder: threading.Event().wait(60)
+sys.modules[module.__name__] = module
+from trackmdp.cli import main
+sys.exit(main(["train"]))
+"""
+    process = subprocess.Popen(
+        [sys.executable, "-c", code],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=ENVIRONMENT,
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline().startswith("train ppo on a 10x10 grid")
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    assert (process.returncode, said) == (130, "trackmdp train: interrupted\n")
+    assert not list(empty_folder.iterdir())

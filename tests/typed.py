@@ -1,0 +1,32 @@
+"""Commands as a user types them, run in this process."""
+
+from __future__ import annotations
+
+import sys
+import types
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from trackmdp.cli import main
+
+
+def stub(monkeypatch: pytest.MonkeyPatch, command: str, run: Callable[[Any, Path], Any]) -> None:
+    """Let `run` do the work of a command."""
+    module = types.ModuleType(f"trackmdp.commands.{command}")
+    module.run = run  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+
+
+def refused(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    """The one line with which a command refuses `words`; nothing may have been written to the current folder."""
+    status = main(list(words))
+    captured = capsys.readouterr()
+    lines = captured.err.splitlines()
+    assert (status, len(lines), captured.out) == (2, 1, ""), (words, status, captured)
+    assert not list(Path.cwd().iterdir()), words
+    prefix = f"trackmdp {words[0]}: "
+    assert lines[0].startswith(prefix)
+    return lines[0].removeprefix(prefix)
