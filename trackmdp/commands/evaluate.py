@@ -30,7 +30,7 @@ def run(cfg: EvaluateConfig, folder: Path) -> float:
     torch.set_num_threads(cfg.threads)
     device = make_device(cfg.device)
     world, max_steps, chains, subject = _trained(cfg, device) if cfg.run else _baseline(cfg)
-    judge = Judge(world)
+    judge = Judge(world, max_steps)
     verdict = judge.score(chains)
     simulation = None
     if cfg.episodes:
@@ -103,5 +103,5 @@ def _show(
     title = f"simulated, {simulation.episodes} episodes ± s.e." if simulation else "simulated"
     console.print(table(subject, ["figure", "exact", title, "Q_MDP exact"], rows))
     console.print(
-        f"upper bound (clocked) {judge.upper:,.4f}; regret per step {verdict.regret_per_step:.4f}; results in {folder}"
+        f"upper bound (clocked) {judge.upper:,.4f}; regret per step {round(verdict.regret_per_step, 4) + 0.0:.4f}; results in {folder}"
     )

@@ -19,7 +19,6 @@ from trackmdp import __version__
 from trackmdp.build import make_algorithm, make_collector, make_device, make_world
 from trackmdp.config import TrainConfig, to_yaml
 from trackmdp.seeding import seed_global
-from trackmdp.solvers.chains import evaluate
 from trackmdp.training import checkpoint
 from trackmdp.training.display import Display, make_console, table
 from trackmdp.training.judge import Judge, Verdict, figures
@@ -41,7 +40,7 @@ def run(cfg: TrainConfig, folder: Path) -> float:
     seed_global(cfg.seed)
     algorithm = make_algorithm(cfg, world, device)
     collector = make_collector(cfg, world, algorithm, device)
-    judge = Judge(world)
+    judge = Judge(world, cfg.grid.max_steps)
     metrics = MetricsLog(folder, tensorboard=cfg.log.name == "tensorboard")
     every = Intervals(cfg.evaluation.every, cfg.log.every, cfg.checkpoint.every)
     digest = config_digest(cfg)
@@ -99,7 +98,7 @@ def _summary(
 
 def _show(console: Console, cfg: TrainConfig, judge: Judge, verdict: Verdict, seconds: float, folder: Path) -> None:
     world = judge.world
-    all_on = evaluate(world, np.ones((world.num_cells, world.num_choices, world.num_cells), dtype=bool))
+    all_on = judge.evaluate(np.ones((world.num_cells, world.num_choices, world.num_cells), dtype=bool))
     rows = [
         [name, f"{e.aihtr:,.3f}", f"{100 * e.accuracy:.2f} %", f"{e.sensors_per_step:.2f}"]
         for name, e in ((f"learned ({cfg.algo.name})", verdict.evaluation), ("Q_MDP", judge.qmdp), ("all on", all_on))
@@ -107,5 +106,5 @@ def _show(console: Console, cfg: TrainConfig, judge: Judge, verdict: Verdict, se
     rows.append(["upper bound (clocked)", f"{judge.upper:,.3f}", "", ""])
     console.print(table("exact values", ["policy", "AIHTR", "accuracy", "sensors per step"], rows))
     console.print(
-        f"regret per step {verdict.regret_per_step:.4f} to the upper bound, after {seconds:.1f} s; results in {folder}"
+        f"regret per step {round(verdict.regret_per_step, 4) + 0.0:.4f} to the upper bound, after {seconds:.1f} s; results in {folder}"
     )

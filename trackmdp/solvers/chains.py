@@ -7,7 +7,7 @@ probabilities of switching the sensors on, independently of each other and of th
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +18,7 @@ from trackmdp.errors import UserError
 from trackmdp.solvers.renewal import IndexArray, accumulate, expected_steps, row_index, row_sums
 from trackmdp.world.model import Array, BoolArray, World
 
-__all__ = ["Evaluation", "Prediction", "evaluate", "regret_per_step", "unroll"]
+__all__ = ["Evaluation", "Prediction", "evaluate", "pool", "regret_per_step", "renewal", "unroll"]
 
 
 @dataclass(frozen=True)
@@ -69,28 +69,35 @@ class Prediction:
 
 def evaluate(world: World, chains: npt.NDArray[np.generic]) -> Evaluation:
     """The exact value of the policy that follows `chains` (`[M, t_max + 1, M]`, bool or probabilities)."""
+    located, gathered = sparse.csr_array((world.num_cells, world.num_cells)), np.zeros((world.num_cells, 5))
+    for hit, earned in renewal(world, chains):
+        located, gathered = located + hit, gathered + earned
+    return pool(accumulate(located, gathered), expected_steps(world))
+
+
+def renewal(world: World, chains: npt.NDArray[np.generic]) -> Iterator[tuple[sparse.csr_array, Array]]:
+    """What happens at each step from one detection to the next, for all located cells at once.
+
+    Yields:
+        t_max + 2 pairs, the last of the forced step: `[M, M]` sparse, the probability of being located in j at this
+        step, and `[M, 5]`, expected reward, step in the grid, detection, sensors on by choice, safe action.
+    """
     chains = _check(world, chains)
-    located = sparse.csr_array((world.num_cells, world.num_cells))
     mass = sparse.eye_array(world.num_cells, format="csr")
-    reward, steps, detections, sensors, safe = gathered = np.zeros((5, world.num_cells))
+    nothing = np.zeros(world.num_cells)
     for n in range(world.num_choices):
         predicted = mass @ world.transition
         inside = row_sums(predicted)
         on = chains[:, n]
         sensed = on[row_index(predicted), predicted.indices]
         hit = _with_data(predicted, predicted.data * sensed)
-        located = located + hit
-        detections += row_sums(hit)
-        sensors += on.sum(axis=1) * inside
-        reward += world.reward * row_sums(hit) - (on @ world.cost) * inside
-        steps += inside
+        detected = row_sums(hit)
+        reward = world.reward * detected - (on @ world.cost) * inside
+        yield hit, np.stack([reward, inside, detected, on.sum(axis=1) * inside, nothing], axis=1)
         mass = _with_data(predicted, predicted.data * (1.0 - sensed))
     forced = mass @ world.transition
-    safe += row_sums(forced)
-    steps += safe
-    detections += safe
-    reward += (world.reward - world.safe_cost) * safe
-    return _pool(world, accumulate(located + forced, gathered.T))
+    inside = row_sums(forced)
+    yield forced, np.stack([(world.reward - world.safe_cost) * inside, inside, inside, nothing, inside], axis=1)
 
 
 def regret_per_step(upper_aihtr: float, evaluation: Evaluation) -> float:
@@ -131,8 +138,11 @@ def _with_data(matrix: sparse.csr_array, data: Array) -> sparse.csr_array:
     return changed
 
 
-def _pool(world: World, totals: Array) -> Evaluation:
-    """`totals`: `[M, 5]` reward, steps in the grid, detections, sensors, safe actions per episode."""
+def pool(totals: Array, length: Array) -> Evaluation:
+    """An evaluation from `[M, 5]` reward, steps in the grid, detections, sensors, safe actions per episode.
+
+    `length` `[M]` is the expected number of steps of an episode, the exit step included.
+    """
     value, steps, detections, sensors, safe = totals.T
     in_grid = float(steps.mean())
     return Evaluation(
@@ -141,7 +151,7 @@ def _pool(world: World, totals: Array) -> Evaluation:
         accuracy=float(detections.mean()) / in_grid if in_grid else 1.0,
         sensors_per_step=float(sensors.mean()) / in_grid if in_grid else 0.0,
         safe_per_episode=float(safe.mean()),
-        expected_length=float(expected_steps(world).mean()),
+        expected_length=float(length.mean()),
         steps=steps,
         detections=detections,
         sensors=sensors,

@@ -87,7 +87,7 @@ def simulate(
         device: where to run.
     """
     env = TrackEnv(world, episodes, seed=seed, stream="evaluation", max_steps=max_steps, device=device)
-    totals = torch.zeros(5, episodes, dtype=torch.float64, device=device)
+    totals = torch.zeros(6, episodes, dtype=torch.float64, device=device)
     running = torch.ones(episodes, dtype=torch.bool, device=device)
     with preserved_global_rng(), set_exploration_type(ExplorationType.DETERMINISTIC):
         state = env.reset()
@@ -100,16 +100,17 @@ def simulate(
 
 
 def _figures(env: TrackEnv, state: TensorDict, following: TensorDict) -> Tensor:
-    """`[5, B]` reward, steps in the grid, detections, sensors on by choice, forced actions of one step."""
+    """`[6, B]` reward, step in the grid, detection, sensors on by choice, forced action, step of one step."""
     in_grid = ~following["terminated"].squeeze(-1)
     forced = (state["steps_since_detection"] > env.t_max) & in_grid
     detected = (following["steps_since_detection"] == 0) & in_grid
     chosen = state["action"].sum(-1) * (in_grid & ~forced)
-    return torch.stack([following["reward"].squeeze(-1).double(), in_grid, detected, chosen, forced])
+    every = torch.ones_like(in_grid)
+    return torch.stack([following["reward"].squeeze(-1).double(), in_grid, detected, chosen, forced, every])
 
 
 def _summary(totals: Tensor) -> Simulation:
-    reward, steps, detections, sensors, forced = totals
+    reward, steps, detections, sensors, forced, length = totals
     some = steps > 0
     return Simulation(
         episodes=len(reward),
@@ -118,7 +119,7 @@ def _summary(totals: Tensor) -> Simulation:
         episode_accuracy=_mean(detections[some] / steps[some]),
         sensors_per_step=_ratio(sensors, steps),
         safe_per_episode=_mean(forced),
-        expected_length=_mean(steps + 1),
+        expected_length=_mean(length),
     )
 
 

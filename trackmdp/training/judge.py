@@ -5,9 +5,12 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from trackmdp.solvers import bounds, qmdp
+import numpy as np
+import numpy.typing as npt
+
+from trackmdp.solvers import bounds, horizon, qmdp
 from trackmdp.solvers.chains import Evaluation, evaluate, regret_per_step
-from trackmdp.world.model import BoolArray, World
+from trackmdp.world.model import World
 
 __all__ = ["Judge", "Verdict", "figures"]
 
@@ -23,21 +26,38 @@ class Verdict:
 
 
 class Judge:
-    """Scores learned, fixed and solved policies alike, by their chains."""
+    """Scores learned, fixed and solved policies alike, by their chains.
 
-    def __init__(self, world: World) -> None:
-        self.world = world
-        self.bounds = {
-            "paper": float(bounds.paper(world).mean()),
-            "valid": float(bounds.valid(world).mean()),
-            "clocked": float(bounds.clocked(world).mean()),
-        }
-        self.upper = self.bounds["clocked"]
-        self.qmdp = evaluate(world, qmdp.solve(world))
+    Args:
+        world: the task and the motion.
+        max_steps: episodes are cut after this many steps, and so are all figures; None for never. The paper's bound
+            knows no such limit and is None then.
+    """
 
-    def score(self, chains: BoolArray) -> Verdict:
+    def __init__(self, world: World, max_steps: int | None = None) -> None:
+        self.world, self.max_steps = world, max_steps
+        self.bounds: dict[str, float | None]
+        if max_steps is None:
+            self.bounds = {
+                "paper": float(bounds.paper(world).mean()),
+                "valid": float(bounds.valid(world).mean()),
+            }
+            self.upper = float(bounds.clocked(world).mean())
+        else:
+            self.bounds = {"paper": None, "valid": float(horizon.valid(world, max_steps).mean())}
+            self.upper = float(horizon.clocked(world, max_steps).mean())
+        self.bounds["clocked"] = self.upper
+        self.qmdp = self.evaluate(qmdp.solve(world))
+
+    def evaluate(self, chains: npt.NDArray[np.generic]) -> Evaluation:
         """Exact figures of the policy with these `chains` `[M, t_max+1, M]`."""
-        evaluation = evaluate(self.world, chains)
+        if self.max_steps is None:
+            return evaluate(self.world, chains)
+        return horizon.evaluate(self.world, chains, self.max_steps)
+
+    def score(self, chains: npt.NDArray[np.generic]) -> Verdict:
+        """Exact figures and the regret per step."""
+        evaluation = self.evaluate(chains)
         return Verdict(evaluation, regret_per_step(self.upper, evaluation))
 
 

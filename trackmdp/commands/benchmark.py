@@ -1,0 +1,44 @@
+"""`benchmark`: measure speed and quality on this machine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from trackmdp.bench import speed
+from trackmdp.bench.machine import machine
+from trackmdp.build import make_device, make_world
+from trackmdp.config import BenchmarkConfig
+from trackmdp.training.display import make_console, table
+from trackmdp.training.metrics import write_json
+from trackmdp.world.model import World
+
+__all__ = ["PARTS", "run"]
+
+PARTS: dict[str, Callable[[BenchmarkConfig, World, torch.device], list[dict[str, Any]]]] = {
+    "env": speed.env_speed,
+    "collector": speed.collector_speed,
+    "train": speed.train_speed,
+}
+
+
+def run(cfg: BenchmarkConfig, folder: Path) -> None:
+    """Measure `cfg.part` and write `benchmark.json` to `folder`."""
+    console = make_console(cfg.quiet)
+    torch.set_num_threads(cfg.threads)
+    device = make_device(cfg.device)
+    where = machine()
+    with console.status(f"measuring {cfg.part}"):
+        rows = PARTS[cfg.part](cfg, make_world(cfg), device)
+    write_json(folder / "benchmark.json", {"machine": where, "rows": rows})
+    shown = [key for key in rows[0] if not isinstance(rows[0][key], dict)]
+    title = f"{where['processor']}, {where['cores']} cores, {cfg.threads} torch threads, {device}"
+    console.print(table(title, shown, [[_text(row[key]) for key in shown] for row in rows]))
+    console.print(f"results in {folder}")
+
+
+def _text(value: Any) -> str:
+    return f"{value:,.3g}" if isinstance(value, float) and abs(value) < 1000 else f"{value:,.0f}" if isinstance(value, float) else str(value)
