@@ -19,6 +19,8 @@ from trackmdp import __version__
 from trackmdp.build import make_algorithm, make_collector, make_device, make_world
 from trackmdp.config import TrainConfig, to_yaml
 from trackmdp.seeding import seed_global
+from trackmdp.solvers import optimal
+from trackmdp.solvers.optimal import Solution
 from trackmdp.training import checkpoint
 from trackmdp.training.display import Display, make_console, table
 from trackmdp.training.judge import Judge, Verdict, figures
@@ -55,11 +57,23 @@ def run(cfg: TrainConfig, folder: Path) -> float:
     finally:
         collector.shutdown()
         metrics.close()
+    solution = _solve(cfg, world, console)
+    if solution is not None:
+        verdict = judge.tighten(solution.upper, verdict)
     times = {"wall_seconds": time.time() - started, "cpu_seconds": time.process_time() - used}
-    summary = _summary(cfg, judge, verdict, frames, times, digest)
+    summary = _summary(cfg, judge, verdict, solution, frames, times, digest)
     write_json(folder / "summary.json", summary)
-    _show(console, cfg, judge, verdict, times["wall_seconds"], folder)
+    _show(console, cfg, judge, verdict, solution)
+    console.print(f"{times['wall_seconds']:.1f} s; results in {folder}")
     return verdict.evaluation.aihtr
+
+
+def _solve(cfg: TrainConfig, world: World, console: Console) -> Solution | None:
+    """The certified optimum, where it is asked for; there is none for episodes cut by `grid.max_steps`."""
+    if not cfg.optimal.enabled or cfg.grid.max_steps is not None:
+        return None
+    with console.status(f"solving for the optimum, at most {cfg.optimal.time_limit:g} s"):
+        return optimal.solve(world, time_limit=cfg.optimal.time_limit)
 
 
 def config_digest(cfg: TrainConfig) -> str:
@@ -78,7 +92,13 @@ def _write_inputs(cfg: TrainConfig, world: World, folder: Path) -> None:
 
 
 def _summary(
-    cfg: TrainConfig, judge: Judge, verdict: Verdict, frames: int, times: dict[str, float], digest: str
+    cfg: TrainConfig,
+    judge: Judge,
+    verdict: Verdict,
+    solution: Solution | None,
+    frames: int,
+    times: dict[str, float],
+    digest: str,
 ) -> dict[str, Any]:
     packages = ("torch", "torchrl", "tensordict", "hydra-core", "numpy", "scipy")
     return {
@@ -89,6 +109,9 @@ def _summary(
         "policy": figures(verdict.evaluation),
         "qmdp": figures(judge.qmdp),
         "bounds": judge.bounds,
+        "optimal": {"lower": solution.lower, "upper": solution.upper, "certified": solution.certified}
+        if solution
+        else None,
         "regret_per_step": verdict.regret_per_step,
         "versions": {"trackmdp": __version__, "python": platform.python_version()}
         | {name: version(name) for name in packages},
@@ -96,15 +119,20 @@ def _summary(
     }
 
 
-def _show(console: Console, cfg: TrainConfig, judge: Judge, verdict: Verdict, seconds: float, folder: Path) -> None:
-    world = judge.world
-    all_on = judge.evaluate(np.ones((world.num_cells, world.num_choices, world.num_cells), dtype=bool))
+def _show(console: Console, cfg: TrainConfig, judge: Judge, verdict: Verdict, solution: Solution | None) -> None:
+    shape = (judge.world.num_cells, judge.world.num_choices, judge.world.num_cells)
+    policies = {
+        f"learned ({cfg.algo.name})": verdict.evaluation,
+        "Q_MDP": judge.qmdp,
+        "all on": judge.evaluate(np.ones(shape, dtype=bool)),
+    }
+    if solution is not None:
+        policies["optimum" if solution.certified else "best known"] = judge.evaluate(solution.chains)
     rows = [
         [name, f"{e.aihtr:,.3f}", f"{100 * e.accuracy:.2f} %", f"{e.sensors_per_step:.2f}"]
-        for name, e in ((f"learned ({cfg.algo.name})", verdict.evaluation), ("Q_MDP", judge.qmdp), ("all on", all_on))
+        for name, e in policies.items()
     ]
-    rows.append(["upper bound (clocked)", f"{judge.upper:,.3f}", "", ""])
+    rows.append(["upper bound", f"{judge.upper:,.3f}", "", ""])
     console.print(table("exact values", ["policy", "AIHTR", "accuracy", "sensors per step"], rows))
-    console.print(
-        f"regret per step {round(verdict.regret_per_step, 4) + 0.0:.4f} to the upper bound, after {seconds:.1f} s; results in {folder}"
-    )
+    regret = round(verdict.regret_per_step, 4) + 0.0
+    console.print(f"regret per step {regret:.4f} to the upper bound")

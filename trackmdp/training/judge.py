@@ -60,6 +60,11 @@ class Judge:
         evaluation = self.evaluate(chains)
         return Verdict(evaluation, regret_per_step(self.upper, evaluation))
 
+    def tighten(self, upper: float, verdict: Verdict) -> Verdict:
+        """Take a proved upper bound into account, from now on and in `verdict`."""
+        self.upper = min(self.upper, upper)
+        return Verdict(verdict.evaluation, regret_per_step(self.upper, verdict.evaluation))
+
 
 def figures(evaluation: Evaluation) -> dict[str, Any]:
     """The single figures of an evaluation, as they stand in `summary.json`."""
