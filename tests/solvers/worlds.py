@@ -44,12 +44,14 @@ def paper_world(support_size: int, cost: float, t_max: int, size: int = 10) -> W
 
 
 @st.composite
-def tiny_worlds(draw: st.DrawFn, *, size: int = 2, most_t_max: int = 1) -> World:
+def tiny_worlds(draw: st.DrawFn, *, size: int = 2, most_t_max: int = 1, support: int | None = None) -> World:
     """Any kernel with some zeros, per-cell costs, and a safe action cheaper or dearer than all sensors."""
     m = size**2
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     kernel = rng.random((m, m)) ** draw(st.sampled_from([1, 4]))
     kernel *= rng.random((m, m)) < draw(st.sampled_from([0.4, 0.7, 1.0]))
+    if support is not None:
+        kernel *= np.argsort(rng.random((m, m)), axis=1) < support
     kernel *= (1.0 - draw(st.sampled_from([0.02, 0.2]))) / np.maximum(kernel.sum(axis=1, keepdims=True), 1e-300)
     spread = draw(st.sampled_from([0.0, 1.0]))
     cost = draw(st.sampled_from([0.0, 0.1, 0.25, 0.5, 1.2])) * (1.0 + spread * rng.random(m))
@@ -94,10 +96,19 @@ def best_by_enumeration(world: World) -> Array:
 
 
 def _all_renewals(world: World, x: int) -> tuple[Array, Array]:
-    outcomes = [renewal(world, x, chain) for chain in _all_chains(world.num_choices, world.num_cells)]
+    outcomes = [renewal(world, x, chain) for chain in _all_chains(world, x)]
     return np.array([earned for earned, _ in outcomes]), np.stack([located for _, located in outcomes])
 
 
-def _all_chains(length: int, cells: int) -> Iterator[BoolArray]:
-    sets = [np.array(bits) for bits in itertools.product([False, True], repeat=cells)]
-    return (np.stack(chain) for chain in itertools.product(sets, repeat=length))
+def _all_chains(world: World, x: int) -> Iterator[BoolArray]:
+    """Every chain of sets of cells that can be reached in that many moves; a sensor anywhere else only costs."""
+    reachable, options = np.eye(world.num_cells)[x], []
+    for _ in range(world.num_choices):
+        reachable = reachable @ world.kernel
+        cells = np.flatnonzero(reachable)
+        options.append([np.isin(np.arange(world.num_cells), chosen) for chosen in _subsets(cells)])
+    return (np.stack(chain) for chain in itertools.product(*options))
+
+
+def _subsets(cells: np.ndarray) -> Iterator[tuple[int, ...]]:
+    return itertools.chain.from_iterable(itertools.combinations(cells, k) for k in range(len(cells) + 1))

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from trackmdp.solvers import qmdp
 from trackmdp.solvers.chains import Prediction, unroll
-from trackmdp.solvers.qmdp import TIE
 from trackmdp.world.model import BoolArray, World
 
 __all__ = ["solve"]
 
 
-def solve(world: World, *, threshold: float) -> BoolArray:
-    """Chains that sense j iff the predicted probability of j, given the misses so far, is at least `threshold`."""
+def solve(world: World, *, threshold: float | None = None) -> BoolArray:
+    """Chains that sense j iff the predicted probability of j, given the misses so far, is at least `threshold`.
+
+    Without one, sense where the sensor earns its price in this very step: p_j r >= c_j p_in.
+    """
+    if threshold is None:
+        return qmdp.solve(world, in_grid=True)
 
     def likely(seen: Prediction) -> BoolArray:
-        return seen.mass >= threshold * seen.before[seen.rows] * (1.0 - TIE)
+        return seen.mass >= threshold * seen.before[seen.rows] * (1.0 - qmdp.TIE)
 
     return unroll(world, likely)

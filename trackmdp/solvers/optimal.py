@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trackmdp.solvers import search
-from trackmdp.solvers.bounds import clocked
+from trackmdp.solvers import clocked, search
+from trackmdp.solvers.bounds import clocked_table
 from trackmdp.solvers.branch import Tree
 from trackmdp.solvers.chains import evaluate
 from trackmdp.solvers.layers import Layer, build, chains_to_sets, sets_to_chains
@@ -24,6 +24,8 @@ from trackmdp.world.model import Array, BoolArray, World
 
 __all__ = ["Progress", "Solution", "solve"]
 
+ROUNDING = 1e-10
+"""Relative gap that is not told from rounding, whatever the tolerance."""
 FIRST_SECONDS = 1.0
 """How long the first search of a round may take before its improvements are used; later rounds may take longer."""
 
@@ -105,16 +107,29 @@ class _Run:
         self.started = time.monotonic()
         self.ends = self.started + time_limit
         self.layers: list[Layer] = build(world, world.num_choices)
-        self.bound = clocked(world)
+        table = clocked_table(world)
+        self.bound = table.value
+        self.longest = float(expected_steps(world).max())
         self.nodes = 0
-        self.use(search.solve(world))
+        self.chains = clocked.solve(world, table=table.table)
+        self.value = evaluate(world, self.chains).value
 
-    def use(self, chains: BoolArray) -> None:
-        """Take `chains` as the policy at hand."""
-        self.chains, self.value = chains, evaluate(self.world, chains).value
-        scale = self.tolerance * max(1.0, abs(float(self.value.mean())))
-        self.gap_allowed = scale
-        self.slack = 0.5 * scale / float(expected_steps(self.world).max())
+    def use(self, chains: BoolArray) -> bool:
+        """Take `chains` as the policy at hand if it is better."""
+        value = evaluate(self.world, chains).value
+        better = bool(value.sum() > self.value.sum())
+        if better:
+            self.chains, self.value = chains, value
+        return better
+
+    @property
+    def gap_allowed(self) -> float:
+        return max(self.tolerance, ROUNDING) * max(1.0, abs(float(self.value.mean())))
+
+    @property
+    def slack(self) -> float:
+        """Improvements of one renewal below this cannot add up to more than half of the gap allowed."""
+        return 0.5 * self.gap_allowed / self.longest
 
     @property
     def certified(self) -> bool:
@@ -126,8 +141,9 @@ class _Run:
             self.on_progress(Progress(float(self.value.mean()), float(self.bound.mean()), seconds, self.nodes))
 
     def search(self) -> None:
-        patience = FIRST_SECONDS
+        self.use(search.solve(self.world))
         self.report()
+        patience = FIRST_SECONDS
         while not self.certified and time.monotonic() < self.ends:
             improved = self.round(patience)
             self.report()
@@ -152,9 +168,7 @@ class _Run:
         for x, steps in tree.improvements().items():
             chains[x] = _sets_without(self.world, x, steps)
         sets = search.improve(self.world, self.layers, chains_to_sets(self.layers, chains))
-        before = self.value.sum()
-        self.use(sets_to_chains(self.world, self.layers, sets))
-        return bool(self.value.sum() > before)
+        return self.use(sets_to_chains(self.world, self.layers, sets))
 
     def explore(self, tree: Tree, patience: float) -> None:
         """Until the tree is closed or time is over; improvements, where there are some, end it after `patience`."""
@@ -195,7 +209,8 @@ class _Run:
 
     def solution(self, interrupted: bool) -> Solution:
         seconds = time.monotonic() - self.started
-        return Solution(self.chains, self.value, self.bound, self.certified, seconds, self.nodes, interrupted)
+        bound = np.maximum(self.bound, self.value)
+        return Solution(self.chains, self.value, bound, self.certified, seconds, self.nodes, interrupted)
 
 
 def _sets_without(world: World, x: int, steps: list[set[int]]) -> BoolArray:
@@ -203,7 +218,7 @@ def _sets_without(world: World, x: int, steps: list[set[int]]) -> BoolArray:
     chain = np.zeros((world.num_choices, world.num_cells), dtype=bool)
     mass = np.eye(world.num_cells)[x]
     for n, left in enumerate(steps):
-        mass = mass @ world.kernel
+        mass = mass @ world.transition
         chain[n] = mass > 0
         chain[n, sorted(left)] = False
         mass = np.where(chain[n], 0.0, mass)

@@ -1,0 +1,181 @@
+"""The certified optimum and the searches on the way to it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+
+from tests.solvers.worlds import (
+    PAPER_REFERENCES,
+    REFERENCES,
+    best_by_enumeration,
+    paper_world,
+    reference_world,
+    tiny_worlds,
+)
+from trackmdp.solvers import bounds, optimal, search
+from trackmdp.solvers.chains import evaluate
+from trackmdp.solvers.layers import build, chains_to_sets, sets_to_chains
+from trackmdp.solvers.search import InnerProblem
+from trackmdp.world.kernels import drift, random_walk
+from trackmdp.world.model import World
+
+
+def assert_optimal(world: World, best: np.ndarray, tolerance: float = 1e-9) -> None:
+    solution = optimal.solve(world, tolerance=tolerance, time_limit=60)
+    scale = 1.0 + np.abs(best).max()
+    assert solution.certified
+    np.testing.assert_allclose(solution.value, best, rtol=0, atol=2 * tolerance * scale)
+    np.testing.assert_allclose(solution.value, evaluate(world, solution.chains).value, rtol=0, atol=1e-12 * scale)
+    assert (best <= solution.bound + 1e-9 * scale).all()
+    assert solution.lower <= solution.upper
+
+
+@pytest.mark.parametrize("reference", REFERENCES, ids=lambda row: row["name"])
+def test_reference_values(reference: dict) -> None:
+    world = reference_world(reference)
+    assert_optimal(world, np.array(reference["optimal_value"]))
+    chains = optimal.solve(world).chains
+    assert evaluate(world, chains).accuracy == pytest.approx(reference["optimal_accuracy"], abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "row", PAPER_REFERENCES, ids=lambda row: f"Z{row['support_size']}-c{row['cost']}-T{row['t_max']}"
+)
+def test_the_papers_worlds_are_certified(row: dict) -> None:
+    world = paper_world(row["support_size"], row["cost"], row["t_max"])
+    solution = optimal.solve(world, time_limit=60)
+    assert solution.certified
+    assert solution.upper - solution.lower <= 1e-6 * max(1.0, abs(solution.lower))
+    assert solution.lower == pytest.approx(row["best_known"], abs=1e-7)
+
+
+@settings(max_examples=40)
+@given(tiny_worlds())
+def test_every_chain_of_a_2x2_world_tried(world: World) -> None:
+    assert_optimal(world, best_by_enumeration(world))
+
+
+@settings(max_examples=10)
+@given(tiny_worlds(size=3, most_t_max=1, support=3))
+def test_every_chain_of_a_3x3_world_tried(world: World) -> None:
+    assert_optimal(world, best_by_enumeration(world))
+
+
+@settings(max_examples=10)
+@given(tiny_worlds(size=2, most_t_max=3, support=2))
+def test_every_chain_of_up_to_four_sets_tried(world: World) -> None:
+    assert_optimal(world, best_by_enumeration(world))
+
+
+@settings(max_examples=30)
+@given(tiny_worlds(most_t_max=2))
+def test_the_search_ends_where_no_single_set_can_be_improved(world: World) -> None:
+    chains = search.solve(world)
+    value = evaluate(world, chains).value
+    layers = build(world, world.num_choices)
+    sets = chains_to_sets(layers, chains)
+    np.testing.assert_array_equal(sets_to_chains(world, layers, sets), chains)
+    problem = InnerProblem.of(world, layers, value)
+    later, worth = problem.undetected(sets)
+    np.testing.assert_allclose(worth, value, rtol=1e-9, atol=1e-9)
+    _, ascended = problem.undetected(problem.ascend(sets, sweeps=1))
+    np.testing.assert_allclose(ascended, worth, rtol=1e-9, atol=1e-9)
+    assert len(later) == world.num_choices
+
+
+def test_the_homotopy_finds_sets_that_have_to_change_together() -> None:
+    """Z = 5, c = 0.22, t_max = 1: ascent from the clocked sets ends lower, the homotopy at the optimum."""
+    world = paper_world(5, 0.22, 1)
+    layers = build(world, world.num_choices)
+    abrupt = search.solve(world, steps=1)
+    gradual = search.solve(world)
+    assert evaluate(world, abrupt).aihtr < 89.9 < evaluate(world, gradual).aihtr
+    assert evaluate(world, gradual).aihtr == pytest.approx(89.98088602712643, abs=1e-9)
+    assert len(layers) == 2
+
+
+def test_an_open_bracket_holds_the_optimum() -> None:
+    """Stopped at once, the bracket is wide but holds the value that is certified with more time."""
+    world = paper_world(5, 0.22, 3)
+    stopped = optimal.solve(world, time_limit=1e-9)
+    assert not stopped.certified
+    assert not stopped.interrupted
+    certified = optimal.solve(world, time_limit=60)
+    assert (stopped.value <= certified.bound + 1e-9).all()
+    assert (certified.value <= stopped.bound + 1e-9).all()
+    assert stopped.lower <= certified.lower <= certified.upper <= stopped.upper
+
+
+def test_the_bracket_only_closes_while_the_search_goes_on() -> None:
+    seen: list[optimal.Progress] = []
+    optimal.solve(paper_world(5, 0.22, 2), on_progress=seen.append)
+    lowers, uppers = [step.lower for step in seen], [step.upper for step in seen]
+    assert len(seen) >= 3
+    assert lowers == sorted(lowers)
+    assert uppers == sorted(uppers, reverse=True)
+
+
+def test_ctrl_c_keeps_the_bracket() -> None:
+    seen: list[optimal.Progress] = []
+
+    def interrupt(step: optimal.Progress) -> None:
+        seen.append(step)
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+
+    solution = optimal.solve(paper_world(5, 0.22, 2), on_progress=interrupt)
+    assert solution.interrupted
+    assert not solution.certified
+    assert solution.lower == pytest.approx(seen[-1].lower)
+    assert solution.upper == pytest.approx(seen[-1].upper)
+
+
+def test_the_same_world_gives_the_same_policy() -> None:
+    first, second = (optimal.solve(paper_world(5, 0.22, 2)) for _ in range(2))
+    np.testing.assert_array_equal(first.chains, second.chains)
+    assert first.nodes == second.nodes
+
+
+def _kernel_with_edges() -> np.ndarray:
+    """3x3: a row of one cell, a cell that cannot be reached, a strong asymmetry, exit 1e-6 but from one cell."""
+    kernel = drift(3, direction=0.0, persistence=0.9, exit_probability=1e-6, border="renormalize")
+    kernel[:, 4] = 0.0
+    kernel[0] = 0.0
+    kernel[0, 1] = 1.0 - 1e-6
+    return kernel / np.maximum(kernel.sum(axis=1, keepdims=True), 1e-300) * (1.0 - 1e-6)
+
+
+EDGES = {
+    "free sensors": (0.0, None, 1),
+    "sensors dearer than the reward": (1.5, None, 2),
+    "no choice but one": (0.2, None, 0),
+    "per-cell costs": (np.linspace(0.0, 0.5, 9), None, 1),
+    "free safe action": (0.3, 0.0, 2),
+    "safe action dear": (0.3, 1e4, 1),
+}
+
+
+@pytest.mark.parametrize("name", EDGES)
+@pytest.mark.parametrize("shape", ["edges", "walk"])
+def test_numeric_edges(name: str, shape: str) -> None:
+    price, safe, t_max = EDGES[name]
+    cost = np.broadcast_to(price, (9,)).astype(float)
+    walk = random_walk(3, stay=0.2, diagonal=False, exit_probability=0.01, border="clip")
+    kernel = _kernel_with_edges() if shape == "edges" else walk
+    world = World(3, 1.0, cost, float(cost.sum()) if safe is None else safe, t_max, kernel)
+    solution = optimal.solve(world, time_limit=20)
+    scale = 1.0 + np.abs(solution.bound).max()
+    assert np.isfinite(solution.value).all()
+    assert np.isfinite(solution.bound).all()
+    assert solution.certified
+    assert (solution.value <= bounds.clocked(world) + 1e-8 * scale).all()
+    assert (bounds.clocked(world) <= bounds.valid(world) + 1e-8 * scale).all()
+    np.testing.assert_array_equal(solution.chains, optimal.solve(world, time_limit=20).chains)
+
+
+def test_a_larger_grid_is_certified() -> None:
+    solution = optimal.solve(paper_world(5, 0.22, 1, size=20), time_limit=60)
+    assert solution.certified
+    assert solution.lower == pytest.approx(25.459964, abs=1e-5)
