@@ -131,5 +131,6 @@ def _shown(value: Any) -> Any:
 def _plain(error: Exception) -> str:
     """What an error and its cause say, in one line."""
     said = [str(each).strip() for each in (error, error.__cause__) if each is not None]
-    lines = [line for text in said for line in text.splitlines()[:2] if line]
-    return ": ".join(dict.fromkeys(line.rstrip(".:") for line in lines)) or type(error).__name__
+    lines = [line.strip(" .:") for text in said for line in text.splitlines()[:2]]
+    told = [line for line in lines if line and not line.startswith(("To append", "full_key"))]
+    return ": ".join(dict.fromkeys(told)) or type(error).__name__
