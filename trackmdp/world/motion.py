@@ -26,7 +26,7 @@ class Motion:
         closed[:m, :m] = kernel
         closed[:, m] = np.clip(1.0 - closed.sum(axis=1), 0.0, 1.0)
         rows, successors = np.nonzero(closed)
-        edges = np.cumsum(closed, axis=1)[rows, successors]
+        edges = np.minimum(np.cumsum(closed, axis=1)[rows, successors], 1.0)  # a sum may round to more
         last = np.append(rows[1:] != rows[:-1], True)
         edges[last] = 1.0
         self._edges = torch.as_tensor(rows + edges, device=device)
