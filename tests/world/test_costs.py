@@ -1,0 +1,48 @@
+"""The pseudo-reward against hand numbers: r = 2, c = 0.1, 0.2, 0.3, 0.4, D = 0.9."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from trackmdp.world.costs import Costs
+from trackmdp.world.model import Task
+
+ACTION = torch.tensor([[True, False, True, False]])
+
+
+def costs(cost: list[float]) -> Costs:
+    return Costs(Task(2, 2.0, np.array(cost), 0.9, 1))
+
+
+@pytest.mark.parametrize(
+    ("sensed", "forced", "in_grid", "reward"),
+    [
+        (True, False, True, 2.0 - 0.4),
+        (False, False, True, -0.4),
+        (False, True, True, 2.0 - 0.9),
+        (True, True, True, 2.0 - 0.9),
+        (False, False, False, 0.0),
+        (False, True, False, 0.0),
+    ],
+)
+def test_one_step(sensed: bool, forced: bool, in_grid: bool, reward: float) -> None:
+    flags = [torch.tensor([flag]) for flag in (sensed, forced, in_grid)]
+    earned = costs([0.1, 0.2, 0.3, 0.4]).pseudo_reward(ACTION, *flags)
+    assert earned.shape == (1,)
+    assert earned.item() == pytest.approx(reward)
+
+
+def test_sensing_cost_per_cell_and_for_all_cells() -> None:
+    actions = torch.tensor([[0, 0, 0, 0], [1, 0, 1, 0], [0, 1, 0, 1], [1, 1, 1, 1]], dtype=torch.bool)
+    per_cell = costs([0.1, 0.2, 0.3, 0.4]).sensing_cost(actions)
+    np.testing.assert_allclose(per_cell, [0, 0.4, 0.6, 1.0], rtol=1e-6)
+    same = costs([0.3] * 4).sensing_cost(actions)
+    np.testing.assert_allclose(same, [0, 0.6, 0.6, 1.2], rtol=1e-6)
+    assert per_cell.dtype == same.dtype == torch.float32
+
+
+def test_more_than_255_sensors_are_counted() -> None:
+    task = Task(40, 1.0, np.full(1600, 0.5), 0.9, 1)
+    assert Costs(task).sensing_cost(torch.ones(1, 1600, dtype=torch.bool)).item() == 800.0

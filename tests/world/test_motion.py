@@ -1,0 +1,115 @@
+"""The sampler agrees with the table it is derived from, to the last draw."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from tests.helpers import random_kernel
+from trackmdp.world.motion import Motion
+
+LARGEST = 1.0 - 2.0**-40
+"""Draws lie on a grid of 2^-40."""
+
+
+def closed(kernel: np.ndarray) -> np.ndarray:
+    """The table with the exit as its last column."""
+    return np.append(kernel, 1.0 - kernel.sum(axis=1, keepdims=True), axis=1)
+
+
+@st.composite
+def kernels(draw: st.DrawFn) -> np.ndarray:
+    """Tables of up to 30 cells: rows of one cell, of all cells, of tiny probabilities; exits of 0, 1e-6 and more."""
+    m = draw(st.sampled_from([1, 4, 9, 30]))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    table = random_kernel(rng, m, draw(st.sampled_from([0.0, 1e-6, 0.3])), draw(st.sampled_from([0.0, 0.2, 1.0])))
+    tiny = rng.random((m, m)) < draw(st.sampled_from([0.0, 0.3]))
+    return np.where(tiny, table * 1e-13, table)
+
+
+@given(kernels(), st.integers(0, 2**32 - 1))
+def test_a_cell_of_probability_zero_is_never_reached(kernel: np.ndarray, seed: int) -> None:
+    m = len(kernel)
+    motion, possible = Motion(kernel), np.append(kernel > 0, closed(kernel)[:, -1:] > 1e-15, axis=1)
+    edges = np.floor(np.cumsum(closed(kernel), axis=1) * 2**40)
+    near = [edges + step for step in (-2, -1, 0, 1, 2)]
+    draws = np.concatenate([*near, np.zeros((m, 1)), np.floor(np.random.default_rng(seed).random((m, 20)) * 2**40)], 1)
+    draws = torch.as_tensor(np.clip(draws, 0, 2**40 - 1) / 2**40)
+    cells = torch.arange(m).repeat_interleave(draws.shape[1])
+    assert possible[cells, motion.move(cells, draws.flatten())].all()
+
+
+@pytest.mark.parametrize("exit_probability", [0.0, 1e-6, 0.3])
+def test_each_successor_has_its_own_stretch_of_draws(exit_probability: float) -> None:
+    """Just below and just above every edge of every row: nowhere is the sampler off the table by more than 2^-37."""
+    kernel = random_kernel(np.random.default_rng(0), 40, exit_probability)
+    kernel = np.where(kernel > 1e-6, kernel, 0.0)
+    motion, table, step = Motion(kernel), closed(kernel), 2.0**-37
+    for cell, row in enumerate(table):
+        successors = np.flatnonzero(row > 1e-9)
+        ends = np.cumsum(row)[successors]
+        below = motion.move(torch.full((len(ends),), cell), torch.as_tensor(ends - step))
+        assert below.tolist() == successors.tolist()
+        above = motion.move(torch.full((len(ends) - 1,), cell), torch.as_tensor(ends[:-1] + step))
+        assert above.tolist() == successors[1:].tolist()
+
+
+def test_the_last_cells_of_a_large_grid_are_sampled_as_finely() -> None:
+    """64 x 64 cells, exit 1e-6: the exit owns exactly the last millionth of the draws of every cell."""
+    m = 4096
+    kernel = np.zeros((m, m))
+    kernel[np.arange(m), np.arange(m)[::-1]] = 1 - 1e-6
+    motion, cells = Motion(kernel), torch.arange(m)
+    stays = motion.move(cells, torch.full((m,), 1 - 1e-6 - 2.0**-38, dtype=torch.float64))
+    leaves = motion.move(cells, torch.full((m,), 1 - 1e-6 + 2.0**-38, dtype=torch.float64))
+    assert torch.equal(stays, cells.flip(0))
+    assert (leaves == m).all()
+    assert torch.equal(motion.move(cells, torch.zeros(m, dtype=torch.float64)), cells.flip(0))
+    assert (motion.move(cells, torch.full((m,), LARGEST, dtype=torch.float64)) == m).all()
+
+
+def test_a_row_that_sums_to_a_little_more_than_one_stays_in_its_row() -> None:
+    """Row sums up to 1 + 1e-9 are accepted; a last cell smaller than that excess must not shift the next row."""
+    kernel = np.eye(9) * (1 + 9e-10)
+    kernel[:8, 8] = 1e-12
+    motion, cells = Motion(kernel), torch.arange(9)
+    for draw in (0.0, 2.0**-40, 2.0**-31, 0.4):
+        assert torch.equal(motion.move(cells, torch.full((9,), draw, dtype=torch.float64)), cells)
+    last = motion.move(cells, torch.full((9,), LARGEST, dtype=torch.float64))
+    assert ((last == cells) | (last == 8)).all()
+
+
+def test_an_exited_target_stays_away() -> None:
+    motion = Motion(random_kernel(np.random.default_rng(1), 9, 0.1))
+    draws = torch.tensor([0.0, 0.5, LARGEST], dtype=torch.float64)
+    assert motion.move(torch.full((3,), 9), draws).tolist() == [9, 9, 9]
+
+
+def test_draws_are_uniform_on_their_grid_and_the_generators_alone() -> None:
+    motion = Motion(random_kernel(np.random.default_rng(1), 4, 0.1))
+    draws = motion.draw(100_000, torch.Generator().manual_seed(5))
+    torch.rand(3)
+    assert torch.equal(draws, motion.draw(100_000, torch.Generator().manual_seed(5)))
+    assert draws.dtype == torch.float64
+    assert ((draws >= 0) & (draws < 1)).all()
+    assert torch.equal(draws * 2**40, (draws * 2**40).round())
+    assert stats.kstest(draws.numpy(), "uniform").pvalue > 1e-3
+
+
+def test_frequencies_are_those_of_the_table() -> None:
+    kernel = random_kernel(np.random.default_rng(2), 9, 0.05)
+    motion, rng, count = Motion(kernel), torch.Generator().manual_seed(0), 100_000
+    for cell in range(9):
+        moved = motion.move(torch.full((count,), cell), motion.draw(count, rng))
+        observed = np.bincount(moved.numpy(), minlength=10)
+        expected = closed(kernel)[cell] * count
+        assert not observed[expected < 1e-9].any()
+        likely = expected > 5
+        assert (
+            stats.chisquare(observed[likely], expected[likely] * observed[likely].sum() / expected[likely].sum())[1]
+            > 1e-3
+        )
