@@ -26,6 +26,7 @@ COMMANDS = {
 def main(argv: list[str] | None = None) -> int:
     """Run one command; returns the exit status: 0, 1 (a bug), 2 (a user's mistake) or 130 (interrupted)."""
     words = sys.argv[1:] if argv is None else argv
+    os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL reports every buffer it makes
     try:
         status = _dispatch(words)
         sys.stdout.flush()

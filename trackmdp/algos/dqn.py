@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictParams, TensorDictSequential
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import RandomSampler
@@ -33,6 +33,10 @@ class AdditiveDQNLoss(LossModule):
     chosen by the online network (per sensor, which for an additive Q is the joint maximum) and valued by the target
     network. Writes `td_error` `[batch]`; weighs by `priority_weight` where there is one.
     """
+
+    qvalue_network: TensorDictModule
+    qvalue_network_params: TensorDictParams
+    target_qvalue_network_params: TensorDictParams
 
     def __init__(self, qvalue: TensorDictModule) -> None:
         super().__init__()

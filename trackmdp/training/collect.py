@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModuleBase
@@ -10,6 +11,7 @@ from torchrl.collectors import BaseCollector, Collector, MultiAsyncCollector, Mu
 
 from trackmdp.config.learning import Collector as CollectorConfig
 from trackmdp.config.learning import MultiAsync, MultiSync
+from trackmdp.seeding import derive
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.model import World
 
@@ -30,18 +32,23 @@ def make_collector(
 
     The environment's own `_step_and_maybe_reset` and the flags below make TorchRL's collector as fast as a loop by hand.
     """
-    env = partial(TrackEnv, world, cfg.envs, seed=seed, max_steps=max_steps, device=env_device)
+    env = {"num_envs": cfg.envs, "seed": seed, "max_steps": max_steps, "device": env_device}
     common = {
         "frames_per_batch": cfg.frames_per_batch,
         "total_frames": cfg.total_frames,
-        "track_traj_ids": False,
         "auto_register_policy_transforms": False,
         "env_device": env_device,
         "policy_device": device,
         "storing_device": device,
     }
     if isinstance(cfg, (MultiSync, MultiAsync)):
-        workers = [partial(env, stream=f"world-{worker}") for worker in range(cfg.workers)]
+        workers = [partial(_worker_env, world, worker, env) for worker in range(cfg.workers)]
         kind = MultiSyncCollector if isinstance(cfg, MultiSync) else MultiAsyncCollector
-        return kind(workers, policy, num_threads=1, num_sub_threads=cfg.threads, **common)
-    return Collector(env(), policy, **common)
+        return kind(workers, policy, num_threads=torch.get_num_threads(), num_sub_threads=cfg.threads, **common)
+    return Collector(TrackEnv(world, **env), policy, track_traj_ids=False, **common)
+
+
+def _worker_env(world: World, worker: int, env: dict[str, Any]) -> TrackEnv:
+    """Built in a worker process: its own stream for the targets, and for the actions sampled there."""
+    torch.manual_seed(derive(env["seed"], "torch", worker))
+    return TrackEnv(world, stream=f"world-{worker}", **env)
