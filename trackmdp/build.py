@@ -99,13 +99,17 @@ def make_device(name: str, key: str = "device") -> torch.device:
 
 def make_algorithm(cfg: TrainConfig, world: World, device: torch.device) -> Algorithm:
     """The learner; it is given the task, never the motion."""
-    from trackmdp.algos import a2c, dqn, ppo
-    from trackmdp.config import A2c, Dqn, Ppo
+    from trackmdp.algos import a2c, dqn, hindsight, ppo
+    from trackmdp.config import A2c, Dqn, Hindsight, Ppo
 
-    makers: dict[type[Any], Callable[..., Algorithm]] = {A2c: a2c.A2C, Ppo: ppo.PPO, Dqn: dqn.DQN}
-    iterations = -(-cfg.collector.total_frames // cfg.collector.frames_per_batch)
-    make = makers[type(cfg.algo)]
-    return make(world.task, cfg.algo, iterations=iterations, seed=cfg.seed, device=device)
+    task, batches = world.task, -(-cfg.collector.total_frames // cfg.collector.frames_per_batch)
+    makers: dict[type[Any], Callable[[Any], Algorithm]] = {
+        Hindsight: lambda c: hindsight.Hindsight(task, c, iterations=batches, seed=cfg.seed, device=device),
+        A2c: lambda c: a2c.A2C(task, c, iterations=batches, device=device),
+        Ppo: lambda c: ppo.PPO(task, c, iterations=batches, seed=cfg.seed, device=device),
+        Dqn: lambda c: dqn.DQN(task, c, iterations=batches, seed=cfg.seed, device=device),
+    }
+    return makers[type(cfg.algo)](cfg.algo)
 
 
 def make_collector(cfg: TrainConfig, world: World, algorithm: Algorithm, device: torch.device) -> BaseCollector:

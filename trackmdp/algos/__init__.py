@@ -1,0 +1,1 @@
+"""Learning methods: loss, optimizer and update of one algorithm per file."""

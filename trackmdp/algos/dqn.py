@@ -10,7 +10,6 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictParams, TensorDictSequential
-from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import RandomSampler
 from torchrl.objectives import LossModule, SoftUpdate
@@ -19,7 +18,7 @@ from trackmdp.algos.common import Averages, clipped_step, set_learning_rate
 from trackmdp.algos.prioritized import PrioritizedSampler
 from trackmdp.config.learning import Dqn
 from trackmdp.policies.actor_critic import STATE_KEYS
-from trackmdp.policies.qvalue import EpsilonFlip, make_qvalue
+from trackmdp.policies.qvalue import EpsilonFlip, joint_value, make_qvalue
 from trackmdp.seeding import generator
 from trackmdp.world.model import Task
 
@@ -27,11 +26,12 @@ __all__ = ["DQN", "AdditiveDQNLoss", "n_step"]
 
 
 class AdditiveDQNLoss(LossModule):
-    """Squared TD error of Q(s, a) = base(s) + Σ_j a_j q_j(s).
+    """Squared TD error of an additive Q (`AdditiveQ`).
 
-    The target is y = R + γ^n [base'(s') + Σ_j a'_j q'_j(s')] while s' is not terminal, with a' = {j : q_j(s') > 0}
-    chosen by the online network (per sensor, which for an additive Q is the joint maximum) and valued by the target
-    network. Writes `td_error` `[batch]`; weighs by `priority_weight` where there is one.
+    The target is y = R + γ^n Q'(s', a') while s' is not terminal, with a' = {j : q_j(s') > 0} chosen by the online
+    network (per sensor, which for an additive Q is the joint maximum) and valued by the target network.
+
+    Writes `td_error` `[batch]`; weighs by `priority_weight` where there is one.
     """
 
     qvalue_network: TensorDictModule
@@ -44,11 +44,11 @@ class AdditiveDQNLoss(LossModule):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """`loss` of a batch of transitions as `n_step` makes them."""
-        chosen = _joint(self._values(tensordict, self.qvalue_network_params), tensordict["action"])
+        chosen = joint_value(self._values(tensordict, self.qvalue_network_params), tensordict["action"])
         with torch.no_grad():
             following = tensordict["next"]
             best = self._values(following, self.qvalue_network_params)["sensor_value"] > 0
-            future = _joint(self._values(following, self.target_qvalue_network_params), best)
+            future = joint_value(self._values(following, self.target_qvalue_network_params), best)
             alive = ~following["terminated"].squeeze(-1)
             target = following["reward"].squeeze(-1) + tensordict["discount"] * future * alive
         error = target - chosen
@@ -104,7 +104,8 @@ class DQN:
             self.target.step()
             if self.cfg.prioritized.enabled:
                 self.buffer.update_priority(rows["index"], rows["td_error"])
-            averages.add(loss=losses["loss"], q_value=losses["q_value"], td_error=rows["td_error"].mean(), grad_norm=norm)
+            error = rows["td_error"].mean()
+            averages.add(loss=losses["loss"], q_value=losses["q_value"], td_error=error, grad_norm=norm)
         epsilon = self.cfg.epsilon.at(progress)
         self.explore.epsilon.fill_(epsilon)
         return {"learning_rate": rate, "epsilon": epsilon} | averages.means()
@@ -154,9 +155,3 @@ def n_step(batch: TensorDictBase, steps: int, gamma: float) -> TensorDictBase:
     rows["discount"] = gamma ** taken.to(reward.dtype)
     rows["next"] = following
     return rows.reshape(-1)
-
-
-def _joint(values: TensorDictBase, action: Tensor) -> Tensor:
-    sensor = values["sensor_value"]
-    flipped = action.to(sensor.dtype) - (sensor > 0).to(sensor.dtype)
-    return values["base"].squeeze(-1) + (sensor * flipped).sum(-1)

@@ -46,7 +46,13 @@ class PrioritizedSampler(Sampler):
         """As `extend`, for one item."""
         self.extend(torch.tensor([index]))
 
-    def update_priority(self, index: Tensor | int, priority: Tensor | float, *, storage: Storage | None = None) -> None:
+    def update_priority(
+        self,
+        index: Tensor | int,
+        priority: Tensor | float,
+        *,
+        storage: Storage | None = None,  # noqa: ARG002  TorchRL passes it
+    ) -> None:
         """Set the priorities of `index` to |priority|."""
         value = torch.as_tensor(priority, dtype=torch.float64, device=self._mass.device).abs() + _SMALLEST
         self._largest = torch.maximum(self._largest, value.max())

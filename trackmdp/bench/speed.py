@@ -62,7 +62,11 @@ def collector_speed(cfg: BenchmarkConfig, world: World, device: torch.device) ->
                 auto_register_policy_transforms=False,
             )
             batches = iter(collector)
-            figures = rate(lambda batches=batches: next(batches).numel(), cfg.seconds, device)
+
+            def batch(batches: Any = batches) -> int:
+                return next(batches).numel()
+
+            figures = rate(batch, cfg.seconds, device)
             collector.shutdown()
             rows.append({"part": "collector", "policy": name, "envs": envs, **figures})
     return rows

@@ -13,19 +13,20 @@ from rich.console import Console
 from trackmdp.build import make_algorithm, make_baseline, make_device, make_world
 from trackmdp.config import EvaluateConfig, load_run
 from trackmdp.policies.fixed import ChainPolicy
+from trackmdp.reports.picture import draw
 from trackmdp.seeding import generator
 from trackmdp.training import checkpoint
 from trackmdp.training.display import make_console, table
 from trackmdp.training.evaluate import Simulation, chains_of, simulate
 from trackmdp.training.judge import Judge, Verdict, figures
-from trackmdp.training.metrics import write_json
+from trackmdp.training.metrics import write_json, write_text
 from trackmdp.world.model import World
 
 __all__ = ["run"]
 
 
 def run(cfg: EvaluateConfig, folder: Path) -> float:
-    """Write `evaluation.json` and `sets.json` to `folder`; returns the exact AIHTR."""
+    """Write `evaluation.json`, `sets.json` and `picture.txt` to `folder`; returns the exact AIHTR."""
     console = make_console(cfg.quiet)
     torch.set_num_threads(cfg.threads)
     device = make_device(cfg.device)
@@ -34,13 +35,12 @@ def run(cfg: EvaluateConfig, folder: Path) -> float:
     verdict = judge.score(chains)
     simulation = None
     if cfg.episodes:
-        policy = ChainPolicy(chains, generator(cfg.seed, "evaluation", "policy", device=device), device)
-        simulation = simulate(
-            world, policy, episodes=cfg.episodes, seed=cfg.seed, max_steps=max_steps, device=device
-        )
+        policy = ChainPolicy(chains, device, generator(cfg.seed, "evaluation", "policy", device=device))
+        simulation = simulate(world, policy, episodes=cfg.episodes, seed=cfg.seed, max_steps=max_steps, device=device)
     write_json(folder / "evaluation.json", _report(subject, judge, verdict, simulation))
     if chains.dtype == np.bool_:
         write_json(folder / "sets.json", sets(chains))
+        write_text(folder / "picture.txt", draw(world, chains, seed=cfg.seed))
     _show(console, subject, judge, verdict, simulation, folder)
     return verdict.evaluation.aihtr
 
@@ -49,9 +49,7 @@ def sets(chains: np.ndarray) -> dict[str, Any]:
     """For each located cell the list of sensed cells at n = 0 ... t_max."""
     return {
         "t_max": chains.shape[1] - 1,
-        "sets": {
-            str(cell): [np.flatnonzero(on).tolist() for on in chain] for cell, chain in enumerate(chains)
-        },
+        "sets": {str(cell): [np.flatnonzero(on).tolist() for on in chain] for cell, chain in enumerate(chains)},
     }
 
 
@@ -102,6 +100,5 @@ def _show(
         rows.append([label, f"{exact[key]:,.4f}", simulated, f"{qmdp[key]:,.4f}"])
     title = f"simulated, {simulation.episodes} episodes ± s.e." if simulation else "simulated"
     console.print(table(subject, ["figure", "exact", title, "Q_MDP exact"], rows))
-    console.print(
-        f"upper bound (clocked) {judge.upper:,.4f}; regret per step {round(verdict.regret_per_step, 4) + 0.0:.4f}; results in {folder}"
-    )
+    regret = round(verdict.regret_per_step, 4) + 0.0
+    console.print(f"upper bound (clocked) {judge.upper:,.4f}; regret per step {regret:.4f}; results in {folder}")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import os
 import platform
 import time
 from importlib.metadata import version
@@ -88,7 +87,7 @@ def _write_inputs(cfg: TrainConfig, world: World, folder: Path) -> None:
     np.save(buffer, world.kernel)
     part = folder / "kernel.npy.part"
     part.write_bytes(buffer.getvalue())
-    os.replace(part, folder / "kernel.npy")
+    part.replace(folder / "kernel.npy")
 
 
 def _summary(

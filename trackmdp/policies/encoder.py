@@ -17,7 +17,7 @@ class StateEncoder(nn.Module):
     Embeddings stand for the one-hots, and the history is multiplied only where n > 0 (most rows have none).
     """
 
-    def __init__(self, task: Task, hidden: int, scale: float = 0.1) -> None:
+    def __init__(self, task: Task, hidden: int, *, scale: float = 0.1, history_scale: float = 0.1) -> None:
         super().__init__()
         self.stages = task.t_max + 2
         self.cell = nn.Embedding(task.num_cells, hidden)
@@ -26,7 +26,7 @@ class StateEncoder(nn.Module):
         self.history = nn.Linear(task.num_choices * task.num_cells, hidden)
         for table in (self.cell, self.stage, self.cell_and_stage):
             nn.init.normal_(table.weight, std=scale)
-        nn.init.normal_(self.history.weight, std=scale)
+        nn.init.normal_(self.history.weight, std=history_scale)
         nn.init.zeros_(self.history.bias)
 
     def forward(self, last_cell: Tensor, steps_since_detection: Tensor, action_history: Tensor) -> Tensor:

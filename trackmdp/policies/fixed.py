@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -14,8 +16,8 @@ __all__ = ["AllOn", "ChainPolicy", "RandomSubset"]
 class AllOn(TensorDictModuleBase):
     """Every sensor on (or, with `on=False`, none) at every step."""
 
-    in_keys = ["last_cell"]
-    out_keys = ["action"]
+    in_keys: ClassVar = ["last_cell"]
+    out_keys: ClassVar = ["action"]
 
     def __init__(self, num_cells: int, on: bool = True) -> None:
         super().__init__()
@@ -31,8 +33,8 @@ class AllOn(TensorDictModuleBase):
 class RandomSubset(TensorDictModuleBase):
     """Each sensor on with probability 1/2, from its own generator; what benchmarks drive the environment with."""
 
-    in_keys = ["last_cell"]
-    out_keys = ["action"]
+    in_keys: ClassVar = ["last_cell"]
+    out_keys: ClassVar = ["action"]
 
     def __init__(self, num_cells: int, generator: torch.Generator) -> None:
         super().__init__()
@@ -53,18 +55,18 @@ class ChainPolicy(TensorDictModuleBase):
 
     Args:
         chains: `[M, t_max+1, M]`, bool, or the probabilities of switching each sensor on.
-        generator: draws the sensors where `chains` are probabilities.
         device: where the table lives.
+        generator: draws the sensors where `chains` are probabilities.
     """
 
-    in_keys = ["last_cell", "steps_since_detection"]
-    out_keys = ["action"]
+    in_keys: ClassVar = ["last_cell", "steps_since_detection"]
+    out_keys: ClassVar = ["action"]
 
     def __init__(
         self,
         chains: npt.NDArray[np.generic],
-        generator: torch.Generator | None = None,
         device: torch.device | str = "cpu",
+        generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
         self.generator = generator

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
@@ -12,44 +14,54 @@ from trackmdp.policies.actor_critic import STATE_KEYS
 from trackmdp.policies.encoder import StateEncoder
 from trackmdp.world.model import Task
 
-__all__ = ["AdditiveQ", "EpsilonFlip", "make_qvalue"]
+__all__ = ["AdditiveQ", "EpsilonFlip", "joint_value", "make_qvalue"]
 
-_LARGEST = 6.0  # e^6 sensor costs: far above any gain worth telling apart
+_ALL_ON = 0.5  # sensors start a little above zero: what can be left out is learned, not what must be found
 
 
 class AdditiveQ(nn.Module):
-    """Q(s, a) = base(s) + Σ_j a_j q_j(s) with q_j = c_j (e^{u_j} - 1): what detecting with j is worth, less its price.
+    """Q(s, a) = V(s) + Σ_j (a_j - 1[q_j(s) > 0]) q_j(s): a dueling network over sensors.
 
-    The best subset is {j : q_j > 0}. The exponential keeps the many sensors that never detect anything at -c_j exactly
-    where a linear q_j would scatter around it, within a threshold of a few hundredths of the gains.
+    V(s) is the value of the best subset {j : q_j > 0}, and only sensors that differ from it contribute, so that the
+    targets' noise reaches q_j through the few sensors flipped for exploration alone (after Wang et al. 2016).
+    q_j counts in units of the sensor's price.
     """
+
+    unit: Tensor
 
     def __init__(self, task: Task, hidden: int, scale: float) -> None:
         super().__init__()
         self.t_max = task.t_max
-        self.encoder = StateEncoder(task, hidden)
-        self.base = nn.Linear(hidden, 1)
-        self.gain = nn.Linear(hidden, task.num_cells)
-        for head in (self.base, self.gain):
+        self.encoder = StateEncoder(task, hidden, scale=1.0, history_scale=0.03)
+        self.base, self.sensor = nn.Linear(hidden, 1), nn.Linear(hidden, task.num_cells)
+        for head, start in ((self.base, 0.0), (self.sensor, _ALL_ON)):
             nn.init.orthogonal_(head.weight, gain=0.01)
-            nn.init.zeros_(head.bias)
-        cost = torch.as_tensor(task.cost, dtype=torch.float32) * scale
-        self.register_buffer("unit", cost.clamp_min(0.01 * scale * max(task.reward, 1e-6)))
-        self.register_buffer("cost", cost)
+            nn.init.constant_(head.bias, start)
+        price = torch.as_tensor(task.cost, dtype=torch.float32).clamp_min(0.01 * task.reward)
+        self.register_buffer("unit", scale * price)
 
-    def forward(self, last_cell: Tensor, steps_since_detection: Tensor, action_history: Tensor) -> tuple[Tensor, Tensor]:
-        """`base` `[..., 1]` and `sensor_value` `[..., M]`, the latter 0 where the safe action is forced."""
+    def forward(
+        self, last_cell: Tensor, steps_since_detection: Tensor, action_history: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """V `[..., 1]` and q `[..., M]`, the latter 0 where the safe action is forced."""
         features = self.encoder(last_cell, steps_since_detection, action_history)
-        gain = self.unit * torch.exp(self.gain(features).clamp_max(_LARGEST))
         free = (steps_since_detection <= self.t_max).unsqueeze(-1)
-        return self.base(features), (gain - self.cost) * free
+        return self.base(features), self.unit * self.sensor(features) * free
+
+
+def joint_value(values: TensorDictBase, action: Tensor) -> Tensor:
+    """`[...]` Q(s, a) of `action` `[..., M]` from the `base` and `sensor_value` of a network."""
+    sensor = values["sensor_value"]
+    flipped = action.to(sensor.dtype) - (sensor > 0).to(sensor.dtype)
+    return values["base"].squeeze(-1) + (sensor * flipped).sum(-1)
 
 
 class EpsilonFlip(TensorDictModuleBase):
     """The greedy subset {j : q_j > 0}; while exploring, each sensor is flipped with probability epsilon."""
 
-    in_keys = ["sensor_value"]
-    out_keys = ["action"]
+    in_keys: ClassVar = ["sensor_value"]
+    out_keys: ClassVar = ["action"]
+    epsilon: Tensor
 
     def __init__(self, epsilon: float) -> None:
         super().__init__()
@@ -64,5 +76,5 @@ class EpsilonFlip(TensorDictModuleBase):
 
 
 def make_qvalue(task: Task, hidden: int, scale: float) -> TensorDictModule:
-    """State -> `base`, `sensor_value`."""
+    """State -> `base` `[B, 1]`, `sensor_value` `[B, M]`, for rewards multiplied by `scale`."""
     return TensorDictModule(AdditiveQ(task, hidden, scale), in_keys=STATE_KEYS, out_keys=["base", "sensor_value"])

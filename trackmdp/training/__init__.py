@@ -1,0 +1,1 @@
+"""From an algorithm to a run: collecting, judging, logging, saving."""

@@ -30,7 +30,7 @@ def save(folder: Path, iteration: int, state: dict[str, Any], *, keep: int) -> P
         torch.save({"format": FORMAT, "iteration": iteration, **state}, stream)
         stream.flush()
         os.fsync(stream.fileno())
-    os.replace(part, file)
+    part.replace(file)
     _sync(folder)
     for old in _all(folder)[:-keep]:
         old.unlink()

@@ -30,10 +30,10 @@ def make_collector(
 ) -> BaseCollector:
     """A collector of batches `[B, time]` on `device` (the learner's); its frames are env steps.
 
-    The environment's own `_step_and_maybe_reset` and the flags below make TorchRL's collector as fast as a loop by hand.
+    The environment's own `_step_and_maybe_reset` and the flags below make the collector as fast as a loop by hand.
     """
-    env = {"num_envs": cfg.envs, "seed": seed, "max_steps": max_steps, "device": env_device}
-    common = {
+    env: dict[str, Any] = {"num_envs": cfg.envs, "seed": seed, "max_steps": max_steps, "device": env_device}
+    common: dict[str, Any] = {
         "frames_per_batch": cfg.frames_per_batch,
         "total_frames": cfg.total_frames,
         "auto_register_policy_transforms": False,

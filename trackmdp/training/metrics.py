@@ -16,7 +16,7 @@ __all__ = ["MetricsLog", "write_json", "write_text"]
 class MetricsLog:
     """One row per logged iteration; the columns are those of the first row.
 
-    A value that is not there, or not finite, leaves its field empty. Numbers are written so that they read back exactly.
+    A value that is not there, or not finite, leaves its field empty. Numbers read back exactly.
     """
 
     def __init__(self, folder: Path, *, tensorboard: bool) -> None:
@@ -54,7 +54,7 @@ def write_text(file: Path, text: str) -> None:
         stream.write(text)
         stream.flush()
         os.fsync(stream.fileno())
-    os.replace(part, file)
+    part.replace(file)
 
 
 def write_json(file: Path, content: Mapping[str, Any]) -> None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from trackmdp.world.model import Task
+from trackmdp.world.model import Array, Task
 
 __all__ = ["Costs"]
 
@@ -17,12 +18,13 @@ class Costs:
         self.reward, self.safe_cost = float(task.reward), float(task.safe_cost)
         self.sensor = torch.as_tensor(task.cost, dtype=torch.float32, device=device)
         self._uniform = bool((self.sensor == self.sensor[0]).all())
+        self._steps = torch.as_tensor(_whole_steps(task.cost), device=device)
 
     def sensing_cost(self, action: Tensor) -> Tensor:
         """`[B]` price of the sensors switched on in `action` `[B, M]`: c·|a|, or the sum of the cells' own c."""
         if self._uniform:
             return action.view(torch.uint8).sum(-1, dtype=torch.int32) * self.sensor[0]  # a bool sum converts first
-        return action.to(self.sensor.dtype) @ self.sensor
+        return (action.to(self._steps.dtype) @ self._steps).to(self.sensor.dtype)
 
     def pseudo_reward(self, action: Tensor, sensed: Tensor, forced: Tensor, in_grid: Tensor) -> Tensor:
         """`[B]` reward of one step: r·1[sensed] - c·|a|, or r - D when the safe action is forced; 0 on the exit step.
@@ -35,3 +37,9 @@ class Costs:
         """
         chosen = self.reward * sensed - self.sensing_cost(action)
         return torch.where(forced, self.reward - self.safe_cost, chosen) * in_grid
+
+
+def _whole_steps(cost: Array) -> Array:
+    """`[M]` float64 prices rounded to 2^-40 of the largest: their sums are exact, whatever the order and the batch."""
+    step = 2.0 ** (np.ceil(np.log2(max(cost.max(), 1e-300))) - 40)
+    return np.round(cost / step) * step

@@ -99,7 +99,7 @@ class TrackEnv(EnvBase):
         for name, rng in self._generators.items():
             rng.set_state(state[name])
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDictBase:
+    def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDictBase:  # noqa: ARG002
         """Fresh rows for the whole batch; TorchRL merges in those that its mask asks for."""
         return TensorDict(self._fresh(), self.batch_size, device=self.device)
 
@@ -111,9 +111,7 @@ class TrackEnv(EnvBase):
             "target": start,
             "last_cell": start.clone(),
             "steps_since_detection": torch.zeros_like(start),
-            "action_history": torch.zeros(
-                b, self.t_max + 1, self.num_cells, dtype=torch.bool, device=self.device
-            ),
+            "action_history": torch.zeros(b, self.t_max + 1, self.num_cells, dtype=torch.bool, device=self.device),
         }
         if self.max_steps:
             state["step_count"] = torch.zeros_like(start)
@@ -148,7 +146,7 @@ class TrackEnv(EnvBase):
         return following
 
     def _remember(self, history: Tensor, action: Tensor, n: Tensor, missed: Tensor) -> Tensor:
-        """h_{k+1}: `action` in slot n where the target was missed, empty elsewhere. Misses are few, so rows are picked."""
+        """h_{k+1}: `action` in slot n where the target was missed, empty elsewhere; misses are few."""
         kept = torch.zeros_like(history)
         rows = missed.nonzero().squeeze(-1)
         kept[rows] = history[rows]

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Literal, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from trackmdp.errors import UserError
 from trackmdp.world.model import Array
@@ -115,7 +116,7 @@ def check_table(table: Array, size: int, *, truncates: bool, source: str) -> Arr
         raise UserError(f"{source}: row {row} sums to {sums[row]:.6g}, expected at most 1 (the rest is the exit)")
     if not truncates and (trapped := ~_can_exit(table)).any():
         raise UserError(
-            f"{source}: from cell {_first(trapped)} the target never exits, so its episode never ends; set grid.max_steps"
+            f"{source}: from cell {_first(trapped)} the target never exits, so no episode ends; set grid.max_steps"
         )
     return table
 
@@ -188,5 +189,5 @@ def _can_exit(table: Array) -> np.ndarray:
         leaves = grown
 
 
-def _first(flags: np.ndarray) -> int:
+def _first(flags: npt.ArrayLike) -> int:
     return int(np.flatnonzero(flags)[0])
