@@ -18,12 +18,15 @@ class Algorithm(Protocol):
 
     policy: TensorDictModuleBase
     """Acts while collecting."""
-    actor: TensorDictModuleBase
-    """The deterministic policy that is judged."""
     iterations: int
     """Iterations of the whole run."""
     device: torch.device
     """Where the networks live."""
+
+    @property
+    def actor(self) -> TensorDictModuleBase:
+        """The deterministic policy that is judged."""
+        ...
 
     def step(self, batch: TensorDictBase | None) -> dict[str, float]:
         """One iteration of learning on `batch` `[B, time]` (None once all frames are in); returns its diagnostics."""
