@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 import torch
 from rich.console import Console
+from tensordict.nn import TensorDictModuleBase
 
 from trackmdp.build import make_algorithm, make_baseline, make_device, make_world
-from trackmdp.config import EvaluateConfig, load_run
+from trackmdp.config import EvaluateConfig, RandomK, load_run
+from trackmdp.policies import fixed
 from trackmdp.policies.fixed import ChainPolicy
 from trackmdp.reports.picture import draw
 from trackmdp.seeding import generator
@@ -35,7 +37,10 @@ def run(cfg: EvaluateConfig, folder: Path) -> float:
     verdict = judge.score(chains)
     simulation = None
     if cfg.episodes:
-        policy = ChainPolicy(chains, device, generator(cfg.seed, "evaluation", "policy", device=device))
+        policy: TensorDictModuleBase = ChainPolicy(chains, device)
+        if isinstance(cfg.baseline, RandomK):
+            draws = generator(cfg.seed, "evaluation", "policy", device=device)
+            policy = fixed.RandomK(world.num_cells, cfg.baseline.k, draws)
         simulation = simulate(world, policy, episodes=cfg.episodes, seed=cfg.seed, max_steps=max_steps, device=device)
     write_json(folder / "evaluation.json", _report(subject, judge, verdict, simulation))
     if chains.dtype == np.bool_:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-import numpy as np
-import numpy.typing as npt
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 
-__all__ = ["AllOn", "ChainPolicy", "RandomSubset"]
+from trackmdp.world.model import BoolArray
+
+__all__ = ["AllOn", "ChainPolicy", "RandomK", "RandomSubset"]
 
 
 class AllOn(TensorDictModuleBase):
@@ -50,32 +51,41 @@ class RandomSubset(TensorDictModuleBase):
         return tensordict.set("action", bits.flatten(-2)[..., :m].bool())
 
 
+class RandomK(TensorDictModuleBase):
+    """k sensors drawn anew at every step, each subset of that size equally likely."""
+
+    in_keys: ClassVar = ["last_cell"]
+    out_keys: ClassVar = ["action"]
+
+    def __init__(self, num_cells: int, k: int, generator: torch.Generator) -> None:
+        super().__init__()
+        self.num_cells, self.k, self.generator = num_cells, k, generator
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write `action` `[B, M]`: the k largest of M uniform draws."""
+        shape = (*tensordict["last_cell"].shape, self.num_cells)
+        draws = torch.rand(shape, generator=self.generator, device=self.generator.device)
+        action = torch.zeros(shape, dtype=torch.bool, device=draws.device)
+        return tensordict.set("action", action.scatter_(-1, draws.topk(self.k, dim=-1).indices, value=True))
+
+
 class ChainPolicy(TensorDictModuleBase):
-    """A policy as a table: the sensors on at n misses after locating the target in x.
+    """A deterministic policy as a table: the sensors on at n misses after locating the target in x.
 
     Args:
-        chains: `[M, t_max+1, M]`, bool, or the probabilities of switching each sensor on.
+        chains: `[M, t_max+1, M]` bool.
         device: where the table lives.
-        generator: draws the sensors where `chains` are probabilities.
     """
 
     in_keys: ClassVar = ["last_cell", "steps_since_detection"]
     out_keys: ClassVar = ["action"]
+    chains: Tensor
 
-    def __init__(
-        self,
-        chains: npt.NDArray[np.generic],
-        device: torch.device | str = "cpu",
-        generator: torch.Generator | None = None,
-    ) -> None:
+    def __init__(self, chains: BoolArray, device: torch.device | str = "cpu") -> None:
         super().__init__()
-        self.generator = generator
-        self.register_buffer("chains", torch.as_tensor(chains, device=device))
+        self.register_buffer("chains", torch.as_tensor(chains, dtype=torch.bool, device=device))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action` `[B, M]`; where the safe action is forced the last set stands in, unused."""
         n = tensordict["steps_since_detection"].clamp_max(self.chains.shape[1] - 1)
-        on = self.chains[tensordict["last_cell"], n]
-        if on.dtype != torch.bool:
-            on = torch.rand(on.shape, generator=self.generator, device=on.device) < on
-        return tensordict.set("action", on)
+        return tensordict.set("action", self.chains[tensordict["last_cell"], n])
