@@ -1,0 +1,53 @@
+"""A tracked target in plain text: some steps of one episode, with the sensors that are on."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from trackmdp.seeding import derive
+from trackmdp.world.model import BoolArray, World
+
+__all__ = ["LEGEND", "draw"]
+
+FOUND, MISSED, ON, OFF = "●", "○", "▪", "·"
+LEGEND = f"{FOUND} target, detected   {MISSED} target, missed   {ON} sensor on   {OFF} sensor off"
+MARGIN = "   "
+
+
+def draw(world: World, chains: npt.NDArray[np.generic], *, seed: int, steps: int = 6) -> str:
+    """The first `steps` steps of an episode from the middle of the grid, side by side, under the legend.
+
+    Args:
+        world: its kernel moves the target.
+        chains: `[M, t_max+1, M]` sensors switched on; a probability counts as on from 1/2.
+        seed: of the target's path, stream ``"picture"``.
+        steps: frames drawn at most; fewer if the target exits before.
+    """
+    sensed = np.asarray(chains, dtype=float) >= 0.5
+    frames = [_frame(world, *step) for step in _episode(world, sensed, seed, steps)]
+    columns = [[f"step {k}", *frame] for k, frame in enumerate(frames, start=1)]
+    wide = [[row.ljust(max(map(len, column))) for row in column] for column in columns]
+    lines = [MARGIN.join(rows) for rows in zip(*wide, strict=True)]
+    return "\n".join([*(line.rstrip() for line in lines), "", LEGEND, ""])
+
+
+def _episode(world: World, sensed: BoolArray, seed: int, steps: int) -> list[tuple[int, BoolArray]]:
+    """The target's cell and the sensors `[M]` of each step, the exit step left out."""
+    rng = np.random.default_rng(derive(seed, "picture"))
+    last = cell = world.size // 2 * (world.size + 1)
+    misses, frames = 0, []
+    for _ in range(steps):
+        on = sensed[last, misses] if misses <= world.t_max else np.ones(world.num_cells, dtype=bool)
+        cell = int(rng.choice(world.num_cells + 1, p=[*world.kernel[cell], max(0.0, 1.0 - world.kernel[cell].sum())]))
+        if cell == world.num_cells:
+            break
+        frames.append((cell, on))
+        last, misses = (cell, 0) if on[cell] else (last, misses + 1)
+    return frames
+
+
+def _frame(world: World, cell: int, on: BoolArray) -> list[str]:
+    marks = np.where(on, ON, OFF)
+    marks[cell] = FOUND if on[cell] else MISSED
+    return [" ".join(row) for row in marks.reshape(world.size, world.size)]
