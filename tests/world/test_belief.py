@@ -48,7 +48,7 @@ def test_a_tiny_mass_still_counts() -> None:
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 1e-6, 0.4]), st.integers(1, 4))
 def test_it_is_the_posterior_over_all_paths(seed: int, exit_probability: float, steps: int) -> None:
-    """Weigh every path of a 4-cell world by its probability, keep those that dodge the sensors, count where they end."""
+    """Weigh every path of a 4-cell world by its probability, keep those that dodge the sensors."""
     rng = np.random.default_rng(seed)
     kernel, start = random_kernel(rng, 4, exit_probability), int(rng.integers(4))
     actions = rng.random((steps, 4)) < 0.4
