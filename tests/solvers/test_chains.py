@@ -50,7 +50,7 @@ def test_counts_agree_with_the_reference(reference: dict) -> None:
 def test_a_world_by_hand() -> None:
     """Two cells matter: the target hops 0 -> 1 -> 0 and exits with probability 1/2 each step; sense nothing, t_max = 0.
 
-    From either cell: a miss in the grid (1/2), then the forced step (1/4, located). Renewals per episode: 1 / (1 - 1/4).
+    From either cell: a miss in the grid (1/2), then the forced step (1/4, located). Renewals: 1 / (1 - 1/4).
     """
     kernel = np.zeros((4, 4))
     kernel[0, 1] = kernel[1, 0] = 0.5

@@ -96,11 +96,11 @@ def best_by_enumeration(world: World) -> Array:
 
 
 def _all_renewals(world: World, x: int) -> tuple[Array, Array]:
-    outcomes = [renewal(world, x, chain) for chain in _all_chains(world, x)]
+    outcomes = [renewal(world, x, chain) for chain in all_chains(world, x)]
     return np.array([earned for earned, _ in outcomes]), np.stack([located for _, located in outcomes])
 
 
-def _all_chains(world: World, x: int) -> Iterator[BoolArray]:
+def all_chains(world: World, x: int) -> Iterator[BoolArray]:
     """Every chain of sets of cells that can be reached in that many moves; a sensor anywhere else only costs."""
     reachable, options = np.eye(world.num_cells)[x], []
     for _ in range(world.num_choices):

@@ -75,14 +75,22 @@ class _Choices:
 
 
 class Tree:
-    """The open choices for F_H(e_x) from every cell x, given R_0 ... R_{H-1} (upper bounds of F_h(e_j)).
+    """The open choices for F_H from every located cell x, given R_0 ... R_{H-1} (upper bounds of F_h(e_j)).
 
     Attributes:
         best: `[M]`, worth of the best chain found, or the `lower` it started from.
         nodes: choices looked at so far.
     """
 
-    def __init__(self, world: World, detected: Array, revealed: list[Array], lower: Array, slack: float) -> None:
+    def __init__(
+        self,
+        world: World,
+        detected: Array,
+        revealed: list[Array],
+        lower: Array,
+        slack: float,
+        mass: sparse.csr_array | None = None,
+    ) -> None:
         """Start with nothing chosen.
 
         Args:
@@ -91,6 +99,7 @@ class Tree:
             revealed: R_0 ... R_{H-1}, each `[M]`; R_0 is exact (what follows the last set).
             lower: `[M]`, worth of a known chain from each cell.
             slack: chains better than the best known by less than this are not looked for.
+            mass: `[M, M]`, where the undetected target may be, per located cell; without it, there: F_H(e_x).
         """
         self._world, self._detected, self._revealed, self._slack = world, detected, revealed, slack
         self.best = lower.copy()
@@ -99,7 +108,8 @@ class Tree:
         self._heap: list[tuple[float, int, _Choices]] = []
         self._ticket = itertools.count()
         m = world.num_cells
-        self._open(np.arange(m), np.zeros(m), sparse.eye_array(m, format="csr"), len(revealed), None)
+        start = sparse.eye_array(m, format="csr") if mass is None else mass
+        self._open(np.arange(m), np.zeros(m), start, len(revealed), None)
 
     @property
     def closed(self) -> bool:
@@ -107,15 +117,15 @@ class Tree:
         return not self._heap
 
     def upper(self) -> Array:
-        """`[M]` proved upper bound of F_H(e_x)."""
+        """`[M]` proved upper bound of F_H."""
         bound = self.best + self._slack
         for _, _, choices in self._heap:
             np.maximum.at(bound, choices.start, choices.bound)
         return bound
 
-    def run(self, go_on: Callable[[], bool]) -> None:
-        """Look at open choices, best first, while there are some and `go_on()`."""
-        while self._heap and go_on():
+    def run(self, go_on: Callable[[Tree], bool]) -> None:
+        """Look at open choices, best first, while there are some and `go_on(self)`."""
+        while self._heap and go_on(self):
             self._decide(heapq.heappop(self._heap)[2])
 
     def improvements(self) -> dict[int, list[set[int]]]:
@@ -155,7 +165,7 @@ class Tree:
         return sparse.csr_array((mass, cells, pointer), shape=(len(left), self._world.num_cells))
 
     def _one_more_set(self, mass: sparse.csr_array, sets_left: int) -> tuple[Array, sparse.csr_array, Array, Array]:
-        """Bound of F on each row with one more set chosen jointly; also the prediction, worth of sensing, of leaving."""
+        """Bound of F on each row, one more set chosen jointly; also the prediction, worth of sensing and of leaving."""
         moved = mass @ self._world.transition
         rows, cells = row_index(moved), moved.indices
         sense = moved.data * self._detected[cells] - self._world.cost[cells] * row_sums(moved)[rows]

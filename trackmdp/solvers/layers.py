@@ -12,18 +12,19 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.solvers.renewal import IndexArray, row_index
-from trackmdp.world.model import Array, BoolArray, World
+from trackmdp.world.model import BoolArray, World
 
 __all__ = ["Layer", "build", "sets_to_chains", "chains_to_sets"]
 
 
 @dataclass(frozen=True)
 class Layer:
-    """The entries after one more move.
+    """The entries after t moves.
 
     Attributes:
         rows, cells: `[E]`, located cell and possible position of each entry.
-        moves: `[E_before, E]`, probability of moving from an entry of the layer before to one of this layer.
+        moves: `[E_before, E]`, probability of moving from an entry of the layer before to one of this layer; in
+            layer 0, where nothing has moved yet, the identity.
     """
 
     rows: IndexArray
@@ -32,10 +33,10 @@ class Layer:
 
 
 def build(world: World, length: int) -> list[Layer]:
-    """Layers 1 ... `length`, all located cells together."""
+    """Layers 0 ... `length`, all located cells together."""
     m = world.num_cells
     rows = cells = np.arange(m)
-    layers = []
+    layers = [Layer(rows, cells, sparse.eye_array(m, format="csr"))]
     for _ in range(length):
         step = world.transition[cells]
         origin = row_index(step)
@@ -47,13 +48,13 @@ def build(world: World, length: int) -> list[Layer]:
 
 
 def sets_to_chains(world: World, layers: list[Layer], sets: list[BoolArray]) -> BoolArray:
-    """`[M, t_max + 1, M]` chains from the sensed entries of each layer."""
+    """`[M, t_max + 1, M]` chains from the sensed entries of layers 1 ... t_max + 1."""
     chains = np.zeros((world.num_cells, len(sets), world.num_cells), dtype=bool)
-    for n, (layer, on) in enumerate(zip(layers, sets, strict=True)):
+    for n, (layer, on) in enumerate(zip(layers[1:], sets, strict=True)):
         chains[layer.rows, n, layer.cells] = on
     return chains
 
 
 def chains_to_sets(layers: list[Layer], chains: BoolArray) -> list[BoolArray]:
-    """The sensed entries of each layer."""
-    return [chains[layer.rows, n, layer.cells] for n, layer in enumerate(layers)]
+    """The sensed entries of layers 1 ... t_max + 1."""
+    return [chains[layer.rows, n, layer.cells] for n, layer in enumerate(layers[1:])]

@@ -17,6 +17,7 @@ from trackmdp.solvers import clocked, search
 from trackmdp.solvers.bounds import clocked_table
 from trackmdp.solvers.branch import Tree
 from trackmdp.solvers.chains import evaluate
+from trackmdp.solvers.known import next_table
 from trackmdp.solvers.layers import Layer, build, chains_to_sets, sets_to_chains
 from trackmdp.solvers.renewal import accumulate, expected_steps
 from trackmdp.solvers.search import InnerProblem
@@ -175,7 +176,7 @@ class _Run:
         enough = time.monotonic() + patience
         reported = time.monotonic()
 
-        def go_on() -> bool:
+        def go_on(tree: Tree) -> bool:
             nonlocal reported
             now = time.monotonic()
             if now - reported > 1.0:
@@ -195,15 +196,10 @@ class _Run:
 
     def revealed(self, problem: InnerProblem, known: list[Array], length: int, patience: float) -> Array:
         """`[M]` upper bound of what `length` more sets can earn with the target known to be in each cell."""
-        layers = self.layers[:length]
-        inner = InnerProblem(self.world, layers, problem.detected, problem.missed)
-        credit = [problem.detected - known[length - 1 - t] for t in range(length)]
-        sets = [np.zeros(len(layer.rows), dtype=bool) for layer in layers]
-        for optimism in np.linspace(1.0, 0.0, 11):
-            sets = inner.ascend(sets, sweeps=3, optimism=float(optimism), credit=credit)
-        tree = Tree(self.world, problem.detected, known, inner.undetected(sets)[1], self.slack)
+        inner = InnerProblem(self.world, self.layers[: length + 1], problem.detected, problem.missed)
+        tree = next_table(inner, known, self.slack)
         enough = min(self.ends, time.monotonic() + patience)
-        tree.run(lambda: time.monotonic() < enough)
+        tree.run(lambda _: time.monotonic() < enough)
         self.nodes += tree.nodes
         return tree.upper()
 

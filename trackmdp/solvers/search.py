@@ -29,7 +29,7 @@ class InnerProblem:
 
     Attributes:
         world: the problem.
-        layers: possible positions after each of the H sets to be chosen.
+        layers: possible positions before the first of the H sets to be chosen and after each move: H + 1 layers.
         detected: `[M]`, worth of sensing the target in each cell, r + V.
         missed: `[M]`, worth of the target being in each cell, undetected, after the last set.
     """
@@ -45,45 +45,60 @@ class InnerProblem:
         detected = world.reward + value
         return cls(world, layers, detected, world.transition @ (detected - world.safe_cost))
 
-    def undetected(self, sets: list[BoolArray]) -> tuple[list[Array], Array]:
-        """W_t per entry of each layer, and the worth `[M]` of the whole chain from each located cell."""
+    @property
+    def length(self) -> int:
+        """H, sets to be chosen."""
+        return len(self.layers) - 1
+
+    def undetected(self, sets: list[BoolArray]) -> list[Array]:
+        """W_t per entry of each layer: what follows when the target is there, undetected, and `sets` go on."""
         later = [self.missed[self.layers[-1].cells]]
-        for t in range(len(self.layers) - 1, -1, -1):
-            layer, on = self.layers[t], sets[t]
+        for before, layer, on in reversed(list(zip(self.layers, self.layers[1:], sets, strict=False))):
             paid = per_row(layer.rows, on * self.world.cost[layer.cells], self.world.num_cells)
-            before = self.layers[t - 1] if t else None
-            rows = before.rows if before else np.arange(self.world.num_cells)
-            cells = before.cells if before else rows
             gross = layer.moves @ np.where(on, self.detected[layer.cells], later[0])
-            later.insert(0, gross - paid[rows] * self.world.stay_probability[cells])
-        return later[1:], later[0]
+            later.insert(0, gross - paid[before.rows] * self.world.stay_probability[before.cells])
+        return later
+
+    def worth(self, sets: list[BoolArray], mass: Array) -> Array:
+        """`[M]` what `sets` earn from undetected `mass` (`[E]`, on the first layer)."""
+        return per_row(self.layers[0].rows, mass * self.undetected(sets)[0], self.world.num_cells)
 
     def ascend(
-        self, sets: list[BoolArray], *, sweeps: int, optimism: float = 0.0, credit: list[Array] | None = None
+        self,
+        sets: list[BoolArray],
+        mass: Array,
+        *,
+        sweeps: int,
+        optimism: float = 0.0,
+        credit: list[Array] | None = None,
     ) -> list[BoolArray]:
         """At most `sweeps` times, the best set at each step given the others; `sets` is left as it is.
 
         Args:
-            sets: sensed entries of each layer.
+            sets: sensed entries of each layer but the first.
+            mass: `[E]`, undetected mass on the first layer.
             sweeps: passes over the steps; ends early where nothing changes.
             optimism: weight of `credit` against the exact credit r + V - W_t.
             credit: per step, `[M]` optimistic credit.
         """
         for _ in range(sweeps):
-            later, _ = self.undetected(sets)
-            mass, chosen = np.ones(self.world.num_cells), []
-            for t, layer in enumerate(self.layers):
-                mass = mass @ layer.moves
-                inside = per_row(layer.rows, mass, self.world.num_cells)
-                gain = self.detected[layer.cells] - later[t]
+            later, now, chosen = self.undetected(sets), mass, []
+            for t, layer in enumerate(self.layers[1:]):
+                now = now @ layer.moves
+                inside = per_row(layer.rows, now, self.world.num_cells)
+                gain = self.detected[layer.cells] - later[t + 1]
                 if credit is not None:
                     gain = optimism * credit[t][layer.cells] + (1.0 - optimism) * gain
-                chosen.append(mass * gain > self.world.cost[layer.cells] * inside[layer.rows])
-                mass = mass * ~chosen[-1]
+                chosen.append(now * gain > self.world.cost[layer.cells] * inside[layer.rows])
+                now = now * ~chosen[-1]
             if all((new == old).all() for new, old in zip(chosen, sets, strict=True)):
                 break
             sets = chosen
         return sets
+
+    def none_sensed(self) -> list[BoolArray]:
+        """Sets to start from."""
+        return [np.zeros(len(layer.rows), dtype=bool) for layer in self.layers[1:]]
 
 
 def solve(world: World, *, steps: int = 30, sweeps: int = 3) -> BoolArray:
@@ -92,10 +107,10 @@ def solve(world: World, *, steps: int = 30, sweeps: int = 3) -> BoolArray:
     table = clocked_table(world).table
     credit = list((world.reward + table[:, :1] - table[:, 1:]).T)
     chains, value = clocked.solve(world, table=table), table[:, 0]
-    sets = chains_to_sets(layers, chains)
+    sets, located = chains_to_sets(layers, chains), np.ones(world.num_cells)
     for step in range(steps + 1):
         problem = InnerProblem.of(world, layers, value)
-        sets = problem.ascend(sets, sweeps=sweeps, optimism=1.0 - step / steps, credit=credit)
+        sets = problem.ascend(sets, located, sweeps=sweeps, optimism=1.0 - step / steps, credit=credit)
         value = evaluate(world, sets_to_chains(world, layers, sets)).value
     ascended = improve(world, layers, sets)
     both = [sets_to_chains(world, layers, ascended), chains]
@@ -104,9 +119,9 @@ def solve(world: World, *, steps: int = 30, sweeps: int = 3) -> BoolArray:
 
 def improve(world: World, layers: list[Layer], sets: list[BoolArray], *, sweeps: int = 10) -> list[BoolArray]:
     """Policy iteration by ascent, until the mean value no longer grows."""
-    value = evaluate(world, sets_to_chains(world, layers, sets)).value
+    value, located = evaluate(world, sets_to_chains(world, layers, sets)).value, np.ones(world.num_cells)
     while True:
-        candidate = InnerProblem.of(world, layers, value).ascend(sets, sweeps=sweeps)
+        candidate = InnerProblem.of(world, layers, value).ascend(sets, located, sweeps=sweeps)
         better = evaluate(world, sets_to_chains(world, layers, candidate)).value
         if better.sum() <= value.sum() + 1e-12 * np.abs(value).sum():
             return sets

@@ -1,0 +1,144 @@
+"""Theorem 3: the position of a target that was missed, estimated from Q-values alone.
+
+With ã all sensors and ã_x all but the one at x, Q(s, ã) - Q(s, ã_x) = p(x) (r + V(x) - W(x)) - c_x p_in, W(x) what
+follows when the target is known to be at x but the clock runs on. The paper takes W = V, which holds for the position
+but not for the clock; with W as it is, the belief's probability p(x) comes out exactly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+from trackmdp.solvers.branch import Tree
+from trackmdp.solvers.chains import evaluate, renewal
+from trackmdp.solvers.known import tables
+from trackmdp.solvers.layers import Layer, build, chains_to_sets
+from trackmdp.solvers.renewal import IndexArray, accumulate, per_row
+from trackmdp.world.model import Array, BoolArray, World
+
+__all__ = ["EstimatorAccuracy", "PositionEstimate", "accuracy", "known_positions", "positions"]
+
+MOST_NODES = 100_000
+"""Choices looked at per table; where it ends early, W is an upper bound, and the exact form is exact all the same."""
+
+
+@dataclass(frozen=True)
+class PositionEstimate:
+    """What Q says about the next position, at every info state that `chains` can be in after n misses.
+
+    Attributes:
+        n: misses so far.
+        rows, cells: `[E]`, located cell and possible next position.
+        belief: `[E]`, Pr(X_{k+1} = cell | s_k), from the belief filter.
+        paper: `[E]`, (Q(s, ã) - Q(s, ã_x) + c_x) / r, as printed.
+        exact: `[E]`, (Q(s, ã) - Q(s, ã_x) + c_x p_in) / (r + V(x) - W(x)).
+        missed: `[E]`, joint probability, per renewal, of n misses, this position next, and missing it as well.
+    """
+
+    n: int
+    rows: IndexArray
+    cells: IndexArray
+    belief: Array
+    paper: Array
+    exact: Array
+    missed: Array
+
+
+@dataclass(frozen=True)
+class EstimatorAccuracy:
+    """Share of missed steps whose position is estimated right; 1 where nothing is ever missed.
+
+    Attributes:
+        paper: argmax of the paper's form.
+        exact: argmax of the exact form.
+        bayes: argmax of the belief; nothing is better.
+        missed_per_episode: steps in the grid without detection, per episode.
+    """
+
+    paper: float
+    exact: float
+    bayes: float
+    missed_per_episode: float
+
+
+def known_positions(world: World, value: Array) -> list[Array]:
+    """W after n + 1 misses, for n = 0 ... t_max, each `[M]`: best play from a known position, V = `value`."""
+    detected = world.reward + value
+    forced = world.transition @ (detected - world.safe_cost)
+    known = tables(world, detected, forced, world.t_max, slack=1e-9, go_on=_go_on)
+    return known[::-1]
+
+
+def positions(world: World, chains: BoolArray, value: Array) -> list[PositionEstimate]:
+    """The estimates at every info state on the chains, n = 0 ... t_max.
+
+    Q-values are those of playing best from a known position, V = `value` once located: the optimal policy's own
+    where `chains` and `value` are optimal.
+    """
+    layers = build(world, world.num_choices)
+    later = known_positions(world, value)
+    mass, estimates = np.ones(world.num_cells), []
+    for n, sensed in enumerate(chains_to_sets(layers, chains)):
+        predicted = mass @ layers[n + 1].moves
+        before = per_row(layers[n].rows, mass, world.num_cells)
+        estimates.append(_estimate(world, n, layers[n + 1], predicted, before, value, later[n], ~sensed))
+        mass = predicted * ~sensed
+    return estimates
+
+
+def accuracy(world: World, chains: BoolArray, value: Array | None = None) -> EstimatorAccuracy:
+    """How often the estimates are right on missed steps, pooled over a uniform start.
+
+    Args:
+        world: the problem.
+        chains: `[M, t_max + 1, M]`, the policy that senses.
+        value: `[M]`, V of the Q-values; the policy's own where not given.
+    """
+    policy = evaluate(world, chains)
+    visits = _visits(world, chains)
+    missed, right = 0.0, np.zeros(3)
+    for estimate in positions(world, chains, policy.value if value is None else value):
+        weight = visits[estimate.rows] * estimate.missed
+        missed += float(weight.sum())
+        for which, score in enumerate((estimate.paper, estimate.exact, estimate.belief)):
+            right[which] += float(weight[_best(estimate.rows, score, estimate.missed > 0)].sum())
+    paper, exact, bayes = np.minimum(right / missed, 1.0) if missed else np.ones(3)
+    return EstimatorAccuracy(float(paper), float(exact), float(bayes), missed)
+
+
+def _estimate(
+    world: World, n: int, layer: Layer, predicted: Array, before: Array, value: Array, later: Array, unsensed: BoolArray
+) -> PositionEstimate:
+    reached = np.flatnonzero(predicted > 0)
+    rows, cells = layer.rows[reached], layer.cells[reached]
+    p = predicted[reached] / before[rows]
+    inside = per_row(rows, p, world.num_cells)[rows]
+    # Q(s, ã) and Q(s, ã_x) share all terms but those of x.
+    all_on = p * (world.reward + value[cells]) - world.cost[cells] * inside
+    difference = all_on - p * later[cells]
+    paper = (difference + world.cost[cells]) / world.reward
+    worth = world.reward + value[cells] - later[cells]
+    exact = np.divide(difference + world.cost[cells] * inside, worth, out=np.zeros_like(p), where=worth != 0.0)
+    return PositionEstimate(n, rows, cells, p, paper, exact, predicted[reached] * unsensed[reached])
+
+
+def _best(rows: IndexArray, score: Array, allowed: BoolArray) -> IndexArray:
+    """The allowed entry of highest score in each row; of scores equal but for rounding, the first."""
+    entries = np.flatnonzero(allowed)
+    rounded = score[entries].round(9)
+    order = entries[np.lexsort((entries, -rounded, rows[entries]))]
+    return order[np.unique(rows[order], return_index=True)[1]]
+
+
+def _visits(world: World, chains: BoolArray) -> Array:
+    """`[M]` expected renewals that start in each cell, per episode from a uniform start."""
+    start = np.full(world.num_cells, 1.0 / world.num_cells)
+    located = sum((hit for hit, _ in renewal(world, chains)), sparse.csr_array((world.num_cells, world.num_cells)))
+    return accumulate(located.T.tocsr(), start)
+
+
+def _go_on(tree: Tree) -> bool:
+    return tree.nodes < MOST_NODES

@@ -1,0 +1,60 @@
+"""What h more sets can earn where the target's position is known but the clock runs on: R_h(j) = F_h(e_j)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from trackmdp.solvers.branch import Tree
+from trackmdp.solvers.layers import Layer, build
+from trackmdp.solvers.search import InnerProblem
+from trackmdp.world.model import Array, BoolArray, World
+
+__all__ = ["first_guess", "next_table", "tables"]
+
+
+def first_guess(problem: InnerProblem, known: list[Array], mass: Array) -> list[BoolArray]:
+    """Sets found by a homotopy from the credit r + V - R, `known` being R_0 ... R_{H-1}; see `search`."""
+    credit = [problem.detected - known[problem.length - 1 - t] for t in range(problem.length)]
+    sets = problem.none_sensed()
+    for optimism in np.linspace(1.0, 0.0, 11):
+        sets = problem.ascend(sets, mass, sweeps=3, optimism=float(optimism), credit=credit)
+    return sets
+
+
+def next_table(problem: InnerProblem, known: list[Array], slack: float) -> Tree:
+    """The tree that gives R_H once run (`Tree.upper`), H the length of `problem`, from R_0 ... R_{H-1}."""
+    mass = np.ones(problem.world.num_cells)
+    lower = problem.worth(first_guess(problem, known, mass), mass)
+    return Tree(problem.world, problem.detected, known, lower, slack)
+
+
+def tables(
+    world: World,
+    detected: Array,
+    missed: Array,
+    length: int,
+    *,
+    slack: float,
+    go_on: Callable[[Tree], bool],
+    layers: list[Layer] | None = None,
+) -> list[Array]:
+    """R_0 ... R_length, each `[M]`; upper bounds where `go_on` ends a search early.
+
+    Args:
+        world: the problem.
+        detected: `[M]`, worth of sensing the target in each cell, r + V.
+        missed: `[M]`, R_0.
+        length: sets of the last table.
+        slack: worth that may be missed.
+        go_on: asked now and then whether to look further.
+        layers: possible positions, where they are known already.
+    """
+    layers = build(world, length) if layers is None else layers
+    known = [missed]
+    for sets in range(1, length + 1):
+        tree = next_table(InnerProblem(world, layers[: sets + 1], detected, missed), known, slack)
+        tree.run(go_on)
+        known.append(tree.upper())
+    return known

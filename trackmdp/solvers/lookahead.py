@@ -1,0 +1,84 @@
+"""Look some sets ahead: plan them jointly, count on a simpler value after them, carry out the first, plan anew."""
+
+from __future__ import annotations
+
+from typing import Literal, TypeAlias
+
+import numpy as np
+from scipy import sparse
+
+from trackmdp.solvers.bounds import clocked_table, valid
+from trackmdp.solvers.branch import Tree
+from trackmdp.solvers.known import first_guess, tables
+from trackmdp.solvers.layers import Layer, build
+from trackmdp.solvers.search import InnerProblem
+from trackmdp.world.model import Array, BoolArray, World
+
+__all__ = ["Tail", "solve"]
+
+Tail: TypeAlias = Literal["qmdp", "clocked"]
+
+SLACK = 1e-9
+MOST_NODES = 2_000_000
+"""Choices looked at per plan; a count, not a time, so that the same world gives the same policy."""
+
+
+def solve(world: World, *, depth: int = 2, tail: Tail = "clocked") -> BoolArray:
+    """Chains of the policy that plans `depth` sets at every info state, fewer where the safe action comes before.
+
+    Args:
+        world: the problem.
+        depth: sets planned, at least 1; 1 gives Q_MDP (with the in-grid factor) and the clocked policy.
+        tail: the value after them: `qmdp`, the position known after every action, or `clocked`, U(j, n).
+    """
+    table = _tail_table(world, tail)
+    layers = build(world, world.num_choices)
+    chains = np.zeros((world.num_cells, world.num_choices, world.num_cells), dtype=bool)
+    mass = np.ones(world.num_cells)
+    for n in range(world.num_choices):
+        sets = min(depth, world.num_choices - n)
+        problem = InnerProblem(world, layers[n : n + sets + 1], world.reward + table[:, 0], table[:, n + sets])
+        sensed = _first_set(problem, layers, mass)
+        chains[layers[n + 1].rows, n, layers[n + 1].cells] = sensed
+        mass = (mass @ layers[n + 1].moves) * ~sensed
+    return chains
+
+
+def _tail_table(world: World, tail: Tail) -> Array:
+    """`[M, t_max + 2]` worth of the target being known in a cell after n misses."""
+    if tail == "clocked":
+        return clocked_table(world).table
+    return np.repeat(valid(world)[:, None], world.t_max + 2, axis=1)
+
+
+def _first_set(problem: InnerProblem, layers: list[Layer], mass: Array) -> BoolArray:
+    """`[E]` the first set of the best plan from each located cell, on the second layer of `problem`."""
+    world, known = problem.world, _known(problem, layers)
+    sets = first_guess(problem, known, mass)
+    origin, after = problem.layers[:2]
+    here = sparse.csr_array((mass, (origin.rows, origin.cells)), shape=(world.num_cells, world.num_cells))
+    here.eliminate_zeros()
+    tree = Tree(world, problem.detected, known, problem.worth(sets, mass), SLACK, here)
+    tree.run(_go_on)
+    sensed, possible = sets[0].copy(), mass @ after.moves > 0
+    for x, left_out in tree.improvements().items():
+        mine = after.rows == x
+        sensed[mine] = possible[mine] & ~np.isin(after.cells[mine], list(left_out[0]))
+    return sensed
+
+
+def _known(problem: InnerProblem, layers: list[Layer]) -> list[Array]:
+    """R_0 ... R_{H-1} for the plan's tail."""
+    return tables(
+        problem.world,
+        problem.detected,
+        problem.missed,
+        problem.length - 1,
+        slack=SLACK,
+        go_on=_go_on,
+        layers=layers,
+    )
+
+
+def _go_on(tree: Tree) -> bool:
+    return tree.nodes < MOST_NODES

@@ -1,0 +1,122 @@
+"""The POMDP of Section IV solved as one, over belief states (beta, n): a check on all that is built on chains.
+
+Every belief that some sequence of actions can lead to is listed, and the finite MDP over them is solved by policy
+iteration. Beliefs multiply with the actions tried, so this is for worlds of a few cells.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy import sparse
+
+from trackmdp.errors import UserError
+from trackmdp.solvers.renewal import accumulate
+from trackmdp.world.model import Array, BoolArray, World
+
+__all__ = ["BeliefSolution", "solve"]
+
+DIGITS = 12
+"""Beliefs that agree to this many digits are one."""
+
+
+@dataclass(frozen=True)
+class BeliefSolution:
+    """The optimum over belief states.
+
+    Attributes:
+        value: `[M]`, V*_POMDP((e_b, 0)).
+        beliefs: number of belief states (beta, n) that can be reached.
+    """
+
+    value: Array
+    beliefs: int
+
+
+@dataclass
+class _BeliefMdp:
+    """One row per belief state and admissible action; `state[i]` is the belief state row i belongs to."""
+
+    state: list[int] = field(default_factory=list)
+    reward: list[float] = field(default_factory=list)
+    successors: list[tuple[list[int], list[float]]] = field(default_factory=list)
+
+    def add(self, state: int, reward: float, successors: list[int], probability: list[float]) -> None:
+        self.state.append(state)
+        self.reward.append(reward)
+        self.successors.append((successors, probability))
+
+
+def solve(world: World, *, most_beliefs: int = 50_000) -> BeliefSolution:
+    """Policy iteration over all reachable belief states.
+
+    Raises:
+        UserError: there are more than `most_beliefs` of them.
+    """
+    problem, count = _enumerate(world, most_beliefs)
+    rows = len(problem.state)
+    columns = [column for successors, _ in problem.successors for column in successors]
+    data = [p for _, probability in problem.successors for p in probability]
+    pointer = np.concatenate([[0], np.cumsum([len(successors) for successors, _ in problem.successors])])
+    moves = sparse.csr_array((data, columns, pointer), shape=(rows, count))
+    reward, state = np.array(problem.reward), np.array(problem.state)
+    first = np.flatnonzero(np.diff(state, prepend=-1))
+    choice, value = first, accumulate(moves[first], reward[first])
+    while True:
+        worth = reward + moves @ value
+        best = np.maximum.reduceat(worth, first)
+        better = best > worth[choice] + 1e-12 * (1.0 + np.abs(value).max())
+        if not better.any():
+            return BeliefSolution(value[: world.num_cells], count)
+        choice = np.where(better, _first_best(worth, best, state, first), choice)
+        value = accumulate(moves[choice], reward[choice])
+
+
+def _first_best(worth: Array, best: Array, state: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """`[S]` the first row of each belief state that attains its best."""
+    attained = np.flatnonzero(worth >= best[state])
+    return attained[np.searchsorted(attained, first)]
+
+
+def _enumerate(world: World, most_beliefs: int) -> tuple[_BeliefMdp, int]:
+    beliefs = [(belief, 0) for belief in np.eye(world.num_cells)]
+    index = {_key(belief, n): i for i, (belief, n) in enumerate(beliefs)}
+    actions = np.array(list(itertools.product([True, False], repeat=world.num_cells)))
+    problem = _BeliefMdp()
+    for i, (belief, n) in enumerate(beliefs):  # grows while it is gone through
+        predicted = belief @ world.kernel
+        if n == world.num_choices:
+            problem.add(i, (world.reward - world.safe_cost) * float(predicted.sum()), *_sparse(predicted))
+            continue
+        for action in actions:
+            after, missed = _miss(predicted, action)
+            targets, probability = _sparse(np.where(action, predicted, 0.0))
+            if missed > 0:
+                key = _key(after, n + 1)
+                if key not in index:
+                    index[key] = len(beliefs)
+                    beliefs.append((after, n + 1))
+                targets, probability = [*targets, index[key]], [*probability, missed]
+            price = float(world.cost[action].sum() * predicted.sum())
+            problem.add(i, world.reward * float(predicted[action].sum()) - price, targets, probability)
+        if len(beliefs) > most_beliefs:
+            raise UserError(f"grid.size={world.size}: more than {most_beliefs} belief states, expected a smaller world")
+    return problem, len(beliefs)
+
+
+def _miss(predicted: Array, action: BoolArray) -> tuple[Array, float]:
+    """Eq. belief_up given no detection and no exit, and the probability of that."""
+    left = np.where(action, 0.0, predicted)
+    missed = float(left.sum())
+    return (left / missed if missed else left), missed
+
+
+def _sparse(vector: Array) -> tuple[list[int], list[float]]:
+    cells = np.flatnonzero(vector)
+    return cells.tolist(), vector[cells].tolist()
+
+
+def _key(belief: Array, n: int) -> tuple[int, bytes]:
+    return n, (belief.round(DIGITS) + 0.0).tobytes()
