@@ -1,0 +1,66 @@
+"""The encoder against an ordinary linear layer on explicit one-hots."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import one_hot
+
+from tests.helpers import random_state, small_world
+from trackmdp.policies.encoder import StateEncoder, StateNetwork
+from trackmdp.world.model import World
+
+
+def features(world: World, cell: Tensor, n: Tensor, history: Tensor) -> Tensor:
+    """`[B, K]`: cell, n, both, and the history's bits, each as 0 or 1."""
+    m, stages = world.num_cells, world.t_max + 2
+    parts = [one_hot(cell, m), one_hot(n, stages), one_hot(cell * stages + n, m * stages), history.flatten(1)]
+    return torch.cat(parts, dim=1).double()
+
+
+@pytest.mark.parametrize("t_max", [0, 2])
+def test_it_is_a_linear_layer_on_one_hots(t_max: int) -> None:
+    world = small_world(t_max=t_max)
+    torch.manual_seed(0)
+    encoder = StateEncoder(world.task, 8).double()
+    with torch.no_grad():
+        encoder.history.bias.normal_()
+    rows = random_state(world, 60, seed=1)
+    inputs = [rows[key] for key in ("last_cell", "steps_since_detection", "action_history")]
+    tables = [encoder.cell, encoder.stage, encoder.cell_and_stage]
+    weight = torch.cat([*(table.weight.T for table in tables), encoder.history.weight], dim=1).detach().requires_grad_()
+    bias = encoder.history.bias.detach().clone().requires_grad_()
+    dense = torch.relu(features(world, *inputs) @ weight.T + bias)
+    ours = encoder(*inputs)
+    torch.testing.assert_close(ours, dense)
+    probe = torch.randn(60, 8, dtype=torch.float64)
+    (ours * probe).sum().backward()
+    (dense * probe).sum().backward()
+    gradients = [*(table.weight.grad.T for table in tables), encoder.history.weight.grad]
+    torch.testing.assert_close(torch.cat(gradients, dim=1), weight.grad)
+    torch.testing.assert_close(encoder.history.bias.grad, bias.grad)
+
+
+def test_batches_of_any_shape_and_rows_alone() -> None:
+    world = small_world(t_max=1)
+    torch.manual_seed(0)
+    network = StateNetwork(world.task, 8, nn.Linear(8, 3)).double()
+    rows = random_state(world, 12, seed=2)
+    inputs = [rows[key] for key in ("last_cell", "steps_since_detection", "action_history")]
+    flat = network(*inputs)
+    assert flat.shape == (12, 3)
+    torch.testing.assert_close(network(*(x.reshape(3, 4, *x.shape[1:]) for x in inputs)), flat.reshape(3, 4, 3))
+    for row in range(12):
+        torch.testing.assert_close(network(*(x[row] for x in inputs)), flat[row])
+        torch.testing.assert_close(network(*(x[row : row + 1] for x in inputs)), flat[row : row + 1])
+
+
+def test_every_state_has_features_of_its_own() -> None:
+    world = small_world(t_max=1)
+    torch.manual_seed(0)
+    encoder = StateEncoder(world.task, 64)
+    cell, n = torch.cartesian_prod(torch.arange(9), torch.arange(3)).unbind(-1)
+    seen = encoder(cell, n, torch.zeros(27, 2, 9, dtype=torch.bool)).detach()
+    distance = torch.cdist(seen, seen) + torch.eye(27)
+    assert distance.min() > 1e-3

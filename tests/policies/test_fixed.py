@@ -1,0 +1,52 @@
+"""Policies that learn nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from tests.helpers import random_state, small_world
+from trackmdp.policies.fixed import AllOn, ChainPolicy, RandomK, RandomSubset
+
+
+@pytest.mark.parametrize("on", [True, False])
+def test_all_on_and_none(on: bool) -> None:
+    acted = AllOn(9, on)(random_state(small_world(), 5, seed=0))
+    assert acted["action"].tolist() == [[on] * 9] * 5
+
+
+def test_a_chain_is_looked_up_by_cell_and_misses() -> None:
+    chains = np.zeros((4, 2, 4), dtype=bool)
+    chains[1, 0, 2] = chains[1, 1, 3] = chains[2, 1, 0] = True
+    rows = {"last_cell": torch.tensor([1, 1, 2, 0, 1]), "steps_since_detection": torch.tensor([0, 1, 1, 1, 2])}
+    action = ChainPolicy(chains)(TensorDict(rows, [5]))["action"]
+    on = [cells.nonzero().flatten().tolist() for cells in action]
+    assert on == [[2], [3], [0], [], [3]]
+    assert action.dtype == torch.bool
+
+
+@pytest.mark.parametrize("k", [0, 1, 3, 9])
+def test_random_k_draws_exactly_k_from_its_own_generator(k: int) -> None:
+    rows = TensorDict({"last_cell": torch.zeros(20_000, dtype=torch.int64)}, [20_000])
+    before = torch.get_rng_state()
+    action = RandomK(9, k, torch.Generator().manual_seed(0))(rows)["action"].clone()
+    assert torch.equal(RandomK(9, k, torch.Generator().manual_seed(0))(rows)["action"], action)
+    assert torch.equal(torch.get_rng_state(), before)
+    assert (action.sum(-1) == k).all()
+    share = k / 9
+    assert (action.double().mean(0) - share).abs().max() <= 5 * (share * (1 - share) / 20_000) ** 0.5
+
+
+def test_random_subsets_are_fair_coins_of_their_own_generator() -> None:
+    """130 sensors span three words; every sensor on half the time, every pair of neighbours independent."""
+    rows = TensorDict({"last_cell": torch.zeros(20_000, dtype=torch.int64)}, [20_000])
+    before = torch.get_rng_state()
+    action = RandomSubset(130, torch.Generator().manual_seed(0))(rows)["action"].clone()
+    assert torch.equal(RandomSubset(130, torch.Generator().manual_seed(0))(rows)["action"], action)
+    assert torch.equal(torch.get_rng_state(), before)
+    assert action.shape == (20_000, 130)
+    tolerance = 5 * 0.5 / 20_000**0.5
+    assert (action.double().mean(0) - 0.5).abs().max() < tolerance
+    assert ((action[:, 1:] == action[:, :-1]).double().mean(0) - 0.5).abs().max() < tolerance
