@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from trackmdp.bench import speed
+from trackmdp.bench import quality, speed
 from trackmdp.bench.machine import machine
 from trackmdp.build import make_device, make_world
 from trackmdp.config import BenchmarkConfig
@@ -22,6 +22,7 @@ PARTS: dict[str, Callable[[BenchmarkConfig, World, torch.device], list[dict[str,
     "env": speed.env_speed,
     "collector": speed.collector_speed,
     "train": speed.train_speed,
+    "quality": quality.quality,
 }
 
 
@@ -43,4 +44,4 @@ def run(cfg: BenchmarkConfig, folder: Path) -> None:
 def _text(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:,.3g}" if abs(value) < 1000 else f"{value:,.0f}"
-    return str(value)
+    return "never" if value is None else str(value)

@@ -50,6 +50,10 @@ class Option:
         """Whether `value` has the right type and lies in the range."""
         if value is None:
             return self.nullable
+        if typing.get_origin(self.kind) is list:
+            (item,) = typing.get_args(self.kind)
+            single = dataclasses.replace(self, kind=item)
+            return isinstance(value, list) and len(value) > 0 and all(map(single.allows, value))
         if self.kind is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
         if self.kind in _KINDS and type(value) is not self.kind:
@@ -67,6 +71,9 @@ class Option:
         )
 
     def _kind_in_range(self) -> str:
+        if typing.get_origin(self.kind) is list:
+            (item,) = typing.get_args(self.kind)
+            return f"a list, each {dataclasses.replace(self, kind=item)._kind_in_range()}"
         kind = _KINDS.get(self.kind, str(self.kind))
         if self.ge is not None and self.le is not None:
             return f"{kind} from {self.ge:g} to {self.le:g}"

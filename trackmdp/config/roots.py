@@ -104,12 +104,14 @@ class BenchmarkConfig(WorldConfig):
     """Measure speed and quality on this machine."""
 
     part: str = option(
-        "what is measured", choices=("env", "collector", "train", "solver", "quality", "growth", "memory")
+        "what is measured", choices=("env", "collector", "train", "quality", "solver")
     )
     seed: int = option("every random draw derives from it", ge=0)
     device: str = option("device of environments and networks", expects="cpu, cuda, cuda:N or auto")
     threads: int = option("torch threads", unit="threads", ge=1, le=256)
-    seconds: float = option("least time spent on each figure", unit="s", gt=0)
+    seconds: float = option("least time spent on each figure of speed", unit="s", gt=0)
+    algos: list[str] = option("algorithms that `quality` trains", expects="a list of algorithms, as [hindsight,ppo]")
+    seeds: list[int] = option("seeds that `quality` trains with", ge=0)
     peers: str | None = option("folder with the scripts of the peers to run beside ours", expects="a folder")
 
 
