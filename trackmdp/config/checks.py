@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from trackmdp.config.baselines import RandomK
-from trackmdp.config.learning import Collector, Dqn, MultiAsync, MultiSync, Ppo, Schedule
+from trackmdp.config.learning import Collector, Dqn, Ppo, Schedule, Workers
 from trackmdp.config.options import Option, options, refuse
 from trackmdp.config.roots import BenchmarkConfig, EvaluateConfig, SolveConfig, TrainConfig, WorldConfig
 from trackmdp.config.world import Cost, PaperCost, RandomSupport, Table
@@ -107,7 +107,7 @@ def _check_cost(cost: Cost, cells: int) -> None:
 
 
 def _check_collector(collector: Collector) -> None:
-    workers = collector.workers if isinstance(collector, (MultiSync, MultiAsync)) else 1
+    workers = collector.workers if isinstance(collector, Workers) else 1
     stepped = collector.envs * workers
     if collector.frames_per_batch % stepped:
         expected = f"a multiple of {stepped} (collector.envs" + (" x collector.workers)" if workers > 1 else ")")

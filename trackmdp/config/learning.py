@@ -21,6 +21,7 @@ __all__ = [
     "Schedule",
     "Single",
     "Tensorboard",
+    "Workers",
 ]
 
 
@@ -126,7 +127,6 @@ class Collector:
     )
     envs: int = option("environments stepped together, in each worker", ge=1)
     device: str = option("device the environments live on", expects="cpu, cuda, cuda:N or auto")
-    threads: int = option("torch threads of each process that collects", unit="threads", ge=1, le=256)
 
 
 @choice("collector", "single")
@@ -135,20 +135,24 @@ class Single(Collector):
     """In the process that learns."""
 
 
-@choice("collector", "multi_sync")
 @dataclass(kw_only=True)
-class MultiSync(Collector):
-    """In worker processes; every batch waits for all of them."""
+class Workers(Collector):
+    """What the two collectors with worker processes have more."""
 
     workers: int = option("worker processes", ge=1, le=256)
+    threads: int = option("torch threads of each worker process", unit="threads", ge=1, le=256)
+
+
+@choice("collector", "multi_sync")
+@dataclass(kw_only=True)
+class MultiSync(Workers):
+    """In worker processes; every batch waits for all of them."""
 
 
 @choice("collector", "multi_async")
 @dataclass(kw_only=True)
-class MultiAsync(Collector):
+class MultiAsync(Workers):
     """In worker processes; a batch is what one of them has ready."""
-
-    workers: int = option("worker processes", ge=1, le=256)
 
 
 @dataclass(kw_only=True)

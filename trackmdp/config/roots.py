@@ -35,10 +35,9 @@ class WorldConfig:
 
 @dataclass(kw_only=True)
 class Evaluation:
-    """How often and how well the policy is judged while it learns."""
+    """How often the policy is judged while it learns."""
 
     every: int = option("iterations from one exact evaluation to the next", unit="iterations", ge=1)
-    episodes: int = option("episodes simulated at the end; 0 = exact figures only", unit="episodes", ge=0)
 
 
 @dataclass(kw_only=True)
@@ -103,9 +102,7 @@ class VerifyConfig(WorldConfig):
 class BenchmarkConfig(WorldConfig):
     """Measure speed and quality on this machine."""
 
-    part: str = option(
-        "what is measured", choices=("env", "collector", "train", "quality", "solver")
-    )
+    part: str = option("what is measured", choices=("env", "collector", "train", "quality", "solver"))
     seed: int = option("every random draw derives from it", ge=0)
     device: str = option("device of environments and networks", expects="cpu, cuda, cuda:N or auto")
     threads: int = option("torch threads", unit="threads", ge=1, le=256)
