@@ -130,7 +130,7 @@ def make_collector(cfg: TrainConfig, world: World, algorithm: Algorithm, device:
 def make_baseline(cfg: Baseline, world: World) -> np.ndarray:
     """`[M, t_max+1, M]` chains of a policy that is not learned; probabilities for `random_k`, else bool."""
     from trackmdp import config
-    from trackmdp.solvers import clocked, myopic, qmdp
+    from trackmdp.solvers import clocked, fcr, lookahead, myopic, optimal, qmdp
 
     shape = (world.num_cells, world.num_choices, world.num_cells)
     makers: dict[type[Any], Callable[[Any], np.ndarray]] = {
@@ -140,5 +140,8 @@ def make_baseline(cfg: Baseline, world: World) -> np.ndarray:
         config.RandomK: lambda c: np.full(shape, c.k / world.num_cells),
         config.Myopic: lambda c: myopic.solve(world, threshold=c.threshold),
         config.Clocked: lambda c: clocked.solve(world),
+        config.Fcr: lambda c: fcr.solve(world, in_grid=c.in_grid),
+        config.Lookahead: lambda c: lookahead.solve(world, depth=c.depth, tail=c.tail),
+        config.Optimal: lambda c: optimal.solve(world, time_limit=c.time_limit, tolerance=c.tolerance).chains,
     }
     return makers[type(cfg)](cfg)

@@ -17,6 +17,8 @@ from trackmdp.policies import fixed
 from trackmdp.policies.fixed import ChainPolicy
 from trackmdp.reports.picture import draw
 from trackmdp.seeding import generator
+from trackmdp.solvers import estimator
+from trackmdp.solvers.chains import sets_of
 from trackmdp.training import checkpoint
 from trackmdp.training.display import make_console, table
 from trackmdp.training.evaluate import Simulation, chains_of, simulate
@@ -42,20 +44,19 @@ def run(cfg: EvaluateConfig, folder: Path) -> float:
             draws = generator(cfg.seed, "evaluation", "policy", device=device)
             policy = fixed.RandomK(world.num_cells, cfg.baseline.k, draws)
         simulation = simulate(world, policy, episodes=cfg.episodes, seed=cfg.seed, max_steps=max_steps, device=device)
-    write_json(folder / "evaluation.json", _report(subject, judge, verdict, simulation))
+    estimate = estimator.accuracy(world, chains) if chains.dtype == np.bool_ and max_steps is None else None
+    report = _report(subject, judge, verdict, simulation) | {"estimator": asdict(estimate) if estimate else None}
+    write_json(folder / "evaluation.json", report)
     if chains.dtype == np.bool_:
-        write_json(folder / "sets.json", sets(chains))
+        write_json(folder / "sets.json", sets_of(chains))
         write_text(folder / "picture.txt", draw(world, chains, seed=cfg.seed))
     _show(console, subject, judge, verdict, simulation, folder)
+    if estimate is not None:
+        shares = (
+            f"from Q {estimate.exact:.2%} (printed form {estimate.paper:.2%}), from the belief {estimate.bayes:.2%}"
+        )
+        console.print(f"missed steps whose position is estimated right: {shares}")
     return verdict.evaluation.aihtr
-
-
-def sets(chains: np.ndarray) -> dict[str, Any]:
-    """For each located cell the list of sensed cells at n = 0 ... t_max."""
-    return {
-        "t_max": chains.shape[1] - 1,
-        "sets": {str(cell): [np.flatnonzero(on).tolist() for on in chain] for cell, chain in enumerate(chains)},
-    }
 
 
 def _trained(cfg: EvaluateConfig, device: torch.device) -> tuple[World, int | None, np.ndarray, str]:

@@ -35,7 +35,7 @@ class _Frontier:
     """B info states whose next set is to be chosen, with the K cells (padded) where leaving might pay.
 
     Attributes:
-        start: `[B]`, located cell.
+        start: `[B]`, the problem (located cell) they belong to.
         sets_left: sets still to be chosen, the next one included.
         relaxed: `[B]`, earned so far plus the bound on the rest with every cell at its better choice.
         cells, mass, regret: `[B, K]`; `regret` is what sensing costs against the bound on leaving.
@@ -78,7 +78,7 @@ class Tree:
     """The open choices for F_H from every located cell x, given R_0 ... R_{H-1} (upper bounds of F_h(e_j)).
 
     Attributes:
-        best: `[M]`, worth of the best chain found, or the `lower` it started from.
+        best: `[B]`, worth of the best chain found, or the `lower` it started from.
         nodes: choices looked at so far.
     """
 
@@ -97,9 +97,9 @@ class Tree:
             world: the problem.
             detected: `[M]`, worth of sensing the target in each cell, r + V.
             revealed: R_0 ... R_{H-1}, each `[M]`; R_0 is exact (what follows the last set).
-            lower: `[M]`, worth of a known chain from each cell.
+            lower: `[B]`, worth of a known chain for each problem.
             slack: chains better than the best known by less than this are not looked for.
-            mass: `[M, M]`, where the undetected target may be, per located cell; without it, there: F_H(e_x).
+            mass: `[B, M]`, where the undetected target may be, one problem per row; without it, B = M and row x is e_x.
         """
         self._world, self._detected, self._revealed, self._slack = world, detected, revealed, slack
         self.best = lower.copy()
@@ -107,9 +107,8 @@ class Tree:
         self._leaves: dict[int, list[set[int]]] = {}
         self._heap: list[tuple[float, int, _Choices]] = []
         self._ticket = itertools.count()
-        m = world.num_cells
-        start = sparse.eye_array(m, format="csr") if mass is None else mass
-        self._open(np.arange(m), np.zeros(m), start, len(revealed), None)
+        start = sparse.eye_array(world.num_cells, format="csr") if mass is None else mass
+        self._open(np.arange(len(lower)), np.zeros(len(lower)), start, len(revealed), None)
 
     @property
     def closed(self) -> bool:
@@ -117,7 +116,7 @@ class Tree:
         return not self._heap
 
     def upper(self) -> Array:
-        """`[M]` proved upper bound of F_H."""
+        """`[B]` proved upper bound of F_H."""
         bound = self.best + self._slack
         for _, _, choices in self._heap:
             np.maximum.at(bound, choices.start, choices.bound)
@@ -129,7 +128,7 @@ class Tree:
             self._decide(heapq.heappop(self._heap)[2])
 
     def improvements(self) -> dict[int, list[set[int]]]:
-        """Per located cell with a better chain than it started from: the cells to leave unsensed at each step."""
+        """Per problem with a better chain than it started from: the cells to leave unsensed at each step."""
         return self._leaves
 
     def _decide(self, choices: _Choices) -> None:

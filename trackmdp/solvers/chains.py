@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +19,7 @@ from trackmdp.errors import UserError
 from trackmdp.solvers.renewal import IndexArray, accumulate, expected_steps, row_index, row_sums
 from trackmdp.world.model import Array, BoolArray, World
 
-__all__ = ["Evaluation", "Prediction", "evaluate", "pool", "regret_per_step", "renewal", "unroll"]
+__all__ = ["Evaluation", "Prediction", "evaluate", "pool", "regret_per_step", "sets_of", "renewal", "unroll"]
 
 
 @dataclass(frozen=True)
@@ -119,6 +120,14 @@ def unroll(world: World, rule: Callable[[Prediction], BoolArray]) -> BoolArray:
         chains[rows, n, predicted.indices] = sensed
         mass = _with_data(predicted, predicted.data * ~sensed)
     return chains
+
+
+def sets_of(chains: BoolArray) -> dict[str, Any]:
+    """Plain lists, to be written: for each located cell the sensed cells at n = 0 ... t_max."""
+    return {
+        "t_max": chains.shape[1] - 1,
+        "sets": {str(cell): [np.flatnonzero(on).tolist() for on in chain] for cell, chain in enumerate(chains)},
+    }
 
 
 def _check(world: World, chains: npt.NDArray[np.generic]) -> Array:

@@ -1,0 +1,55 @@
+"""Two remarks of the paper on worlds of its own: where Q_MDP is optimal, and where its bound is none."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from trackmdp.solvers import bounds, clocked, optimal, qmdp
+from trackmdp.solvers.chains import evaluate
+from trackmdp.solvers.theorems import Check
+from trackmdp.world.kernels import Border, random_support
+from trackmdp.world.model import World
+
+__all__ = ["check", "paper_world"]
+
+
+def paper_world(support_size: int, cost: float, t_max: int, border: Border = "renormalize") -> World:
+    """The world of Section VII, N = 10, r = 1, D = N² c, the kernel drawn with seed Z."""
+    kernel = random_support(
+        10,
+        support_size=support_size,
+        radius=1,
+        low_probability=0.15,
+        exit_probability=0.005,
+        border=border,
+        seed=support_size,
+    )
+    return World(10, 1.0, np.full(100, cost), 100 * cost, t_max, kernel)
+
+
+def check(tolerance: float) -> Iterator[Check]:
+    """Both remarks, each with its figures."""
+    yield _support(tolerance)
+    yield _printed_bound(tolerance)
+
+
+def _support(tolerance: float) -> Check:
+    world = paper_world(4, 0.14, 1)
+    support = world.kernel > 0
+    best, simple = optimal.solve(world), qmdp.solve(world)
+    wrong = sum(int((chains[:, 0] != support).sum()) for chains in (best.chains, simple))
+    missed = 1.0 - evaluate(world, best.chains).accuracy
+    deviation = max(float(wrong), missed)
+    statement = "optimum and Q_MDP sense exactly the support, accuracy 100 %: sensors that differ"
+    return Check("remark, c = 0.14, Z = 4", statement, deviation, deviation <= tolerance, note="N = 10, t_max 1")
+
+
+def _printed_bound(tolerance: float) -> Check:
+    world = paper_world(5, 0.16, 5, border="inside")
+    printed, achieved = bounds.paper(world).mean(), evaluate(world, clocked.solve(world)).aihtr
+    note = f"bound {printed:.2f}, a policy attains {achieved:.2f} (border inside, Z = 5, c = 0.16, t_max 5)"
+    statement = "no policy exceeds the printed bound"
+    excess = float(achieved - printed)
+    return Check("the printed bound", statement, excess, excess <= tolerance, expected=False, note=note)
