@@ -32,8 +32,10 @@ def bad_values(item: Option) -> list[str]:
         bad += [str(item.kind(limit + by)) for limit, by in limits if limit is not None]
     if item.kind is int:
         bad += ["1.5"]
-    if item.choices or item.expects.startswith("cpu"):
+    if item.kind is str and (item.choices or item.expects.startswith("cpu")):
         bad += ["elsewhere", "[cpu]"]
+    if item.kind in (list[int], list[str]):
+        bad += ["elsewhere", "[]", "[elsewhere]", "[1.5]", "[null]"] + (["[-1]"] if item.ge == 0 else [])
     if item.kind is Any:
         bad += ["-1", "words", "{a: 1}", "nan", "[1,2]"]
     return bad

@@ -43,6 +43,7 @@ class Option:
     def expected(self) -> str:
         """What a value must be, in words: ``an integer from 3 to 64 (cells)``."""
         words = self.expects or (f"one of {', '.join(self.choices)}" if self.choices else self._kind_in_range())
+        words = f"a list, each {words}" if self._element else words
         words += " or null" if self.nullable else ""
         return words + (f" ({self.unit})" if self.unit else "")
 
@@ -50,10 +51,8 @@ class Option:
         """Whether `value` has the right type and lies in the range."""
         if value is None:
             return self.nullable
-        if typing.get_origin(self.kind) is list:
-            (item,) = typing.get_args(self.kind)
-            single = dataclasses.replace(self, kind=item)
-            return isinstance(value, list) and len(value) > 0 and all(map(single.allows, value))
+        if self._element:
+            return isinstance(value, list) and len(value) > 0 and all(map(self._element.allows, value))
         if self.kind is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
         if self.kind in _KINDS and type(value) is not self.kind:
@@ -61,6 +60,13 @@ class Option:
         if self.choices:
             return value in self.choices
         return not isinstance(value, (int, float)) or self._in_range(value)
+
+    @property
+    def _element(self) -> Option | None:
+        """What the elements must be, if this is a list."""
+        if typing.get_origin(self.kind) is not list:
+            return None
+        return dataclasses.replace(self, kind=typing.get_args(self.kind)[0], nullable=False)
 
     def _in_range(self, value: float) -> bool:
         return math.isfinite(value) and (
@@ -71,10 +77,7 @@ class Option:
         )
 
     def _kind_in_range(self) -> str:
-        if typing.get_origin(self.kind) is list:
-            (item,) = typing.get_args(self.kind)
-            return f"a list, each {dataclasses.replace(self, kind=item)._kind_in_range()}"
-        kind = _KINDS.get(self.kind, str(self.kind))
+        kind = _KINDS.get(self._element.kind if self._element else self.kind, str(self.kind))
         if self.ge is not None and self.le is not None:
             return f"{kind} from {self.ge:g} to {self.le:g}"
         signs = ((">=", self.ge), (">", self.gt), ("<=", self.le), ("<", self.lt))

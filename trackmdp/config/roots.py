@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from trackmdp.config.baselines import Baseline
 from trackmdp.config.learning import Algo, Collector, Log
-from trackmdp.config.options import option
+from trackmdp.config.options import GROUPS, option
 from trackmdp.config.world import Cost, Grid, Kernel
 
 __all__ = [
@@ -107,7 +107,7 @@ class BenchmarkConfig(WorldConfig):
     device: str = option("device of environments and networks", expects="cpu, cuda, cuda:N or auto")
     threads: int = option("torch threads", unit="threads", ge=1, le=256)
     seconds: float = option("least time spent on each figure of speed", unit="s", gt=0)
-    algos: list[str] = option("algorithms that `quality` trains", expects="a list of algorithms, as [hindsight,ppo]")
+    algos: list[str] = option("algorithms that `quality` trains", choices=tuple(GROUPS["algo"]))
     seeds: list[int] = option("seeds that `quality` trains with", ge=0)
     peers: str | None = option("folder with the scripts of the peers to run beside ours", expects="a folder")
 
