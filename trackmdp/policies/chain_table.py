@@ -61,6 +61,7 @@ class Neighbourhood(nn.Module):
 
     cells: Tensor
     _code: Tensor
+    _center: Tensor
 
     def __init__(self, size: int, radius: int, device: torch.device) -> None:
         super().__init__()

@@ -1,0 +1,70 @@
+"""What switching one sensor on is worth (theory: credit that reaches the optimum).
+
+The motion is exogenous, so on a fully sensed path every policy can be replayed, its misses included. At an info state
+with n misses, the target moving to cell y next, the sensor of y gains what a detection is worth more than a miss, no
+other sensor gains anything, and each sensor that is on costs its c.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+__all__ = ["chain_returns", "clocked_advantage", "sensing_gain"]
+
+
+def sensing_gain(
+    clocked: Tensor, own: Tensor | None = None, *, reward: float, discount: float, blend: float = 0.0
+) -> Tensor:
+    """The gain of having the target's sensor on: r + γ[(1-λ)(U(y,0) - U(y,n+1)) + λ(V(y) - G_{n+1})].
+
+    At λ = 0 the clocked values judge, which are optimistic about what follows a miss; at λ = 1 the policy's own
+    continuation does. Taking λ slowly from 0 to 1 leads past optima that no change of a single sensor improves.
+
+    Args:
+        clocked: U(y,0) - U(y,n+1), any shape.
+        own: V(y) - G_{n+1}, same shape, where G_{n+1} is the return of the policy's own chain from n + 1 misses on, the
+            target truly being at y; not needed at λ = 0.
+        reward: r.
+        discount: γ of the credit.
+        blend: λ.
+    """
+    advantage = clocked if own is None else torch.lerp(clocked, own, blend)
+    return reward + discount * advantage
+
+
+def clocked_advantage(clocked: Tensor) -> Tensor:
+    """U(y,0) - U(y,n+1), `[T+1, M]`: what a detection in cell y after n misses is worth more than a miss.
+
+    Args:
+        clocked: `[M, T+2]`, U(y,n), the value when the position is revealed after every action but the clock runs on.
+    """
+    return (clocked[:, :1] - clocked[:, 1:]).T.contiguous()
+
+
+def chain_returns(
+    hits: Tensor, inside: Tensor, set_cost: Tensor, value: Tensor, *, reward: float, safe_cost: float, discount: float
+) -> Tensor:
+    """Return of a chain of sets from each of its steps on, along paths, the target undetected until then.
+
+    Backwards from the safe action: G_{T+1} = r - D + γV(y), G_n = r + γV(y) - c(A_n) if y is in A_n, else
+    γG_{n+1} - c(A_n), where y is the cell the target moves to at that step; 0 once the target has left.
+
+    Args:
+        hits: bool `[T+1, B]`, whether A_n contains y.
+        inside: bool `[T+2, B]`, whether the target is in the grid after the move.
+        set_cost: `[T+1, B]`, c(A_n), the cost of the sensors on.
+        value: `[T+2, B]`, V(y).
+        reward: r.
+        safe_cost: D.
+        discount: γ.
+
+    Returns:
+        `[T+2, B]`.
+    """
+    found = reward + discount * value
+    returns = [(found[-1] - safe_cost) * inside[-1]]
+    for n in reversed(range(len(hits))):
+        outcome = torch.where(hits[n], found[n], discount * returns[-1]) - set_cost[n]
+        returns.append(outcome * inside[n])
+    return torch.stack(returns[::-1])
