@@ -40,6 +40,7 @@ def make_collector(
         "env_device": env_device,
         "policy_device": device,
         "storing_device": device,
+        "trust_policy": True,  # a policy without parameters (all sensors on) lives on any device
     }
     if isinstance(cfg, (MultiSync, MultiAsync)):
         workers = [partial(_worker_env, world, worker, env) for worker in range(cfg.workers)]
