@@ -82,5 +82,7 @@ def clipped_step(
 
 def explained_variance(predicted: Tensor, target: Tensor) -> Tensor:
     """1 - Var[target - predicted] / Var[target]; 0 where the target does not vary."""
+    if target.numel() < 2:
+        return torch.zeros(())
     variance = target.var()
     return torch.where(variance > 0, 1 - (target - predicted).var() / variance, torch.zeros_like(variance))

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 from torchrl.objectives import LossModule
 from torchrl.objectives.value import GAE
 
@@ -57,8 +58,7 @@ class OnPolicy:
         fit = explained_variance(batch["state_value"], batch["value_target"]).item()
         data = batch.select(*_KEPT).reshape(-1)
         free = (data["steps_since_detection"] <= self._t_max).unsqueeze(-1)
-        chosen = data["advantage"][free]
-        data["advantage"] = (data["advantage"] - chosen.mean()) / (chosen.std() + 1e-8) * free
+        data["advantage"] = _normalised(data["advantage"], free)
         return data, {"learning_rate": rate, "entropy_coef": entropy, "explained_variance": fit}
 
     def state_dict(self) -> dict[str, Any]:
@@ -76,3 +76,11 @@ class OnPolicy:
         self.critic.load_state_dict(state["critic"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.iteration = state["iteration"]
+
+
+def _normalised(advantage: Tensor, counted: Tensor) -> Tensor:
+    """`advantage` with mean 0 and variance 1 over the `counted` rows, 0 elsewhere; one row alone tells nothing."""
+    chosen = advantage[counted]
+    if len(chosen) < 2:
+        return torch.zeros_like(advantage)
+    return (advantage - chosen.mean()) / (chosen.std() + 1e-8) * counted
