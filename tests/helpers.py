@@ -10,10 +10,12 @@ import torch
 from hydra import compose, initialize_config_dir
 from hypothesis import strategies as st
 from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from trackmdp.build import make_algorithm
 from trackmdp.config import GROUPS, ROOTS, EvaluateConfig, TrainConfig, conf_dir, from_hydra, register
 from trackmdp.config.world import BORDERS
+from trackmdp.world.env import TrackEnv
 from trackmdp.world.model import Array, World
 
 KERNELS = [name for name in GROUPS["kernel"] if name != "table"]
@@ -26,6 +28,7 @@ __all__ = [
     "BORDERS",
     "KERNELS",
     "algorithm",
+    "collect",
     "configured",
     "evaluate_config",
     "hop_world",
@@ -103,6 +106,18 @@ def random_state(world: World, rows: int, seed: int) -> TensorDict:
         "action": torch.rand(rows, m, generator=rng) < 0.4,
     }
     return TensorDict(state, [rows])
+
+
+@torch.no_grad()
+def collect(world: World, policy: Any, envs: int, time: int, *, seed: int = 0, max_steps: int | None = None) -> Any:
+    """Frames `[envs, time]` of `policy`, as a collector would hand them over."""
+    env = TrackEnv(world, envs, seed=seed, max_steps=max_steps)
+    rows, frames = env.reset(), []
+    with set_exploration_type(ExplorationType.RANDOM):
+        for _ in range(time):
+            frame, rows = env.step_and_maybe_reset(policy(rows))
+            frames.append(frame.clone())
+    return torch.stack(frames, dim=1)
 
 
 def algorithm(name: str, world: World, *overrides: str) -> Any:

@@ -1,0 +1,105 @@
+"""What A2C and PPO learn from: advantages against hand values, and no credit for forced steps."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from tests.helpers import algorithm, collect, hop_world, small_world
+
+ON_POLICY = ["a2c", "ppo"]
+GAMMA, LAMBDA, SCALE, CONSTANT = 0.8, 0.5, 0.1, 3.0
+SETTINGS = (f"algo.gamma={GAMMA}", f"algo.lam={LAMBDA}", f"algo.reward_scale={SCALE}")
+
+
+def frames(terminated: list[int], truncated: list[int], misses: list[int]) -> TensorDict:
+    """One row of four steps with rewards 10, 20, 30, 40."""
+    ends, cuts = (torch.tensor(flags, dtype=torch.bool).reshape(1, 4, 1) for flags in (terminated, truncated))
+    state = {
+        "last_cell": torch.tensor([[0, 1, 2, 3]]),
+        "steps_since_detection": torch.tensor([misses]),
+        "action_history": torch.zeros(1, 4, 2, 4, dtype=torch.bool),
+    }
+    following = {**state, "reward": torch.tensor([[[10.0], [20.0], [30.0], [40.0]]])}
+    following |= {"terminated": ends, "truncated": cuts, "done": ends | cuts}
+    action = {"action": torch.ones(1, 4, 4, dtype=torch.bool), "action_log_prob": torch.zeros(1, 4)}
+    return TensorDict({**state, **action, "next": TensorDict(following, [1, 4])}, [1, 4])
+
+
+def constant_critic(name: str) -> object:
+    learner = algorithm(name, hop_world(), *SETTINGS)
+    with torch.no_grad():
+        learner.critic.module.head.weight.zero_()
+        learner.critic.module.head.bias.fill_(CONSTANT)
+    return learner
+
+
+def advantages(errors: list[float], ends: list[bool]) -> list[float]:
+    """A_t = δ_t + γλ A_{t+1}, started anew after the end of an episode."""
+    following, found = 0.0, []
+    for error, end in zip(reversed(errors), reversed(ends), strict=True):
+        following = error + (0.0 if end else GAMMA * LAMBDA * following)
+        found.append(following)
+    return found[::-1]
+
+
+@pytest.mark.parametrize("name", ON_POLICY)
+@pytest.mark.parametrize("flag", ["none", "terminated", "truncated"])
+def test_the_advantage_at_the_end_of_an_episode(name: str, flag: str) -> None:
+    """With V = 3 everywhere, δ = r/10 + 0.8·3 - 3, but r/10 - 3 where the target has exited; truncation bootstraps."""
+    flags = {kind: [0, int(flag == kind), 0, 0] for kind in ("terminated", "truncated")}
+    batch = frames(**flags, misses=[0, 1, 0, 0])
+    constant_critic(name).prepare(batch)
+    bootstrap = [GAMMA * CONSTANT * (not ended) for ended in flags["terminated"]]
+    errors = [r + v - CONSTANT for r, v in zip([1.0, 2.0, 3.0, 4.0], bootstrap, strict=True)]
+    expected = torch.tensor(advantages(errors, [False, flag != "none", False, False]))
+    torch.testing.assert_close(batch["advantage"].flatten(), expected)
+    torch.testing.assert_close(batch["value_target"].flatten(), expected + CONSTANT)
+
+
+@pytest.mark.parametrize("name", ON_POLICY)
+def test_forced_steps_get_no_credit_and_count_for_nothing(name: str) -> None:
+    """T_max = 1, so the step at n = 2 is forced; the others are normalised among themselves."""
+    batch = frames([0, 0, 0, 1], [0] * 4, misses=[0, 1, 2, 0])
+    data, _ = constant_critic(name).prepare(batch)
+    raw = batch["advantage"].flatten()[[0, 1, 3]]
+    assert data["advantage"][2] == 0.0
+    normalised = data["advantage"].flatten()[[0, 1, 3]]
+    assert normalised.mean().item() == pytest.approx(0.0, abs=1e-6)
+    ratio = (raw - raw.mean()) / normalised
+    torch.testing.assert_close(ratio, ratio[0].expand(3))
+    assert ratio[0] > 0
+
+
+@pytest.mark.parametrize("name", ON_POLICY)
+@pytest.mark.parametrize("misses", [0, 2])
+def test_a_single_frame_and_a_batch_of_forced_steps_stay_finite(name: str, misses: int) -> None:
+    learner = constant_critic(name)
+    batch = frames([0] * 4, [0] * 4, [misses] * 4)[:, :1]
+    data, diagnostics = learner.prepare(batch)
+    assert data["advantage"].tolist() == [[0.0]]
+    assert all(value == value for value in diagnostics.values())
+
+
+@pytest.mark.parametrize("name", ON_POLICY)
+def test_schedules_follow_the_progress_of_the_run(name: str) -> None:
+    schedule = ("algo.learning_rate={start: 0.4, end: 0.1, begin: 0, until: 1}",)
+    learner = algorithm(name, small_world(), *schedule, "algo.entropy={start: 0.2, end: 0, begin: 0.5, until: 0.75}")
+    assert learner.iterations == 16
+    seen = []
+    for _ in range(16):
+        _, diagnostics = learner.prepare(collect(small_world(), learner.policy, 2, 4))
+        assert learner.optimizer.param_groups[0]["lr"] == diagnostics["learning_rate"]
+        assert learner.loss.entropy_coeff.item() == pytest.approx(diagnostics["entropy_coef"])
+        seen.append((diagnostics["learning_rate"], diagnostics["entropy_coef"]))
+    rates, entropies = zip(*seen, strict=True)
+    assert rates == pytest.approx([0.4 - 0.3 * i / 16 for i in range(16)])
+    assert entropies == pytest.approx([0.2] * 9 + [0.15, 0.1, 0.05] + [0.0] * 4)
+
+
+@pytest.mark.parametrize("name", ON_POLICY)
+def test_the_explained_variance_of_a_perfect_and_a_constant_critic(name: str) -> None:
+    batch = frames([0] * 4, [0] * 4, [0] * 4)
+    _, diagnostics = constant_critic(name).prepare(batch)
+    assert diagnostics["explained_variance"] == pytest.approx(0.0, abs=1e-5)
