@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 __all__ = ["MoveBuffer", "sensed_moves"]
 
@@ -25,25 +22,24 @@ class MoveBuffer:
     """
 
     def __init__(self, num_cells: int, capacity: int, generator: torch.Generator) -> None:
-        self.num_cells, self._generator = num_cells, generator
-        self._replay = TensorDictReplayBuffer(storage=LazyTensorStorage(capacity, device=generator.device))
+        self.num_cells, self._capacity, self._generator = num_cells, capacity, generator
+        # Oldest first; no grid has more cells than 16 bits count.
+        self._moves = torch.empty(2, 0, dtype=torch.int16, device=generator.device)
         self._index: tuple[Tensor, Tensor, Tensor] | None = None
 
     def __len__(self) -> int:
-        return len(self._replay)
+        return self._moves.shape[1]
 
     def extend(self, batch: TensorDictBase) -> None:
         """Add the moves sensed in a collected batch `[B, time]`."""
-        start, end = sensed_moves(batch, self.num_cells)
-        if len(start):
-            # No grid has more cells than 16 bits count.
-            self._replay.extend(TensorDict({"start": start.short(), "end": end.short()}, start.shape))
+        fresh = torch.stack(sensed_moves(batch, self.num_cells)).to(self._moves)
+        self._moves = torch.cat([self._moves, fresh], dim=1)[:, -self._capacity :].contiguous()
         self._index = None
 
     def moves(self) -> tuple[Tensor, Tensor]:
         """Cells before and after every move, int64 `[K]` each."""
-        kept = self._replay[:]
-        return kept["start"].long(), kept["end"].long()
+        start, end = self._moves.long()
+        return start, end
 
     def paths(self, count: int, steps: int) -> Tensor:
         """`[steps + 1, count]` int64 cells of `count` paths, M from the exit on; every cell starts equally many.
@@ -77,14 +73,13 @@ class MoveBuffer:
         # Half a float's spacing below the count, so that a draw close to 1 does not round up to the next cell's moves.
         return ends, first, seen.clamp(min=1).float() * (1.0 - 2.0**-24)
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, Tensor]:
         """The moves; the generator is its owner's to save."""
-        return self._replay.state_dict()
+        return {"moves": self._moves}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Continue from a `state_dict`."""
-        self._replay.load_state_dict(state)
-        self._index = None
+        self._moves, self._index = state["moves"].to(self._moves), None
 
 
 def sensed_moves(batch: TensorDictBase, num_cells: int) -> tuple[Tensor, Tensor]:

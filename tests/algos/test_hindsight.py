@@ -1,0 +1,256 @@
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torch import Tensor
+
+from tests.helpers import algorithm, collect, hop_world, small_world
+from trackmdp.algos.hindsight_loss import HindsightLoss, decision_loss
+from trackmdp.errors import UserError
+from trackmdp.solvers import optimal
+from trackmdp.solvers.chains import evaluate, regret_per_step
+from trackmdp.training.evaluate import chains_of
+from trackmdp.world.model import World
+
+SHORT = ("algo.updates=30", "algo.updates_per_iteration=10", "algo.batch_size=512", "algo.hidden=16")
+SOLVES = ("algo.updates=300", "algo.updates_per_iteration=100", "algo.batch_size=2048", "algo.hidden=32")
+
+
+def batches(world: World, count: int = 16, *, envs: int = 32, seed: int = 0) -> list[Any]:
+    """What the collector hands over with `tests.helpers.algorithm`'s budget."""
+    time = 8 * count
+    return list(collect(world, algorithm("hindsight", world).policy, envs, time, seed=seed).split(8, dim=1))
+
+
+def learn(world: World, data: list[Any], *overrides: str) -> Any:
+    learner = algorithm("hindsight", world, *overrides)
+    for batch in [*data, *[None] * (learner.iterations - len(data))]:
+        learner.step(batch)
+    return learner
+
+
+def policy(learner: Any, world: World) -> Any:
+    return chains_of(learner.actor, world)
+
+
+@given(st.floats(-5, 5), st.floats(0, 3), st.floats(0, 3), st.floats(0.01, 2))
+def test_decision_loss_is_least_where_sensing_pays(logit: float, plus: float, minus: float, price: float) -> None:
+    """Its slope is (c + G⁻ + G⁺)σ(z) - G⁺, zero at z = log(G⁺ / (c + G⁻))."""
+    z = torch.tensor(logit, dtype=torch.float64, requires_grad=True)
+    parts = [torch.tensor(part, dtype=torch.float64) for part in (plus, minus, price)]
+    decision_loss(z, *parts).backward()
+    assert z.grad is not None
+    assert z.grad.item() == pytest.approx((price + minus + plus) * torch.sigmoid(z).item() - plus, abs=1e-9)
+
+
+def test_decision_loss_stops_pulling_at_large_logits() -> None:
+    logits = torch.tensor([-30.0, 30.0], requires_grad=True)
+    decision_loss(logits, torch.ones(2), torch.zeros(2), torch.ones(2)).sum().backward()
+    assert logits.grad is not None
+    assert logits.grad.tolist() == [0.0, 0.0]
+
+
+def written_out(loss: HindsightLoss, world: World, cells: Tensor, on: Tensor, blend: float) -> dict[str, Tensor]:
+    """The losses one path, clock and sensor at a time, as the theory writes them (whole grid, no normalisation)."""
+    m, last, g = world.num_cells, world.num_choices, loss.discount
+    cost, safe = world.cost / world.reward, 1.0 - world.safe_cost / world.reward
+    softplus = torch.nn.functional.softplus
+    actor, clocked_actor = loss.actor(), loss.clocked_actor()
+    value = [*loss.critic().flatten(), torch.tensor(0.0)]
+    clocked = [*loss.clocked_critic().squeeze(-1), torch.zeros(last + 1)]
+    u = [[clocked[x][n] + (safe if n == last and x < m else 0.0) for n in range(last + 1)] for x in range(m + 1)]
+
+    def follow(path: list[int], n: int) -> Tensor:
+        """G_n: the return of the chain from step n on."""
+        y = path[n + 1]
+        if y == m:
+            return torch.tensor(0.0)
+        if n == last:
+            return safe + g * value[y].detach()
+        chosen = on[path[0], n]
+        after = 1.0 + g * value[y].detach() if chosen[y] else g * follow(path, n + 1)
+        return after - float((chosen.numpy() * cost).sum())
+
+    def decide(z: Tensor, y: int, gain: Tensor) -> Tensor:
+        paid = sum(float(cost[j]) * softplus(z[j]) for j in range(m))
+        return paid + gain.clamp(min=0) * softplus(-z[y]) + (-gain).clamp(min=0) * softplus(z[y])
+
+    total = {name: torch.tensor(0.0) for name in ("actor", "critic", "clocked_actor", "clocked_critic")}
+    for path in cells.T.tolist():
+        x, y = path[:2]
+        target = follow(path, 0)
+        total["critic"] = total["critic"] + (value[x] - target).square()
+        for n in range(last + 1):
+            if y == m:
+                aim = torch.tensor(0.0)
+            elif n == last:
+                aim = safe + g * u[y][0]
+            else:
+                chosen = clocked_actor[x, n] > 0
+                aim = 1.0 + g * u[y][0] if chosen[y] else g * u[y][n + 1]
+                aim = aim - float((chosen.numpy() * cost).sum())
+                gain = 1.0 + g * (u[y][0] - u[y][n + 1]).detach()
+                total["clocked_actor"] = total["clocked_actor"] + decide(clocked_actor[x, n], y, gain)
+            total["clocked_critic"] = total["clocked_critic"] + (u[x][n] - aim.detach()).square()
+        for n in range(last):
+            y = path[n + 1]
+            if y == m:
+                break
+            trust = (1 - blend) * (u[y][0] - u[y][n + 1]) + blend * (value[y] - follow(path, n + 1))
+            total["actor"] = total["actor"] + decide(actor[x, n], y, (1.0 + g * trust).detach())
+            if on[x, n, y]:
+                break
+    return total
+
+
+@pytest.mark.parametrize("t_max", [0, 1, 2])
+@pytest.mark.parametrize("blend", [0.0, 0.6, 1.0])
+def test_summed_up_losses_are_those_of_every_path_apart(t_max: int, blend: float) -> None:
+    """Gradients agree with autograd through the formulas; clocks are weighed apart, so each is compared by direction.
+
+    Targets do not carry the constant part of a squared error, hence gradients and not values.
+    """
+    world = replace(small_world(t_max=t_max), cost=np.linspace(0.1, 0.5, 9), reward=2.0)
+    rng = torch.Generator().manual_seed(1)
+    loss = HindsightLoss(world.task, reach=2, hidden=6, discount=0.7, generator=rng)
+    cells = torch.randint(10, (t_max + 3, 60), generator=rng)
+    cells[0] %= 9
+    cells = torch.where((cells == 9).cummax(0).values, 9, cells)
+    on = torch.rand(9, t_max + 1, 9, generator=rng) < 0.3
+    summed, apart = loss(cells, on, blend), written_out(loss, world, cells, on, blend)
+    for name in ("critic", "clocked_critic"):
+        ours, theirs = (gradient(part[name], getattr(loss, name)) for part in (summed, apart))
+        torch.testing.assert_close(ours * cells.shape[1], theirs, rtol=1e-3, atol=1e-3)
+    for name in ("actor", "clocked_actor"):
+        ours, theirs = (rows(part[name], getattr(loss, name)) for part in (summed, apart))
+        for n in range(t_max + 1):
+            ratio = ours[:, n].norm() / theirs[:, n].norm()
+            torch.testing.assert_close(ours[:, n], theirs[:, n] * ratio, rtol=1e-3, atol=1e-6)
+
+
+def gradient(loss: Tensor, net: torch.nn.Module) -> Tensor:
+    parts = torch.autograd.grad(loss, list(net.parameters()), retain_graph=True)
+    return torch.cat([part.flatten() for part in parts])
+
+
+def rows(loss: Tensor, net: Any) -> Tensor:
+    """`[M, C, hidden]` gradient of every row, through the embedding that belongs to it alone."""
+    return torch.autograd.grad(loss, net.pair, retain_graph=True)[0]
+
+
+@pytest.mark.parametrize("t_max", [0, 2])
+def test_reaches_the_optimum_of_a_small_world(t_max: int) -> None:
+    world = small_world(t_max=t_max, exit_probability=0.02)
+    learner = learn(world, batches(world, 32), *SOLVES, "algo.total_frames=8192")
+    best = optimal.solve(world, time_limit=5.0)
+    assert regret_per_step(best.upper, evaluate(world, policy(learner, world))) < 0.01
+
+
+def test_prices_are_per_cell() -> None:
+    """The hopping target is worth sensing in the cheap cells only; r = 2, and a miss costs D in the end."""
+    world = replace(hop_world(0, safe_cost=0.1), cost=np.array([0.1, 9.0, 0.1, 9.0]))
+    chains = policy(learn(world, batches(world), *SOLVES), world)
+    assert chains[:, 0].astype(int).tolist() == [[0, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 0], [1, 0, 0, 0]]
+
+
+def test_the_unit_of_reward_does_not_matter() -> None:
+    world = small_world()
+    data = batches(world)
+    scaled = replace(world, reward=world.reward * 1024, cost=world.cost * 1024, safe_cost=world.safe_cost * 1024)
+    assert np.array_equal(policy(learn(world, data, *SHORT), world), policy(learn(scaled, data, *SHORT), world))
+
+
+def test_reads_nothing_that_was_not_sensed() -> None:
+    """Positions after steps that did not sense everything, the true cell and the reward may be anything."""
+    world = small_world()
+    rng = torch.Generator().manual_seed(0)
+    data = batches(world)
+    for batch in data:
+        batch["action"] &= torch.rand(*batch.shape, 1, generator=rng) < 0.8
+    poisoned = [batch.clone() for batch in data]
+    for batch in poisoned:
+        missed = ~batch["action"].all(-1)
+        for place in (batch, batch["next"]):
+            place["target"] = torch.randint_like(place["target"], 9, generator=rng)
+            place["action_history"] = torch.rand(place["action_history"].shape, generator=rng) < 0.5
+        batch["next", "reward"] = torch.randn(batch["next", "reward"].shape, generator=rng)
+        batch["next", "last_cell"][missed] = torch.randint(9, (int(missed.sum()),), generator=rng)
+    clean, other = learn(world, data, *SHORT), learn(world, poisoned, *SHORT)
+    assert_same(clean.state_dict(), other.state_dict())
+
+
+def test_the_same_seed_learns_the_same_and_another_does_not() -> None:
+    world = small_world()
+    data = batches(world)
+    first, second, third = (learn(world, data, *SHORT, f"seed={seed}").state_dict() for seed in (0, 0, 1))
+    assert_same(first, second)
+    with pytest.raises(AssertionError):
+        assert_same(first, third)
+
+
+@pytest.mark.parametrize("saved_at", [3, 16, 17])
+def test_a_resumed_run_ends_as_the_unbroken_one(saved_at: int) -> None:
+    world = small_world()
+    data = batches(world)
+    whole, begun = learn(world, data, *SHORT), algorithm("hindsight", world, *SHORT)
+    steps = [*data, *[None] * (begun.iterations - len(data))]
+    for batch in steps[:saved_at]:
+        begun.step(batch)
+    file = io.BytesIO()
+    torch.save(begun.state_dict(), file)
+    file.seek(0)
+    resumed = algorithm("hindsight", world, *SHORT, "seed=5")
+    resumed.load_state_dict(torch.load(file, weights_only=True))
+    for batch in steps[saved_at:]:
+        resumed.step(batch)
+    assert_same(whole.state_dict(), resumed.state_dict())
+    assert np.array_equal(policy(whole, world), policy(resumed, world))
+
+
+def assert_same(first: Any, second: Any) -> None:
+    """Equal to the last bit, through all containers."""
+    if isinstance(first, dict):
+        assert first.keys() == second.keys()
+        for key in first:
+            assert_same(first[key], second[key])
+    elif isinstance(first, (list, tuple)):
+        assert len(first) == len(second)
+        for one, other in zip(first, second, strict=True):
+            assert_same(one, other)
+    elif isinstance(first, Tensor | TensorDict):
+        assert bool((first == second).all())
+    else:
+        assert first == second
+
+
+def test_collects_with_every_sensor_on() -> None:
+    world = small_world()
+    frames = batches(world, 1)[0]
+    assert bool(frames["action"].all())
+
+
+def test_learns_once_the_frames_are_in() -> None:
+    world = small_world()
+    learner = algorithm("hindsight", world, *SHORT)
+    figures = [learner.step(batch) for batch in batches(world)]
+    assert [row["updates"] for row in figures] == [0] * 16
+    assert learner.iterations == 16 + 3
+    assert [learner.step(None)["updates"] for _ in range(3)] == [10, 20, 30]
+
+
+def test_frames_without_a_move_are_refused_in_one_line() -> None:
+    world = small_world()
+    learner = algorithm("hindsight", world, *SHORT)
+    for batch in batches(world):
+        batch["action"].zero_()
+        learner.step(batch)
+    with pytest.raises(UserError, match=r"^algo\.total_frames: .*$"):
+        learner.step(None)
