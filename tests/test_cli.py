@@ -17,7 +17,7 @@ from tests.config.cases import composed, of_command
 from tests.typed import refused, stub
 from trackmdp.cli import COMMANDS, main
 from trackmdp.config import GROUPS, ROOTS, options
-from trackmdp.errors import UserError
+from trackmdp.errors import Preempted, RunError, UserError
 
 ROOT = Path(__file__).parents[1]
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
@@ -156,9 +156,9 @@ def test_a_run_gets_its_config_and_its_folder(
 ) -> None:
     calls = []
     stub(monkeypatch, "train", lambda cfg, folder: calls.append((cfg, folder)))
-    assert main(["train", "grid.size=5", "seed=3", "hydra.run.dir=runs/a b"]) == 0
+    assert main(["train", "algo=ppo", "grid.size=5", "seed=3", "hydra.run.dir=runs/a b"]) == 0
     assert capsys.readouterr().out == "train ppo on a 5x5 grid, T_max 1, kernel random_support, seed 3 -> runs/a b\n"
-    assert calls == [(composed("train", "grid.size=5", "seed=3"), empty_folder / "runs/a b")]
+    assert calls == [(composed("train", "algo=ppo", "grid.size=5", "seed=3"), empty_folder / "runs/a b")]
     assert main(["train", "quiet=true"]) == 0
     assert capsys.readouterr().out == ""
     assert re.fullmatch(r"runs/\d{4}-\d\d-\d\d/\d\d-\d\d-\d\d-\d{6}", str(calls[1][1].relative_to(empty_folder)))
@@ -314,8 +314,26 @@ sys.exit(main(["train"]))
         env=ENVIRONMENT,
     )
     assert process.stdout is not None
-    assert process.stdout.readline().startswith("train ppo on a 10x10 grid")
+    assert process.stdout.readline().startswith("train ")
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=60)
     assert (process.returncode, said) == (130, "trackmdp train: interrupted\n")
     assert not list(empty_folder.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "line"),
+    [
+        (RunError("iteration 3: the loss is not finite"), 1, "iteration 3: the loss is not finite"),
+        (Preempted(signal.SIGTERM), 143, "stopped by signal 15"),
+    ],
+)
+def test_a_run_that_breaks_down_ends_in_one_line(
+    error: BaseException, status: int, line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(cfg: Any, folder: Path) -> None:
+        raise error
+
+    stub(monkeypatch, "train", run)
+    assert main(["train"]) == status
+    assert capsys.readouterr().err == f"trackmdp train: {line}\n"

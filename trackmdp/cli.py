@@ -10,7 +10,7 @@ import sys
 import traceback
 
 from trackmdp import __version__
-from trackmdp.errors import BUG, INTERRUPTED, USER_MISTAKE, UserError
+from trackmdp.errors import FAILED, INTERRUPTED, USER_MISTAKE, Preempted, RunError, UserError
 
 __all__ = ["COMMANDS", "main"]
 
@@ -24,7 +24,7 @@ COMMANDS = {
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run one command; returns the exit status: 0, 1 (a bug), 2 (a user's mistake) or 130 (interrupted)."""
+    """Run one command; returns the exit status: 0, or one of `trackmdp.errors`, or 128 + the signal that ended it."""
     words = sys.argv[1:] if argv is None else argv
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL reports every buffer it makes
     try:
@@ -33,7 +33,7 @@ def main(argv: list[str] | None = None) -> int:
         return status
     except BrokenPipeError:  # `trackmdp train --help | head`: nobody listens any more
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return BUG
+        return FAILED
 
 
 def _dispatch(words: list[str]) -> int:
@@ -51,17 +51,20 @@ def _dispatch(words: list[str]) -> int:
     except KeyboardInterrupt:
         sys.stderr.write(f"trackmdp {command}: interrupted\n")
         return INTERRUPTED
-    except UserError as error:
+    except Preempted as error:
+        sys.stderr.write(f"trackmdp {command}: {error}\n")
+        return 128 + error.signal
+    except (UserError, RunError) as error:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             traceback.print_exc()
         name = f"trackmdp {command}" if command in COMMANDS else "trackmdp"
         sys.stderr.write(f"{name}: {' '.join(str(error).split())}\n")
-        return USER_MISTAKE
+        return USER_MISTAKE if isinstance(error, UserError) else FAILED
     except BrokenPipeError:
         raise
     except Exception:  # a bug: whoever reads it needs all of it
         traceback.print_exc()
-        return BUG
+        return FAILED
 
 
 def _run(command: str, words: list[str]) -> int:

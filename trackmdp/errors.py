@@ -1,11 +1,11 @@
-"""The one exception that stands for a user's mistake, and the exit statuses."""
+"""What stops a command without being a bug."""
 
 from __future__ import annotations
 
-__all__ = ["BUG", "INTERRUPTED", "USER_MISTAKE", "UserError"]
+__all__ = ["FAILED", "INTERRUPTED", "USER_MISTAKE", "Preempted", "RunError", "UserError"]
 
-USER_MISTAKE, BUG, INTERRUPTED = 2, 1, 130
-"""Exit statuses of a command."""
+FAILED, USER_MISTAKE, INTERRUPTED = 1, 2, 130
+"""Exit statuses of a command: a bug or a run that broke down, a user's mistake, Ctrl-C."""
 
 
 class UserError(ValueError):
@@ -14,3 +14,22 @@ class UserError(ValueError):
     The command line prints the message as one line and exits with status 2. It is a `ValueError`, never
     `SystemExit`, so that one bad job does not end a whole Hydra sweep.
     """
+
+
+class RunError(RuntimeError):
+    """A run that cannot go on: a loss that is not finite, a full disk, a worker that died.
+
+    The command line prints the message as one line and exits with status 1.
+    """
+
+
+class Preempted(BaseException):
+    """A signal ended a run between two iterations, after its checkpoint was saved.
+
+    The command line exits with status 128 + the signal's number, so that a scheduler can tell it from a failure. It is
+    no `Exception`: it ends a whole sweep, not one job of it.
+    """
+
+    def __init__(self, signal: int) -> None:
+        super().__init__(f"stopped by signal {signal}")
+        self.signal = signal

@@ -24,7 +24,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from trackmdp.config import ROOTS, EvaluateConfig, WorldConfig, conf_dir, from_hydra, load_run, register
 from trackmdp.diagnose import diagnose
-from trackmdp.errors import BUG, USER_MISTAKE, UserError
+from trackmdp.errors import FAILED, USER_MISTAKE, RunError, UserError
 from trackmdp.outputs import make_folder, remove_if_empty
 
 __all__ = ["launch"]
@@ -65,8 +65,8 @@ def _run_once(command: str, args: argparse.Namespace, hydra: Hydra) -> int:
         hydra.run(_config_name(command, args), job, overrides)
     finally:
         remove_if_empty(made)
-    if job.mistake is not None:
-        raise job.mistake
+    if job.told is not None:
+        raise job.told
     return 0
 
 
@@ -96,7 +96,7 @@ def _sweep(command: str, args: argparse.Namespace, hydra: Hydra) -> int:
     sys.stderr.write(
         f"trackmdp {command}: {len(job.failures)} of {job.started} jobs failed: {'; '.join(job.failures)}\n"
     )
-    return BUG if job.bugs else USER_MISTAKE
+    return FAILED if job.broken else USER_MISTAKE
 
 
 @dataclass
@@ -106,9 +106,9 @@ class _Job:
     command: str
     sweeps: bool
     started: int = 0
-    mistake: UserError | None = None
+    told: UserError | RunError | None = None
     failures: list[str] = field(default_factory=list)
-    bugs: int = 0
+    broken: int = 0
 
     def __call__(self, cfg: DictConfig) -> Any:
         hydra = HydraConfig.get()
@@ -123,8 +123,8 @@ class _Job:
             run: Callable[[Any, Path], Any] = importlib.import_module(f"trackmdp.commands.{self.command}").run
             return run(typed, folder)
         except Exception as error:
-            if not self.sweeps and isinstance(error, UserError):
-                self.mistake = error  # raised once Hydra is done: it would add lines of its own
+            if not self.sweeps and isinstance(error, (UserError, RunError)):
+                self.told = error  # raised once Hydra is done: it would add lines of its own
                 return None
             if self.sweeps:
                 self._report(error, f"job {hydra.job.num} ({', '.join(task)})", folder)
@@ -133,8 +133,8 @@ class _Job:
     def _report(self, error: Exception, name: str, folder: Path) -> None:
         """Say at once which job of a sweep failed; the others go on."""
         remove_if_empty([folder])
-        if not isinstance(error, UserError):
-            self.bugs += 1
+        self.broken += not isinstance(error, UserError)
+        if not isinstance(error, (UserError, RunError)):
             traceback.print_exc()
         self.failures.append(f"{name}: {' '.join(str(error).split()) or type(error).__name__}")
         sys.stderr.write(f"trackmdp {self.command}: {self.failures[-1]}\n")
