@@ -22,7 +22,8 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from trackmdp.config import ROOTS, EvaluateConfig, WorldConfig, conf_dir, from_hydra, load_run, register
+from trackmdp.config import ROOTS, EvaluateConfig, TrainConfig, WorldConfig, conf_dir, from_hydra, load_run, register
+from trackmdp.config.resume import continued, run_folder
 from trackmdp.diagnose import diagnose
 from trackmdp.errors import FAILED, USER_MISTAKE, RunError, UserError
 from trackmdp.outputs import make_folder, remove_if_empty
@@ -56,6 +57,9 @@ def _run_once(command: str, args: argparse.Namespace, hydra: Hydra) -> int:
     cfg = _compose(command, args, hydra, RunMode.RUN)
     typed = _checked(command, cfg, cfg.hydra.overrides.task, Path.cwd())
     folder = Path(cfg.hydra.run.dir)
+    if isinstance(typed, TrainConfig):
+        folder = run_folder(typed, folder)
+        typed = continued(typed, folder, cfg.hydra.overrides.task)
     made = make_folder("hydra.run.dir", folder)
     job = _Job(command, sweeps=False)
     # Hydra composes once more, and the time stamp of the folder must stay.
@@ -116,6 +120,8 @@ class _Job:
         folder, typed_in, task = Path(hydra.runtime.output_dir), Path(hydra.runtime.cwd), list(hydra.overrides.task)
         try:
             typed = _checked(self.command, cfg, task, typed_in)
+            if isinstance(typed, TrainConfig):
+                typed = continued(typed, folder, task)
             if self.sweeps:
                 announce(
                     self.command, typed, folder.relative_to(typed_in) if folder.is_relative_to(typed_in) else folder

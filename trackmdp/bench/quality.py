@@ -29,7 +29,8 @@ def quality(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[di
     seconds of collecting, learning and evaluating.
     """
     typed = [word for word in HydraConfig.get().overrides.task if word.split("=")[0].split(".")[0] in _WORLD]
-    return [_trained(algo, seed, [*typed, f"threads={cfg.threads}"], device) for algo in cfg.algos for seed in cfg.seeds]
+    typed.append(f"threads={cfg.threads}")
+    return [_trained(algo, seed, typed, device) for algo in cfg.algos for seed in cfg.seeds]
 
 
 _WORLD = ("grid", "kernel", "cost")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import io
+import math
 import platform
 import time
 from importlib.metadata import version
@@ -13,18 +15,23 @@ from typing import Any
 import numpy as np
 import torch
 from rich.console import Console
+from torchrl.collectors import BaseCollector
 
 from trackmdp import __version__
+from trackmdp.algos.common import Algorithm
 from trackmdp.build import make_algorithm, make_collector, make_device, make_world
 from trackmdp.config import TrainConfig, to_yaml
+from trackmdp.errors import RunError, UserError
 from trackmdp.seeding import seed_global
 from trackmdp.solvers import optimal
 from trackmdp.solvers.optimal import Solution
 from trackmdp.training import checkpoint
 from trackmdp.training.display import Display, make_console, table
 from trackmdp.training.judge import Judge, Verdict, figures
-from trackmdp.training.loop import Intervals, train
+from trackmdp.training.lock import locked
+from trackmdp.training.loop import Intervals, Position, train
 from trackmdp.training.metrics import MetricsLog, write_json, write_text
+from trackmdp.training.state import capture, find, restore, take_weights
 from trackmdp.world.model import World
 
 __all__ = ["run"]
@@ -32,39 +39,78 @@ __all__ = ["run"]
 
 def run(cfg: TrainConfig, folder: Path) -> float:
     """Train as `cfg` says and write config, kernel, metrics, checkpoints and summary to `folder`; returns the AIHTR."""
-    started, used = time.time(), time.process_time()
+    try:
+        with locked(folder):
+            return _run(cfg, folder)
+    except OSError as error:
+        raise RunError(f"{error.filename or folder}: {error.strerror or error}; the last checkpoint stands") from error
+
+
+def _run(cfg: TrainConfig, folder: Path) -> float:
+    started, used = time.monotonic(), time.process_time()
     console = make_console(cfg.quiet)
     torch.set_num_threads(cfg.threads)
     device = make_device(cfg.device)
     world = make_world(cfg)
-    _write_inputs(cfg, world, folder)
+    state, passed_over = find(cfg, folder, device)
+    for line in passed_over:
+        console.print(f"passed over: {line}")
+    _write_inputs(cfg, world, folder, resumed=state is not None)
     seed_global(cfg.seed)
     algorithm = make_algorithm(cfg, world, device)
-    collector = make_collector(cfg, world, algorithm, device)
+    collector = make_collector(cfg, world, algorithm, device, done=state["position"]["frames"] if state else 0)
     judge = Judge(world, cfg.grid.max_steps)
-    metrics = MetricsLog(folder, tensorboard=cfg.log.name == "tensorboard")
-    every = Intervals(cfg.evaluation.every, cfg.log.every, cfg.checkpoint.every)
-    digest = config_digest(cfg)
+    metrics = MetricsLog(folder, tensorboard=cfg.log.name == "tensorboard", position=state["metrics"] if state else 0)
+    start = _start(cfg, algorithm, collector, state, console, device)
+    best = state["best"] if state else -math.inf
 
-    def save(iteration: int, frames: int) -> None:
-        state = {"algorithm": algorithm.state_dict(), "frames": frames, "config_sha256": digest}
-        checkpoint.save(folder / "checkpoints", iteration, state, keep=cfg.checkpoint.keep)
+    def save(at: Position, verdict: Verdict) -> None:
+        nonlocal best
+        better = verdict.evaluation.aihtr > best
+        best = max(best, verdict.evaluation.aihtr)
+        content = capture(cfg, algorithm, collector, at, metrics=metrics.position, best=best)
+        checkpoint.save(folder / "checkpoints", at.iteration, content, keep=cfg.checkpoint.keep, best=better)
 
+    every = Intervals(cfg.evaluation.every, cfg.log.every, cfg.checkpoint.every, cfg.checkpoint.seconds)
     try:
-        with Display(console, f"{cfg.algo.name} seed {cfg.seed}", algorithm.iterations) as display:
-            verdict, frames = train(algorithm, collector, judge, metrics, display, every, save)
+        with Display(
+            console, f"{cfg.algo.name} seed {cfg.seed}", algorithm.iterations, start.iteration, start.frames
+        ) as display:
+            verdict, end = train(algorithm, collector, judge, metrics, display, every, save, start)
     finally:
         collector.shutdown()
         metrics.close()
     solution = _solve(cfg, world, console)
     if solution is not None:
         verdict = judge.tighten(solution.upper, verdict)
-    times = {"wall_seconds": time.time() - started, "cpu_seconds": time.process_time() - used}
-    summary = _summary(cfg, judge, verdict, solution, frames, times, digest)
-    write_json(folder / "summary.json", summary)
+    times = {
+        "wall_seconds": time.monotonic() - started + start.seconds,
+        "cpu_seconds": time.process_time() - used,
+    }
+    write_json(folder / "summary.json", _summary(cfg, judge, verdict, solution, end.frames, times))
     _show(console, cfg, judge, verdict, solution)
     console.print(f"{times['wall_seconds']:.1f} s; results in {folder}")
     return verdict.evaluation.aihtr
+
+
+def _start(
+    cfg: TrainConfig,
+    algorithm: Algorithm,
+    collector: BaseCollector,
+    state: dict[str, Any] | None,
+    console: Console,
+    device: torch.device,
+) -> Position:
+    """Where the run begins: after its last checkpoint, or from scratch, perhaps with the weights of another run."""
+    if state is not None:
+        start = restore(state, algorithm, collector)
+        console.print(f"goes on after iteration {start.iteration}, {start.frames:,} frames")
+        return start
+    if cfg.init_from is not None:
+        console.print(
+            f"weights from {cfg.init_from}: {', '.join(take_weights(algorithm, Path(cfg.init_from), device))}"
+        )
+    return Position()
 
 
 def _solve(cfg: TrainConfig, world: World, console: Console) -> Solution | None:
@@ -75,19 +121,23 @@ def _solve(cfg: TrainConfig, world: World, console: Console) -> Solution | None:
         return optimal.solve(world, time_limit=cfg.optimal.time_limit)
 
 
-def config_digest(cfg: TrainConfig) -> str:
-    """SHA-256 of the resolved config, output options aside."""
-    return hashlib.sha256(to_yaml(cfg).encode()).hexdigest()
+def _write_inputs(cfg: TrainConfig, world: World, folder: Path, *, resumed: bool) -> None:
+    """`config.yaml` and `kernel.npy`: all that it takes to do the run again.
 
-
-def _write_inputs(cfg: TrainConfig, world: World, folder: Path) -> None:
-    """`config.yaml` and `kernel.npy`: all that it takes to do the run again."""
-    write_text(folder / "config.yaml", to_yaml(cfg))
+    Raises:
+        UserError: the run that goes on was begun with another kernel.
+    """
+    file = folder / "kernel.npy"
+    if resumed and not np.array_equal(np.load(file, allow_pickle=False), world.kernel):
+        raise UserError(
+            f"{file}: the run's kernel is not the one that its config describes now; it cannot change on resume"
+        )
+    write_text(folder / "config.yaml", to_yaml(dataclasses.replace(cfg, resume=None)))
     buffer = io.BytesIO()
     np.save(buffer, world.kernel)
-    part = folder / "kernel.npy.part"
+    part = file.with_name("kernel.npy.part")
     part.write_bytes(buffer.getvalue())
-    part.replace(folder / "kernel.npy")
+    part.replace(file)
 
 
 def _summary(
@@ -97,7 +147,6 @@ def _summary(
     solution: Solution | None,
     frames: int,
     times: dict[str, float],
-    digest: str,
 ) -> dict[str, Any]:
     packages = ("torch", "torchrl", "tensordict", "hydra-core", "numpy", "scipy")
     return {
@@ -114,7 +163,7 @@ def _summary(
         "regret_per_step": verdict.regret_per_step,
         "versions": {"trackmdp": __version__, "python": platform.python_version()}
         | {name: version(name) for name in packages},
-        "config_sha256": digest,
+        "config_sha256": hashlib.sha256(to_yaml(dataclasses.replace(cfg, resume=None)).encode()).hexdigest(),
     }
 
 

@@ -63,6 +63,10 @@ def absolute_paths(cfg: WorldConfig, folder: Path) -> None:
         cfg.cost.sensor = str(folder / cfg.cost.sensor)
     if isinstance(cfg, EvaluateConfig) and cfg.run is not None:
         cfg.run = str(folder / cfg.run)
+    if isinstance(cfg, TrainConfig):
+        if cfg.resume not in (None, "auto"):
+            cfg.resume = str(folder / cfg.resume)
+        cfg.init_from = cfg.init_from and str(folder / cfg.init_from)
     if isinstance(cfg, BenchmarkConfig) and cfg.peers is not None:
         cfg.peers = str(folder / cfg.peers)
 

@@ -52,7 +52,8 @@ class OptimalBound:
 class Checkpoint:
     """When the state of the run is saved."""
 
-    every: int = option("iterations from one checkpoint to the next; 0 = only at the end", unit="iterations", ge=0)
+    every: int = option("frames from one checkpoint to the next; 0 = not counted in frames", unit="frames", ge=0)
+    seconds: float | None = option("time from one checkpoint to the next; null = not by time", unit="s", gt=0)
     keep: int = option("newest checkpoints kept", ge=1)
 
 
@@ -69,6 +70,13 @@ class TrainConfig(WorldConfig):
     evaluation: Evaluation
     optimal: OptimalBound
     checkpoint: Checkpoint
+    resume: str | None = option(
+        "go on with a run: auto = the one in hydra.run.dir, where there is one",
+        expects="auto, a run's folder, a checkpoint",
+    )
+    init_from: str | None = option(
+        "start from the weights of another run, where shapes fit", expects="the folder of a run"
+    )
 
 
 @dataclass(kw_only=True)

@@ -28,10 +28,14 @@ class _Figures(ProgressColumn):
 
 
 class Display:
-    """Shows the progress of `iterations` iterations; a context manager."""
+    """Shows the progress of `iterations` iterations; a context manager.
 
-    def __init__(self, console: Console, title: str, iterations: int) -> None:
+    `first` iterations and `frames` frames were an earlier process's; they do not count for the speed.
+    """
+
+    def __init__(self, console: Console, title: str, iterations: int, first: int = 0, frames: int = 0) -> None:
         self._console, self._title, self._iterations = console, title, iterations
+        self._first, self._frames = first, frames
         self._bar: Progress | None = None
         self._started = self._last_line = time.monotonic()
 
@@ -40,7 +44,7 @@ class Display:
             columns = (TextColumn("{task.description}"), BarColumn(), _Figures(), TimeElapsedColumn())
             self._bar = Progress(*columns, TextColumn("left"), TimeRemainingColumn(), console=self._console)
             self._bar.start()
-            self._task = self._bar.add_task(self._title, total=self._iterations, figures="")
+            self._task = self._bar.add_task(self._title, total=self._iterations, completed=self._first, figures="")
         return self
 
     def __exit__(
@@ -52,15 +56,18 @@ class Display:
     def update(self, iteration: int, frames: int, aihtr: float, gap: float) -> None:
         """After `iteration` iterations; `gap` is the AIHTR missing to the upper bound."""
         elapsed = time.monotonic() - self._started
-        figures = f"{frames:,} frames  {frames / max(elapsed, 1e-9):,.0f}/s  AIHTR {aihtr:,.2f}  gap {gap:,.2f}"
+        speed = (frames - self._frames) / max(elapsed, 1e-9)
+        figures = f"{frames:,} frames  {speed:,.0f}/s  AIHTR {aihtr:,.2f}  gap {gap:,.2f}"
         if self._bar is not None:
             self._bar.update(self._task, completed=iteration, figures=figures)
             return
         now, last = time.monotonic(), iteration == self._iterations
-        if self._console.quiet or not (last or iteration == 1 or now - self._last_line >= _SECONDS_BETWEEN_LINES):
+        if self._console.quiet or not (
+            last or iteration == self._first + 1 or now - self._last_line >= _SECONDS_BETWEEN_LINES
+        ):
             return
         self._last_line = now
-        left = elapsed / iteration * (self._iterations - iteration)
+        left = elapsed / (iteration - self._first) * (self._iterations - iteration)
         self._console.print(f"{self._title}: {100 * iteration // self._iterations:3d} %  {figures}  {left:,.0f} s left")
 
 

@@ -3,28 +3,47 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
+from tensordict import TensorDictBase
 from torchrl.collectors import BaseCollector
 
 from trackmdp.algos.common import Algorithm
+from trackmdp.errors import Preempted, RunError
 from trackmdp.training.display import Display
 from trackmdp.training.evaluate import chains_of
 from trackmdp.training.judge import Judge, Verdict
 from trackmdp.training.metrics import MetricsLog
+from trackmdp.training.signals import Signals
 
-__all__ = ["Intervals", "train"]
+__all__ = ["Intervals", "Position", "train"]
 
 
 @dataclass(frozen=True)
 class Intervals:
-    """Iterations from one exact evaluation, metrics row or checkpoint (0 = only at the end) to the next."""
+    """How often a run is judged, logged and saved.
+
+    Attributes:
+        evaluate: iterations from one exact evaluation to the next.
+        log: iterations from one metrics row to the next.
+        save_frames: frames from one checkpoint to the next; 0 for none.
+        save_seconds: seconds from one checkpoint to the next; None for none.
+    """
 
     evaluate: int
     log: int
-    checkpoint: int
+    save_frames: int
+    save_seconds: float | None
+
+
+@dataclass(frozen=True)
+class Position:
+    """How far a run is: iterations done, frames collected, seconds spent."""
+
+    iteration: int = 0
+    frames: int = 0
+    seconds: float = 0.0
 
 
 def train(
@@ -34,8 +53,9 @@ def train(
     metrics: MetricsLog,
     display: Display,
     every: Intervals,
-    save: Callable[[int, int], Any],
-) -> tuple[Verdict, int]:
+    save: Callable[[Position, Verdict], None],
+    start: Position,
+) -> tuple[Verdict, Position]:
     """Collect, learn, judge, log and save, until the algorithm's iterations are done.
 
     Args:
@@ -45,43 +65,72 @@ def train(
         metrics: gets one row every `every.log` iterations, and the last.
         display: gets the figures of the last evaluation after each iteration.
         every: the intervals.
-        save: called with (iteration, frames) when a checkpoint is due.
+        save: writes a checkpoint of this moment, a boundary between two iterations.
+        start: where an earlier process left the run.
 
     Returns:
-        The last verdict and the number of frames collected.
+        The last verdict and position.
+
+    Raises:
+        Preempted: a signal asked for the end; a checkpoint has been saved.
+        RunError: the loss is not finite, or collecting broke down; the last checkpoint stands.
     """
-    batches, frames, started = iter(collector), 0, time.monotonic()
-    for iteration in range(1, algorithm.iterations + 1):
-        batch = next(batches, None)
-        frames += batch.numel() if batch is not None else 0
-        diagnostics = algorithm.step(batch)
-        if batch is not None:
-            collector.update_policy_weights_()
-        last = iteration == algorithm.iterations
-        judged = last or iteration == 1 or iteration % every.evaluate == 0
-        if judged:
-            verdict = judge.score(chains_of(algorithm.actor, judge.world, algorithm.device))
-        if last or iteration % every.log == 0:
-            metrics.write(_row(iteration, frames, verdict if judged else None, diagnostics, time.monotonic() - started))
-        if last or (every.checkpoint and iteration % every.checkpoint == 0):
-            save(iteration, frames)
-        display.update(iteration, frames, verdict.evaluation.aihtr, judge.upper - verdict.evaluation.aihtr)
-    return verdict, frames
+    began, batches = time.monotonic() - start.seconds, iter(collector)
+    saved, at = start, start
+    verdict = judge.score(chains_of(algorithm.actor, judge.world, algorithm.device))
+    with Signals() as signals:
+        for iteration in range(start.iteration + 1, algorithm.iterations + 1):
+            batch = _next(batches, iteration)
+            try:
+                diagnostics = algorithm.step(batch)
+            except FloatingPointError as error:
+                raise RunError(f"iteration {iteration}: {error}; the last checkpoint holds a good state") from error
+            if batch is not None:
+                collector.update_policy_weights_()
+            frames = at.frames + (batch.numel() if batch is not None else 0)
+            at = Position(iteration, frames, time.monotonic() - began)
+            last = iteration == algorithm.iterations
+            judged = last or iteration == 1 or iteration % every.evaluate == 0
+            if judged:
+                verdict = judge.score(chains_of(algorithm.actor, judge.world, algorithm.device))
+            if last or iteration % every.log == 0:
+                metrics.write(_row(at, verdict if judged else None, diagnostics))
+            if last or signals.received or _due(saved, at, every):
+                save(at, verdict)
+                saved = at
+            display.update(iteration, frames, verdict.evaluation.aihtr, judge.upper - verdict.evaluation.aihtr)
+            if signals.received and not last:
+                raise Preempted(signals.received)
+    return verdict, replace(at, seconds=time.monotonic() - began)
 
 
-def _row(
-    iteration: int, frames: int, verdict: Verdict | None, diagnostics: dict[str, float], seconds: float
-) -> dict[str, float | int | None]:
+def _next(batches: Iterator[TensorDictBase], iteration: int) -> TensorDictBase | None:
+    try:
+        return next(batches, None)
+    except (RuntimeError, OSError) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise RunError(
+            f"iteration {iteration}: collecting broke down ({reason}); the last checkpoint stands"
+        ) from error
+
+
+def _due(saved: Position, at: Position, every: Intervals) -> bool:
+    frames = every.save_frames and at.frames // every.save_frames > saved.frames // every.save_frames
+    seconds = every.save_seconds is not None and at.seconds - saved.seconds >= every.save_seconds
+    return bool(frames or seconds)
+
+
+def _row(at: Position, verdict: Verdict | None, diagnostics: dict[str, float]) -> dict[str, float | int | None]:
     """Counters, exact figures (empty between evaluations), diagnostics, and last the columns that time decides."""
     evaluation = verdict.evaluation if verdict else None
     return {
-        "iteration": iteration,
-        "frames": frames,
+        "iteration": at.iteration,
+        "frames": at.frames,
         "aihtr": evaluation.aihtr if evaluation else None,
         "regret_per_step": verdict.regret_per_step if verdict else None,
         "accuracy": evaluation.accuracy if evaluation else None,
         "sensors_per_step": evaluation.sensors_per_step if evaluation else None,
         **diagnostics,
-        "seconds": seconds,
-        "frames_per_second": frames / seconds,
+        "seconds": at.seconds,
+        "frames_per_second": at.frames / at.seconds,
     }

@@ -17,11 +17,21 @@ class MetricsLog:
     """One row per logged iteration; the columns are those of the first row.
 
     A value that is not there, or not finite, leaves its field empty. Numbers read back exactly.
+
+    Args:
+        folder: of the run.
+        tensorboard: write event files as well.
+        position: the `position` up to which the file of an earlier process holds; what follows is cut off.
     """
 
-    def __init__(self, folder: Path, *, tensorboard: bool) -> None:
-        self._file = (folder / "metrics.csv").open("w", newline="")
+    def __init__(self, folder: Path, *, tensorboard: bool, position: int = 0) -> None:
+        file = folder / "metrics.csv"
+        self._file = file.open("r+" if position else "w", newline="")
         self._writer: csv.DictWriter[str] | None = None
+        if position:
+            self._writer = csv.DictWriter(self._file, fieldnames=next(csv.reader([self._file.readline()])))
+            self._file.truncate(position)
+            self._file.seek(0, os.SEEK_END)
         self._events = None
         if tensorboard:
             from torch.utils.tensorboard import SummaryWriter  # optional dependency, a second to import
@@ -39,6 +49,11 @@ class MetricsLog:
         if self._events is not None:
             for key, value in known.items():
                 self._events.add_scalar(key, value, int(row["frames"] or 0))
+
+    @property
+    def position(self) -> int:
+        """Bytes of `metrics.csv` so far."""
+        return self._file.tell()
 
     def close(self) -> None:
         """End the files."""

@@ -1,0 +1,101 @@
+"""Going on with a run: its saved config rules, and only some options may differ."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from trackmdp.config.checks import validate
+from trackmdp.config.roots import TrainConfig
+from trackmdp.config.tree import load_run
+from trackmdp.errors import UserError
+
+__all__ = ["CHANGEABLE", "continued", "run_folder"]
+
+CHANGEABLE = (
+    "collector.total_frames",
+    "optimal",
+    "evaluation",
+    "log",
+    "checkpoint",
+    "device",
+    "collector.device",
+    "quiet",
+)
+"""Options, or groups of them, that may differ when a run goes on: budget, solving, logging, saving and devices."""
+
+
+def run_folder(cfg: TrainConfig, chosen: Path) -> Path:
+    """The folder that the run writes to: that of the run it goes on with, else `chosen`.
+
+    Raises:
+        UserError: `resume` names what is no run, or `chosen` holds a run and `resume` does not say to go on with it.
+    """
+    if cfg.resume is None:
+        if (chosen / "config.yaml").is_file():
+            raise UserError(
+                f"hydra.run.dir={chosen}: holds a run already; go on with it by resume=auto, or choose another folder"
+            )
+        return chosen
+    if cfg.resume == "auto":
+        return chosen
+    named = Path(cfg.resume)
+    folder = named.parent.parent if named.is_file() else named
+    if not (folder / "config.yaml").is_file():
+        raise UserError(f"resume={cfg.resume}: expected auto, the folder of a run, or one of its checkpoints")
+    return folder
+
+
+def continued(cfg: TrainConfig, folder: Path, words: Sequence[str]) -> TrainConfig:
+    """The config to run with: where `cfg.resume` asks for it and `folder` holds a run, that of the run.
+
+    Args:
+        cfg: what was typed, composed with the defaults.
+        folder: of the run.
+        words: the overrides that were typed; only these are held against the saved config.
+
+    Raises:
+        UserError: an override differs from the saved config and is not in `CHANGEABLE`.
+    """
+    if cfg.resume is None or not (folder / "config.yaml").is_file():
+        return cfg
+    saved = load_run(folder)
+    for word in words:
+        key = word.lstrip("+~").split("=", 1)[0].split("@")[0].replace("/", ".")
+        if key.split(".")[0] in ("hydra", "resume"):
+            continue
+        old, new = _look(saved, key), _look(cfg, key)
+        if _same(old, new):
+            continue
+        if not any(key == allowed or key.startswith(f"{allowed}.") for allowed in CHANGEABLE):
+            raise UserError(f"{key}: the run has {_shown(old)}, typed was {_shown(new)}; it cannot change on resume")
+        _put(saved, key, new)
+    validate(saved)
+    return dataclasses.replace(saved, resume=cfg.resume)
+
+
+def _look(cfg: Any, key: str) -> Any:
+    """The value at a dotted key; None where the run chose another option of a group, which has no such key."""
+    for name in key.split("."):
+        cfg = getattr(cfg, name, None)
+    return cfg
+
+
+def _put(cfg: Any, key: str, value: Any) -> None:
+    *parents, last = key.split(".")
+    for name in parents:
+        cfg = getattr(cfg, name)
+    setattr(cfg, last, value)
+
+
+def _same(old: Any, new: Any) -> bool:
+    """Equal values, or the same option chosen from a group, whose own values are compared where they were typed."""
+    if dataclasses.is_dataclass(old) and hasattr(old, "name"):
+        return type(old) is type(new)
+    return bool(old == new)
+
+
+def _shown(value: Any) -> str:
+    return str(getattr(value, "name", "null" if value is None else value))

@@ -1,0 +1,37 @@
+"""Asked to stop: a scheduler's signal is heard at once and answered between two iterations."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from types import FrameType, TracebackType
+
+__all__ = ["Signals"]
+
+_HEARD = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
+
+
+class Signals:
+    """While entered, SIGTERM, SIGINT and SIGUSR1 are noted in `received` instead of ending the process.
+
+    A second one of the same kind acts as it did before. Outside the main thread signals are not touched.
+    """
+
+    def __init__(self) -> None:
+        self.received = 0
+
+    def __enter__(self) -> Signals:
+        self._before = {}
+        if threading.current_thread() is threading.main_thread():
+            self._before = {number: signal.signal(number, self._note) for number in _HEARD}
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
+        self.received = number
+        signal.signal(number, self._before[signal.Signals(number)])

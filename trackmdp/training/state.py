@@ -1,0 +1,144 @@
+"""The whole state of a run: taken between two iterations, put back exactly, or refused."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+from torchrl.collectors import BaseCollector, Collector
+
+from trackmdp.algos.common import Algorithm
+from trackmdp.config import TrainConfig, to_dict
+from trackmdp.config.resume import CHANGEABLE
+from trackmdp.errors import UserError
+from trackmdp.training import checkpoint
+from trackmdp.training.collect import collector_state, load_collector_state
+from trackmdp.training.loop import Position
+
+__all__ = ["capture", "find", "identity", "restore", "take_weights"]
+
+_EXACT = ("torch", "torchrl", "tensordict", "trackmdp")
+_NOT_WEIGHTS = ("optimizer", "buffer", "generator")
+
+
+def identity(cfg: TrainConfig) -> str:
+    """SHA-256 of all options that must not change when a run goes on."""
+    plain = to_dict(cfg)
+    for key in (*CHANGEABLE, "resume"):
+        *parents, last = key.split(".")
+        node = plain
+        for name in parents:
+            node = node[name]
+        node.pop(last)
+    return hashlib.sha256(repr(plain).encode()).hexdigest()
+
+
+def capture(
+    cfg: TrainConfig, algorithm: Algorithm, collector: BaseCollector, at: Position, *, metrics: int, best: float
+) -> dict[str, Any]:
+    """Everything that the next iteration depends on, and what has been written so far.
+
+    Args:
+        cfg: the run's config.
+        algorithm: networks, optimizers, schedules, buffers.
+        collector: rows in mid-episode and the environment's generators.
+        at: how far the run is.
+        metrics: bytes of `metrics.csv`.
+        best: the highest AIHTR of any checkpoint.
+    """
+    cuda = torch.cuda.get_rng_state_all() if torch.cuda.is_available() else []
+    return {
+        "identity": identity(cfg),
+        "versions": {name: version(name) for name in _EXACT},
+        "algorithm": algorithm.state_dict(),
+        "collector": collector_state(collector),
+        "random": {"cpu": torch.get_rng_state(), "cuda": cuda},
+        "position": vars(at),
+        "metrics": metrics,
+        "best": best,
+    }
+
+
+def restore(state: Mapping[str, Any], algorithm: Algorithm, collector: BaseCollector) -> Position:
+    """Put a captured state back, the random generators last; call after everything has been built."""
+    algorithm.load_state_dict(state["algorithm"])
+    if state["collector"] is not None and isinstance(collector, Collector):
+        load_collector_state(collector, state["collector"])
+    torch.set_rng_state(state["random"]["cpu"].cpu())
+    if state["random"]["cuda"] and torch.cuda.is_available():
+        torch.cuda.set_rng_state_all([rng.cpu() for rng in state["random"]["cuda"]])
+    return Position(**state["position"])
+
+
+def find(cfg: TrainConfig, folder: Path, device: torch.device) -> tuple[dict[str, Any] | None, list[str]]:
+    """The state to go on from, None to start anew; and a line for each checkpoint that had to be passed over.
+
+    `resume=auto` and a run's folder fall back to the newest checkpoint that can be read; a checkpoint named by itself
+    is taken or refused.
+
+    Raises:
+        UserError: nothing can be read, or it belongs to another run or to other versions.
+    """
+    if cfg.resume is None:
+        return None, []
+    named = Path(cfg.resume)
+    files = [named] if named.is_file() else checkpoint.available(folder / "checkpoints")
+    if not files and cfg.resume == "auto":
+        return None, []
+    passed_over: list[str] = []
+    for file in files:
+        try:
+            state = checkpoint.load(file, device)
+        except UserError as error:
+            passed_over.append(str(error))
+            continue
+        _check(state, cfg, file)
+        return state, passed_over
+    raise UserError(
+        f"resume={cfg.resume}: no checkpoint that can be read ({'; '.join(passed_over) or 'there is none'})"
+    )
+
+
+def take_weights(algorithm: Algorithm, run: Path, device: torch.device) -> list[str]:
+    """Start from the weights of another run's newest checkpoint, where name and shape fit; returns the names taken.
+
+    Raises:
+        UserError: the run has no checkpoint, or nothing of it fits.
+    """
+    given = dict(_weights(checkpoint.load(checkpoint.newest(run), device)["algorithm"]))
+    own = algorithm.state_dict()
+    taken = []
+    with torch.no_grad():
+        for name, tensor in _weights(own):
+            if name in given and given[name].shape == tensor.shape:
+                tensor.copy_(given[name])
+                taken.append(name)
+    if not taken:
+        raise UserError(f"init_from={run}: none of its weights has the name and shape of one of ours")
+    algorithm.load_state_dict(own)
+    return taken
+
+
+def _check(state: Mapping[str, Any], cfg: TrainConfig, file: Path) -> None:
+    if state["identity"] != identity(cfg):
+        raise UserError(f"{file}: belongs to a run with another config")
+    for name, written in state["versions"].items():
+        if written != version(name):
+            raise UserError(f"{file}: written with {name} {written}, this is {version(name)}; expected the same")
+
+
+def _weights(state: Mapping[str, Any], prefix: str = "") -> list[tuple[str, torch.Tensor]]:
+    """The floating-point tensors of an algorithm's state that belong to networks."""
+    found: list[tuple[str, torch.Tensor]] = []
+    for name, value in state.items():
+        if name in _NOT_WEIGHTS:
+            continue
+        if isinstance(value, Mapping):
+            found += _weights(value, f"{prefix}{name}.")
+        elif isinstance(value, torch.Tensor) and value.is_floating_point():
+            found.append((f"{prefix}{name}", value))
+    return found
