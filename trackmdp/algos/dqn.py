@@ -61,6 +61,14 @@ class AdditiveDQNLoss(LossModule):
             return self.qvalue_network(tensordict.select(*STATE_KEYS))
 
 
+class _ZeroedStorage(LazyTensorStorage):
+    """Slots that hold no transition yet are zero, so that a checkpoint is the same bytes in every process."""
+
+    def _init(self, data: TensorDictBase) -> None:
+        super()._init(data)
+        self._storage.zero_()
+
+
 class DQN:
     """Learns off policy from a replay buffer; explores by flipping sensors; the target network is what is judged."""
 
@@ -77,7 +85,7 @@ class DQN:
         per = cfg.prioritized
         sampler = PrioritizedSampler(cfg.buffer_size, per.alpha, per.beta, device) if per.enabled else RandomSampler()
         self.buffer = TensorDictReplayBuffer(
-            storage=LazyTensorStorage(cfg.buffer_size, device=device), sampler=sampler, batch_size=cfg.batch_size
+            storage=_ZeroedStorage(cfg.buffer_size, device=device), sampler=sampler, batch_size=cfg.batch_size
         )
         self.buffer.set_rng(generator(seed, "buffer", device=device))
 
