@@ -99,12 +99,13 @@ def make_device(name: str, key: str = "device") -> torch.device:
 
 def make_algorithm(cfg: TrainConfig, world: World, device: torch.device) -> Algorithm:
     """The learner; it is given the task, never the motion."""
-    from trackmdp.algos import a2c, dqn, hindsight, ppo
-    from trackmdp.config import A2c, Dqn, Hindsight, Ppo
+    from trackmdp.algos import a2c, dqn, hindsight, learned_kernel, ppo
+    from trackmdp.config import A2c, Dqn, Hindsight, LearnedKernel, Ppo
 
     task, batches = world.task, -(-cfg.collector.total_frames // cfg.collector.frames_per_batch)
     makers: dict[type[Any], Callable[[Any], Algorithm]] = {
         Hindsight: lambda c: hindsight.Hindsight(task, c, iterations=batches, seed=cfg.seed, device=device),
+        LearnedKernel: lambda c: learned_kernel.LearnedKernel(task, c, iterations=batches, seed=cfg.seed, device=device),
         A2c: lambda c: a2c.A2C(task, c, iterations=batches, device=device),
         Ppo: lambda c: ppo.PPO(task, c, iterations=batches, seed=cfg.seed, device=device),
         Dqn: lambda c: dqn.DQN(task, c, iterations=batches, seed=cfg.seed, device=device),
@@ -112,8 +113,10 @@ def make_algorithm(cfg: TrainConfig, world: World, device: torch.device) -> Algo
     return makers[type(cfg.algo)](cfg.algo)
 
 
-def make_collector(cfg: TrainConfig, world: World, algorithm: Algorithm, device: torch.device) -> BaseCollector:
-    """The source of frames."""
+def make_collector(
+    cfg: TrainConfig, world: World, algorithm: Algorithm, device: torch.device, done: int = 0
+) -> BaseCollector:
+    """The source of the frames that are left after the first `done`."""
     from trackmdp.training.collect import make_collector as make
 
     return make(
@@ -124,6 +127,7 @@ def make_collector(cfg: TrainConfig, world: World, algorithm: Algorithm, device:
         max_steps=cfg.grid.max_steps,
         env_device=make_device(cfg.collector.device, "collector.device"),
         device=device,
+        done=done,
     )
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from trackmdp.bench import quality, speed
+from trackmdp.bench import learned, quality, solver, speed
 from trackmdp.bench.machine import machine
 from trackmdp.build import make_device, make_world
 from trackmdp.config import BenchmarkConfig
@@ -23,6 +23,8 @@ PARTS: dict[str, Callable[[BenchmarkConfig, World, torch.device], list[dict[str,
     "collector": speed.collector_speed,
     "train": speed.train_speed,
     "quality": quality.quality,
+    "solver": solver.solver,
+    "learned_kernel": learned.learned_kernel,
 }
 
 

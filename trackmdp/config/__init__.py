@@ -13,6 +13,7 @@ from trackmdp.config.baselines import (
     RandomK,
 )
 from trackmdp.config.checks import validate
+from trackmdp.config.learned_kernel import LearnedKernel
 from trackmdp.config.learning import (
     A2c,
     Algo,
@@ -66,6 +67,7 @@ __all__ = [
     "Fcr",
     "Grid",
     "Kernel",
+    "LearnedKernel",
     "Log",
     "Lookahead",
     "MultiAsync",

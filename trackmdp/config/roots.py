@@ -110,7 +110,7 @@ class VerifyConfig(WorldConfig):
 class BenchmarkConfig(WorldConfig):
     """Measure speed and quality on this machine."""
 
-    part: str = option("what is measured", choices=("env", "collector", "train", "quality", "solver"))
+    part: str = option("what is measured", choices=("env", "collector", "train", "quality", "solver", "learned_kernel"))
     seed: int = option("every random draw derives from it", ge=0)
     device: str = option("device of environments and networks", expects="cpu, cuda, cuda:N or auto")
     threads: int = option("torch threads", unit="threads", ge=1, le=256)

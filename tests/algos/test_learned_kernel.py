@@ -1,0 +1,91 @@
+"""The learned kernel as an algorithm: what it reads, what it plans, what it reports."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from tests.helpers import algorithm, collect, hop_world, small_world
+from trackmdp.algos.learned_kernel import observed_paths
+from trackmdp.solvers import optimal
+from trackmdp.solvers.chains import evaluate
+from trackmdp.world.model import World
+
+
+def learn(world: World, batches: int, *overrides: str) -> tuple[object, list[dict[str, float]]]:
+    learner = algorithm("learned_kernel", world, "algo.rounds_at_end=50", *overrides)
+    learner.iterations = batches
+    return learner, [learner.step(collect(world, learner.policy, 256, 20, seed=batch)) for batch in range(batches)]
+
+
+def test_paths_are_read_from_what_the_tracker_saw() -> None:
+    """Nothing is sensed: the target hops on unseen, is located by the safe action, or exits; `target` is not read."""
+    world = hop_world(t_max=1)
+    learner = algorithm("learned_kernel", world)
+    learner.policy.chains.zero_()
+    batch = collect(world, learner.policy, 64, 30)
+    paths = observed_paths(batch.exclude("target", ("next", "target")), 4)
+    located = paths.end < 4
+    assert set(paths.misses[located].tolist()) == {2}
+    np.testing.assert_array_equal(paths.end[located], (paths.start[located] + 3) % 4)
+    assert set(paths.misses[~located].tolist()) == {0, 1, 2}
+    assert not paths.sensed.any()
+    ended = batch["next", "terminated"].sum() + (batch["next", "steps_since_detection"] == 0).sum()
+    assert len(paths.end) <= int(ended)
+
+
+@pytest.mark.parametrize("sensing", ["all", "chosen"])
+def test_it_finds_the_optimum_of_a_small_world(sensing: str) -> None:
+    world = small_world(3)
+    learner, _ = learn(world, 12, f"algo.sensing={sensing}", "algo.warm_up=5000")
+    best = optimal.solve(world)
+    found = evaluate(world, learner.actor.chains.numpy())
+    assert found.aihtr == pytest.approx(best.lower, abs=0.01)
+    all_on = evaluate(world, np.ones((9, 2, 9), dtype=bool))
+    assert found.aihtr > all_on.aihtr + 1
+
+
+def test_chosen_sets_cost_less() -> None:
+    world = small_world(3)
+    _, fully = learn(world, 6)
+    learner, chosen = learn(world, 6, "algo.sensing=chosen", "algo.warm_up=5000")
+    assert fully[-1]["sensors_per_frame"] == pytest.approx(9.0)
+    assert chosen[0]["sensors_per_frame"] == pytest.approx(9.0)
+    assert chosen[-1]["sensors_per_frame"] < 5.0
+    assert chosen[-1]["reward_per_frame"] > fully[-1]["reward_per_frame"]
+    assert not learner.policy.chains.all()
+
+
+def test_its_uncertainty_shrinks_and_covers_the_truth() -> None:
+    world = small_world(3)
+    learner, rows = learn(world, 12, "algo.samples=50")
+    assert rows[-1]["believed_deviation"] < 0.6 * rows[0]["believed_deviation"]
+    truth = evaluate(world, learner.actor.chains.numpy()).aihtr
+    assert abs(rows[-1]["believed_aihtr"] - truth) < 4 * rows[-1]["believed_deviation"]
+    visits = [row["least_visits"] for row in rows]
+    assert visits == sorted(visits)
+    assert visits[0] > 0
+
+
+def test_a_resumed_learner_goes_on_as_the_first() -> None:
+    world = small_world(3)
+    words = ("algo.sensing=chosen", "algo.warm_up=0")
+    first, _ = learn(world, 3, *words)
+    second = algorithm("learned_kernel", world, *words)
+    second.iterations = 3
+    second.load_state_dict(first.state_dict())
+    batch = collect(world, first.policy, 64, 20, seed=7)
+    assert first.step(batch) == second.step(batch)
+    assert torch.equal(first.policy.chains, second.policy.chains)
+    assert torch.equal(first.actor.chains, second.actor.chains)
+
+
+def test_the_state_is_plain_tensors_and_words(tmp_path) -> None:
+    """It can be loaded without unpickling anything else."""
+    learner, _ = learn(small_world(3), 2, "algo.sensing=chosen", "algo.warm_up=0")
+    torch.save(learner.state_dict(), tmp_path / "state.pt")
+    state = torch.load(tmp_path / "state.pt", weights_only=True)
+    again = algorithm("learned_kernel", small_world(3))
+    again.load_state_dict(state)
+    assert torch.equal(again.actor.chains, learner.actor.chains)

@@ -1,0 +1,128 @@
+"""Learned kernel: estimate the motion from detections, then plan with it as if it were the truth.
+
+What a careful practitioner would try before deep reinforcement learning. Steps are spent with all sensors on, so that
+every move is seen, or on sets planned for a kernel drawn from the posterior (posterior sampling, Thompson 1933), which
+costs far less and leaves moves to be inferred from misses.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+
+from trackmdp.config.learned_kernel import LearnedKernel as LearnedKernelConfig
+from trackmdp.policies.fixed import ChainPolicy
+from trackmdp.seeding import derive
+from trackmdp.solvers import search
+from trackmdp.solvers.chains import evaluate
+from trackmdp.solvers.kernel_estimate import KernelEstimate, Paths
+from trackmdp.world.model import Array, BoolArray, Task, World
+
+__all__ = ["LearnedKernel", "observed_paths"]
+
+
+class LearnedKernel:
+    """Plans anew after every batch; `actor` is the plan for the posterior mean.
+
+    Args:
+        task: grid, rewards and costs.
+        cfg: how steps are spent and how much the prior counts.
+        iterations: batches to come.
+        seed: seed of the run.
+        device: where the policies' tables live; the estimate is on the CPU.
+    """
+
+    def __init__(
+        self, task: Task, cfg: LearnedKernelConfig, *, iterations: int, seed: int, device: torch.device
+    ) -> None:
+        self.task, self.cfg, self.iterations, self.device = task, cfg, iterations, device
+        self._estimate = KernelEstimate(task.size, weight=cfg.prior, exit_weight=cfg.exit_prior)
+        self._rng = np.random.default_rng(derive(seed, "learned_kernel"))
+        self._iteration, self._spent = 0, np.zeros(3)
+        shape = (task.num_cells, task.num_choices, task.num_cells)
+        self.policy = ChainPolicy(np.ones(shape, dtype=bool), device)
+        self.actor = ChainPolicy(np.ones(shape, dtype=bool), device)
+
+    def step(self, batch: TensorDictBase | None) -> dict[str, float]:
+        """Take in one batch `[B, time]`, plan, and choose the sets of the next one."""
+        self._iteration += 1
+        if batch is not None:
+            self._estimate.add(observed_paths(batch, self.task.num_cells))
+            self._spent += [batch.numel(), *_spent(batch)]
+        self._estimate.fit(self.cfg.rounds_at_end if self._iteration == self.iterations else self.cfg.rounds)
+        chains = search.solve(self._world(self._estimate.mean()))
+        self.actor.chains.copy_(torch.as_tensor(chains))
+        if self.cfg.sensing == "chosen" and self._spent[0] >= self.cfg.warm_up:
+            drawn = search.solve(self._world(self._estimate.sample(self._rng)))
+            self.policy.chains.copy_(torch.as_tensor(drawn))
+        return self._diagnostics(chains)
+
+    def _world(self, kernel: Array) -> World:
+        """The task with the `[M, M + 1]` kernel believed."""
+        task = self.task
+        return World(task.size, task.reward, task.cost, task.safe_cost, task.t_max, kernel[:, :-1])
+
+    def _diagnostics(self, chains: BoolArray) -> dict[str, float]:
+        """What the plan is believed to be worth, how sure that is, and what learning has cost so far."""
+        drawn = [self._world(self._estimate.sample(self._rng)) for _ in range(self.cfg.samples)]
+        believed = np.array([evaluate(world, chains).aihtr for world in drawn])
+        frames, reward, sensors = self._spent
+        return {
+            "believed_aihtr": evaluate(self._world(self._estimate.mean()), chains).aihtr,
+            "believed_deviation": float(believed.std()),
+            "least_visits": float(self._estimate.visits.min()),
+            "reward_per_frame": reward / max(frames, 1.0),
+            "sensors_per_frame": sensors / max(frames, 1.0),
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        """The observations, the estimate, the draws to come and the two tables."""
+        return {
+            "iteration": self._iteration,
+            "spent": torch.as_tensor(self._spent),
+            "rng": _rng_state(self._rng),
+            "estimate": {name: torch.as_tensor(part) for name, part in self._estimate.state().items()},
+            "policy": self.policy.chains.clone(),
+            "actor": self.actor.chains.clone(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from a `state_dict`."""
+        self._iteration, self._spent = state["iteration"], state["spent"].cpu().numpy().copy()
+        self._rng.bit_generator.state = _unpacked(state["rng"])
+        self._estimate.load_state({name: part.cpu().numpy() for name, part in state["estimate"].items()})
+        self.policy.chains.copy_(state["policy"])
+        self.actor.chains.copy_(state["actor"])
+
+
+def observed_paths(batch: TensorDictBase, num_cells: int) -> Paths:
+    """The paths that end in a collected batch `[B, time]`: from a detection to the next one or to the exit.
+
+    Read is only what the tracker saw: where and when it located the target, its own sets, and that the target left.
+    """
+    after = batch["next"]
+    exited = after["terminated"].squeeze(-1)
+    ended = exited | (after["steps_since_detection"] == 0)
+    end = torch.where(exited, num_cells, after["last_cell"])
+    parts = (batch["last_cell"], batch["steps_since_detection"], batch["action_history"], end)
+    return Paths(*(part[ended].cpu().numpy() for part in parts))
+
+
+def _spent(batch: TensorDictBase) -> tuple[float, float]:
+    """Reward, and sensors switched on by choice, in a batch."""
+    free = batch["steps_since_detection"] < batch["action_history"].shape[-2]
+    return batch["next", "reward"].sum().item(), (batch["action"].sum(-1) * free).sum().item()
+
+
+def _rng_state(rng: np.random.Generator) -> dict[str, Any]:
+    """PCG64's state without integers beyond 64 bits."""
+    state = rng.bit_generator.state
+    inner = {name: str(value) for name, value in state["state"].items()}
+    return {**state, "state": inner}
+
+
+def _unpacked(state: dict[str, Any]) -> dict[str, Any]:
+    return {**state, "state": {name: int(value) for name, value in state["state"].items()}}

@@ -1,0 +1,24 @@
+"""Schema of the algorithm that learns the motion first and plans with it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from trackmdp.config.learning import Algo
+from trackmdp.config.options import choice, option
+
+__all__ = ["LearnedKernel"]
+
+
+@choice("algo", "learned_kernel")
+@dataclass(kw_only=True)
+class LearnedKernel(Algo):
+    """Estimate the motion from detections, then plan with the estimate; no networks."""
+
+    sensing: str = option("all sensors on, or sets chosen by posterior sampling", choices=("all", "chosen"))
+    warm_up: int = option("with chosen sets: env steps with all sensors on before them", unit="frames", ge=0)
+    prior: float = option("the pooled motion counts as much as this many moves out of each cell", unit="moves", gt=0)
+    exit_prior: float = option("the pooled exit probability counts as much as this many moves", unit="moves", gt=0)
+    rounds: int = option("EM rounds after each batch", ge=1)
+    rounds_at_end: int = option("EM rounds after the last batch", ge=1)
+    samples: int = option("kernels drawn for the uncertainty reported", ge=2)
