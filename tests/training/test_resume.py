@@ -1,0 +1,125 @@
+"""A run that is cut goes on as if nothing had happened: by the command line, in processes of their own."""
+
+from __future__ import annotations
+
+import csv
+import os
+import random
+import signal
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from trackmdp.training import checkpoint
+
+TIMED = ("seconds", "frames_per_second")
+RECIPES = {
+    "ppo": ["algo=ppo"],
+    "a2c": ["algo=a2c", "collector.envs=64"],
+    "dqn": ["algo=dqn", "algo.buffer_size=20000", "algo.batch_size=128", "algo.updates=2"],
+    "dqn-prioritized": [
+        "algo=dqn",
+        "algo.buffer_size=20000",
+        "algo.batch_size=128",
+        "algo.updates=2",
+        "algo.n_step=3",
+        "algo.prioritized.enabled=true",
+    ],
+    "hindsight": ["algo=hindsight", "algo.updates=120", "algo.batch_size=1024", "algo.updates_per_iteration=4"],
+}
+SMALL = ["grid.size=3", "optimal.enabled=false", "evaluation.every=4", "collector.total_frames=61440"]
+BATCHES = ["collector.frames_per_batch=2048", "collector.envs=64"]
+
+
+def command(folder: Path, *words: str) -> list[str]:
+    return [sys.executable, "-m", "trackmdp.cli", "train", f"hydra.run.dir={folder}", *words]
+
+
+def train(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command(folder, *words), capture_output=True, text=True, check=False, env=environment())
+
+
+def environment() -> dict[str, str]:
+    return {**os.environ, "OMP_NUM_THREADS": "1"}
+
+
+def cut(folder: Path, number: int, after: int, *words: str) -> int:
+    """Start a run, send it a signal once `metrics.csv` has `after` rows, and return its exit status."""
+    with subprocess.Popen(command(folder, *words), env=environment(), stdout=subprocess.DEVNULL) as process:
+        while process.poll() is None and len(rows(folder)) < after:
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(timeout=0.01)
+        process.send_signal(number)
+        return process.wait()
+
+
+def rows(folder: Path) -> list[dict[str, str]]:
+    """Rows of `metrics.csv` without the columns that time decides."""
+    file = folder / "metrics.csv"
+    if not file.is_file():
+        return []
+    with file.open(newline="") as stream:
+        return [{k: v for k, v in row.items() if k not in TIMED} for row in csv.DictReader(stream)]
+
+
+def tensors(state: Any, prefix: str = "") -> dict[str, Any]:
+    """Every leaf of a checkpoint but times and places in files."""
+    if isinstance(state, dict):
+        found: dict[str, Any] = {}
+        for key, value in state.items():
+            if key not in ("seconds", "metrics"):
+                found |= tensors(value, f"{prefix}.{key}")
+        return found
+    if isinstance(state, (list, tuple)):
+        return {k: v for i, value in enumerate(state) for k, v in tensors(value, f"{prefix}[{i}]").items()}
+    return {prefix: state}
+
+
+def assert_same_run(one: Path, other: Path) -> None:
+    assert rows(one) == rows(other)
+    mine, theirs = (tensors(checkpoint.load(checkpoint.newest(run))) for run in (one, other))
+    assert mine.keys() == theirs.keys()
+    for key, value in mine.items():
+        if isinstance(value, torch.Tensor):
+            assert torch.equal(value, theirs[key]), key
+        else:
+            assert value == theirs[key], key
+
+
+def resumes_exactly(folder: Path, recipe: str, kills: int) -> None:
+    """`kills` SIGKILLs at random moments, then on to the end: equal to a run that was never cut."""
+    words = [*SMALL, *BATCHES, *RECIPES[recipe]]
+    assert train(folder / "whole", *words).returncode == 0
+    whole, moments = len(rows(folder / "whole")), random.Random(recipe)
+    words += ["resume=auto", "checkpoint.every=2048", "checkpoint.seconds=0.05"]
+    for kill in range(kills):
+        done = len(rows(folder / "cut"))
+        cut(folder / "cut", signal.SIGKILL, min(whole, done + moments.randint(1, max(2, whole // (kills + 1)))), *words)
+    last = train(folder / "cut", *words)
+    assert last.returncode == 0, last.stderr
+    assert_same_run(folder / "whole", folder / "cut")
+
+
+def test_a_kill_changes_nothing(tmp_path: Path) -> None:
+    resumes_exactly(tmp_path, "dqn-prioritized", kills=1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_many_kills_change_nothing(tmp_path: Path, recipe: str) -> None:
+    resumes_exactly(tmp_path, recipe, kills=20)
+
+
+def test_a_signal_saves_and_says_so(tmp_path: Path) -> None:
+    number = signal.SIGTERM
+    words = [*SMALL, *BATCHES, *RECIPES["hindsight"], "checkpoint.seconds=null"]
+    assert cut(tmp_path / "cut", number, 5, *words) == 128 + number
+    done = rows(tmp_path / "cut")
+    assert 5 <= len(done) < 30
+    assert checkpoint.load(checkpoint.newest(tmp_path / "cut"))["iteration"] == len(done)
+    assert not (tmp_path / "cut" / "summary.json").exists()
