@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from trackmdp.build import make_algorithm
-from trackmdp.config import GROUPS, ROOTS, EvaluateConfig, TrainConfig, conf_dir, from_hydra, register
+from trackmdp.config import GROUPS, ROOTS, EvaluateConfig, TrainConfig, conf_dir, from_hydra, options, register
 from trackmdp.config.world import BORDERS
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.model import Array, World
@@ -121,7 +121,9 @@ def collect(world: World, policy: Any, envs: int, time: int, *, seed: int = 0, m
 
 
 def algorithm(name: str, world: World, *overrides: str) -> Any:
-    """The learner `name` for `world`, with its own options as in conf/ but for `overrides`."""
+    """The learner `name` for `world` on a small budget, its other options as in conf/ but for `overrides`."""
+    small = {"hidden": 32, "batch_size": 64, "buffer_size": 4096, "updates": 2, "rounds": 2, "rounds_at_end": 2}
+    mine = [f"algo.{key}={value}" for key, value in small.items() if key in options(GROUPS["algo"][name])]
     budget = ("algo.total_frames=4096", "algo.frames_per_batch=256", "algo.envs=32")
-    cfg = train_config(f"algo={name}", *budget, *overrides)
+    cfg = train_config(f"algo={name}", *budget, *mine, *overrides)
     return make_algorithm(cfg, world, torch.device("cpu"))
