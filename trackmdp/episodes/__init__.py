@@ -1,0 +1,1 @@
+"""Episodes as files: recorded, logged in MCAP, read back, re-simulated, shown."""

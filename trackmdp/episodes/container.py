@@ -1,0 +1,332 @@
+"""The MCAP container, read strictly: every byte that is handed on has a checksum, and it has been checked.
+
+The mcap package checks neither attachments nor the summary, and looks for chunks through records without a checksum.
+Here the summary is checked first, and whatever lies outside it is compared with what the summary says of it.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from bisect import bisect_left
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import lz4.frame
+import zstandard
+
+from trackmdp.errors import UserError
+
+__all__ = ["MAGIC", "Body", "Chunk", "Container", "Damaged", "Message", "opened", "records", "unpacked"]
+
+MAGIC = b"\x89MCAP0\r\n"
+HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
+ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = range(9, 16)
+_FOOTER_LENGTH = 1 + 8 + 20
+_CHUNK_LIMIT = 2**28  # bytes; a damaged or hostile size must not fill the memory
+
+
+class Damaged(Exception):
+    """A checksum or a structure that is not as it should be; the message says where."""
+
+
+class Body:
+    """A record's content, read from front to back."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data, self.place = data, 0
+
+    def numbers(self, layout: str) -> tuple[int, ...]:
+        """Little-endian numbers of a `struct` layout."""
+        values = struct.unpack_from(f"<{layout}", self.data, self.place)
+        self.place += struct.calcsize(f"<{layout}")
+        return values
+
+    def sized(self, layout: str = "I") -> bytes:
+        """Bytes after their length."""
+        (length,) = self.numbers(layout)
+        if length > len(self.data) - self.place:
+            raise Damaged("a length that leads out of its record")
+        self.place += length
+        return self.data[self.place - length : self.place]
+
+    def text(self) -> str:
+        """A string."""
+        return self.sized().decode("utf-8")
+
+
+@dataclass(frozen=True)
+class Message:
+    """One message."""
+
+    topic: str
+    log_time: int
+    data: bytes
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Where a chunk lies, and what it must be, by the summary."""
+
+    begin: int
+    end: int
+    offset: int
+    length: int
+    compression: str
+    compressed: int
+    size: int
+
+
+class Container:
+    """A finished MCAP file, opened for random access.
+
+    Raises:
+        UserError: not an MCAP file, an unfinished one, or one whose summary is damaged.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        self.stream = opened(file)
+        try:
+            self.profile, self.library = self._header()
+            self._summary()
+        except (Damaged, struct.error, UnicodeDecodeError) as error:
+            self.stream.close()
+            raise UserError(f"file={file}: damaged ({error}); recover=true saves what can be read") from error
+        except UserError:
+            self.stream.close()
+            raise
+
+    def _header(self) -> tuple[str, str]:
+        opcode, body = next(records(self.stream, len(MAGIC)))
+        if opcode != HEADER:
+            raise Damaged("its first record is not the header")
+        header = Body(body)
+        return header.text(), header.text()
+
+    def _summary(self) -> None:
+        """Read the index of chunks, attachments and metadata; its checksum covers the footer as well."""
+        self.length = self.stream.seek(0, 2)
+        if self.length < 2 * len(MAGIC) + _FOOTER_LENGTH:
+            raise UserError(_cut(self.file))
+        self.stream.seek(self.length - _FOOTER_LENGTH - len(MAGIC))
+        footer, magic = self.stream.read(_FOOTER_LENGTH), self.stream.read()
+        if magic != MAGIC:
+            raise UserError(_cut(self.file))
+        opcode, size, self.summary_start, _, checksum = struct.unpack("<BQQQI", footer)
+        summary_length = self.length - _FOOTER_LENGTH - len(MAGIC) - self.summary_start
+        if (opcode, size) != (FOOTER, 20) or not len(MAGIC) < self.summary_start or summary_length <= 0:
+            raise Damaged("the footer")
+        self.stream.seek(self.summary_start)
+        summary = self.stream.read(summary_length)
+        if zlib.crc32(footer[:-4], zlib.crc32(summary)) != checksum:
+            raise Damaged("the checksum of the summary")
+        self._index(summary)
+
+    def _index(self, summary: bytes) -> None:
+        self.channels: dict[int, str] = {}
+        self.chunks: list[Chunk] = []
+        self.attachments: dict[str, tuple[int, int]] = {}
+        self.metadata: dict[str, tuple[int, int]] = {}
+        for opcode, data in _split(summary):
+            body = Body(data)
+            if opcode == CHUNK_INDEX:
+                self.chunks.append(_chunk_of(body))
+            elif opcode == CHANNEL:
+                number, _ = body.numbers("HH")
+                self.channels[number] = body.text()
+            elif opcode == ATTACHMENT_INDEX:
+                offset, length, *_ = body.numbers("QQQQQ")
+                self.attachments[body.text()] = offset, length
+            elif opcode == METADATA_INDEX:
+                offset, length = body.numbers("QQ")
+                self.metadata[body.text()] = offset, length
+        self.chunks.sort(key=lambda chunk: chunk.begin)
+        self._ends = [chunk.end for chunk in self.chunks]
+
+    def _record(self, opcode: int, offset: int, length: int) -> bytes:
+        """The content of the record that the summary says is there."""
+        self.stream.seek(offset)
+        data = self.stream.read(length)
+        if len(data) != length or struct.unpack_from("<BQ", data) != (opcode, length - 9):
+            raise Damaged(f"the record at byte {offset}")
+        return data[9:]
+
+    def attachment(self, name: str) -> bytes:
+        """The content of the attachment `name`, its checksum checked."""
+        if name not in self.attachments:
+            raise Damaged(f"no attachment {name}")
+        found, content = attachment_of(self._record(ATTACHMENT, *self.attachments[name]))
+        if found != name:
+            raise Damaged(f"attachment {name}")
+        return content
+
+    def tell(self, name: str) -> dict[str, str]:
+        """The metadata called `name`; the container has no checksum for it."""
+        if name not in self.metadata:
+            raise Damaged(f"no metadata {name}")
+        found, content = metadata_of(self._record(METADATA, *self.metadata[name]))
+        if found != name:
+            raise Damaged(f"metadata {name}")
+        return content
+
+    def chunks_between(self, begin: int, end: int) -> list[Chunk]:
+        """The chunks with messages from log time `begin` to `end`, in their order; logs are in order of time."""
+        found = []
+        for chunk in self.chunks[bisect_left(self._ends, begin) :]:
+            if chunk.begin > end:
+                break
+            found.append(chunk)
+        return found
+
+    def messages(self, chunk: Chunk) -> list[Message]:
+        """All messages of a chunk, its checksum checked."""
+        body = self._record(CHUNK, chunk.offset, chunk.length)
+        said, content = unpacked(body)
+        if said != (chunk.begin, chunk.end, chunk.size, chunk.compression, chunk.compressed):
+            raise Damaged(f"the chunk at byte {chunk.offset}")
+        return list(messages_of(content, dict(self.channels)))
+
+    def check_data(self) -> None:
+        """Compare the checksum over all that lies before the summary; reads the whole file.
+
+        Raises:
+            Damaged: it differs.
+        """
+        end = self.summary_start - 13
+        self.stream.seek(0)
+        checksum, left = 0, end
+        while left:
+            data = self.stream.read(min(left, 2**20))
+            checksum, left = zlib.crc32(data, checksum), left - len(data)
+        opcode, size, written = struct.unpack("<BQI", self.stream.read(13))
+        if (opcode, size) != (DATA_END, 4) or written not in (0, checksum):
+            raise Damaged("the checksum over the data section")
+        if written == 0:
+            raise Damaged("no checksum over the data section")
+
+
+def opened(file: Path) -> BinaryIO:
+    """The file, if it begins as an MCAP file does.
+
+    Raises:
+        UserError: it does not.
+    """
+    if file.is_dir():
+        raise UserError(f"file={file}: a folder, expected an MCAP file")
+    try:
+        stream = file.open("rb")
+    except OSError as error:
+        raise UserError(f"file={file}: {(error.strerror or 'cannot be read').lower()}, expected an MCAP file") from error
+    start = stream.read(len(MAGIC))
+    if start != MAGIC:
+        stream.close()
+        what = "an empty file" if not start else "not an MCAP file"
+        raise UserError(f"file={file}: {what}, expected a log written with log=mcap")
+    return stream
+
+
+def _cut(file: Path) -> str:
+    return f"file={file}: cut off before its end; recover=true saves every episode that is whole"
+
+
+def records(stream: BinaryIO, offset: int) -> Iterator[tuple[int, bytes]]:
+    """Opcode and content of the records from `offset` on, up to the closing magic.
+
+    Raises:
+        Damaged: one reaches beyond the end of the file.
+    """
+    length = stream.seek(0, 2)
+    while offset < length:
+        stream.seek(offset)
+        head = stream.read(9)
+        if length - offset == len(MAGIC) and head == MAGIC:
+            return
+        size = int.from_bytes(head[1:], "little")
+        if len(head) < 9 or size > length - offset - 9:
+            raise Damaged(f"the record at byte {offset} reaches beyond the end of the file")
+        offset += 9 + size
+        yield head[0], stream.read(size)
+
+
+def _split(data: bytes) -> Iterator[tuple[int, bytes]]:
+    place = 0
+    while place < len(data):
+        opcode, size = struct.unpack_from("<BQ", data, place)
+        place += 9 + size
+        if place > len(data):
+            raise Damaged("a record that reaches beyond its section")
+        yield opcode, data[place - size : place]
+
+
+def _chunk_of(body: Body) -> Chunk:
+    begin, end, offset, length = body.numbers("QQQQ")
+    body.sized()
+    body.numbers("Q")
+    compression = body.text()
+    return Chunk(begin, end, offset, length, compression, *body.numbers("QQ"))
+
+
+def attachment_of(data: bytes) -> tuple[str, bytes]:
+    """Name and content of an attachment record."""
+    if zlib.crc32(data[:-4]) != int.from_bytes(data[-4:], "little"):
+        raise Damaged("the checksum of an attachment")
+    body = Body(data)
+    body.numbers("QQ")
+    name, _ = body.text(), body.text()
+    return name, body.sized("Q")
+
+
+def metadata_of(data: bytes) -> tuple[str, dict[str, str]]:
+    """Name and content of a metadata record."""
+    body = Body(data)
+    name, pairs = body.text(), Body(body.sized())
+    content = {}
+    while pairs.place < len(pairs.data):
+        key = pairs.text()
+        content[key] = pairs.text()
+    return name, content
+
+
+def unpacked(data: bytes) -> tuple[tuple[int, int, int, str, int], bytes]:
+    """What a chunk record says of itself, and its content, the checksum checked.
+
+    Raises:
+        Damaged: the checksum is missing or wrong, or the compression cannot be undone.
+    """
+    body = Body(data)
+    begin, end, size, checksum = body.numbers("QQQI")
+    compression = body.text()
+    packed = body.sized("Q")
+    if size > _CHUNK_LIMIT:
+        raise Damaged(f"a chunk of {size} bytes")
+    try:
+        content = _UNPACK[compression](packed, size)
+    except (KeyError, zstandard.ZstdError, RuntimeError, MemoryError, ValueError) as error:
+        raise Damaged(f"a chunk that cannot be decompressed ({compression or 'none'})") from error
+    if len(content) != size or zlib.crc32(content) != checksum or checksum == 0:
+        raise Damaged("the checksum of a chunk")
+    return (begin, end, size, compression, len(packed)), content
+
+
+_UNPACK = {
+    "": lambda packed, size: packed,  # noqa: ARG005
+    "zstd": lambda packed, size: zstandard.ZstdDecompressor().decompress(packed, max_output_size=size),
+    "lz4": lambda packed, size: lz4.frame.decompress(packed),  # noqa: ARG005
+}
+
+
+def messages_of(content: bytes, channels: dict[int, str]) -> Iterator[Message]:
+    """The messages of a chunk's content; channels it defines are added to `channels`."""
+    for opcode, data in _split(content):
+        if opcode == MESSAGE:
+            number, _, log_time, _ = struct.unpack_from("<HIQQ", data)
+            if number not in channels:
+                raise Damaged(f"a message of an unknown channel {number}")
+            yield Message(channels[number], log_time, data[22:])
+        elif opcode == CHANNEL:
+            body = Body(data)
+            number, _ = body.numbers("HH")
+            channels[number] = body.text()

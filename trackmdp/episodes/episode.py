@@ -1,0 +1,176 @@
+"""One recorded episode, and the same as a TensorDict."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from tensordict import TensorDict
+
+from trackmdp.world.model import BoolArray
+
+__all__ = ["Episode", "Floats", "Integers", "first_difference"]
+
+Floats: TypeAlias = npt.NDArray[np.float32]
+Integers: TypeAlias = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """T steps of one target. Row t is step t: what was known and chosen before the move, what came of it after.
+
+    Attributes:
+        number: its place in the log.
+        seed: all its draws derive from it, so that it replays alone.
+        policy: which of the log's policies acted.
+        start: cell in which the target was located at the start.
+        misses: `[T]` n before the step.
+        action: `[T, M]` sensors on; where the safe action is forced (n > t_max) it counts for nothing.
+        belief: `[T, M]` probability of each cell after the move, given all that was observed before it; a row sums to
+            the probability of no exit.
+        probability: `[T, M]` with which the policy switched each sensor on.
+        target: `[T]` the true cell after the move, M once exited.
+        located: `[T]` whether the target was located in that cell.
+        reward: `[T]` reward of the step.
+        terminated: the target exited in the last step.
+        truncated: the last step was the last one allowed.
+    """
+
+    number: int
+    seed: int
+    policy: int
+    start: int
+    misses: Integers
+    action: BoolArray
+    belief: Floats
+    probability: Floats
+    target: Integers
+    located: BoolArray
+    reward: Floats
+    terminated: bool
+    truncated: bool
+    first_tick: int | None = field(default=None)
+    """Place of its first step on the log's time line; None until it is logged."""
+
+    def __len__(self) -> int:
+        return len(self.target)
+
+    @cached_property
+    def last_cell(self) -> Integers:
+        """`[T]` cell of the last detection before the step, x_{l(k)}."""
+        found = np.where(self.located, np.arange(len(self)), -1)
+        latest = np.concatenate([[-1], np.maximum.accumulate(found)[:-1]])
+        return np.where(latest < 0, self.start, self.target[latest])
+
+    @cached_property
+    def observation(self) -> Integers:
+        """`[T]` the cell in which the target was located by the step, -1 if in none."""
+        return np.where(self.located, self.target, -1)
+
+    @cached_property
+    def returns(self) -> npt.NDArray[np.float64]:
+        """`[T]` reward summed up to and with the step."""
+        return np.cumsum(self.reward, dtype=np.float64)
+
+    def forced(self, t_max: int) -> BoolArray:
+        """`[T]` whether the safe action replaced the chosen one."""
+        exited = self.target == self.action.shape[1]
+        return (self.misses > t_max) & ~exited
+
+    def to_tensordict(self, t_max: int, max_steps: int | None = None) -> TensorDict:
+        """`[T]` steps under the keys of `TrackEnv`, as a rollout has them: the outcome of each step under `next`.
+
+        Args:
+            t_max: T_max of the world.
+            max_steps: where set, `step_count` is among the keys.
+        """
+        history = self._history(t_max)
+        after = np.concatenate([self.misses[1:], [0]])
+        after[-1] = 0 if self.located[-1] or self.terminated else self.misses[-1] + 1
+        following = {
+            "target": self.target,
+            "last_cell": np.where(self.located, self.target, self.last_cell),
+            "steps_since_detection": after,
+            "action_history": np.concatenate([history[1:], self._final_history(history[-1], t_max)[None]]),
+            "reward": self.reward[:, None],
+            **_ends(len(self), self.terminated, self.truncated),
+        }
+        current = {
+            "target": np.concatenate([[self.start], self.target[:-1]]),
+            "last_cell": self.last_cell,
+            "steps_since_detection": self.misses,
+            "action_history": history,
+            "action": self.action,
+            **_ends(len(self), terminated=False, truncated=False),
+        }
+        if max_steps:
+            current["step_count"] = np.arange(len(self))
+            following["step_count"] = current["step_count"] + 1
+        made = {key: torch.as_tensor(value) for key, value in current.items()}
+        nested = TensorDict({key: torch.as_tensor(value) for key, value in following.items()}, [len(self)])
+        return TensorDict({**made, "next": nested}, [len(self)])
+
+    def _history(self, t_max: int) -> BoolArray:
+        """`[T, t_max+1, M]` h before each step: slot s holds the action at s misses, empty from slot n on."""
+        slots = np.arange(t_max + 1)
+        steps = np.arange(len(self))[:, None] - self.misses[:, None] + slots
+        filled = slots < self.misses[:, None]
+        return self.action[np.where(filled, steps, 0)] & filled[..., None]
+
+    def _final_history(self, history: BoolArray, t_max: int) -> BoolArray:
+        """`[t_max+1, M]` h after the last step."""
+        if self.located[-1] or self.terminated:
+            return np.zeros_like(history)
+        kept = history.copy()
+        kept[min(int(self.misses[-1]), t_max)] = self.action[-1]
+        return kept
+
+
+def _ends(steps: int, terminated: bool, truncated: bool) -> dict[str, Any]:
+    flags = {name: np.zeros((steps, 1), dtype=bool) for name in ("done", "terminated", "truncated")}
+    for name, value in (("terminated", terminated), ("truncated", truncated), ("done", terminated or truncated)):
+        flags[name][-1] = value
+    return flags
+
+
+SCALARS = ("seed", "policy", "start", "terminated", "truncated")
+PER_STEP = ("target", "misses", "action", "located", "reward", "probability", "belief")
+
+
+def first_difference(logged: Episode, again: Episode, *, belief_tolerance: float = 0.0) -> str | None:
+    """Where two recordings of an episode part, in words; None where every bit is the same.
+
+    Args:
+        logged: one of them.
+        again: the other.
+        belief_tolerance: differences of the belief up to this one pass.
+    """
+    for name in SCALARS:
+        mine, other = getattr(logged, name), getattr(again, name)
+        if mine != other:
+            return f"{name}: logged {mine}, re-simulated {other}"
+    steps = min(len(logged), len(again))
+    found = [_differing(logged, again, name, steps, belief_tolerance) for name in PER_STEP]
+    earliest = min((each for each in found if each is not None), default=None, key=lambda each: each[0])
+    if earliest is not None:
+        return f"step {earliest[0]}, {earliest[1]}"
+    if len(logged) != len(again):
+        return f"length: logged {len(logged)} steps, re-simulated {len(again)}"
+    return None
+
+
+def _differing(logged: Episode, again: Episode, name: str, steps: int, tolerance: float) -> tuple[int, str] | None:
+    """The first step at which the arrays called `name` differ, and how."""
+    mine, other = getattr(logged, name)[:steps], getattr(again, name)[:steps]
+    differs = mine != other
+    if name == "belief" and tolerance:
+        differs = np.abs(mine - other) > tolerance
+    if not differs.any():
+        return None
+    where = tuple(int(each) for each in np.argwhere(differs)[0])
+    cell = f" of cell {where[1]}" if len(where) > 1 else ""
+    return where[0], f"{name}{cell}: logged {mine[where]}, re-simulated {other[where]}"

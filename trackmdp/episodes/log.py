@@ -1,0 +1,96 @@
+"""The log of a run: records episodes of the policies it is given, and never stops the run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from trackmdp.episodes.layout import write_layout
+from trackmdp.episodes.record import Acting, Chains, record
+from trackmdp.episodes.writer import EpisodeWriter
+from trackmdp.seeding import derive
+from trackmdp.world.model import World
+
+__all__ = ["EpisodeLog", "free_name"]
+
+
+class EpisodeLog:
+    """`episodes.mcap` in a run's folder.
+
+    When the disk is full, or the file fails in another way, that is said once and logging is over; the run goes on, and
+    what was written stays under the `.part` name.
+
+    Args:
+        folder: the run's folder.
+        world: the world.
+        seed: seed of the run, from which each episode's own derives.
+        config: text of the run's `config.yaml`.
+        max_steps: where episodes are cut; None for never.
+        layout: write a viewer's layout next to the log.
+        warn: is told, in one line, that logging is over.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        world: World,
+        *,
+        seed: int,
+        config: str,
+        max_steps: int | None,
+        layout: bool,
+        warn: Callable[[str], None],
+    ) -> None:
+        self._world, self._seed, self._max_steps, self._warn = world, seed, max_steps, warn
+        self.file, self.episodes = free_name(folder / "episodes.mcap"), 0
+        self._writer: EpisodeWriter | None = None
+        try:
+            facts = {"seed": str(seed)}
+            self._writer = EpisodeWriter(self.file, world, facts=facts, config=config, max_steps=max_steps)
+            if layout:
+                write_layout(folder / "episodes.layout.json")
+        except OSError as error:
+            self._stop(error)
+
+    def record(self, acting: Acting, facts: Mapping[str, str], episodes: int, *names: str | int) -> None:
+        """Record `episodes` episodes of a policy; their seeds are those called (`"episode"`, `names`, 0, 1, ...)."""
+        if self._writer is None:
+            return
+        seeds = [derive(self._seed, "episode", *names, number) for number in range(episodes)]
+        try:
+            policy = self._writer.add_policy(facts, acting.chains if isinstance(acting, Chains) else None)
+            recorded = record(
+                self._world, acting, seeds, first=self.episodes, policy=policy, max_steps=self._max_steps
+            )
+            for episode in recorded:
+                self._writer.add(episode)
+                self.episodes += 1
+            self._writer.flush()
+        except OSError as error:
+            self._stop(error)
+
+    def close(self) -> None:
+        """Finish the file, unless logging is over already."""
+        if self._writer is None:
+            return
+        try:
+            self._writer.finish()
+            self._writer = None
+        except OSError as error:
+            self._stop(error)
+
+    def _stop(self, error: OSError) -> None:
+        part = self.file.with_name(f"{self.file.name}.part")
+        self._warn(f"{part}: {(error.strerror or 'cannot be written').lower()}; no more episodes are logged")
+        if self._writer is not None:
+            self._writer.abandon()
+            self._writer = None
+
+
+def free_name(file: Path) -> Path:
+    """`file`, or with a number where a log, finished or not, has that name: a log cannot be appended to."""
+    number, free = 1, file
+    while free.exists() or free.with_name(f"{free.name}.part").exists():
+        number += 1
+        free = file.with_name(f"{file.stem}-{number}{file.suffix}")
+    return free

@@ -1,0 +1,117 @@
+"""Steps and episodes as messages, written as text directly: this is what logging spends its time on."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from trackmdp.episodes.episode import Episode
+from trackmdp.episodes.schema import time_of
+from trackmdp.errors import UserError
+
+__all__ = ["decode", "grid_messages", "row_of", "step_messages"]
+
+_CELL = np.dtype([("belief", "<f4"), ("policy", "<f4"), ("active", "u1"), ("target", "u1")])
+_TYPES = {"<f4": 7, "|u1": 1}  # foxglove.NumericType
+_FIELDS = [
+    {"name": name, "offset": int(_CELL.fields[name][1]), "type": _TYPES[_CELL[name].str]} for name in _CELL.names
+]
+_POSE = {"position": {"x": 0, "y": 0, "z": 0}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}
+_WORDS = ("false", "true")
+
+
+def row_of(episode: Episode, t_max: int, first_tick: int) -> dict[str, Any]:
+    """The `/episode` message."""
+    return {
+        "episode": episode.number,
+        "seed": str(episode.seed),
+        "policy": episode.policy,
+        "start": episode.start,
+        "length": len(episode),
+        "return": float(episode.returns[-1]),
+        "detections": int(episode.located.sum()),
+        "forced": int(episode.forced(t_max).sum()),
+        "terminated": episode.terminated,
+        "truncated": episode.truncated,
+        "start_time": str(time_of(first_tick)),
+        "end_time": str(time_of(first_tick + len(episode) - 1)),
+    }
+
+
+def step_messages(episode: Episode, size: int, t_max: int) -> Iterator[bytes]:
+    """The `/step` messages."""
+    cells, last = size**2, len(episode) - 1
+    target = np.where(episode.target == cells, -1, episode.target)
+    x = np.where(target < 0, -1, target % size)
+    y = np.where(target < 0, -1, size - 1 - target // size)
+    steps, ids = np.nonzero(episode.action)
+    active = [",".join(map(str, each.tolist())) for each in np.split(ids, np.searchsorted(steps, range(1, last + 1)))]
+    columns = (
+        (episode.misses, episode.last_cell, episode.action.sum(1), episode.forced(t_max))
+        + (target, x, y, episode.observation)
+        + (episode.reward.astype(np.float64), episode.returns)
+    )
+    for t, (n, cell, count, forced, at, at_x, at_y, obs, reward, total) in enumerate(
+        zip(*(column.tolist() for column in columns), strict=True)
+    ):
+        yield (
+            f'{{"episode":{episode.number},"t":{t},"n":{n},"last_cell":{cell},"active":[{active[t]}],'
+            f'"n_active":{count},"forced":{_WORDS[forced]},"target":{at},"target_x":{at_x},"target_y":{at_y},'
+            f'"obs":{obs},"reward":{reward!r},"ep_return":{total!r},"first":{_WORDS[t == 0]},"last":{_WORDS[t == last]}}}'
+        ).encode()
+
+
+def grid_messages(episode: Episode, size: int, first_tick: int) -> Iterator[bytes]:
+    """The `/grid` messages; the grid is turned upside down, since a viewer's first row is the lowest."""
+    cells = np.zeros((len(episode), size**2 + 1), _CELL)
+    cells["belief"][:, :-1] = episode.belief
+    cells["policy"][:, :-1] = episode.probability
+    cells["active"][:, :-1] = episode.action
+    cells["target"][np.arange(len(episode)), episode.target] = 1
+    turned = np.ascontiguousarray(cells[:, :-1].reshape(-1, size, size)[:, ::-1])
+    stride = _CELL.itemsize
+    constant = {"frame_id": "grid", "pose": _POSE, "column_count": size, "cell_size": {"x": 1, "y": 1}}
+    constant |= {"row_stride": size * stride, "cell_stride": stride, "fields": _FIELDS}
+    head = json.dumps(constant, separators=(",", ":")).encode()[1:]
+    for t, grid in enumerate(turned):
+        seconds, rest = divmod(time_of(first_tick + t), 1_000_000_000)
+        stamp = b'{"timestamp":{"sec":%d,"nsec":%d},' % (seconds, rest)
+        yield b'%s%s,"data":"%s"}' % (stamp, head[:-1], base64.b64encode(grid.tobytes()))
+
+
+def decode(row: dict[str, Any], steps: list[bytes], grids: list[bytes], size: int, first_tick: int) -> Episode:
+    """The episode that these messages were made from.
+
+    Raises:
+        UserError: they do not fit together.
+    """
+    number, count, m = row["episode"], row["length"], size**2
+    said = [json.loads(step) for step in steps]
+    if [(each["episode"], each["t"]) for each in said] != [(number, t) for t in range(count)] or len(grids) != count:
+        raise UserError(f"episode={number}: its steps do not fit together")
+    packed = b"".join(base64.b64decode(json.loads(grid)["data"], validate=True) for grid in grids)
+    cells = np.frombuffer(packed, _CELL).reshape(count, size, size)[:, ::-1].reshape(count, m)
+    target = np.array([each["target"] for each in said], dtype=np.int64)
+    action = np.zeros((count, m), dtype=bool)
+    for t, each in enumerate(said):
+        action[t, each["active"]] = True
+    return Episode(
+        number=number,
+        seed=int(row["seed"]),
+        policy=row["policy"],
+        start=row["start"],
+        misses=np.array([each["n"] for each in said], dtype=np.int64),
+        action=action,
+        belief=np.ascontiguousarray(cells["belief"]),
+        probability=np.ascontiguousarray(cells["policy"]),
+        target=np.where(target < 0, m, target),
+        located=np.array([each["obs"] >= 0 for each in said]),
+        reward=np.array([each["reward"] for each in said], dtype=np.float32),
+        terminated=row["terminated"],
+        truncated=row["truncated"],
+        first_tick=first_tick,
+    )

@@ -1,0 +1,208 @@
+"""Reading a log: episodes as TensorDicts, in any order, without loading the file."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+from bisect import bisect_left
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any, TypeVar
+
+import numpy as np
+from tensordict import TensorDict
+
+from trackmdp.episodes import schema
+from trackmdp.episodes.container import Container, Damaged, Message
+from trackmdp.episodes.episode import Episode
+from trackmdp.episodes.messages import decode
+from trackmdp.errors import UserError
+from trackmdp.world.model import Array, BoolArray, World
+
+__all__ = ["EpisodeReader", "check_run"]
+
+R = TypeVar("R")
+
+
+class EpisodeReader:
+    """The episodes of a finished log, by number.
+
+    `reader[12]` is episode 12 as a TensorDict `[T]` with the keys of `TrackEnv`, iteration yields one after another,
+    `reader.read(12)` has belief and policy as well. Checksums are always checked: a damaged part raises.
+
+    Args:
+        file: the log.
+
+    Raises:
+        UserError: not a finished log of this format, or a damaged one; also raised when damage is met later.
+    """
+
+    def __init__(self, file: Path | str) -> None:
+        self.file = Path(file)
+        self._container = Container(self.file)
+        try:
+            self._open()
+        except BaseException:
+            self.close()
+            raise
+
+    def _open(self) -> None:
+        file, container = self.file, self._container
+        if container.profile or schema.RUN not in container.metadata:
+            kind = f"profile {container.profile!r}" if container.profile else f"it has no metadata {schema.RUN}"
+            raise UserError(f"file={file}: not a log of trackmdp ({kind})")
+        self.run = check_run(file, self._checked(self._told, schema.RUN))
+        if container.library != f"trackmdp {self.run['trackmdp']}":
+            raise self._damage("the header")
+        if schema.END not in container.metadata:
+            raise self._damage(f"no metadata {schema.END}")
+        self.end = self._checked(self._told, schema.END)
+        index = self.attachment("episodes.json", self.end["episodes.json.sha256"])
+        self.rows: list[dict[str, Any]] = json.loads(index)
+        self.policies = [self._checked(self._told, f"{schema.POLICY}.{k}") for k in range(int(self.end["policies"]))]
+        self._numbers = [row["episode"] for row in self.rows]
+        self._held: tuple[int, list[Message]] = (-1, [])
+        steps = sum(row["length"] for row in self.rows)
+        if (str(len(self.rows)), str(steps)) != (self.end["episodes"], self.end["steps"]):
+            raise self._damage("the index of episodes")
+
+    def __enter__(self) -> EpisodeReader:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._container.stream.close()
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __iter__(self) -> Iterator[TensorDict]:
+        return (self[number] for number in self._numbers)
+
+    def __getitem__(self, number: int) -> TensorDict:
+        """Episode `number` as a TensorDict `[T]`, keys as in `TrackEnv`."""
+        return self.read(number).to_tensordict(self.t_max, self.max_steps)
+
+    @property
+    def t_max(self) -> int:
+        """T_max."""
+        return int(self.run["t_max"])
+
+    @property
+    def max_steps(self) -> int | None:
+        """Where episodes are cut; None for never."""
+        return int(self.run["max_steps"]) if self.run["max_steps"] else None
+
+    def episodes(self) -> Iterator[Episode]:
+        """All episodes, one after another, with belief and policy."""
+        return (self.read(number) for number in self._numbers)
+
+    def row(self, number: int) -> dict[str, Any]:
+        """What the index says of an episode.
+
+        Raises:
+            UserError: there is no such episode.
+        """
+        place = bisect_left(self._numbers, number)
+        if self._numbers[place : place + 1] != [number]:
+            ends = f"{self._numbers[0]} to {self._numbers[-1]}" if self._numbers else "none"
+            raise UserError(f"episode={number}: {self.file} holds {len(self)} episodes ({ends})")
+        return self.rows[place]
+
+    def read(self, number: int) -> Episode:
+        """Episode `number`."""
+        row = self.row(number)
+        begin, end = int(row["start_time"]), int(row["end_time"])
+        mine: dict[str, list[bytes]] = {"/step": [], "/grid": [], "/episode": []}
+        for message in self._checked(self._between, begin, end):
+            mine.setdefault(message.topic, []).append(message.data)
+        if [json.loads(text) for text in mine["/episode"]] != [row]:
+            raise self._damage(f"episode {number} is not what the index says")
+        size = int(self.run["size"])
+        return self._checked(decode, row, mine["/step"], mine["/grid"], size, schema.tick_of(begin))
+
+    def _between(self, begin: int, end: int) -> list[Message]:
+        """The messages from one log time to another; the chunk read last is kept, for the episode after."""
+        found = []
+        for chunk in self._container.chunks_between(begin, end):
+            if self._held[0] != chunk.offset:
+                self._held = chunk.offset, self._container.messages(chunk)
+            found += [message for message in self._held[1] if begin <= message.log_time <= end]
+        return found
+
+    def attachment(self, name: str, sha256: str | None = None) -> bytes:
+        """An attachment, its digest checked; that of `trackmdp.run` unless given."""
+        content = self._checked(self._container.attachment, name)
+        if schema.digest(content) != (self.run.get(f"{name}.sha256") if sha256 is None else sha256):
+            raise self._damage(f"attachment {name} is not what was written")
+        return content
+
+    def policy_table(self, number: int) -> bytes | None:
+        """The file of policy `number`; None if it has no chains."""
+        sha256 = self.policies[number]["table.sha256"]
+        return self.attachment(f"policy-{number}.npy", sha256) if sha256 else None
+
+    def chains(self, number: int) -> BoolArray | None:
+        """`[M, t_max+1, M]` of policy `number`; None if it has none."""
+        table = self.policy_table(number)
+        if table is None:
+            return None
+        cells = int(self.run["size"]) ** 2
+        return np.unpackbits(_load(table), axis=-1, count=cells).astype(bool)
+
+    def world(self) -> World:
+        """The world in which the episodes were recorded."""
+        run = self.run
+        kernel, cost = (_load(self.attachment(name)) for name in ("kernel.npy", "cost.npy"))
+        return World(int(run["size"]), float(run["reward"]), cost, float(run["safe_cost"]), self.t_max, kernel)
+
+    def check_all(self) -> None:
+        """Check every byte of the file, those without meaning to this reader included."""
+        self._checked(self._container.check_data)
+        for name in ("config.yaml", "kernel.npy", "cost.npy"):
+            self.attachment(name)
+        for number in range(len(self.policies)):
+            self.policy_table(number)
+
+    def _told(self, name: str) -> dict[str, str]:
+        content = schema.unsealed(name, self._container.tell(name))
+        if content is None:
+            raise Damaged(f"metadata {name} is not what was written")
+        return content
+
+    def _checked(self, work: Any, *arguments: Any) -> Any:
+        """What `work` returns; whatever damage makes it raise ends in one line."""
+        try:
+            return work(*arguments)
+        except (Damaged, struct.error, ValueError, KeyError, TypeError, IndexError) as error:
+            if isinstance(error, UserError):
+                raise
+            raise self._damage(str(error)) from error
+
+    def _damage(self, what: str) -> UserError:
+        return UserError(f"file={self.file}: damaged ({what}); recover=true saves what can be read")
+
+
+def check_run(file: Path, run: dict[str, str]) -> dict[str, str]:
+    """The metadata `trackmdp.run`, if it is of this format.
+
+    Raises:
+        UserError: it is of another.
+    """
+    found = run.get("format_version")
+    if found != schema.FORMAT:
+        writer = run.get("trackmdp", "unknown")
+        raise UserError(f"file={file}: format {found} (trackmdp {writer}), expected format {schema.FORMAT}")
+    return run
+
+
+def _load(content: bytes) -> Array:
+    table: Array = np.load(io.BytesIO(content), allow_pickle=False)
+    return table

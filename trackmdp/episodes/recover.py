@@ -1,0 +1,150 @@
+"""Rebuilding a log that was cut off or damaged: every episode that is whole is written anew."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from trackmdp.episodes import container, schema
+from trackmdp.episodes.container import Damaged
+from trackmdp.episodes.messages import decode
+from trackmdp.episodes.reader import check_run
+from trackmdp.episodes.writer import EpisodeWriter
+from trackmdp.errors import UserError
+
+__all__ = ["Recovered", "recover", "recovered_name"]
+
+_TABLES = ("config.yaml", "kernel.npy", "cost.npy")
+
+
+@dataclass(frozen=True)
+class Recovered:
+    """What was saved: the new file, the episodes in it, and whether anything was damaged or missing."""
+
+    file: Path
+    episodes: int
+    damaged: tuple[str, ...]
+
+
+@dataclass
+class _Found:
+    """What could be read so far."""
+
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    attachments: dict[str, bytes] = field(default_factory=dict)
+    steps: dict[int, bytes] = field(default_factory=dict)
+    grids: dict[int, bytes] = field(default_factory=dict)
+
+
+def recovered_name(file: Path) -> Path:
+    """`runs/episodes.recovered.mcap` for `runs/episodes.mcap` and for `runs/episodes.mcap.part`."""
+    return file.with_name(f"{Path(file.name.removesuffix('.part')).stem}.recovered.mcap")
+
+
+def recover(file: Path) -> Recovered:
+    """Write every whole episode of `file` to `recovered_name(file)`; `file` stays as it is.
+
+    Raises:
+        UserError: not a log of this format, or its first part is lost, or the new file already exists.
+    """
+    target = recovered_name(file)
+    if target.exists():
+        raise UserError(f"file={file}: {target} already exists")
+    damaged: list[str] = []
+    writer, episodes = _rewrite(file, target, damaged)
+    if writer is None:
+        raise UserError(f"file={file}: too damaged, what says how it was recorded is lost ({'; '.join(damaged)})")
+    return Recovered(writer.finish(), episodes, tuple(damaged))
+
+
+def _rewrite(file: Path, target: Path, damaged: list[str]) -> tuple[EpisodeWriter | None, int]:
+    found, writer, episodes = _Found(), None, 0
+    policies: set[int] = set()
+    with container.opened(file) as stream:
+        for topic, time, data in _whole(stream, found, damaged):
+            {"/step": found.steps, "/grid": found.grids}.get(topic, {})[time] = data
+            if topic != "/episode":
+                continue
+            writer = writer or _begin(file, target, found)
+            row: dict[str, Any] = json.loads(data)
+            try:
+                if writer is None:
+                    raise Damaged("what says how it was recorded")
+                _policies_up_to(row["policy"], writer, found, policies)
+                episodes += _copy(row, found, writer)
+            except (Damaged, ValueError, KeyError, TypeError, IndexError, struct.error) as error:
+                damaged.append(f"episode {row.get('episode')}: {error}")
+            found.steps.clear()
+            found.grids.clear()
+        writer = writer or _begin(file, target, found)
+    if found.steps or schema.END not in found.metadata:
+        damaged.append("the end is missing")
+    if writer is not None:
+        last = max((int(name.rpartition(".")[2]) for name in found.metadata if schema.POLICY in name), default=-1)
+        _policies_up_to(last, writer, found, policies)
+    return writer, episodes
+
+
+def _whole(stream: Any, found: _Found, damaged: list[str]) -> Iterator[tuple[str, int, bytes]]:
+    """The messages of every chunk that is whole; attachments and metadata go to `found`."""
+    channels: dict[int, str] = {}
+    walk = container.records(stream, len(container.MAGIC))
+    while True:
+        try:
+            opcode, body = next(walk)
+            if opcode == container.DATA_END:
+                return
+            if opcode == container.METADATA:
+                name, content = container.metadata_of(body)
+                plain = schema.unsealed(name, content)
+                if plain is None:
+                    raise Damaged(f"metadata {name}")
+                found.metadata[name] = plain
+            elif opcode == container.ATTACHMENT:
+                name, attached = container.attachment_of(body)
+                found.attachments[name] = attached
+            elif opcode == container.CHUNK:
+                for message in container.messages_of(container.unpacked(body)[1], channels):
+                    yield message.topic, message.log_time, message.data
+        except StopIteration:
+            return
+        except (Damaged, struct.error, UnicodeDecodeError) as error:
+            damaged.append(str(error))
+
+
+def _begin(file: Path, target: Path, found: _Found) -> EpisodeWriter | None:
+    """The new log, if all that it starts with has been found."""
+    if schema.RUN not in found.metadata:
+        return None
+    run = check_run(file, found.metadata[schema.RUN])
+    tables = {name: found.attachments.get(name, b"") for name in _TABLES}
+    if any(schema.digest(content) != run.get(f"{name}.sha256") for name, content in tables.items()):
+        return None
+    return EpisodeWriter.copy(target, run, tables)
+
+
+def _policies_up_to(number: int, writer: EpisodeWriter, found: _Found, done: set[int]) -> None:
+    """Copy the policies up to `number` that have not been copied."""
+    for each in range(len(done), number + 1):
+        facts = dict(found.metadata.get(f"{schema.POLICY}.{each}", {}))
+        if not facts:
+            raise Damaged(f"policy {each} is lost")
+        sha256, table = facts.pop("table.sha256"), found.attachments.get(f"policy-{each}.npy")
+        if sha256 and (table is None or schema.digest(table) != sha256):
+            raise Damaged(f"policy {each} is lost")
+        writer.copy_policy(facts, table if sha256 else None)
+        done.add(each)
+
+
+def _copy(row: dict[str, Any], found: _Found, writer: EpisodeWriter) -> int:
+    """Write the episode that `row` describes, from the steps found since the one before."""
+    begin, end = int(row["start_time"]), int(row["end_time"])
+    steps = [data for time, data in found.steps.items() if begin <= time <= end]
+    grids = [data for time, data in found.grids.items() if begin <= time <= end]
+    size = int(found.metadata[schema.RUN]["size"])
+    writer.add(decode(row, steps, grids, size, schema.tick_of(begin)))
+    return 1

@@ -1,0 +1,207 @@
+"""Writing a log: whole episodes one after another, each safe once `add` has returned a hundred steps later."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from mcap.writer import Writer
+
+from trackmdp.episodes import messages, schema
+from trackmdp.episodes.episode import Episode
+from trackmdp.episodes.schema import time_of
+from trackmdp.world.model import BoolArray, World
+
+__all__ = ["EpisodeWriter", "packed"]
+
+FLUSH_STEPS = 100
+"""An episode's end closes the chunk once so many steps are in it, and hands it to the operating system."""
+
+_MEDIA = {".yaml": "application/yaml", ".json": "application/json", ".npy": "application/octet-stream"}
+
+
+class EpisodeWriter:
+    """One log, written by one process: `FILE.part` while it grows, `FILE` once `finish` has it on the disk.
+
+    Args:
+        file: the log; its folder exists.
+        world: the world of all its episodes; its tables go into the log, so that it can be re-simulated.
+        facts: what else the log says of the run, such as `seed`.
+        config: text of the run's `config.yaml`.
+        max_steps: where episodes are cut; None for never.
+    """
+
+    def __init__(
+        self, file: Path, world: World, *, facts: Mapping[str, str], config: str, max_steps: int | None = None
+    ) -> None:
+        tables = {
+            "config.yaml": config.encode(),
+            "kernel.npy": _npy(world.kernel),
+            "cost.npy": _npy(world.cost),
+        }
+        run = {
+            **schema.versions(),
+            **facts,
+            "format_version": schema.FORMAT,
+            "size": str(world.size),
+            "t_max": str(world.t_max),
+            "max_steps": "" if max_steps is None else str(max_steps),
+            "reward": repr(float(world.reward)),
+            "safe_cost": repr(float(world.safe_cost)),
+            "tick_ns": str(schema.TICK_NS),
+            **{f"{name}.sha256": schema.digest(content) for name, content in tables.items()},
+        }
+        self._size, self._t_max = world.size, world.t_max
+        self._open(file, run, tables)
+
+    @classmethod
+    def copy(cls, file: Path, run: Mapping[str, str], tables: Mapping[str, bytes]) -> EpisodeWriter:
+        """A log that starts with the metadata `trackmdp.run` and the attachments of another."""
+        writer = cls.__new__(cls)
+        writer._size, writer._t_max = int(run["size"]), int(run["t_max"])
+        writer._open(file, dict(run), dict(tables))
+        return writer
+
+    def _open(self, file: Path, run: dict[str, str], tables: dict[str, bytes]) -> None:
+        self.file, self.part = file, file.with_name(f"{file.name}.part")
+        self._lock, self._process = threading.Lock(), os.getpid()
+        self._rows: list[dict[str, Any]] = []
+        self._policies = self._unflushed = self._tick = 0
+        self._stream = self.part.open("wb")
+        self._writer = Writer(self._stream, enable_data_crcs=True)
+        self._writer.start(library=f"trackmdp {run['trackmdp']}")
+        self._channels = {topic: self._register(topic) for topic in schema.SCHEMAS}
+        self._tell(schema.RUN, run)
+        for name, content in tables.items():
+            self._attach(name, content)
+        self._flush()
+
+    def _register(self, topic: str) -> int:
+        name, description = schema.SCHEMAS[topic]
+        text = json.dumps(description, separators=(",", ":")).encode()
+        number = self._writer.register_schema(name, "jsonschema", text)
+        return self._writer.register_channel(topic, "json", number)
+
+    def add_policy(self, facts: Mapping[str, str], chains: BoolArray | None = None) -> int:
+        """Add the policy of the episodes that follow; returns its number.
+
+        Args:
+            facts: what the log says of it: `kind`, and for a reader `label`.
+            chains: `[M, t_max+1, M]` of a deterministic policy.
+        """
+        with self._lock:
+            return self._add_policy(dict(facts), None if chains is None else packed(chains))
+
+    def copy_policy(self, facts: Mapping[str, str], table: bytes | None) -> int:
+        """Add a policy as it was read from another log."""
+        with self._lock:
+            return self._add_policy(dict(facts), table)
+
+    def _add_policy(self, facts: dict[str, str], table: bytes | None) -> int:
+        number = self._policies
+        facts |= {"table.sha256": schema.digest(table) if table is not None else ""}
+        self._tell(f"{schema.POLICY}.{number}", facts)
+        if table is not None:
+            self._attach(f"policy-{number}.npy", table)
+        self._flush()
+        self._policies += 1
+        return number
+
+    def add(self, episode: Episode) -> None:
+        """Append an episode.
+
+        Raises:
+            OSError: the disk is full, or the file cannot be written for another reason.
+        """
+        if os.getpid() != self._process:
+            raise RuntimeError(f"{self.file}: opened by process {self._process}, written by {os.getpid()}")
+        with self._lock:
+            tick = self._tick if episode.first_tick is None else episode.first_tick
+            row = messages.row_of(episode, self._t_max, tick)
+            self._add_messages(episode, tick, row)
+            self._rows.append(row)
+            self._tick = tick + len(episode) + schema.GAP
+            self._unflushed += len(episode)
+            if self._unflushed >= FLUSH_STEPS:
+                self._flush()
+
+    def _add_messages(self, episode: Episode, tick: int, row: dict[str, Any]) -> None:
+        if not (np.isfinite(episode.reward).all() and 0 <= tick < 2**50):
+            raise ValueError(f"episode {episode.number}: a reward that is not finite, or a time out of range")
+        add, step, grid = self._writer.add_message, self._channels["/step"], self._channels["/grid"]
+        steps = messages.step_messages(episode, self._size, self._t_max)
+        grids = messages.grid_messages(episode, self._size, tick)
+        for place, (said, cells) in enumerate(zip(steps, grids, strict=True), start=tick):
+            time, sequence = time_of(place), place & 0xFFFFFFFF
+            add(step, time, said, time, sequence)
+            add(grid, time, cells, time, sequence)
+        text = json.dumps(row, allow_nan=False, separators=(",", ":")).encode()
+        add(self._channels["/episode"], time, text, time, sequence)
+
+    def flush(self) -> None:
+        """Close the chunk and hand it to the operating system: it then survives a kill of this process."""
+        with self._lock:
+            self._flush()
+
+    def finish(self) -> Path:
+        """Complete the file and give it its name; returns it."""
+        with self._lock:
+            index = json.dumps(self._rows, allow_nan=False, separators=(",", ":")).encode()
+            self._flush()
+            self._attach("episodes.json", index)
+            steps = sum(row["length"] for row in self._rows)
+            counts = {"episodes": str(len(self._rows)), "steps": str(steps), "policies": str(self._policies)}
+            self._tell(schema.END, {"complete": "true", **counts, "episodes.json.sha256": schema.digest(index)})
+            self._writer.finish()
+            self._stream.flush()
+            os.fsync(self._stream.fileno())
+            self._stream.close()
+        self.part.replace(self.file)
+        _sync(self.file.parent)
+        return self.file
+
+    def abandon(self) -> None:
+        """Close the file as it is, under its `.part` name; what was flushed can be recovered."""
+        try:
+            self._stream.close()
+        except OSError:
+            self._stream.raw.close()
+
+    def _flush(self) -> None:
+        self._writer.flush()
+        self._stream.flush()
+        self._unflushed = 0
+
+    def _tell(self, name: str, content: dict[str, str]) -> None:
+        self._writer.add_metadata(name, schema.seal(name, content))
+
+    def _attach(self, name: str, content: bytes) -> None:
+        time = time_of(self._tick)
+        self._writer.add_attachment(time, time, name, _MEDIA[Path(name).suffix], content)
+
+
+def packed(chains: BoolArray) -> bytes:
+    """The `.npy` of a policy: its chains `[M, t_max+1, M]`, eight sensors to a byte."""
+    return _npy(np.packbits(chains, axis=-1))
+
+
+def _npy(table: npt.NDArray[Any]) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, np.ascontiguousarray(table), allow_pickle=False)
+    return buffer.getvalue()
+
+
+def _sync(folder: Path) -> None:
+    """Make the rename itself survive a power failure."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
