@@ -68,11 +68,11 @@ def rows(folder: Path) -> list[dict[str, str]]:
 
 
 def tensors(state: Any, prefix: str = "") -> dict[str, Any]:
-    """Every leaf of a checkpoint but times and places in files."""
+    """Every leaf of a checkpoint but times, places in files, and the best of those that happened to be saved."""
     if isinstance(state, dict):
         found: dict[str, Any] = {}
         for key, value in state.items():
-            if key not in ("seconds", "metrics"):
+            if key not in ("seconds", "metrics", "best"):
                 found |= tensors(value, f"{prefix}.{key}")
         return found
     if isinstance(state, (list, tuple)):
