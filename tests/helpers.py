@@ -18,9 +18,15 @@ from trackmdp.config.world import BORDERS
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.model import Array, World
 
-KERNELS = [name for name in GROUPS["kernel"] if name != "table"]
-ALGORITHMS = list(GROUPS["algo"])
-BASELINES = list(GROUPS["baseline"])
+
+def _without_files(group: str) -> list[str]:
+    """Choices of a group that need no file of the user's."""
+    return [name for name in GROUPS[group] if "???" not in (Path(conf_dir()) / group / f"{name}.yaml").read_text()]
+
+
+KERNELS = _without_files("kernel")
+ALGORITHMS = _without_files("algo")
+BASELINES = _without_files("baseline")
 
 __all__ = [
     "ALGORITHMS",
