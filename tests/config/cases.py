@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,20 @@ from typing import Any
 from hydra import compose, initialize_config_dir
 
 from trackmdp.config import GROUPS, ROOTS, Option, conf_dir, from_hydra, options, register
+
+
+REFUSED = {("evaluate", "log=csv"), ("evaluate", "log=tensorboard")}
+"""Choices that a command's group offers and its rules refuse."""
+
+
+def files_of(command: str, choice: str) -> list[str]:
+    """A value for each option that has none in conf/: the files a user must name."""
+    group, _, name = choice.partition("=")
+    folder = Path(conf_dir())
+    places = [(folder / f"{command}.yaml", ""), (folder / group / f"{name}.yaml", f"{group}.")]
+    texts = [(file.read_text(encoding="utf-8"), prefix) for file, prefix in places if file.is_file()]
+    pattern = re.compile(r"^(\w+): \?\?\?", flags=re.MULTILINE)
+    return [f"{prefix}{key}=no.npy" for text, prefix in texts for key in pattern.findall(text)]
 
 
 def composed(command: str, *overrides: str) -> Any:
@@ -42,8 +57,11 @@ def distinct() -> list[tuple[str, list[str], str, Option]]:
     found: dict[tuple[str, Option], tuple[str, list[str], str, Option]] = {}
     for command, root in ROOTS.items():
         for choice, key, item in _walk(root, "", ""):
-            words = [choice] if choice else ["baseline=qmdp"] if command == "evaluate" else []
-            if choice == "kernel=table" and key != "kernel.path":
-                words.append("kernel.path=no.npy")
+            if (command, choice) in REFUSED:
+                continue
+            words = [choice] if choice else []
+            words += [word for word in files_of(command, choice) if not word.startswith(f"{key}=")]
+            if command == "evaluate" and not choice.startswith("baseline="):
+                words.append("baseline=qmdp")
             found.setdefault((key, item), (command, words, key, item))
     return list(found.values())
