@@ -11,7 +11,6 @@ from hydra import compose, initialize_config_dir
 
 from trackmdp.config import GROUPS, ROOTS, Option, conf_dir, from_hydra, options, register
 
-
 REFUSED = {("evaluate", "log=csv"), ("evaluate", "log=tensorboard")}
 """Choices that a command's group offers and its rules refuse."""
 
