@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import Any, Protocol
 
@@ -53,8 +54,16 @@ class Averages:
             self._values.setdefault(name, []).append(value.detach())
 
     def means(self) -> dict[str, float]:
-        """The mean of each diagnostic."""
-        return {name: torch.stack(values).mean().item() for name, values in self._values.items()}
+        """The mean of each diagnostic.
+
+        Raises:
+            FloatingPointError: one is not finite; the learner is lost, and what it has written since is no good.
+        """
+        means = {name: torch.stack(values).mean().item() for name, values in self._values.items()}
+        for name, value in means.items():
+            if not math.isfinite(value):
+                raise FloatingPointError(f"{name} is {value}")
+        return means
 
 
 def set_learning_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:

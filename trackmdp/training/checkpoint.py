@@ -1,18 +1,17 @@
 """Checkpoints: one file each, whole or absent, with a hash over its bytes; tensors and plain values only.
 
-A file is one line of fixed length, naming the format and the SHA-256 of the rest, and then what `torch.save` writes.
+A file is what `torch.save` writes, and then one line of fixed length: the format, and the SHA-256 of all before it.
 """
 
 from __future__ import annotations
 
 import hashlib
-import io
 import os
 import pickle
 import re
-from collections.abc import Iterator
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, Any, BinaryIO, cast
 
 import torch
 
@@ -20,9 +19,10 @@ from trackmdp.errors import UserError
 
 __all__ = ["BEST", "FORMAT", "LAST", "available", "load", "newest", "save"]
 
-FORMAT = 2
+FORMAT = 3
 BEST, LAST = "best.pt", "last.pt"
-_HEADER = 128
+_SEAL = 128
+_SMALL = 2**20
 _NAME = re.compile(r"iteration-(\d+)\.pt")
 
 
@@ -32,15 +32,15 @@ def save(folder: Path, iteration: int, state: dict[str, Any], *, keep: int, best
     The file appears under its name only once its bytes are on the disk; a failure leaves the older ones as they were.
     """
     folder.mkdir(exist_ok=True)
+    for left in folder.glob("*.part"):  # of a process that was killed while it saved
+        left.unlink()
     file = folder / f"iteration-{iteration:08d}.pt"
     part = file.with_suffix(".part")
     try:
-        with part.open("w+b") as stream:
-            stream.write(_header("0" * 64))
-            torch.save({"format": FORMAT, "iteration": iteration, **state}, stream)
-            digest = _digest(stream)
-            stream.seek(0)
-            stream.write(_header(digest))
+        with part.open("wb") as stream:
+            hashed = _Hashed(stream)
+            torch.save({"format": FORMAT, "iteration": iteration, **state}, cast("IO[bytes]", hashed))
+            stream.write(_seal(hashed.digest.hexdigest()))
             stream.flush()
             os.fsync(stream.fileno())
         part.replace(file)
@@ -75,13 +75,15 @@ def newest(run: Path) -> Path:
 def load(file: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
     """Read a checkpoint; its bytes are checked before they are decoded, and no code in it is ever run.
 
+    On the CPU its tensors are pages of the file, read once they are needed: a large buffer is not held twice.
+
     Raises:
         UserError: the file is missing, damaged, foreign, or of another format.
     """
     try:
         with file.open("rb") as stream:
             _check(file, stream)
-            state = torch.load(io.BufferedReader(_Payload(stream)), map_location=device, weights_only=True)
+        state = torch.load(str(file), map_location=device, mmap=True, weights_only=True)
     except FileNotFoundError:
         raise UserError(f"{file}: no such file") from None
     except (RuntimeError, EOFError, OSError, ValueError, KeyError, pickle.UnpicklingError) as error:
@@ -90,58 +92,54 @@ def load(file: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
         raise UserError(f"{file}: a checkpoint that cannot be read ({type(error).__name__})") from error
     if not isinstance(state, dict) or state.get("format") != FORMAT:
         raise UserError(f"{file}: not the state of a run")
+    _take_out(state)
     return state
 
 
-class _Payload(io.RawIOBase):
-    """A file without its header, as a file of its own."""
+def _take_out(value: Any) -> None:
+    """Copy the small tensors out of the file's pages, so that at most a large one keeps the file open."""
+    if isinstance(value, torch.Tensor):
+        if value.nbytes <= _SMALL:
+            value.data = value.clone()
+    elif isinstance(value, (Mapping, list, tuple)):
+        for part in value.values() if isinstance(value, Mapping) else value:
+            _take_out(part)
+
+
+class _Hashed:
+    """A file that is only written to, front to back, and hashed on the way."""
 
     def __init__(self, stream: BinaryIO) -> None:
-        self._stream = stream
-        self.seek(0)
+        self._stream, self.digest = stream, hashlib.sha256()
 
-    def readable(self) -> bool:
-        return True
+    def write(self, piece: bytes) -> int:
+        self.digest.update(piece)
+        return self._stream.write(piece)
 
-    def seekable(self) -> bool:
-        return True
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        return self._stream.seek(offset + _HEADER if whence == os.SEEK_SET else offset, whence) - _HEADER
-
-    def tell(self) -> int:
-        return self._stream.tell() - _HEADER
-
-    def readinto(self, buffer: Any) -> int:
-        return self._stream.readinto(buffer)  # type: ignore[attr-defined]
+    def flush(self) -> None:
+        self._stream.flush()
 
 
-def _header(digest: str) -> bytes:
-    return f"trackmdp checkpoint {FORMAT} sha256 {digest}".encode().ljust(_HEADER - 1) + b"\n"
+def _seal(digest: str) -> bytes:
+    return f"\ntrackmdp checkpoint {FORMAT} sha256 {digest}".encode().ljust(_SEAL - 1) + b"\n"
 
 
 def _check(file: Path, stream: BinaryIO) -> None:
-    found = re.fullmatch(rb"trackmdp checkpoint (\d+) sha256 ([0-9a-f]{64}) *\n", stream.read(_HEADER))
+    size = max(stream.seek(0, os.SEEK_END) - _SEAL, 0)
+    stream.seek(size)
+    found = re.fullmatch(rb"\ntrackmdp checkpoint (\d+) sha256 ([0-9a-f]{64}) *\n", stream.read())
     if found is None:
-        raise UserError(f"{file}: not a checkpoint of this program")
+        raise UserError(f"{file}: damaged, or not a checkpoint of this program")
     if int(found[1]) != FORMAT:
         raise UserError(f"{file}: checkpoint format {int(found[1])}, expected {FORMAT}")
-    if _digest(stream) != found[2].decode():
-        raise UserError(f"{file}: damaged, its content does not match its hash")
-
-
-def _digest(stream: BinaryIO) -> str:
-    """SHA-256 of all that follows the header, in pieces, so that a large buffer is not held twice."""
-    stream.seek(_HEADER)
+    stream.seek(0)
     digest = hashlib.sha256()
-    for piece in _pieces(stream):
+    while size:
+        piece = stream.read(min(size, 2**20))
         digest.update(piece)
-    return digest.hexdigest()
-
-
-def _pieces(stream: BinaryIO) -> Iterator[bytes]:
-    while piece := stream.read(2**20):
-        yield piece
+        size -= len(piece)
+    if digest.hexdigest() != found[2].decode():
+        raise UserError(f"{file}: damaged, its content does not match its hash")
 
 
 def _numbered(folder: Path) -> list[Path]:
@@ -151,7 +149,6 @@ def _numbered(folder: Path) -> list[Path]:
 def _link(file: Path, name: Path) -> None:
     """Give `file` a second name, replacing what had it."""
     part = name.with_suffix(".part")
-    part.unlink(missing_ok=True)
     os.link(file, part)
     part.replace(name)
 

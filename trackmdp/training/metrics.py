@@ -65,11 +65,15 @@ class MetricsLog:
 def write_text(file: Path, text: str) -> None:
     """Write a file whole or not at all."""
     part = file.with_name(f"{file.name}.part")
-    with part.open("w") as stream:
-        stream.write(text)
-        stream.flush()
-        os.fsync(stream.fileno())
-    part.replace(file)
+    try:
+        with part.open("w") as stream:
+            stream.write(text)
+            stream.flush()
+            os.fsync(stream.fileno())
+        part.replace(file)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
 
 
 def write_json(file: Path, content: Mapping[str, Any]) -> None:

@@ -77,11 +77,11 @@ def restore(state: Mapping[str, Any], algorithm: Algorithm, collector: BaseColle
 def find(cfg: TrainConfig, folder: Path, device: torch.device) -> tuple[dict[str, Any] | None, list[str]]:
     """The state to go on from, None to start anew; and a line for each checkpoint that had to be passed over.
 
-    `resume=auto` and a run's folder fall back to the newest checkpoint that can be read; a checkpoint named by itself
-    is taken or refused.
+    `resume=auto` and a run's folder fall back to the newest checkpoint that can be read and is this run's; a checkpoint
+    named by itself is taken or refused.
 
     Raises:
-        UserError: nothing can be read, or it belongs to another run or to other versions.
+        UserError: every one is damaged, or belongs to another run or to other versions.
     """
     if cfg.resume is None:
         return None, []
@@ -93,14 +93,12 @@ def find(cfg: TrainConfig, folder: Path, device: torch.device) -> tuple[dict[str
     for file in files:
         try:
             state = checkpoint.load(file, device)
+            _check(state, cfg, file)
         except UserError as error:
             passed_over.append(str(error))
             continue
-        _check(state, cfg, file)
         return state, passed_over
-    raise UserError(
-        f"resume={cfg.resume}: no checkpoint that can be read ({'; '.join(passed_over) or 'there is none'})"
-    )
+    raise UserError(f"resume={cfg.resume}: no checkpoint to go on from ({'; '.join(passed_over) or 'there is none'})")
 
 
 def take_weights(algorithm: Algorithm, run: Path, device: torch.device) -> list[str]:
@@ -124,7 +122,7 @@ def take_weights(algorithm: Algorithm, run: Path, device: torch.device) -> list[
 
 
 def _check(state: Mapping[str, Any], cfg: TrainConfig, file: Path) -> None:
-    if state["identity"] != identity(cfg):
+    if state.get("identity") != identity(cfg):
         raise UserError(f"{file}: belongs to a run with another config")
     for name, written in state["versions"].items():
         if written != version(name):
