@@ -1,0 +1,63 @@
+"""A collector's worker processes: one that dies is noticed at once, also while the collector waits for its answer."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType, TracebackType
+from typing import Any
+
+from torchrl.collectors import BaseCollector
+
+__all__ = ["Watch"]
+
+
+class Watch:
+    """While entered, the end of a worker process of `collector` breaks off what waits for it.
+
+    TorchRL looks for dead workers where it waits for a batch, but waits for ever where one should acknowledge new
+    weights. Here SIGCHLD interrupts the wait. Outside the main thread, and without workers, nothing is done.
+    """
+
+    def __init__(self, collector: BaseCollector) -> None:
+        self._processes: list[Any] = list(getattr(collector, "procs", ()))
+        self._waiting = False
+
+    def __enter__(self) -> Watch:
+        self._before: Any = None
+        if self._processes and threading.current_thread() is threading.main_thread():
+            self._before = signal.signal(signal.SIGCHLD, self._heard)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if self._before is not None:
+            signal.signal(signal.SIGCHLD, self._before)
+
+    @contextmanager
+    def waiting(self) -> Iterator[None]:
+        """Around a call of the collector.
+
+        Raises:
+            RuntimeError: a worker has died, before or meanwhile.
+        """
+        self._waiting = True
+        try:
+            self._check()
+            yield
+        finally:
+            self._waiting = False
+
+    def _heard(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
+        if self._waiting:
+            self._check()
+
+    def _check(self) -> None:
+        for index, process in enumerate(self._processes):
+            code = process.exitcode
+            if code is not None:
+                how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with status {code}"
+                raise RuntimeError(f"worker {index} {how}")
