@@ -23,6 +23,7 @@ OURS = [line for line in COMMANDS if not line.startswith("python -c")]
 SHORT = {
     "train": ["collector.total_frames=8192", "collector.frames_per_batch=4096", "optimal.time_limit=1"],
     "evaluate": ["episodes=20"],
+    "replay": [],
 }
 
 

@@ -20,6 +20,7 @@ COMMANDS = {
     "solve": "solve a world with its motion model",
     "verify": "check the paper's theorems on a world",
     "benchmark": "measure speed and quality on this machine",
+    "replay": "list, play, verify and recover logged episodes, or show one as a web page",
 }
 
 

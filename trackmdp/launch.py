@@ -22,7 +22,17 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from trackmdp.config import ROOTS, EvaluateConfig, TrainConfig, WorldConfig, conf_dir, from_hydra, load_run, register
+from trackmdp.config import (
+    ROOTS,
+    CommandConfig,
+    EvaluateConfig,
+    TrainConfig,
+    WorldConfig,
+    conf_dir,
+    from_hydra,
+    load_run,
+    register,
+)
 from trackmdp.config.resume import continued, run_folder
 from trackmdp.diagnose import diagnose
 from trackmdp.errors import FAILED, USER_MISTAKE, RunError, UserError
@@ -146,9 +156,9 @@ class _Job:
         sys.stderr.write(f"trackmdp {self.command}: {self.failures[-1]}\n")
 
 
-def announce(command: str, cfg: WorldConfig, folder: Path) -> None:
+def announce(command: str, cfg: CommandConfig, folder: Path) -> None:
     """The first line at the terminal, before anything heavy is imported."""
-    if cfg.quiet:
+    if cfg.quiet or not isinstance(cfg, WorldConfig):
         return
     what = next((getattr(cfg, name).name for name in ("algo", "baseline", "solver") if getattr(cfg, name, None)), "")
     if isinstance(cfg, EvaluateConfig) and cfg.run is not None:
@@ -165,7 +175,7 @@ def _say(line: str) -> None:
     sys.stdout.flush()
 
 
-def _checked(command: str, cfg: DictConfig, task: Sequence[str], folder: Path) -> WorldConfig:
+def _checked(command: str, cfg: DictConfig, task: Sequence[str], folder: Path) -> CommandConfig:
     """The typed config of one job, with every check that does not need the heavy libraries."""
     if "hydra" in cfg:
         cfg = cfg.copy()
@@ -178,7 +188,7 @@ def _checked(command: str, cfg: DictConfig, task: Sequence[str], folder: Path) -
             if key.split(".")[0].split("@")[0] in WORLD_KEYS:
                 raise UserError(f"{word}: not together with run={typed.run}, whose own world is used")
         load_run(typed.run)
-    elif reads_files(typed):
+    elif isinstance(typed, WorldConfig) and reads_files(typed):
         from trackmdp.build import make_world
 
         make_world(typed)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,10 @@ from rich.console import Console
 from tensordict.nn import TensorDictModuleBase
 
 from trackmdp.build import make_algorithm, make_baseline, make_device, make_world
-from trackmdp.config import EvaluateConfig, RandomK, load_run
+from trackmdp.commands import playback
+from trackmdp.config import EvaluateConfig, Mcap, Playback, RandomK, load_run, to_yaml
+from trackmdp.episodes.log import EpisodeLog
+from trackmdp.episodes.record import Chains, RandomSets
 from trackmdp.policies import fixed
 from trackmdp.policies.fixed import ChainPolicy
 from trackmdp.reports.picture import draw
@@ -34,6 +38,8 @@ def run(cfg: EvaluateConfig, folder: Path) -> float:
     console = make_console(cfg.quiet)
     torch.set_num_threads(cfg.threads)
     device = make_device(cfg.device)
+    if isinstance(cfg.baseline, Playback):
+        return playback.run(cfg, folder, console, device)
     world, max_steps, chains, subject = _trained(cfg, device) if cfg.run else _baseline(cfg)
     judge = Judge(world, max_steps)
     verdict = judge.score(chains)
@@ -51,12 +57,38 @@ def run(cfg: EvaluateConfig, folder: Path) -> float:
         write_json(folder / "sets.json", sets_of(chains))
         write_text(folder / "picture.txt", draw(world, chains, seed=cfg.seed))
     _show(console, subject, judge, verdict, simulation, folder)
+    if cfg.log is not None:
+        _log_episodes(cfg, world, max_steps, chains, subject, folder, console)
     if estimate is not None:
         shares = (
             f"from Q {estimate.exact:.2%} (printed form {estimate.paper:.2%}), from the belief {estimate.bayes:.2%}"
         )
         console.print(f"missed steps whose position is estimated right: {shares}")
     return verdict.evaluation.aihtr
+
+
+def _log_episodes(
+    cfg: EvaluateConfig,
+    world: World,
+    max_steps: int | None,
+    chains: np.ndarray,
+    subject: str,
+    folder: Path,
+    console: Console,
+) -> None:
+    """Write `episodes.mcap`: as many episodes as are simulated, each from a generator of its own."""
+    assert isinstance(cfg.log, Mcap)
+    described = to_yaml(load_run(cfg.run) if cfg.run else cfg)
+    warn = partial(console.print, markup=False, style="bold")
+    log = EpisodeLog(
+        folder, world, seed=cfg.seed, config=described, max_steps=max_steps, layout=cfg.log.layout, warn=warn
+    )
+    if isinstance(cfg.baseline, RandomK):
+        log.record(RandomSets(world.num_cells, cfg.baseline.k), {"label": subject}, cfg.episodes)
+    else:
+        log.record(Chains(chains), {"label": subject}, cfg.episodes)
+    log.close()
+    console.print(f"{log.episodes} episodes in {log.file}", markup=False)
 
 
 def _trained(cfg: EvaluateConfig, device: torch.device) -> tuple[World, int | None, np.ndarray, str]:

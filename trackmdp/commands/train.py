@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import io
+import json
 import math
 import platform
 import time
@@ -20,7 +21,9 @@ from torchrl.collectors import BaseCollector
 from trackmdp import __version__
 from trackmdp.algos.common import Algorithm
 from trackmdp.build import make_algorithm, make_collector, make_device, make_world
-from trackmdp.config import TrainConfig, to_yaml
+from trackmdp.config import Mcap, TrainConfig, to_yaml
+from trackmdp.episodes.log import EpisodeLog
+from trackmdp.episodes.record import Chains
 from trackmdp.errors import RunError, UserError
 from trackmdp.seeding import seed_global
 from trackmdp.solvers import optimal
@@ -38,17 +41,31 @@ __all__ = ["run"]
 
 
 def run(cfg: TrainConfig, folder: Path) -> float:
-    """Train as `cfg` says and write config, kernel, metrics, checkpoints and summary to `folder`; returns the AIHTR."""
+    """Train as `cfg` says and write config, kernel, metrics, checkpoints and summary to `folder`; returns the AIHTR.
+
+    Raises:
+        UserError: the config asks for what is not there, or for more memory than there is.
+        RunError: learning or writing broke down.
+        Preempted: a signal ended the run; it can go on.
+    """
     try:
         with locked(folder):
             return _run(cfg, folder)
     except OSError as error:
-        raise RunError(f"{error.filename or folder}: {error.strerror or error}; the last checkpoint stands") from error
+        if not folder.is_dir():
+            raise RunError(f"hydra.run.dir={folder}: the folder was removed while the run wrote to it") from error
+        raise RunError(
+            f"{error.filename or folder}: {error.strerror or error}; resume=auto goes on from the last checkpoint"
+        ) from error
 
 
 def _run(cfg: TrainConfig, folder: Path) -> float:
     started, used = time.monotonic(), time.process_time()
     console = make_console(cfg.quiet)
+    reached = _finished(cfg, folder)
+    if reached is not None:
+        console.print(f"finished before; results in {folder}")
+        return reached
     torch.set_num_threads(cfg.threads)
     device = make_device(cfg.device)
     world = make_world(cfg)
@@ -63,6 +80,7 @@ def _run(cfg: TrainConfig, folder: Path) -> float:
     metrics = MetricsLog(folder, tensorboard=cfg.log.name == "tensorboard", position=state["metrics"] if state else 0)
     start = _start(cfg, algorithm, collector, state, console, device)
     best = state["best"] if state else -math.inf
+    del state  # it may hold a replay buffer
 
     def save(at: Position, verdict: Verdict) -> None:
         nonlocal best
@@ -71,15 +89,23 @@ def _run(cfg: TrainConfig, folder: Path) -> float:
         content = capture(cfg, algorithm, collector, at, metrics=metrics.position, best=best)
         checkpoint.save(folder / "checkpoints", at.iteration, content, keep=cfg.checkpoint.keep, best=better)
 
+    log = _episode_log(cfg, world, folder, console)
+
+    def record(iteration: int, chains: np.ndarray) -> None:
+        if log is not None and isinstance(cfg.log, Mcap) and _recorded(cfg, iteration, algorithm.iterations):
+            log.record(Chains(chains), {"label": f"iteration {iteration}"}, cfg.log.episodes, iteration)
+
     every = Intervals(cfg.evaluation.every, cfg.log.every, cfg.checkpoint.every, cfg.checkpoint.seconds)
     try:
         with Display(
             console, f"{cfg.algo.name} seed {cfg.seed}", algorithm.iterations, start.iteration, start.frames
         ) as display:
-            verdict, end = train(algorithm, collector, judge, metrics, display, every, save, start)
+            verdict, end = train(algorithm, collector, judge, metrics, display, every, save, start, record)
     finally:
         collector.shutdown()
         metrics.close()
+        if log is not None:
+            log.close()
     solution = _solve(cfg, world, console)
     if solution is not None:
         verdict = judge.tighten(solution.upper, verdict)
@@ -91,6 +117,22 @@ def _run(cfg: TrainConfig, folder: Path) -> float:
     _show(console, cfg, judge, verdict, solution)
     console.print(f"{times['wall_seconds']:.1f} s; results in {folder}")
     return verdict.evaluation.aihtr
+
+
+def _finished(cfg: TrainConfig, folder: Path) -> float | None:
+    """The AIHTR of a run that has nothing left to do; what an older config led to does not count, and is removed."""
+    file = folder / "summary.json"
+    if cfg.resume is None or not file.is_file():
+        return None
+    summary = json.loads(file.read_text(encoding="utf-8"))
+    if summary["config_sha256"] == _digest(cfg):
+        return float(summary["policy"]["aihtr"])
+    file.unlink()
+    return None
+
+
+def _digest(cfg: TrainConfig) -> str:
+    return hashlib.sha256(to_yaml(dataclasses.replace(cfg, resume=None)).encode()).hexdigest()
 
 
 def _start(
@@ -111,6 +153,28 @@ def _start(
             f"weights from {cfg.init_from}: {', '.join(take_weights(algorithm, Path(cfg.init_from), device))}"
         )
     return Position()
+
+
+def _episode_log(cfg: TrainConfig, world: World, folder: Path, console: Console) -> EpisodeLog | None:
+    """The log of simulated episodes, where it is asked for."""
+    if not isinstance(cfg.log, Mcap):
+        return None
+    described = to_yaml(dataclasses.replace(cfg, resume=None))
+    return EpisodeLog(
+        folder,
+        world,
+        seed=cfg.seed,
+        config=described,
+        max_steps=cfg.grid.max_steps,
+        layout=cfg.log.layout,
+        warn=console.print,
+    )
+
+
+def _recorded(cfg: TrainConfig, iteration: int, last: int) -> bool:
+    """Whether episodes of the evaluation after an iteration are logged: the first, every k-th, and the last."""
+    assert isinstance(cfg.log, Mcap)
+    return iteration in (1, last) or iteration % (cfg.evaluation.every * cfg.log.evaluations) == 0
 
 
 def _solve(cfg: TrainConfig, world: World, console: Console) -> Solution | None:
@@ -163,7 +227,7 @@ def _summary(
         "regret_per_step": verdict.regret_per_step,
         "versions": {"trackmdp": __version__, "python": platform.python_version()}
         | {name: version(name) for name in packages},
-        "config_sha256": hashlib.sha256(to_yaml(dataclasses.replace(cfg, resume=None)).encode()).hexdigest(),
+        "config_sha256": _digest(cfg),
     }
 
 

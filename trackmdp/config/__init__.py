@@ -9,6 +9,7 @@ from trackmdp.config.baselines import (
     Myopic,
     NoSensors,
     Optimal,
+    Playback,
     Qmdp,
     RandomK,
 )
@@ -22,6 +23,7 @@ from trackmdp.config.learning import (
     Dqn,
     Hindsight,
     Log,
+    Mcap,
     MultiAsync,
     MultiSync,
     Ppo,
@@ -35,15 +37,17 @@ from trackmdp.config.roots import (
     ROOTS,
     BenchmarkConfig,
     Checkpoint,
+    CommandConfig,
     EvaluateConfig,
     Evaluation,
     OptimalBound,
+    ReplayConfig,
     SolveConfig,
     TrainConfig,
     VerifyConfig,
     WorldConfig,
 )
-from trackmdp.config.tree import conf_dir, from_hydra, load, load_run, register, suggestion, to_dict, to_yaml
+from trackmdp.config.tree import conf_dir, from_hydra, load, load_run, register, suggestion, to_dict, to_yaml, world_of
 from trackmdp.config.world import Cost, Drift, Grid, Kernel, PaperCost, RandomSupport, RandomWalk, Table
 
 __all__ = [
@@ -57,6 +61,7 @@ __all__ = [
     "Checkpoint",
     "Clocked",
     "Collector",
+    "CommandConfig",
     "Cost",
     "Csv",
     "Dqn",
@@ -70,6 +75,7 @@ __all__ = [
     "LearnedKernel",
     "Log",
     "Lookahead",
+    "Mcap",
     "MultiAsync",
     "MultiSync",
     "Myopic",
@@ -78,12 +84,14 @@ __all__ = [
     "OptimalBound",
     "Option",
     "PaperCost",
+    "Playback",
     "Ppo",
     "Prioritized",
     "Qmdp",
     "RandomK",
     "RandomSupport",
     "RandomWalk",
+    "ReplayConfig",
     "Schedule",
     "Single",
     "SolveConfig",
@@ -102,4 +110,5 @@ __all__ = [
     "to_dict",
     "to_yaml",
     "validate",
+    "world_of",
 ]

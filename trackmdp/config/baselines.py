@@ -10,7 +10,19 @@ from typing import ClassVar
 
 from trackmdp.config.options import choice, option
 
-__all__ = ["AllOn", "Baseline", "Clocked", "Fcr", "Lookahead", "Myopic", "NoSensors", "Optimal", "Qmdp", "RandomK"]
+__all__ = [
+    "AllOn",
+    "Baseline",
+    "Clocked",
+    "Fcr",
+    "Lookahead",
+    "Myopic",
+    "NoSensors",
+    "Optimal",
+    "Playback",
+    "Qmdp",
+    "RandomK",
+]
 
 
 @dataclass(kw_only=True)
@@ -91,3 +103,12 @@ class Optimal(Baseline):
 
     time_limit: float = option("stop closing the bracket after this long", unit="s", gt=0)
     tolerance: float = option("bracket that counts as closed, relative to the value", ge=0, lt=1)
+
+
+@choice("baseline", "playback")
+@dataclass(kw_only=True)
+class Playback(Baseline):
+    """The actions of a logged episode again, step by step, whatever is observed; none on after the last."""
+
+    file: str = option("the log", expects="a file written with log=mcap")
+    episode: int = option("which of its episodes", ge=0)

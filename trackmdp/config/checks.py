@@ -8,10 +8,18 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from trackmdp.config.baselines import RandomK
-from trackmdp.config.learning import Collector, Dqn, Ppo, Schedule, Workers
+from trackmdp.config.baselines import Playback, RandomK
+from trackmdp.config.learning import Collector, Dqn, Mcap, Ppo, Schedule, Workers
 from trackmdp.config.options import Option, options, refuse
-from trackmdp.config.roots import BenchmarkConfig, EvaluateConfig, SolveConfig, TrainConfig, WorldConfig
+from trackmdp.config.roots import (
+    BenchmarkConfig,
+    CommandConfig,
+    EvaluateConfig,
+    ReplayConfig,
+    SolveConfig,
+    TrainConfig,
+    WorldConfig,
+)
 from trackmdp.config.world import Cost, PaperCost, RandomSupport, Table
 from trackmdp.errors import UserError
 
@@ -36,7 +44,7 @@ def nodes(cfg: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
             yield from nodes(value, f"{prefix}.{name}".lstrip("."))
 
 
-def validate(cfg: WorldConfig) -> None:
+def validate(cfg: CommandConfig) -> None:
     """Raise a `UserError` naming key, value and allowed range for the first option that breaks a rule."""
     for key, described, value in leaves(cfg):
         if not described.allows(value):
@@ -46,6 +54,8 @@ def validate(cfg: WorldConfig) -> None:
     for key, node in nodes(cfg):
         if isinstance(node, Schedule) and node.until < node.begin:
             raise refuse(f"{key}.until", node.until, f"not less than {key}.begin={node.begin}")
+    if not isinstance(cfg, WorldConfig):
+        return
     _check_kernel(cfg)
     _check_cost(cfg.cost, cfg.grid.size**2)
     if isinstance(cfg, TrainConfig):
@@ -55,14 +65,21 @@ def validate(cfg: WorldConfig) -> None:
         _check_judged(cfg)
 
 
-def absolute_paths(cfg: WorldConfig, folder: Path) -> None:
+def absolute_paths(cfg: CommandConfig, folder: Path) -> None:
     """Resolve every path of the config against `folder`, where the user typed the command."""
+    if isinstance(cfg, ReplayConfig):
+        cfg.file = str(folder / cfg.file)
+        cfg.html, cfg.csv, cfg.layout = (path and str(folder / path) for path in (cfg.html, cfg.csv, cfg.layout))
+    if not isinstance(cfg, WorldConfig):
+        return
     if isinstance(cfg.kernel, Table):
         cfg.kernel.path = str(folder / cfg.kernel.path)
     if isinstance(cfg.cost, PaperCost) and isinstance(cfg.cost.sensor, str):
         cfg.cost.sensor = str(folder / cfg.cost.sensor)
     if isinstance(cfg, EvaluateConfig) and cfg.run is not None:
         cfg.run = str(folder / cfg.run)
+    if isinstance(cfg, EvaluateConfig) and isinstance(cfg.baseline, Playback):
+        cfg.baseline.file = str(folder / cfg.baseline.file)
     if isinstance(cfg, TrainConfig):
         if cfg.resume not in (None, "auto"):
             cfg.resume = str(folder / cfg.resume)
@@ -135,6 +152,12 @@ def _check_judged(cfg: EvaluateConfig | SolveConfig) -> None:
         if (cfg.run is None) == (cfg.baseline is None):
             given = "neither" if cfg.run is None else "both"
             raise UserError(f"expected exactly one of run=FOLDER and baseline=NAME, got {given}")
+        if cfg.log is not None and not isinstance(cfg.log, Mcap):
+            raise refuse("log", cfg.log.name, "mcap or null; an evaluation has no iterations")
+        if isinstance(cfg.baseline, Playback) and cfg.log is not None:
+            raise refuse("log", cfg.log.name, "null with baseline=playback, whose episodes are logged already")
+        if isinstance(cfg.baseline, Playback) and cfg.episodes == 0:
+            raise refuse("episodes", 0, "at least 1 with baseline=playback, which is only simulated")
         if isinstance(cfg.baseline, RandomK) and cfg.baseline.k > cfg.grid.size**2:
             cells = cfg.grid.size**2
             raise refuse(

@@ -15,6 +15,7 @@ __all__ = [
     "Dqn",
     "Hindsight",
     "Log",
+    "Mcap",
     "MultiAsync",
     "MultiSync",
     "Ppo",
@@ -192,3 +193,15 @@ class Csv(Log):
 @dataclass(kw_only=True)
 class Tensorboard(Log):
     """`metrics.csv` and TensorBoard event files."""
+
+
+@choice("log", "mcap")
+@dataclass(kw_only=True)
+class Mcap(Log):
+    """`episodes.mcap`: simulated episodes, step by step, for `replay` and viewers; in training `metrics.csv` too."""
+
+    evaluations: int = option(
+        "training: from one recorded evaluation to the next; the last is recorded too", unit="evaluations", ge=1
+    )
+    episodes: int = option("training: episodes recorded of each such evaluation", unit="episodes", ge=1)
+    layout: bool = option("write a viewer's layout next to the log")

@@ -1,4 +1,4 @@
-"""Schema of each command: what can be set for train, evaluate, solve, verify and benchmark."""
+"""Schema of each command: what can be set for it."""
 
 from __future__ import annotations
 
@@ -13,9 +13,11 @@ __all__ = [
     "ROOTS",
     "BenchmarkConfig",
     "Checkpoint",
+    "CommandConfig",
     "EvaluateConfig",
     "Evaluation",
     "OptimalBound",
+    "ReplayConfig",
     "SolveConfig",
     "TrainConfig",
     "VerifyConfig",
@@ -24,10 +26,16 @@ __all__ = [
 
 
 @dataclass(kw_only=True)
-class WorldConfig:
-    """What every command has: a world, and how much is said."""
+class CommandConfig:
+    """What every command has."""
 
     quiet: bool = option("say nothing at the terminal but errors")
+
+
+@dataclass(kw_only=True)
+class WorldConfig(CommandConfig):
+    """What every command has that takes place in a world."""
+
     grid: Grid
     kernel: Kernel
     cost: Cost
@@ -85,6 +93,7 @@ class EvaluateConfig(WorldConfig):
 
     run: str | None = option("folder of a training run; its world is taken from there", expects="the folder of a run")
     baseline: Baseline | None
+    log: Log | None
     seed: int = option("seed of the simulated episodes", ge=0)
     device: str = option("device of the simulation", expects="cpu, cuda, cuda:N or auto")
     threads: int = option("torch threads", unit="threads", ge=1, le=256)
@@ -110,7 +119,9 @@ class VerifyConfig(WorldConfig):
 class BenchmarkConfig(WorldConfig):
     """Measure speed and quality on this machine."""
 
-    part: str = option("what is measured", choices=("env", "collector", "train", "quality", "solver", "learned_kernel"))
+    part: str = option(
+        "what is measured", choices=("env", "collector", "train", "quality", "solver", "learned_kernel", "log")
+    )
     seed: int = option("every random draw derives from it", ge=0)
     device: str = option("device of environments and networks", expects="cpu, cuda, cuda:N or auto")
     threads: int = option("torch threads", unit="threads", ge=1, le=256)
@@ -120,11 +131,26 @@ class BenchmarkConfig(WorldConfig):
     peers: str | None = option("folder with the scripts of the peers to run beside ours", expects="a folder")
 
 
-ROOTS: dict[str, type[WorldConfig]] = {
+@dataclass(kw_only=True)
+class ReplayConfig(CommandConfig):
+    """Look at logged episodes, prove them, rebuild a damaged log; without more than file=, list what it holds."""
+
+    file: str = option("the log", expects="a file written with log=mcap")
+    episode: int | None = option("play this episode; for html= and csv= the one that is written", ge=0)
+    verify: bool = option("re-simulate every episode and name the first difference")
+    recover: bool = option("write every whole episode of a cut or damaged log to a new one beside it")
+    html: str | None = option("write one episode (by default the first) as a web page", expects="a file to write")
+    csv: str | None = option("write steps.csv and episodes.csv", expects="a folder")
+    layout: str | None = option("write the layout for viewers", expects="a file to write")
+    speed: float = option("speed of playing", unit="steps/s", gt=0, le=1000)
+
+
+ROOTS: dict[str, type[CommandConfig]] = {
     "train": TrainConfig,
     "evaluate": EvaluateConfig,
     "solve": SolveConfig,
     "verify": VerifyConfig,
     "benchmark": BenchmarkConfig,
+    "replay": ReplayConfig,
 }
 """Command -> its schema; `conf/<command>.yaml` holds the values."""

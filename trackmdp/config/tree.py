@@ -15,7 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from trackmdp.config.checks import absolute_paths, validate
 from trackmdp.config.options import GROUPS, Option, options
-from trackmdp.config.roots import ROOTS, TrainConfig, WorldConfig
+from trackmdp.config.roots import ROOTS, CommandConfig, TrainConfig, WorldConfig
 from trackmdp.errors import UserError
 
 __all__ = [
@@ -28,9 +28,10 @@ __all__ = [
     "suggestion",
     "to_dict",
     "to_yaml",
+    "world_of",
 ]
 
-C = TypeVar("C", bound=WorldConfig)
+C = TypeVar("C", bound=CommandConfig)
 
 
 def conf_dir() -> str:
@@ -129,6 +130,23 @@ def load(file: Path, root: type[C]) -> C:
         validate(typed)
     except UserError as error:
         raise UserError(f"{file}: {error}") from error
+    return typed
+
+
+def world_of(text: str) -> WorldConfig:
+    """The world that the text of a `config.yaml` describes, whatever command it was written by.
+
+    Raises:
+        UserError: it does not describe one.
+    """
+    try:
+        plain = OmegaConf.to_container(OmegaConf.create(text))
+    except Exception as error:
+        raise UserError(f"not a config ({_first_line(error)})") from error
+    assert isinstance(plain, Mapping)
+    known = options(WorldConfig)
+    typed: WorldConfig = _build({key: value for key, value in plain.items() if key in known}, WorldConfig, "")
+    validate(typed)
     return typed
 
 

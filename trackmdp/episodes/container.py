@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-import lz4.frame
 import zstandard
 
 from trackmdp.errors import UserError
@@ -219,7 +218,8 @@ def opened(file: Path) -> BinaryIO:
     try:
         stream = file.open("rb")
     except OSError as error:
-        raise UserError(f"file={file}: {(error.strerror or 'cannot be read').lower()}, expected an MCAP file") from error
+        reason = (error.strerror or "cannot be read").lower()
+        raise UserError(f"file={file}: {reason}, expected an MCAP file") from error
     start = stream.read(len(MAGIC))
     if start != MAGIC:
         stream.close()
@@ -304,7 +304,7 @@ def unpacked(data: bytes) -> tuple[tuple[int, int, int, str, int], bytes]:
         raise Damaged(f"a chunk of {size} bytes")
     try:
         content = _UNPACK[compression](packed, size)
-    except (KeyError, zstandard.ZstdError, RuntimeError, MemoryError, ValueError) as error:
+    except (KeyError, zstandard.ZstdError, MemoryError) as error:
         raise Damaged(f"a chunk that cannot be decompressed ({compression or 'none'})") from error
     if len(content) != size or zlib.crc32(content) != checksum or checksum == 0:
         raise Damaged("the checksum of a chunk")
@@ -312,9 +312,8 @@ def unpacked(data: bytes) -> tuple[tuple[int, int, int, str, int], bytes]:
 
 
 _UNPACK = {
-    "": lambda packed, size: packed,  # noqa: ARG005
+    "": lambda packed, size: packed,
     "zstd": lambda packed, size: zstandard.ZstdDecompressor().decompress(packed, max_output_size=size),
-    "lz4": lambda packed, size: lz4.frame.decompress(packed),  # noqa: ARG005
 }
 
 

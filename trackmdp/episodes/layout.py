@@ -18,7 +18,10 @@ def layout() -> dict[str, Any]:
         "3D!policy": _map("policy"),
         "Plot!misses": _plot("/step.n", "/step.n_active"),
         "Plot!reward": _plot("/step.reward", "/step.ep_return"),
-        "StateTransitions!seen": {"isSynced": True, "paths": [{"value": "/step.obs", "timestampMethod": "publishTime"}]},
+        "StateTransitions!seen": {
+            "isSynced": True,
+            "paths": [{"value": "/step.obs", "timestampMethod": "publishTime"}],
+        },
         "RawMessages!episode": {"topicPath": "/episode"},
     }
     maps = _split("row", "3D!belief", "3D!policy")

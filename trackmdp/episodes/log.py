@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from trackmdp.episodes.layout import write_layout
-from trackmdp.episodes.record import Acting, Chains, record
+from trackmdp.episodes.record import Acting, record
 from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.seeding import derive
 from trackmdp.world.model import World
@@ -58,10 +58,8 @@ class EpisodeLog:
             return
         seeds = [derive(self._seed, "episode", *names, number) for number in range(episodes)]
         try:
-            policy = self._writer.add_policy(facts, acting.chains if isinstance(acting, Chains) else None)
-            recorded = record(
-                self._world, acting, seeds, first=self.episodes, policy=policy, max_steps=self._max_steps
-            )
+            policy = self._writer.add_policy({**facts, **acting.facts}, getattr(acting, "chains", None))
+            recorded = record(self._world, acting, seeds, first=self.episodes, policy=policy, max_steps=self._max_steps)
             for episode in recorded:
                 self._writer.add(episode)
                 self.episodes += 1

@@ -16,9 +16,12 @@ from trackmdp.errors import UserError
 __all__ = ["decode", "grid_messages", "row_of", "step_messages"]
 
 _CELL = np.dtype([("belief", "<f4"), ("policy", "<f4"), ("active", "u1"), ("target", "u1")])
-_TYPES = {"<f4": 7, "|u1": 1}  # foxglove.NumericType
+_FLOAT32, _UINT8 = 7, 1  # foxglove.NumericType
 _FIELDS = [
-    {"name": name, "offset": int(_CELL.fields[name][1]), "type": _TYPES[_CELL[name].str]} for name in _CELL.names
+    {"name": "belief", "offset": 0, "type": _FLOAT32},
+    {"name": "policy", "offset": 4, "type": _FLOAT32},
+    {"name": "active", "offset": 8, "type": _UINT8},
+    {"name": "target", "offset": 9, "type": _UINT8},
 ]
 _POSE = {"position": {"x": 0, "y": 0, "z": 0}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}
 _WORDS = ("false", "true")
@@ -50,18 +53,16 @@ def step_messages(episode: Episode, size: int, t_max: int) -> Iterator[bytes]:
     y = np.where(target < 0, -1, size - 1 - target // size)
     steps, ids = np.nonzero(episode.action)
     active = [",".join(map(str, each.tolist())) for each in np.split(ids, np.searchsorted(steps, range(1, last + 1)))]
-    columns = (
-        (episode.misses, episode.last_cell, episode.action.sum(1), episode.forced(t_max))
-        + (target, x, y, episode.observation)
-        + (episode.reward.astype(np.float64), episode.returns)
-    )
+    known = (episode.misses, episode.last_cell, episode.action.sum(1), episode.forced(t_max))
+    came = (target, x, y, episode.observation, episode.reward.astype(np.float64), episode.returns)
     for t, (n, cell, count, forced, at, at_x, at_y, obs, reward, total) in enumerate(
-        zip(*(column.tolist() for column in columns), strict=True)
+        zip(*(column.tolist() for column in (*known, *came)), strict=True)
     ):
         yield (
             f'{{"episode":{episode.number},"t":{t},"n":{n},"last_cell":{cell},"active":[{active[t]}],'
             f'"n_active":{count},"forced":{_WORDS[forced]},"target":{at},"target_x":{at_x},"target_y":{at_y},'
-            f'"obs":{obs},"reward":{reward!r},"ep_return":{total!r},"first":{_WORDS[t == 0]},"last":{_WORDS[t == last]}}}'
+            f'"obs":{obs},"reward":{reward!r},"ep_return":{total!r},'
+            f'"first":{_WORDS[t == 0]},"last":{_WORDS[t == last]}}}'
         ).encode()
 
 

@@ -155,7 +155,7 @@ class EpisodeReader:
         if table is None:
             return None
         cells = int(self.run["size"]) ** 2
-        return np.unpackbits(_load(table), axis=-1, count=cells).astype(bool)
+        return np.unpackbits(_load(table).astype(np.uint8), axis=-1, count=cells).astype(bool)
 
     def world(self) -> World:
         """The world in which the episodes were recorded."""

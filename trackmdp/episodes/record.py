@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import torch
@@ -28,12 +28,27 @@ _CELLS_AT_ONCE = 25_600  # rows x cells stepped together: memory stays bounded o
 class Acting(Protocol):
     """A policy as it is recorded: a pure function of state and draws."""
 
-    draws: int
-    """Uniform draws one decision takes."""
+    @property
+    def draws(self) -> int:
+        """Uniform draws one decision takes."""
+        ...
+
+    @property
+    def facts(self) -> dict[str, str]:
+        """What a log says of it: its `kind` and what else it takes to act again."""
+        ...
 
     def act(self, state: dict[str, Tensor], step: int, draws: Tensor) -> tuple[Tensor, Tensor | None]:
-        """`action` `[B, M]` bool at step `step` of the episode from `draws` `[B, draws]`, and the probability `[B, M]`
-        with which each sensor was to be on (None: the action itself)."""
+        """What is done in a state.
+
+        Args:
+            state: the keys of `TrackEnv`, `[B, ...]`.
+            step: of the episode.
+            draws: `[B, draws]`, uniform.
+
+        Returns:
+            `action` `[B, M]`, and the probability `[B, M]` with which each sensor was to be on (None: the action).
+        """
         ...
 
 
@@ -41,6 +56,7 @@ class Chains:
     """A deterministic policy by its chains `[M, t_max+1, M]`."""
 
     draws = 0
+    facts: ClassVar = {"kind": "chains"}
 
     def __init__(self, chains: BoolArray) -> None:
         self.chains = chains
@@ -64,6 +80,11 @@ class RandomSets:
         """One for each cell."""
         return self.num_cells
 
+    @property
+    def facts(self) -> dict[str, str]:
+        """See `Acting`."""
+        return {"kind": "random_k", "k": str(self.k)}
+
     def act(self, state: dict[str, Tensor], step: int, draws: Tensor) -> tuple[Tensor, Tensor | None]:  # noqa: ARG002
         """See `Acting`."""
         action = torch.zeros(draws.shape, dtype=torch.bool)
@@ -75,6 +96,7 @@ class Issued:
     """The actions `[T, M]` of a logged episode, in their order; no sensor on after the last."""
 
     draws = 0
+    facts: ClassVar = {"kind": "playback"}
 
     def __init__(self, actions: BoolArray) -> None:
         self._actions = torch.as_tensor(actions)
@@ -159,7 +181,7 @@ class _Batch:
             moves, choices = self._draws.at(step, running)
             action, probability = self._acting.act(state, step, choices)
             predicted = self._predict(belief)
-            following = self._env.advance(state | {"action": action}, moves)  # type: ignore[arg-type]
+            following = self._env.advance(state | {"action": action}, moves)
             taken.append(_kept(running, state, action, probability, predicted, following))
             running = running & ~following["done"].squeeze(-1)
             if not running.any():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 from tensordict import TensorDictBase
@@ -16,6 +17,8 @@ from trackmdp.training.evaluate import chains_of
 from trackmdp.training.judge import Judge, Verdict
 from trackmdp.training.metrics import MetricsLog
 from trackmdp.training.signals import Signals
+from trackmdp.training.workers import Watch
+from trackmdp.world.model import BoolArray
 
 __all__ = ["Intervals", "Position", "train"]
 
@@ -55,6 +58,7 @@ def train(
     every: Intervals,
     save: Callable[[Position, Verdict], None],
     start: Position,
+    on_judged: Callable[[int, BoolArray], None] | None = None,
 ) -> tuple[Verdict, Position]:
     """Collect, learn, judge, log and save, until the algorithm's iterations are done.
 
@@ -67,6 +71,7 @@ def train(
         every: the intervals.
         save: writes a checkpoint of this moment, a boundary between two iterations.
         start: where an earlier process left the run.
+        on_judged: called with the iteration and the chains of each policy judged.
 
     Returns:
         The last verdict and position.
@@ -78,21 +83,24 @@ def train(
     began, batches = time.monotonic() - start.seconds, iter(collector)
     saved, at = start, start
     verdict = judge.score(chains_of(algorithm.actor, judge.world, algorithm.device))
-    with Signals() as signals:
+    with Signals() as signals, Watch(collector) as watch:
         for iteration in range(start.iteration + 1, algorithm.iterations + 1):
-            batch = _next(batches, iteration)
+            batch = _next(batches, watch, iteration)
             try:
                 diagnostics = algorithm.step(batch)
             except FloatingPointError as error:
                 raise RunError(f"iteration {iteration}: {error}; the last checkpoint holds a good state") from error
             if batch is not None:
-                collector.update_policy_weights_()
+                _hand_over(collector, watch, iteration)
             frames = at.frames + (batch.numel() if batch is not None else 0)
             at = Position(iteration, frames, time.monotonic() - began)
             last = iteration == algorithm.iterations
             judged = last or iteration == 1 or iteration % every.evaluate == 0
             if judged:
-                verdict = judge.score(chains_of(algorithm.actor, judge.world, algorithm.device))
+                chains = chains_of(algorithm.actor, judge.world, algorithm.device)
+                verdict = judge.score(chains)
+                if on_judged is not None:
+                    on_judged(iteration, chains)
             if last or iteration % every.log == 0:
                 metrics.write(_row(at, verdict if judged else None, diagnostics))
             if last or signals.received or _due(saved, at, every):
@@ -104,13 +112,26 @@ def train(
     return verdict, replace(at, seconds=time.monotonic() - began)
 
 
-def _next(batches: Iterator[TensorDictBase], iteration: int) -> TensorDictBase | None:
-    try:
+def _next(batches: Iterator[TensorDictBase], watch: Watch, iteration: int) -> TensorDictBase | None:
+    with _named(iteration), watch.waiting():
         return next(batches, None)
+
+
+def _hand_over(collector: BaseCollector, watch: Watch, iteration: int) -> None:
+    """Collect with the new weights from now on."""
+    with _named(iteration), watch.waiting():
+        collector.update_policy_weights_()
+
+
+@contextmanager
+def _named(iteration: int) -> Iterator[None]:
+    """Where and why collecting broke down."""
+    try:
+        yield
     except (RuntimeError, OSError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise RunError(
-            f"iteration {iteration}: collecting broke down ({reason}); the last checkpoint stands"
+            f"iteration {iteration}: collecting broke down ({reason}); resume=auto goes on from the last checkpoint"
         ) from error
 
 

@@ -1,0 +1,67 @@
+"""`evaluate baseline=playback`: the actions of a logged episode again, on its own target and on others."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+from rich.console import Console
+
+from trackmdp.build import make_world
+from trackmdp.config import EvaluateConfig, Playback
+from trackmdp.episodes.episode import Episode
+from trackmdp.episodes.reader import EpisodeReader
+from trackmdp.episodes.record import Issued, record
+from trackmdp.errors import UserError
+from trackmdp.policies import playback
+from trackmdp.training.display import table
+from trackmdp.training.evaluate import simulate
+from trackmdp.training.metrics import write_json
+from trackmdp.world.model import World
+
+__all__ = ["run"]
+
+
+def run(cfg: EvaluateConfig, folder: Path, console: Console, device: torch.device) -> float:
+    """Write `evaluation.json` to `folder`; returns the simulated AIHTR.
+
+    Such a policy ignores what it observes, so that it has no chains and no exact value.
+    """
+    assert isinstance(cfg.baseline, Playback)
+    world = make_world(cfg)
+    with EpisodeReader(cfg.baseline.file) as reader:
+        if int(reader.run["size"]) != world.size:
+            raise UserError(
+                f"baseline.file={cfg.baseline.file}: recorded on a grid of size {reader.run['size']}, "
+                f"expected grid.size={world.size}"
+            )
+        logged = reader.read(cfg.baseline.episode)
+    again = reissued(world, logged, cfg.grid.max_steps)
+    policy = playback.Playback(logged.action, device)
+    simulation = simulate(
+        world, policy, episodes=cfg.episodes, seed=cfg.seed, max_steps=cfg.grid.max_steps, device=device
+    )
+    report = {
+        "policy": cfg.baseline.name,
+        "file": Path(cfg.baseline.file).name,
+        "episode": logged.number,
+        "logged_return": float(logged.returns[-1]),
+        "return": float(again.returns[-1]),
+        "simulated": asdict(simulation),
+    }
+    write_json(folder / "evaluation.json", report)
+    rows = [
+        ["logged", f"{report['logged_return']:,.4f}"],
+        ["again, on the same target", f"{report['return']:,.4f}"],
+        [f"on {cfg.episodes} other targets", f"{simulation.aihtr.mean:,.4f} ± {simulation.aihtr.standard_error:.4f}"],
+    ]
+    console.print(table(f"actions of episode {logged.number}", ["", "return"], rows))
+    console.print(f"results in {folder}")
+    return simulation.aihtr.mean
+
+
+def reissued(world: World, logged: Episode, max_steps: int | None) -> Episode:
+    """The episode with its own seed and its own actions, in `world`."""
+    (again,) = record(world, Issued(logged.action), [logged.seed], first=logged.number, max_steps=max_steps)
+    return again

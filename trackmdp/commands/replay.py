@@ -1,0 +1,125 @@
+"""`replay`: list, play, verify and recover logged episodes, and write them as a web page or as tables."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from trackmdp.build import make_world
+from trackmdp.config import ReplayConfig, Table, world_of
+from trackmdp.episodes.layout import write_layout
+from trackmdp.episodes.page import write_page
+from trackmdp.episodes.player import play
+from trackmdp.episodes.reader import EpisodeReader
+from trackmdp.episodes.recover import recover
+from trackmdp.episodes.schema import versions_apart
+from trackmdp.episodes.tables import write_tables
+from trackmdp.episodes.verify import verify
+from trackmdp.errors import RunError, UserError
+from trackmdp.training.display import make_console, table
+
+__all__ = ["run"]
+
+
+def run(cfg: ReplayConfig, folder: Path) -> None:  # noqa: ARG001  what is written has a name of its own
+    """Do what `cfg` asks for with the log `cfg.file`.
+
+    Raises:
+        RunError: an episode did not come out the same.
+    """
+    console = make_console(cfg.quiet)
+    file = Path(cfg.file)
+    if cfg.recover:
+        file = _recover(console, file)
+    with EpisodeReader(file) as reader:
+        if apart := versions_apart(reader.run):
+            console.print(f"made by other versions: {apart}", markup=False)
+        asked = _exports(console, cfg, reader)
+        if cfg.verify:
+            _verify(console, cfg, reader)
+        if asked or cfg.verify or cfg.recover:
+            return
+        if cfg.episode is None:
+            _list(console, reader)
+        else:
+            play(console, reader.read(cfg.episode), reader.world().task, cfg.speed)
+
+
+def _recover(console: Console, file: Path) -> Path:
+    saved = recover(file)
+    console.print(f"{saved.episodes} episodes -> {saved.file}", markup=False)
+    for line in saved.damaged:
+        console.print(f"lost: {line}", markup=False)
+    return saved.file
+
+
+def _exports(console: Console, cfg: ReplayConfig, reader: EpisodeReader) -> bool:
+    """Write the page, the tables and the layout that are asked for; returns whether any was."""
+    if not reader.rows and (cfg.html or cfg.csv):
+        raise UserError(f"file={reader.file}: holds no episode")
+    writers: list[tuple[str, str | None, Callable[[Path], object]]] = [
+        ("html", cfg.html, lambda path: write_page(reader, path, cfg.episode)),
+        ("csv", cfg.csv, lambda path: write_tables(reader, path, cfg.episode)),
+        ("layout", cfg.layout, write_layout),
+    ]
+    for key, path, write in writers:
+        if path is None:
+            continue
+        try:
+            write(Path(path))
+        except OSError as error:
+            raise UserError(f"{key}={path}: cannot be written ({(error.strerror or str(error)).lower()})") from error
+        console.print(f"{key} -> {path}", markup=False)
+    return any(path is not None for _, path, _ in writers)
+
+
+def _verify(console: Console, cfg: ReplayConfig, reader: EpisodeReader) -> None:
+    difference = _kernel_difference(reader)
+    if difference is None:
+        numbers = None if cfg.episode is None else [reader.row(cfg.episode)["episode"]]
+        with console.status("re-simulating"):
+            verified = verify(reader, numbers=numbers)
+        difference = verified.difference
+    if difference is not None:
+        apart = versions_apart(reader.run)
+        because = f"; made by other versions: {apart}" if apart else ""
+        raise RunError(f"file={cfg.file}: {difference}{because}")
+    console.print(f"{verified.episodes} episodes, {verified.steps:,} steps: the same to the bit", markup=False)
+
+
+def _kernel_difference(reader: EpisodeReader) -> str | None:
+    """Where the kernel of the log is not the one its config describes; a table of the user's own is taken as it is."""
+    cfg = world_of(reader.attachment("config.yaml").decode())
+    if isinstance(cfg.kernel, Table) or isinstance(getattr(cfg.cost, "sensor", None), str):
+        return None
+    described, logged = make_world(cfg).kernel, reader.world().kernel
+    if described.shape != logged.shape:
+        return f"kernel: logged {logged.shape}, the config gives {described.shape}"
+    places = np.argwhere(described != logged)
+    if not len(places):
+        return None
+    x, y = (int(each) for each in places[0])
+    return f"kernel from cell {x} to {y}: logged {logged[x, y]}, the config gives {described[x, y]}"
+
+
+def _list(console: Console, reader: EpisodeReader) -> None:
+    steps = sum(row["length"] for row in reader.rows)
+    n, seed = reader.run["size"], reader.run.get("seed", "")
+    console.print(f"{len(reader)} episodes, {steps:,} steps on a {n}x{n} grid, T_max {reader.t_max}, seed {seed}")
+    rows = [
+        [
+            str(row["episode"]),
+            reader.policies[row["policy"]].get("label", ""),
+            str(row["length"]),
+            f"{row['return']:,.2f}",
+            str(row["detections"]),
+            str(row["forced"]),
+            "exited" if row["terminated"] else "cut",
+        ]
+        for row in reader.rows
+    ]
+    columns = ["episode", "policy", "steps", "return", "located", "forced", "end"]
+    console.print(table(str(reader.file), columns, rows))

@@ -1,0 +1,57 @@
+"""A step of an episode in plain text."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from trackmdp.episodes.episode import Episode
+from trackmdp.world.model import Task
+
+__all__ = ["LEGEND", "frame", "outcome", "sentence", "where"]
+
+FOUND, MISSED, ON = "●", "○", "▪"
+_SHADES = " ·░▒▓"
+LEGEND = f"{FOUND} target, located   {MISSED} target, missed   {ON} sensor on   ·░▒▓ where it was expected"
+
+
+def outcome(episode: Episode, t: int, task: Task) -> str:
+    """What became of step `t`: exited, forced, detected or missed."""
+    if episode.target[t] == task.num_cells:
+        return "exited"
+    if episode.misses[t] > task.t_max:
+        return "forced"
+    return "detected" if episode.located[t] else "missed"
+
+
+def where(cell: int, size: int) -> str:
+    """A cell in words."""
+    return f"row {cell // size + 1}, column {cell % size + 1}" if cell < size**2 else "outside"
+
+
+def sentence(episode: Episode, t: int, task: Task) -> str:
+    """A step in one line."""
+    state = outcome(episode, t, task)
+    words = {
+        "exited": "the target has left the grid",
+        "forced": f"safe action forced, target located in {where(int(episode.target[t]), task.size)}",
+        "detected": f"target detected in {where(int(episode.target[t]), task.size)}",
+        "missed": f"target missed in {where(int(episode.target[t]), task.size)}",
+    }
+    return (
+        f"step {t + 1} of {len(episode)}: {words[state]}; {int(episode.action[t].sum())} sensors on, "
+        f"{int(episode.misses[t])} misses before; reward {episode.reward[t]:.2f}, total {episode.returns[t]:.2f}"
+    )
+
+
+def frame(episode: Episode, t: int, task: Task) -> str:
+    """The grid at a step: the target over the sensors that are on over the belief."""
+    belief = episode.belief[t]
+    levels = np.digitize(belief, [1e-6, 0.05, 0.2, 0.5])
+    marks = np.array(list(_SHADES))[levels]
+    if outcome(episode, t, task) != "forced":
+        marks = np.where(episode.action[t], ON, marks)
+    if episode.target[t] < task.num_cells:
+        marks[episode.target[t]] = FOUND if episode.located[t] else MISSED
+    rows = [" ".join(row) for row in marks.reshape(task.size, task.size)]
+    edge = "─" * (2 * task.size + 1)
+    return "\n".join([f"┌{edge}┐", *(f"│ {row} │" for row in rows), f"└{edge}┘"])

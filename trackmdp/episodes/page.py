@@ -1,0 +1,76 @@
+"""One logged episode as a web page of its own: no network, no other file."""
+
+from __future__ import annotations
+
+import html
+import json
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from trackmdp.episodes.episode import Episode
+from trackmdp.episodes.reader import EpisodeReader
+from trackmdp.solvers import bounds, horizon
+from trackmdp.training.metrics import write_text
+
+__all__ = ["MOST_CELLS", "MOST_STEPS", "page", "write_page"]
+
+MOST_STEPS = 2000
+"""Steps on a page; a longer episode is cut there, and the page says so."""
+
+MOST_CELLS = 100
+"""Shaded cells of a step, the likeliest."""
+
+
+def write_page(reader: EpisodeReader, file: Path, number: int | None = None) -> None:
+    """Write the page of episode `number`, by default the first of the log.
+
+    Raises:
+        UserError: there is no such episode.
+        OSError: the file cannot be written.
+    """
+    wanted = reader.rows[0]["episode"] if number is None else number
+    write_text(file, page(reader, reader.read(wanted)))
+
+
+def page(reader: EpisodeReader, episode: Episode) -> str:
+    """The page as text."""
+    template = files("trackmdp.episodes").joinpath("page.html").read_text(encoding="utf-8")
+    content = json.dumps(_content(reader, episode), separators=(",", ":"), allow_nan=False)
+    label = reader.policies[episode.policy].get("label", "")
+    title = html.escape(f"Episode {episode.number}: {label}" if label else f"Episode {episode.number}")
+    # `<` inside the JSON could close its element
+    return template.replace("@TITLE@", title).replace("@DATA@", content.replace("<", "\\u003c"))
+
+
+def _content(reader: EpisodeReader, episode: Episode) -> dict[str, Any]:
+    world, shown = reader.world(), slice(0, MOST_STEPS)
+    limit = reader.max_steps
+    bound = bounds.clocked(world) if limit is None else horizon.clocked(world, limit)
+    target = np.where(episode.target == world.num_cells, -1, episode.target)
+    about = f"{world.size} x {world.size} grid, {len(episode)} steps, seed {reader.run.get('seed', '')}"
+    if len(episode) > MOST_STEPS:
+        about += f"; the first {MOST_STEPS:,} steps are shown"
+    return {
+        "size": world.size,
+        "about": about,
+        "bound": float(bound[episode.start]),
+        "target": target[shown].tolist(),
+        "located": episode.located[shown].astype(int).tolist(),
+        "forced": episode.forced(world.t_max)[shown].astype(int).tolist(),
+        "n": episode.misses[shown].tolist(),
+        "reward": episode.reward[shown].tolist(),
+        "total": episode.returns[shown].tolist(),
+        "active": [row.nonzero()[0].tolist() for row in episode.action[shown]],
+        "belief": [_sparse(row) for row in episode.belief[shown]],
+    }
+
+
+def _sparse(belief: Any) -> list[int]:
+    """Cell, probability in ten-thousandths, cell, ...: the likeliest cells, in their order."""
+    share = np.rint(belief * 10_000).astype(int)
+    cells = np.sort(np.argsort(-share, kind="stable")[:MOST_CELLS])
+    cells = cells[share[cells] > 0]
+    return np.stack([cells, share[cells]], axis=1).ravel().tolist()
