@@ -1,11 +1,16 @@
-"""Checkpoints are whole or absent, and nothing in a foreign one is ever run."""
+"""Checkpoints are whole or absent, and what is not exactly what was written is not taken."""
 
 from __future__ import annotations
 
+import hashlib
 import io
+import os
 import pickle
-import zipfile
-from collections.abc import Callable
+import random
+import re
+import resource
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,129 +20,158 @@ import torch
 from trackmdp.errors import UserError
 from trackmdp.training import checkpoint
 
-STATE = {"algorithm": {"weight": torch.arange(6.0).reshape(2, 3), "iteration": 3}, "frames": 4096}
+
+def state(seed: int = 0, size: int = 2000) -> dict[str, Any]:
+    rng = torch.Generator().manual_seed(seed)
+    weights = torch.rand(size, generator=rng)
+    return {"weights": weights, "counter": seed, "nested": {"flags": weights > 0.5, "rates": [0.1, None, "a"]}}
+
+
+@contextmanager
+def disk_of(bytes_per_file: int) -> Iterator[None]:
+    """No file may grow beyond this: a write fails as it does on a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (bytes_per_file, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def names(folder: Path) -> list[str]:
-    return sorted(file.name for file in folder.glob("iteration-*"))
+    return sorted(file.name for file in folder.iterdir())
 
 
-def test_what_is_saved_comes_back(tmp_path: Path) -> None:
-    file = checkpoint.save(tmp_path / "checkpoints", 7, STATE, keep=2)
-    assert file.name == "iteration-00000007.pt"
-    assert checkpoint.newest(tmp_path) == file
-    state = checkpoint.load(file)
-    assert state["iteration"] == 7
-    assert state["frames"] == 4096
-    assert torch.equal(state["algorithm"]["weight"], STATE["algorithm"]["weight"])
+def sealed(payload: bytes) -> bytes:
+    """A file that passes every check on its bytes."""
+    return payload + checkpoint._seal(hashlib.sha256(payload).hexdigest())
 
 
-def test_the_newest_are_kept_whatever_else_lies_there(tmp_path: Path) -> None:
-    folder = tmp_path / "checkpoints"
-    folder.mkdir()
-    (folder / "iteration-note.pt").write_text("mine")
-    for iteration in (1, 5, 9, 10, 100_000_000):
-        checkpoint.save(folder, iteration, STATE, keep=3)
-    kept = ["iteration-00000009.pt", "iteration-00000010.pt", "iteration-100000000.pt"]
-    assert names(folder) == [*kept, "iteration-note.pt"]
-    assert checkpoint.load(checkpoint.newest(tmp_path))["iteration"] == 100_000_000
+def corrupted(content: bytes, other: bytes, rng: random.Random) -> bytes:
+    """One of: a few bits flipped, cut, something appended, the content of another file."""
+    kind = rng.choice(["flip", "cut", "append", "swap"])
+    if kind == "flip":
+        changed = bytearray(content)
+        for place in rng.sample(range(len(content)), rng.randint(1, 3)):
+            changed[place] ^= 1 << rng.randrange(8)
+        return bytes(changed)
+    if kind == "cut":
+        return content[: rng.randrange(len(content))]
+    if kind == "append":
+        return content + rng.choice([b"\n", b"\0" * 4096, content[: rng.randint(1, 999)], content])
+    seal = len(checkpoint._seal("0" * 64))
+    return other[:-seal] + content[-seal:]
 
 
-@pytest.mark.parametrize("moment", ["save", "fsync", "replace"])
-def test_a_crash_while_saving_leaves_the_last_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: str) -> None:
-    folder = tmp_path / "checkpoints"
-    before = checkpoint.save(folder, 1, STATE, keep=1)
-    content = before.read_bytes()
-
-    def crash(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    target = {"save": "torch.save", "fsync": "os.fsync", "replace": "pathlib.Path.replace"}[moment]
-    monkeypatch.setattr(target, crash)
-    with pytest.raises(KeyboardInterrupt):
-        checkpoint.save(folder, 2, STATE, keep=1)
-    monkeypatch.undo()
-    assert names(folder) == [before.name]
-    assert checkpoint.newest(tmp_path).read_bytes() == content
-    checkpoint.save(folder, 2, STATE, keep=1)
-    assert names(folder) == ["iteration-00000002.pt"]
+def test_what_is_read_is_what_was_saved(tmp_path: Path) -> None:
+    file = checkpoint.save(tmp_path / "checkpoints", 7, state(3), keep=2)
+    read = checkpoint.load(file)
+    assert (read["iteration"], read["counter"], read["nested"]["rates"]) == (7, 3, [0.1, None, "a"])
+    assert torch.equal(read["weights"], state(3)["weights"])
+    assert torch.equal(read["nested"]["flags"], state(3)["nested"]["flags"])
 
 
-def test_a_run_without_a_checkpoint_says_so(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="the run has not saved one yet"):
-        checkpoint.newest(tmp_path)
+def test_a_large_tensor_is_a_page_of_the_file_and_writing_to_it_leaves_the_file_alone(tmp_path: Path) -> None:
+    file = checkpoint.save(tmp_path / "checkpoints", 1, state(size=2**19), keep=2)
+    read = checkpoint.load(file)
+    read["weights"].zero_()
+    assert torch.equal(checkpoint.load(file)["weights"], state(size=2**19)["weights"])
 
 
-class Trap:
-    def __init__(self, mark: Path) -> None:
-        self.mark = mark
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return (Path.touch, (self.mark,))
-
-
-def pickled(file: Path) -> bytes:
-    return pickle.dumps(Trap(file.with_name("executed")))
+def test_the_newest_are_kept_and_the_best_for_ever(tmp_path: Path) -> None:
+    for iteration in range(1, 6):
+        checkpoint.save(tmp_path, iteration, state(iteration), keep=2, best=iteration == 2)
+    assert names(tmp_path) == ["best.pt", "iteration-00000004.pt", "iteration-00000005.pt", "last.pt"]
+    assert [checkpoint.load(tmp_path / name)["iteration"] for name in (checkpoint.BEST, checkpoint.LAST)] == [2, 5]
+    assert [file.name for file in checkpoint.available(tmp_path)] == ["iteration-00000005.pt", "iteration-00000004.pt"]
 
 
-def trapped(file: Path) -> bytes:
-    stream = io.BytesIO()
-    torch.save({"format": checkpoint.FORMAT, "x": Trap(file.with_name("executed"))}, stream)
-    return stream.getvalue()
+def test_two_hundred_random_corruptions_are_all_refused(tmp_path: Path) -> None:
+    file = checkpoint.save(tmp_path / "mine", 1, state(1), keep=1)
+    other = checkpoint.save(tmp_path / "theirs", 1, state(2), keep=1).read_bytes()
+    content, rng = file.read_bytes(), random.Random(7)
+    for trial in range(200):
+        file.write_bytes(changed := corrupted(content, other, rng))
+        assert changed != content
+        with pytest.raises(UserError, match=re.escape(str(file))):
+            checkpoint.load(file)
+            pytest.fail(f"corruption {trial} was loaded")
+    file.write_bytes(content)
+    assert checkpoint.load(file)["counter"] == 1
 
 
-def trapped_inside(file: Path) -> bytes:
-    """A genuine checkpoint, header and all, whose content runs code when it is unpickled."""
-    made = checkpoint.save(file.parent / "other", 1, {"x": Trap(file.with_name("executed"))}, keep=1)
-    return made.read_bytes()
+class Doctored:
+    """Pickled, it is a call of `os.mkdir`."""
+
+    def __init__(self, marker: Path) -> None:
+        self.marker = marker
+
+    def __reduce__(self) -> Any:
+        return os.mkdir, (str(self.marker),)
 
 
-def other_format(file: Path) -> bytes:
-    stream = io.BytesIO()
-    torch.save({"format": checkpoint.FORMAT + 1}, stream)
-    return stream.getvalue()
+def test_code_in_a_checkpoint_is_not_run(tmp_path: Path) -> None:
+    file, marker = tmp_path / "iteration-00000001.pt", tmp_path / "executed"
+    zipped = io.BytesIO()
+    torch.save({"format": checkpoint.FORMAT, "evil": Doctored(marker)}, zipped)
+    for payload in (zipped.getvalue(), pickle.dumps(Doctored(marker)), b"", b"\x80\x02."):
+        file.write_bytes(sealed(payload))
+        with pytest.raises(UserError, match="cannot be read"):
+            checkpoint.load(file)
+        assert not marker.exists()
+    pickle.loads(pickle.dumps(Doctored(marker)))  # noqa: S301  it does run when it is unpickled
+    assert marker.exists()
 
 
-def tensor(file: Path) -> bytes:
-    stream = io.BytesIO()
-    torch.save(torch.ones(3), stream)
-    return stream.getvalue()
+@pytest.mark.parametrize("content", [{"format": 1}, {"iteration": 3}, [1, 2]])
+def test_another_format_is_refused(tmp_path: Path, content: Any) -> None:
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    (tmp_path / "foreign.pt").write_bytes(sealed(buffer.getvalue()))
+    with pytest.raises(UserError, match="not the state of a run"):
+        checkpoint.load(tmp_path / "foreign.pt")
+    (tmp_path / "foreign.pt").write_bytes(buffer.getvalue())
+    with pytest.raises(UserError, match="not a checkpoint of this program"):
+        checkpoint.load(tmp_path / "foreign.pt")
 
 
-def zipped(file: Path) -> bytes:
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w") as archive:
-        archive.writestr("hello", "world")
-    return stream.getvalue()
-
-
-def flipped(file: Path) -> bytes:
-    content = bytearray(file.read_bytes())
-    content[len(content) // 2] ^= 1
-    return bytes(content)
-
-
-FOREIGN: dict[str, Callable[[Path], bytes]] = {
-    "empty": lambda file: b"",
-    "text": lambda file: b"hello\nworld\n",
-    "half": lambda file: file.read_bytes()[: len(file.read_bytes()) // 2],
-    "short by a byte": lambda file: file.read_bytes()[:-1],
-    "a bit flipped": flipped,
-    "zip": zipped,
-    "a tensor": tensor,
-    "another format": other_format,
-    "pickle": pickled,
-    "trap": trapped,
-    "trap with a header": trapped_inside,
-}
-
-
-@pytest.mark.parametrize("case", FOREIGN)
-def test_a_damaged_or_foreign_file_is_refused_in_one_line_and_runs_nothing(tmp_path: Path, case: str) -> None:
-    file = checkpoint.save(tmp_path / "checkpoints", 1, STATE, keep=1)
-    file.write_bytes(FOREIGN[case](file))
-    with pytest.raises(UserError) as refused:
+def test_an_older_format_is_named(tmp_path: Path) -> None:
+    file = checkpoint.save(tmp_path, 1, state(), keep=1)
+    file.write_bytes(file.read_bytes().replace(f"checkpoint {checkpoint.FORMAT} ".encode(), b"checkpoint 1 "))
+    with pytest.raises(UserError, match=f"format 1, expected {checkpoint.FORMAT}"):
         checkpoint.load(file)
-    assert str(file) in str(refused.value)
-    assert "\n" not in str(refused.value)
-    assert not list(tmp_path.rglob("executed"))
+
+
+@pytest.mark.parametrize("room", [0, 300, 5000, 8000])
+def test_a_full_disk_leaves_the_older_checkpoints_whole(tmp_path: Path, room: int) -> None:
+    checkpoint.save(tmp_path, 1, state(1), keep=1, best=True)
+    before = names(tmp_path)
+    with disk_of(room), pytest.raises(OSError, match="too large"):
+        checkpoint.save(tmp_path, 2, state(2), keep=1, best=True)
+    assert names(tmp_path) == before
+    assert checkpoint.load(checkpoint.available(tmp_path)[0])["counter"] == 1
+    checkpoint.save(tmp_path, 2, state(2), keep=1, best=True)
+    assert checkpoint.load(tmp_path / checkpoint.LAST)["counter"] == 2
+
+
+@pytest.mark.parametrize("call", ["fsync", "link"])
+def test_a_failure_at_any_step_leaves_a_whole_checkpoint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str
+) -> None:
+    def fails(*args: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    checkpoint.save(tmp_path, 1, state(1), keep=2)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, call, fails)
+        with pytest.raises(OSError, match="No space"):
+            checkpoint.save(tmp_path, 2, state(2), keep=2)
+    assert not [name for name in names(tmp_path) if name.endswith(".part")]
+    newest = checkpoint.load(checkpoint.available(tmp_path)[0])
+    assert newest["counter"] == newest["iteration"]
+
+
+def test_what_a_killed_save_left_is_cleared_away(tmp_path: Path) -> None:
+    (tmp_path / "iteration-00000009.part").write_bytes(b"half")
+    checkpoint.save(tmp_path, 10, state(), keep=2)
+    assert names(tmp_path) == ["iteration-00000010.pt", "last.pt"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import os
 import random
 import signal
@@ -10,14 +9,12 @@ import subprocess
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import pytest
-import torch
 
+from tests.training.runs import assert_same_run, rows
 from trackmdp.training import checkpoint
 
-TIMED = ("seconds", "frames_per_second")
 RECIPES = {
     "ppo": ["algo=ppo"],
     "a2c": ["algo=a2c", "collector.envs=64"],
@@ -56,39 +53,6 @@ def cut(folder: Path, number: int, after: int, *words: str) -> int:
                 process.wait(timeout=0.01)
         process.send_signal(number)
         return process.wait()
-
-
-def rows(folder: Path) -> list[dict[str, str]]:
-    """Rows of `metrics.csv` without the columns that time decides."""
-    file = folder / "metrics.csv"
-    if not file.is_file():
-        return []
-    with file.open(newline="") as stream:
-        return [{k: v for k, v in row.items() if k not in TIMED} for row in csv.DictReader(stream)]
-
-
-def tensors(state: Any, prefix: str = "") -> dict[str, Any]:
-    """Every leaf of a checkpoint but times, places in files, and the best of those that happened to be saved."""
-    if isinstance(state, dict):
-        found: dict[str, Any] = {}
-        for key, value in state.items():
-            if key not in ("seconds", "metrics", "best"):
-                found |= tensors(value, f"{prefix}.{key}")
-        return found
-    if isinstance(state, (list, tuple)):
-        return {k: v for i, value in enumerate(state) for k, v in tensors(value, f"{prefix}[{i}]").items()}
-    return {prefix: state}
-
-
-def assert_same_run(one: Path, other: Path) -> None:
-    assert rows(one) == rows(other)
-    mine, theirs = (tensors(checkpoint.load(checkpoint.newest(run))) for run in (one, other))
-    assert mine.keys() == theirs.keys()
-    for key, value in mine.items():
-        if isinstance(value, torch.Tensor):
-            assert torch.equal(value, theirs[key]), key
-        else:
-            assert value == theirs[key], key
 
 
 def resumes_exactly(folder: Path, recipe: str, kills: int) -> None:

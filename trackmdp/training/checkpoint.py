@@ -39,7 +39,7 @@ def save(folder: Path, iteration: int, state: dict[str, Any], *, keep: int, best
     try:
         with part.open("wb") as stream:
             hashed = _Hashed(stream)
-            torch.save({"format": FORMAT, "iteration": iteration, **state}, cast("IO[bytes]", hashed))
+            hashed.save({"format": FORMAT, "iteration": iteration, **state})
             stream.write(_seal(hashed.digest.hexdigest()))
             stream.flush()
             os.fsync(stream.fileno())
@@ -111,10 +111,21 @@ class _Hashed:
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream, self.digest = stream, hashlib.sha256()
+        self._failure: OSError | None = None
+
+    def save(self, state: dict[str, Any]) -> None:
+        try:
+            torch.save(state, cast("IO[bytes]", self))
+        except RuntimeError as error:  # what torch says when a write failed, whatever the reason
+            raise self._failure or error from None
 
     def write(self, piece: bytes) -> int:
         self.digest.update(piece)
-        return self._stream.write(piece)
+        try:
+            return self._stream.write(piece)
+        except OSError as error:
+            self._failure = error
+            raise
 
     def flush(self) -> None:
         self._stream.flush()

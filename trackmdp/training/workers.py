@@ -59,5 +59,6 @@ class Watch:
         for index, process in enumerate(self._processes):
             code = process.exitcode
             if code is not None:
+                self._waiting = False  # the others end next, when the collector is shut down
                 how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with status {code}"
                 raise RuntimeError(f"worker {index} {how}")

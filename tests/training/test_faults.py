@@ -1,0 +1,171 @@
+"""What breaks while a run is going on: it ends with one line, what was saved stands, and going on loses nothing."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import resource
+import shutil
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from tests.helpers import train_config
+from tests.training.runs import BUDGET, QUICK, SMALL, assert_same_run, at_iteration, rows, train
+from trackmdp.build import make_algorithm, make_world
+from trackmdp.errors import Preempted, RunError, UserError
+from trackmdp.training import checkpoint
+from trackmdp.training.lock import locked
+from trackmdp.training.state import _weights
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Runs that nothing happened to."""
+    folders = {algo: tmp_path_factory.mktemp("whole") / algo for algo in SMALL}
+    for algo, folder in folders.items():
+        train(folder, algo=algo)
+    return folders
+
+
+def saved(folder: Path) -> list[int]:
+    """Iterations of the checkpoints, all of which can be read; nothing half-written lies about."""
+    assert not list(folder.rglob("*.part"))
+    return [checkpoint.load(file)["iteration"] for file in checkpoint.available(folder / "checkpoints")]
+
+
+def test_a_disk_that_fills_up_costs_nothing_but_a_call(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: dict[str, Path]
+) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with monkeypatch.context() as patch:
+        at_iteration(patch, 5, lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard)))
+        try:
+            with pytest.raises(RunError, match="File too large; resume=auto goes on from the last checkpoint"):
+                train(tmp_path)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert saved(tmp_path) == [4, 3]
+    train(tmp_path, "resume=auto")
+    assert_same_run(tmp_path, whole["ppo"])
+
+
+def test_a_disk_too_small_for_any_checkpoint(tmp_path: Path, whole: dict[str, Path]) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
+    try:
+        with pytest.raises(RunError, match="File too large"):
+            train(tmp_path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert saved(tmp_path) == []
+    train(tmp_path, "resume=auto")
+    assert_same_run(tmp_path, whole["ppo"])
+
+
+def test_the_folder_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "run"
+    at_iteration(monkeypatch, 3, lambda: shutil.rmtree(folder))
+    with pytest.raises(RunError, match=f"hydra.run.dir={folder}: the folder was removed"):
+        train(folder)
+    assert not folder.exists()
+
+
+@pytest.mark.parametrize("algo", SMALL)
+def test_a_loss_that_is_not_finite_names_the_iteration_and_leaves_the_last_good_state(
+    algo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: dict[str, Path]
+) -> None:
+    cfg = train_config(*SMALL[algo], *QUICK, *BUDGET)
+    learner = type(make_algorithm(cfg, make_world(cfg), torch.device("cpu")))
+    step, bad = learner.step, 10 if algo == "hindsight" else 4
+
+    def poisoned(self: Any, batch: Any) -> dict[str, float]:
+        if poisoned.calls == bad - 1:
+            with torch.no_grad():
+                for _, weights in _weights(self.state_dict()):
+                    weights.fill_(torch.nan)
+        poisoned.calls += 1
+        return step(self, batch)
+
+    poisoned.calls = 0
+    with monkeypatch.context() as patch:
+        patch.setattr(learner, "step", poisoned)
+        with pytest.raises(RunError, match=f"iteration {bad}: .* is nan"):
+            train(tmp_path, "checkpoint.every=0", "checkpoint.seconds=1e-9", algo=algo)
+    assert saved(tmp_path) == [bad - 1, bad - 2]
+    train(tmp_path, "checkpoint.every=0", "checkpoint.seconds=1e-9", "resume=auto", algo=algo)
+    assert_same_run(tmp_path, whole[algo])
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGUSR1])
+def test_a_signal_ends_the_run_after_its_iteration_is_saved(
+    number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: dict[str, Path]
+) -> None:
+    before = signal.getsignal(number)
+    with monkeypatch.context() as patch:
+        at_iteration(patch, 3, lambda: signal.raise_signal(number))
+        with pytest.raises(Preempted) as told:
+            train(tmp_path, "checkpoint.every=0")
+    assert (told.value.signal, saved(tmp_path), signal.getsignal(number)) == (number, [3], before)
+    train(tmp_path, "checkpoint.every=0", "resume=auto")
+    assert_same_run(tmp_path, whole["ppo"])
+
+
+def test_rows_written_after_the_checkpoint_are_cut_off(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: dict[str, Path]
+) -> None:
+    def breaks() -> None:
+        raise OSError(5, "Input/output error")
+
+    with monkeypatch.context() as patch:
+        at_iteration(patch, 5, breaks)
+        with pytest.raises(RunError, match="Input/output error"):
+            train(tmp_path, "checkpoint.every=512")
+    assert saved(tmp_path) == [4, 2]
+    assert len(rows(tmp_path)) == 5
+    with (tmp_path / "metrics.csv").open("a") as stream:
+        stream.write("6,1536,0.1")  # a row that was being written
+    train(tmp_path, "checkpoint.every=512", "resume=auto")
+    assert_same_run(tmp_path, whole["ppo"])
+
+
+def test_one_process_per_folder(tmp_path: Path) -> None:
+    with locked(tmp_path), pytest.raises(UserError, match="another process is running in this folder"):
+        train(tmp_path)
+    assert {file.name for file in tmp_path.iterdir()} == {".lock"}
+    train(tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("collector", ["multi_sync", "multi_async"])
+@pytest.mark.parametrize("when", ["between", "while collecting"])
+def test_a_worker_that_is_killed_is_named(
+    collector: str, when: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from trackmdp.training.workers import Watch
+
+    def kill() -> None:
+        os.kill(multiprocessing.active_children()[0].pid or 0, signal.SIGKILL)
+
+    if when == "between":
+        at_iteration(monkeypatch, 3, kill)
+    else:
+        check, calls = Watch._check, iter([*range(7), None])
+
+        def killing(self: Watch) -> None:
+            check(self)
+            if next(calls, 0) is None:  # what follows waits for an answer that never comes
+                kill()
+
+        monkeypatch.setattr(Watch, "_check", killing)
+    with pytest.raises(RunError, match=r"iteration \d: collecting broke down \(worker [01] .*(SIGKILL|-9)"):
+        train(tmp_path, f"collector={collector}")
+    assert not multiprocessing.active_children()
+    assert saved(tmp_path)[0] >= 2
+    monkeypatch.undo()
+    train(tmp_path, f"collector={collector}", "resume=auto")
+    assert saved(tmp_path)[0] == 8
+    assert [int(row["iteration"]) for row in rows(tmp_path)] == list(range(1, 9))
