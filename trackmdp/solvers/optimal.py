@@ -27,8 +27,11 @@ __all__ = ["Progress", "Solution", "bracketed", "solve"]
 
 ROUNDING = 1e-10
 """Relative gap that is not told from rounding, whatever the tolerance."""
-FIRST_SECONDS = 1.0
-"""How long the first search of a round may take before its improvements are used; later rounds may take longer."""
+FIRST_NODES = 100_000
+"""Nodes before the first round's improvements are used; twice as many in each later round. Not seconds, so that the
+same world gives the same policy on any machine."""
+WORTH_A_RESTART = 0.02
+"""Share of the bracket that improvements have to close for the search to start anew with them."""
 
 
 @dataclass(frozen=True)
@@ -152,15 +155,15 @@ class _Run:
     def search(self) -> None:
         self.use(search.solve(self.world))
         self.report()
-        patience = FIRST_SECONDS
+        patience = FIRST_NODES
         while not self.certified and time.monotonic() < self.ends:
             improved = self.round(patience)
             self.report()
             if not improved:
                 return
-            patience *= 2.0
+            patience *= 2
 
-    def round(self, patience: float) -> bool:
+    def round(self, patience: int) -> bool:
         """Search the renewals of the policy at hand; whether a better policy was found."""
         problem = InnerProblem.of(self.world, self.layers, self.value)
         revealed = [problem.missed]
@@ -169,8 +172,13 @@ class _Run:
         tree = Tree(self.world, problem.detected, revealed, self.value, self.slack)
         try:
             self.explore(tree, patience)
-        finally:
+        finally:  # what was found and proved is kept when the user interrupts as well
             self.tighten(tree)
+            improved = self.adopt(tree)
+        return improved
+
+    def adopt(self, tree: Tree) -> bool:
+        """Use the better chains that the tree has found; whether the policy is better with them."""
         if not tree.improvements():
             return False
         chains = self.chains.copy()
@@ -179,19 +187,28 @@ class _Run:
         sets = search.improve(self.world, self.layers, chains_to_sets(self.layers, chains))
         return self.use(sets_to_chains(self.world, self.layers, sets))
 
-    def explore(self, tree: Tree, patience: float) -> None:
-        """Until the tree is closed or time is over; improvements, where there are some, end it after `patience`."""
-        enough = time.monotonic() + patience
-        reported = time.monotonic()
+    def explore(self, tree: Tree, patience: int) -> None:
+        """Until the tree is closed or time is over.
+
+        After `patience` nodes, improvements that close a good part of the bracket end it too: what is proved for a
+        better policy is worth more, but all that is proved for this one has to be proved anew.
+        """
+        reported, next_look = time.monotonic(), patience
 
         def go_on(tree: Tree) -> bool:
-            nonlocal reported
+            nonlocal reported, next_look
             now = time.monotonic()
             if now - reported > 1.0:
                 reported = now
                 self.tighten(tree)
                 self.report()
-            return now < self.ends and (now < enough or not tree.improvements())
+            if tree.nodes >= next_look:
+                next_look += patience
+                self.tighten(tree)
+                gained = accumulate(self.world.transition, tree.best - self.value).mean()
+                if gained > WORTH_A_RESTART * float((self.bound - self.value).mean()):
+                    return False
+            return now < self.ends
 
         before = tree.nodes
         tree.run(go_on)
@@ -202,12 +219,11 @@ class _Run:
         residual = np.maximum(tree.upper() - self.value, 0.0)
         self.bound = np.minimum(self.bound, self.value + accumulate(self.world.transition, residual))
 
-    def revealed(self, problem: InnerProblem, known: list[Array], length: int, patience: float) -> Array:
+    def revealed(self, problem: InnerProblem, known: list[Array], length: int, patience: int) -> Array:
         """`[M]` upper bound of what `length` more sets can earn with the target known to be in each cell."""
         inner = InnerProblem(self.world, self.layers[: length + 1], problem.detected, problem.missed)
         tree = next_table(inner, known, self.slack)
-        enough = min(self.ends, time.monotonic() + patience)
-        tree.run(lambda _: time.monotonic() < enough)
+        tree.run(lambda tree: tree.nodes < patience and time.monotonic() < self.ends)
         self.nodes += tree.nodes
         return tree.upper()
 
