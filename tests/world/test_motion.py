@@ -97,6 +97,7 @@ def test_draws_are_uniform_on_their_grid_and_the_generators_alone() -> None:
     assert draws.dtype == torch.float64
     assert ((draws >= 0) & (draws < 1)).all()
     assert torch.equal(draws * 2**40, (draws * 2**40).round())
+    assert len(draws.unique()) > 99_990
     assert stats.kstest(draws.numpy(), "uniform").pvalue > 1e-3
 
 
