@@ -55,7 +55,7 @@ class LearnedKernel:
         self._estimate.fit(self.cfg.rounds_at_end if self._iteration == self.iterations else self.cfg.rounds)
         chains = search.solve(self._world(self._estimate.mean()))
         self.actor.chains.copy_(torch.as_tensor(chains))
-        if self.cfg.sensing == "chosen" and self._spent[0] >= self.cfg.warm_up:
+        if self._spent[0] >= self.cfg.warm_up and self.cfg.sensing == "chosen":
             drawn = search.solve(self._world(self._estimate.sample(self._rng)))
             self.policy.chains.copy_(torch.as_tensor(drawn))
         return self._diagnostics(chains)
