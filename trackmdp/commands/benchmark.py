@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from trackmdp.bench import learned, quality, solver, speed
+from trackmdp.bench import learned, log, quality, solver, speed
 from trackmdp.bench.machine import machine
 from trackmdp.build import make_device, make_world
 from trackmdp.config import BenchmarkConfig
@@ -25,6 +25,7 @@ PARTS: dict[str, Callable[[BenchmarkConfig, World, torch.device], list[dict[str,
     "quality": quality.quality,
     "solver": solver.solver,
     "learned_kernel": learned.learned_kernel,
+    "log": log.log_speed,
 }
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -79,9 +78,8 @@ def _log_episodes(
     """Write `episodes.mcap`: as many episodes as are simulated, each from a generator of its own."""
     assert isinstance(cfg.log, Mcap)
     described = to_yaml(load_run(cfg.run) if cfg.run else cfg)
-    warn = partial(console.print, markup=False, style="bold")
     log = EpisodeLog(
-        folder, world, seed=cfg.seed, config=described, max_steps=max_steps, layout=cfg.log.layout, warn=warn
+        folder, world, seed=cfg.seed, config=described, max_steps=max_steps, layout=cfg.log.layout, command="evaluate"
     )
     if isinstance(cfg.baseline, RandomK):
         log.record(RandomSets(world.num_cells, cfg.baseline.k), {"label": subject}, cfg.episodes)

@@ -33,7 +33,7 @@ from trackmdp.training.display import Display, make_console, table
 from trackmdp.training.judge import Judge, Verdict, figures
 from trackmdp.training.lock import locked
 from trackmdp.training.loop import Intervals, Position, train
-from trackmdp.training.metrics import MetricsLog, write_json, write_text
+from trackmdp.training.metrics import MetricsLog, write_bytes, write_json, write_text
 from trackmdp.training.state import capture, find, restore, take_weights
 from trackmdp.world.model import World
 
@@ -89,7 +89,7 @@ def _run(cfg: TrainConfig, folder: Path) -> float:
         content = capture(cfg, algorithm, collector, at, metrics=metrics.position, best=best)
         checkpoint.save(folder / "checkpoints", at.iteration, content, keep=cfg.checkpoint.keep, best=better)
 
-    log = _episode_log(cfg, world, folder, console)
+    log = _episode_log(cfg, world, folder)
 
     def record(iteration: int, chains: np.ndarray) -> None:
         if log is not None and isinstance(cfg.log, Mcap) and _recorded(cfg, iteration, algorithm.iterations):
@@ -155,7 +155,7 @@ def _start(
     return Position()
 
 
-def _episode_log(cfg: TrainConfig, world: World, folder: Path, console: Console) -> EpisodeLog | None:
+def _episode_log(cfg: TrainConfig, world: World, folder: Path) -> EpisodeLog | None:
     """The log of simulated episodes, where it is asked for."""
     if not isinstance(cfg.log, Mcap):
         return None
@@ -167,7 +167,7 @@ def _episode_log(cfg: TrainConfig, world: World, folder: Path, console: Console)
         config=described,
         max_steps=cfg.grid.max_steps,
         layout=cfg.log.layout,
-        warn=console.print,
+        command="train",
     )
 
 
@@ -199,9 +199,7 @@ def _write_inputs(cfg: TrainConfig, world: World, folder: Path, *, resumed: bool
     write_text(folder / "config.yaml", to_yaml(dataclasses.replace(cfg, resume=None)))
     buffer = io.BytesIO()
     np.save(buffer, world.kernel)
-    part = file.with_name("kernel.npy.part")
-    part.write_bytes(buffer.getvalue())
-    part.replace(file)
+    write_bytes(file, buffer.getvalue())
 
 
 def _summary(

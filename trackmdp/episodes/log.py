@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 from trackmdp.episodes.layout import write_layout
@@ -27,7 +28,7 @@ class EpisodeLog:
         config: text of the run's `config.yaml`.
         max_steps: where episodes are cut; None for never.
         layout: write a viewer's layout next to the log.
-        warn: is told, in one line, that logging is over.
+        command: named where it is said, on standard error, that logging is over.
     """
 
     def __init__(
@@ -39,9 +40,9 @@ class EpisodeLog:
         config: str,
         max_steps: int | None,
         layout: bool,
-        warn: Callable[[str], None],
+        command: str,
     ) -> None:
-        self._world, self._seed, self._max_steps, self._warn = world, seed, max_steps, warn
+        self._world, self._seed, self._max_steps, self._command = world, seed, max_steps, command
         self.file, self.episodes = free_name(folder / "episodes.mcap"), 0
         self._writer: EpisodeWriter | None = None
         try:
@@ -79,7 +80,8 @@ class EpisodeLog:
 
     def _stop(self, error: OSError) -> None:
         part = self.file.with_name(f"{self.file.name}.part")
-        self._warn(f"{part}: {(error.strerror or 'cannot be written').lower()}; no more episodes are logged")
+        reason = (error.strerror or "cannot be written").lower()
+        sys.stderr.write(f"trackmdp {self._command}: {part}: {reason}; no more episodes are logged\n")
         if self._writer is not None:
             self._writer.abandon()
             self._writer = None

@@ -1,0 +1,139 @@
+"""What is written is what is read, to the bit, whichever way it is read."""
+
+from __future__ import annotations
+
+import json
+import os
+from base64 import b64decode
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+
+from tests.episodes.logs import CONFIG, WORLD, policy, recorded, rewritten, write
+from trackmdp.episodes import schema
+from trackmdp.episodes.episode import first_difference
+from trackmdp.episodes.reader import EpisodeReader
+from trackmdp.episodes.record import RandomSets
+from trackmdp.episodes.verify import verify
+from trackmdp.episodes.writer import EpisodeWriter
+from trackmdp.errors import UserError
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("log") / "a.mcap", recorded(30))
+
+
+def test_episodes_come_back_bit_for_bit_in_any_order(log: Path) -> None:
+    with EpisodeReader(log) as reader:
+        assert len(reader) == 30
+        for number in (29, 0, 17, 16, 29):
+            assert first_difference(recorded(30)[number], reader.read(number)) is None
+        expected = [episode.to_tensordict(WORLD.t_max) for episode in recorded(30)]
+        for mine, theirs in zip(expected, reader, strict=True):
+            assert (mine == theirs).all()
+            assert torch.equal(mine["next", "reward"], theirs["next", "reward"])
+
+
+def test_write_read_write_gives_the_same_bytes(log: Path, tmp_path: Path) -> None:
+    assert rewritten(log, tmp_path / "b.mcap").read_bytes() == log.read_bytes()
+    assert write(tmp_path / "c.mcap", recorded(30)).read_bytes() == log.read_bytes()
+    assert write(tmp_path / "d.mcap", recorded(30, seed=1)).read_bytes() != log.read_bytes()
+
+
+def test_a_random_policy_and_cut_episodes_come_back_too(tmp_path: Path) -> None:
+    acting = RandomSets(16, 3)
+    episodes = recorded(10, acting=acting, max_steps=6)
+    file = write(tmp_path / "a.mcap", episodes, acting=acting, max_steps=6)
+    with EpisodeReader(file) as reader:
+        assert all(first_difference(a, b) is None for a, b in zip(episodes, reader.episodes(), strict=True))
+        assert (reader.max_steps, reader.chains(0)) == (6, None)
+        assert verify(reader).difference is None
+        assert any(row["truncated"] for row in reader.rows)
+        assert reader[0]["step_count"].tolist() == list(range(len(reader.read(0))))
+    assert rewritten(file, tmp_path / "b.mcap").read_bytes() == file.read_bytes()
+
+
+def test_it_feeds_a_replay_buffer(log: Path) -> None:
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(5000), batch_size=16)
+    with EpisodeReader(log) as reader:
+        buffer.extend(torch.cat(list(reader)))
+    assert len(buffer) == sum(map(len, recorded(30)))
+    assert buffer.sample()["next", "action_history"].shape == (16, 3, 16)
+
+
+def test_what_the_log_carries_simulates_again(log: Path) -> None:
+    with EpisodeReader(log) as reader:
+        world = reader.world()
+        assert (world.kernel == WORLD.kernel).all()
+        assert (world.cost == WORLD.cost).all()
+        assert (world.size, world.t_max, world.reward, world.safe_cost) == (4, 2, WORLD.reward, WORLD.safe_cost)
+        assert (reader.chains(0) == policy().chains).all()
+        assert reader.attachment("config.yaml").decode() == CONFIG
+        assert schema.versions().items() <= reader.run.items()
+        verified = verify(reader)
+        assert (verified.episodes, verified.difference) == (30, None)
+        assert verified.steps == sum(map(len, recorded(30)))
+
+
+def test_rows_say_what_became_of_each_episode(log: Path) -> None:
+    with EpisodeReader(log) as reader:
+        for row, episode in zip(reader.rows, recorded(30), strict=True):
+            assert row["seed"] == str(episode.seed)
+            assert row["length"] == len(episode)
+            assert row["return"] == pytest.approx(episode.reward.astype(float).sum(), abs=1e-9)
+            assert row["detections"] == episode.located.sum()
+            assert int(row["end_time"]) - int(row["start_time"]) == (len(episode) - 1) * schema.TICK_NS
+        gaps = [int(b["start_time"]) - int(a["end_time"]) for a, b in zip(reader.rows, reader.rows[1:], strict=False)]
+        assert min(gaps) > schema.TICK_NS
+        with pytest.raises(UserError, match=r"episode=30: .* holds 30 episodes \(0 to 29\)"):
+            reader[30]
+
+
+def test_the_name_appears_only_with_the_end(tmp_path: Path) -> None:
+    writer = EpisodeWriter(tmp_path / "a.mcap", WORLD, facts={}, config=CONFIG)
+    assert {file.name for file in tmp_path.iterdir()} == {"a.mcap.part"}
+    writer.finish()
+    assert {file.name for file in tmp_path.iterdir()} == {"a.mcap"}
+    with EpisodeReader(tmp_path / "a.mcap") as empty:
+        assert (len(empty), list(empty)) == (0, [])
+
+
+def test_a_bad_episode_does_not_spoil_the_file(tmp_path: Path) -> None:
+    good, bad = recorded(2)
+    bad.reward[0] = np.nan
+    writer = EpisodeWriter(tmp_path / "a.mcap", WORLD, facts={}, config=CONFIG)
+    writer.add_policy({"kind": "chains"}, policy().chains)
+    with pytest.raises(ValueError, match="not finite"):
+        writer.add(bad)
+    writer.add(good)
+    with EpisodeReader(writer.finish()) as reader:
+        assert first_difference(good, reader.read(0)) is None
+
+
+def test_another_process_may_not_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    writer = EpisodeWriter(tmp_path / "a.mcap", WORLD, facts={}, config=CONFIG)
+    process = os.getpid()
+    monkeypatch.setattr(os, "getpid", lambda: process + 1)
+    with pytest.raises(RuntimeError, match="opened by process"):
+        writer.add(recorded(1)[0])
+    writer.abandon()
+
+
+def test_grid_messages_keep_to_the_rules_of_viewers(log: Path) -> None:
+    """A field ends within its cell, a row within its stride, data are whole rows; no null, no array of arrays."""
+    with EpisodeReader(log) as reader:
+        messages = [each for each in reader._between(0, 2**63) if each.topic == "/grid"]
+        episode = reader.read(0)
+    said = json.loads(messages[0].data)
+    size = {1: 1, 7: 4}
+    assert all(each["offset"] + size[each["type"]] <= said["cell_stride"] for each in said["fields"])
+    assert said["row_stride"] >= said["column_count"] * said["cell_stride"]
+    data = b64decode(said["data"])
+    assert len(data) == 4 * said["row_stride"]
+    lowest = np.frombuffer(data[:4], "<f4")[0]  # belief of the first cell of the last of our rows
+    assert lowest == episode.belief[0, 12]
+    assert "null" not in json.dumps(list(schema.SCHEMAS.values()))

@@ -1,0 +1,156 @@
+"""Recorded episodes: each on its own generator, stepped by the environment, believed by the filter."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+
+from tests.episodes.logs import WORLD, policy, recorded
+from tests.helpers import hop_world
+from trackmdp.episodes.episode import Episode, first_difference
+from trackmdp.episodes.record import Acting, Chains, Issued, RandomSets, record
+from trackmdp.policies.fixed import ChainPolicy
+from trackmdp.seeding import derive
+from trackmdp.world.belief import BeliefFilter
+from trackmdp.world.env import TrackEnv
+from trackmdp.world.motion import Motion
+
+ACTING: dict[str, Acting] = {"chains": policy(), "random_k": RandomSets(16, 3)}
+
+
+def stepped_alone(seed: int, max_steps: int | None) -> TensorDict:
+    """The episode as the environment itself makes it, one row, from the same draws."""
+    rng = torch.Generator().manual_seed(seed)
+    start, motion = torch.randint(16, (1,), generator=rng), Motion(WORLD.kernel)
+    env = TrackEnv(WORLD, 1, max_steps=max_steps)
+    state = env.reset().set("target", start).set("last_cell", start.clone())
+    acting, steps = ChainPolicy(policy().chains), []
+    while True:
+        if len(steps) % 256 == 0:
+            block = motion.draw(256, rng)
+        state = acting(state)
+        following = TensorDict(env.advance(state, block[len(steps) % 256].unsqueeze(0)), [1])
+        steps.append(state.clone().set("next", following))
+        if following["done"].item():
+            return torch.cat(steps)
+        state = TensorDict({key: following[key] for key in env.state_keys_of_step}, [1])
+        state.update({key: torch.zeros(1, 1, dtype=torch.bool) for key in ("done", "terminated", "truncated")})
+
+
+@pytest.mark.parametrize("max_steps", [None, 7])
+def test_an_episode_is_what_the_environment_makes_of_its_draws(max_steps: int | None) -> None:
+    for number, episode in enumerate(recorded(12, max_steps=max_steps)):
+        mine = episode.to_tensordict(WORLD.t_max, max_steps)
+        theirs = stepped_alone(derive(0, "episode", number), max_steps)
+        assert set(mine.keys(True, True)) == set(theirs.keys(True, True))
+        for key in theirs.keys(True, True):
+            assert mine[key].dtype == theirs[key].dtype, key
+            assert torch.equal(mine[key], theirs[key]), key
+
+
+@pytest.mark.parametrize("max_steps", [None, 9])
+def test_its_keys_are_those_of_a_rollout(max_steps: int | None) -> None:
+    env = TrackEnv(WORLD, 1, max_steps=max_steps)
+    rollout = env.rollout(3, ChainPolicy(policy().chains))
+    mine = recorded(1, max_steps=max_steps)[0].to_tensordict(WORLD.t_max, max_steps)
+    assert set(mine.keys(True, True)) == set(rollout.keys(True, True))
+    for key in mine.keys(True, True):
+        assert mine[key].dtype == rollout[key].dtype
+        assert mine[key].shape[1:] == rollout[key].shape[2:]
+
+
+@pytest.mark.parametrize("name", ACTING)
+@settings(max_examples=15)
+@given(numbers=st.lists(st.integers(0, 299), min_size=1, max_size=5, unique=True))
+def test_an_episode_is_the_same_alone_and_among_others(name: str, numbers: list[int]) -> None:
+    everyone = together(name)
+    seeds = [everyone[number].seed for number in numbers]
+    for number, alone in zip(numbers, record(WORLD, ACTING[name], seeds), strict=True):
+        assert first_difference(everyone[number], alone) is None
+
+
+def together(name: str, made: dict[str, list[Episode]] = {}) -> list[Episode]:  # noqa: B006  made once
+    if name not in made:
+        made[name] = recorded(300, acting=ACTING[name])
+    return made[name]
+
+
+@pytest.mark.parametrize("name", ACTING)
+def test_the_belief_is_the_filters(name: str) -> None:
+    exact = BeliefFilter(WORLD.kernel)
+    for episode in together(name)[:10]:
+        belief = exact.detect(torch.tensor([episode.start]))
+        for t in range(len(episode)):
+            predicted = exact.predict(belief)
+            np.testing.assert_allclose(episode.belief[t], predicted[0].numpy(), rtol=1e-6, atol=1e-9)
+            action = torch.as_tensor(episode.action[t : t + 1])
+            found = torch.tensor([int(episode.target[t])])
+            belief = exact.detect(found) if episode.located[t] else exact.miss(predicted, action)
+
+
+def test_by_hand() -> None:
+    """2x2, the target hops 0 -> 1 -> 2 -> 3 -> 0; only the sensor of cell 2 is ever on, T_max 1, D = 0.9, r = 2."""
+    world = hop_world()
+    only = np.zeros((4, 2, 4), dtype=bool)
+    only[..., 2] = True
+    long = [episode for episode in record(world, Chains(only), range(400)) if episode.start == 0 and len(episode) > 4]
+    episode = long[0]
+    assert episode.target[:4].tolist() == [1, 2, 3, 0]
+    assert episode.misses[:4].tolist() == [0, 1, 0, 1]
+    assert episode.observation[:4].tolist() == [-1, 2, -1, -1]
+    assert episode.last_cell[:4].tolist() == [0, 0, 2, 2]
+    np.testing.assert_allclose(episode.reward[:4], [-0.3, 1.7, -0.3, -0.3], rtol=1e-6)
+    np.testing.assert_allclose(episode.returns[:4], [-0.3, 1.4, 1.1, 0.8], rtol=1e-6)
+    np.testing.assert_allclose(episode.belief[0], [0, 0.75, 0, 0])
+    assert episode.misses[4] == 2
+    assert episode.forced(1)[:5].tolist() == [False] * 4 + [True]
+    assert (episode.target[-1], episode.terminated, episode.truncated) == (4, True, False)
+    assert episode.reward[-1] == 0
+
+
+def test_issued_actions_give_the_episode_again() -> None:
+    for episode in together("random_k")[:20]:
+        (again,) = record(WORLD, Issued(episode.action), [episode.seed])
+        again = dataclasses.replace(again, probability=episode.probability)
+        assert first_difference(episode, again) is None
+    (longer,) = record(WORLD, Issued(episode.action[:1]), [episode.seed])
+    assert not longer.action[1:].any()
+
+
+CHANGES: list[tuple[str, Any, str]] = [
+    ("seed", 5, "seed: logged 5, "),
+    ("start", -1, "start: logged -1, "),
+    ("truncated", True, "truncated: logged True, "),
+    ("reward", 2, "step 2, reward: logged "),
+    ("target", 1, "step 1, target: logged "),
+    ("action", (3, 7), "step 3, action of cell 7: logged "),
+    ("belief", (0, 2), "step 0, belief of cell 2: logged "),
+]
+
+
+@pytest.mark.parametrize(("name", "change", "message"), CHANGES)
+def test_the_first_difference_is_named(name: str, change: Any, message: str) -> None:
+    episode = max(recorded(5), key=len)
+    value = getattr(episode, name)
+    if isinstance(value, np.ndarray):
+        value = value.copy()
+        value[change] = ~value[change] if value.dtype == bool else value[change] + 1
+        value[-1] = value[0]
+    else:
+        value = change
+    changed = dataclasses.replace(episode, **{name: value})
+    assert (first_difference(changed, episode) or "").startswith(message)
+
+
+def test_a_belief_within_the_tolerance_passes() -> None:
+    episode = recorded(1)[0]
+    changed = dataclasses.replace(episode, belief=episode.belief + np.float32(1e-7))
+    assert first_difference(changed, episode)
+    assert first_difference(changed, episode, belief_tolerance=1e-6) is None
