@@ -41,6 +41,7 @@ class LearnedKernel:
         self.task, self.cfg, self.iterations, self.device = task, cfg, iterations, device
         self._estimate = KernelEstimate(task.size, weight=cfg.prior, exit_weight=cfg.exit_prior)
         self._rng = np.random.default_rng(derive(seed, "learned_kernel"))
+        self._chooses, self._warm_up = cfg.sensing == "chosen", cfg.warm_up
         self._iteration, self._spent = 0, np.zeros(3)
         shape = (task.num_cells, task.num_choices, task.num_cells)
         self.policy = ChainPolicy(np.ones(shape, dtype=bool), device)
@@ -55,7 +56,7 @@ class LearnedKernel:
         self._estimate.fit(self.cfg.rounds_at_end if self._iteration == self.iterations else self.cfg.rounds)
         chains = search.solve(self._world(self._estimate.mean()))
         self.actor.chains.copy_(torch.as_tensor(chains))
-        if self._spent[0] >= self.cfg.warm_up and self.cfg.sensing == "chosen":
+        if self._chooses and self._spent[0] >= self._warm_up:
             drawn = search.solve(self._world(self._estimate.sample(self._rng)))
             self.policy.chains.copy_(torch.as_tensor(drawn))
         return self._diagnostics(chains)
