@@ -20,6 +20,7 @@ COMMANDS = {
     "solve": "solve a world with its motion model",
     "verify": "check the paper's theorems on a world",
     "benchmark": "measure speed and quality on this machine",
+    "export": "write a learned policy as a file that runs without this package",
     "replay": "list, play, verify and recover logged episodes, or show one as a web page",
 }
 

@@ -26,6 +26,7 @@ from trackmdp.config import (
     ROOTS,
     CommandConfig,
     EvaluateConfig,
+    ExportConfig,
     TrainConfig,
     WorldConfig,
     conf_dir,
@@ -187,6 +188,8 @@ def _checked(command: str, cfg: DictConfig, task: Sequence[str], folder: Path) -
             key = word.lstrip("+~").split("=")[0]
             if key.split(".")[0].split("@")[0] in WORLD_KEYS:
                 raise UserError(f"{word}: not together with run={typed.run}, whose own world is used")
+        load_run(typed.run)
+    elif isinstance(typed, ExportConfig):
         load_run(typed.run)
     elif isinstance(typed, WorldConfig) and reads_files(typed):
         from trackmdp.build import make_world

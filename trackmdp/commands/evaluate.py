@@ -11,8 +11,9 @@ import torch
 from rich.console import Console
 from tensordict.nn import TensorDictModuleBase
 
-from trackmdp.build import make_algorithm, make_baseline, make_device, make_world
+from trackmdp.build import make_baseline, make_device, make_world
 from trackmdp.commands import playback
+from trackmdp.commands.trained import trained
 from trackmdp.config import EvaluateConfig, Mcap, Playback, RandomK, load_run, to_yaml
 from trackmdp.episodes.log import EpisodeLog
 from trackmdp.episodes.record import Chains, RandomSets
@@ -22,9 +23,8 @@ from trackmdp.reports.picture import draw
 from trackmdp.seeding import generator
 from trackmdp.solvers import estimator
 from trackmdp.solvers.chains import sets_of
-from trackmdp.training import checkpoint
 from trackmdp.training.display import make_console, table
-from trackmdp.training.evaluate import Simulation, chains_of, simulate
+from trackmdp.training.evaluate import Simulation, simulate
 from trackmdp.training.judge import Judge, Verdict, figures
 from trackmdp.training.metrics import write_json, write_text
 from trackmdp.world.model import World
@@ -91,13 +91,8 @@ def _log_episodes(
 
 def _trained(cfg: EvaluateConfig, device: torch.device) -> tuple[World, int | None, np.ndarray, str]:
     assert cfg.run is not None
-    trained = load_run(cfg.run)
-    world = make_world(trained)
-    algorithm = make_algorithm(trained, world, device)
-    file = checkpoint.newest(Path(cfg.run))
-    algorithm.load_state_dict(checkpoint.load(file, device)["algorithm"])
-    chains = chains_of(algorithm.actor, world.task, device)
-    return world, trained.grid.max_steps, chains, f"{trained.algo.name}, {file.name}"
+    policy = trained(cfg.run, device)
+    return policy.world, policy.max_steps, policy.chains, policy.subject
 
 
 def _baseline(cfg: EvaluateConfig) -> tuple[World, int | None, np.ndarray, str]:

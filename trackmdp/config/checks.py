@@ -15,6 +15,7 @@ from trackmdp.config.roots import (
     BenchmarkConfig,
     CommandConfig,
     EvaluateConfig,
+    ExportConfig,
     ReplayConfig,
     SolveConfig,
     TrainConfig,
@@ -70,6 +71,8 @@ def absolute_paths(cfg: CommandConfig, folder: Path) -> None:
     if isinstance(cfg, ReplayConfig):
         cfg.file = str(folder / cfg.file)
         cfg.html, cfg.csv, cfg.layout = (path and str(folder / path) for path in (cfg.html, cfg.csv, cfg.layout))
+    if isinstance(cfg, ExportConfig):
+        cfg.run = str(folder / cfg.run)
     if not isinstance(cfg, WorldConfig):
         return
     if isinstance(cfg.kernel, Table):

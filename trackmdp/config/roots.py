@@ -16,6 +16,7 @@ __all__ = [
     "CommandConfig",
     "EvaluateConfig",
     "Evaluation",
+    "ExportConfig",
     "OptimalBound",
     "ReplayConfig",
     "SolveConfig",
@@ -145,6 +146,17 @@ class ReplayConfig(CommandConfig):
     speed: float = option("speed of playing", unit="steps/s", gt=0, le=1000)
 
 
+@dataclass(kw_only=True)
+class ExportConfig(CommandConfig):
+    """Write a learned policy as a file that runs without this package."""
+
+    run: str = option("folder of a training run", expects="the folder of a run")
+    format: str = option(
+        "torch_export: policy.pt2, onnx: policy.onnx, sets: sets.json", choices=("torch_export", "onnx", "sets")
+    )
+    checkpoint: str = option("which of the run's checkpoints", choices=("newest", "best"))
+
+
 ROOTS: dict[str, type[CommandConfig]] = {
     "train": TrainConfig,
     "evaluate": EvaluateConfig,
@@ -152,5 +164,6 @@ ROOTS: dict[str, type[CommandConfig]] = {
     "verify": VerifyConfig,
     "benchmark": BenchmarkConfig,
     "replay": ReplayConfig,
+    "export": ExportConfig,
 }
 """Command -> its schema; `conf/<command>.yaml` holds the values."""

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-__all__ = ["MetricsLog", "write_json", "write_text"]
+__all__ = ["MetricsLog", "write_bytes", "write_json", "write_text"]
 
 
 class MetricsLog:
@@ -64,10 +64,15 @@ class MetricsLog:
 
 def write_text(file: Path, text: str) -> None:
     """Write a file whole or not at all."""
+    write_bytes(file, text.encode())
+
+
+def write_bytes(file: Path, content: bytes) -> None:
+    """Write a file whole or not at all."""
     part = file.with_name(f"{file.name}.part")
     try:
-        with part.open("w") as stream:
-            stream.write(text)
+        with part.open("wb") as stream:
+            stream.write(content)
             stream.flush()
             os.fsync(stream.fileno())
         part.replace(file)

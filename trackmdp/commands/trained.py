@@ -1,0 +1,41 @@
+"""What a run has learned, from one of its checkpoints."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from trackmdp.build import make_algorithm, make_world
+from trackmdp.config import load_run
+from trackmdp.training import checkpoint
+from trackmdp.training.evaluate import chains_of
+from trackmdp.world.model import BoolArray, World
+
+__all__ = ["Trained", "trained"]
+
+
+@dataclass(frozen=True)
+class Trained:
+    """The policy of a run as `chains` `[M, t_max+1, M]`, where it was learned, and the checkpoint it is from."""
+
+    world: World
+    max_steps: int | None
+    chains: BoolArray
+    subject: str
+
+
+def trained(run: str, device: torch.device, *, best: bool = False) -> Trained:
+    """The policy of the newest checkpoint of the run in the folder `run`, or of the best one.
+
+    Raises:
+        UserError: that is no run, or the checkpoint is missing or damaged.
+    """
+    cfg, folder = load_run(run), Path(run)
+    world = make_world(cfg)
+    algorithm = make_algorithm(cfg, world, device)
+    file = folder / "checkpoints" / checkpoint.BEST if best else checkpoint.newest(folder)
+    algorithm.load_state_dict(checkpoint.load(file, device)["algorithm"])
+    chains = chains_of(algorithm.actor, world.task, device)
+    return Trained(world, cfg.grid.max_steps, chains, f"{cfg.algo.name}, {file.name}")
