@@ -26,7 +26,7 @@ KERNELS: dict[type[Kernel], Callable[..., Array]] = {
     RandomSupport: kernels.random_support,
     RandomWalk: kernels.random_walk,
     Drift: kernels.drift,
-    Table: lambda size, *, path: kernels.load_table(path),  # noqa: ARG005  a table has its own size, checked below
+    Table: lambda size, *, path: kernels.load_table(path),  # a table has its own size, checked below
 }
 
 
@@ -105,7 +105,9 @@ def make_algorithm(cfg: TrainConfig, world: World, device: torch.device) -> Algo
     task, batches = world.task, -(-cfg.collector.total_frames // cfg.collector.frames_per_batch)
     makers: dict[type[Any], Callable[[Any], Algorithm]] = {
         Hindsight: lambda c: hindsight.Hindsight(task, c, iterations=batches, seed=cfg.seed, device=device),
-        LearnedKernel: lambda c: learned_kernel.LearnedKernel(task, c, iterations=batches, seed=cfg.seed, device=device),
+        LearnedKernel: lambda c: learned_kernel.LearnedKernel(
+            task, c, iterations=batches, seed=cfg.seed, device=device
+        ),
         A2c: lambda c: a2c.A2C(task, c, iterations=batches, device=device),
         Ppo: lambda c: ppo.PPO(task, c, iterations=batches, seed=cfg.seed, device=device),
         Dqn: lambda c: dqn.DQN(task, c, iterations=batches, seed=cfg.seed, device=device),
