@@ -37,9 +37,10 @@ def sentence(episode: Episode, t: int, task: Task) -> str:
         "detected": f"target detected in {where(int(episode.target[t]), task.size)}",
         "missed": f"target missed in {where(int(episode.target[t]), task.size)}",
     }
+    on = "" if state == "forced" else f"{int(episode.action[t].sum())} sensors on, "
     return (
-        f"step {t + 1} of {len(episode)}: {words[state]}; {int(episode.action[t].sum())} sensors on, "
-        f"{int(episode.misses[t])} misses before; reward {episode.reward[t]:.2f}, total {episode.returns[t]:.2f}"
+        f"step {t + 1} of {len(episode)}: {words[state]}; {on}{int(episode.misses[t])} misses before; "
+        f"reward {episode.reward[t]:.2f}, total {episode.returns[t]:.2f}"
     )
 
 

@@ -1,0 +1,129 @@
+"""The page of an episode: what it holds, and what it does in a browser."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.episodes.browser import CHROMIUM, Browser
+from tests.episodes.logs import WORLD, recorded, write
+from tests.helpers import train_config
+from trackmdp.build import make_world
+from trackmdp.episodes.page import MOST_STEPS, page, write_page
+from trackmdp.episodes.reader import EpisodeReader
+from trackmdp.episodes.record import Chains, record
+from trackmdp.solvers import bounds, qmdp
+
+
+@pytest.fixture(scope="module")
+def reader(tmp_path_factory: pytest.TempPathFactory) -> Iterator[EpisodeReader]:
+    with EpisodeReader(write(tmp_path_factory.mktemp("log") / "a.mcap", recorded(20))) as reader:
+        yield reader
+
+
+def longest(reader: EpisodeReader) -> int:
+    return int(max(reader.rows, key=lambda row: row["length"])["episode"])
+
+
+def data_of(text: str) -> dict[str, list[float]]:
+    found = re.search(r'<script id="data" type="application/json">(.*?)</script>', text, flags=re.DOTALL)
+    assert found
+    content: dict[str, list[float]] = json.loads(found[1])
+    return content
+
+
+def test_a_page_holds_the_episode_to_the_digit(reader: EpisodeReader) -> None:
+    episode = reader.read(longest(reader))
+    data = data_of(page(reader, episode))
+    assert data["reward"] == episode.reward.tolist()
+    assert data["total"] == episode.returns.tolist()
+    assert data["n"] == episode.misses.tolist()
+    assert data["bound"] == pytest.approx(bounds.clocked(WORLD)[episode.start])
+    shares = dict(zip(data["belief"][0][::2], data["belief"][0][1::2], strict=True))  # type: ignore[index]
+    assert shares[int(episode.belief[0].argmax())] == pytest.approx(1e4 * episode.belief[0].max(), abs=0.5)
+
+
+def test_a_page_is_one_small_file_that_asks_for_nothing(tmp_path: Path) -> None:
+    world = make_world(train_config())
+    acting = Chains(qmdp.solve(world))
+    episode = next(each for each in record(world, acting, range(100)) if 100 <= len(each) < 150)
+    with EpisodeReader(write(tmp_path / "a.mcap", [episode], acting=acting, world=world)) as reader:
+        write_page(reader, tmp_path / "a.html")
+    text = (tmp_path / "a.html").read_text(encoding="utf-8")
+    assert len(text.encode()) < 250_000 * len(episode) / 150
+    assert not re.findall(r"(?:src|href)=|url\(|@import|fetch\(", text)
+    assert "default-src 'none'" in text
+
+
+def test_what_a_log_says_cannot_break_out_of_the_page(reader: EpisodeReader) -> None:
+    reader.policies[0]["label"], seed = "</script><b>&", reader.run["seed"]
+    reader.run["seed"] = "</script>"
+    text = page(reader, reader.read(0))
+    reader.policies[0]["label"], reader.run["seed"] = "a policy", seed
+    assert text.count("</script>") == 2
+    assert "&lt;/script&gt;&lt;b&gt;&amp;" in text
+
+
+def test_a_long_episode_is_cut_and_the_page_says_so(reader: EpisodeReader, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("trackmdp.episodes.page.MOST_STEPS", 5)
+    data = data_of(page(reader, reader.read(longest(reader))))
+    assert len(data["target"]) == len(data["belief"]) == 5
+    assert "the first 5 steps are shown" in str(data["about"])
+    assert MOST_STEPS == 2000
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
+def test_the_page_in_a_browser(reader: EpisodeReader, tmp_path: Path) -> None:
+    number = longest(reader)
+    episode = reader.read(number)
+    write_page(reader, tmp_path / "a.html", number)
+    last = len(episode) - 1
+    with Browser(tmp_path / "profile") as browser:
+        browser.view(360, 740, "dark")
+        browser.open(tmp_path / "a.html")
+        assert browser.ask("Number(document.getElementById('slider').max)") == last
+        assert browser.ask("document.querySelectorAll('.cell').length") == len(reader.world().cost) + 1  # and its key
+
+        def value(name: str) -> float:
+            return float(browser.ask(f"document.getElementById('v-{name}').dataset.value"))
+
+        def check(t: int) -> None:
+            assert value("step") == t + 1
+            assert value("reward") == episode.reward[t]
+            assert value("total") == episode.returns[t]
+            assert value("n") == episode.misses[t]
+            assert value("active") == episode.action[t].sum()
+            said = browser.ask("document.getElementById('said').textContent")
+            assert said.startswith(f"Step {t + 1} of {last + 1}. ")
+            if episode.target[t] < 16:
+                place = f"row {episode.target[t] // 4 + 1}, column {episode.target[t] % 4 + 1}"
+                assert place in said
+
+        check(0)
+        for key, t in (("ArrowRight", 1), ("ArrowRight", 2), ("End", last), ("ArrowLeft", last - 1), ("Home", 0)):
+            browser.press(key)
+            check(t)
+        browser.press("+")
+        assert browser.ask("document.getElementById('speed').value") == "10"
+        browser.press(" ")
+        assert browser.ask("document.getElementById('play').textContent") == "Pause"
+        assert browser.ask("document.getElementById('said').getAttribute('aria-live')") == "off"
+        browser.ask(
+            "new Promise((done) => { const look = () => at >= 2 ? done() : requestAnimationFrame(look); look(); })"
+        )
+        browser.press(" ")
+        assert browser.ask("document.getElementById('play').textContent") == "Play"
+        assert browser.ask("document.getElementById('said').getAttribute('aria-live')") == "polite"
+        assert value("step") >= 3
+        browser.ask("document.getElementById('next').click()")
+        assert browser.ask("document.documentElement.scrollWidth") <= 360
+        assert browser.ask("getComputedStyle(document.body).backgroundColor") == "rgb(22, 24, 27)"
+        browser.shoot(tmp_path / "phone.png")
+        browser.view(1000, 760, "light")
+        assert browser.ask("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
+        browser.shoot(tmp_path / "desk.png")
+        assert browser.problems == []
