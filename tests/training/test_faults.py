@@ -94,9 +94,9 @@ def test_a_loss_that_is_not_finite_names_the_iteration_and_leaves_the_last_good_
     with monkeypatch.context() as patch:
         patch.setattr(learner, "step", poisoned)
         with pytest.raises(RunError, match=f"iteration {bad}: .* is nan"):
-            train(tmp_path, "checkpoint.every=0", "checkpoint.seconds=1e-9", algo=algo)
-    assert saved(tmp_path) == [bad - 1, bad - 2]
-    train(tmp_path, "checkpoint.every=0", "checkpoint.seconds=1e-9", "resume=auto", algo=algo)
+            train(tmp_path, algo=algo)
+    assert saved(tmp_path) == ([8, 7] if algo == "hindsight" else [3, 2])
+    train(tmp_path, "resume=auto", algo=algo)
     assert_same_run(tmp_path, whole[algo])
 
 
@@ -135,7 +135,7 @@ def test_rows_written_after_the_checkpoint_are_cut_off(
 def test_one_process_per_folder(tmp_path: Path) -> None:
     with locked(tmp_path), pytest.raises(UserError, match="another process is running in this folder"):
         train(tmp_path)
-    assert {file.name for file in tmp_path.iterdir()} == {".lock"}
+    assert not list(tmp_path.iterdir())
     train(tmp_path)
 
 

@@ -28,7 +28,7 @@ from trackmdp.errors import RunError, UserError
 from trackmdp.seeding import seed_global
 from trackmdp.solvers import optimal
 from trackmdp.solvers.optimal import Solution
-from trackmdp.training import checkpoint
+from trackmdp.training import checkpoint, memory
 from trackmdp.training.display import Display, make_console, table
 from trackmdp.training.judge import Judge, Verdict, figures
 from trackmdp.training.lock import locked
@@ -69,6 +69,7 @@ def _run(cfg: TrainConfig, folder: Path) -> float:
     torch.set_num_threads(cfg.threads)
     device = make_device(cfg.device)
     world = make_world(cfg)
+    console.print(memory.check(cfg, world.task, device))
     state, passed_over = find(cfg, folder, device)
     for line in passed_over:
         console.print(f"passed over: {line}")

@@ -62,7 +62,11 @@ class Checkpoint:
     """When the state of the run is saved."""
 
     every: int = option("frames from one checkpoint to the next; 0 = not counted in frames", unit="frames", ge=0)
-    seconds: float | None = option("time from one checkpoint to the next; null = not by time", unit="s", gt=0)
+    seconds: float | None = option(
+        "time from one checkpoint to the next, longer where saving would take over 2 %; null = not by time",
+        unit="s",
+        gt=0,
+    )
     keep: int = option("newest checkpoints kept", ge=1)
 
 

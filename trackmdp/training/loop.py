@@ -22,6 +22,8 @@ from trackmdp.world.model import BoolArray
 
 __all__ = ["Intervals", "Position", "train"]
 
+_SAVING = 50  # seconds of training to one of saving, at least
+
 
 @dataclass(frozen=True)
 class Intervals:
@@ -31,7 +33,7 @@ class Intervals:
         evaluate: iterations from one exact evaluation to the next.
         log: iterations from one metrics row to the next.
         save_frames: frames from one checkpoint to the next; 0 for none.
-        save_seconds: seconds from one checkpoint to the next; None for none.
+        save_seconds: seconds from one checkpoint to the next, more where saving takes long; None for none.
     """
 
     evaluate: int
@@ -81,7 +83,7 @@ def train(
         RunError: the loss is not finite, or collecting broke down; the last checkpoint stands.
     """
     began, batches = time.monotonic() - start.seconds, iter(collector)
-    saved, at = start, start
+    saved, at, rest = start, start, 0.0
     verdict = judge.score(chains_of(algorithm.actor, judge.world, algorithm.device))
     with Signals() as signals, Watch(collector) as watch:
         for iteration in range(start.iteration + 1, algorithm.iterations + 1):
@@ -103,9 +105,10 @@ def train(
                     on_judged(iteration, chains)
             if last or iteration % every.log == 0:
                 metrics.write(_row(at, verdict if judged else None, diagnostics))
-            if last or signals.received or _due(saved, at, every):
+            if last or signals.received or _due(saved, at, rest, every):
+                begin = time.monotonic()
                 save(at, verdict)
-                saved = at
+                saved, rest = at, _SAVING * (time.monotonic() - begin)
             display.update(iteration, frames, verdict.evaluation.aihtr, judge.upper - verdict.evaluation.aihtr)
             if signals.received and not last:
                 raise Preempted(signals.received)
@@ -135,9 +138,10 @@ def _named(iteration: int) -> Iterator[None]:
         ) from error
 
 
-def _due(saved: Position, at: Position, every: Intervals) -> bool:
+def _due(saved: Position, at: Position, rest: float, every: Intervals) -> bool:
+    """Whether to save at `at`; by time not before `rest` seconds, or saving would take too much of it."""
     frames = every.save_frames and at.frames // every.save_frames > saved.frames // every.save_frames
-    seconds = every.save_seconds is not None and at.seconds - saved.seconds >= every.save_seconds
+    seconds = every.save_seconds is not None and at.seconds - saved.seconds >= max(every.save_seconds, rest)
     return bool(frames or seconds)
 
 

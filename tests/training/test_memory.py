@@ -1,0 +1,97 @@
+"""What a run needs of the memory is known before it is taken."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from tests.helpers import collect, small_world, train_config
+from trackmdp.algos.dqn import DQN
+from trackmdp.cli import main
+from trackmdp.config import Dqn
+from trackmdp.errors import UserError
+from trackmdp.training.memory import available, check, needs
+
+CPU = torch.device("cpu")
+
+
+def nbytes(state: Any) -> int:
+    if isinstance(state, dict):
+        return sum(map(nbytes, state.values()))
+    return state.nbytes if isinstance(state, torch.Tensor) and state.dim() else 0
+
+
+def system(root: Path, free: int, **cgroup: str) -> Path:
+    (root / "proc").mkdir()
+    (root / "sys/fs/cgroup").mkdir(parents=True)
+    (root / "proc/meminfo").write_text(f"MemTotal: 99 kB\nMemAvailable:    {free} kB\n")
+    for name, text in cgroup.items():
+        (root / "sys/fs/cgroup" / name.replace("_", ".", 1)).write_text(text)
+    return root
+
+
+@pytest.mark.parametrize("prioritized", [True, False])
+@pytest.mark.parametrize("t_max", [0, 2])
+def test_the_replay_buffer_takes_what_was_estimated(prioritized: bool, t_max: int) -> None:
+    world = small_world(size=4, t_max=t_max)
+    words = ("algo=dqn", "algo.buffer_size=3000", "algo.updates=1", f"algo.prioritized.enabled={prioritized}")
+    cfg = train_config(*words, "algo.batch_size=64", "collector.frames_per_batch=256")
+    assert isinstance(cfg.algo, Dqn)
+    learner = DQN(world.task, cfg.algo, iterations=1, seed=0, device=CPU)
+    learner.step(collect(world, learner.policy, 16, 4))
+    held = learner.state_dict()["buffer"]
+    del held["_rng"]
+    assert needs(cfg, world.task)["algo.buffer_size"] == nbytes(held)
+
+
+def test_a_buffer_that_cannot_fit_is_refused_before_anything_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "run"
+    assert main(["train", "algo=dqn", "algo.buffer_size=1000000000000", f"hydra.run.dir={folder}"]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith("trackmdp train: algo.buffer_size=1000000000000: needs about 511,")
+    assert told.endswith(" GiB are available\n")
+    assert told.count("\n") == 1
+    assert not folder.exists()
+
+
+def test_batches_that_cannot_fit_are_named() -> None:
+    cfg = train_config("algo=ppo", "collector.frames_per_batch=2560000000", "collector.total_frames=2560000000")
+    with pytest.raises(UserError, match=r"^collector.frames_per_batch=2560000000: needs about [\d,.]+ GiB, "):
+        check(cfg, small_world().task, CPU)
+
+
+def test_a_run_says_what_it_takes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["grid.size=3", "collector.total_frames=512", "collector.frames_per_batch=512", "collector.envs=32"]
+    budget = ["algo.updates=1", "optimal.enabled=false"]
+    assert main(["train", *words, *budget, f"hydra.run.dir={tmp_path}"]) == 0
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("memory: "))
+    assert "collector.frames_per_batch 0.00 GiB, algo.buffer_size 0.00 GiB, algo.hidden 0.00 GiB" in line
+
+
+@pytest.mark.parametrize(
+    ("cgroup", "kib"),
+    [
+        ({}, 8000),
+        ({"memory_max": "max\n", "memory_current": "1024\n"}, 8000),
+        ({"memory_max": f"{5000 * 1024}\n", "memory_current": f"{2000 * 1024}\n"}, 3000),
+        (
+            {
+                "memory_max": f"{5000 * 1024}\n",
+                "memory_current": f"{2000 * 1024}\n",
+                "memory_stat": f"anon 5\ninactive_file {500 * 1024}\n",
+            },
+            3500,
+        ),
+    ],
+)
+def test_the_job_may_have_less_than_the_machine(tmp_path: Path, cgroup: dict[str, str], kib: int) -> None:
+    assert available(CPU, system(tmp_path, 8000, **cgroup)) == kib * 1024
+
+
+def test_a_system_that_does_not_say_counts_as_unlimited(tmp_path: Path) -> None:
+    assert available(CPU, tmp_path) == 2**63

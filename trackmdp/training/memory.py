@@ -1,0 +1,92 @@
+"""What a run needs of the memory, estimated before anything large is made."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from trackmdp.config import A2c, Dqn, Hindsight, Ppo, TrainConfig
+from trackmdp.errors import UserError
+from trackmdp.world.model import Task
+
+__all__ = ["available", "check", "needs"]
+
+_GIB = 2**30
+_NUMBER, _INDEX = 4, 8  # bytes of a float32 and of an int64
+_CGROUPS = (
+    ("memory.max", "memory.current", "inactive_file"),
+    ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+)
+
+
+def check(cfg: TrainConfig, task: Task, device: torch.device) -> str:
+    """One line about the memory that the run needs and what there is on `device`.
+
+    Raises:
+        UserError: it cannot fit; the option that takes most of it is named.
+    """
+    parts, free = needs(cfg, task), available(device)
+    total = sum(parts.values())
+    if total > free:
+        key = max(parts, key=lambda name: parts[name])
+        value = getattr(getattr(cfg, key.split(".")[0]), key.split(".")[1])
+        raise UserError(f"{key}={value}: needs about {_gib(total)}, {_gib(free)} are available")
+    shares = ", ".join(f"{key} {_gib(size)}" for key, size in parts.items())
+    return f"memory: about {_gib(total)} of {_gib(free)} ({shares})"
+
+
+def needs(cfg: TrainConfig, task: Task) -> dict[str, int]:
+    """Bytes of the replay buffer, of collected batches and of networks, by the option that they grow with."""
+    state = 2 * _INDEX + task.num_choices * task.num_cells
+    frame = 2 * (state + _INDEX + 3) + task.num_cells + _NUMBER * (task.num_cells + 2)
+    parts = {"collector.frames_per_batch": 2 * cfg.collector.frames_per_batch * frame}  # collected, and handed over
+    if isinstance(cfg.algo, Dqn):
+        transition = 2 * state + task.num_cells + 2 * _NUMBER + 1 + _INDEX
+        priority = 8 if cfg.algo.prioritized.enabled else 0
+        parts["algo.buffer_size"] = cfg.algo.buffer_size * (transition + priority)
+    if isinstance(cfg.algo, Hindsight):
+        moves = min(cfg.algo.buffer_size, cfg.collector.total_frames)
+        parts["algo.buffer_size"] = moves * (4 + 5 * _INDEX)  # two cells of 16 bits, and their sorting
+    if isinstance(cfg.algo, (A2c, Ppo, Dqn, Hindsight)):
+        inputs = task.num_cells * (2 * task.num_choices + 3) + task.num_choices + 1
+        with_moments = 4 * _NUMBER * (inputs + task.num_cells)
+        parts["algo.hidden"] = 2 * (cfg.algo.hidden or 256) * with_moments
+    return parts
+
+
+def available(device: torch.device, root: Path = Path("/")) -> int:
+    """Bytes that can still be had on `device`: on the CPU what the system, and the job's own limit, leave.
+
+    A system that does not say counts as unlimited. `root` is where its files are.
+    """
+    if device.type == "cuda":
+        return int(torch.cuda.mem_get_info(device)[0])
+    free = [_entry(root / "proc/meminfo", "MemAvailable:", 1024)]
+    for limit, used, cache in _CGROUPS:
+        for folder in (root / "sys/fs/cgroup", root / "sys/fs/cgroup/memory"):
+            most, now = _number(folder / limit), _number(folder / used)
+            if most is not None and now is not None:
+                free.append(most - now + (_entry(folder / "memory.stat", cache, 1) or 0))
+    return min((each for each in free if each is not None), default=2**63)
+
+
+def _entry(file: Path, name: str, unit: int) -> int | None:
+    """The number after `name` in a file of lines."""
+    try:
+        rows = (line.split() for line in file.read_text().splitlines())
+        return next((int(row[1]) * unit for row in rows if row and row[0] == name), None)
+    except OSError:
+        return None
+
+
+def _number(file: Path) -> int | None:
+    try:
+        text = file.read_text().strip()
+    except OSError:
+        return None
+    return int(text) if text.isdigit() else None
+
+
+def _gib(size: int) -> str:
+    return f"{size / _GIB:,.2f} GiB"
