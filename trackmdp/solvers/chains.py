@@ -130,10 +130,12 @@ def sets_of(chains: BoolArray) -> dict[str, Any]:
     }
 
 
-def _check(world: World, chains: npt.NDArray[np.generic]) -> Array:
+def _check(world: World, chains: npt.NDArray[np.generic]) -> Array | BoolArray:
     expected = (world.num_cells, world.num_choices, world.num_cells)
     if chains.shape != expected:
         raise UserError(f"chains: expected shape {expected} (M, t_max + 1, M), got {chains.shape}")
+    if chains.dtype == np.bool_:  # no copy as numbers, which would take eight times the memory
+        return chains.astype(np.bool_, copy=False)
     numbers = np.asarray(chains, dtype=np.float64)
     if not ((numbers >= 0) & (numbers <= 1)).all():
         raise UserError("chains: expected probabilities between 0 and 1")
