@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,6 +10,7 @@ import numpy as np
 from trackmdp.config import Cost, Drift, Kernel, PaperCost, RandomSupport, RandomWalk, Table, WorldConfig
 from trackmdp.errors import UserError
 from trackmdp.world import kernels
+from trackmdp.world.files import read_numbers
 from trackmdp.world.model import Array, World
 
 if TYPE_CHECKING:  # the world is built, and a config checked, before anything heavy is imported
@@ -59,25 +59,13 @@ def _costs(cost: Cost, cells: int) -> tuple[float, Array, float]:
 def _price_per_cell(sensor: float | list[float] | str, cells: int) -> Array:
     if not isinstance(sensor, str):
         return np.broadcast_to(np.asarray(sensor, dtype=np.float64), (cells,)).copy()
-    price = _read_prices(Path(sensor))
+    price = read_numbers("cost.sensor", sensor, name="cost").ravel()
     if price.size != cells:
         raise UserError(f"cost.sensor={sensor}: {price.size} values, expected {cells} (one per cell)")
     if not (np.isfinite(price) & (price >= 0)).all():
         bad = int(np.flatnonzero(~(np.isfinite(price) & (price >= 0)))[0])
         raise UserError(f"cost.sensor={sensor}: cell {bad} costs {price[bad]}, expected a finite number >= 0")
     return price
-
-
-def _read_prices(file: Path) -> Array:
-    """`[K]` numbers of a .npy file or of a .csv file of any shape, row by row."""
-    if not file.is_file():
-        raise UserError(f"cost.sensor={file}: no such file")
-    try:
-        table = np.load(file, allow_pickle=False) if file.suffix == ".npy" else np.loadtxt(file, delimiter=",", ndmin=1)
-        return np.asarray(table, dtype=np.float64).ravel()
-    except (OSError, ValueError, TypeError, EOFError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise UserError(f"cost.sensor={file}: not a table of numbers ({reason})") from error
 
 
 def make_device(name: str, key: str = "device") -> torch.device:

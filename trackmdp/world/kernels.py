@@ -6,15 +6,14 @@ The sampler of the environment is derived from the table (`trackmdp.world.env`);
 from __future__ import annotations
 
 import math
-import warnings
-import zipfile
 from pathlib import Path
-from typing import Any, BinaryIO, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from trackmdp.errors import UserError
+from trackmdp.world.files import read_numbers
 from trackmdp.world.model import Array
 
 __all__ = ["Border", "random_support", "random_walk", "drift", "load_table", "check_table"]
@@ -76,20 +75,7 @@ def drift(size: int, *, direction: float, persistence: float, exit_probability: 
 
 def load_table(path: str | Path) -> Array:
     """Read a kernel table from a .npy, .npz (its only array, or the one called `kernel`) or .csv file."""
-    file = Path(path)
-    if not file.is_file():
-        raise UserError(f"kernel.path={path}: no such file")
-    try:
-        with warnings.catch_warnings(action="error"), file.open("rb") as stream:  # numpy only warns of an empty .csv
-            table = _read_array(file, stream)
-    except UserError:
-        raise
-    except (OSError, ValueError, TypeError, EOFError, KeyError, UserWarning, zipfile.BadZipFile) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise UserError(f"kernel.path={path}: not a table of numbers ({reason})") from error
-    if not isinstance(table, np.ndarray) or table.dtype.kind not in "biuf":
-        raise UserError(f"kernel.path={path}: not a table of numbers (but of {getattr(table, 'dtype', type(table))})")
-    return table.astype(np.float64)
+    return read_numbers("kernel.path", path, name="kernel")
 
 
 def check_table(table: Array, size: int, *, truncates: bool, source: str) -> Array:
@@ -162,20 +148,6 @@ def _place(size: int, cell: int, offsets: np.ndarray, weights: Array, border: Bo
 def _homogeneous(size: int, window: np.ndarray, weights: Array, exit_probability: float, border: Border) -> Array:
     scaled = weights * (1.0 - exit_probability)
     return np.stack([_place(size, cell, window, scaled, border) for cell in range(size**2)])
-
-
-def _read_array(file: Path, stream: BinaryIO) -> Any:
-    if file.suffix == ".npy":
-        return np.load(stream, allow_pickle=False)
-    if file.suffix == ".npz":
-        with np.load(stream, allow_pickle=False) as archive:
-            names = archive.files
-            if "kernel" not in names and len(names) != 1:
-                raise UserError(f"kernel.path={file}: expected one array or one called 'kernel', found {names}")
-            return archive["kernel" if "kernel" in names else names[0]]
-    if file.suffix == ".csv":
-        return np.loadtxt(file, delimiter=",", ndmin=2)
-    raise UserError(f"kernel.path={file}: expected a .npy, .npz or .csv file")
 
 
 def _can_exit(table: Array) -> np.ndarray:
