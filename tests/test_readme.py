@@ -21,7 +21,12 @@ SETUP = [line for line in BLOCKS if line.startswith("pip install")]
 COMMANDS = [line for line in BLOCKS if line.startswith(("python ", "trackmdp "))]
 OURS = [line for line in COMMANDS if not line.startswith("python -c")]
 SHORT = {
-    "train": ["collector.total_frames=8192", "collector.frames_per_batch=4096", "optimal.time_limit=1"],
+    "train": [
+        "collector.total_frames=8192",
+        "collector.frames_per_batch=4096",
+        "collector.envs=64",
+        "optimal.time_limit=1",
+    ],
     "evaluate": ["episodes=20"],
     "replay": [],
 }
