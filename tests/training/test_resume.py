@@ -61,7 +61,7 @@ def resumes_exactly(folder: Path, recipe: str, kills: int) -> None:
     assert train(folder / "whole", *words).returncode == 0
     whole, moments = len(rows(folder / "whole")), random.Random(recipe)
     words += ["resume=auto", "checkpoint.every=2048", "checkpoint.seconds=0.05"]
-    for kill in range(kills):
+    for _ in range(kills):
         done = len(rows(folder / "cut"))
         cut(folder / "cut", signal.SIGKILL, min(whole, done + moments.randint(1, max(2, whole // (kills + 1)))), *words)
     last = train(folder / "cut", *words)

@@ -9,6 +9,7 @@ import json
 import math
 import platform
 import time
+from contextlib import ExitStack
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -73,40 +74,37 @@ def _run(cfg: TrainConfig, folder: Path) -> float:
     state, passed_over = find(cfg, folder, device)
     for line in passed_over:
         console.print(f"passed over: {line}")
-    _write_inputs(cfg, world, folder, resumed=state is not None)
-    seed_global(cfg.seed)
-    algorithm = make_algorithm(cfg, world, device)
-    collector = make_collector(cfg, world, algorithm, device, done=state["position"]["frames"] if state else 0)
-    judge = Judge(world, cfg.grid.max_steps)
-    metrics = MetricsLog(folder, tensorboard=cfg.log.name == "tensorboard", position=state["metrics"] if state else 0)
-    start = _start(cfg, algorithm, collector, state, console, device)
-    best = state["best"] if state else -math.inf
-    del state  # it may hold a replay buffer
-
-    def save(at: Position, verdict: Verdict) -> None:
-        nonlocal best
-        better = verdict.evaluation.aihtr > best
-        best = max(best, verdict.evaluation.aihtr)
-        content = capture(cfg, algorithm, collector, at, metrics=metrics.position, best=best)
-        checkpoint.save(folder / "checkpoints", at.iteration, content, keep=cfg.checkpoint.keep, best=better)
-
-    log = _episode_log(cfg, world, folder)
-
-    def record(iteration: int, chains: np.ndarray) -> None:
-        if log is not None and isinstance(cfg.log, Mcap) and _recorded(cfg, iteration, algorithm.iterations):
-            log.record(Chains(chains), {"label": f"iteration {iteration}"}, cfg.log.episodes, iteration)
-
-    every = Intervals(cfg.evaluation.every, cfg.log.every, cfg.checkpoint.every, cfg.checkpoint.seconds)
-    try:
-        with Display(
-            console, f"{cfg.algo.name} seed {cfg.seed}", algorithm.iterations, start.iteration, start.frames
-        ) as display:
-            verdict, end = train(algorithm, collector, judge, metrics, display, every, save, start, record)
-    finally:
-        collector.shutdown()
-        metrics.close()
+    with ExitStack() as opened:
+        seed_global(cfg.seed)
+        algorithm = make_algorithm(cfg, world, device)
+        collector = make_collector(cfg, world, algorithm, device, done=state["position"]["frames"] if state else 0)
+        opened.callback(collector.shutdown)
+        judge = Judge(world, cfg.grid.max_steps)
+        start = _start(cfg, algorithm, collector, state, console, device)
+        written, best = (state["metrics"], state["best"]) if state else (0, -math.inf)
+        _write_inputs(cfg, world, folder, resumed=state is not None)
+        del state  # it may hold a replay buffer
+        metrics = MetricsLog(folder, tensorboard=cfg.log.name == "tensorboard", position=written)
+        opened.callback(metrics.close)
+        log = _episode_log(cfg, world, folder)
         if log is not None:
-            log.close()
+            opened.callback(log.close)
+
+        def save(at: Position, verdict: Verdict) -> None:
+            nonlocal best
+            better = verdict.evaluation.aihtr > best
+            best = max(best, verdict.evaluation.aihtr)
+            content = capture(cfg, algorithm, collector, at, metrics=metrics.position, best=best)
+            checkpoint.save(folder / "checkpoints", at.iteration, content, keep=cfg.checkpoint.keep, best=better)
+
+        def record(iteration: int, chains: np.ndarray) -> None:
+            if log is not None and isinstance(cfg.log, Mcap) and _recorded(cfg, iteration, algorithm.iterations):
+                log.record(Chains(chains), {"label": f"iteration {iteration}"}, cfg.log.episodes, iteration)
+
+        every = Intervals(cfg.evaluation.every, cfg.log.every, cfg.checkpoint.every, cfg.checkpoint.seconds)
+        title = f"{cfg.algo.name} seed {cfg.seed}"
+        with Display(console, title, algorithm.iterations, start.iteration, start.frames) as display:
+            verdict, end = train(algorithm, collector, judge, metrics, display, every, save, start, record)
     solution = _solve(cfg, world, console)
     if solution is not None:
         verdict = judge.tighten(solution.upper, verdict)
@@ -126,7 +124,7 @@ def _finished(cfg: TrainConfig, folder: Path) -> float | None:
     if cfg.resume is None or not file.is_file():
         return None
     summary = json.loads(file.read_text(encoding="utf-8"))
-    if summary["config_sha256"] == _digest(cfg):
+    if summary["config_sha256"] in [_digest(dataclasses.replace(cfg, quiet=quiet)) for quiet in (True, False)]:
         return float(summary["policy"]["aihtr"])
     file.unlink()
     return None

@@ -1,0 +1,190 @@
+"""Going on with a run: what may differ, what is refused, what happens to a run that is done or damaged."""
+
+from __future__ import annotations
+
+import random
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.helpers import train_config
+from tests.training.runs import BUDGET, QUICK, SMALL, assert_same_run, at_iteration, rows, train
+from tests.training.test_checkpoint import corrupted
+from trackmdp.cli import main
+from trackmdp.config import load_run
+from trackmdp.errors import RunError, UserError
+from trackmdp.training import checkpoint
+from trackmdp.training.state import find
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run with three checkpoints."""
+    folder = tmp_path_factory.mktemp("state") / "whole"
+    train(folder, "checkpoint.keep=3")
+    return folder
+
+
+@pytest.fixture
+def half(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A run that broke down in its fifth iteration."""
+
+    def breaks() -> None:
+        raise OSError(5, "Input/output error")
+
+    with monkeypatch.context() as patch:
+        at_iteration(patch, 5, breaks)
+        with pytest.raises(RunError):
+            train(tmp_path / "half", "checkpoint.keep=3")
+    return tmp_path / "half"
+
+
+def typed(folder: Path, *words: str) -> int:
+    return main(["train", *SMALL["ppo"], *QUICK, *BUDGET, "checkpoint.keep=3", f"hydra.run.dir={folder}", *words])
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(file): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
+def test_two_hundred_corruptions_are_passed_over_for_the_one_before(whole: Path, tmp_path: Path) -> None:
+    train(tmp_path / "other", "seed=5")
+    foreign = checkpoint.newest(tmp_path / "other").read_bytes()
+    cfg = train_config(*SMALL["ppo"], *QUICK, *BUDGET, "checkpoint.keep=3", "resume=auto")
+    newest, rng = checkpoint.newest(whole), random.Random(3)
+    content = newest.read_bytes()
+    try:
+        for trial in range(200):
+            newest.write_bytes(foreign if trial % 20 == 0 else corrupted(content, foreign, rng))
+            state, passed_over = find(cfg, whole, CPU)
+            assert state is not None
+            assert state["iteration"] == 7, trial
+            assert [line.split(":")[0] for line in passed_over] == [str(newest)]
+    finally:
+        newest.write_bytes(content)
+    assert find(cfg, whole, CPU)[1] == []
+
+
+def test_auto_goes_on_from_the_one_before_and_says_so(
+    half: Path, whole: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    newest = checkpoint.newest(half)
+    newest.write_bytes(newest.read_bytes()[:-1000])
+    assert typed(half, "resume=auto", "quiet=false") == 0
+    out = capsys.readouterr().out
+    assert f"passed over: {newest}: damaged" in out
+    assert "goes on after iteration 3, 768 frames" in out
+    assert_same_run(half, whole)
+
+
+def test_a_checkpoint_that_is_named_is_taken_or_refused(
+    half: Path, whole: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    chosen = half / "checkpoints" / "iteration-00000003.pt"
+    content = chosen.read_bytes()
+    chosen.write_bytes(content[:-1])
+    assert typed(half, f"resume={chosen}") == 2
+    assert re.fullmatch(f"trackmdp train: resume={chosen}: no checkpoint .*damaged.*\n", capsys.readouterr().err)
+    chosen.write_bytes(content)
+    assert typed(half, f"resume={chosen}") == 0
+    assert_same_run(half, whole)
+
+
+def test_no_run_starts_anew_where_every_checkpoint_is_damaged(half: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for file in checkpoint.available(half / "checkpoints"):
+        file.write_bytes(b"")
+    before = files(half)
+    assert typed(half, "resume=auto") == 2
+    assert capsys.readouterr().err.count("damaged, or not a checkpoint") == 3
+    assert files(half) == before
+
+
+@pytest.mark.parametrize(
+    ("word", "told"),
+    [
+        ("algo.clip=0.25", "algo.clip: the run has 0.2, typed was 0.25"),
+        ("seed=1", "seed: the run has 0, typed was 1"),
+        ("algo=a2c", "algo: the run has ppo, typed was a2c"),
+        ("collector.envs=64", "collector.envs: the run has 32, typed was 64"),
+        ("grid.max_steps=9", "grid.max_steps: the run has null, typed was 9"),
+    ],
+)
+def test_another_option_is_refused(word: str, told: str, half: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = files(half)
+    assert typed(half, "resume=auto", word) == 2
+    assert capsys.readouterr().err == f"trackmdp train: {told}; it cannot change on resume\n"
+    assert files(half) == before
+
+
+def test_budget_logging_and_saving_may_change(half: Path) -> None:
+    words = ["collector.total_frames=2560", "checkpoint.every=512", "evaluation.every=2", "log.every=2"]
+    assert typed(half, "resume=auto", *words) == 0
+    assert [int(row["iteration"]) for row in rows(half)] == [1, 2, 3, 4, 6, 8, 10]
+    saved = load_run(half)
+    assert (saved.collector.total_frames, saved.checkpoint.every, saved.log.every, saved.seed) == (2560, 512, 2, 0)
+
+
+def test_a_config_edited_by_hand_is_not_the_run(half: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = half / "config.yaml"
+    config.write_text(config.read_text().replace("lam: 0.5", "lam: 0.6"))
+    assert main(["train", "resume=auto", f"hydra.run.dir={half}"]) == 2
+    assert "belongs to a run with another config" in capsys.readouterr().err
+
+
+def test_another_version_is_refused(half: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cfg = train_config(*SMALL["ppo"], *QUICK, *BUDGET, "checkpoint.keep=3", "resume=auto")
+    monkeypatch.setattr("trackmdp.training.state.version", lambda name: "0.0")
+    with pytest.raises(UserError, match=r"written with torch [\d.]+\S*, this is 0.0; expected the same"):
+        find(cfg, half, CPU)
+
+
+def test_a_kernel_that_changed_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kernel, world = tmp_path / "kernel.npy", ("kernel=table", f"kernel.path={tmp_path / 'kernel.npy'}")
+    np.save(kernel, np.full((9, 9), 0.1))
+    with monkeypatch.context() as patch:
+        at_iteration(patch, 5, lambda: (_ for _ in ()).throw(OSError(5, "Input/output error")))
+        with pytest.raises(RunError):
+            train(tmp_path / "run", *world)
+    np.save(kernel, np.full((9, 9), 0.05))
+    assert main(["train", "resume=auto", f"hydra.run.dir={tmp_path / 'run'}"]) == 2
+    assert "the run's kernel is not the one that its config describes now" in capsys.readouterr().err
+
+
+def test_a_finished_run_ends_at_once_and_stays_as_it_is(whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = files(whole)
+    assert typed(whole, "resume=auto", "quiet=false") == 0
+    assert "finished before" in capsys.readouterr().out
+    assert files(whole) == before
+
+
+def test_a_folder_with_a_run_is_refused_without_resume(whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = files(whole)
+    assert typed(whole) == 2
+    assert "holds a run already; go on with it by resume=auto" in capsys.readouterr().err
+    assert files(whole) == before
+
+
+def test_weights_are_taken_where_they_fit(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = checkpoint.load(checkpoint.newest(whole))["algorithm"]
+    words = [f"init_from={whole}", "quiet=false", "seed=3", "collector.total_frames=256"]
+    assert typed(tmp_path / "same", *words, "algo.learning_rate.start=0", "algo.learning_rate.end=0") == 0
+    mine = checkpoint.load(checkpoint.newest(tmp_path / "same"))["algorithm"]
+    for name in ("policy", "critic"):
+        for key, tensor in mine[name].items():
+            assert torch.equal(tensor, given[name][key]), key
+    assert f"weights from {whole}: " in (out := capsys.readouterr().out)
+    assert out.count("encoder.cell.weight") == 2
+    assert typed(tmp_path / "longer", *words, "grid.t_max=2") == 0
+    taken = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("weights from"))
+    assert "encoder.cell.weight" in taken
+    assert "encoder.history.weight" not in taken
+    assert main(["train", *SMALL["dqn"], *BUDGET, *QUICK, f"hydra.run.dir={tmp_path / 'none'}", words[0]]) == 2
+    assert "none of its weights has the name and shape of one of ours" in capsys.readouterr().err
+    assert not (tmp_path / "none").exists()
