@@ -116,6 +116,7 @@ def test_samples_spread_around_the_mean_as_counts_allow() -> None:
     rng = np.random.default_rng(0)
     drawn = np.stack([estimate.sample(rng)[0] for _ in range(4000)])
     np.testing.assert_allclose(drawn.mean(axis=0), [0, 0.3, 0.6, 0, 0.1], atol=0.005)
+    np.testing.assert_allclose(drawn[:, 2].std(), np.sqrt(0.6 * 0.4 / 101), rtol=0.05)
     np.testing.assert_allclose(drawn[:, 4].std(), np.sqrt(0.1 * 0.9 / 101), rtol=0.05)
     np.testing.assert_allclose(drawn.sum(axis=1), 1.0)
 
