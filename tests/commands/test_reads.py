@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.config.cases import composed
+from tests.helpers import BASELINES
 from tests.reads import record_reads, unread
 from trackmdp.config import GROUPS, conf_dir
 
@@ -42,7 +43,7 @@ def test_collectors_with_workers_read_every_option(collector: str, tmp_path: Pat
     assert not never_read("train", f"collector={collector} {SHORT}", tmp_path)
 
 
-@pytest.mark.parametrize("baseline", GROUPS["baseline"])
+@pytest.mark.parametrize("baseline", BASELINES)
 def test_evaluate_reads_every_option(baseline: str, tmp_path: Path) -> None:
     assert not never_read("evaluate", f"baseline={baseline} grid.size=3 quiet=true episodes=10", tmp_path)
 

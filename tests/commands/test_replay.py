@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import errno
+import importlib
 import json
 import os
 import pty
@@ -17,6 +18,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.config.cases import composed
+from tests.reads import record_reads, unread
 from trackmdp.cli import main
 from trackmdp.commands.playback import reissued
 from trackmdp.config import world_of
@@ -86,6 +89,25 @@ def test_training_logs_the_first_the_kth_and_the_last_evaluation(
         assert len({row["seed"] for row in reader.rows}) == 16
     assert replay(capsys, f"file={tmp_path}/a/episodes.mcap", "verify=true")[0] == 0
     assert len((tmp_path / "a/metrics.csv").read_text().splitlines()) == 17
+
+
+def test_every_option_is_read(log: Path, tmp_path: Path) -> None:
+    words = ("quiet=true", "log=mcap", "evaluation.every=2", "log.evaluations=1", *TRAIN)
+    cfg = composed("train", *words)
+    with record_reads(cfg) as reads:
+        importlib.import_module("trackmdp.commands.train").run(cfg, tmp_path)
+    assert {key for key in unread(cfg, reads) if key.startswith("log")} == set()
+    cfg = composed("replay", f"file={log}", "quiet=true", "episode=2")
+    with record_reads(cfg) as reads:
+        importlib.import_module("trackmdp.commands.replay").run(cfg, tmp_path)
+    assert unread(cfg, reads) == set()
+    playback = ("baseline=playback", f"baseline.file={log}", *WORLD, "quiet=true", "episodes=5")
+    for words in (playback, ("baseline=qmdp", "log=mcap", *WORLD, "quiet=true", "episodes=5")):
+        cfg = composed("evaluate", *words)
+        with record_reads(cfg) as reads:
+            importlib.import_module("trackmdp.commands.evaluate").run(cfg, tmp_path)
+        of_training = {"log.every", "log.evaluations", "log.episodes"}
+        assert unread(cfg, reads) - of_training == set()
 
 
 def test_listing_and_playing_as_plain_text(log: Path, capsys: pytest.CaptureFixture[str]) -> None:

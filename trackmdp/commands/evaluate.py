@@ -37,7 +37,7 @@ def run(cfg: EvaluateConfig, folder: Path) -> float:
     console = make_console(cfg.quiet)
     torch.set_num_threads(cfg.threads)
     device = make_device(cfg.device)
-    if isinstance(cfg.baseline, Playback):
+    if cfg.run is None and isinstance(cfg.baseline, Playback):
         return playback.run(cfg, folder, console, device)
     world, max_steps, chains, subject = _trained(cfg, device) if cfg.run else _baseline(cfg)
     judge = Judge(world, max_steps)
