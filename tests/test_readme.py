@@ -29,6 +29,7 @@ SHORT = {
     ],
     "evaluate": ["episodes=20"],
     "replay": [],
+    "export": [],
 }
 
 

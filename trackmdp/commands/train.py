@@ -84,7 +84,8 @@ def _run(cfg: TrainConfig, folder: Path) -> float:
         written, best = (state["metrics"], state["best"]) if state else (0, -math.inf)
         _write_inputs(cfg, world, folder, resumed=state is not None)
         del state  # it may hold a replay buffer
-        metrics = MetricsLog(folder, tensorboard=cfg.log.name == "tensorboard", position=written)
+        events = cfg.log.name == "tensorboard"
+        metrics = MetricsLog(folder, tensorboard=events, position=written, frames=start.frames)
         opened.callback(metrics.close)
         log = _episode_log(cfg, world, folder)
         if log is not None:

@@ -166,13 +166,13 @@ class Workers(Collector):
 @choice("collector", "multi_sync")
 @dataclass(kw_only=True)
 class MultiSync(Workers):
-    """In worker processes; every batch waits for all of them."""
+    """In worker processes; every batch waits for all of them. A resumed run starts new episodes."""
 
 
 @choice("collector", "multi_async")
 @dataclass(kw_only=True)
 class MultiAsync(Workers):
-    """In worker processes; a batch is what one of them has ready."""
+    """In worker processes; a batch is what one of them has ready. A resumed run starts new episodes."""
 
 
 @dataclass(kw_only=True)

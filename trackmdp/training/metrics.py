@@ -22,9 +22,10 @@ class MetricsLog:
         folder: of the run.
         tensorboard: write event files as well.
         position: the `position` up to which the file of an earlier process holds; what follows is cut off.
+        frames: those of the earlier process; its events after them are hidden.
     """
 
-    def __init__(self, folder: Path, *, tensorboard: bool, position: int = 0) -> None:
+    def __init__(self, folder: Path, *, tensorboard: bool, position: int = 0, frames: int = 0) -> None:
         file = folder / "metrics.csv"
         self._file = file.open("r+" if position else "w", newline="")
         self._writer: csv.DictWriter[str] | None = None
@@ -36,7 +37,7 @@ class MetricsLog:
         if tensorboard:
             from torch.utils.tensorboard import SummaryWriter  # optional dependency, a second to import
 
-            self._events = SummaryWriter(folder / "tensorboard")
+            self._events = SummaryWriter(folder / "tensorboard", purge_step=frames + 1 if position else None)
 
     def write(self, row: Mapping[str, float | int | None]) -> None:
         """Append `row`; it must hold `frames`."""
