@@ -13,6 +13,7 @@ from trackmdp.solvers import bounds, clocked, optimal, qmdp, remarks, theorems
 from trackmdp.solvers.chains import evaluate
 from trackmdp.solvers.optimal import Solution
 from trackmdp.solvers.theorems import Check
+from trackmdp.world.kernels import random_walk
 from trackmdp.world.model import BoolArray, World
 
 
@@ -85,3 +86,10 @@ def test_the_printed_bound_is_exceeded() -> None:
     assert attained <= bounds.valid(world).mean()
     assert not row.holds
     assert row.deviation == pytest.approx(attained - bounds.paper(world).mean())
+
+
+def test_ties_do_not_look_like_failures() -> None:
+    """A walk on nine cells, each as likely: from an inner cell p r = c p_in exactly, to sense or not is the same."""
+    kernel = random_walk(4, stay=1 / 9, diagonal=True, exit_probability=0.1, border="renormalize")
+    world = World(4, 1.0, np.full(16, 1 / 9), 16 / 9, 1, kernel)
+    assert all(row.passed for row in checks(world).values())
