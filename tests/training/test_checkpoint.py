@@ -171,6 +171,18 @@ def test_a_failure_at_any_step_leaves_a_whole_checkpoint(
     assert newest["counter"] == newest["iteration"]
 
 
+def test_saving_does_not_hold_the_state_twice(tmp_path: Path) -> None:
+    large = {"buffer": torch.ones(2**24)}
+    size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (size + large["buffer"].nbytes // 2, hard))
+    try:
+        file = checkpoint.save(tmp_path, 1, large, keep=1)
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+    assert torch.equal(checkpoint.load(file)["buffer"], large["buffer"])
+
+
 def test_what_a_killed_save_left_is_cleared_away(tmp_path: Path) -> None:
     (tmp_path / "iteration-00000009.part").write_bytes(b"half")
     checkpoint.save(tmp_path, 10, state(), keep=2)

@@ -157,6 +157,18 @@ def test_a_kernel_that_changed_is_refused(
     assert "the run's kernel is not the one that its config describes now" in capsys.readouterr().err
 
 
+def test_events_after_the_checkpoint_are_hidden(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    with monkeypatch.context() as patch:
+        at_iteration(patch, 5, lambda: (_ for _ in ()).throw(OSError(5, "Input/output error")))
+        with pytest.raises(RunError):
+            train(tmp_path, "log=tensorboard", "checkpoint.every=512")
+    train(tmp_path, "log=tensorboard", "checkpoint.every=512", "resume=auto")
+    events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    assert [event.step for event in events.Scalars("iteration")] == list(range(256, 2049, 256))
+
+
 def test_a_finished_run_ends_at_once_and_stays_as_it_is(whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = files(whole)
     assert typed(whole, "resume=auto", "quiet=false") == 0
