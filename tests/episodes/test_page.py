@@ -54,7 +54,7 @@ def test_a_page_is_one_small_file_that_asks_for_nothing(tmp_path: Path) -> None:
     with EpisodeReader(write(tmp_path / "a.mcap", [episode], acting=acting, world=world)) as reader:
         write_page(reader, tmp_path / "a.html")
     text = (tmp_path / "a.html").read_text(encoding="utf-8")
-    assert len(text.encode()) < 250_000 * len(episode) / 150
+    assert len(text.encode()) < 250_000
     assert not re.findall(r"(?:src|href)=|url\(|@import|fetch\(", text)
     assert "default-src 'none'" in text
 

@@ -22,6 +22,7 @@ from trackmdp.world.motion import Motion
 __all__ = ["Acting", "Chains", "Issued", "RandomSets", "record"]
 
 _BLOCK = 256  # draws taken from an episode's generator at a time
+_STEPS_AT_ONCE = 64  # taken before the rows that have ended are dropped from them
 _CELLS_AT_ONCE = 25_600  # rows x cells stepped together: memory stays bounded on large grids
 
 
@@ -176,15 +177,19 @@ class _Batch:
         state = self._env.reset().select(*self._env.state_keys_of_step).to_dict()
         state |= {"target": start, "last_cell": start}
         running = torch.ones(len(start), dtype=torch.bool)
-        belief, taken = self._filter.detect(start), []
+        belief, steps, taken = self._filter.detect(start), [], []
         for step in itertools.count():
             moves, choices = self._draws.at(step, running)
             action, probability = self._acting.act(state, step, choices)
             predicted = self._predict(belief)
             following = self._env.advance(state | {"action": action}, moves)
-            taken.append(_kept(running, state, action, probability, predicted, following))
+            steps.append(_step(running, state, action, probability, predicted, following))
             running = running & ~following["done"].squeeze(-1)
-            if not running.any():
+            over = not running.any()
+            if over or len(steps) == _STEPS_AT_ONCE:
+                taken.append(_kept(steps))
+                steps = []
+            if over:
                 break
             belief = self._updated(predicted, action, following)
             state = {key: following[key] for key in state}
@@ -213,26 +218,37 @@ class _Batch:
             yield Episode(first + row, seed, policy, start[row], terminated=terminated, truncated=truncated, **steps)
 
 
-def _kept(
+def _step(
     running: Tensor,
     state: dict[str, Tensor],
     action: Tensor,
     probability: Tensor | None,
     predicted: Tensor,
     following: dict[str, Tensor],
-) -> dict[str, Any]:
-    """What an `Episode` holds of one step, for the rows still running."""
-    exited = following["terminated"].squeeze(-1)
+) -> dict[str, Tensor]:
+    """One step of all rows, `[B, ...]`."""
     step = {
-        "row": torch.arange(len(running)),
+        "running": running,
         "misses": state["steps_since_detection"],
         "action": action,
-        "belief": predicted.float(),
-        "probability": action.float() if probability is None else probability,
+        "belief": predicted,
         "target": following["target"],
-        "located": (following["steps_since_detection"] == 0) & ~exited,
-        "reward": following["reward"].squeeze(-1),
-        "terminated": exited,
-        "truncated": following["truncated"].squeeze(-1),
+        "after": following["steps_since_detection"],
+        "reward": following["reward"],
+        "terminated": following["terminated"],
+        "truncated": following["truncated"],
     }
-    return {name: value[running].numpy() for name, value in step.items()}
+    return step if probability is None else step | {"probability": probability}
+
+
+def _kept(steps: list[dict[str, Tensor]]) -> dict[str, Any]:
+    """What an `Episode` holds of some steps, for the rows that were running; step after step."""
+    running = torch.stack([step["running"] for step in steps])
+    kept = {name: torch.stack([step[name] for step in steps])[running] for name in steps[0] if name != "running"}
+    exited = kept["terminated"].squeeze(-1)
+    kept["row"] = running.nonzero()[:, 1]
+    kept["located"] = (kept.pop("after") == 0) & ~exited
+    kept["belief"] = kept["belief"].float()
+    kept.setdefault("probability", kept["action"].float())
+    kept |= {"terminated": exited, "truncated": kept["truncated"].squeeze(-1), "reward": kept["reward"].squeeze(-1)}
+    return {name: value.numpy() for name, value in kept.items()}
