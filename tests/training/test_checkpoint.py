@@ -154,6 +154,17 @@ def test_a_full_disk_leaves_the_older_checkpoints_whole(tmp_path: Path, room: in
     assert checkpoint.load(tmp_path / checkpoint.LAST)["counter"] == 2
 
 
+def test_the_reason_of_a_failed_write_is_not_lost_in_torch() -> None:
+    class Full(io.BytesIO):
+        def write(self, piece: Any) -> int:
+            if self.tell() > 500:
+                raise OSError(28, "No space left on device")
+            return super().write(piece)
+
+    with pytest.raises(OSError, match="No space left"):
+        checkpoint._Hashed(Full()).save(state())
+
+
 @pytest.mark.parametrize("call", ["fsync", "link"])
 def test_a_failure_at_any_step_leaves_a_whole_checkpoint(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str

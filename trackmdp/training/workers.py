@@ -57,7 +57,7 @@ class Watch:
 
     def _check(self) -> None:
         for index, process in enumerate(self._processes):
-            code = process.exitcode
+            code = None if process._closed else process.exitcode
             if code is not None:
                 self._waiting = False  # the others end next, when the collector is shut down
                 how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with status {code}"
