@@ -264,6 +264,21 @@ def test_a_full_disk_stops_the_log_and_is_said_once(
     assert not (tmp_path / "a/episodes.mcap").exists()
 
 
+def test_an_evaluation_outlives_its_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(writer: EpisodeWriter) -> Path:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(EpisodeWriter, "finish", full)
+    words = ["evaluate", "baseline=qmdp", *WORLD, "log=mcap", "episodes=5", f"hydra.run.dir={tmp_path}"]
+    assert main(words) == 0
+    said = capsys.readouterr()
+    assert said.err.endswith("no space left on device; no more episodes are logged\n")
+    assert "episodes in " not in said.out
+    assert (tmp_path / "evaluation.json").is_file()
+
+
 def test_a_file_that_may_not_grow_leaves_what_was_flushed(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -85,8 +85,8 @@ def _log_episodes(
         log.record(RandomSets(world.num_cells, cfg.baseline.k), {"label": subject}, cfg.episodes)
     else:
         log.record(Chains(chains), {"label": subject}, cfg.episodes)
-    log.close()
-    console.print(f"{log.episodes} episodes in {log.file}", markup=False)
+    if log.close():
+        console.print(f"{log.episodes} episodes in {log.file}", markup=False)
 
 
 def _trained(cfg: EvaluateConfig, device: torch.device) -> tuple[World, int | None, np.ndarray, str]:

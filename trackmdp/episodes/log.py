@@ -68,15 +68,17 @@ class EpisodeLog:
         except OSError as error:
             self._stop(error)
 
-    def close(self) -> None:
-        """Finish the file, unless logging is over already."""
+    def close(self) -> bool:
+        """Finish the file, unless logging is over already; returns whether the file is whole."""
         if self._writer is None:
-            return
+            return False
         try:
             self._writer.finish()
-            self._writer = None
         except OSError as error:
             self._stop(error)
+            return False
+        self._writer = None
+        return True
 
     def _stop(self, error: OSError) -> None:
         part = self.file.with_name(f"{self.file.name}.part")
