@@ -1,0 +1,158 @@
+"""A training run with all that belongs to it, begun anew or taken up where an earlier process left it."""
+
+from __future__ import annotations
+
+import io
+import math
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import torch
+from rich.console import Console
+
+from trackmdp.build import make_algorithm, make_collector, make_device, make_world
+from trackmdp.commands.summary import config_text
+from trackmdp.config import Mcap, TrainConfig
+from trackmdp.episodes.log import EpisodeLog
+from trackmdp.episodes.record import Chains
+from trackmdp.errors import UserError
+from trackmdp.seeding import seed_global
+from trackmdp.training import checkpoint, memory
+from trackmdp.training.display import Display
+from trackmdp.training.judge import Judge, Verdict
+from trackmdp.training.loop import Intervals, Position, train
+from trackmdp.training.metrics import MetricsLog, write_bytes, write_text
+from trackmdp.training.state import capture, find, restore, take_weights
+from trackmdp.world.model import World
+
+__all__ = ["Session"]
+
+
+class Session:
+    """World, learner, collector, judge and logs of one run; a context manager that ends what it began.
+
+    Raises:
+        UserError: the config asks for what is not there, for more memory than there is, or for a run that is not this.
+    """
+
+    def __init__(self, cfg: TrainConfig, folder: Path, console: Console) -> None:
+        self.cfg, self.folder, self.console = cfg, folder, console
+        self._opened = ExitStack()
+        torch.set_num_threads(cfg.threads)
+        self.device = make_device(cfg.device)
+        self.world = make_world(cfg)
+        console.print(memory.check(cfg, self.world.task, self.device))
+        state, passed_over = find(cfg, folder, self.device)
+        for line in passed_over:
+            console.print(f"passed over: {line}")
+        with self._opened as opened:
+            self._build(state, opened)
+            self._opened = opened.pop_all()
+
+    def _build(self, state: dict[str, Any] | None, opened: ExitStack) -> None:
+        cfg, folder = self.cfg, self.folder
+        seed_global(cfg.seed)
+        self.algorithm = make_algorithm(cfg, self.world, self.device)
+        done = state["position"]["frames"] if state else 0
+        self.collector = make_collector(cfg, self.world, self.algorithm, self.device, done=done)
+        opened.callback(self.collector.shutdown)
+        self.judge = Judge(self.world, cfg.grid.max_steps)
+        self.start = self._start(state)
+        self._best = state["best"] if state else -math.inf
+        _write_inputs(cfg, self.world, folder, resumed=state is not None)
+        events, written = cfg.log.name == "tensorboard", state["metrics"] if state else 0
+        self.metrics = MetricsLog(folder, tensorboard=events, position=written, frames=self.start.frames)
+        opened.callback(self.metrics.close)
+        self.log = _episode_log(cfg, self.world, folder)
+        if self.log is not None:
+            opened.callback(self.log.close)
+
+    def _start(self, state: dict[str, Any] | None) -> Position:
+        """After the last checkpoint, or from scratch, perhaps with the weights of another run."""
+        if state is not None:
+            start = restore(state, self.algorithm, self.collector)
+            self.console.print(f"goes on after iteration {start.iteration}, {start.frames:,} frames")
+            return start
+        if self.cfg.init_from is not None:
+            taken = take_weights(self.algorithm, Path(self.cfg.init_from), self.device)
+            self.console.print(f"weights from {self.cfg.init_from}: {', '.join(taken)}")
+        return Position()
+
+    def __enter__(self) -> Session:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._opened.close()
+
+    def train(self) -> tuple[Verdict, Position]:
+        """Run to the end; the last verdict and position."""
+        cfg, start = self.cfg, self.start
+        every = Intervals(cfg.evaluation.every, cfg.log.every, cfg.checkpoint.every, cfg.checkpoint.seconds)
+        title = f"{cfg.algo.name} seed {cfg.seed}"
+        with Display(self.console, title, self.algorithm.iterations, start.iteration, start.frames) as display:
+            return train(
+                self.algorithm,
+                self.collector,
+                self.judge,
+                self.metrics,
+                display,
+                every,
+                self._save,
+                start,
+                self._record,
+            )
+
+    def _save(self, at: Position, verdict: Verdict) -> None:
+        better = verdict.evaluation.aihtr > self._best
+        self._best = max(self._best, verdict.evaluation.aihtr)
+        written = self.metrics.position
+        state = capture(self.cfg, self.algorithm, self.collector, at, metrics=written, best=self._best)
+        checkpoint.save(self.folder / "checkpoints", at.iteration, state, keep=self.cfg.checkpoint.keep, best=better)
+
+    def _record(self, iteration: int, chains: np.ndarray) -> None:
+        """Log episodes of the evaluation after the first iteration, every k-th one, and the last."""
+        log = self.cfg.log
+        if self.log is None or not isinstance(log, Mcap):
+            return
+        if (
+            iteration in (1, self.algorithm.iterations)
+            or iteration % (self.cfg.evaluation.every * log.evaluations) == 0
+        ):
+            self.log.record(Chains(chains), {"label": f"iteration {iteration}"}, log.episodes, iteration)
+
+
+def _episode_log(cfg: TrainConfig, world: World, folder: Path) -> EpisodeLog | None:
+    """The log of simulated episodes, where it is asked for."""
+    if not isinstance(cfg.log, Mcap):
+        return None
+    return EpisodeLog(
+        folder,
+        world,
+        seed=cfg.seed,
+        config=config_text(cfg),
+        max_steps=cfg.grid.max_steps,
+        layout=cfg.log.layout,
+        command="train",
+    )
+
+
+def _write_inputs(cfg: TrainConfig, world: World, folder: Path, *, resumed: bool) -> None:
+    """`config.yaml` and `kernel.npy`: all that it takes to do the run again.
+
+    Raises:
+        UserError: the run that goes on was begun with another kernel.
+    """
+    file = folder / "kernel.npy"
+    if resumed and not np.array_equal(np.load(file, allow_pickle=False), world.kernel):
+        raise UserError(
+            f"{file}: the run's kernel is not the one that its config describes now; it cannot change on resume"
+        )
+    write_text(folder / "config.yaml", config_text(cfg))
+    buffer = io.BytesIO()
+    np.save(buffer, world.kernel)
+    write_bytes(file, buffer.getvalue())
