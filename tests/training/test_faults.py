@@ -7,6 +7,7 @@ import os
 import resource
 import shutil
 import signal
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from trackmdp.errors import Preempted, RunError, UserError
 from trackmdp.training import checkpoint
 from trackmdp.training.lock import locked
 from trackmdp.training.state import _weights
+from trackmdp.training.workers import Watch
 
 
 @pytest.fixture(scope="module")
@@ -139,28 +141,45 @@ def test_one_process_per_folder(tmp_path: Path) -> None:
     train(tmp_path)
 
 
+def while_collecting(patch: pytest.MonkeyPatch, action: Callable[[], Any]) -> None:
+    """Do something just before the fourth batch is waited for."""
+    check, calls = Watch._check, iter([*range(6), None])  # two calls in each iteration: for the batch, for the weights
+
+    def checked(self: Watch) -> None:
+        check(self)
+        if next(calls, 0) is None:
+            action()
+
+    patch.setattr(Watch, "_check", checked)
+
+
+@pytest.mark.slow
+def test_a_signal_to_the_workers_as_well_is_no_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def signal_all() -> None:
+        signal.raise_signal(signal.SIGTERM)
+        for worker in multiprocessing.active_children():
+            os.kill(worker.pid or 0, signal.SIGTERM)
+
+    with monkeypatch.context() as patch:
+        while_collecting(patch, signal_all)
+        with pytest.raises(Preempted) as told:
+            train(tmp_path, "collector=multi_sync", "checkpoint.every=0")
+    assert (told.value.signal, saved(tmp_path)) == (signal.SIGTERM, [3])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("collector", ["multi_sync", "multi_async"])
 @pytest.mark.parametrize("when", ["between", "while collecting"])
 def test_a_worker_that_is_killed_is_named(
     collector: str, when: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from trackmdp.training.workers import Watch
-
     def kill() -> None:
         os.kill(multiprocessing.active_children()[0].pid or 0, signal.SIGKILL)
 
     if when == "between":
         at_iteration(monkeypatch, 3, kill)
     else:
-        check, calls = Watch._check, iter([*range(7), None])
-
-        def killing(self: Watch) -> None:
-            check(self)
-            if next(calls, 0) is None:  # what follows waits for an answer that never comes
-                kill()
-
-        monkeypatch.setattr(Watch, "_check", killing)
+        while_collecting(monkeypatch, kill)
     with pytest.raises(RunError, match=r"iteration \d: collecting broke down \(worker [01] .*(SIGKILL|-9)"):
         train(tmp_path, f"collector={collector}")
     assert not multiprocessing.active_children()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from functools import partial
 from typing import Any
 
@@ -54,6 +55,7 @@ def make_collector(
 
 def _worker_env(world: World, worker: str, env: dict[str, Any]) -> TrackEnv:
     """Built in a worker process: its own stream for the targets, and for the actions sampled there."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the workers as well; the learner tells them to end
     torch.manual_seed(derive(env["seed"], "torch", worker))
     return TrackEnv(world, stream=f"world-{worker}", **env)
 

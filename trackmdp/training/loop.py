@@ -87,7 +87,13 @@ def train(
     verdict = judge.score(chains_of(algorithm.actor, judge.world, algorithm.device))
     with Signals() as signals, Watch(collector) as watch:
         for iteration in range(start.iteration + 1, algorithm.iterations + 1):
-            batch = _next(batches, watch, iteration)
+            try:
+                batch = _next(batches, watch, iteration)
+            except RunError:
+                if not signals.received:
+                    raise
+                save(at, verdict)  # the signal went to the workers as well, and nothing has been learned since
+                raise Preempted(signals.received) from None
             try:
                 diagnostics = algorithm.step(batch)
             except FloatingPointError as error:
