@@ -8,6 +8,9 @@ after any step. Two things follow for the set of the next step, with m = zP and 
 * a choice N of cells to leave, among the others, is worth at most what is sensed plus min{R_{h-1} z_N, one more set
   chosen jointly and revealed only then}.
 
+The loss against revealing at once is superadditive, so what two cells lose when both are left bounds what any set
+of undecided cells takes away (`Tree._least_loss`).
+
 Cells are decided one by one, the likeliest first; open choices are kept best first in batches, so that all the
 arithmetic is on arrays and sparse rows.
 """
@@ -17,7 +20,7 @@ from __future__ import annotations
 import heapq
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
@@ -28,6 +31,8 @@ from trackmdp.world.model import Array, BoolArray, World
 __all__ = ["Tree"]
 
 LARGEST_BATCH = 4096
+MOST_PAIRED = 10
+"""Cells of one state up to which every pair is looked at for a better bound."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +45,7 @@ class _Frontier:
         relaxed: `[B]`, earned so far plus the bound on the rest with every cell at its better choice.
         cells, mass, regret: `[B, K]`; `regret` is what sensing costs against the bound on leaving.
         count: `[B]`, cells that are not padding.
+        rest: `[B, K + 1]`, least that the cells from the k-th on take away from `relaxed`.
         origin: the batch these states came from and `[B]` their places in it; none at the start.
     """
 
@@ -50,24 +56,28 @@ class _Frontier:
     mass: Array
     regret: Array
     count: IndexArray
+    rest: Array
     origin: tuple[_Choices, IndexArray] | None
 
 
 @dataclass(frozen=True)
 class _Choices:
-    """P partial choices of the next set: the first `decided` cells of each state are left (`left`) or sensed."""
+    """P partial choices of the next set: the first `decided` cells of each state are left (`left`) or sensed.
+
+    `relaxed` `[P]` has the undecided cells at their better choice; `lost` is what those left lose together.
+    """
 
     frontier: _Frontier
     decided: int
     state: IndexArray
     left: BoolArray
     relaxed: Array
+    lost: Array
     bound: Array
 
     def pick(self, kept: IndexArray | BoolArray) -> _Choices:
-        return _Choices(
-            self.frontier, self.decided, self.state[kept], self.left[kept], self.relaxed[kept], self.bound[kept]
-        )
+        numbers = (part[kept] for part in (self.relaxed, self.lost, self.bound))
+        return _Choices(self.frontier, self.decided, self.state[kept], self.left[kept], *numbers)
 
     @property
     def start(self) -> IndexArray:
@@ -143,18 +153,52 @@ class Tree:
             return
         self.nodes += 2 * len(split.state)
         sensed = split.relaxed - frontier.regret[split.state, k]
-        credit = np.maximum(split.relaxed - split.bound, 0.0)  # what leaving the cells so far together loses
         left = split.left.copy()
         left[:, k] = True
-        self._push(_Choices(frontier, k + 1, split.state, split.left, sensed, sensed - credit))
-        self._push(_Choices(frontier, k + 1, split.state, left, split.relaxed, self._joint(split, left)))
+        for cells, relaxed, lost in (
+            (split.left, sensed, split.lost),
+            (left, split.relaxed, self._joint_loss(split, left)),
+        ):
+            bound = np.minimum(split.bound, relaxed - lost - frontier.rest[split.state, k + 1])
+            self._push(_Choices(frontier, k + 1, split.state, cells, relaxed, lost, bound))
 
-    def _joint(self, choices: _Choices, left: BoolArray) -> Array:
-        """`[P]` bound with the cells `left` revealed one step later, if that is less."""
-        sets_left = choices.frontier.sets_left - 1
-        mass = self._left_mass(choices, left)
-        now = mass @ self._revealed[sets_left]
-        return choices.relaxed - np.maximum(now - self._one_more_set(mass, sets_left)[0], 0.0)
+    def _joint_loss(self, choices: _Choices, left: BoolArray) -> Array:
+        """`[P]` least that the cells `left` lose, being left together, against each being revealed."""
+        return self._loss(self._left_mass(choices, left), choices.frontier.sets_left - 1)
+
+    def _loss(self, mass: sparse.csr_array, sets_left: int) -> Array:
+        """`[P]` how much less one more set chosen jointly is worth than the position revealed at once."""
+        return np.maximum(mass @ self._revealed[sets_left] - self._one_more_set(mass, sets_left)[0], 0.0)
+
+    def _least_loss(self, frontier: _Frontier) -> Array:
+        """`[B, K + 1]` least that the cells from the k-th on cost against the relaxed worth, however they are decided.
+
+        Sensing cell a costs its regret. Leaving several loses, F being sublinear, at least the mean over the ways to
+        pair them: half of what a loses with the partner it goes best with. Leaving one or none, all others are sensed.
+        """
+        count, width = len(frontier.start), frontier.cells.shape[1]
+        if not 2 <= width <= MOST_PAIRED:
+            return np.zeros((count, width + 1))
+        pair = np.full((count, width, width), np.inf)
+        for shift in range(1, width):
+            state, place = np.nonzero(np.arange(shift, width) < frontier.count[:, None])
+            lost = self._pair_loss(frontier, state, place, place + shift)
+            pair[state, place, place + shift] = pair[state, place + shift, place] = lost
+        rest = np.zeros((count, width + 1))
+        present = np.arange(width) < frontier.count[:, None]
+        for k in range(width):
+            later = pair[:, k:, k:].min(axis=2)
+            regret = np.where(present[:, k:], frontier.regret[:, k:], 0.0)
+            several = np.where(present[:, k:], np.minimum(later / 2.0, regret), 0.0).sum(axis=1)
+            rest[:, k] = np.minimum(several, regret.sum(axis=1) - regret.max(axis=1))
+        return rest
+
+    def _pair_loss(self, frontier: _Frontier, state: IndexArray, a: IndexArray, b: IndexArray) -> Array:
+        cells = np.stack([frontier.cells[state, a], frontier.cells[state, b]], axis=1)
+        masses = np.stack([frontier.mass[state, a], frontier.mass[state, b]], axis=1)
+        pointer = np.arange(len(state) + 1) * 2
+        mass = sparse.csr_array((masses.ravel(), cells.ravel(), pointer), shape=(len(state), self._world.num_cells))
+        return self._loss(mass, frontier.sets_left - 1)
 
     def _left_mass(self, choices: _Choices, left: BoolArray) -> sparse.csr_array:
         row, place = np.nonzero(left)
@@ -189,9 +233,11 @@ class Tree:
             return
         kept = np.flatnonzero(self._hopeful(start, relaxed))
         frontier = _frontier(start, sets_left, relaxed, moved, leave - sense, kept, origin)
-        width = frontier.cells.shape[1]
-        left = np.zeros((len(kept), width), dtype=bool)
-        self._push(_Choices(frontier, 0, np.arange(len(kept)), left, frontier.relaxed, frontier.relaxed))
+        frontier = replace(frontier, rest=self._least_loss(frontier))
+        left = np.zeros(frontier.cells.shape, dtype=bool)
+        bound = frontier.relaxed - frontier.rest[:, 0]
+        none = np.zeros(len(kept))
+        self._push(_Choices(frontier, 0, np.arange(len(kept)), left, frontier.relaxed, none, bound))
 
     def _record(
         self, start: IndexArray, worth: Array, moved: sparse.csr_array, left: BoolArray, origin: _Choices | None
@@ -241,7 +287,8 @@ def _frontier(
     mass[rows[entry], column] = moved.data[entry]
     loss[rows[entry], column] = regret[entry]
     source = None if origin is None else (origin, kept)
-    return _Frontier(start[kept], sets_left, relaxed[kept], cells, mass, loss, count, source)
+    none = np.zeros((len(kept), shape[1] + 1))
+    return _Frontier(start[kept], sets_left, relaxed[kept], cells, mass, loss, count, none, source)
 
 
 def _sets_left_out(choices: _Choices | None, place: int) -> list[set[int]]:
