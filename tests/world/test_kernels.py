@@ -198,7 +198,7 @@ def test_the_drift_heads_where_it_is_told(direction: float) -> None:
     row = drift(5, direction=direction, persistence=1.0, exit_probability=0.0, border="clip")[12]
     cells = np.flatnonzero(row)
     assert len(cells) <= 2
-    angles = np.degrees(np.arctan2(cells // 5 - 2, cells % 5 - 2)) % 360
+    angles = np.degrees(np.arctan2(2 - cells // 5, cells % 5 - 2)) % 360
     away = (angles - direction + 180) % 360 - 180
     assert abs(away).max() <= 45.0 + 1e-9
     assert row[cells] @ away == pytest.approx(0, abs=1e-9)

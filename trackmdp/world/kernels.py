@@ -60,6 +60,7 @@ def random_walk(size: int, *, stay: float, diagonal: bool, exit_probability: flo
 def drift(size: int, *, direction: float, persistence: float, exit_probability: float, border: Border) -> Array:
     """A target that heads one way: it keeps to `direction` (degrees, 0 = right, 90 = up) with `persistence`.
 
+    Row 0 is the top one, as in all pictures.
     With the rest of the probability it moves to any of the 9 cells around, uniformly. A direction between two of
     the eight neighbours is shared between them in proportion to the angle, so the mean heading is as asked.
     """
@@ -68,7 +69,7 @@ def drift(size: int, *, direction: float, persistence: float, exit_probability: 
     eighth, share = divmod((direction % 360.0) / 45.0, 1.0)
     for step, part in ((int(eighth), 1.0 - share), (int(eighth) + 1, share)):
         angle = math.radians(45.0 * step)
-        heading = (round(math.sin(angle)), round(math.cos(angle)))
+        heading = (-round(math.sin(angle)), round(math.cos(angle)))
         weights[(window == heading).all(axis=1)] += persistence * part
     return _homogeneous(size, window, weights, exit_probability, border)
 
