@@ -46,7 +46,7 @@ def reachable(chains: BoolArray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return cells, steps, chains[cells, np.minimum(steps, choices - 1)] | forced
 
 
-@pytest.mark.parametrize("form", PROGRAMS)
+@pytest.mark.parametrize("form", ["onnx", pytest.param("torch_export", marks=pytest.mark.slow)])
 def test_a_program_without_this_package_gets_the_same_sets(form: str, run: Path, tmp_path: Path) -> None:
     assert main(["export", f"run={run}", f"format={form}", f"hydra.run.dir={tmp_path}"]) == 0
     chains = trained(str(run), torch.device("cpu")).chains
