@@ -9,6 +9,7 @@ from trackmdp.config.options import choice, option
 
 __all__ = [
     "A2c",
+    "ActorCritic",
     "Algo",
     "Collector",
     "Csv",
@@ -55,10 +56,9 @@ class Algo:
     envs: int = option("environments stepped together", ge=1)
 
 
-@choice("algo", "a2c")
 @dataclass(kw_only=True)
-class A2c(Algo):
-    """Advantage actor-critic, one Bernoulli per sensor, one joint advantage."""
+class ActorCritic(Algo):
+    """What A2C and PPO have in common."""
 
     gamma: float = option("discount while learning; policies are judged undiscounted", ge=0, le=1)
     lam: float = option("λ of the generalised advantage estimate", ge=0, le=1)
@@ -69,25 +69,22 @@ class A2c(Algo):
     hidden: int = option("units of the hidden layer, in the actor and in the critic", unit="units", ge=1, le=4096)
     initial_logit: float = option("actor's output bias at the start", unit="logits", ge=-20, le=20)
     reward_scale: float = option("factor on rewards while learning", gt=0)
+
+
+@choice("algo", "a2c")
+@dataclass(kw_only=True)
+class A2c(ActorCritic):
+    """Advantage actor-critic, one Bernoulli per sensor, one joint advantage."""
 
 
 @choice("algo", "ppo")
 @dataclass(kw_only=True)
-class Ppo(Algo):
+class Ppo(ActorCritic):
     """Proximal policy optimisation, one Bernoulli per sensor, one joint advantage."""
 
-    gamma: float = option("discount while learning; policies are judged undiscounted", ge=0, le=1)
-    lam: float = option("λ of the generalised advantage estimate", ge=0, le=1)
-    learning_rate: Schedule
-    entropy: Schedule
     clip: float = option("how far the probability ratio may leave 1", gt=0, lt=1)
     epochs: int = option("passes over each collected batch", ge=1, le=100)
     minibatches: int = option("parts each batch is cut into", ge=1)
-    critic_coef: float = option("weight of the value loss", ge=0)
-    max_grad_norm: float = option("gradients are clipped to this norm", gt=0)
-    hidden: int = option("units of the hidden layer, in the actor and in the critic", unit="units", ge=1, le=4096)
-    initial_logit: float = option("actor's output bias at the start", unit="logits", ge=-20, le=20)
-    reward_scale: float = option("factor on rewards while learning", gt=0)
 
 
 @dataclass(kw_only=True)

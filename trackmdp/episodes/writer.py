@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from mcap.writer import Writer
 
+from trackmdp.durable import sync_folder
 from trackmdp.episodes import messages, schema
 from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.schema import time_of
@@ -164,7 +165,7 @@ class EpisodeWriter:
             os.fsync(self._stream.fileno())
             self._stream.close()
         self.part.replace(self.file)
-        _sync(self.file.parent)
+        sync_folder(self.file.parent)
         return self.file
 
     def abandon(self) -> None:
@@ -196,12 +197,3 @@ def _npy(table: npt.NDArray[Any]) -> bytes:
     buffer = io.BytesIO()
     np.save(buffer, np.ascontiguousarray(table), allow_pickle=False)
     return buffer.getvalue()
-
-
-def _sync(folder: Path) -> None:
-    """Make the rename itself survive a power failure."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

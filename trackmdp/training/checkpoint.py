@@ -15,6 +15,7 @@ from typing import IO, Any, BinaryIO, cast
 
 import torch
 
+from trackmdp.durable import sync_folder, whole_file
 from trackmdp.errors import UserError
 
 __all__ = ["BEST", "FORMAT", "LAST", "available", "load", "newest", "save"]
@@ -35,21 +36,13 @@ def save(folder: Path, iteration: int, state: dict[str, Any], *, keep: int, best
     for left in folder.glob("*.part"):  # of a process that was killed while it saved
         left.unlink()
     file = folder / f"iteration-{iteration:08d}.pt"
-    part = file.with_suffix(".part")
-    try:
-        with part.open("wb") as stream:
-            hashed = _Hashed(stream)
-            hashed.save({"format": FORMAT, "iteration": iteration, **state})
-            stream.write(_seal(hashed.digest.hexdigest()))
-            stream.flush()
-            os.fsync(stream.fileno())
-        part.replace(file)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
+    with whole_file(file) as stream:
+        hashed = _Hashed(stream)
+        hashed.save({"format": FORMAT, "iteration": iteration, **state})
+        stream.write(_seal(hashed.digest.hexdigest()))
     for name in (LAST, BEST) if best else (LAST,):
         _link(file, folder / name)
-    _sync(folder)
+    sync_folder(folder)
     for old in _numbered(folder)[:-keep]:
         old.unlink()
     return file
@@ -162,12 +155,3 @@ def _link(file: Path, name: Path) -> None:
     part = name.with_suffix(".part")
     os.link(file, part)
     part.replace(name)
-
-
-def _sync(folder: Path) -> None:
-    """Make the renames themselves survive a power failure."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

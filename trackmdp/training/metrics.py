@@ -10,6 +10,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from trackmdp.durable import whole_file
+
 __all__ = ["MetricsLog", "write_bytes", "write_json", "write_text"]
 
 
@@ -70,16 +72,8 @@ def write_text(file: Path, text: str) -> None:
 
 def write_bytes(file: Path, content: bytes) -> None:
     """Write a file whole or not at all."""
-    part = file.with_name(f"{file.name}.part")
-    try:
-        with part.open("wb") as stream:
-            stream.write(content)
-            stream.flush()
-            os.fsync(stream.fileno())
-        part.replace(file)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
+    with whole_file(file) as stream:
+        stream.write(content)
 
 
 def write_json(file: Path, content: Mapping[str, Any]) -> None:

@@ -60,9 +60,9 @@ def random_walk(size: int, *, stay: float, diagonal: bool, exit_probability: flo
 def drift(size: int, *, direction: float, persistence: float, exit_probability: float, border: Border) -> Array:
     """A target that heads one way: it keeps to `direction` (degrees, 0 = right, 90 = up) with `persistence`.
 
-    Row 0 is the top one, as in all pictures.
     With the rest of the probability it moves to any of the 9 cells around, uniformly. A direction between two of
-    the eight neighbours is shared between them in proportion to the angle, so the mean heading is as asked.
+    the eight neighbours is shared between them in proportion to the angle, so the mean heading is as asked. Row 0 is
+    the top one, as in all pictures.
     """
     window = _window(1)
     weights = np.full(len(window), (1.0 - persistence) / len(window))
