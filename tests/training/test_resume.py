@@ -75,7 +75,13 @@ def test_a_kill_changes_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("recipe", RECIPES)
-def test_many_kills_change_nothing(tmp_path: Path, recipe: str) -> None:
+def test_two_kills_change_nothing(tmp_path: Path, recipe: str) -> None:
+    resumes_exactly(tmp_path, recipe, kills=2)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_twenty_kills_change_nothing(tmp_path: Path, recipe: str) -> None:
     resumes_exactly(tmp_path, recipe, kills=20)
 
 
