@@ -65,7 +65,7 @@ def tensors(state: Any, prefix: str = "") -> dict[str, Any]:
     if isinstance(state, dict):
         found: dict[str, Any] = {}
         for key, value in state.items():
-            if key not in ("seconds", "metrics", "best"):
+            if key not in ("seconds", "metrics", "best", "recorded"):
                 found |= tensors(value, f"{prefix}.{key}")
         return found
     if isinstance(state, (list, tuple)):

@@ -66,7 +66,7 @@ class Session:
         events, written = cfg.log.name == "tensorboard", state["metrics"] if state else 0
         self.metrics = MetricsLog(folder, tensorboard=events, position=written, frames=self.start.frames)
         opened.callback(self.metrics.close)
-        self.log = _episode_log(cfg, self.world, folder)
+        self.log = _episode_log(cfg, self.world, folder, state["recorded"] if state else None)
         if self.log is not None:
             opened.callback(self.log.close)
 
@@ -111,7 +111,10 @@ class Session:
         better = verdict.evaluation.aihtr > self._best
         self._best = max(self._best, verdict.evaluation.aihtr)
         written = self.metrics.position
-        state = capture(self.cfg, self.algorithm, self.collector, at, metrics=written, best=self._best)
+        recorded = self.log.policies if self.log is not None else None
+        state = capture(
+            self.cfg, self.algorithm, self.collector, at, metrics=written, best=self._best, recorded=recorded
+        )
         checkpoint.save(self.folder / "checkpoints", at.iteration, state, keep=self.cfg.checkpoint.keep, best=better)
 
     def _record(self, iteration: int, chains: np.ndarray) -> None:
@@ -126,7 +129,7 @@ class Session:
             self.log.record(Chains(chains), {"label": f"iteration {iteration}"}, log.episodes, iteration)
 
 
-def _episode_log(cfg: TrainConfig, world: World, folder: Path) -> EpisodeLog | None:
+def _episode_log(cfg: TrainConfig, world: World, folder: Path, policies: int | None) -> EpisodeLog | None:
     """The log of simulated episodes, where it is asked for."""
     if not isinstance(cfg.log, Mcap):
         return None
@@ -137,6 +140,7 @@ def _episode_log(cfg: TrainConfig, world: World, folder: Path) -> EpisodeLog | N
         config=config_text(cfg),
         max_steps=cfg.grid.max_steps,
         layout=cfg.log.layout,
+        policies=policies,
         command="train",
     )
 

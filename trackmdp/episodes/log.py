@@ -8,6 +8,7 @@ from pathlib import Path
 
 from trackmdp.episodes.layout import write_layout
 from trackmdp.episodes.record import Acting, record
+from trackmdp.episodes.recover import taken_over
 from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.seeding import derive
 from trackmdp.world.model import World
@@ -28,6 +29,8 @@ class EpisodeLog:
         config: text of the run's `config.yaml`.
         max_steps: where episodes are cut; None for never.
         layout: write a viewer's layout next to the log.
+        policies: go on after so many policies of the log of an earlier process, what it wrote later being cut off; None
+            for a log of its own.
         command: named where it is said, on standard error, that logging is over.
     """
 
@@ -41,17 +44,43 @@ class EpisodeLog:
         max_steps: int | None,
         layout: bool,
         command: str,
+        policies: int | None = None,
     ) -> None:
         self._world, self._seed, self._max_steps, self._command = world, seed, max_steps, command
-        self.file, self.episodes = free_name(folder / "episodes.mcap"), 0
         self._writer: EpisodeWriter | None = None
         try:
-            facts = {"seed": str(seed)}
-            self._writer = EpisodeWriter(self.file, world, facts=facts, config=config, max_steps=max_steps)
+            self.file, self.episodes = folder / "episodes.mcap", 0
+            if policies is not None:
+                self._take_over(policies)
+            if self._writer is None:
+                self.file = free_name(self.file)
+                facts = {"seed": str(seed)}
+                self._writer = EpisodeWriter(self.file, world, facts=facts, config=config, max_steps=max_steps)
             if layout:
                 write_layout(folder / "episodes.layout.json")
         except OSError as error:
             self._stop(error)
+
+    @property
+    def policies(self) -> int:
+        """How many policies have been recorded."""
+        return 0 if self._writer is None else self._writer.policies
+
+    def _take_over(self, policies: int) -> None:
+        """Go on with the log of an earlier process, which was killed (`.part`) or ended in order."""
+        part = self.file.with_name(f"{self.file.name}.part")
+        earlier = self.file.with_name(f"{self.file.name}.earlier")
+        written = part if part.exists() else self.file
+        if not written.exists():
+            return
+        written.replace(earlier)
+        taken = taken_over(earlier, self.file, policies)
+        if taken is None:
+            earlier.replace(written)
+            sys.stderr.write(f"trackmdp {self._command}: {written}: not whole; a new log is begun beside it\n")
+            return
+        self._writer, self.episodes = taken
+        earlier.unlink()
 
     def record(self, acting: Acting, facts: Mapping[str, str], episodes: int, *names: str | int) -> None:
         """Record `episodes` episodes of a policy; their seeds are those called (`"episode"`, `names`, 0, 1, ...)."""

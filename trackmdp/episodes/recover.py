@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -16,7 +17,7 @@ from trackmdp.episodes.reader import check_run
 from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.errors import UserError
 
-__all__ = ["Recovered", "recover", "recovered_name"]
+__all__ = ["Recovered", "recover", "recovered_name", "taken_over"]
 
 _TABLES = ("config.yaml", "kernel.npy", "cost.npy")
 
@@ -61,7 +62,24 @@ def recover(file: Path) -> Recovered:
     return Recovered(writer.finish(), episodes, tuple(damaged))
 
 
-def _rewrite(file: Path, target: Path, damaged: list[str]) -> tuple[EpisodeWriter | None, int]:
+def taken_over(file: Path, target: Path, policies: int) -> tuple[EpisodeWriter, int] | None:
+    """A log that goes on after the first `policies` policies of another, and the number of episodes it holds so far.
+
+    None if they are not all there; `target` is then not left behind.
+    """
+    writer, episodes = _rewrite(file, target, [], most=policies)
+    if writer is None:
+        return None
+    if writer.policies < policies:
+        writer.abandon()
+        writer.part.unlink()
+        return None
+    writer.flush()
+    return writer, episodes
+
+
+def _rewrite(file: Path, target: Path, damaged: list[str], most: float = math.inf) -> tuple[EpisodeWriter | None, int]:
+    """Copy what is whole of the first `most` policies and their episodes."""
     found, writer, episodes = _Found(), None, 0
     policies: set[int] = set()
     with container.opened(file) as stream:
@@ -74,6 +92,8 @@ def _rewrite(file: Path, target: Path, damaged: list[str]) -> tuple[EpisodeWrite
             try:
                 if writer is None:
                     raise Damaged("what says how it was recorded")
+                if row["policy"] >= most:
+                    break
                 _policies_up_to(row["policy"], writer, found, policies)
                 episodes += _copy(row, found, writer)
             except (Damaged, ValueError, KeyError, TypeError, IndexError, struct.error) as error:
@@ -85,7 +105,7 @@ def _rewrite(file: Path, target: Path, damaged: list[str]) -> tuple[EpisodeWrite
         damaged.append("the end is missing")
     if writer is not None:
         last = max((int(name.rpartition(".")[2]) for name in found.metadata if schema.POLICY in name), default=-1)
-        _policies_up_to(last, writer, found, policies)
+        _policies_up_to(int(min(last, most - 1)), writer, found, policies)
     return writer, episodes
 
 
@@ -133,6 +153,7 @@ def _policies_up_to(number: int, writer: EpisodeWriter, found: _Found, done: set
         facts = dict(found.metadata.get(f"{schema.POLICY}.{each}", {}))
         if not facts:
             raise Damaged(f"policy {each} is lost")
+        writer.flush()  # as when it was recorded, so that a copy has the same bytes
         sha256, table = facts.pop("table.sha256"), found.attachments.get(f"policy-{each}.npy")
         if sha256 and (table is None or schema.digest(table) != sha256):
             raise Damaged(f"policy {each} is lost")

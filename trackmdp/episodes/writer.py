@@ -90,6 +90,11 @@ class EpisodeWriter:
         number = self._writer.register_schema(name, "jsonschema", text)
         return self._writer.register_channel(topic, "json", number)
 
+    @property
+    def policies(self) -> int:
+        """How many policies the log holds."""
+        return self._policies
+
     def add_policy(self, facts: Mapping[str, str], chains: BoolArray | None = None) -> int:
         """Add the policy of the episodes that follow; returns its number.
 

@@ -38,7 +38,14 @@ def identity(cfg: TrainConfig) -> str:
 
 
 def capture(
-    cfg: TrainConfig, algorithm: Algorithm, collector: BaseCollector, at: Position, *, metrics: int, best: float
+    cfg: TrainConfig,
+    algorithm: Algorithm,
+    collector: BaseCollector,
+    at: Position,
+    *,
+    metrics: int,
+    best: float,
+    recorded: int | None = None,
 ) -> dict[str, Any]:
     """Everything that the next iteration depends on, and what has been written so far.
 
@@ -49,6 +56,7 @@ def capture(
         at: how far the run is.
         metrics: bytes of `metrics.csv`.
         best: the highest AIHTR of any checkpoint.
+        recorded: policies in the log of episodes; None where there is none.
     """
     cuda = torch.cuda.get_rng_state_all() if torch.cuda.is_available() else []
     return {
@@ -60,6 +68,7 @@ def capture(
         "position": vars(at),
         "metrics": metrics,
         "best": best,
+        "recorded": recorded,
     }
 
 

@@ -1,0 +1,62 @@
+"""The log of episodes of a run that is cut and goes on: the same bytes as if it never had been."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.training.runs import at_iteration, train
+from trackmdp.episodes.log import EpisodeLog
+from trackmdp.episodes.reader import EpisodeReader
+
+LOGGED = ("log=mcap", "log.episodes=3", "log.evaluations=1", "evaluation.every=2")
+
+
+class Killed(BaseException):
+    """The process ends here: nothing is closed."""
+
+
+def killed() -> None:
+    raise Killed
+
+
+def cut(folder: Path, monkeypatch: pytest.MonkeyPatch, *, closes: bool) -> None:
+    """A run that ends once iteration 6 is recorded, before its checkpoint."""
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        if not closes:
+            patch.setattr(EpisodeLog, "close", lambda self: self._writer.abandon())  # the file stays as it is
+        at_iteration(patch, 6, killed)
+        train(folder, *LOGGED)
+
+
+def count(log: Path) -> int:
+    with EpisodeReader(log) as reader:
+        return len(reader)
+
+
+@pytest.mark.parametrize("closes", [False, True])
+def test_it_is_cut_back_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, closes: bool) -> None:
+    train(tmp_path / "whole", *LOGGED)
+    cut(tmp_path / "cut", monkeypatch, closes=closes)
+    left = tmp_path / "cut" / ("episodes.mcap" if closes else "episodes.mcap.part")
+    assert left.is_file()
+    train(tmp_path / "cut", *LOGGED, "resume=auto")
+    logs = sorted(file.name for file in (tmp_path / "cut").glob("episodes*"))
+    assert logs == ["episodes.mcap"]
+    mine, whole = (tmp_path / run / "episodes.mcap" for run in ("cut", "whole"))
+    assert count(whole) == 15
+    assert mine.read_bytes() == whole.read_bytes()
+
+
+def test_a_log_that_lost_episodes_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cut(tmp_path / "cut", monkeypatch, closes=False)
+    part = tmp_path / "cut" / "episodes.mcap.part"
+    short = part.read_bytes()[:4000]
+    part.write_bytes(short)
+    train(tmp_path / "cut", *LOGGED, "resume=auto")
+    assert "not whole; a new log is begun beside it" in capsys.readouterr().err
+    assert part.read_bytes() == short
+    assert count(tmp_path / "cut" / "episodes-2.mcap") == 6
