@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from torchrl.collectors import Collector
 
 from trackmdp.bench.machine import rate
 from trackmdp.build import make_algorithm, make_collector
-from trackmdp.config import GROUPS, BenchmarkConfig, TrainConfig, from_hydra, to_dict
+from trackmdp.config import GROUPS, BenchmarkConfig, TrainConfig, from_hydra
 from trackmdp.policies.actor_critic import make_actor
 from trackmdp.policies.fixed import AllOn, RandomSubset
 from trackmdp.seeding import generator
@@ -73,23 +74,27 @@ def collector_speed(cfg: BenchmarkConfig, world: World, device: torch.device) ->
 
 
 def train_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[Row]:
-    """Frames per second of collecting and learning, for each algorithm as its config stands."""
+    """Frames per second of collecting and learning, for each algorithm as its config stands.
+
+    Each is run for five times `seconds`, or to its end where that comes first (`whole`): then the updates that follow
+    the last frame count as well.
+    """
     rows = []
     for name in GROUPS["algo"]:
         train = train_config([f"algo={name}", f"seed={cfg.seed}", f"threads={cfg.threads}"])
         train.grid, train.kernel, train.cost = cfg.grid, cfg.kernel, cfg.cost
         algorithm = make_algorithm(train, world, device)
         collector = make_collector(train, world, algorithm, device)
-        batches = iter(collector)
-
-        def iteration(batches: Any = batches, algorithm: Any = algorithm) -> int:
-            batch = next(batches)
+        batches, frames, done = iter(collector), 0, 0
+        wall, cpu = time.perf_counter(), time.process_time()
+        while done < algorithm.iterations and time.perf_counter() - wall < 5 * cfg.seconds:
+            batch = next(batches, None)
+            frames, done = frames + (batch.numel() if batch is not None else 0), done + 1
             algorithm.step(batch)
-            return batch.numel()
-
-        figures = rate(iteration, cfg.seconds, device)
+        spent, used = time.perf_counter() - wall, time.process_time() - cpu
         collector.shutdown()
-        rows.append({"part": "train", "algo": name, "settings": to_dict(train.algo), **figures})
+        figures = {"per_second": frames / spent, "cpu_us_each": 1e6 * used / frames}
+        rows.append({"part": "train", "algo": name, "whole": done == algorithm.iterations, **figures})
     return rows
 
 
