@@ -82,54 +82,81 @@ def train(
         Preempted: a signal asked for the end; a checkpoint has been saved.
         RunError: the loss is not finite, or collecting broke down; the last checkpoint stands.
     """
-    began, batches = time.monotonic() - start.seconds, iter(collector)
-    saved, at, rest = start, start, 0.0
-    verdict = judge.score(chains_of(algorithm.actor, judge.world, algorithm.device))
-    with Signals() as signals, Watch(collector) as watch:
-        for iteration in range(start.iteration + 1, algorithm.iterations + 1):
-            try:
-                batch = _next(batches, watch, iteration)
-            except RunError:
-                if not signals.received:
-                    raise
-                save(at, verdict)  # the signal went to the workers as well, and nothing has been learned since
-                raise Preempted(signals.received) from None
-            try:
-                diagnostics = algorithm.step(batch)
-            except FloatingPointError as error:
-                raise RunError(f"iteration {iteration}: {error}; the last checkpoint holds a good state") from error
-            if batch is not None:
-                _hand_over(collector, watch, iteration)
-            frames = at.frames + (batch.numel() if batch is not None else 0)
-            at = Position(iteration, frames, time.monotonic() - began)
-            last = iteration == algorithm.iterations
-            judged = last or iteration == 1 or iteration % every.evaluate == 0
-            if judged:
-                chains = chains_of(algorithm.actor, judge.world, algorithm.device)
-                verdict = judge.score(chains)
-                if on_judged is not None:
-                    on_judged(iteration, chains)
-            if last or iteration % every.log == 0:
-                metrics.write(_row(at, verdict if judged else None, diagnostics))
-            if last or signals.received or _due(saved, at, rest, every):
-                begin = time.monotonic()
-                save(at, verdict)
-                saved, rest = at, _SAVING * (time.monotonic() - begin)
-            display.update(iteration, frames, verdict.evaluation.aihtr, judge.upper - verdict.evaluation.aihtr)
-            if signals.received and not last:
-                raise Preempted(signals.received)
-    return verdict, replace(at, seconds=time.monotonic() - began)
+    return _Loop(algorithm, collector, judge, metrics, display, every, save, start, on_judged).run()
 
 
-def _next(batches: Iterator[TensorDictBase], watch: Watch, iteration: int) -> TensorDictBase | None:
-    with _named(iteration), watch.waiting():
-        return next(batches, None)
+@dataclass
+class _Loop:
+    """What `train` is given, and how far it is."""
 
+    algorithm: Algorithm
+    collector: BaseCollector
+    judge: Judge
+    metrics: MetricsLog
+    display: Display
+    every: Intervals
+    save: Callable[[Position, Verdict], None]
+    at: Position
+    on_judged: Callable[[int, BoolArray], None] | None
 
-def _hand_over(collector: BaseCollector, watch: Watch, iteration: int) -> None:
-    """Collect with the new weights from now on."""
-    with _named(iteration), watch.waiting():
-        collector.update_policy_weights_()
+    def run(self) -> tuple[Verdict, Position]:
+        began, last = time.monotonic() - self.at.seconds, self.algorithm.iterations
+        self._batches, self._saved, self._rest = iter(self.collector), self.at, 0.0
+        self._verdict = self.judge.score(self._chains())
+        with Signals() as self._signals, Watch(self.collector) as self._watch:
+            for iteration in range(self.at.iteration + 1, last + 1):
+                batch = self._collect(iteration)
+                diagnostics = self._learn(batch, iteration)
+                frames = self.at.frames + (batch.numel() if batch is not None else 0)
+                self.at = Position(iteration, frames, time.monotonic() - began)
+                self._account(diagnostics)
+                if self._signals.received and iteration < last:
+                    raise Preempted(self._signals.received)
+        return self._verdict, replace(self.at, seconds=time.monotonic() - began)
+
+    def _collect(self, iteration: int) -> TensorDictBase | None:
+        """The next batch, None once all frames are in."""
+        try:
+            with _named(iteration), self._watch.waiting():
+                return next(self._batches, None)
+        except RunError:
+            if not self._signals.received:
+                raise
+            self.save(self.at, self._verdict)  # the signal went to the workers too; nothing has been learned since
+            raise Preempted(self._signals.received) from None
+
+    def _learn(self, batch: TensorDictBase | None, iteration: int) -> dict[str, float]:
+        """One iteration of learning, after which the collector has the new weights."""
+        try:
+            diagnostics = self.algorithm.step(batch)
+        except FloatingPointError as error:
+            raise RunError(f"iteration {iteration}: {error}; the last checkpoint holds a good state") from error
+        if batch is not None:
+            with _named(iteration), self._watch.waiting():
+                self.collector.update_policy_weights_()
+        return diagnostics
+
+    def _account(self, diagnostics: dict[str, float]) -> None:
+        """Judge, log, save and show what is due after an iteration."""
+        at, every = self.at, self.every
+        last = at.iteration == self.algorithm.iterations
+        judged = last or at.iteration == 1 or at.iteration % every.evaluate == 0
+        if judged:
+            chains = self._chains()
+            self._verdict = self.judge.score(chains)
+            if self.on_judged is not None:
+                self.on_judged(at.iteration, chains)
+        if last or at.iteration % every.log == 0:
+            self.metrics.write(_row(at, self._verdict if judged else None, diagnostics))
+        if last or self._signals.received or _due(self._saved, at, self._rest, every):
+            begin = time.monotonic()
+            self.save(at, self._verdict)
+            self._saved, self._rest = at, _SAVING * (time.monotonic() - begin)
+        aihtr = self._verdict.evaluation.aihtr
+        self.display.update(at.iteration, at.frames, aihtr, self.judge.upper - aihtr)
+
+    def _chains(self) -> BoolArray:
+        return chains_of(self.algorithm.actor, self.judge.world, self.algorithm.device)
 
 
 @contextmanager
