@@ -89,7 +89,7 @@ class Container:
         self.file = file
         self.stream = opened(file)
         try:
-            self.profile, self.library = self._header()
+            self.profile, self.made_by = self._header()
             self._summary()
         except (Damaged, struct.error, UnicodeDecodeError) as error:
             self.stream.close()

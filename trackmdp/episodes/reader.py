@@ -54,7 +54,7 @@ class EpisodeReader:
             kind = f"profile {container.profile!r}" if container.profile else f"it has no metadata {schema.RUN}"
             raise UserError(f"file={file}: not a log of trackmdp ({kind})")
         self.run = check_run(file, self._checked(self._told, schema.RUN))
-        if container.library != f"trackmdp {self.run['trackmdp']}":
+        if container.made_by != f"trackmdp {self.run['trackmdp']}":
             raise self._damage("the header")
         if schema.END not in container.metadata:
             raise self._damage(f"no metadata {schema.END}")
