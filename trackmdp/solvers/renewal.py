@@ -22,7 +22,7 @@ IndexArray: TypeAlias = npt.NDArray[np.integer[Any]]
 
 LONGEST_EPISODE = 1e12
 _ENDLESS = (
-    "kernel: from some cell the target never exits: expected an exit reachable from everywhere, else values diverge"
+    "kernel: from some cell the target never exits, so no value is finite: expected an exit reachable from each cell"
 )
 
 
@@ -67,8 +67,3 @@ def per_row(rows: IndexArray, values: Array, count: int) -> Array:
 def row_index(matrix: sparse.csr_array) -> IndexArray:
     """`[nnz]` the row of each stored entry."""
     return np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
-
-
-_ENDLESS = (
-    "kernel: from some cell the target never exits, so no value is finite: expected an exit reachable from each cell"
-)
