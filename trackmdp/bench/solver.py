@@ -22,12 +22,14 @@ T_MAX = (0, 1, 2, 3, 4, 5)
 PAIRS = ((5, 0.16), (5, 0.22))
 TIME_LIMIT = 60
 _RUN = """
-import json, resource, sys
+import json, re, resource, sys
 from pathlib import Path
 from trackmdp.cli import main
 status = main(["solve", *sys.argv[2:], "quiet=true", f"hydra.run.dir={sys.argv[1]}/run"])
 usage = resource.getrusage(resource.RUSAGE_SELF)
-used = {"cpu_seconds": usage.ru_utime + usage.ru_stime, "peak_mib": usage.ru_maxrss / 1024}
+own = Path("/proc/self/status")  # ru_maxrss starts at the peak of the process that started this one
+peak = int(re.search(r"VmHWM:\\s+(\\d+)", own.read_text())[1]) if own.is_file() else usage.ru_maxrss
+used = {"cpu_seconds": usage.ru_utime + usage.ru_stime, "peak_mib": peak / 1024}
 Path(sys.argv[1], "usage.json").write_text(json.dumps(used))
 sys.exit(status)
 """
