@@ -22,11 +22,12 @@ from trackmdp.errors import UserError
 from trackmdp.seeding import seed_global
 from trackmdp.training import checkpoint, memory
 from trackmdp.training.display import Display
+from trackmdp.training.evaluate import chains_of
 from trackmdp.training.judge import Judge, Verdict
 from trackmdp.training.loop import Intervals, Position, train
 from trackmdp.training.metrics import MetricsLog, write_bytes, write_text
 from trackmdp.training.state import capture, find, restore, take_weights
-from trackmdp.world.model import World
+from trackmdp.world.model import BoolArray, World
 
 __all__ = ["Session"]
 
@@ -106,6 +107,10 @@ class Session:
                 start,
                 self._record,
             )
+
+    def chains(self) -> BoolArray:
+        """`[M, t_max + 1, M]` of the policy as it is now."""
+        return chains_of(self.algorithm.actor, self.world.task, self.device)
 
     def _save(self, at: Position, verdict: Verdict) -> None:
         better = verdict.evaluation.aihtr > self._best

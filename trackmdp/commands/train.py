@@ -13,6 +13,7 @@ from trackmdp.commands.session import Session
 from trackmdp.commands.summary import digest, show, summarize
 from trackmdp.config import TrainConfig
 from trackmdp.errors import RunError
+from trackmdp.reports import policy
 from trackmdp.solvers import optimal
 from trackmdp.solvers.optimal import Solution
 from trackmdp.training.display import make_console
@@ -24,7 +25,7 @@ __all__ = ["run"]
 
 
 def run(cfg: TrainConfig, folder: Path) -> float:
-    """Train as `cfg` says and write config, kernel, metrics, checkpoints and summary to `folder`; returns the AIHTR.
+    """Train as `cfg` says and write inputs, metrics, checkpoints, policy and summary to `folder`; returns the AIHTR.
 
     Raises:
         UserError: the config asks for what is not there, or for more memory than there is.
@@ -59,6 +60,7 @@ def _run(cfg: TrainConfig, folder: Path) -> float:
         "wall_seconds": time.monotonic() - started + session.start.seconds,
         "cpu_seconds": time.process_time() - used,
     }
+    policy.write(folder / policy.FILE, policy.Policy(session.chains(), verdict.evaluation.value))
     write_json(folder / "summary.json", summarize(cfg, judge, verdict, solution, end.frames, times))
     show(console, cfg, judge, verdict, solution)
     console.print(f"{times['wall_seconds']:.1f} s; results in {folder}")

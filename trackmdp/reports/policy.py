@@ -1,0 +1,64 @@
+"""A learned policy as a run leaves it: `policy.npz`, its sets and its exact values, without pickle."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from trackmdp.durable import whole_file
+from trackmdp.errors import UserError
+from trackmdp.world.model import Array, BoolArray
+
+__all__ = ["FILE", "Policy", "pack", "read", "write"]
+
+FILE = "policy.npz"
+
+
+@dataclass(frozen=True, eq=False)
+class Policy:
+    """A deterministic policy.
+
+    Attributes:
+        chains: `[M, t_max + 1, M]`, sensors on at n misses after the target was located in each cell.
+        value: `[M]`, expected reward of an episode from each start cell, exactly.
+    """
+
+    chains: BoolArray
+    value: Array
+
+
+def pack(policy: Policy) -> bytes:
+    """The bytes of a `policy.npz`: `chains` as bits, their `shape`, and `value`; the same policy, the same bytes."""
+    stream = io.BytesIO()
+    bits, shape = np.packbits(policy.chains), np.array(policy.chains.shape)
+    np.savez_compressed(stream, chains=bits, shape=shape, value=policy.value)
+    return stream.getvalue()
+
+
+def write(file: Path, policy: Policy) -> None:
+    """Write the policy, whole or not at all."""
+    with whole_file(file) as stream:
+        stream.write(pack(policy))
+
+
+def read(file: Path) -> Policy:
+    """Read a policy back.
+
+    Raises:
+        UserError: the file is missing or damaged, or holds something else.
+    """
+    try:
+        with np.load(io.BytesIO(file.read_bytes()), allow_pickle=False) as stored:
+            bits, shape, value = (stored[key] for key in ("chains", "shape", "value"))
+        m, choices, sensors = map(int, shape)
+        if sensors != m or value.shape != (m,) or bits.size != (m * choices * m + 7) // 8:
+            raise ValueError("arrays that do not belong together")
+        chains = np.unpackbits(bits, count=m * choices * m).astype(np.bool_).reshape(m, choices, m)
+        return Policy(chains, np.asarray(value, dtype=np.float64))
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise UserError(f"{file}: not the policy of a run ({' '.join(str(error).split())})") from error
