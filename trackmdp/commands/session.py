@@ -25,7 +25,7 @@ from trackmdp.training.display import Display
 from trackmdp.training.evaluate import chains_of
 from trackmdp.training.judge import Judge, Verdict
 from trackmdp.training.loop import Intervals, Position, train
-from trackmdp.training.metrics import MetricsLog, write_bytes, write_text
+from trackmdp.training.metrics import MetricsLog, write_bytes, write_json, write_text
 from trackmdp.training.state import capture, find, restore, take_weights
 from trackmdp.world.model import BoolArray, World
 
@@ -64,6 +64,8 @@ class Session:
         self.start = self._start(state)
         self._best = state["best"] if state else -math.inf
         _write_inputs(cfg, self.world, folder, resumed=state is not None)
+        plan = {"iterations": self.algorithm.iterations, "upper_bound": self.judge.upper}
+        write_json(folder / "plan.json", plan)  # for those who watch the run
         events, written = cfg.log.name == "tensorboard", state["metrics"] if state else 0
         self.metrics = MetricsLog(folder, tensorboard=events, position=written, frames=self.start.frames)
         opened.callback(self.metrics.close)

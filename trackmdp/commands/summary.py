@@ -12,6 +12,7 @@ import numpy as np
 from rich.console import Console
 
 from trackmdp import __version__
+from trackmdp.bench.machine import machine
 from trackmdp.config import TrainConfig, to_yaml
 from trackmdp.solvers.optimal import Solution
 from trackmdp.training.display import table
@@ -55,6 +56,7 @@ def summarize(
         "regret_per_step": verdict.regret_per_step,
         "versions": {"trackmdp": __version__, "python": platform.python_version()}
         | {name: version(name) for name in _PACKAGES},
+        "machine": machine(),
         "config_sha256": digest(cfg),
     }
 
