@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +10,7 @@ from typing import Any
 
 import torch
 
+from trackmdp.bench.process import measured
 from trackmdp.config import BenchmarkConfig
 from trackmdp.world.model import World
 
@@ -21,18 +20,6 @@ SIZES = (5, 10, 20, 30)
 T_MAX = (0, 1, 2, 3, 4, 5)
 PAIRS = ((5, 0.16), (5, 0.22))
 TIME_LIMIT = 60
-_RUN = """
-import json, re, resource, sys
-from pathlib import Path
-from trackmdp.cli import main
-status = main(["solve", *sys.argv[2:], "quiet=true", f"hydra.run.dir={sys.argv[1]}/run"])
-usage = resource.getrusage(resource.RUSAGE_SELF)
-own = Path("/proc/self/status")  # ru_maxrss starts at the peak of the process that started this one
-peak = int(re.search(r"VmHWM:\\s+(\\d+)", own.read_text())[1]) if own.is_file() else usage.ru_maxrss
-used = {"cpu_seconds": usage.ru_utime + usage.ru_stime, "peak_mib": peak / 1024}
-Path(sys.argv[1], "usage.json").write_text(json.dumps(used))
-sys.exit(status)
-"""
 
 
 def solver(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[dict[str, Any]]:  # noqa: ARG001
@@ -51,10 +38,9 @@ def _solved(support: int, cost: float, size: int, t_max: int) -> dict[str, Any]:
     """One solve, as typed; `cpu_seconds` and `peak_mib` are of the whole process, the start of Python included."""
     world = [f"kernel.support_size={support}", f"cost.sensor={cost}", f"grid.size={size}", f"grid.t_max={t_max}"]
     with tempfile.TemporaryDirectory() as folder:
-        words = [folder, *world, f"solver.time_limit={TIME_LIMIT}"]
-        subprocess.run([sys.executable, "-c", _RUN, *words], check=True)
+        words = [*world, f"solver.time_limit={TIME_LIMIT}", "quiet=true", f"hydra.run.dir={folder}/run"]
+        usage = measured("solve", *words)
         solution = json.loads(Path(folder, "run", "solution.json").read_text())
-        usage = json.loads(Path(folder, "usage.json").read_text())
     return {
         "part": "solver",
         "Z": support,
@@ -65,5 +51,6 @@ def _solved(support: int, cost: float, size: int, t_max: int) -> dict[str, Any]:
         "gap_per_step": solution["regret_per_step"],
         "nodes": solution["nodes"],
         "solve_seconds": solution["seconds"],
-        **usage,
+        "cpu_seconds": usage.cpu_seconds,
+        "peak_mib": usage.peak_mib,
     }

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from trackmdp.bench import learned, log, quality, solver, speed
+from trackmdp.bench import learned, log, memory, peers, quality, solver, speed
 from trackmdp.bench.machine import machine
 from trackmdp.build import make_device, make_world
 from trackmdp.config import BenchmarkConfig
@@ -23,6 +23,10 @@ PARTS: dict[str, Callable[[BenchmarkConfig, World, torch.device], list[dict[str,
     "collector": speed.collector_speed,
     "train": speed.train_speed,
     "quality": quality.quality,
+    "pairs": quality.pairs,
+    "growth": quality.growth,
+    "memory": memory.memory,
+    "peers": peers.peers,
     "solver": solver.solver,
     "learned_kernel": learned.learned_kernel,
     "log": log.log_speed,
@@ -41,6 +45,11 @@ def run(cfg: BenchmarkConfig, folder: Path) -> None:
     shown = [key for key in rows[0] if not isinstance(rows[0][key], dict)]
     title = f"{where['processor']}, {where['cores']} cores, {cfg.threads} torch threads, {device}"
     console.print(table(title, shown, [[_text(row[key]) for key in shown] for row in rows]))
+    if cfg.part == "quality":
+        counted = [[algo, text, str(runs), "#" * runs] for algo, text, runs in quality.histogram(rows)]
+        console.print(table("runs by regret per step", ["algo", "regret", "runs", ""], counted))
+    if cfg.part == "peers":
+        console.print(peers.chart(rows, cfg.seeds[0]), markup=False, highlight=False)
     console.print(f"results in {folder}")
 
 

@@ -125,15 +125,33 @@ class BenchmarkConfig(WorldConfig):
     """Measure speed and quality on this machine."""
 
     part: str = option(
-        "what is measured", choices=("env", "collector", "train", "quality", "solver", "learned_kernel", "log")
+        "what is measured",
+        choices=(
+            "env",
+            "collector",
+            "train",
+            "quality",
+            "pairs",
+            "growth",
+            "memory",
+            "peers",
+            "solver",
+            "learned_kernel",
+            "log",
+        ),
     )
     seed: int = option("every random draw derives from it", ge=0)
     device: str = option("device of environments and networks", expects="cpu, cuda, cuda:N or auto")
     threads: int = option("torch threads", unit="threads", ge=1, le=256)
     seconds: float = option("least time spent on each figure of speed", unit="s", gt=0)
-    algos: list[str] = option("algorithms that `quality` trains", choices=tuple(GROUPS["algo"]))
-    seeds: list[int] = option("seeds that `quality` trains with", ge=0)
-    peers: str | None = option("folder with the scripts of the peers to run beside ours", expects="a folder")
+    algos: list[str] = option("algorithms that `quality`, `pairs`, `growth` train", choices=tuple(GROUPS["algo"]))
+    seeds: list[int] = option("seeds that they and `peers` train with; `growth`: the first", ge=0)
+    peers: str | None = option(
+        "`peers`: folder with the scripts <name>_peer.py to run beside ours", expects="the folder of the scripts"
+    )
+    peers_python: list[str] | None = option(
+        "`peers`: the interpreter of each script, in the order of their names; null: this one"
+    )
 
 
 @dataclass(kw_only=True)
