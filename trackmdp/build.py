@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from trackmdp.config import Cost, Drift, Kernel, PaperCost, RandomSupport, RandomWalk, Table, WorldConfig
+from trackmdp.config import Cost, Drift, Kernel, PaperCost, RandomSupport, RandomWalk, Table, Tracks, WorldConfig
 from trackmdp.errors import UserError
 from trackmdp.world import kernels
 from trackmdp.world.files import read_numbers
 from trackmdp.world.model import Array, World
+from trackmdp.world.tracks import Recorded, Setting, check_tracks, load_tracks, split
 
 if TYPE_CHECKING:  # the world is built, and a config checked, before anything heavy is imported
     import torch
@@ -20,7 +21,7 @@ if TYPE_CHECKING:  # the world is built, and a config checked, before anything h
     from trackmdp.algos.common import Algorithm
     from trackmdp.config import Baseline, TrainConfig
 
-__all__ = ["make_algorithm", "make_baseline", "make_collector", "make_device", "make_world"]
+__all__ = ["make_algorithm", "make_baseline", "make_collector", "make_device", "make_setting", "make_world"]
 
 KERNELS: dict[type[Kernel], Callable[..., Array]] = {
     RandomSupport: kernels.random_support,
@@ -28,6 +29,32 @@ KERNELS: dict[type[Kernel], Callable[..., Array]] = {
     Drift: kernels.drift,
     Table: lambda size, *, path: kernels.load_table(path),  # a table has its own size, checked below
 }
+
+
+def make_setting(cfg: WorldConfig) -> Setting:
+    """The world a config describes, or its recorded tracks.
+
+    Raises:
+        UserError: a file is missing or malformed, or the kernel or a track breaks a rule.
+    """
+    return make_recorded(cfg) if isinstance(cfg.kernel, Tracks) else make_world(cfg)
+
+
+def make_recorded(cfg: WorldConfig) -> Recorded:
+    """The recorded tracks a config names, those held out set apart.
+
+    Raises:
+        UserError: the file is missing or malformed, a track is too short, or one of the two parts would be empty.
+    """
+    kernel, size, t_max = cfg.kernel, cfg.grid.size, cfg.grid.t_max
+    assert isinstance(kernel, Tracks)
+    tracks = load_tracks(kernel.path, size, exits=kernel.ends == "exit")
+    shortest = max(kernel.min_length or t_max + 3, 1 if kernel.ends == "exit" else 2)  # a cut track of one has no step
+    check_tracks(tracks, shortest, f"kernel.path={kernel.path}")
+    mine, held_out = split(tracks, kernel.held_out, kernel.seed)
+    reward, price, safe = _costs(cfg.cost, size**2)
+    anywhere = kernel.starts == "anywhere"
+    return Recorded(size, reward, price, safe, t_max, mine, held_out, anywhere=anywhere, markov=kernel.markov)
 
 
 def make_world(cfg: WorldConfig) -> World:
@@ -85,7 +112,7 @@ def make_device(name: str, key: str = "device") -> torch.device:
     return device
 
 
-def make_algorithm(cfg: TrainConfig, world: World, device: torch.device) -> Algorithm:
+def make_algorithm(cfg: TrainConfig, world: Setting, device: torch.device) -> Algorithm:
     """The learner; it is given the task, never the motion."""
     from trackmdp.algos import a2c, dqn, hindsight, learned_kernel, ppo
     from trackmdp.config import A2c, Dqn, Hindsight, LearnedKernel, Ppo
@@ -104,7 +131,7 @@ def make_algorithm(cfg: TrainConfig, world: World, device: torch.device) -> Algo
 
 
 def make_collector(
-    cfg: TrainConfig, world: World, algorithm: Algorithm, device: torch.device, done: int = 0
+    cfg: TrainConfig, world: Setting, algorithm: Algorithm, device: torch.device, done: int = 0
 ) -> BaseCollector:
     """The source of the frames that are left after the first `done`."""
     from trackmdp.training.collect import make_collector as make
@@ -121,21 +148,31 @@ def make_collector(
     )
 
 
-def make_baseline(cfg: Baseline, world: World) -> np.ndarray:
+def make_baseline(cfg: Baseline, setting: Setting) -> np.ndarray:
     """`[M, t_max+1, M]` chains of a policy that is not learned; probabilities for `random_k`, else bool."""
+    from trackmdp import config
+
+    shape = (setting.num_cells, setting.num_choices, setting.num_cells)
+    makers: dict[type[Any], Callable[[Any], np.ndarray]] = {
+        config.AllOn: lambda c: np.ones(shape, dtype=bool),
+        config.NoSensors: lambda c: np.zeros(shape, dtype=bool),
+        config.RandomK: lambda c: np.full(shape, c.k / setting.num_cells),
+    }
+    if isinstance(setting, World):
+        makers |= _planners(setting)
+    return makers[type(cfg)](cfg)
+
+
+def _planners(world: World) -> dict[type[Any], Callable[[Any], np.ndarray]]:
+    """The baselines that read the kernel."""
     from trackmdp import config
     from trackmdp.solvers import clocked, fcr, lookahead, myopic, optimal, qmdp
 
-    shape = (world.num_cells, world.num_choices, world.num_cells)
-    makers: dict[type[Any], Callable[[Any], np.ndarray]] = {
+    return {
         config.Qmdp: lambda c: qmdp.solve(world, in_grid=c.in_grid),
-        config.AllOn: lambda c: np.ones(shape, dtype=bool),
-        config.NoSensors: lambda c: np.zeros(shape, dtype=bool),
-        config.RandomK: lambda c: np.full(shape, c.k / world.num_cells),
         config.Myopic: lambda c: myopic.solve(world, threshold=c.threshold),
         config.Clocked: lambda c: clocked.solve(world),
         config.Fcr: lambda c: fcr.solve(world, in_grid=c.in_grid),
         config.Lookahead: lambda c: lookahead.solve(world, depth=c.depth, tail=c.tail),
         config.Optimal: lambda c: optimal.solve(world, time_limit=c.time_limit, tolerance=c.tolerance).chains,
     }
-    return makers[type(cfg)](cfg)

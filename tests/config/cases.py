@@ -11,7 +11,9 @@ from hydra import compose, initialize_config_dir
 
 from trackmdp.config import GROUPS, ROOTS, Option, conf_dir, from_hydra, options, register
 
-REFUSED = {("evaluate", "log=csv"), ("evaluate", "log=tensorboard")}
+REFUSED = {("evaluate", "log=csv"), ("evaluate", "log=tensorboard")} | {
+    (command, "kernel=tracks") for command in ("evaluate", "solve", "verify", "benchmark")
+}
 """Choices that a command's group offers and its rules refuse."""
 
 

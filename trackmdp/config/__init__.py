@@ -49,7 +49,7 @@ from trackmdp.config.roots import (
     WorldConfig,
 )
 from trackmdp.config.tree import conf_dir, from_hydra, load, load_run, register, suggestion, to_dict, to_yaml, world_of
-from trackmdp.config.world import Cost, Drift, Grid, Kernel, PaperCost, RandomSupport, RandomWalk, Table
+from trackmdp.config.world import Cost, Drift, Grid, Kernel, PaperCost, RandomSupport, RandomWalk, Table, Tracks
 
 __all__ = [
     "GROUPS",
@@ -99,6 +99,7 @@ __all__ = [
     "SolveConfig",
     "Table",
     "Tensorboard",
+    "Tracks",
     "TrainConfig",
     "VerifyConfig",
     "WorldConfig",

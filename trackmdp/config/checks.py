@@ -6,9 +6,10 @@ import dataclasses
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from types import NoneType
 from typing import Any
 
-from trackmdp.config.baselines import Playback, RandomK
+from trackmdp.config.baselines import AllOn, NoSensors, Playback, RandomK
 from trackmdp.config.learning import Collector, Dqn, Mcap, Ppo, Schedule, Workers
 from trackmdp.config.options import Option, options, refuse
 from trackmdp.config.roots import (
@@ -21,7 +22,7 @@ from trackmdp.config.roots import (
     TrainConfig,
     WorldConfig,
 )
-from trackmdp.config.world import Cost, PaperCost, RandomSupport, Table
+from trackmdp.config.world import Cost, PaperCost, RandomSupport, Table, Tracks
 from trackmdp.errors import UserError
 
 __all__ = ["absolute_paths", "leaves", "validate"]
@@ -58,6 +59,7 @@ def validate(cfg: CommandConfig) -> None:
     if not isinstance(cfg, WorldConfig):
         return
     _check_kernel(cfg)
+    _check_tracks(cfg)
     _check_cost(cfg.cost, cfg.grid.size**2)
     if isinstance(cfg, TrainConfig):
         _check_collector(cfg.collector)
@@ -75,7 +77,7 @@ def absolute_paths(cfg: CommandConfig, folder: Path) -> None:
         cfg.run = str(folder / cfg.run)
     if not isinstance(cfg, WorldConfig):
         return
-    if isinstance(cfg.kernel, Table):
+    if isinstance(cfg.kernel, (Table, Tracks)):
         cfg.kernel.path = str(folder / cfg.kernel.path)
     if isinstance(cfg.cost, PaperCost) and isinstance(cfg.cost.sensor, str):
         cfg.cost.sensor = str(folder / cfg.cost.sensor)
@@ -109,6 +111,20 @@ def _check_kernel(cfg: WorldConfig) -> None:
     if kernel.low_probability + kernel.exit_probability >= 1:
         expected = f"less than 1 - kernel.exit_probability = {1 - kernel.exit_probability:g}"
         raise refuse("kernel.low_probability", kernel.low_probability, expected)
+
+
+def _check_tracks(cfg: WorldConfig) -> None:
+    """Recorded tracks hold no motion model."""
+    if not isinstance(cfg.kernel, Tracks):
+        return
+    if not isinstance(cfg, (TrainConfig, EvaluateConfig)):
+        raise refuse("kernel", "tracks", "a motion model, which train and evaluate do without")
+    if isinstance(cfg.log, Mcap):
+        raise refuse("log", "mcap", "csv or tensorboard with kernel=tracks; episodes are logged with a motion model")
+    if isinstance(cfg, EvaluateConfig) and not isinstance(cfg.baseline, (AllOn, NoSensors, RandomK, NoneType)):
+        raise refuse(
+            "baseline", cfg.baseline.name, "all_on, none or random_k with kernel=tracks, without a motion model"
+        )
 
 
 def _check_cost(cost: Cost, cells: int) -> None:

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 from trackmdp.config.options import choice, option
 
-__all__ = ["Cost", "Drift", "Grid", "Kernel", "RandomSupport", "RandomWalk", "Table"]
+__all__ = ["Cost", "Drift", "Grid", "Kernel", "RandomSupport", "RandomWalk", "Table", "Tracks"]
 
 BORDERS = ("renormalize", "inside", "clip", "exit")
 
@@ -71,6 +71,30 @@ class Table(Kernel):
     """A table of your own: row i holds the probabilities of moving from cell i to each cell."""
 
     path: str = option("file with the M x M table", expects="a path to a .npy, .npz or .csv file")
+
+
+@choice("kernel", "tracks")
+@dataclass(kw_only=True)
+class Tracks(Kernel):
+    """No motion model but recorded tracks: learn from most of them, and judge on those held out."""
+
+    path: str = option(
+        "file with columns track, cell (or row, column) and, if wanted, step", expects="a path to a .csv or .npz file"
+    )
+    ends: str = option(
+        "what the end of a track is: exit = the target left the grid, cut = the recording stopped",
+        choices=("exit", "cut"),
+    )
+    starts: str = option(
+        "where episodes begin while learning: first = where a track does, anywhere = at any recorded point",
+        choices=("first", "anywhere"),
+    )
+    held_out: float = option("share of the tracks to judge on, which no learner sees", gt=0, lt=1)
+    seed: int = option("seed of the draw of the held-out tracks", ge=0)
+    min_length: int | None = option(
+        "fewest cells of a track; null = grid.t_max + 3, a whole path of a policy", unit="cells", ge=1
+    )
+    markov: bool = option("take the next move to depend on the cell alone, so that moves of different tracks combine")
 
 
 @dataclass(kw_only=True)

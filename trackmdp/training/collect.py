@@ -15,13 +15,13 @@ from trackmdp.config.learning import Collector as CollectorConfig
 from trackmdp.config.learning import MultiAsync, MultiSync
 from trackmdp.seeding import derive
 from trackmdp.world.env import TrackEnv
-from trackmdp.world.model import World
+from trackmdp.world.tracks import Setting
 
 __all__ = ["collector_state", "load_collector_state", "make_collector"]
 
 
 def make_collector(
-    world: World,
+    world: Setting,
     policy: TensorDictModuleBase,
     cfg: CollectorConfig,
     *,
@@ -53,7 +53,7 @@ def make_collector(
     return Collector(TrackEnv(world, **env), policy, track_traj_ids=False, **common)
 
 
-def _worker_env(world: World, worker: str, env: dict[str, Any]) -> TrackEnv:
+def _worker_env(world: Setting, worker: str, env: dict[str, Any]) -> TrackEnv:
     """Built in a worker process: its own stream for the targets, and for the actions sampled there."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the workers as well; the learner tells them to end
     torch.manual_seed(derive(env["seed"], "torch", worker))

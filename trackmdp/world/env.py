@@ -8,10 +8,9 @@ from torch import Tensor
 from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from trackmdp.seeding import generator
 from trackmdp.world.costs import Costs
-from trackmdp.world.model import World
-from trackmdp.world.motion import Motion
+from trackmdp.world.targets import make_targets
+from trackmdp.world.tracks import Setting
 
 __all__ = ["TrackEnv"]
 
@@ -23,18 +22,22 @@ class TrackEnv(EnvBase):
     reward 0; else if it has been missed t_max + 1 times in a row the safe action replaces `action` and locates it;
     else it is located exactly where its cell's sensor is on.
 
+    On recorded tracks the target goes along one of them; where its recording stops before it exits, the episode is
+    truncated.
+
     The state lies in the tensordict, so the environment itself holds nothing but its generators:
 
     - `last_cell` `[B]` int64, the cell of the last detection, x_{l(k)};
     - `steps_since_detection` `[B]` int64, n(k), 0 ... t_max + 1;
     - `action_history` `[B, t_max+1, M]` bool, the actions since then; slots n and later are empty;
     - `target` `[B]` int64, the true cell, M once exited: for the step, the log and tests; no policy reads it;
+    - `point` `[B]` int64, only with recorded tracks: where in the recording it is; no policy reads it;
     - `step_count` `[B]` int64, only with `max_steps`.
 
     Args:
-        world: the task and the target's motion.
+        world: the task and the target's motion, or recorded tracks.
         num_envs: B.
-        seed: seed of the run; the generators are those called (`stream`, "motion") and (`stream`, "start").
+        seed: seed of the run; the generators' names begin with `stream`.
         stream: name that keeps this environment's draws apart from all others.
         max_steps: truncate episodes after this many steps; None for never.
         device: where the tensors live.
@@ -42,7 +45,7 @@ class TrackEnv(EnvBase):
 
     def __init__(
         self,
-        world: World,
+        world: Setting,
         num_envs: int,
         *,
         seed: int = 0,
@@ -54,7 +57,7 @@ class TrackEnv(EnvBase):
         self.num_envs, self.max_steps = num_envs, max_steps
         self.num_cells, self.t_max = world.num_cells, world.t_max
         self._stream = stream
-        self._motion = Motion(world.kernel, self.device)
+        self._targets = make_targets(world, self.device)
         self._costs = Costs(world, self.device)
         self._rows = torch.arange(num_envs, device=self.device)
         self._no = torch.zeros(num_envs, 1, dtype=torch.bool, device=self.device)
@@ -64,7 +67,7 @@ class TrackEnv(EnvBase):
     @property
     def state_keys_of_step(self) -> tuple[str, ...]:
         """The keys a step reads from the one before."""
-        keys = ("target", "last_cell", "steps_since_detection", "action_history")
+        keys = ("target", *self._targets.hidden, "last_cell", "steps_since_detection", "action_history")
         return (*keys, "step_count") if self.max_steps else keys
 
     def _make_specs(self) -> None:
@@ -77,6 +80,8 @@ class TrackEnv(EnvBase):
             action_history=Binary(m, shape=(b, choices, m), dtype=torch.bool, device=self.device),
             shape=(b,),
         )
+        for key, values in self._targets.hidden.items():
+            observation[key] = Categorical(values, **index)
         if self.max_steps:
             observation["step_count"] = Categorical(self.max_steps + 1, **index)
         self.observation_spec = observation
@@ -86,62 +91,63 @@ class TrackEnv(EnvBase):
         self.done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=(b,))
 
     def _set_seed(self, seed: int | None) -> None:
-        self._generators = {
-            name: generator(seed or 0, self._stream, name, device=self.device) for name in ("motion", "start")
-        }
+        self._targets.seed(seed or 0, self._stream)
 
     def generator_state(self) -> dict[str, Tensor]:
         """State of the environment's generators, for a checkpoint."""
-        return {name: rng.get_state() for name, rng in self._generators.items()}
+        return self._targets.state()
 
     def set_generator_state(self, state: dict[str, Tensor]) -> None:
         """Continue the generators where `generator_state` left them."""
-        for name, rng in self._generators.items():
-            rng.set_state(state[name])
+        self._targets.load_state(state)
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDictBase:  # noqa: ARG002
+    def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDictBase:
         """Fresh rows for the whole batch; TorchRL merges in those that its mask asks for."""
-        return TensorDict(self._fresh(), self.batch_size, device=self.device)
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        rows = None if mask is None else mask.view(-1).nonzero().squeeze(-1)
+        return TensorDict(self._fresh(rows), self.batch_size, device=self.device)
 
-    def _fresh(self) -> dict[str, Tensor]:
-        """Located in a uniformly drawn cell: s_0 = (x_0, 0, ∅)."""
-        b = self.num_envs
-        start = torch.randint(self.num_cells, (b,), generator=self._generators["start"], device=self.device)
-        state = {
-            "target": start,
+    def _fresh(self, rows: Tensor | None = None) -> dict[str, Tensor]:
+        """Located where the target starts: s_0 = (x_0, 0, ∅); of the rows only `rows` are used, None for all."""
+        state = self._targets.start(self.num_envs, rows)
+        start = state["target"]
+        state |= {
             "last_cell": start.clone(),
             "steps_since_detection": torch.zeros_like(start),
-            "action_history": torch.zeros(b, self.t_max + 1, self.num_cells, dtype=torch.bool, device=self.device),
+            "action_history": torch.zeros(
+                *start.shape, self.t_max + 1, self.num_cells, dtype=torch.bool, device=self.device
+            ),
         }
         if self.max_steps:
             state["step_count"] = torch.zeros_like(start)
         return state
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        draws = self._motion.draw(self.num_envs, self._generators["motion"])
+        draws = self._targets.draw(self.num_envs)
         return TensorDict(self.advance(tensordict, draws), self.batch_size, device=self.device)
 
     def advance(self, state: TensorDictBase, draws: Tensor) -> dict[str, Tensor]:
-        """The step as a function of state, `action` and the motion's uniform `draws` `[B]`."""
+        """The step as a function of state, `action` and the uniform `draws` `[B]` of the motion (tracks need none)."""
         action, n = state["action"], state["steps_since_detection"]
-        target = self._motion.move(state["target"], draws)
+        moved = self._targets.move(state, draws)
+        target = moved["target"]
         in_grid = target < self.num_cells
         sensed = action[self._rows, target.clamp_max(self.num_cells - 1)] & in_grid
         forced = n > self.t_max
         located = (sensed | forced) & in_grid
         missed = in_grid & ~located
-        following = {
-            "target": target,
+        following = moved | {
             "last_cell": torch.where(located, target, state["last_cell"]),
             "steps_since_detection": (n + 1) * missed,
             "action_history": self._remember(state["action_history"], action, n, missed),
             "reward": self._costs.pseudo_reward(action, sensed, forced, in_grid).unsqueeze(-1),
         }
         terminated = ~in_grid.unsqueeze(-1)
-        truncated = self._no
+        cut = self._targets.cut(moved)
+        truncated = self._no if cut is None else cut.unsqueeze(-1)
         if self.max_steps:
             following["step_count"] = state["step_count"] + 1
-            truncated = (following["step_count"] >= self.max_steps).unsqueeze(-1) & ~terminated
+            truncated = (following["step_count"] >= self.max_steps).unsqueeze(-1) & ~terminated | truncated
         following |= {"terminated": terminated, "truncated": truncated.clone(), "done": terminated | truncated}
         return following
 
@@ -161,7 +167,7 @@ class TrackEnv(EnvBase):
         carry = {key: following[key] for key in self.state_keys_of_step}
         ended = done.squeeze(-1).nonzero().squeeze(-1)
         if len(ended):
-            fresh = self._fresh()
+            fresh = self._fresh(ended)
             carry = {key: value.index_copy(0, ended, fresh[key][ended]) for key, value in carry.items()}
         flags = {key: torch.zeros_like(done) for key in ("done", "terminated", "truncated")}
         return tensordict, TensorDict(carry | flags, self.batch_size, device=self.device)

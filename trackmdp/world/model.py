@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TypeAlias
 
@@ -30,6 +30,8 @@ class Task:
         cost: `[M]`, c per cell: the price of one sensor switched on for one step; M = N².
         safe_cost: D, the price of the safe action, forced after t_max + 1 misses in a row.
         t_max: T_max; the controller chooses freely at n = 0 ... t_max.
+        markov: whether the next move depends on the target's cell alone, so that a learner may put paths together from
+            moves seen on different ones.
     """
 
     size: int
@@ -37,6 +39,7 @@ class Task:
     cost: Array
     safe_cost: float
     t_max: int
+    markov: bool = field(default=True, kw_only=True)
 
     def __post_init__(self) -> None:
         if self.cost.shape != (self.num_cells,):
@@ -53,6 +56,11 @@ class Task:
     def num_choices(self) -> int:
         """T_max + 1, the free choices between two forced ones."""
         return self.t_max + 1
+
+    @property
+    def task(self) -> Task:
+        """The same task without the motion."""
+        return Task(self.size, self.reward, self.cost, self.safe_cost, self.t_max, markov=self.markov)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,11 +80,6 @@ class World(Task):
             raise UserError(
                 f"kernel: expected a {m}x{m} table for a {self.size}x{self.size} grid, got {self.kernel.shape}"
             )
-
-    @property
-    def task(self) -> Task:
-        """The same task without the motion."""
-        return Task(self.size, self.reward, self.cost, self.safe_cost, self.t_max)
 
     @cached_property
     def transition(self) -> sparse.csr_array:

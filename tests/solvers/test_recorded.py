@@ -1,0 +1,134 @@
+"""Replaying a policy on recorded tracks: by hand, against the environment, against the exact values."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.helpers import small_world
+from tests.tracks import by_hand, drawn, recorded
+from trackmdp.policies.fixed import ChainPolicy
+from trackmdp.solvers.chains import evaluate
+from trackmdp.solvers.recorded import replay
+from trackmdp.world.env import TrackEnv
+from trackmdp.world.model import BoolArray
+from trackmdp.world.tracks import Recorded
+
+FIGURES = ("aihtr", "accuracy", "sensors_per_step", "safe_per_episode", "expected_length")
+
+
+def sensing(*sets: tuple[int, int, list[int]], t_max: int = 1) -> BoolArray:
+    """Chains on 3x3 that sense `cells` n misses after locating the target in x, for each (x, n, cells)."""
+    chains = np.zeros((9, t_max + 1, 9), dtype=bool)
+    for cell, n, cells in sets:
+        chains[cell, n, cells] = True
+    return chains
+
+
+CHAINS = sensing((0, 0, [1]), (1, 0, [2, 3]), (1, 1, [5]))
+
+
+@pytest.mark.parametrize(
+    ("track", "reward", "steps", "detections", "sensors", "safe", "length"),
+    [
+        ([0, 1], 1 - 0.2, 1, 1, 1, 0, 2),  # found at once; the exit step costs nothing
+        ([0, 1, 3], 0.8 + (1 - 0.4), 2, 2, 3, 0, 3),
+        ([0, 1, 4, 5], 0.8 - 0.4 + (1 - 0.2), 3, 2, 1 + 2 + 1, 0, 4),
+        ([0, 1, 4, 4, 4], 0.8 - 0.4 - 0.2 + (1 - 1.8), 4, 2, 4, 1, 5),  # missed twice, then forced
+        ([0, 1, 4, 4, 4, 5], 0.8 - 0.4 - 0.2 - 0.8, 5, 2, 4, 1, 6),  # located in 4, where nothing is sensed
+        ([0], 0.0, 0, 0, 0, 0, 1),
+    ],
+)
+def test_figures_by_hand(
+    track: list[int], reward: float, steps: int, detections: int, sensors: int, safe: int, length: int
+) -> None:
+    other = [1, 3]  # a track beside it, which must not count
+    both = replay(recorded(by_hand(track)), by_hand(track, other), CHAINS)
+    assert both.totals[0] == pytest.approx([reward, steps, detections, sensors, safe])
+    assert both.length.tolist() == [length, 2]
+    assert both.totals[1] == pytest.approx([0.6, 1, 1, 2, 0])
+
+
+def test_a_recording_that_stops_has_no_exit_step() -> None:
+    stops = replay(recorded(by_hand([0, 1])), by_hand([0, 1], [0, 1, 4], exits=[False, False]), CHAINS)
+    assert stops.length.tolist() == [1, 2]
+    assert stops.totals[:, 0] == pytest.approx([0.8, 0.4])
+
+
+def in_the_environment(setting: Recorded, chains: BoolArray, max_steps: int | None) -> np.ndarray:
+    """`[K, 6]` reward, steps in the grid, detections, sensors, safe actions, length, stepping `TrackEnv`."""
+    count = len(setting.tracks)
+    env, policy = TrackEnv(setting, count, max_steps=max_steps), ChainPolicy(chains)
+    state = env.reset()
+    totals, running = torch.zeros(6, count), torch.ones(count, dtype=torch.bool)
+    begun = state["point"]
+    while running.any():
+        state = policy(state)
+        following = env.step(state)["next"]
+        inside = ~following["terminated"].squeeze(-1)
+        forced = (state["steps_since_detection"] > setting.t_max) & inside
+        found = (following["steps_since_detection"] == 0) & inside
+        sensors = state["action"].sum(-1) * (inside & ~forced)
+        figures = [following["reward"].squeeze(-1), inside, found, sensors, forced, torch.ones(count)]
+        totals += torch.stack(figures) * running
+        running &= ~following["done"].squeeze(-1)
+        state = following.select(*env.state_keys_of_step)
+    return totals[:, begun.argsort()].T.numpy()  # in the order of the tracks
+
+
+@given(st.integers(0, 2**31), st.integers(0, 3), st.sampled_from([None, 1, 4]), st.floats(0, 1))
+@settings(max_examples=50)
+def test_figures_are_those_of_the_environment(seed: int, t_max: int, max_steps: int | None, density: float) -> None:
+    rng = np.random.default_rng(seed)
+    tracks = drawn(small_world(seed=seed).kernel, 30, seed)
+    tracks = replace(tracks, exits=rng.random(30) < 0.7).select(tracks.lengths > 1)
+    setting = replace(recorded(tracks, t_max=t_max), cost=rng.random(9), safe_cost=0.7)
+    chains = rng.random((9, t_max + 1, 9)) < density
+    ours = replay(setting, tracks.limited(max_steps), chains)
+    stepped = in_the_environment(setting, chains, max_steps)
+    np.testing.assert_allclose(np.column_stack([ours.totals, ours.length]), stepped, rtol=1e-5, atol=1e-5)
+
+
+def test_the_mean_over_many_tracks_is_the_exact_value() -> None:
+    world = small_world(t_max=2)
+    rng = np.random.default_rng(0)
+    chains = rng.random((9, 3, 9)) < 0.3
+    tracks = drawn(world.kernel, 20_000)
+    exact = evaluate(world, chains)
+    many = replay(world, tracks, chains)
+    ours = many.evaluation(tracks.cells[tracks.first[:-1]], 9)
+    for name in FIGURES:
+        assert getattr(ours, name) == pytest.approx(getattr(exact, name), rel=0.02)
+    np.testing.assert_allclose(ours.value, exact.value, atol=0.2)
+
+
+def test_intervals_cover_the_exact_value_19_times_of_20() -> None:
+    world = small_world(t_max=1)
+    chains = np.random.default_rng(1).random((9, 2, 9)) < 0.3
+    exact, trials = evaluate(world, chains), 400
+    covered = dict.fromkeys(FIGURES, 0)
+    tracks = drawn(world.kernel, 60 * trials)
+    for trial in range(trials):
+        mine = np.arange(len(tracks)) // 60 == trial
+        for name, interval in replay(world, tracks.select(mine), chains).intervals().items():
+            covered[name] += interval.low <= getattr(exact, name) <= interval.high
+    assert all(0.90 * trials < count < 0.985 * trials for count in covered.values()), covered
+
+
+def test_a_single_track_has_no_interval() -> None:
+    alone = replay(recorded(by_hand([0, 1])), by_hand([0, 1]), CHAINS).intervals()
+    assert alone["aihtr"].mean == pytest.approx(0.8)
+    assert np.isnan([alone["aihtr"].low, alone["aihtr"].high]).all()
+
+
+def test_probabilities_give_the_mean_over_draws() -> None:
+    """Half of the time the sensor on 1 is on and finds the target; else it is missed twice and then forced."""
+    chains = sensing((0, 0, [1])) * 0.5
+    only = replay(recorded(by_hand([0])), by_hand([0, 1, 1, 1]), chains)
+    assert only.totals[0] == pytest.approx([0.5 - 0.5 * 0.2 + 0.5 * (1 - 1.8), 3, 0.5 + 0.5, 0.5, 0.5])
+    assert only.length[0] == 4

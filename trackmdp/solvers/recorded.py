@@ -1,0 +1,141 @@
+"""Valuing a policy on recorded tracks: it is replayed on every one of them, since sensing does not move the target."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse, stats
+from scipy.sparse.linalg import spsolve_triangular
+
+from trackmdp.solvers.chains import Evaluation, pool
+from trackmdp.solvers.renewal import IndexArray
+from trackmdp.world.model import Array, Task
+from trackmdp.world.tracks import Tracks
+
+__all__ = ["Interval", "Replay", "replay"]
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A mean over tracks, or a ratio of such means, and its 95 % confidence interval (nan for a single track)."""
+
+    mean: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Replay:
+    """What a policy earned and did on K tracks, each from its first cell to its end.
+
+    Attributes:
+        totals: `[K, 5]` reward, steps in the grid, detections, sensors on by choice, safe actions; expected ones where
+            the policy draws.
+        length: `[K]` steps, the exit step included.
+    """
+
+    totals: Array
+    length: Array
+
+    def evaluation(self, starts: IndexArray, num_cells: int) -> Evaluation:
+        """The figures of all tracks together, and by start cell, nan where no track starts; `starts` is `[K]`."""
+        together = pool(self.totals, self.length)
+        count = np.bincount(starts, minlength=num_cells)
+        with np.errstate(invalid="ignore"):
+            by_cell = [np.bincount(starts, weights, num_cells) / count for weights in self.totals.T]
+        value, steps, detections, sensors, safe = by_cell
+        return Evaluation(
+            aihtr=together.aihtr,
+            value=value,
+            accuracy=together.accuracy,
+            sensors_per_step=together.sensors_per_step,
+            safe_per_episode=together.safe_per_episode,
+            expected_length=together.expected_length,
+            steps=steps,
+            detections=detections,
+            sensors=sensors,
+            safe_actions=safe,
+        )
+
+    def intervals(self) -> dict[str, Interval]:
+        """Figure -> its mean and interval, the tracks taken as independent."""
+        reward, steps, detections, sensors, safe = self.totals.T
+        one = np.ones_like(steps)
+        return {
+            "aihtr": _interval(reward, one),
+            "accuracy": _interval(detections, steps),
+            "sensors_per_step": _interval(sensors, steps),
+            "safe_per_episode": _interval(safe, one),
+            "expected_length": _interval(self.length, one),
+        }
+
+
+def replay(task: Task, tracks: Tracks, chains: npt.NDArray[np.generic]) -> Replay:
+    """Follow `chains` `[M, t_max+1, M]` (bool or probabilities) along every track, from its first cell.
+
+    Every point of the recording is taken as one where the target may be located; what follows up to the next detection
+    is known from the recording, so that one triangular system tells which points are reached.
+    """
+    m = task.num_cells
+    line = tracks.closed(m)
+    points = len(line.cells)
+    track = np.repeat(np.arange(len(line)), np.diff(line.first))
+    last = line.first[1:][track] - 1
+    figures, hits = _renewals(task, line.cells, last, chains)
+    reached = np.zeros(points)
+    reached[line.first[:-1]] = 1.0
+    start, end, weight = hits
+    onward = sparse.csr_array((weight, (end, start)), shape=(points, points))
+    reached = spsolve_triangular(sparse.eye_array(points, format="csr") - onward, reached, unit_diagonal=True)
+    sums = np.stack([np.bincount(track, reached * figure, len(line)) for figure in figures], axis=1)
+    return Replay(sums[:, :5].astype(np.float64), sums[:, 5].astype(np.float64))
+
+
+def _renewals(
+    task: Task, cells: IndexArray, last: IndexArray, chains: npt.NDArray[np.generic]
+) -> tuple[list[Array], tuple[IndexArray, IndexArray, Array]]:
+    """From every point, located there, to the next detection or the end of the track.
+
+    Returns:
+        Six `[P]`, the columns of `Replay.totals` and the steps; and the detections as a sparse matrix: from which
+        point, at which one, with what probability.
+    """
+    m, points = task.num_cells, np.arange(len(cells))
+    figures, hits = np.zeros((6, len(cells))), []
+    at, undetected = points[cells < m], np.ones(int((cells < m).sum()))
+    for n in range(task.num_choices + 1):
+        going = (at + n + 1 <= last[at]) & (undetected > 0)
+        at, undetected = at[going], undetected[going]
+        cell = cells[at + n + 1]
+        inside = cell < m
+        figures[5, at] += undetected
+        at, undetected, cell = at[inside], undetected[inside], cell[inside]
+        if n < task.num_choices:
+            on = chains[:, n].astype(np.float64)
+            sensed = on[cells[at], cell]
+            sensors, price, safe = on.sum(axis=1)[cells[at]], (on @ task.cost)[cells[at]], 0.0
+        else:
+            sensed, sensors, safe = np.ones(len(at)), np.zeros(len(at)), 1.0
+            price = np.full(len(at), task.safe_cost)
+        for row, amount in enumerate((task.reward * sensed - price, 1.0, sensed, sensors, safe)):
+            figures[row, at] += undetected * amount
+        found = sensed > 0
+        hits.append((at[found], (at + n + 1)[found], (undetected * sensed)[found]))
+        undetected = undetected * (1.0 - sensed)
+    start, end, weight = (np.concatenate(part) for part in zip(*hits, strict=True))
+    return list(figures), (start, end, weight)
+
+
+def _interval(part: Array, whole: Array) -> Interval:
+    """Σ part / Σ whole over the tracks; its spread by the delta method, with Student's t."""
+    count, total = len(part), whole.sum()
+    if not total:
+        return Interval(np.nan, np.nan, np.nan)
+    ratio = float(part.sum() / total)
+    if count < 2:
+        return Interval(ratio, np.nan, np.nan)
+    error = (part - ratio * whole).std(ddof=1) / (total / count * np.sqrt(count))
+    margin = float(stats.t.ppf(0.975, count - 1) * error)
+    return Interval(ratio, ratio - margin, ratio + margin)

@@ -1,0 +1,87 @@
+"""Where a policy stands without a motion model: how it does on recorded tracks that no learner has seen."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from trackmdp.solvers import qmdp
+from trackmdp.solvers.chains import Evaluation
+from trackmdp.solvers.kernel_estimate import KernelEstimate
+from trackmdp.solvers.recorded import Interval, replay
+from trackmdp.training.judge import Verdict
+from trackmdp.world.model import BoolArray, World
+from trackmdp.world.tracks import Recorded, Tracks
+
+__all__ = ["ESTIMATED", "HeldOutJudge", "estimated_kernel"]
+
+ESTIMATED = "Q_MDP of the estimated kernel"
+"""Q_MDP for the motion as the tracks to learn from show it."""
+
+
+class HeldOutJudge:
+    """Scores policies by their chains, on every held-out track from its first cell to its end.
+
+    Without a motion model there are no bounds, no Q_MDP and no regret: `upper` and the verdicts' regrets are nan.
+
+    Args:
+        world: the task and its recorded tracks.
+        max_steps: tracks are cut after this many steps; None for never.
+    """
+
+    def __init__(self, world: Recorded, max_steps: int | None = None) -> None:
+        self.world, self.max_steps = world, max_steps
+        self.tracks = world.held_out.limited(max_steps)
+        self.bounds: dict[str, float | None] = {"paper": None, "valid": None, "clocked": None}
+        self.upper, self.qmdp = math.nan, None
+        self._starts = self.tracks.cells[self.tracks.first[:-1]]
+
+    def evaluate(self, chains: npt.NDArray[np.generic]) -> Evaluation:
+        """Figures on the held-out tracks of the policy with these `chains` `[M, t_max+1, M]`."""
+        return replay(self.world, self.tracks, chains).evaluation(self._starts, self.world.num_cells)
+
+    def score(self, chains: npt.NDArray[np.generic]) -> Verdict:
+        """Figures on the held-out tracks."""
+        return Verdict(self.evaluate(chains), math.nan)
+
+    def intervals(self, chains: npt.NDArray[np.generic]) -> dict[str, Interval]:
+        """Figure -> its mean over the held-out tracks with a 95 % confidence interval."""
+        return replay(self.world, self.tracks, chains).intervals()
+
+    def references(self) -> dict[str, BoolArray]:
+        """Chains of the policies to hold a learned one against, by their names in tables."""
+        task = self.world
+        shape = (task.num_cells, task.num_choices, task.num_cells)
+        kernel = estimated_kernel(task.tracks, task.size)
+        world = World(task.size, task.reward, task.cost, task.safe_cost, task.t_max, kernel)
+        return {
+            "all on": np.ones(shape, dtype=bool),
+            "no sensors": np.zeros(shape, dtype=bool),
+            ESTIMATED: qmdp.solve(world),
+        }
+
+    def report(self, chains: npt.NDArray[np.generic]) -> dict[str, Any]:
+        """What is written of a policy: its figures on the held-out tracks beside those of the references."""
+        policies = {"policy": chains, **self.references()}
+        figures = {
+            name: {figure: asdict(interval) for figure, interval in self.intervals(each).items()}
+            for name, each in policies.items()
+        }
+        return {"tracks": len(self.tracks), "of": len(self.tracks) + len(self.world.tracks), "figures": figures}
+
+
+def estimated_kernel(tracks: Tracks, size: int) -> npt.NDArray[np.float64]:
+    """`[M, M]` the motion as `tracks` show it: posterior mean, the prior of a row counting as one move."""
+    m = size**2
+    estimate = KernelEstimate(size, weight=1.0, exit_weight=1.0)
+    line = tracks.closed(m)
+    moves = np.ones(len(line.cells), dtype=bool)
+    moves[line.first[1:] - 1] = False
+    at = np.flatnonzero(moves)
+    np.add.at(estimate.direct, (line.cells[at], line.cells[at + 1]), 1.0)
+    estimate.counts = estimate.direct
+    return estimate.mean()[:, :-1]

@@ -1,0 +1,179 @@
+"""Where the targets of an environment come from: sampled from a kernel, or replayed from recorded tracks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from trackmdp.seeding import generator
+from trackmdp.world.model import World
+from trackmdp.world.motion import Motion
+from trackmdp.world.tracks import Recorded, Setting, Tracks
+
+__all__ = ["RecordedTargets", "SampledTargets", "Targets", "make_targets"]
+
+
+class Targets(Protocol):
+    """A batch of targets; where they are lies in the environment's state, here are only the generators."""
+
+    hidden: Mapping[str, int]
+    """Keys of the state beside `target`, and how many values each may have."""
+
+    def seed(self, seed: int, stream: str) -> None:
+        """Begin the draws of a seed and a stream."""
+        ...
+
+    def state(self) -> dict[str, Tensor]:
+        """How far the draws are, for a checkpoint."""
+        ...
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Go on where `state` was taken."""
+        ...
+
+    def start(self, count: int, rows: Tensor | None) -> dict[str, Tensor]:
+        """`target` and the hidden keys `[count]` of fresh targets; only `rows` of them are used, None for all."""
+        ...
+
+    def draw(self, count: int) -> Tensor:
+        """What chance has a part in the next move of each."""
+        ...
+
+    def move(self, state: Mapping[str, Tensor], draws: Tensor) -> dict[str, Tensor]:
+        """`target` and the hidden keys after one move; a target of M has exited."""
+        ...
+
+    def cut(self, moved: Mapping[str, Tensor]) -> Tensor | None:
+        """`[B]` whether no more is known of the target after this move; None if that never is so."""
+        ...
+
+
+def make_targets(setting: Setting, device: torch.device) -> Targets:
+    """The targets of a world or of recorded tracks."""
+    if isinstance(setting, World):
+        return SampledTargets(setting, device)
+    return RecordedTargets(setting, device)
+
+
+class SampledTargets:
+    """Targets that move as the kernel says; they start uniformly over the cells."""
+
+    def __init__(self, world: World, device: torch.device) -> None:
+        self.hidden: Mapping[str, int] = {}
+        self._cells, self._device = world.num_cells, device
+        self._motion = Motion(world.kernel, device)
+
+    def seed(self, seed: int, stream: str) -> None:
+        """The generators are those called (`stream`, "motion") and (`stream`, "start")."""
+        self._generators = {name: generator(seed, stream, name, device=self._device) for name in ("motion", "start")}
+
+    def state(self) -> dict[str, Tensor]:
+        """See `Targets`."""
+        return {name: rng.get_state() for name, rng in self._generators.items()}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """See `Targets`."""
+        for name, rng in self._generators.items():
+            rng.set_state(state[name])
+
+    def start(self, count: int, rows: Tensor | None) -> dict[str, Tensor]:  # noqa: ARG002
+        """See `Targets`; draws for all rows, so that what a row gets does not depend on the others."""
+        start = torch.randint(self._cells, (count,), generator=self._generators["start"], device=self._device)
+        return {"target": start}
+
+    def draw(self, count: int) -> Tensor:
+        """`[count]` uniform draws."""
+        return self._motion.draw(count, self._generators["motion"])
+
+    def move(self, state: Mapping[str, Tensor], draws: Tensor) -> dict[str, Tensor]:
+        """See `Targets`."""
+        return {"target": self._motion.move(state["target"], draws)}
+
+    def cut(self, moved: Mapping[str, Tensor]) -> None:
+        """See `Targets`."""
+
+
+class RecordedTargets:
+    """Targets that go along recorded tracks.
+
+    Episodes begin at the starts in shuffled order, each once before any comes again: the first cells of the tracks, or
+    all recorded points. `point` is the place on the line that all tracks, each closed by the exit, form end to end.
+    """
+
+    def __init__(self, setting: Recorded, device: torch.device) -> None:
+        cells, following, starts, cut = _line(setting.tracks, setting.num_cells, anywhere=setting.anywhere)
+        self.hidden: Mapping[str, int] = {"point": len(cells)}
+        self._cells, self._following, self._starts, self._cut = (
+            torch.as_tensor(part, device=device) for part in (cells, following, starts, cut)
+        )
+        self._device, self._drawn = device, 0
+
+    def seed(self, seed: int, stream: str) -> None:
+        """The e-th order of the starts comes from the generator called (`stream`, "tracks", e)."""
+        self._names = (seed, stream)
+        self._drawn, self._orders = 0, dict[int, Tensor]()
+
+    def state(self) -> dict[str, Tensor]:
+        """How many episodes have begun."""
+        return {"drawn": torch.tensor(self._drawn)}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """See `Targets`."""
+        self._drawn = int(state["drawn"])
+
+    def start(self, count: int, rows: Tensor | None) -> dict[str, Tensor]:
+        """See `Targets`."""
+        wanted = torch.arange(count, device=self._device) if rows is None else rows
+        point = self._starts.new_zeros(count)
+        point[wanted] = self._next(len(wanted))
+        return {"target": self._cells[point], "point": point}
+
+    def _next(self, count: int) -> Tensor:
+        """`[count]` starts, the next ones in order."""
+        if count == 0:
+            return self._starts[:0]
+        length = len(self._starts)
+        begin, end = self._drawn, self._drawn + count
+        rounds = range(begin // length, (end - 1) // length + 1)
+        self._orders = {
+            number: self._orders[number] if number in self._orders else self._order(number) for number in rounds
+        }
+        self._drawn = end
+        offset = rounds[0] * length
+        return torch.cat(list(self._orders.values()))[begin - offset : end - offset]
+
+    def _order(self, number: int) -> Tensor:
+        seed, stream = self._names
+        order = torch.randperm(len(self._starts), generator=generator(seed, stream, "tracks", number))
+        return self._starts[order.to(self._device)]
+
+    def draw(self, count: int) -> Tensor:  # noqa: ARG002
+        """Nothing is left to chance."""
+        return torch.empty(0, device=self._device)
+
+    def move(self, state: Mapping[str, Tensor], draws: Tensor) -> dict[str, Tensor]:  # noqa: ARG002
+        """See `Targets`."""
+        point = self._following[state["point"]]
+        return {"target": self._cells[point], "point": point}
+
+    def cut(self, moved: Mapping[str, Tensor]) -> Tensor:
+        """Where the recording stops."""
+        return self._cut[moved["point"]]
+
+
+def _line(tracks: Tracks, num_cells: int, *, anywhere: bool) -> tuple[np.ndarray, ...]:
+    """The line of all points: its cells (M for an exit), what follows each point, the starts, and where it is cut."""
+    closed = tracks.closed(num_cells)
+    last = closed.first[1:] - 1
+    following = np.arange(len(closed.cells)) + 1
+    following[last] = last
+    cut = np.zeros(len(closed.cells), dtype=bool)
+    cut[last] = ~tracks.exits
+    starts = closed.first[:-1]
+    if anywhere:
+        starts = np.flatnonzero((closed.cells < num_cells) & ~cut)
+    return closed.cells, following, starts, cut

@@ -1,0 +1,201 @@
+"""Recorded tracks: the cells a target was in, step by step, from which a policy is learned without a motion model."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from trackmdp.errors import UserError
+from trackmdp.seeding import derive
+from trackmdp.world.files import read_columns
+from trackmdp.world.model import Array, BoolArray, Task, World
+
+__all__ = ["Indices", "Recorded", "Setting", "Tracks", "check_tracks", "load_tracks", "split"]
+
+Indices: TypeAlias = npt.NDArray[np.int64]
+
+_COLUMNS = (
+    {"track", "cell"},
+    {"track", "step", "cell"},
+    {"track", "row", "column"},
+    {"track", "step", "row", "column"},
+)
+_FORMAT = "track, cell (or row, column) and, if wanted, step"
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """K recorded tracks, end to end.
+
+    Attributes:
+        cells: `[P]`, the cells of all tracks, one track after the other.
+        first: `[K + 1]`, where each track begins in `cells`, and P.
+        exits: `[K]`, whether the target left the grid after the last cell; if not, the recording stopped there.
+        names: `[K]`, the id of each track.
+    """
+
+    cells: Indices
+    first: Indices
+    exits: BoolArray
+    names: Indices
+
+    def __len__(self) -> int:
+        return len(self.exits)
+
+    @property
+    def lengths(self) -> Indices:
+        """`[K]` cells of each track."""
+        return np.diff(self.first)
+
+    def select(self, chosen: BoolArray) -> Tracks:
+        """The tracks for which `chosen` `[K]` holds."""
+        lengths = self.lengths
+        cells = self.cells[np.repeat(chosen, lengths)]
+        return Tracks(cells, _ends(lengths[chosen]), self.exits[chosen], self.names[chosen])
+
+    def limited(self, max_steps: int | None) -> Tracks:
+        """The tracks, cut off after `max_steps` steps; None for never."""
+        if max_steps is None:
+            return self
+        lengths = self.lengths
+        step = np.arange(len(self.cells)) - np.repeat(self.first[:-1], lengths)
+        kept = np.minimum(lengths, max_steps + 1)
+        return Tracks(self.cells[step <= max_steps], _ends(kept), self.exits & (lengths <= max_steps), self.names)
+
+    def closed(self, num_cells: int) -> Tracks:
+        """The tracks with the exit, a cell called M, as the last one where the target left."""
+        cells = np.insert(self.cells, self.first[1:][self.exits], num_cells)
+        return Tracks(cells, _ends(self.lengths + self.exits), self.exits, self.names)
+
+    def digest(self) -> str:
+        """SHA-256 of all that was recorded."""
+        digest = hashlib.sha256()
+        for part in (self.cells, self.first, self.exits, self.names):
+            digest.update(np.ascontiguousarray(part).tobytes())
+        return digest.hexdigest()
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded(Task):
+    """A task whose target is known from recorded tracks alone.
+
+    Attributes:
+        tracks: those to learn from.
+        held_out: those to judge on; no learner sees them.
+        anywhere: episodes begin at any recorded point, not only with a track.
+    """
+
+    tracks: Tracks
+    held_out: Tracks
+    anywhere: bool = field(default=False, kw_only=True)
+
+    @property
+    def judged(self) -> Recorded:
+        """The same task on the held-out tracks, each from its first cell."""
+        return replace(self, tracks=self.held_out, anywhere=False)
+
+
+Setting: TypeAlias = World | Recorded
+"""What learning and judging take place in: a world with its motion model, or recorded tracks."""
+
+
+def load_tracks(path: str | Path, size: int, *, exits: bool) -> Tracks:
+    """Read tracks from a .csv file with a header line, or from arrays of the same names in an .npz file.
+
+    The columns are `track` (an integer, the same for all steps of a track), `cell` (or `row` and `column`), and if
+    wanted `step`. Without `step` a track's cells are in the order of the file.
+
+    Args:
+        path: the file.
+        size: N.
+        exits: whether the target left the grid at the end of each track.
+
+    Raises:
+        UserError: the file is not of that form, a cell lies outside the grid, or a step is missing or there twice.
+    """
+    source, columns = f"kernel.path={path}", read_columns("kernel.path", path)
+    if set(columns) not in _COLUMNS:
+        raise UserError(f"{source}: columns {', '.join(columns)}, expected {_FORMAT}")
+    if not len(columns["track"]):
+        raise UserError(f"{source}: no tracks, expected at least two")
+    numbers = {name: _integers(source, name, column) for name, column in columns.items()}
+    track, cell = numbers["track"], _cells(source, numbers, size)
+    order = np.lexsort((numbers.get("step", np.zeros_like(track)), track))
+    track, cell = track[order], cell[order]
+    if "step" in numbers:
+        _check_steps(source, track, numbers["step"][order])
+    names, lengths = np.unique(track, return_counts=True)
+    return Tracks(cell, _ends(lengths), np.full(len(names), exits), names)
+
+
+def check_tracks(tracks: Tracks, shortest: int, source: str) -> Tracks:
+    """Return `tracks` if each has at least `shortest` cells.
+
+    Raises:
+        UserError: one has fewer.
+    """
+    short = tracks.lengths < shortest
+    if short.any():
+        first = int(np.flatnonzero(short)[0])
+        others = f" ({short.sum()} of {len(tracks)} are too short)" if short.sum() > 1 else ""
+        raise UserError(
+            f"{source}: track {tracks.names[first]} has {tracks.lengths[first]} cells, expected at least "
+            f"{shortest}{others}"
+        )
+    return tracks
+
+
+def split(tracks: Tracks, share: float, seed: int) -> tuple[Tracks, Tracks]:
+    """Whole tracks to learn from, and about `share` of them, drawn at random, held out.
+
+    Raises:
+        UserError: one of the two parts is empty.
+    """
+    count = round(share * len(tracks))
+    if not 0 < count < len(tracks):
+        left = "none to judge on" if count == 0 else "none to learn from"
+        raise UserError(f"kernel.held_out={share}: leaves, of {len(tracks)} tracks, {left}; expected both")
+    held_out = np.zeros(len(tracks), dtype=bool)
+    held_out[np.random.default_rng(derive(seed, "held_out")).permutation(len(tracks))[:count]] = True
+    return tracks.select(~held_out), tracks.select(held_out)
+
+
+def _ends(lengths: Indices) -> Indices:
+    return np.concatenate([[0], np.cumsum(lengths)])
+
+
+def _integers(source: str, name: str, column: Array) -> Indices:
+    bad = ~(np.abs(column) < 2**53) | (column != np.floor(column))
+    if bad.any():
+        entry = int(np.flatnonzero(bad)[0])
+        raise UserError(f"{source}: {name} of entry {entry + 1} is {column[entry]}, expected an integer")
+    return column.astype(np.int64)
+
+
+def _cells(source: str, numbers: dict[str, Indices], size: int) -> Indices:
+    limits = {"cell": size**2} if "cell" in numbers else {"row": size, "column": size}
+    for name, limit in limits.items():
+        outside = (numbers[name] < 0) | (numbers[name] >= limit)
+        if outside.any():
+            entry = int(np.flatnonzero(outside)[0])
+            raise UserError(
+                f"{source}: {name} of entry {entry + 1} is {numbers[name][entry]}, expected 0 to {limit - 1} on a "
+                f"grid of grid.size={size}"
+            )
+    return numbers["cell"] if "cell" in numbers else numbers["row"] * size + numbers["column"]
+
+
+def _check_steps(source: str, track: Indices, step: Indices) -> None:
+    jump = np.diff(step)
+    bad = (np.diff(track) == 0) & (jump != 1)
+    if not bad.any():
+        return
+    at = int(np.flatnonzero(bad)[0])
+    if jump[at] == 0:
+        raise UserError(f"{source}: track {track[at]} has step {step[at]} twice")
+    raise UserError(f"{source}: track {track[at]} has a gap: step {step[at + 1]} follows step {step[at]}")
