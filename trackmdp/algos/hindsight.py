@@ -19,6 +19,7 @@ from torch import Tensor
 from trackmdp.algos.common import Averages, set_learning_rate
 from trackmdp.algos.hindsight_loss import HindsightLoss
 from trackmdp.algos.moves import MoveBuffer
+from trackmdp.algos.segments import SegmentBuffer
 from trackmdp.config.learning import Hindsight as HindsightConfig
 from trackmdp.errors import UserError
 from trackmdp.policies.fixed import AllOn, ChainPolicy
@@ -48,7 +49,7 @@ class Hindsight:
         self._collecting, self._iteration, self._update = iterations, 0, 0
         self.iterations = iterations + -(-self.updates // cfg.updates_per_iteration)
         self._generator = generator(seed, "hindsight", device=device)
-        self._buffer = MoveBuffer(task.num_cells, cfg.buffer_size, self._generator)
+        self._buffer = _buffer(task, cfg.buffer_size, self._generator)
         self._learner: _Learner | None = None
         self.policy = AllOn(task.num_cells)
         shape = (task.num_cells, task.num_choices, task.num_cells)
@@ -111,6 +112,13 @@ class Hindsight:
         size, (start, end) = self.task.size, self._buffer.moves()
         moved = torch.maximum((start // size - end // size).abs(), (start % size - end % size).abs())
         return int(moved.masked_fill_(end == self.task.num_cells, 0).max())
+
+
+def _buffer(task: Task, capacity: int, rng: torch.Generator) -> MoveBuffer | SegmentBuffer:
+    """Paths put together from moves where the next one depends on the cell alone, else only those that were sensed."""
+    if task.markov:
+        return MoveBuffer(task.num_cells, capacity, rng)
+    return SegmentBuffer(task.num_cells, task.t_max + 2, capacity, rng)
 
 
 class _Learner:

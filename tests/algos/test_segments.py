@@ -1,0 +1,136 @@
+"""Path segments: whole, as sensed, whatever the batches they came in."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.helpers import collect, small_world
+from tests.tracks import by_hand, drawn, recorded
+from trackmdp.algos.segments import SegmentBuffer
+from trackmdp.policies.fixed import AllOn
+
+M = 9
+SETTING = recorded(drawn(small_world(exit_probability=0.2).kernel, 300))
+
+
+def buffer(steps: int = 3, capacity: int = 10_000, seed: int = 0) -> SegmentBuffer:
+    return SegmentBuffer(M, steps, capacity, torch.Generator().manual_seed(seed))
+
+
+def segments(made: SegmentBuffer) -> list[tuple[int, ...]]:
+    return sorted(map(tuple, made.state_dict()["segments"].T.tolist()))
+
+
+def frames(*tracks: list[int], exits: bool = True, envs: int = 1, time: int = 12, max_steps: int | None = None) -> Any:
+    return collect(recorded(by_hand(*tracks, exits=exits)), AllOn(M), envs, time, max_steps=max_steps)
+
+
+def test_segments_are_those_of_the_track_by_hand() -> None:
+    made = buffer()
+    made.extend(frames([0, 1, 2, 3], time=4))
+    assert segments(made) == [(0, 1, 2, 3), (1, 2, 3, 9)]
+    made.extend(frames([0, 1, 2, 3], time=4))  # the same row has begun the track anew
+    assert segments(made) == [(0, 1, 2, 3)] * 2 + [(1, 2, 3, 9)] * 2 + [(2, 3, 9, 9), (3, 9, 9, 9)]
+
+
+def test_a_recording_that_stops_ends_its_segments() -> None:
+    made = buffer()
+    made.extend(frames([0, 1, 2, 3, 4], exits=False, time=8))
+    assert segments(made) == [(0, 1, 2, 3)] * 2 + [(1, 2, 3, 4)] * 2
+    limited = buffer()
+    limited.extend(frames([0, 1, 2, 3, 4, 5, 6, 7], time=8, max_steps=4))
+    assert segments(limited) == [(0, 1, 2, 3)] * 2 + [(1, 2, 3, 4)] * 2
+
+
+@pytest.mark.parametrize("cut", [1, 2, 5, 20])
+def test_batches_in_pieces_give_what_they_give_in_one(cut: int) -> None:
+    batch = collect(SETTING, AllOn(M), 16, 40)
+    whole, pieces = buffer(), buffer()
+    whole.extend(batch)
+    for part in batch.split(cut, dim=1):
+        pieces.extend(part)
+    assert segments(pieces) == segments(whole)
+    assert len(whole) > 500
+
+
+def test_rows_that_are_others_are_not_joined() -> None:
+    first, second = collect(SETTING, AllOn(M), 16, 8, seed=0), collect(SETTING, AllOn(M), 16, 8, seed=1)
+    made, apart = buffer(), [buffer(), buffer()]
+    for batch, alone in zip((first, second), apart, strict=True):
+        made.extend(batch)
+        alone.extend(batch)
+    assert segments(made) == sorted(segments(apart[0]) + segments(apart[1]))
+
+
+def test_a_step_that_was_not_fully_sensed_breaks_a_segment() -> None:
+    batch = frames([0, 1, 2, 3, 4, 5, 6, 7, 8], time=8)
+    batch["action"][0, 4, 0] = False
+    made = buffer()
+    made.extend(batch)
+    assert segments(made) == [(0, 1, 2, 3), (1, 2, 3, 4), (5, 6, 7, 8)]
+
+
+def test_paths_start_everywhere_and_are_whole_segments() -> None:
+    made = buffer()
+    made.extend(collect(SETTING, AllOn(M), 16, 60))
+    seen = set(segments(made))
+    cells = made.paths(40 * M, 3)
+    assert torch.bincount(cells[0], minlength=M).tolist() == [40] * M
+    assert set(map(tuple, cells.T.tolist())) <= seen
+    assert made.paths(50, 1).shape == (2, 50)
+
+
+def test_first_moves_have_the_proportions_seen() -> None:
+    made = buffer(steps=1)
+    made.extend(frames([0, 1], [0, 2], [0, 1], [0, 3], time=8))
+    cells = made.paths(80 * M, 1)
+    left = torch.bincount(cells[1][cells[0] == 0], minlength=M + 1)
+    assert left[[1, 2, 3]].tolist() == [40, 20, 20]
+
+
+def test_outside_follows_on_a_cell_without_segments() -> None:
+    made = buffer()
+    made.extend(frames([0, 1, 2, 3], time=4))
+    cells = made.paths(M, 3)
+    assert {int(path[0]): path[1:].tolist() for path in cells.T}[5] == [M, M, M]
+
+
+def test_the_oldest_segments_go_first() -> None:
+    made = buffer(steps=1, capacity=2)
+    made.extend(frames([0, 1, 2, 3], time=4))
+    assert segments(made) == [(2, 3), (3, 9)]
+
+
+def test_moves_are_all_of_the_segments() -> None:
+    """Also those that begin no segment, as the last one of a recording."""
+    made = buffer()
+    made.extend(frames([0, 1, 2, 8], exits=False, time=3))
+    start, end = made.moves()
+    assert list(zip(start.tolist(), end.tolist(), strict=True)) == [(0, 1), (1, 2), (2, 8)]
+
+
+@given(st.integers(0, 2**31), st.integers(1, 5), st.integers(1, 12))
+def test_segments_are_pieces_of_tracks(seed: int, steps: int, time: int) -> None:
+    tracks = drawn(small_world(exit_probability=0.2).kernel, 20, seed)
+    made = buffer(steps)
+    for part in collect(recorded(tracks), AllOn(M), 5, 24, seed=seed).split(time, dim=1):
+        made.extend(part)
+    lines = [[*tracks.cells[a:b], *[M] * steps] for a, b in zip(tracks.first[:-1], tracks.first[1:], strict=True)]
+    pieces = {tuple(map(int, line[i : i + steps + 1])) for line in lines for i in range(len(line) - steps)}
+    assert set(segments(made)) <= pieces
+
+
+def test_a_saved_buffer_goes_on_the_same() -> None:
+    batch = collect(SETTING, AllOn(M), 16, 40)
+    one, other = buffer(seed=3), buffer(seed=3)
+    one.extend(batch[:, :17])
+    other.load_state_dict(one.state_dict())
+    for made in (one, other):
+        made.extend(batch[:, 17:])
+    assert segments(one) == segments(other)
+    assert torch.equal(one.paths(50, 3), other.paths(50, 3))

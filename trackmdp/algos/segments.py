@@ -1,0 +1,134 @@
+"""Paths as they were sensed, whole, for targets whose next move depends on more than the cell they are in."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.nn.functional import pad
+
+__all__ = ["SegmentBuffer"]
+
+
+class SegmentBuffer:
+    """Replay buffer of path segments: a located cell and the cells sensed in the `steps` steps after it, M for outside.
+
+    Unlike `MoveBuffer` it never puts a path together from moves of different ones. A segment begins at every fully
+    sensed step that is followed by enough others; which these are says nothing about where the target went.
+
+    Args:
+        num_cells: M.
+        steps: steps of a segment.
+        capacity: segments kept; the oldest go first.
+        generator: draws the paths; the buffer lives on its device.
+    """
+
+    def __init__(self, num_cells: int, steps: int, capacity: int, generator: torch.Generator) -> None:
+        self.num_cells, self.steps, self._capacity, self._generator = num_cells, steps, capacity, generator
+        # Oldest first; no grid has more cells than 16 bits count.
+        self._segments = torch.empty(steps + 1, 0, dtype=torch.int16, device=generator.device)
+        self._tail: dict[str, Tensor] = {}
+        self._index: tuple[Tensor, Tensor, Tensor] | None = None
+
+    def __len__(self) -> int:
+        return self._segments.shape[1]
+
+    def extend(self, batch: TensorDictBase) -> None:
+        """Add the segments of a collected batch `[B, time]`; its rows go on where those of the last batch ended."""
+        frames = {key: value.to(self._segments.device) for key, value in _frames(batch, self.num_cells).items()}
+        if self._tail and _goes_on(self._tail, frames):
+            frames = {key: torch.cat([self._tail[key], frames[key]], dim=1) for key in frames}
+        fresh = _segments(frames, self.steps, self.num_cells)
+        self._segments = torch.cat([self._segments, fresh], dim=1)[:, -self._capacity :].contiguous()
+        self._tail = {key: value[:, value.shape[1] - self.steps + 1 :].clone() for key, value in frames.items()}
+        self._index = None
+
+    def moves(self) -> tuple[Tensor, Tensor]:
+        """Cells before and after every move of every segment, int64 `[steps * K]` each; M after an exit."""
+        return self._segments[:-1].long().flatten(), self._segments[1:].long().flatten()
+
+    def paths(self, count: int, steps: int) -> Tensor:
+        """`[steps + 1, count]` int64 cells of `count` paths, M from the exit on; every cell starts equally many.
+
+        The first moves are stratified: out of each cell the paths leave in the proportions of the moves seen.
+        """
+        order, first, seen = self._index = self._index or self._sort()
+        device, m = order.device, self.num_cells
+        place = torch.arange(count, device=device)
+        offset = torch.randint(m, (1,), generator=self._generator, device=device)
+        draws = torch.rand(count, generator=self._generator, device=device)
+        same_start = (m - 1 + count - place % m).div(m, rounding_mode="floor")
+        start = (place + offset) % m
+        share = (place // m + draws) / same_start
+        chosen = order.index_select(0, (share * seen[start]).long() + first[start])
+        # The last column stands for the cells in which no segment begins.
+        cells = pad(self._segments[: steps + 1], (0, 1), value=m).index_select(1, chosen).long()
+        cells[0] = start
+        return cells
+
+    def _sort(self) -> tuple[Tensor, Tensor, Tensor]:
+        """All segments in the order of their first cells, and per cell where its own begin and how many they are."""
+        m = self.num_cells
+        start, end = self._segments[:2].long()
+        order = torch.cat([(start * (m + 1) + end).argsort(stable=True), start.new_tensor([len(self)])])
+        seen = torch.bincount(start, minlength=m)
+        first = torch.where(seen > 0, seen.cumsum(0) - seen, len(self))
+        # Half a float's spacing below the count, so that a draw close to 1 does not round up to the next cell's.
+        return order, first, seen.clamp(min=1).float() * (1.0 - 2.0**-24)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The segments, and the end of the last batch; the generator is its owner's to save."""
+        return {"segments": self._segments, "tail": dict(self._tail)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from a `state_dict`."""
+        self._segments = state["segments"].to(self._segments)
+        self._tail = {key: value.to(self._segments.device) for key, value in state["tail"].items()}
+        self._index = None
+
+
+def _frames(batch: TensorDictBase, num_cells: int) -> dict[str, Tensor]:
+    """`[B, time]` of a collected batch: the cell before and after each step, whether it was sensed, whether it ended.
+
+    Read is only what the tracker saw, as in `sensed_moves`.
+    """
+    after = batch["next"]
+    exited = after["terminated"].squeeze(-1)
+    located = (after["steps_since_detection"] == 0) | exited
+    whole = batch["action"].all(-1) & (batch["steps_since_detection"] == 0) & located
+    end = torch.where(exited, num_cells, after["last_cell"])
+    return {
+        "start": batch["last_cell"].to(torch.int16),
+        "end": end.to(torch.int16),
+        "whole": whole,
+        "done": after["done"].squeeze(-1),
+    }
+
+
+def _goes_on(before: dict[str, Tensor], frames: dict[str, Tensor]) -> bool:
+    """Whether each row that had not ended begins where it stood: not so where workers deliver in any order."""
+    if not before["end"].shape[1] or len(before["end"]) != len(frames["start"]):
+        return False
+    same = before["end"][:, -1] == frames["start"][:, 0]
+    known = before["whole"][:, -1] & frames["whole"][:, 0] & ~before["done"][:, -1]
+    return bool((same | ~known).all())
+
+
+def _segments(frames: dict[str, Tensor], steps: int, num_cells: int) -> Tensor:
+    """`[steps + 1, K]` int16, the segments that are complete: fully sensed to their end or to the exit."""
+    count = frames["start"].shape[1] - steps + 1
+    if count < 1:
+        return frames["start"].new_empty(steps + 1, 0)
+    cells = [frames["start"][:, :count]]
+    complete = torch.ones_like(frames["whole"][:, :count])
+    gone = ~complete
+    for step in range(steps):
+        end, whole, done = (frames[key][:, step : step + count] for key in ("end", "whole", "done"))
+        complete = complete & (whole | gone)
+        cells.append(torch.where(gone, num_cells, end))
+        gone = gone | (end == num_cells)
+        if step < steps - 1:
+            complete = complete & (gone | ~done)
+    return torch.stack(cells)[:, complete]
