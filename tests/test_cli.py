@@ -164,38 +164,6 @@ def test_a_run_gets_its_config_and_its_folder(
     assert re.fullmatch(r"runs/\d{4}-\d\d-\d\d/\d\d-\d\d-\d\d-\d{6}", str(calls[1][1].relative_to(empty_folder)))
 
 
-def test_a_bad_job_does_not_stop_a_sweep_and_is_named_at_the_end(
-    monkeypatch: pytest.MonkeyPatch, empty_folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def run(cfg: Any, folder: Path) -> None:
-        (folder / "size").write_text(str(cfg.grid.size))
-
-    stub(monkeypatch, "train", run)
-    assert main(["train", "-m", "grid.size=5,2,4,99", "hydra.sweep.dir=all", "quiet=true"]) == 2
-    assert {file.read_text() for file in empty_folder.glob("all/*/size")} == {"5", "4"}
-    assert sorted(path.name for path in empty_folder.glob("all/*")) == ["0", "2", "multirun.yaml"]
-    said = capsys.readouterr().err.splitlines()
-    reason = "grid.size=2: expected an integer from 3 to 64 (cells)"
-    assert said[0] == f"trackmdp train: job 1 (grid.size=2, quiet=True): {reason}"
-    assert said[-1].startswith("trackmdp train: 2 of 4 jobs failed: job 1 ")
-    assert "job 3 (grid.size=99, quiet=True)" in said[-1]
-
-
-def test_a_bug_in_a_sweep_shows_its_traceback(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def run(cfg: Any, folder: Path) -> None:
-        if cfg.seed == 0:
-            raise ZeroDivisionError("a bug")
-
-    stub(monkeypatch, "train", run)
-    assert main(["train", "-m", "seed=0,1"]) == 1
-    said = capsys.readouterr()
-    assert "ZeroDivisionError: a bug" in said.err
-    assert "1 of 2 jobs failed" in said.err
-    assert "seed 1" in said.out
-
-
 def test_a_sweep_with_a_wrong_type_or_choice_starts_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     assert refused(capsys, "train", "-m", "quiet=true", "seed=0,abc") == "seed=abc: expected an integer >= 0"
     assert refused(capsys, "train", "-m", "quiet=true", "algo=ppo,sac").startswith("algo=sac: expected one of ")
@@ -286,10 +254,10 @@ def test_help_and_first_line_import_nothing_heavy() -> None:
     code = """
 import sys
 from trackmdp.cli import main
-import trackmdp.launch
+import trackmdp.prepare
 def say(line):
     sys.exit(str(sorted({"torch", "torchrl", "scipy"} & set(sys.modules))))
-trackmdp.launch._say = say
+trackmdp.prepare.say = say
 main(["train", "--help"])
 main(["train"])
 """

@@ -40,15 +40,19 @@ def diagnose(error: Exception, command: str, words: Sequence[str], compose: Comp
     if "multirun" in str(error).lower() and sweeps:
         return UserError(f"{sweeps[0]}: expected one value; add -m to run once for each")
     groups = [override for override in parsed if _group(override, command) in GROUPS]
+    files = [override for override in parsed if _is_choice(override, command)]
+    for override in files:
+        if refusal := _bad_file(override, error):
+            return refusal
     for override in groups:
         if refusal := _bad_choice(override, _group(override, command), error):
             return refusal
-    for overrides in _jobs(groups):
+    for overrides in _jobs([*files, *groups]):
         known = _known(command, overrides, compose)
         if known is None:
             continue
         for override in parsed:
-            if override not in groups and (refusal := _bad_value(override, known)):
+            if override not in [*files, *groups] and (refusal := _bad_value(override, known)):
                 return refusal
     return UserError(_plain(error))
 
@@ -65,6 +69,26 @@ def _bad_choice(override: Override, group: str, error: Exception) -> UserError |
         if f"Could not find '{group}/{value}'" in str(error) or not isinstance(value, str):
             return UserError(f"{group}={_shown(value)}: expected one of {', '.join(GROUPS[group])}")
     return None
+
+
+def _is_choice(override: Override, command: str) -> bool:
+    """Whether a word chooses an experiment, or where and how a sweep is run: one, from the files that are there."""
+    key = override.key_or_group
+    return key.startswith("hydra/") or (key == "experiment" and command == "train")
+
+
+def _bad_file(override: Override, error: Exception) -> UserError | None:
+    """The refusal of a choice that is not there, or of several."""
+    key, values = override.key_or_group, _values(override)
+    if len(values) > 1:
+        return UserError(f"{override.input_line}: expected one {key.split('/')[-1]}")
+    said = str(error)
+    if f"Could not find '{key}/{values[0]}'" not in said:
+        return None
+    listed = said.partition(f"Available options in '{key}':")[2].splitlines()[1:]
+    names = [line.strip() for line in itertools.takewhile(lambda line: line.startswith("\t"), listed)]
+    known = [name for name in names if not name.startswith("base_")]
+    return UserError(f"{key}={_shown(values[0])}: expected one of {', '.join(known) or 'none, since there is none'}")
 
 
 def _jobs(groups: Sequence[Override]) -> Iterator[list[str]]:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import sys
-import traceback
+import shlex
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,29 +18,17 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf import DictConfig, OmegaConf
 
-from trackmdp.config import (
-    ROOTS,
-    CommandConfig,
-    EvaluateConfig,
-    ExportConfig,
-    TrainConfig,
-    WorldConfig,
-    conf_dir,
-    from_hydra,
-    load_run,
-    register,
-)
+from trackmdp.config import CommandConfig, TrainConfig, conf_dir, register
 from trackmdp.config.resume import continued, run_folder
+from trackmdp.config.sweeps import plugin
 from trackmdp.diagnose import diagnose
-from trackmdp.errors import FAILED, USER_MISTAKE, RunError, UserError
+from trackmdp.errors import RunError, UserError
 from trackmdp.outputs import make_folder, remove_if_empty
+from trackmdp.prepare import announce, check_files, typed_config
 
 __all__ = ["launch"]
-
-WORLD_KEYS = ("grid", "kernel", "cost")
 
 
 def launch(command: str, words: Sequence[str]) -> int:
@@ -57,7 +44,7 @@ def launch(command: str, words: Sequence[str]) -> int:
     try:
         if args.cfg or args.info or args.hydra_help or args.shell_completion:
             return _ask_hydra(command, args, hydra)
-        if args.multirun or any(word.startswith("hydra.mode=") for word in args.overrides):
+        if args.multirun or "hydra.mode=MULTIRUN" in args.overrides:
             return _sweep(command, args, hydra)
         return _run_once(command, args, hydra)
     finally:
@@ -72,7 +59,7 @@ def _run_once(command: str, args: argparse.Namespace, hydra: Hydra) -> int:
         folder = run_folder(typed, folder)
         typed = continued(typed, folder, cfg.hydra.overrides.task)
     made = make_folder("hydra.run.dir", folder)
-    job = _Job(command, sweeps=False)
+    job = _Job(command)
     # Hydra composes once more, and the time stamp of the folder must stay.
     overrides = [*args.overrides, "hydra.mode=RUN", _assign("hydra.run.dir", folder)]
     try:
@@ -86,122 +73,55 @@ def _run_once(command: str, args: argparse.Namespace, hydra: Hydra) -> int:
 
 
 def _sweep(command: str, args: argparse.Namespace, hydra: Hydra) -> int:
+    from trackmdp.sweep.launchers import make_launcher
+    from trackmdp.sweep.plan import combinations, of_task, plan, sweep_name
+    from trackmdp.sweep.sweep import sweep
+    from trackmdp.training.display import make_console
+
     cfg = _compose(command, args, hydra, RunMode.MULTIRUN)
+    typed, blocks = of_task(args.overrides), plugin("sweeper", cfg.hydra.sweeper).blocks or []
+    launch_jobs = make_launcher(plugin("launcher", cfg.hydra.launcher))
+    OmegaConf.register_new_resolver("sweep_name", lambda: sweep_name(command, typed, blocks), replace=True)
     folder = Path(cfg.hydra.sweep.dir)
+
+    def composed(words: Sequence[str]) -> DictConfig:
+        alone = argparse.Namespace(**{**vars(args), "overrides": list(words)})
+        return _compose(command, alone, hydra, RunMode.RUN)
+
+    jobs = plan(command, combinations(blocks, typed), folder.absolute(), composed)
+    line = shlex.join(["trackmdp", command, "-m", *args.overrides])
     made = make_folder("hydra.sweep.dir", folder)
-    job = _Job(command, sweeps=True)
-    overrides = [*args.overrides, "hydra.mode=MULTIRUN", _assign("hydra.sweep.dir", folder)]
     try:
-        if not cfg.quiet:
-            _say(f"{command} sweep -> {folder}")
-        hydra.multirun(_config_name(command, args), job, overrides)
-    except (HydraException, OmegaConfBaseException) as error:  # refused before the first job
-        if job.started:
-            raise
-        if made:
-            (folder / "multirun.yaml").unlink(missing_ok=True)
-        raise diagnose(error, command, args.overrides, _composer(command, args, hydra)) from error
-    except Exception:
-        if not job.failures:
-            raise
+        return sweep(folder.absolute(), command, line, jobs, launch_jobs, make_console(cfg.quiet))
     finally:
         remove_if_empty(made)
-    if not job.failures:
-        return 0
-    sys.stderr.write(
-        f"trackmdp {command}: {len(job.failures)} of {job.started} jobs failed: {'; '.join(job.failures)}\n"
-    )
-    return FAILED if job.broken else USER_MISTAKE
 
 
 @dataclass
 class _Job:
-    """What Hydra calls for each job: here, or in another process with a launcher plug-in."""
+    """What Hydra calls to run the command."""
 
     command: str
-    sweeps: bool
-    started: int = 0
     told: UserError | RunError | None = None
-    failures: list[str] = field(default_factory=list)
-    broken: int = 0
 
     def __call__(self, cfg: DictConfig) -> Any:
         hydra = HydraConfig.get()
-        self.started += 1
         folder, typed_in, task = Path(hydra.runtime.output_dir), Path(hydra.runtime.cwd), list(hydra.overrides.task)
         try:
             typed = _checked(self.command, cfg, task, typed_in)
             if isinstance(typed, TrainConfig):
                 typed = continued(typed, folder, task)
-            if self.sweeps:
-                announce(
-                    self.command, typed, folder.relative_to(typed_in) if folder.is_relative_to(typed_in) else folder
-                )
             run: Callable[[Any, Path], Any] = importlib.import_module(f"trackmdp.commands.{self.command}").run
             return run(typed, folder)
-        except Exception as error:
-            if not self.sweeps and isinstance(error, (UserError, RunError)):
-                self.told = error  # raised once Hydra is done: it would add lines of its own
-                return None
-            if self.sweeps:
-                self._report(error, f"job {hydra.job.num} ({', '.join(task)})", folder)
-            raise
-
-    def _report(self, error: Exception, name: str, folder: Path) -> None:
-        """Say at once which job of a sweep failed; the others go on."""
-        remove_if_empty([folder])
-        self.broken += not isinstance(error, UserError)
-        if not isinstance(error, (UserError, RunError)):
-            traceback.print_exc()
-        self.failures.append(f"{name}: {' '.join(str(error).split()) or type(error).__name__}")
-        sys.stderr.write(f"trackmdp {self.command}: {self.failures[-1]}\n")
-
-
-def announce(command: str, cfg: CommandConfig, folder: Path) -> None:
-    """The first line at the terminal, before anything heavy is imported."""
-    if cfg.quiet or not isinstance(cfg, WorldConfig):
-        return
-    what = next((getattr(cfg, name).name for name in ("algo", "baseline", "solver") if getattr(cfg, name, None)), "")
-    if isinstance(cfg, EvaluateConfig) and cfg.run is not None:
-        _say(f"evaluate {cfg.run} -> {folder}")
-        return
-    n = cfg.grid.size
-    seed = f", seed {cfg.seed}" if hasattr(cfg, "seed") else ""
-    where = f"on a {n}x{n} grid, T_max {cfg.grid.t_max}, kernel {cfg.kernel.name}{seed}"
-    _say(" ".join(f"{command} {what} {where} -> {folder}".split()))
-
-
-def _say(line: str) -> None:
-    sys.stdout.write(f"{line}\n")
-    sys.stdout.flush()
+        except (UserError, RunError) as error:
+            self.told = error  # raised once Hydra is done: it would add lines of its own
+            return None
 
 
 def _checked(command: str, cfg: DictConfig, task: Sequence[str], folder: Path) -> CommandConfig:
-    """The typed config of one job, with every check that does not need the heavy libraries."""
-    if "hydra" in cfg:
-        cfg = cfg.copy()
-        cfg._set_flag("struct", False)
-        del cfg["hydra"]
-    typed = from_hydra(cfg, ROOTS[command], folder)
-    if isinstance(typed, EvaluateConfig) and typed.run is not None:
-        for word in task:
-            key = word.lstrip("+~").split("=")[0]
-            if key.split(".")[0].split("@")[0] in WORLD_KEYS:
-                raise UserError(f"{word}: not together with run={typed.run}, whose own world is used")
-        load_run(typed.run)
-    elif isinstance(typed, ExportConfig):
-        load_run(typed.run)
-    elif isinstance(typed, WorldConfig) and reads_files(typed):
-        from trackmdp.build import make_world
-
-        make_world(typed)
+    typed = typed_config(command, cfg, folder)
+    check_files(typed, task)
     return typed
-
-
-def reads_files(cfg: WorldConfig) -> bool:
-    """Whether building the world can still fail: it is read from files, or its target may never exit."""
-    exits = getattr(cfg.kernel, "exit_probability", 0.0) > 1e-9
-    return not exits or isinstance(getattr(cfg.cost, "sensor", None), str)
 
 
 def _ask_hydra(command: str, args: argparse.Namespace, hydra: Hydra) -> int:

@@ -13,6 +13,7 @@ from omegaconf import OmegaConf
 from tests.config.cases import REFUSED, composed, files_of
 from tests.reads import record_reads, unread
 from trackmdp.config import GROUPS, ROOTS, Option, TrainConfig, conf_dir, load, options, to_yaml
+from trackmdp.config.sweeps import PLUGINS
 from trackmdp.errors import UserError
 
 CONF = Path(conf_dir())
@@ -57,9 +58,17 @@ def test_yaml_of_a_command_holds_exactly_the_options_of_its_schema(command: str)
 
 
 def test_every_yaml_file_belongs_to_a_schema() -> None:
-    found = {str(file.relative_to(CONF)) for file in CONF.rglob("*.yaml")}
+    found = {str(file.relative_to(CONF)) for file in CONF.rglob("*.yaml") if file.parent.name != "experiment"}
     expected = {f"{group}/{name}.yaml" for group, name in CHOICES} | {f"{command}.yaml" for command in ROOTS}
+    expected |= {f"hydra/{group}/{name}.yaml" for group, members in PLUGINS.items() for name in members}
     assert found - {"hydra/folders.yaml"} == expected
+
+
+@pytest.mark.parametrize(("group", "name"), [(group, name) for group in PLUGINS for name in PLUGINS[group]])
+def test_yaml_of_a_sweep_holds_exactly_the_options_of_its_schema(group: str, name: str) -> None:
+    values = read(CONF / "hydra" / group / f"{name}.yaml")
+    assert values.pop("defaults") == [f"base_{name}"]
+    assert set(values) == set(options(PLUGINS[group][name]))
 
 
 def test_schemas_hold_no_values() -> None:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from trackmdp.config.checks import validate
 from trackmdp.config.roots import TrainConfig
-from trackmdp.config.tree import load_run
+from trackmdp.config.tree import load_run, to_yaml
 from trackmdp.errors import UserError
 
-__all__ = ["CHANGEABLE", "continued", "run_folder"]
+__all__ = ["CHANGEABLE", "config_text", "continued", "digest", "finished", "run_folder"]
 
 CHANGEABLE = (
     "collector.total_frames",
@@ -25,6 +27,27 @@ CHANGEABLE = (
     "quiet",
 )
 """Options, or groups of them, that may differ when a run goes on: budget, solving, logging, saving and devices."""
+
+
+def config_text(cfg: TrainConfig) -> str:
+    """The text of `config.yaml`; how a run was gone on with is not part of it."""
+    return to_yaml(dataclasses.replace(cfg, resume=None))
+
+
+def digest(cfg: TrainConfig) -> str:
+    """SHA-256 of `config.yaml`."""
+    return hashlib.sha256(config_text(cfg).encode()).hexdigest()
+
+
+def finished(cfg: TrainConfig, folder: Path) -> dict[str, Any] | None:
+    """The `summary.json` of a run that has nothing left to do; None where there is none, or one of another config."""
+    try:
+        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        known = summary["config_sha256"]
+    except (OSError, ValueError, LookupError, TypeError):
+        return None
+    mine = known in [digest(dataclasses.replace(cfg, quiet=quiet)) for quiet in (True, False)]
+    return dict(summary) if mine else None
 
 
 def run_folder(cfg: TrainConfig, chosen: Path) -> Path:

@@ -10,12 +10,14 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from hydra.core.config_store import ConfigStore
+from hydra.core.plugins import Plugins
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from trackmdp.config.checks import absolute_paths, validate
 from trackmdp.config.options import GROUPS, Option, options
 from trackmdp.config.roots import ROOTS, CommandConfig, TrainConfig, WorldConfig
+from trackmdp.config.sweeps import PLUGINS
 from trackmdp.errors import UserError
 
 __all__ = [
@@ -58,6 +60,11 @@ def register() -> None:
     for group, members in GROUPS.items():
         for name, schema in members.items():
             store.store(group=group, name=f"base_{name}", node=schema)
+    Plugins.instance()  # they store configs of their own names, which ours replace
+    for group, members in PLUGINS.items():
+        for name, schema in members.items():
+            store.repo["hydra"][group].pop(f"{name}.yaml", None)
+            store.store(group=f"hydra/{group}", name=f"base_{name}", node=schema)
 
 
 def from_hydra(cfg: DictConfig, root: type[C], folder: Path) -> C:

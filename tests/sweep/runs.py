@@ -1,0 +1,62 @@
+"""Sweeps of tiny runs, as a user types them."""
+
+from __future__ import annotations
+
+import csv
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from trackmdp.cli import main
+from trackmdp.sweep import apart
+
+ROOT = Path(__file__).parents[2]
+TINY = (
+    "grid.size=3",
+    "collector.total_frames=2048",
+    "collector.frames_per_batch=1024",
+    "collector.envs=64",
+    "algo.updates=4",
+    "algo.hidden=8",
+    "optimal.time_limit=1",
+)
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty current folder, and runs that begin as a copy of this process, with all that is patched in it."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(apart, "METHOD", "fork")
+    return tmp_path
+
+
+def swept(*words: str, dir: str = "all") -> int:
+    """The exit status of a sweep of tiny runs in the folder `dir`, in this process."""
+    return main(["train", "-m", *TINY, *words, f"hydra.sweep.dir={dir}"])
+
+
+def started(folder: Path, *words: str, **kwargs: Any) -> subprocess.Popen[str]:
+    """The command as typed in a shell, in `folder`."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "trackmdp.cli", *words],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        **kwargs,
+    )
+
+
+def table(folder: Path) -> list[dict[str, str]]:
+    """Rows of `runs.csv`."""
+    with (folder / "runs.csv").open(newline="", encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))
+
+
+def states(folder: Path) -> list[str]:
+    return [row["state"] for row in table(folder)]

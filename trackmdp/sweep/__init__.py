@@ -1,0 +1,1 @@
+"""Many runs from one line: planned, launched, skipped where finished, gone on with where cut."""

@@ -1,0 +1,97 @@
+"""What a sweep's folder says of its runs, while they run and after."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from trackmdp.errors import UserError
+from trackmdp.training.metrics import write_json
+
+__all__ = ["DONE", "FAILED", "PLAN", "SUMMARY", "Run", "read_json", "read_plan", "run_of", "runs_of", "write_plan"]
+
+PLAN, FAILED, SUMMARY, DONE = "sweep.json", "failed.json", "summary.json", "done.json"
+"""Files: of a sweep; of a run that failed, of a training run that ended, of a run of another command that did."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run of a sweep, as its folder shows it.
+
+    Attributes:
+        folder: of the run.
+        overrides: its words.
+        state: done, failed, running, cut (it can go on) or waiting (not begun).
+        reason: why it failed, in one line.
+        result: the content of `summary.json` (training) or `done.json`; empty unless done.
+    """
+
+    folder: Path
+    overrides: tuple[str, ...]
+    state: str
+    reason: str = ""
+    result: Mapping[str, Any] = field(default_factory=dict)
+
+
+def write_plan(sweep: Path, command: str, line: str, jobs: Sequence[tuple[str, Sequence[str]]]) -> None:
+    """Write `sweep.json`: all runs planned, each with the name of its folder and its overrides."""
+    planned = [{"folder": name, "overrides": list(words)} for name, words in jobs]
+    write_json(sweep / PLAN, {"command": command, "line": line, "jobs": planned})
+
+
+def read_plan(sweep: Path) -> dict[str, Any]:
+    """The content of `sweep.json`: `command`, `line` and `jobs`.
+
+    Raises:
+        UserError: the folder is not that of a sweep.
+    """
+    content = read_json(sweep / PLAN)
+    if not content.keys() >= {"command", "line", "jobs"}:
+        raise UserError(f"sweep={sweep}: expected the folder of a sweep, with {PLAN}")
+    return content
+
+
+def runs_of(sweep: Path) -> list[Run]:
+    """All runs of a sweep, in the order planned.
+
+    Raises:
+        UserError: the folder is not that of a sweep.
+    """
+    return [run_of(sweep / job["folder"], tuple(job["overrides"])) for job in read_plan(sweep)["jobs"]]
+
+
+def run_of(folder: Path, overrides: tuple[str, ...] = ()) -> Run:
+    """One run, as its folder shows it."""
+    if _is_locked(folder):
+        return Run(folder, overrides, "running")
+    for name in (SUMMARY, DONE):
+        if result := read_json(folder / name):
+            return Run(folder, overrides, "done", "", result)
+    if failed := read_json(folder / FAILED):
+        return Run(folder, overrides, "failed", str(failed.get("reason", "")))
+    return Run(folder, overrides, "cut" if (folder / "config.yaml").is_file() else "waiting")
+
+
+def read_json(file: Path) -> dict[str, Any]:
+    """The content of a file that is whole or absent; empty where it is absent or no object."""
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def _is_locked(folder: Path) -> bool:
+    """Whether a process is running in the folder."""
+    try:
+        with (folder / ".lock").open() as stream:
+            fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    return False

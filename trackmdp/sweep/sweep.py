@@ -1,0 +1,134 @@
+"""A sweep from its plan to its table."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from types import FrameType, TracebackType
+
+from rich.console import Console
+
+from trackmdp.config import TrainConfig
+from trackmdp.config.resume import continued, finished
+from trackmdp.errors import FAILED as FAILED_STATUS
+from trackmdp.errors import Preempted, UserError
+from trackmdp.prepare import shown
+from trackmdp.sweep.apart import Outcome
+from trackmdp.sweep.job import STOP, fail
+from trackmdp.sweep.launchers import Launch
+from trackmdp.sweep.plan import Job
+from trackmdp.sweep.state import DONE, FAILED, SUMMARY, Run, run_of, runs_of, write_plan
+from trackmdp.sweep.table import show, status_of, write_table
+from trackmdp.training.lock import locked
+
+__all__ = ["sweep"]
+
+_ROUNDS = 3
+"""How often what a broken launcher left undone is launched."""
+
+
+def sweep(folder: Path, command: str, line: str, jobs: Sequence[Job], launch: Launch, console: Console) -> int:
+    """Run what is not finished, and show what came of all; returns the exit status.
+
+    Args:
+        folder: of the sweep.
+        command: what is run.
+        line: what was typed.
+        jobs: the plan.
+        launch: runs jobs.
+        console: where the table is shown.
+
+    Raises:
+        UserError: the folder is in use.
+        Preempted: a signal ended the sweep; it can go on.
+    """
+    with locked(folder, "hydra.sweep.dir"):
+        write_plan(folder, command, line, [(job.name, job.words) for job in jobs])
+        skipped = {job.folder for job in jobs if _is_finished(job)}
+        waiting = [job for job in jobs if job.folder not in skipped]
+        console.print(_opening(jobs, skipped, folder), markup=False)
+        with _Stop(folder) as stop:
+            for job in waiting:
+                _forget(job)
+            _launch(waiting, launch, stop)
+        runs = runs_of(folder)
+        write_table(folder, runs)
+        show(console, runs, skipped, folder)
+        if stop.received:
+            raise Preempted(stop.received)
+        _tell_failures(command, runs)
+        return status_of(runs)
+
+
+def _is_finished(job: Job) -> bool:
+    """Whether the run is done already, with the very config that is asked for."""
+    if not isinstance(job.cfg, TrainConfig) or run_of(job.folder).state != "done":
+        return False
+    try:
+        return finished(continued(job.cfg, job.folder, job.words), job.folder) is not None
+    except UserError:
+        return False
+
+
+def _forget(job: Job) -> None:
+    """Remove what an earlier call left of a run that is to be run now."""
+    for name in (FAILED, DONE, SUMMARY):
+        (job.folder / name).unlink(missing_ok=True)
+
+
+def _launch(jobs: Sequence[Job], launch: Launch, stop: _Stop) -> None:
+    """Launch `jobs`, and once more what a launcher that broke down left undone."""
+    reason = "it was not run"
+    for _ in range(_ROUNDS):
+        if not jobs or stop.received:
+            return
+        try:
+            launch(jobs)
+        except Exception as error:
+            reason = f"the launcher broke down: {type(error).__name__}: {' '.join(str(error).split())}"
+            sys.stderr.write(f"{reason}\n")
+        jobs = [job for job in jobs if run_of(job.folder).state in ("cut", "waiting")]
+    if stop.received:
+        return
+    for job in jobs:
+        fail(job, Outcome(FAILED_STATUS, reason=reason))
+
+
+def _opening(jobs: Sequence[Job], skipped: Collection[Path], folder: Path) -> str:
+    done = f", {len(skipped)} of them done before" if skipped else ""
+    return f"{len(jobs)} runs{done} -> {shown(folder)}"
+
+
+def _tell_failures(command: str, runs: Sequence[Run]) -> None:
+    failed = [run for run in runs if run.state == "failed"]
+    if failed:
+        sys.stderr.write(f"trackmdp {command}: {len(failed)} of {len(runs)} runs failed\n")
+
+
+class _Stop:
+    """While entered, a signal asks all runs to save and end; a second one of its kind acts as it did before."""
+
+    def __init__(self, folder: Path) -> None:
+        self._file = folder / STOP
+        self.received = 0
+
+    def __enter__(self) -> _Stop:
+        self._file.unlink(missing_ok=True)
+        heard = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
+        self._before = {number: signal.signal(number, self._note) for number in heard}
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        if kind is None:  # else jobs elsewhere may still be about to look
+            self._file.unlink(missing_ok=True)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
+        self.received = number
+        self._file.write_text(str(number), encoding="ascii")
+        signal.signal(number, self._before[signal.Signals(number)])
