@@ -22,6 +22,7 @@ COMMANDS = {
     "benchmark": "measure speed and quality on this machine",
     "export": "write a learned policy as a file that runs without this package",
     "replay": "list, play, verify and recover logged episodes, or show one as a web page",
+    "report": "make figures, tables and a web page of a sweep, or watch it run",
 }
 
 

@@ -18,6 +18,7 @@ from trackmdp.config.roots import (
     EvaluateConfig,
     ExportConfig,
     ReplayConfig,
+    ReportConfig,
     SolveConfig,
     TrainConfig,
     WorldConfig,
@@ -75,6 +76,8 @@ def absolute_paths(cfg: CommandConfig, folder: Path) -> None:
         cfg.html, cfg.csv, cfg.layout = (path and str(folder / path) for path in (cfg.html, cfg.csv, cfg.layout))
     if isinstance(cfg, ExportConfig):
         cfg.run = str(folder / cfg.run)
+    if isinstance(cfg, ReportConfig):
+        cfg.sweep = str(folder / cfg.sweep)
     if not isinstance(cfg, WorldConfig):
         return
     if isinstance(cfg.kernel, (Table, Tracks)):

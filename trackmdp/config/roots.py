@@ -19,6 +19,7 @@ __all__ = [
     "ExportConfig",
     "OptimalBound",
     "ReplayConfig",
+    "ReportConfig",
     "SolveConfig",
     "TrainConfig",
     "VerifyConfig",
@@ -169,6 +170,19 @@ class ReplayConfig(CommandConfig):
 
 
 @dataclass(kw_only=True)
+class ReportConfig(CommandConfig):
+    """Make figures, tables and one web page of a sweep, or watch it run."""
+
+    sweep: str = option(
+        "folder of the sweep, or of stored results", expects="the folder of a sweep or an earlier report"
+    )
+    watch: bool = option("show all runs live until they are done, instead of a report")
+    paper: bool | None = option("add what concerns the paper's settings; null = where the runs are in its worlds")
+    resamples: int = option("bootstrap resamples behind each interval", unit="resamples", ge=100, le=100_000)
+    every: float = option("seconds from one look at the runs to the next, with watch=true", unit="s", gt=0, le=3600)
+
+
+@dataclass(kw_only=True)
 class ExportConfig(CommandConfig):
     """Write a learned policy as a file that runs without this package."""
 
@@ -187,5 +201,6 @@ ROOTS: dict[str, type[CommandConfig]] = {
     "benchmark": BenchmarkConfig,
     "replay": ReplayConfig,
     "export": ExportConfig,
+    "report": ReportConfig,
 }
 """Command -> its schema; `conf/<command>.yaml` holds the values."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import zipfile
 import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from trackmdp.durable import whole_file
 from trackmdp.errors import UserError
 from trackmdp.world.model import Array, BoolArray
 
-__all__ = ["FILE", "Policy", "pack", "read", "write"]
+__all__ = ["FILE", "Policy", "pack", "pack_all", "read", "unpack_all", "write"]
 
 FILE = "policy.npz"
 
@@ -38,6 +39,38 @@ def pack(policy: Policy) -> bytes:
     bits, shape = np.packbits(policy.chains), np.array(policy.chains.shape)
     np.savez_compressed(stream, chains=bits, shape=shape, value=policy.value)
     return stream.getvalue()
+
+
+def pack_all(policies: Mapping[str, Policy]) -> bytes:
+    """The bytes of a file with many policies, each under a name."""
+    every = list(policies.values())
+    arrays = {
+        "names": np.array(list(policies), dtype=np.str_),
+        "shapes": np.array([policy.chains.shape for policy in every], dtype=np.int64).reshape(-1, 3),
+        "chains": np.packbits(np.concatenate([policy.chains.ravel() for policy in every] or [np.zeros(0, bool)])),
+        "values": np.concatenate([policy.value for policy in every] or [np.zeros(0)]),
+    }
+    stream = io.BytesIO()
+    np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
+    return stream.getvalue()
+
+
+def unpack_all(content: bytes) -> dict[str, Policy]:
+    """What `pack_all` packed.
+
+    Raises:
+        ValueError, KeyError: the bytes are something else.
+    """
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as stored:
+            names, shapes, bits, values = (stored[key] for key in ("names", "shapes", "chains", "values"))
+    except (EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(str(error)) from error
+    sizes = shapes.prod(axis=1)
+    flat = np.unpackbits(bits, count=int(sizes.sum())).astype(np.bool_)
+    chains = np.split(flat, np.cumsum(sizes)[:-1]) if len(names) else []
+    value = np.split(values, np.cumsum(shapes[:, 0])[:-1]) if len(names) else []
+    return {str(name): Policy(c.reshape(s), v) for name, c, s, v in zip(names, chains, shapes, value, strict=True)}
 
 
 def write(file: Path, policy: Policy) -> None:

@@ -1,0 +1,8 @@
+"""The same as `trackmdp report`."""
+
+import sys
+
+from trackmdp.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main(["report", *sys.argv[1:]]))

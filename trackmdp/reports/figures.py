@@ -1,0 +1,263 @@
+"""Figures of what was learned: AIHTR and regret against the price of a sensor, learning curves, profiles."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from trackmdp.reports.grouping import Study
+from trackmdp.reports.statistics import Estimate, estimate
+from trackmdp.reports.style import INK, LOOKS, Figure, draw, legend, look, tidy
+from trackmdp.reports.tables import Column, Table
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Canvas
+
+__all__ = [
+    "ALLOWED",
+    "FLOOR",
+    "Panel",
+    "against_cost",
+    "estimate_columns",
+    "panels",
+    "parts",
+    "regret_against_cost",
+    "slug",
+]
+
+FLOOR = 1e-5
+"""Smallest regret drawn on a logarithmic axis."""
+BOUNDS = {
+    "printed bound": "bound_paper",
+    "valid bound": "bound_valid",
+    "clocked bound": "bound_clocked",
+    "optimum": "optimal_lower",
+}
+ALLOWED = (0.01, 0.02)
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One figure's worlds: the same but for the price of a sensor, which rises."""
+
+    name: str
+    title: str
+    costs: Sequence[float]
+    worlds: Sequence[str]
+
+
+def panels(study: Study, chosen: Mapping[tuple[int, float], str] | None = None) -> list[Panel]:
+    """Worlds that differ in `cost.sensor` only, at least two of them to a panel; or the paper's, by Z."""
+    groups: dict[str, list[tuple[float, str]]] = {}
+    if chosen:
+        for (support_size, cost), world in chosen.items():
+            groups.setdefault(f"Z = {support_size}", []).append((cost, world))
+    else:
+        for world in study.worlds:
+            price = study.in_world(world)[0].settings.get("cost.sensor")
+            if isinstance(price, (int, float)):
+                rest = ", ".join(part for part in world.split(", ") if not part.startswith("c="))
+                groups.setdefault(rest, []).append((float(price), world))
+    found = [(title, sorted(entries)) for title, entries in groups.items() if len(entries) > 1]
+    return [
+        Panel(slug(title), title, [cost for cost, _ in entries], [world for _, world in entries])
+        for title, entries in found
+    ]
+
+
+def against_cost(study: Study, panel: Panel, resamples: int) -> Figure:
+    """AIHTR against c: the learned policies with their intervals, Q_MDP, the bounds, the optimum."""
+    learned = _estimates(study, panel, resamples, regret=False)
+    exact = {"Q_MDP": _exact(study, panel, "qmdp_aihtr")}
+    exact |= {label: _exact(study, panel, key) for label, key in BOUNDS.items()}
+    exact = {label: values for label, values in exact.items() if not all(map(math.isnan, values))}
+    split = _split([e.mean for row in learned.values() for e in row] + [v for row in exact.values() for v in row])
+
+    def paint(figure: Canvas) -> None:
+        split_axes = figure.subplots(2, 1, sharex=True, height_ratios=[4, 1]) if split else [figure.subplots()]
+        for axes in split_axes:
+            _learned_lines(axes, panel, learned)
+            for label, values in exact.items():
+                style = LOOKS[label]
+                axes.plot(panel.costs, values, style.line, marker=style.marker, color=style.colour, label=label, lw=1.1)
+            tidy(axes)
+        if split:
+            _break(split_axes[0], split_axes[1], *split)
+        split_axes[0].set_ylabel("AIHTR")
+        split_axes[-1].set_xlabel("c, price of a sensor for one step")
+        split_axes[-1].set_xticks(panel.costs)
+        legend(figure, split_axes[0], first=list(learned))
+
+    table = _cost_table(panel, learned, exact, "aihtr", "AIHTR", digits=3)
+    text = _spoken(panel, learned, exact, digits=1) + (
+        " The axis is broken between the groups of values." if split else ""
+    )
+    title = f"AIHTR against the price of a sensor, {panel.title}; {_n_text(learned)}"
+    return draw(f"aihtr-{panel.name}", title, text, table, 3.9, paint)
+
+
+def regret_against_cost(study: Study, panel: Panel, resamples: int) -> Figure:
+    """Regret per step against c, logarithmic, so that the best are told apart."""
+    learned = _estimates(study, panel, resamples, regret=True)
+    exact = {"Q_MDP": [_qmdp_regret(study, world) for world in panel.worlds]}
+
+    def paint(figure: Canvas) -> None:
+        axes = figure.subplots()
+        _learned_lines(axes, panel, learned, floor=FLOOR)
+        style = LOOKS["Q_MDP"]
+        axes.plot(
+            panel.costs, np.maximum(exact["Q_MDP"], FLOOR), style.line, marker="x", color=style.colour, label="Q_MDP"
+        )
+        for level in ALLOWED:
+            axes.axhline(level, color=INK, linewidth=0.6, linestyle=(0, (1, 2)))
+            axes.annotate(
+                f"{level:g}", (1, level), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=7
+            )
+        axes.set_yscale("log")
+        axes.set_ylabel("regret per step")
+        axes.set_xlabel("c, price of a sensor for one step")
+        axes.set_xticks(panel.costs)
+        tidy(axes)
+        legend(figure, axes, first=list(learned))
+
+    table = _cost_table(panel, learned, exact, "regret", "regret per step", digits=5)
+    title = f"Regret per step to the proved upper bound, {panel.title}; {_n_text(learned)}"
+    return draw(f"regret-{panel.name}", title, _spoken(panel, learned, exact, digits=4), table, 3.4, paint)
+
+
+def _estimates(study: Study, panel: Panel, resamples: int, *, regret: bool) -> dict[str, list[Estimate]]:
+    found = {}
+    for method in study.methods:
+        groups = [
+            study.regrets(world, method) if regret else [run.figure("aihtr") for run in study.of(world, method)]
+            for world in panel.worlds
+        ]
+        if any(groups):
+            kind = "regret" if regret else "aihtr"
+            found[method] = [
+                estimate([group], kind, method, world, resamples=resamples)
+                for group, world in zip(groups, panel.worlds, strict=True)
+            ]
+    return found
+
+
+def _exact(study: Study, panel: Panel, key: str) -> list[float]:
+    """A figure that does not depend on the run; the best of those found."""
+    return [
+        max((value for run in study.in_world(world) if (value := run.figures[key]) is not None), default=math.nan)
+        for world in panel.worlds
+    ]
+
+
+def _qmdp_regret(study: Study, world: str) -> float:
+    run = study.in_world(world)[0]
+    return study.regret(run, world, run.figure("qmdp_aihtr"))
+
+
+def _learned_lines(
+    axes: Axes, panel: Panel, learned: Mapping[str, Sequence[Estimate]], floor: float = -math.inf
+) -> None:
+    """Lines with error bars, a little apart so that the bars can be told from each other."""
+    step = min(np.diff(panel.costs), default=0.02) * 0.04
+    for place, (method, row) in enumerate(learned.items()):
+        style = look(method, place)
+        x = np.asarray(panel.costs) + step * (place - (len(learned) - 1) / 2)
+        mean = np.maximum([e.mean for e in row], floor)
+        low = np.maximum([e.mean if e.low is None else e.low for e in row], floor)
+        high = np.maximum([e.mean if e.high is None else e.high for e in row], floor)
+        bars = np.stack([np.maximum(mean - low, 0), np.maximum(high - mean, 0)])
+        axes.errorbar(
+            x,
+            mean,
+            bars,
+            fmt=style.line,
+            marker=style.marker,
+            color=style.colour,
+            capsize=2,
+            elinewidth=0.9,
+            label=method,
+        )
+
+
+def _split(values: Sequence[float]) -> tuple[float, float, float, float] | None:
+    """Where to break the axis: (lowest, end of the lower part, start of the upper one, highest), None if nowhere.
+
+    It breaks where the widest gap between neighbouring values takes more than half of the axis.
+    """
+    ordered = np.sort([value for value in values if math.isfinite(value)])
+    if len(ordered) < 3:
+        return None
+    gaps = np.diff(ordered)
+    widest = int(gaps.argmax())
+    if gaps[widest] <= 0.5 * (ordered[-1] - ordered[0]):
+        return None
+    return float(ordered[0]), float(ordered[widest]), float(ordered[widest + 1]), float(ordered[-1])
+
+
+def _break(upper: Axes, lower: Axes, bottom: float, lower_end: float, upper_start: float, top: float) -> None:
+    margin = 0.08 * (top - upper_start or 1.0)
+    upper.set_ylim(upper_start - margin, top + margin)
+    small = max(0.25 * (lower_end - bottom), margin)
+    lower.set_ylim(bottom - small, lower_end + small)
+    lower.locator_params(axis="y", nbins=3)
+    upper.spines["bottom"].set_visible(False)
+    upper.tick_params(bottom=False)
+    marks = {"marker": [(-1, -0.6), (1, 0.6)], "markersize": 7, "linestyle": "none", "color": INK, "clip_on": False}
+    upper.plot([0], [0], transform=upper.transAxes, **marks)  # type: ignore[arg-type]
+    lower.plot([0], [1], transform=lower.transAxes, **marks)  # type: ignore[arg-type]
+
+
+def estimate_columns(label: str, digits: int) -> list[Column]:
+    """Columns for what `parts` gives."""
+    return [Column(label, digits), Column("95 % from", digits), Column("to", digits), Column("n")]
+
+
+def parts(e: Estimate) -> list[float | int | None]:
+    """Mean, interval and n as cells."""
+    return [e.mean, e.low, e.high, e.n]
+
+
+def _cost_table(
+    panel: Panel,
+    learned: Mapping[str, Sequence[Estimate]],
+    exact: Mapping[str, Sequence[float]],
+    kind: str,
+    label: str,
+    digits: int,
+) -> Table:
+    rows: list[list[float | int | str | None]] = []
+    for place, cost in enumerate(panel.costs):
+        rows += [[cost, method, *parts(row[place])] for method, row in learned.items() if row[place].n]
+        rows += [[cost, name, values[place], None, None, None] for name, values in exact.items()]
+    columns = [Column("c", 2), Column("policy or bound"), *estimate_columns(label, digits)]
+    return Table(
+        f"{kind}-{panel.name}", f"{label} by price, {panel.title}: interquartile mean over seeds", columns, rows
+    )
+
+
+def _spoken(
+    panel: Panel, learned: Mapping[str, Sequence[Estimate]], exact: Mapping[str, Sequence[float]], digits: int
+) -> str:
+    lines = {method: [e.mean for e in row] for method, row in learned.items()} | dict(exact)
+    costs = ", ".join(f"{cost:g}" for cost in panel.costs)
+    said = [f"{name}: {', '.join(f'{v:.{digits}f}' for v in values)}" for name, values in lines.items()]
+    return f"At c = {costs}. {'; '.join(said)}."
+
+
+def _n_text(learned: Mapping[str, Sequence[Estimate]]) -> str:
+    """`n = 5 seeds (ppo 2)`: how many runs stand behind a point."""
+    counts = {method: sorted({e.n for e in row if e.n}) for method, row in learned.items()}
+    return "seeds per point: " + ", ".join(
+        f"{m} n = {'–'.join(map(str, (c[0], c[-1])[: len(c)]))}" for m, c in counts.items()
+    )
+
+
+def slug(title: str) -> str:
+    """A title as part of a file's name."""
+    kept = "".join(character if character.isalnum() else "-" for character in title.lower())
+    return "-".join(part for part in kept.split("-") if part) or "all"

@@ -1,0 +1,256 @@
+"""From the folder of a sweep to its results; what cannot be read is named, and the rest is used."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from trackmdp.config import Table, TrainConfig, load_run, to_dict
+from trackmdp.errors import UserError
+from trackmdp.reports import policy
+from trackmdp.reports.grouping import Study, study, world_key
+from trackmdp.reports.results import FIGURES, Motion, Point, Problem, Results, Run
+from trackmdp.solvers import bounds, horizon, qmdp
+from trackmdp.solvers.chains import evaluate
+from trackmdp.world.model import World
+
+__all__ = ["gather", "planned", "run_folders"]
+
+MOST_POINTS = 20
+"""Points kept of a learning curve: evenly spaced in the logarithm of the iteration."""
+
+
+def gather(folder: Path, make_world: Callable[[TrainConfig], World]) -> Results:
+    """Read every run below `folder`.
+
+    Args:
+        folder: of a sweep, perhaps one that is not done.
+        make_world: builds the world of a config.
+
+    Raises:
+        UserError: there is no run at all.
+    """
+    plan = planned(folder)
+    names = run_folders(folder, plan)
+    if not names:
+        raise UserError(f"sweep={folder}: no runs in there, expected the folder of a sweep or of stored results")
+    problems: list[Problem] = []
+    runs, summaries = [], []
+    for name in names:
+        read = _read_run(folder, name)
+        if isinstance(read, Problem):
+            problems.append(read)
+        else:
+            runs.append(read[0])
+            summaries.append(read[1])
+    problems += [*_repeated(runs), *_mixed(runs, summaries)]
+    repeated = {problem.run for problem in _repeated(runs)}
+    runs = [run for run in runs if run.name not in repeated]
+    curves = {run.name: _curve(folder / run.name / "metrics.csv") for run in runs}
+    grouped = study(runs)
+    problems += [Problem(name, "no learning curve") for name, curve in curves.items() if not curve]
+    problems += _missing_seeds(grouped) if plan is None else []  # a plan says what else there should be
+    policies, unread = _policies(folder, grouped)
+    motions, unbuilt = _motions(folder, runs, make_world)
+    manifest = _manifest(plan, summaries)
+    return Results(
+        runs, {n: c for n, c in curves.items() if c}, policies, motions, problems + unread + unbuilt, manifest
+    )
+
+
+def planned(folder: Path) -> Mapping[str, Any] | None:
+    """The content of `sweep.json`, where there is a readable one."""
+    try:
+        plan = json.loads((folder / "sweep.json").read_text(encoding="utf-8"))
+        return plan if isinstance(plan, dict) and isinstance(plan.get("jobs"), list) else None
+    except (OSError, ValueError):
+        return None
+
+
+def run_folders(folder: Path, plan: Mapping[str, Any] | None) -> list[str]:
+    """The runs' folders, relative to the sweep's, in a fixed order: those that were planned, and those found."""
+    listed = [str(job["folder"]) for job in plan["jobs"] if isinstance(job, dict) and "folder" in job] if plan else []
+    named = {_relative(folder, name) for name in listed}
+    marks = ("config.yaml", "failed.json", "summary.json")
+    found = {file.parent.relative_to(folder).as_posix() for mark in marks for file in folder.rglob(mark)}
+    return sorted((named | found) - {"."}, key=_natural)
+
+
+def _relative(folder: Path, name: str) -> str:
+    path = Path(name)
+    for base in (folder.resolve(), folder):
+        if path.is_absolute() and path.is_relative_to(base):
+            return path.relative_to(base).as_posix()
+    return path.as_posix() if (folder / path).is_dir() or not path.is_absolute() else path.name
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in name.split("/")]
+
+
+def _read_run(folder: Path, name: str) -> tuple[Run, Mapping[str, Any]] | Problem:
+    """A run and its summary, or why there is none."""
+    place = folder / name
+    if (place / "failed.json").is_file():
+        return Problem(name, f"failed: {_reason(place / 'failed.json')}")
+    if not place.is_dir() or not (place / "config.yaml").is_file():
+        return Problem(name, "not started")
+    if not (place / "summary.json").is_file():
+        return Problem(name, "cut: it has no summary.json")
+    try:
+        cfg = load_run(place)
+        summary = json.loads((place / "summary.json").read_text(encoding="utf-8"))
+        return Run(name, flatten(to_dict(cfg)), _figures(summary), str(summary["config_sha256"])), summary
+    except UserError as error:
+        return Problem(name, str(error).removeprefix(f"run={place}: "))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        return Problem(name, f"its summary.json cannot be read ({' '.join(str(error).split())})")
+
+
+def _reason(file: Path) -> str:
+    try:
+        return str(json.loads(file.read_text(encoding="utf-8"))["reason"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return "no reason given"
+
+
+def flatten(plain: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Every option by its dotted key."""
+    found: dict[str, Any] = {}
+    for key, value in plain.items():
+        found |= flatten(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return found
+
+
+def _figures(summary: Mapping[str, Any]) -> dict[str, float | None]:
+    best = summary["optimal"] or {"lower": None, "upper": None}
+    raw = {
+        **{key: summary[key] for key in ("frames", "wall_seconds", "cpu_seconds")},
+        **summary["policy"],
+        **{f"qmdp_{key}": value for key, value in summary["qmdp"].items()},
+        **{f"bound_{key}": value for key, value in summary["bounds"].items()},
+        **{f"optimal_{key}": best[key] for key in ("lower", "upper")},
+    }
+    return {key: None if raw[key] is None else float(raw[key]) for key in FIGURES}
+
+
+def _curve(file: Path) -> list[Point]:
+    """The points of a run's `metrics.csv` at which the policy was judged, thinned; none where it cannot be read."""
+    try:
+        with file.open(newline="", encoding="utf-8") as stream:
+            rows = [row for row in csv.DictReader(stream) if row.get("aihtr")]
+        points = [
+            Point(int(row["iteration"]), int(row["frames"]), float(row["seconds"]), float(row["aihtr"])) for row in rows
+        ]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
+    if len(points) <= MOST_POINTS:
+        return points
+    wanted = np.geomspace(1, len(points), MOST_POINTS).round().astype(int) - 1
+    return [points[place] for place in sorted({*wanted.tolist(), len(points) - 1})]
+
+
+def _repeated(runs: Iterable[Run]) -> list[Problem]:
+    """Runs of one and the same config: the first counts."""
+    first: dict[str, str] = {}
+    return [
+        Problem(run.name, f"the same config as {first[run.config_sha256]}, which counts")
+        for run in runs
+        if first.setdefault(run.config_sha256, run.name) != run.name
+    ]
+
+
+def _mixed(runs: Sequence[Run], summaries: Sequence[Mapping[str, Any]]) -> list[Problem]:
+    """Runs made with other versions than most."""
+    texts = [json.dumps(summary.get("versions", {}), sort_keys=True) for summary in summaries]
+    if len(set(texts)) < 2:
+        return []
+    usual = json.loads(Counter(texts).most_common(1)[0][0])
+    found = []
+    for run, text in zip(runs, texts, strict=True):
+        own = json.loads(text)
+        other = [f"{k} {own.get(k, 'unknown')}, most have {usual.get(k)}" for k in usual if own.get(k) != usual.get(k)]
+        if other:
+            found.append(Problem(run.name, f"other versions: {'; '.join(other)}"))
+    return found
+
+
+def _missing_seeds(grouped: Study) -> list[Problem]:
+    """Seeds that a method has in one world and not in another."""
+    found = []
+    for method in grouped.methods:
+        groups = {world: grouped.of(world, method) for world in grouped.worlds}
+        seeds = {run.seed for runs in groups.values() for run in runs}
+        for world, runs in groups.items():
+            missing = sorted(seeds - {run.seed for run in runs})
+            if missing:
+                text = f"seed {', '.join(map(str, missing))} missing" if runs else "no run"
+                found.append(Problem(f"{method}, {world}", text))
+    return found
+
+
+def _policies(folder: Path, grouped: Study) -> tuple[dict[str, policy.Policy], list[Problem]]:
+    """Of each world and method the policy of the run in the middle."""
+    found, problems = {}, []
+    for world in grouped.worlds:
+        for method in grouped.methods:
+            runs = sorted(grouped.of(world, method), key=lambda run: (run.figure("aihtr"), run.seed))
+            if not runs:
+                continue
+            name = runs[(len(runs) - 1) // 2].name
+            try:
+                found[name] = policy.read(folder / name / policy.FILE)
+            except UserError as error:
+                problems.append(Problem(name, str(error).removeprefix(f"{folder / name}/")))
+    return found, problems
+
+
+def _motions(
+    folder: Path, runs: Iterable[Run], make_world: Callable[[TrainConfig], World]
+) -> tuple[dict[str, Motion], list[Problem]]:
+    """Motion and references of each world, from the `kernel.npy` of its first run."""
+    found: dict[str, Motion] = {}
+    seen, problems = set[str](), list[Problem]()
+    for run in runs:
+        if world_key(run) in seen:
+            continue
+        seen.add(world_key(run))
+        try:
+            cfg = load_run(folder / run.name)
+            stored = Table(path=str(folder / run.name / "kernel.npy"))
+            world = make_world(dataclasses.replace(cfg, kernel=stored))
+        except UserError as error:
+            problems.append(Problem(run.name, f"its world cannot be built ({error})"))
+            continue
+        limit, simple = cfg.grid.max_steps, qmdp.solve(world)
+        value = evaluate(world, simple) if limit is None else horizon.evaluate(world, simple, limit)
+        bound = bounds.clocked(world) if limit is None else horizon.clocked(world, limit)
+        found[run.name] = Motion(world.transition, value.value, bound)
+    return found, problems
+
+
+def _manifest(plan: Mapping[str, Any] | None, summaries: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Where the results come from; no path of the machine is kept."""
+    line = plan.get("line", "") if plan else ""
+    words = line.split() if isinstance(line, str) else [str(word) for word in line]
+    return {
+        "line": " ".join(word for word in words if not word.startswith(("hydra.sweep.dir=", "hydra.run.dir="))),
+        "planned": len(plan["jobs"]) if plan else None,
+        "wall_seconds": round(sum(float(summary["wall_seconds"]) for summary in summaries), 1),
+        "cpu_seconds": round(sum(float(summary["cpu_seconds"]) for summary in summaries), 1),
+        "versions": _counted(summary.get("versions") for summary in summaries),
+        "machines": _counted(summary.get("machine") for summary in summaries),
+    }
+
+
+def _counted(entries: Iterable[Any]) -> list[dict[str, Any]]:
+    """The different entries, the most frequent first, with the number of runs that have them."""
+    counts = Counter(json.dumps(entry, sort_keys=True) for entry in entries if entry)
+    return [{"runs": count, **json.loads(text)} for text, count in sorted(counts.items(), key=lambda x: (-x[1], x[0]))]

@@ -1,0 +1,141 @@
+"""Runs in groups: the world a run took place in, the method that learned, and the seed within them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from trackmdp.reports.results import Run
+
+__all__ = ["Study", "study", "world_key"]
+
+ORDER = ("a2c", "hindsight", "ppo", "dqn", "learned_kernel")
+SHORT = {"kernel.support_size": "Z", "cost.sensor": "c", "grid.size": "N", "grid.t_max": "T_max"}
+WORLD = ("grid.", "kernel.", "cost.")
+NOT_METHOD = ("seed", "quiet", "device", "threads", "resume", "init_from")
+NOT_METHOD_GROUPS = ("log.", "checkpoint.", "evaluation.", "optimal.")
+
+
+@dataclass(frozen=True)
+class Study:
+    """Runs by world and method.
+
+    Attributes:
+        runs: all of them.
+        worlds: labels, in order.
+        methods: labels, in order.
+        groups: (world, method) -> its runs, by seed.
+    """
+
+    runs: Sequence[Run]
+    worlds: Sequence[str]
+    methods: Sequence[str]
+    groups: Mapping[tuple[str, str], Sequence[Run]]
+
+    def of(self, world: str, method: str) -> Sequence[Run]:
+        """The runs of a method in a world, one per seed."""
+        return self.groups.get((world, method), ())
+
+    def in_world(self, world: str) -> list[Run]:
+        """All runs in a world."""
+        return [run for method in self.methods for run in self.of(world, method)]
+
+    def upper(self, world: str) -> float:
+        """The best proved upper bound on the AIHTR in a world."""
+        found = [run.figures[key] for run in self.in_world(world) for key in ("optimal_upper", "bound_clocked")]
+        return min(value for value in found if value is not None)
+
+    def lower(self, world: str) -> float | None:
+        """The best AIHTR that the solver attained in a world."""
+        found = [run.figures["optimal_lower"] for run in self.in_world(world)]
+        return max((value for value in found if value is not None), default=None)
+
+    def regret(self, run: Run, world: str, aihtr: float | None = None) -> float:
+        """Distance per step to the best proved upper bound, of the run's policy or of one that earns `aihtr`."""
+        earned = run.figure("aihtr") if aihtr is None else aihtr
+        return (self.upper(world) - earned) / run.figure("expected_length")
+
+    def regrets(self, world: str, method: str) -> list[float]:
+        """Regret per step of each run."""
+        return [self.regret(run, world) for run in self.of(world, method)]
+
+
+def study(runs: Sequence[Run]) -> Study:
+    """Group `runs`; labels name only what differs between them."""
+    varied = _varied(runs)
+    labels = {run.name: (_world_label(run, varied), _method_label(run, varied)) for run in runs}
+    order = {labels[run.name]: _order(run, varied) for run in reversed(runs)}
+    groups: dict[tuple[str, str], list[Run]] = {}
+    for run in sorted(runs, key=lambda run: (order[labels[run.name]], run.seed, run.name)):
+        groups.setdefault(labels[run.name], []).append(run)
+    worlds = dict.fromkeys(world for world, _ in sorted(groups, key=lambda label: order[label][0]))
+    methods = dict.fromkeys(method for _, method in sorted(groups, key=lambda label: order[label][1]))
+    return Study(runs, list(worlds), list(methods), groups)
+
+
+def world_key(run: Run) -> str:
+    """The same for runs in the same world."""
+    return json.dumps({key: value for key, value in run.settings.items() if key.startswith(WORLD)}, sort_keys=True)
+
+
+def _varied(runs: Sequence[Run]) -> list[str]:
+    """Options that tell groups apart: not all the same among the runs of one algorithm, nor the copy of another."""
+    values: dict[str, dict[str, set[str]]] = {}
+    for run in runs:
+        for key, value in run.settings.items():
+            owner = "" if key.startswith(WORLD) else run.algo
+            values.setdefault(key, {}).setdefault(owner, set()).add(json.dumps(value))
+    found = [key for key, owned in values.items() if any(len(each) > 1 for each in owned.values())]
+    found = [key for key in found if key not in NOT_METHOD and not key.startswith(NOT_METHOD_GROUPS)]
+    kept: list[str] = []
+    for key in sorted(found, key=lambda key: (not key.startswith(WORLD), key not in SHORT, key)):
+        if key != "algo.name" and not any(_follows(runs, key, other) for other in kept):
+            kept.append(key)
+    return kept
+
+
+def _follows(runs: Iterable[Run], key: str, other: str) -> bool:
+    """Whether the value of `other` says that of `key`, both of the world or both of the method."""
+    if key.startswith(WORLD) != other.startswith(WORLD):
+        return False
+    seen: dict[str, str] = {}
+    pairs = [(run.algo + json.dumps(run.settings.get(other)), json.dumps(run.settings.get(key))) for run in runs]
+    return all(seen.setdefault(mine, its) == its for mine, its in pairs)
+
+
+def _world_label(run: Run, varied: Sequence[str]) -> str:
+    always = ["kernel.support_size", "cost.sensor"]
+    keys = [*always, *(key for key in varied if key.startswith(WORLD) and key not in always)]
+    named = [f"{_short(key)}={_text(run.settings[key])}" for key in keys if run.settings.get(key) is not None]
+    kernel = run.settings.get("kernel.name")
+    return ", ".join(named if kernel == "random_support" else [str(kernel), *named])
+
+
+def _method_label(run: Run, varied: Sequence[str]) -> str:
+    keys = [key for key in varied if not key.startswith(WORLD) and key in run.settings]
+    return ", ".join([run.algo, *(f"{_short(key)}={_text(run.settings[key])}" for key in keys)])
+
+
+def _order(run: Run, varied: Sequence[str]) -> tuple[Any, Any]:
+    world = [_sortable(run.settings.get(key)) for key in [*SHORT, *varied] if key in SHORT or key.startswith(WORLD)]
+    place = ORDER.index(run.algo) if run.algo in ORDER else len(ORDER)
+    method = [_sortable(run.settings.get(key)) for key in varied if not key.startswith(WORLD)]
+    return world, (place, run.algo, method)
+
+
+def _sortable(value: Any) -> tuple[int, float, str]:
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        return 0, float(value), ""
+    return 1, 0.0, json.dumps(value)
+
+
+def _short(key: str) -> str:
+    return SHORT.get(key) or key.removeprefix("algo.").removeprefix("kernel.").removeprefix("grid.")
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, list):
+        return f"a list of {len(value)}"
+    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,168 @@
+"""Maps of one policy: the sets it senses from each located cell, and what it earns from each start cell."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from trackmdp.reports.policy import Policy
+from trackmdp.reports.results import Motion
+from trackmdp.reports.style import INK, LINE, Figure, draw
+from trackmdp.reports.tables import Cell, Column, Table
+from trackmdp.world.model import Array, BoolArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Canvas
+
+__all__ = ["MOST_CELLS", "policy_map", "value_map"]
+
+MOST_CELLS = 400
+"""Cells of a grid that is still drawn cell by cell."""
+LEVELS = 24
+"""Shades of a colour scale."""
+ON, OFF, IDLE = "#0072b2", "#dcebf4", "#d55e01"
+
+
+def policy_map(name: str, where: str, policy: Policy, motion: Motion) -> Figure | None:
+    """Around each located cell, the sensors that are on after no miss and after one; None for a large grid.
+
+    Where the first set leaves nothing out, a miss cannot happen, and nothing is drawn for it.
+    """
+    cells, choices, _ = policy.chains.shape
+    size = math.isqrt(cells)
+    if cells > MOST_CELLS:
+        return None
+    shown = list(range(min(choices, 2)))
+    possible = _possible(policy, motion, len(shown))
+
+    def paint(figure: Canvas) -> None:
+        for axes, n in zip(np.atleast_1d(figure.subplots(len(shown), 1)), shown, strict=True):
+            _tiles(axes, policy.chains[:, n], possible[n], size, reach=n + 1)
+            axes.set_title("just located (n = 0)" if n == 0 else "after one miss (n = 1)", fontsize=8.5)
+
+    rows: list[list[Cell]] = [
+        [int(x), n, int(policy.chains[x, n].sum()), int(possible[n][x].sum()), _cells_text(policy.chains[x, n], size)]
+        for x in range(cells)
+        for n in range(choices)
+        if n < len(shown) and possible[n][x].any()
+    ]
+    columns = [Column("located in cell"), Column("misses n"), Column("sensors on"), Column("possible cells")]
+    title = f"Sets sensed around each located cell, {where}"
+    table = Table(f"sets-{name}", title, [*columns, Column("cells sensed (row.column)")], rows)
+    reached = [possible[n].any(axis=1) for n in shown]
+    mean = [float(policy.chains[r, n].sum(axis=1).mean()) if r.any() else 0.0 for n, r in enumerate(reached)]
+    unsensed = [
+        float((possible[n] & ~policy.chains[:, n])[r].sum(axis=1).mean()) if r.any() else 0.0
+        for n, r in enumerate(reached)
+    ]
+    text = "Each tile is one located cell and its neighbourhood. " + " ".join(
+        f"At n = {n}: {on:.2f} sensors on, {off:.2f} possible cells left out on average."
+        for n, on, off in zip(shown, mean, unsensed, strict=True)
+    )
+    return draw(f"sets-{name}", title, text, table, 0.4 + 3.9 * len(shown), paint)
+
+
+def value_map(name: str, where: str, policy: Policy, motion: Motion) -> Figure | None:
+    """Exact value per start cell, and what the policy and Q_MDP miss to the clocked bound; None for a large grid."""
+    size = math.isqrt(len(policy.value))
+    if len(policy.value) > MOST_CELLS:
+        return None
+    layers = {
+        "value V(x)": policy.value,
+        "missing to the clocked bound": motion.clocked - policy.value,
+        "the same, Q_MDP": motion.clocked - motion.qmdp,
+    }
+
+    def paint(figure: Canvas) -> None:
+        from matplotlib import colormaps
+        from matplotlib.ticker import MaxNLocator
+
+        parts = figure.subplots(1, 3)
+        for axes, (label, values) in zip(parts, layers.items(), strict=True):
+            colours = colormaps["viridis" if axes is parts[0] else "magma_r"].resampled(LEVELS)
+            shade = axes.pcolormesh(values.reshape(size, size), cmap=colours)
+            axes.invert_yaxis()
+            axes.set_aspect("equal")
+            axes.set_xticks([])
+            axes.set_yticks([])
+            axes.set_title(label, fontsize=6.8)
+            bar = figure.colorbar(shade, ax=axes, orientation="horizontal", pad=0.03, fraction=0.07)
+            bar.ax.tick_params(labelsize=6.5)
+            assert bar.solids is not None
+            bar.solids.set_rasterized(False)  # a page takes no pictures
+            bar.locator = MaxNLocator(3)
+            bar.update_ticks()
+
+    columns = [Column("start cell"), Column("row"), Column("column"), *(Column(label, 3) for label in layers)]
+    rows = [
+        [x, x // size + 1, x % size + 1, *(float(values[x]) for values in layers.values())]
+        for x in range(len(policy.value))
+    ]
+    title = f"Value of each start cell, {where}"
+    text = "; ".join(
+        f"{label}: mean {values.mean():.2f}, from {values.min():.2f} to {values.max():.2f}"
+        for label, values in layers.items()
+    )
+    return draw(f"value-{name}", title, f"{text}.", Table(f"value-{name}", title, columns, rows), 2.1, paint)
+
+
+def _possible(policy: Policy, motion: Motion, steps: int) -> list[BoolArray]:
+    """`[M, M]` each: where the target may be after n misses and one more move."""
+    mass = motion.kernel.toarray()
+    found = []
+    for n in range(steps):
+        found.append(mass > 0)
+        mass = np.where(policy.chains[:, n], 0.0, mass) @ motion.kernel
+    return found
+
+
+def _tiles(axes: Axes, on: BoolArray, possible: BoolArray, size: int, reach: int) -> None:
+    """One tile per located cell, `2 reach + 1` cells wide; cells farther away that are possible widen all tiles."""
+    reach = max(reach, _farthest(possible | on, size))
+    side = 2 * reach + 2
+    groups: dict[str, list[tuple[float, float]]] = {ON: [], OFF: [], IDLE: []}
+    for x in range(size * size):
+        row, column = divmod(x, size)
+        for j in np.flatnonzero(possible[x] | on[x]):
+            down, right = j // size - row, j % size - column
+            colour = IDLE if not possible[x, j] else ON if on[x, j] else OFF
+            groups[colour].append((float(column * side + reach + right), float(row * side + reach + down)))
+    _squares(axes, groups)
+    centres = [(x % size * side + reach + 0.5, x // size * side + reach + 0.5) for x in range(size * size)]
+    axes.plot(*np.array(centres).T, ".", color=INK, markersize=12 / side)
+    axes.set_xlim(-1, size * side)
+    axes.set_ylim(size * side, -1)
+    axes.set_aspect("equal")
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_color(LINE)
+
+
+def _squares(axes: Axes, groups: dict[str, list[tuple[float, float]]]) -> None:
+    """All squares of one colour as one path, which keeps the file small."""
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path
+
+    codes = [Path.MOVETO, Path.LINETO, Path.LINETO, Path.LINETO, Path.CLOSEPOLY]
+    for colour, corners in groups.items():
+        if not corners:
+            continue
+        points = [[(x, y), (x + 0.92, y), (x + 0.92, y + 0.92), (x, y + 0.92), (x, y)] for x, y in corners]
+        path = Path(np.array(points).reshape(-1, 2), codes * len(corners))
+        axes.add_patch(PathPatch(path, facecolor=colour, edgecolor="none"))
+
+
+def _farthest(cells: BoolArray, size: int) -> int:
+    located, sensed = np.nonzero(cells)
+    if not len(located):
+        return 0
+    away = np.maximum(np.abs(located // size - sensed // size), np.abs(located % size - sensed % size))
+    return min(int(away.max()), 3)
+
+
+def _cells_text(on: Array | BoolArray, size: int) -> str:
+    return " ".join(f"{j // size + 1}.{j % size + 1}" for j in np.flatnonzero(on))

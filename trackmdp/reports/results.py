@@ -1,0 +1,280 @@
+"""The results of a sweep, small enough to be kept: what a report is made from, and from nothing else.
+
+`runs.csv` holds one row per finished run, `curves.csv` some points of each learning curve, `policies.npz` one policy
+per world and method, `worlds.npz` the motion and two reference values, `manifest.json` the rest.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import sparse
+
+from trackmdp.durable import whole_file
+from trackmdp.errors import UserError
+from trackmdp.reports.policy import Policy, pack_all, unpack_all
+from trackmdp.world.model import Array
+
+__all__ = ["FIGURES", "FORMAT", "Motion", "Point", "Problem", "Results", "Run", "is_stored", "load", "save"]
+
+FORMAT = "trackmdp results 1"
+FIGURES = (
+    "frames",
+    "wall_seconds",
+    "cpu_seconds",
+    "aihtr",
+    "accuracy",
+    "sensors_per_step",
+    "safe_per_episode",
+    "expected_length",
+    "qmdp_aihtr",
+    "qmdp_accuracy",
+    "bound_paper",
+    "bound_valid",
+    "bound_clocked",
+    "optimal_lower",
+    "optimal_upper",
+)
+"""Columns of `runs.csv` that hold what came out of a run; the others are options."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run.
+
+    Attributes:
+        name: its folder, below that of the sweep.
+        settings: every option by its dotted key; an option of a group stands under `<group>.name`.
+        figures: `FIGURES`, None where a run has none.
+        config_sha256: of its `config.yaml`.
+    """
+
+    name: str
+    settings: Mapping[str, Any]
+    figures: Mapping[str, float | None]
+    config_sha256: str
+
+    @property
+    def algo(self) -> str:
+        """Name of the algorithm."""
+        return str(self.settings["algo.name"])
+
+    @property
+    def seed(self) -> int:
+        """Seed of the run."""
+        return int(self.settings["seed"])
+
+    def figure(self, name: str) -> float:
+        """A figure, nan where the run has none."""
+        value = self.figures[name]
+        return float("nan") if value is None else value
+
+
+@dataclass(frozen=True)
+class Point:
+    """One point of a learning curve."""
+
+    iteration: int
+    frames: int
+    seconds: float
+    aihtr: float
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Something that is not as planned: a run that is missing, or one that is not like the others."""
+
+    run: str
+    text: str
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A world's motion and two references.
+
+    Attributes:
+        kernel: `[M, M]`, sparse.
+        qmdp: `[M]`, exact value of Q_MDP per start cell.
+        clocked: `[M]`, clocked bound per start cell.
+    """
+
+    kernel: sparse.csr_array
+    qmdp: Array
+    clocked: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Results:
+    """All of a sweep.
+
+    Attributes:
+        runs: the finished runs, in a fixed order.
+        curves: learning curve of each run, by its name.
+        policies: of some runs, by their names.
+        motions: of the worlds, by the name of the first run in each.
+        problems: what is missing or mixed.
+        manifest: versions, machines, times, the sweep's own line.
+    """
+
+    runs: Sequence[Run]
+    curves: Mapping[str, Sequence[Point]] = field(default_factory=dict)
+    policies: Mapping[str, Policy] = field(default_factory=dict)
+    motions: Mapping[str, Motion] = field(default_factory=dict)
+    problems: Sequence[Problem] = ()
+    manifest: Mapping[str, Any] = field(default_factory=dict)
+
+
+def is_stored(folder: Path) -> bool:
+    """Whether `folder` holds stored results and not the runs themselves."""
+    try:
+        return json.loads((folder / "manifest.json").read_text(encoding="utf-8"))["format"] == FORMAT
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+
+
+def save(results: Results, folder: Path) -> None:
+    """Write all of it to `folder`; the same results, the same bytes."""
+    index = {run.name: number for number, run in enumerate(results.runs)}
+    common = _common(results.runs)
+    varied = sorted({key for run in results.runs for key in run.settings if key not in common[run.algo]})
+    rows = [
+        [
+            run.name,
+            *(_cell(run.settings[key]) if key in run.settings else "" for key in varied),
+            *("" if run.figures[key] is None else repr(run.figures[key]) for key in FIGURES),
+        ]
+        for run in results.runs
+    ]
+    _write(folder / "runs.csv", _csv(["run", *varied, *FIGURES], rows))
+    points = [
+        [index[name], point.iteration, point.frames, f"{point.seconds:.4g}", f"{point.aihtr:.7g}"]
+        for name, curve in sorted(results.curves.items(), key=lambda item: index[item[0]])
+        for point in curve
+    ]
+    _write(folder / "curves.csv", _csv(["run", "iteration", "frames", "seconds", "aihtr"], points))
+    _write(folder / "policies.npz", pack_all({name: results.policies[name] for name in sorted(results.policies)}))
+    _write(folder / "worlds.npz", _pack_motions(results.motions))
+    manifest = {
+        "format": FORMAT,
+        **results.manifest,
+        "problems": [vars(problem) for problem in results.problems],
+        "settings": common,
+        "config_sha256": {run.name: run.config_sha256 for run in results.runs},
+    }
+    _write(folder / "manifest.json", (json.dumps(manifest, indent=1, ensure_ascii=False) + "\n").encode())
+
+
+def load(folder: Path) -> Results:
+    """Read back what `save` wrote.
+
+    Raises:
+        UserError: a file is missing or damaged.
+    """
+    try:
+        manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
+        common, hashes = manifest.pop("settings"), manifest.pop("config_sha256")
+        problems = [Problem(**entry) for entry in manifest.pop("problems")]
+        del manifest["format"]
+        runs = [_run(row, common, hashes) for row in _rows(folder / "runs.csv")]
+        curves: dict[str, list[Point]] = {}
+        for row in _rows(folder / "curves.csv"):
+            point = Point(int(row["iteration"]), int(row["frames"]), float(row["seconds"]), float(row["aihtr"]))
+            curves.setdefault(runs[int(row["run"])].name, []).append(point)
+        policies = unpack_all((folder / "policies.npz").read_bytes())
+        motions = _unpack_motions((folder / "worlds.npz").read_bytes())
+    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise UserError(f"sweep={folder}: stored results that cannot be read ({reason})") from error
+    return Results(runs, curves, policies, motions, problems, manifest)
+
+
+def _run(row: Mapping[str, str], common: Mapping[str, Any], hashes: Mapping[str, str]) -> Run:
+    own = {key: _value(text) for key, text in row.items() if key not in FIGURES and key != "run" and text != ""}
+    figures = {key: float(row[key]) if row[key] else None for key in FIGURES}
+    algo = own.get("algo.name") or next(iter(common))
+    return Run(row["run"], {**common[algo], **own, "algo.name": algo}, figures, hashes[row["run"]])
+
+
+def _common(runs: Iterable[Run]) -> dict[str, dict[str, Any]]:
+    """Algorithm -> the options that have one value in all of its runs."""
+    found: dict[str, dict[str, Any]] = {}
+    for run in runs:
+        if run.algo not in found:
+            found[run.algo] = dict(run.settings)
+        else:
+            shared = found[run.algo]
+            found[run.algo] = {k: v for k, v in shared.items() if k in run.settings and run.settings[k] == v}
+    several = len(found) > 1
+    return {algo: {k: v for k, v in found[algo].items() if k != "algo.name" or not several} for algo in sorted(found)}
+
+
+def _cell(value: Any) -> str:
+    """Text of a setting, from which `_value` tells a number from a word."""
+    if isinstance(value, str):
+        return json.dumps(value) if _value(value) != value or value == "" else value
+    return json.dumps(value)
+
+
+def _value(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text
+
+
+def _pack_motions(motions: Mapping[str, Motion]) -> bytes:
+    names = sorted(motions)
+    each = [motions[name] for name in names]
+    arrays = {
+        "runs": np.array(names, dtype=np.str_),
+        "cells": np.array([len(m.qmdp) for m in each], dtype=np.int64),
+        "entries": np.array([m.kernel.nnz for m in each], dtype=np.int64),
+        "data": np.concatenate([m.kernel.data for m in each] or [np.zeros(0)]),
+        "indices": np.concatenate([m.kernel.indices for m in each] or [np.zeros(0)]).astype(np.int32),
+        "indptr": np.concatenate([m.kernel.indptr for m in each] or [np.zeros(0)]).astype(np.int32),
+        "qmdp": np.concatenate([m.qmdp for m in each] or [np.zeros(0)]),
+        "clocked": np.concatenate([m.clocked for m in each] or [np.zeros(0)]),
+    }
+    stream = io.BytesIO()
+    np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
+    return stream.getvalue()
+
+
+def _unpack_motions(content: bytes) -> dict[str, Motion]:
+    with np.load(io.BytesIO(content), allow_pickle=False) as stored:
+        arrays = {key: stored[key] for key in stored.files}
+    found, cell, entry = {}, 0, 0
+    for place, name in enumerate(arrays["runs"]):
+        m, nnz = int(arrays["cells"][place]), int(arrays["entries"][place])
+        inner, outer = slice(entry, entry + nnz), slice(cell + place, cell + place + m + 1)
+        rows = (arrays["data"][inner], arrays["indices"][inner], arrays["indptr"][outer])
+        cells = slice(cell, cell + m)
+        kernel = sparse.csr_array(rows, shape=(m, m))
+        found[str(name)] = Motion(kernel, arrays["qmdp"][cells], arrays["clocked"][cells])
+        cell, entry = cell + m, entry + nnz
+    return found
+
+
+def _rows(file: Path) -> list[dict[str, str]]:
+    with file.open(newline="", encoding="utf-8") as stream:
+        return list(csv.DictReader(stream, strict=True))
+
+
+def _csv(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> bytes:
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(head)
+    writer.writerows(rows)
+    return stream.getvalue().encode()
+
+
+def _write(file: Path, content: bytes) -> None:
+    with whole_file(file) as stream:
+        stream.write(content)

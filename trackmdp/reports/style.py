@@ -1,0 +1,195 @@
+"""How figures look and how they are written: the same bytes each time, readable small, in light and in dark."""
+
+from __future__ import annotations
+
+import html
+import io
+import re
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from trackmdp.errors import UserError
+from trackmdp.reports.tables import Table
+
+if TYPE_CHECKING:  # an extra, and a second to import
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Canvas
+
+__all__ = ["INK", "LINE", "PALETTE", "Figure", "Look", "Say", "draw", "legend", "look", "require", "tidy"]
+
+Say: TypeAlias = Callable[[str], None]
+"""Told in a few words what is under way."""
+
+WIDTH = 4.3
+"""Inches; as wide as a phone, so that letters keep their size there."""
+INK, LINE, PAGE = "#1b1b1c", "#c4c4c5", "#fffffe"
+PALETTE = {
+    INK: "text",
+    LINE: "line",
+    PAGE: "page",
+    "#d55e01": "vermilion",
+    "#0072b2": "blue",
+    "#00845c": "green",
+    "#b0518c": "purple",
+    "#5c5c5d": "grey",
+    "#a87900": "amber",
+    "#2a93c9": "sky",
+    "#7a3e00": "brown",
+    "#dcebf4": "pale",
+}
+"""Colours of the files, and their names in the style sheet of the page, where they change with the scheme."""
+_DPI = 200
+
+
+@dataclass(frozen=True)
+class Look:
+    """Colour, marker and line of one curve."""
+
+    colour: str
+    marker: str = ""
+    line: str = "-"
+
+
+LOOKS = {
+    "a2c": Look("#d55e01", "o"),
+    "hindsight": Look("#0072b2", "D"),
+    "ppo": Look("#00845c", "s"),
+    "dqn": Look("#b0518c", "^"),
+    "learned_kernel": Look("#2a93c9", "v"),
+    "Q_MDP": Look("#5c5c5d", "x", "--"),
+    "printed bound": Look("#a87900", "", ":"),
+    "valid bound": Look("#5c5c5d", "", ":"),
+    "clocked bound": Look("#7a3e00", "", "-."),
+    "optimum": Look(INK, "+", "-"),
+}
+_MORE = [Look(colour, marker, "--") for marker in "Pp*h<>" for colour in ("#d55e01", "#0072b2", "#00845c", "#b0518c")]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A finished figure.
+
+    Attributes:
+        name: of its files.
+        title: heading; says what n is.
+        text: what the figure shows, in words, for who cannot see it.
+        table: its numbers.
+        svg, png: contents of the files.
+    """
+
+    name: str
+    title: str
+    text: str
+    table: Table
+    svg: bytes
+    png: bytes
+
+    def html(self) -> str:
+        """For the page: the drawing in the page's colours, its text alternative, its numbers."""
+        drawing = _inline(self.svg.decode(), self.name, self.title, self.text)
+        return (
+            f'<figure id="{self.name}">{drawing}<figcaption>{html.escape(self.title)}</figcaption>'
+            f"<details><summary>Numbers</summary>{self.table.html()}</details></figure>"
+        )
+
+
+def require() -> None:
+    """Raise a `UserError` where matplotlib is not installed."""
+    try:
+        import matplotlib  # noqa: F401
+    except ImportError as error:
+        raise UserError("report: drawing takes matplotlib, expected the extra trackmdp[report] installed") from error
+
+
+def look(label: str, place: int) -> Look:
+    """How a method is drawn: by its algorithm, or where its label says more, by its place."""
+    return LOOKS.get(label) or _MORE[place % len(_MORE)]
+
+
+@contextmanager
+def canvas(height: float, name: str, width: float = WIDTH) -> Iterator[Canvas]:
+    """An empty figure, `width` x `height` inches; `name` keeps the ids of several in one page apart."""
+    import matplotlib
+    from matplotlib.figure import Figure as New
+
+    with matplotlib.rc_context(_settings(name)):
+        yield New(figsize=(width, height), layout="constrained")
+
+
+def draw(name: str, title: str, text: str, table: Table, height: float, paint: Callable[[Canvas], None]) -> Figure:
+    """Paint and write one figure."""
+    svg, png = io.BytesIO(), io.BytesIO()
+    with canvas(height, name) as figure:
+        paint(figure)
+        figure.savefig(svg, format="svg", metadata={"Date": None, "Creator": None})
+        figure.savefig(png, format="png", dpi=_DPI, metadata={"Software": None})
+    return Figure(name, title, text, table, svg.getvalue(), png.getvalue())
+
+
+def tidy(axes: Axes) -> None:
+    """Light grid, no box."""
+    axes.grid(True, color=LINE, linewidth=0.5)
+    axes.set_axisbelow(True)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+
+
+def legend(figure: Canvas, axes: Axes, columns: int = 3, first: Sequence[str] = ()) -> None:
+    """Below the axes, `first` labels first; letters a phone still shows."""
+    handles, labels = axes.get_legend_handles_labels()
+    order = sorted(range(len(labels)), key=lambda place: labels[place] not in first)
+    figure.legend(
+        [handles[place] for place in order],
+        [labels[place] for place in order],
+        loc="outside lower center",
+        ncols=columns,
+        fontsize=7.5,
+        frameon=False,
+        columnspacing=1.2,
+    )
+
+
+def _settings(name: str) -> Any:
+    return {
+        "svg.hashsalt": name,
+        "svg.fonttype": "none",
+        "font.family": "DejaVu Sans",
+        "font.size": 8.5,
+        "axes.labelsize": 8.5,
+        "xtick.labelsize": 8,
+        "ytick.labelsize": 8,
+        "text.color": INK,
+        "axes.labelcolor": INK,
+        "axes.edgecolor": INK,
+        "axes.linewidth": 0.6,
+        "xtick.color": INK,
+        "ytick.color": INK,
+        "figure.facecolor": PAGE,
+        "axes.facecolor": PAGE,
+        "savefig.facecolor": PAGE,
+        "lines.linewidth": 1.4,
+        "lines.markersize": 4.5,
+        "axes.unicode_minus": True,
+    }
+
+
+def _inline(svg: str, name: str, title: str, text: str) -> str:
+    """The drawing as part of a page."""
+    body = svg[svg.index("<svg") :]
+    body = re.sub(r"<metadata>.*?</metadata>", "", body, flags=re.DOTALL)
+    body = re.sub(r"<style.*?</style>", "", body, flags=re.DOTALL)
+    view = re.search(r'viewBox="([^"]+)"', body)
+    assert view
+    _, _, rest = body.partition(">")
+    for colour, variable in PALETTE.items():
+        rest = rest.replace(colour, f"var(--{variable})")
+    rest = re.sub(r"\n\s*", "\n", rest)
+    head = (
+        f'<svg class="chart" role="img" viewBox="{view[1]}" xmlns="http://www.w3.org/2000/svg" '
+        f'xmlns:xlink="http://www.w3.org/1999/xlink" aria-labelledby="{name}-t {name}-d">'
+    )
+    return (
+        f'{head}<title id="{name}-t">{html.escape(title)}</title><desc id="{name}-d">{html.escape(text)}</desc>{rest}'
+    )

@@ -1,0 +1,131 @@
+"""One table, three forms: HTML that sorts, CSV to the last digit, LaTeX to be pasted."""
+
+from __future__ import annotations
+
+import csv
+import html
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+__all__ = ["Cell", "Column", "Table"]
+
+Cell: TypeAlias = "float | int | str | bool | None"
+
+_LATEX = {"&": r"\&", "%": r"\%", "#": r"\#", "_": r"\_", "≤": r"$\le$", "±": r"$\pm$", "–": "--", "²": "$^2$"}
+
+
+@dataclass(frozen=True)
+class Column:
+    """Heading, unit and format of a column.
+
+    Attributes:
+        label: heading.
+        digits: decimals of a number; None for as they are.
+        unit: shown in the heading.
+        judged: whether yes is good and no is bad, and is shown so.
+    """
+
+    label: str
+    digits: int | None = None
+    unit: str = ""
+    judged: bool = False
+
+    @property
+    def heading(self) -> str:
+        """Label and unit."""
+        return f"{self.label} ({self.unit})" if self.unit else self.label
+
+    def text(self, value: Cell) -> str:
+        """A cell as it is shown."""
+        if value is None or (isinstance(value, float) and math.isnan(value)):
+            return "–"
+        if isinstance(value, bool):
+            return "yes" if value else "no"
+        if isinstance(value, str):
+            return value
+        if self.digits is None:
+            return f"{value:,}" if isinstance(value, int) else f"{value:g}"
+        shown = f"{value:,.{self.digits}f}"
+        zero = f"{0.0:,.{self.digits}f}"
+        return zero if shown.lstrip("+-") == zero else shown.replace("-", "−")
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows under columns; `name` is that of its files, `caption` says what it shows, with n."""
+
+    name: str
+    caption: str
+    columns: Sequence[Column]
+    rows: Sequence[Sequence[Cell]]
+
+    def csv(self) -> str:
+        """All digits; an empty field where there is nothing."""
+        stream = io.StringIO()
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow([column.heading for column in self.columns])
+        for row in self.rows:
+            writer.writerow([_plain(value) for value in row])
+        return stream.getvalue()
+
+    def latex(self) -> str:
+        """A `tabular` with horizontal rules; it needs no package."""
+        align = "".join("l" if self._is_text(place) else "r" for place in range(len(self.columns)))
+        head = " & ".join(rf"\textbf{{{_escape(column.heading)}}}" for column in self.columns)
+        body = [" & ".join(_escape(c.text(v)) for c, v in zip(self.columns, row, strict=True)) for row in self.rows]
+        lines = [rf"{line} \\" for line in body]
+        return "\n".join(
+            [
+                f"% {self.caption}",
+                rf"\begin{{tabular}}{{{align}}}",
+                r"\hline",
+                rf"{head} \\",
+                r"\hline",
+                *lines,
+                r"\hline",
+                r"\end{tabular}",
+                "",
+            ]
+        )
+
+    def html(self) -> str:
+        """A table whose columns sort when their heading's button is pressed."""
+        heads = "".join(
+            f'<th scope="col"{self._side(place)}><button type="button">{html.escape(column.heading)}</button></th>'
+            for place, column in enumerate(self.columns)
+        )
+        rows = "\n".join(f"<tr>{self._cells(row)}</tr>" for row in self.rows)
+        caption = html.escape(self.caption)
+        return (
+            f'<div class="scroll" tabindex="0" role="region" aria-label="{caption}"><table class="sortable">'
+            f"<caption>{caption}</caption><thead><tr>{heads}</tr></thead>\n<tbody>{rows}</tbody></table></div>"
+        )
+
+    def _cells(self, row: Sequence[Cell]) -> str:
+        cells = []
+        for place, (column, value) in enumerate(zip(self.columns, row, strict=True)):
+            text = html.escape(column.text(value))
+            mark = f' class="{text}"' if isinstance(value, bool) and column.judged else ""
+            number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+            sort = f' data-v="{value!r}"' if number else ""
+            cells.append(f"<td{mark or self._side(place)}{sort}>{text}</td>")
+        return "".join(cells)
+
+    def _side(self, place: int) -> str:
+        return "" if self._is_text(place) else ' class="n"'
+
+    def _is_text(self, place: int) -> bool:
+        return all(isinstance(row[place], (str, bool)) for row in self.rows if row[place] is not None)
+
+
+def _plain(value: Cell) -> Any:
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return ""
+    return repr(value) if isinstance(value, float) else value
+
+
+def _escape(text: str) -> str:
+    return "".join(_LATEX.get(character, character) for character in text.replace("\\", r"\textbackslash "))

@@ -1,0 +1,193 @@
+"""All runs of a sweep at the terminal while they run, from what they leave on the disk."""
+
+from __future__ import annotations
+
+import csv
+import fcntl
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from trackmdp.errors import UserError
+from trackmdp.reports.gather import planned, run_folders
+
+__all__ = ["Status", "look", "watch"]
+
+WAITING, RUNNING, CUT, FAILED, DONE = "waiting", "running", "cut", "failed", "done"
+TAIL = 4096
+"""Bytes read from the end of `metrics.csv`."""
+
+
+@dataclass(frozen=True)
+class Status:
+    """Where a run is.
+
+    Attributes:
+        name: its folder.
+        state: waiting, running, cut, failed or done.
+        share: of its iterations, 0 to 1.
+        gap: AIHTR missing to the upper bound, None while unknown.
+        left: seconds to go, None while unknown.
+        reason: why it failed.
+    """
+
+    name: str
+    state: str
+    share: float = 0.0
+    gap: float | None = None
+    left: float | None = None
+    reason: str = ""
+
+
+def watch(sweep: Path, console: Console, every: float) -> int:
+    """Show the runs until none is waiting or running; returns how many are done.
+
+    At a terminal a table stays in place; piped, a line comes for each run that has changed its state.
+
+    Raises:
+        UserError: there are no runs.
+    """
+    found = look(sweep)
+    if not found:
+        raise UserError(f"sweep={sweep}: no runs in there, expected the folder of a sweep")
+    if console.is_terminal:
+        found = _live(sweep, console, every, found)
+    else:
+        found = _lines(sweep, console, every, found)
+    return sum(status.state == DONE for status in found)
+
+
+def look(sweep: Path) -> list[Status]:
+    """The runs as they are now."""
+    return [_status(sweep / name, name) for name in run_folders(sweep, planned(sweep))]
+
+
+def _live(sweep: Path, console: Console, every: float, found: list[Status]) -> list[Status]:
+    with Live(_table(found, console.height), console=console, auto_refresh=False) as live:
+        while _going(found):
+            time.sleep(every)
+            found = look(sweep)
+            live.update(_table(found, console.height), refresh=True)
+    return found
+
+
+def _lines(sweep: Path, console: Console, every: float, found: list[Status]) -> list[Status]:
+    said: dict[str, str] = {}
+    while True:
+        for status in found:
+            if status.state != WAITING and said.get(status.name) != status.state:
+                said[status.name] = status.state
+                console.print(_line(status), markup=False)
+        if not _going(found):
+            break
+        time.sleep(every)
+        found = look(sweep)
+    console.print(_counts(found), markup=False)
+    return found
+
+
+def _going(found: Sequence[Status]) -> bool:
+    """Whether anything is left to wait for: a run under way, or one that has not begun."""
+    return any(status.state in (WAITING, RUNNING) for status in found)
+
+
+def _status(place: Path, name: str) -> Status:
+    if (place / "failed.json").is_file():
+        return Status(name, FAILED, reason=str(_json(place / "failed.json").get("reason", "")))
+    summary, plan, last = _json(place / "summary.json"), _json(place / "plan.json"), _last_rows(place / "metrics.csv")
+    upper = plan.get("upper_bound")
+    if summary:
+        aihtr, best = summary.get("policy", {}).get("aihtr"), (summary.get("optimal") or {}).get("upper")
+        bounds = [bound for bound in (upper, best) if bound is not None]
+        return Status(name, DONE, 1.0, min(bounds) - aihtr if bounds and aihtr is not None else None, 0.0)
+    if not (place / "config.yaml").is_file():
+        return Status(name, WAITING)
+    state = RUNNING if _held(place / ".lock") else CUT
+    if not last:
+        return Status(name, state)
+    share = min(1.0, float(last[-1]["iteration"]) / plan["iterations"]) if plan.get("iterations") else 0.0
+    judged = [float(row["aihtr"]) for row in last if row.get("aihtr")]
+    gap = upper - judged[-1] if judged and upper is not None else None
+    left = float(last[-1]["seconds"]) * (1 - share) / share if share else None
+    return Status(name, state, share, gap, left)
+
+
+def _json(file: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+        return content if isinstance(content, dict) else {}
+    except (OSError, ValueError):
+        return {}
+
+
+def _last_rows(file: Path) -> list[dict[str, str]]:
+    """The last whole rows of a table that is being written."""
+    try:
+        with file.open("rb") as stream:
+            head = stream.readline().decode()
+            begin = max(stream.tell(), file.stat().st_size - TAIL)
+            cut = begin > stream.tell()
+            stream.seek(begin)
+            lines = stream.read().decode(errors="replace").split("\n")
+    except OSError:
+        return []
+    lines = lines[1 if cut else 0 : -1]  # the last one may be half written
+    names = next(csv.reader([head]), [])
+    rows = [dict(zip(names, row, strict=False)) for row in csv.reader(lines)]
+    return [row for row in rows if len(row) == len(names) and row.get("iteration", "").isdigit() and row.get("seconds")]
+
+
+def _held(file: Path) -> bool:
+    """Whether a process holds the run's lock."""
+    try:
+        with file.open("r") as stream:
+            fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    return False
+
+
+def _table(found: Sequence[Status], height: int) -> Group:
+    shown = Table(expand=False)
+    for label in ("run", "state", "progress", "gap", "left"):
+        shown.add_column(label, justify="left" if label in ("run", "state") else "right")
+    order = {RUNNING: 0, FAILED: 1, CUT: 2, WAITING: 3, DONE: 4}
+    room = max(3, height - 6)
+    ordered = sorted(found, key=lambda status: order[status.state])
+    for status in ordered[:room]:
+        shown.add_row(Text(status.name), Text(status.reason or status.state), *_figures(status))
+    more = [Text(f"and {len(found) - room} more")] if len(found) > room else []
+    return Group(shown, *more, Text(_counts(found)))
+
+
+def _figures(status: Status) -> tuple[str, str, str]:
+    gap = "" if status.gap is None else f"{status.gap:,.2f}"
+    left = "" if status.left is None or status.state != RUNNING else f"{status.left:,.0f} s"
+    return f"{100 * status.share:.0f} %", gap, left
+
+
+def _line(status: Status) -> str:
+    share, gap, left = _figures(status)
+    words = [f"{status.name}: {status.state}"]
+    if status.reason:
+        words.append(status.reason)
+    if status.state in (RUNNING, CUT):
+        words.append(share)
+    words += [f"gap {gap}"] * bool(gap) + [f"{left} left"] * bool(left)
+    return ", ".join(words)
+
+
+def _counts(found: Sequence[Status]) -> str:
+    states = [status.state for status in found]
+    parts = [f"{states.count(state)} {state}" for state in (DONE, RUNNING, FAILED, CUT, WAITING) if state in states]
+    return f"{len(found)} runs: {', '.join(parts)}"
