@@ -13,6 +13,7 @@ from trackmdp.config import (
     CommandConfig,
     EvaluateConfig,
     ExportConfig,
+    ReportConfig,
     WorldConfig,
     from_hydra,
     load_run,
@@ -38,7 +39,7 @@ def typed_config(command: str, cfg: DictConfig, folder: Path) -> CommandConfig:
 
 
 def check_files(cfg: CommandConfig, task: Sequence[str]) -> None:
-    """Check what the config names: runs, tables of motion and prices.
+    """Check what the config names: runs, sweeps, tables of motion and prices.
 
     Args:
         cfg: the typed config.
@@ -55,6 +56,8 @@ def check_files(cfg: CommandConfig, task: Sequence[str]) -> None:
         load_run(cfg.run)
     elif isinstance(cfg, ExportConfig):
         load_run(cfg.run)
+    elif isinstance(cfg, ReportConfig) and not Path(cfg.sweep).is_dir():
+        raise UserError(f"sweep={cfg.sweep}: no such folder")
     elif isinstance(cfg, WorldConfig) and _reads_files(cfg):
         from trackmdp.build import make_setting
 

@@ -8,7 +8,6 @@ from rich.console import Console
 
 from trackmdp.build import make_world
 from trackmdp.config import ReportConfig
-from trackmdp.errors import UserError
 from trackmdp.reports import openings, results, style, watch
 from trackmdp.reports.gather import gather
 from trackmdp.reports.grouping import study
@@ -29,8 +28,6 @@ def run(cfg: ReportConfig, folder: Path) -> float:
         UserError: there is no sweep to report on, or matplotlib is not installed.
     """
     sweep, console = Path(cfg.sweep), make_console(cfg.quiet)
-    if not sweep.is_dir():
-        raise UserError(f"sweep={sweep}: no such folder")
     if cfg.watch:
         return float(watch.watch(sweep, console, cfg.every))
     style.require()

@@ -130,15 +130,11 @@ def flatten(plain: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _figures(summary: Mapping[str, Any]) -> dict[str, float | None]:
-    best = summary["optimal"] or {"lower": None, "upper": None}
-    raw = {
-        **{key: summary[key] for key in ("frames", "wall_seconds", "cpu_seconds")},
-        **summary["policy"],
-        **{f"qmdp_{key}": value for key, value in summary["qmdp"].items()},
-        **{f"bound_{key}": value for key, value in summary["bounds"].items()},
-        **{f"optimal_{key}": best[key] for key in ("lower", "upper")},
-    }
-    return {key: None if raw[key] is None else float(raw[key]) for key in FIGURES}
+    """`FIGURES` of a summary; on recorded tracks there is no Q_MDP, no bound and no optimum."""
+    groups = {"qmdp": summary["qmdp"], "bound": summary["bounds"], "optimal": summary["optimal"]}
+    raw = {key: summary[key] for key in ("frames", "wall_seconds", "cpu_seconds")} | summary["policy"]
+    raw |= {f"{group}_{key}": value for group, values in groups.items() for key, value in (values or {}).items()}
+    return {key: None if raw.get(key) is None else float(raw[key]) for key in FIGURES}
 
 
 def _curve(file: Path) -> list[Point]:
@@ -222,6 +218,8 @@ def _motions(
         if world_key(run) in seen:
             continue
         seen.add(world_key(run))
+        if run.settings["kernel.name"] == "tracks":
+            continue  # no motion is known there
         try:
             cfg = load_run(folder / run.name)
             stored = Table(path=str(folder / run.name / "kernel.npy"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -43,9 +44,9 @@ class Study:
         return [run for method in self.methods for run in self.of(world, method)]
 
     def upper(self, world: str) -> float:
-        """The best proved upper bound on the AIHTR in a world."""
+        """The best proved upper bound on the AIHTR in a world; nan where there is none, as on recorded tracks."""
         found = [run.figures[key] for run in self.in_world(world) for key in ("optimal_upper", "bound_clocked")]
-        return min(value for value in found if value is not None)
+        return min((value for value in found if value is not None), default=math.nan)
 
     def lower(self, world: str) -> float | None:
         """The best AIHTR that the solver attained in a world."""
@@ -58,8 +59,9 @@ class Study:
         return (self.upper(world) - earned) / run.figure("expected_length")
 
     def regrets(self, world: str, method: str) -> list[float]:
-        """Regret per step of each run."""
-        return [self.regret(run, world) for run in self.of(world, method)]
+        """Regret per step of each run; none where no bound is known."""
+        known = not math.isnan(self.upper(world))
+        return [self.regret(run, world) for run in self.of(world, method)] if known else []
 
 
 def study(runs: Sequence[Run]) -> Study:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -69,9 +70,12 @@ def curves(study: Study, points: Mapping[str, Sequence[Point]], by: str, resampl
     return draw(f"learning-{by}", title, f"Regret per step at the end: {ends} {unit}.", table, 3.3, paint)
 
 
-def profiles(study: Study, resamples: int) -> Figure:
+def profiles(study: Study, resamples: int) -> Figure | None:
     """The share of runs whose regret is at most τ."""
-    groups = {m: [study.regrets(world, m) for world in study.worlds] for m in study.methods}
+    regrets = {m: [study.regrets(world, m) for world in study.worlds] for m in study.methods}
+    groups = {method: groups for method, groups in regrets.items() if any(groups)}
+    if not groups:
+        return None
     everything = np.array([value for method in groups.values() for group in method for value in group])
     levels = np.geomspace(1e-4, max(1.0, float(everything.max()) * 1.05), 60)
     found = {m: profile(g, levels, "profile", m, resamples=resamples) for m, g in groups.items()}
@@ -107,6 +111,8 @@ def profiles(study: Study, resamples: int) -> Figure:
 
 def _steps(study: Study, run: Run, world: str, curves: Mapping[str, Sequence[Point]], by: str) -> Array:
     """`[points, 2]` position and regret of one run; of several points at one position the last counts."""
+    if math.isnan(study.upper(world)):
+        return np.zeros((0, 2))
     last = {float(getattr(p, by)): study.regret(run, world, p.aihtr) for p in curves.get(run.name, ())}
     return np.array(sorted(last.items()))
 

@@ -89,7 +89,9 @@ def build(
     _maps(report, results, grouped, chosen)
     if openings:
         _openings(report, grouped, chosen, openings)
-    report.section("runs", "All runs", _folded("Table of all runs", verdicts.runs_table(grouped), report))
+    groups, runs = verdicts.groups_table(grouped, resamples), verdicts.runs_table(grouped)
+    folded = [_folded("By world and method", groups, report), _folded("Every run", runs, report)]
+    report.section("runs", "All runs", *folded)
     report.section("made", "How it was made", _made(results.manifest, resamples))
     return report
 
@@ -148,11 +150,9 @@ def _against_cost(report: Report, grouped: Study, chosen: dict[tuple[int, float]
 
 def _learning(report: Report, results: Results, grouped: Study, resamples: int) -> None:
     drawn = [learning.curves(grouped, results.curves, by, resamples) for by in ("frames", "seconds")]
-    report.section(
-        "learning",
-        "Learning curves and profiles",
-        [*(figure for figure in drawn if figure), learning.profiles(grouped, resamples)],
-    )
+    shown = [figure for figure in (*drawn, learning.profiles(grouped, resamples)) if figure]
+    if shown:
+        report.section("learning", "Learning curves and profiles", shown)
 
 
 def _maps(report: Report, results: Results, grouped: Study, chosen: dict[tuple[int, float], str]) -> None:

@@ -13,7 +13,16 @@ from trackmdp.reports.results import Problem
 from trackmdp.reports.statistics import estimate
 from trackmdp.reports.tables import Cell, Column, Table
 
-__all__ = ["Goal", "acceptance_table", "accuracy_table", "goals", "methods_table", "missing_table", "runs_table"]
+__all__ = [
+    "Goal",
+    "acceptance_table",
+    "accuracy_table",
+    "goals",
+    "groups_table",
+    "methods_table",
+    "missing_table",
+    "runs_table",
+]
 
 PAPERS, DEFAULT = "a2c", "hindsight"
 PAPERS_LIMIT, DEFAULT_LIMIT = 0.02, 0.01
@@ -102,7 +111,7 @@ def methods_table(study: Study, resamples: int) -> Table:
     rows: list[list[Cell]] = []
     for method in study.methods:
         groups = [study.regrets(world, method) for world in study.worlds]
-        everything = np.concatenate([group for group in groups if group])
+        everything = np.array([regret for group in groups for regret in group] or [np.nan])
         found = estimate(groups, "regret", method, resamples=resamples)
         runs = [run for world in study.worlds for run in study.of(world, method)]
         row: list[Cell] = [
@@ -123,6 +132,25 @@ def methods_table(study: Study, resamples: int) -> Table:
     columns += [Column("wall", 1, "s"), Column("CPU", 1, "s")]
     caption = "All methods: regret per step over worlds and seeds (n runs), and what a run takes on average"
     return Table("methods", caption, columns, rows)
+
+
+def groups_table(study: Study, resamples: int) -> Table:
+    """Each method in each world, its seeds together."""
+    rows: list[list[Cell]] = []
+    for world in study.worlds:
+        for method in study.methods:
+            runs = study.of(world, method)
+            if not runs:
+                continue
+            earned = estimate([[r.figure("aihtr") for r in runs]], "aihtr", method, world, resamples=resamples)
+            regret = estimate([study.regrets(world, method)], "regret", method, world, resamples=resamples)
+            rest = [float(np.mean([r.figure(key) for r in runs])) for key in ("accuracy", "sensors_per_step")]
+            row: list[Cell] = [world, method, len(runs), earned.mean, earned.low, earned.high]
+            rows.append([*row, regret.mean, regret.low, regret.high, 100 * rest[0], rest[1]])
+    columns = [Column("world"), Column("method"), Column("n"), Column("AIHTR, IQM", 3), Column("95 % from", 3)]
+    columns += [Column("to", 3), Column("regret per step, IQM", 4), Column("95 % from", 4), Column("to", 4)]
+    columns += [Column("accuracy", 2, "%"), Column("sensors per step", 3)]
+    return Table("groups", "Every world and method: interquartile means over n seeds", columns, rows)
 
 
 def runs_table(study: Study) -> Table:

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import csv
-import fcntl
-import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -18,6 +15,7 @@ from rich.text import Text
 
 from trackmdp.errors import UserError
 from trackmdp.reports.gather import planned, run_folders
+from trackmdp.sweep.state import read_json, run_of
 
 __all__ = ["Status", "look", "watch"]
 
@@ -48,7 +46,7 @@ class Status:
 
 
 def watch(sweep: Path, console: Console, every: float) -> int:
-    """Show the runs until none is waiting or running; returns how many are done.
+    """Show the runs until nothing is left to wait for; returns how many are done.
 
     At a terminal a table stays in place; piped, a line comes for each run that has changed its state.
 
@@ -72,7 +70,7 @@ def look(sweep: Path) -> list[Status]:
 
 def _live(sweep: Path, console: Console, every: float, found: list[Status]) -> list[Status]:
     with Live(_table(found, console.height), console=console, auto_refresh=False) as live:
-        while _going(found):
+        while _going(sweep, found):
             time.sleep(every)
             found = look(sweep)
             live.update(_table(found, console.height), refresh=True)
@@ -86,7 +84,7 @@ def _lines(sweep: Path, console: Console, every: float, found: list[Status]) -> 
             if status.state != WAITING and said.get(status.name) != status.state:
                 said[status.name] = status.state
                 console.print(_line(status), markup=False)
-        if not _going(found):
+        if not _going(sweep, found):
             break
         time.sleep(every)
         found = look(sweep)
@@ -94,38 +92,29 @@ def _lines(sweep: Path, console: Console, every: float, found: list[Status]) -> 
     return found
 
 
-def _going(found: Sequence[Status]) -> bool:
-    """Whether anything is left to wait for: a run under way, or one that has not begun."""
-    return any(status.state in (WAITING, RUNNING) for status in found)
+def _going(sweep: Path, found: Sequence[Status]) -> bool:
+    """Whether anything is left to wait for: a run under way, or one that the sweep, still running, has to begin."""
+    states = {status.state for status in found}
+    return RUNNING in states or (bool(states & {WAITING, CUT}) and run_of(sweep).state == RUNNING)
 
 
 def _status(place: Path, name: str) -> Status:
-    if (place / "failed.json").is_file():
-        return Status(name, FAILED, reason=str(_json(place / "failed.json").get("reason", "")))
-    summary, plan, last = _json(place / "summary.json"), _json(place / "plan.json"), _last_rows(place / "metrics.csv")
-    upper = plan.get("upper_bound")
-    if summary:
-        aihtr, best = summary.get("policy", {}).get("aihtr"), (summary.get("optimal") or {}).get("upper")
+    found, plan = run_of(place), read_json(place / "plan.json")
+    if found.state == FAILED:
+        return Status(name, FAILED, reason=found.reason)
+    upper, last = plan.get("upper_bound"), _last_rows(place / "metrics.csv")
+    if found.state == DONE:
+        summary = read_json(place / "summary.json")
+        earned, best = summary.get("policy", {}).get("aihtr"), (summary.get("optimal") or {}).get("upper")
         bounds = [bound for bound in (upper, best) if bound is not None]
-        return Status(name, DONE, 1.0, min(bounds) - aihtr if bounds and aihtr is not None else None, 0.0)
-    if not (place / "config.yaml").is_file():
-        return Status(name, WAITING)
-    state = RUNNING if _held(place / ".lock") else CUT
+        return Status(name, DONE, 1.0, min(bounds) - earned if bounds and earned is not None else None, 0.0)
     if not last:
-        return Status(name, state)
+        return Status(name, found.state)
     share = min(1.0, float(last[-1]["iteration"]) / plan["iterations"]) if plan.get("iterations") else 0.0
     judged = [float(row["aihtr"]) for row in last if row.get("aihtr")]
     gap = upper - judged[-1] if judged and upper is not None else None
     left = float(last[-1]["seconds"]) * (1 - share) / share if share else None
-    return Status(name, state, share, gap, left)
-
-
-def _json(file: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-        return content if isinstance(content, dict) else {}
-    except (OSError, ValueError):
-        return {}
+    return Status(name, found.state, share, gap, left)
 
 
 def _last_rows(file: Path) -> list[dict[str, str]]:
@@ -143,18 +132,6 @@ def _last_rows(file: Path) -> list[dict[str, str]]:
     names = next(csv.reader([head]), [])
     rows = [dict(zip(names, row, strict=False)) for row in csv.reader(lines)]
     return [row for row in rows if len(row) == len(names) and row.get("iteration", "").isdigit() and row.get("seconds")]
-
-
-def _held(file: Path) -> bool:
-    """Whether a process holds the run's lock."""
-    try:
-        with file.open("r") as stream:
-            fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:
-        return False
-    return False
 
 
 def _table(found: Sequence[Status], height: int) -> Group:
