@@ -11,8 +11,8 @@ import torch
 from rich.console import Console
 from tensordict.nn import TensorDictModuleBase
 
-from trackmdp.build import make_baseline, make_device, make_world
-from trackmdp.commands import playback
+from trackmdp.build import make_baseline, make_device, make_setting
+from trackmdp.commands import held_out, playback
 from trackmdp.commands.trained import trained
 from trackmdp.config import EvaluateConfig, Mcap, Playback, RandomK, load_run, to_yaml
 from trackmdp.episodes.log import EpisodeLog
@@ -28,6 +28,7 @@ from trackmdp.training.evaluate import Simulation, simulate
 from trackmdp.training.judge import Judge, Verdict, figures
 from trackmdp.training.metrics import write_json, write_text
 from trackmdp.world.model import World
+from trackmdp.world.tracks import Recorded, Setting
 
 __all__ = ["run"]
 
@@ -40,6 +41,8 @@ def run(cfg: EvaluateConfig, folder: Path) -> float:
     if cfg.run is None and isinstance(cfg.baseline, Playback):
         return playback.run(cfg, folder, console, device)
     world, max_steps, chains, subject = _trained(cfg, device) if cfg.run else _baseline(cfg)
+    if isinstance(world, Recorded):
+        return held_out.run(world, max_steps, chains, subject, folder, console, cfg.seed)
     judge = Judge(world, max_steps)
     verdict = judge.score(chains)
     simulation = None
@@ -89,15 +92,15 @@ def _log_episodes(
         console.print(f"{log.episodes} episodes in {log.file}", markup=False)
 
 
-def _trained(cfg: EvaluateConfig, device: torch.device) -> tuple[World, int | None, np.ndarray, str]:
+def _trained(cfg: EvaluateConfig, device: torch.device) -> tuple[Setting, int | None, np.ndarray, str]:
     assert cfg.run is not None
     policy = trained(cfg.run, device)
     return policy.world, policy.max_steps, policy.chains, policy.subject
 
 
-def _baseline(cfg: EvaluateConfig) -> tuple[World, int | None, np.ndarray, str]:
+def _baseline(cfg: EvaluateConfig) -> tuple[Setting, int | None, np.ndarray, str]:
     assert cfg.baseline is not None
-    world = make_world(cfg)
+    world = make_setting(cfg)
     return world, cfg.grid.max_steps, make_baseline(cfg.baseline, world), cfg.baseline.name
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import math
 from contextlib import ExitStack
 from pathlib import Path
@@ -13,9 +14,9 @@ import numpy as np
 import torch
 from rich.console import Console
 
-from trackmdp.build import make_algorithm, make_collector, make_device, make_world
-from trackmdp.commands.summary import config_text
+from trackmdp.build import make_algorithm, make_collector, make_device, make_setting
 from trackmdp.config import Mcap, TrainConfig
+from trackmdp.config.resume import config_text
 from trackmdp.episodes.log import EpisodeLog
 from trackmdp.episodes.record import Chains
 from trackmdp.errors import UserError
@@ -23,11 +24,13 @@ from trackmdp.seeding import seed_global
 from trackmdp.training import checkpoint, memory
 from trackmdp.training.display import Display
 from trackmdp.training.evaluate import chains_of
-from trackmdp.training.judge import Judge, Verdict
+from trackmdp.training.held_out import make_judge
+from trackmdp.training.judge import Verdict
 from trackmdp.training.loop import Intervals, Position, train
 from trackmdp.training.metrics import MetricsLog, write_bytes, write_json, write_text
 from trackmdp.training.state import capture, find, restore, take_weights
-from trackmdp.world.model import BoolArray, World
+from trackmdp.world.model import Array, BoolArray, World
+from trackmdp.world.tracks import Recorded, Setting
 
 __all__ = ["Session"]
 
@@ -44,7 +47,7 @@ class Session:
         self._opened = ExitStack()
         torch.set_num_threads(cfg.threads)
         self.device = make_device(cfg.device)
-        self.world = make_world(cfg)
+        self.world = make_setting(cfg)
         console.print(memory.check(cfg, self.world.task, self.device))
         state, passed_over = find(cfg, folder, self.device)
         for line in passed_over:
@@ -60,7 +63,7 @@ class Session:
         done = state["position"]["frames"] if state else 0
         self.collector = make_collector(cfg, self.world, self.algorithm, self.device, done=done)
         opened.callback(self.collector.shutdown)
-        self.judge = Judge(self.world, cfg.grid.max_steps)
+        self.judge = make_judge(self.world, cfg.grid.max_steps)
         self.start = self._start(state)
         self._best = state["best"] if state else -math.inf
         _write_inputs(cfg, self.world, folder, resumed=state is not None)
@@ -136,10 +139,11 @@ class Session:
             self.log.record(Chains(chains), {"label": f"iteration {iteration}"}, log.episodes, iteration)
 
 
-def _episode_log(cfg: TrainConfig, world: World, folder: Path, policies: int | None) -> EpisodeLog | None:
+def _episode_log(cfg: TrainConfig, world: Setting, folder: Path, policies: int | None) -> EpisodeLog | None:
     """The log of simulated episodes, where it is asked for."""
     if not isinstance(cfg.log, Mcap):
         return None
+    assert isinstance(world, World)
     return EpisodeLog(
         folder,
         world,
@@ -152,18 +156,38 @@ def _episode_log(cfg: TrainConfig, world: World, folder: Path, policies: int | N
     )
 
 
-def _write_inputs(cfg: TrainConfig, world: World, folder: Path, *, resumed: bool) -> None:
-    """`config.yaml` and `kernel.npy`: all that it takes to do the run again.
+def _write_inputs(cfg: TrainConfig, world: Setting, folder: Path, *, resumed: bool) -> None:
+    """`config.yaml`, and `kernel.npy` or `tracks.json`: what the run takes in.
 
     Raises:
-        UserError: the run that goes on was begun with another kernel.
+        UserError: the run that goes on was begun with another kernel, or with other tracks.
     """
-    file = folder / "kernel.npy"
-    if resumed and not np.array_equal(np.load(file, allow_pickle=False), world.kernel):
+    name, what = ("kernel.npy", "kernel") if isinstance(world, World) else ("tracks.json", "recording")
+    file = folder / name
+    if resumed and not _same(file, world):
         raise UserError(
-            f"{file}: the run's kernel is not the one that its config describes now; it cannot change on resume"
+            f"{file}: the run's {what} is not the one that its config describes now; it cannot change on resume"
         )
     write_text(folder / "config.yaml", config_text(cfg))
+    write_bytes(file, _npy(world.kernel) if isinstance(world, World) else _described(world))
+
+
+def _same(file: Path, world: Setting) -> bool:
+    if isinstance(world, World):
+        return np.array_equal(np.load(file, allow_pickle=False), world.kernel)
+    return file.read_bytes() == _described(world)
+
+
+def _npy(table: Array) -> bytes:
     buffer = io.BytesIO()
-    np.save(buffer, world.kernel)
-    write_bytes(file, buffer.getvalue())
+    np.save(buffer, table)
+    return buffer.getvalue()
+
+
+def _described(world: Recorded) -> bytes:
+    """Which tracks these are."""
+    parts = {"learned_from": world.tracks, "held_out": world.held_out}
+    content = {
+        name: {"tracks": len(part), "cells": len(part.cells), "sha256": part.digest()} for name, part in parts.items()
+    }
+    return (json.dumps(content, indent=2) + "\n").encode()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import hashlib
 import platform
 from importlib.metadata import version
 from typing import Any
@@ -13,47 +11,41 @@ from rich.console import Console
 
 from trackmdp import __version__
 from trackmdp.bench.machine import machine
-from trackmdp.config import TrainConfig, to_yaml
+from trackmdp.config import TrainConfig
+from trackmdp.config.resume import digest
 from trackmdp.solvers.optimal import Solution
 from trackmdp.training.display import table
+from trackmdp.training.held_out import HeldOutJudge
 from trackmdp.training.judge import Judge, Verdict, figures
 
-__all__ = ["config_text", "digest", "show", "summarize"]
+__all__ = ["show", "summarize"]
 
 _PACKAGES = ("torch", "torchrl", "tensordict", "hydra-core", "numpy", "scipy")
 
 
-def config_text(cfg: TrainConfig) -> str:
-    """The text of `config.yaml`; how a run was gone on with is not part of it."""
-    return to_yaml(dataclasses.replace(cfg, resume=None))
-
-
-def digest(cfg: TrainConfig) -> str:
-    """SHA-256 of `config.yaml`."""
-    return hashlib.sha256(config_text(cfg).encode()).hexdigest()
-
-
 def summarize(
     cfg: TrainConfig,
-    judge: Judge,
+    judge: Judge | HeldOutJudge,
     verdict: Verdict,
     solution: Solution | None,
     frames: int,
     times: dict[str, float],
+    held_out: dict[str, Any] | None,
 ) -> dict[str, Any]:
-    """The content of `summary.json`."""
+    """The content of `summary.json`; on held-out tracks there are no bounds, no Q_MDP and no regret."""
     return {
         "algo": cfg.algo.name,
         "seed": cfg.seed,
         "frames": frames,
         **times,
         "policy": figures(verdict.evaluation),
-        "qmdp": figures(judge.qmdp),
-        "bounds": judge.bounds,
+        "qmdp": figures(judge.qmdp) if isinstance(judge, Judge) else None,
+        "bounds": judge.bounds if isinstance(judge, Judge) else dict.fromkeys(("paper", "valid", "clocked")),
         "optimal": {"lower": solution.lower, "upper": solution.upper, "certified": solution.certified}
         if solution
         else None,
         "regret_per_step": verdict.regret_per_step,
+        "held_out": held_out,
         "versions": {"trackmdp": __version__, "python": platform.python_version()}
         | {name: version(name) for name in _PACKAGES},
         "machine": machine(),

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import time
 from pathlib import Path
 
 from rich.console import Console
 
+from trackmdp.commands.held_out import show_held_out
 from trackmdp.commands.session import Session
-from trackmdp.commands.summary import digest, show, summarize
+from trackmdp.commands.summary import show, summarize
 from trackmdp.config import TrainConfig
+from trackmdp.config.resume import finished
 from trackmdp.errors import RunError
 from trackmdp.reports import policy
 from trackmdp.solvers import optimal
 from trackmdp.solvers.optimal import Solution
 from trackmdp.training.display import make_console
+from trackmdp.training.judge import Judge
 from trackmdp.training.lock import locked
 from trackmdp.training.metrics import write_json
 from trackmdp.world.model import World
@@ -52,31 +53,35 @@ def _run(cfg: TrainConfig, folder: Path) -> float:
         return reached
     with Session(cfg, folder, console) as session:
         verdict, end = session.train()
-    judge = session.judge
-    solution = _solve(cfg, session.world, console)
-    if solution is not None:
-        verdict = judge.tighten(solution.upper, verdict)
+    judge, solution, held_out = session.judge, None, None
+    if isinstance(judge, Judge):
+        solution = _solve(cfg, judge.world, console)
+        verdict = judge.tighten(solution.upper, verdict) if solution is not None else verdict
+    else:
+        held_out = judge.report(session.chains())
     times = {
         "wall_seconds": time.monotonic() - started + session.start.seconds,
         "cpu_seconds": time.process_time() - used,
     }
     policy.write(folder / policy.FILE, policy.Policy(session.chains(), verdict.evaluation.value))
-    write_json(folder / "summary.json", summarize(cfg, judge, verdict, solution, end.frames, times))
-    show(console, cfg, judge, verdict, solution)
+    write_json(folder / "summary.json", summarize(cfg, judge, verdict, solution, end.frames, times, held_out))
+    if isinstance(judge, Judge):
+        show(console, cfg, judge, verdict, solution)
+    elif held_out is not None:
+        show_held_out(console, f"learned ({cfg.algo.name})", held_out)
     console.print(f"{times['wall_seconds']:.1f} s; results in {folder}")
     return verdict.evaluation.aihtr
 
 
 def _finished(cfg: TrainConfig, folder: Path) -> float | None:
     """The AIHTR of a run that has nothing left to do; what an older config led to does not count, and is removed."""
-    file = folder / "summary.json"
-    if cfg.resume is None or not file.is_file():
+    if cfg.resume is None:
         return None
-    summary = json.loads(file.read_text(encoding="utf-8"))
-    if summary["config_sha256"] in [digest(dataclasses.replace(cfg, quiet=quiet)) for quiet in (True, False)]:
-        return float(summary["policy"]["aihtr"])
-    file.unlink()
-    return None
+    summary = finished(cfg, folder)
+    if summary is None:
+        (folder / "summary.json").unlink(missing_ok=True)
+        return None
+    return float(summary["policy"]["aihtr"])
 
 
 def _solve(cfg: TrainConfig, world: World, console: Console) -> Solution | None:

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import torch
 
-from trackmdp.build import make_algorithm, make_world
+from trackmdp.build import make_algorithm, make_setting
 from trackmdp.config import load_run
 from trackmdp.training import checkpoint
 from trackmdp.training.evaluate import chains_of
-from trackmdp.world.model import BoolArray, World
+from trackmdp.world.model import BoolArray
+from trackmdp.world.tracks import Setting
 
 __all__ = ["Trained", "trained"]
 
@@ -20,7 +21,7 @@ __all__ = ["Trained", "trained"]
 class Trained:
     """The policy of a run as `chains` `[M, t_max+1, M]`, where it was learned, and the checkpoint it is from."""
 
-    world: World
+    world: Setting
     max_steps: int | None
     chains: BoolArray
     subject: str
@@ -33,7 +34,7 @@ def trained(run: str, device: torch.device, *, best: bool = False) -> Trained:
         UserError: that is no run, or the checkpoint is missing or damaged.
     """
     cfg, folder = load_run(run), Path(run)
-    world = make_world(cfg)
+    world = make_setting(cfg)
     algorithm = make_algorithm(cfg, world, device)
     file = folder / "checkpoints" / checkpoint.BEST if best else checkpoint.newest(folder)
     algorithm.load_state_dict(checkpoint.load(file, device)["algorithm"])

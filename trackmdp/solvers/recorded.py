@@ -65,6 +65,7 @@ class Replay:
         one = np.ones_like(steps)
         return {
             "aihtr": _interval(reward, one),
+            "reward_per_step": _interval(reward, self.length),
             "accuracy": _interval(detections, steps),
             "sensors_per_step": _interval(sensors, steps),
             "safe_per_episode": _interval(safe, one),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from types import TracebackType
@@ -54,10 +55,12 @@ class Display:
             self._bar.stop()
 
     def update(self, iteration: int, frames: int, aihtr: float, gap: float) -> None:
-        """After `iteration` iterations; `gap` is the AIHTR missing to the upper bound."""
+        """After `iteration` iterations; `gap` is the AIHTR missing to the upper bound, nan if none is known."""
         elapsed = time.monotonic() - self._started
         speed = (frames - self._frames) / max(elapsed, 1e-9)
-        figures = f"{frames:,} frames  {speed:,.0f}/s  AIHTR {aihtr:,.2f}  gap {gap:,.2f}"
+        figures = f"{frames:,} frames  {speed:,.0f}/s  AIHTR {aihtr:,.2f}"
+        if not math.isnan(gap):
+            figures += f"  gap {gap:,.2f}"
         if self._bar is not None:
             self._bar.update(self._task, completed=iteration, figures=figures)
             return

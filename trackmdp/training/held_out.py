@@ -13,14 +13,19 @@ from trackmdp.solvers import qmdp
 from trackmdp.solvers.chains import Evaluation
 from trackmdp.solvers.kernel_estimate import KernelEstimate
 from trackmdp.solvers.recorded import Interval, replay
-from trackmdp.training.judge import Verdict
+from trackmdp.training.judge import Judge, Verdict
 from trackmdp.world.model import BoolArray, World
-from trackmdp.world.tracks import Recorded, Tracks
+from trackmdp.world.tracks import Recorded, Setting, Tracks
 
-__all__ = ["ESTIMATED", "HeldOutJudge", "estimated_kernel"]
+__all__ = ["ESTIMATED", "HeldOutJudge", "estimated_kernel", "make_judge"]
 
 ESTIMATED = "Q_MDP of the estimated kernel"
 """Q_MDP for the motion as the tracks to learn from show it."""
+
+
+def make_judge(setting: Setting, max_steps: int | None = None) -> Judge | HeldOutJudge:
+    """Who judges policies there: exactly, or on the held-out tracks."""
+    return Judge(setting, max_steps) if isinstance(setting, World) else HeldOutJudge(setting, max_steps)
 
 
 class HeldOutJudge:
@@ -36,8 +41,7 @@ class HeldOutJudge:
     def __init__(self, world: Recorded, max_steps: int | None = None) -> None:
         self.world, self.max_steps = world, max_steps
         self.tracks = world.held_out.limited(max_steps)
-        self.bounds: dict[str, float | None] = {"paper": None, "valid": None, "clocked": None}
-        self.upper, self.qmdp = math.nan, None
+        self.upper = math.nan
         self._starts = self.tracks.cells[self.tracks.first[:-1]]
 
     def evaluate(self, chains: npt.NDArray[np.generic]) -> Evaluation:
@@ -71,7 +75,7 @@ class HeldOutJudge:
             name: {figure: asdict(interval) for figure, interval in self.intervals(each).items()}
             for name, each in policies.items()
         }
-        return {"tracks": len(self.tracks), "of": len(self.tracks) + len(self.world.tracks), "figures": figures}
+        return {"tracks": len(self.tracks), "learned_from": len(self.world.tracks), "figures": figures}
 
 
 def estimated_kernel(tracks: Tracks, size: int) -> npt.NDArray[np.float64]:

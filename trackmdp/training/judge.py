@@ -3,26 +3,42 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from trackmdp.solvers import bounds, horizon, qmdp
 from trackmdp.solvers.chains import Evaluation, evaluate, regret_per_step
-from trackmdp.world.model import World
+from trackmdp.world.model import Task, World
 
-__all__ = ["Judge", "Verdict", "figures"]
+__all__ = ["Judge", "Scoring", "Verdict", "figures"]
 
 _PER_CELL = ("value", "steps", "detections", "sensors", "safe_actions")
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """A policy's exact figures and its regret per step to the best upper bound known."""
+    """A policy's figures and its regret per step to the best upper bound known, nan where there is none."""
 
     evaluation: Evaluation
     regret_per_step: float
+
+
+class Scoring(Protocol):
+    """What training asks of a judge."""
+
+    upper: float
+    """The best upper bound known on the AIHTR; nan where there is none."""
+
+    @property
+    def world(self) -> Task:
+        """Where policies are judged."""
+        ...
+
+    def score(self, chains: npt.NDArray[np.generic]) -> Verdict:
+        """Where the policy with these `chains` `[M, t_max+1, M]` stands."""
+        ...
 
 
 class Judge:

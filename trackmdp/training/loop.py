@@ -14,7 +14,7 @@ from trackmdp.algos.common import Algorithm
 from trackmdp.errors import Preempted, RunError
 from trackmdp.training.display import Display
 from trackmdp.training.evaluate import chains_of
-from trackmdp.training.judge import Judge, Verdict
+from trackmdp.training.judge import Scoring, Verdict
 from trackmdp.training.metrics import MetricsLog
 from trackmdp.training.signals import Signals
 from trackmdp.training.workers import Watch
@@ -54,7 +54,7 @@ class Position:
 def train(
     algorithm: Algorithm,
     collector: BaseCollector,
-    judge: Judge,
+    judge: Scoring,
     metrics: MetricsLog,
     display: Display,
     every: Intervals,
@@ -67,7 +67,7 @@ def train(
     Args:
         algorithm: learns from each batch; its `actor` is judged.
         collector: yields batches `[B, time]` until its frames are spent.
-        judge: exact figures of the actor's chains.
+        judge: figures of the actor's chains.
         metrics: gets one row every `every.log` iterations, and the last.
         display: gets the figures of the last evaluation after each iteration.
         every: the intervals.
@@ -91,7 +91,7 @@ class _Loop:
 
     algorithm: Algorithm
     collector: BaseCollector
-    judge: Judge
+    judge: Scoring
     metrics: MetricsLog
     display: Display
     every: Intervals

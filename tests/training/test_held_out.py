@@ -1,0 +1,163 @@
+"""Judging on held-out tracks: by hand, beside references that know no more, and never part of learning."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tests.helpers import ALGORITHMS, algorithm, collect, small_world
+from tests.tracks import by_hand, drawn, recorded, write
+from tests.training.runs import SMALL, tensors
+from tests.training.runs import rows as metrics
+from tests.training.runs import train as train_run
+from trackmdp.solvers import qmdp
+from trackmdp.training import checkpoint
+from trackmdp.training.evaluate import chains_of
+from trackmdp.training.held_out import ESTIMATED, HeldOutJudge, estimated_kernel, make_judge
+from trackmdp.training.judge import Judge
+from trackmdp.world.model import World
+from trackmdp.world.tracks import Tracks, load_tracks, split
+
+
+def test_the_setting_decides_who_judges() -> None:
+    world = small_world()
+    assert type(make_judge(world)) is Judge
+    assert type(make_judge(recorded(drawn(world.kernel, 5)))) is HeldOutJudge
+
+
+def test_only_the_held_out_tracks_count() -> None:
+    """All on: r - 9 c a step in the grid, nothing on the exit step."""
+    judge = HeldOutJudge(recorded(by_hand([0, 1, 2], [3, 3]), by_hand([4, 5], [4, 5, 6, 7], [8, 8])))
+    verdict = judge.score(np.ones((9, 2, 9), dtype=bool))
+    assert verdict.evaluation.aihtr == pytest.approx((1 + 3 + 1) / 3 * (1 - 1.8))
+    assert verdict.evaluation.expected_length == pytest.approx((2 + 4 + 2) / 3)
+    assert (verdict.evaluation.accuracy, verdict.evaluation.sensors_per_step) == (1.0, 9.0)
+    assert math.isnan(verdict.regret_per_step)
+    assert math.isnan(judge.upper)
+    value = verdict.evaluation.value
+    assert value[[4, 8]] == pytest.approx([2 * -0.8, -0.8])
+    assert np.isnan(np.delete(value, [4, 8])).all()
+
+
+def test_episodes_are_cut_where_the_limit_is() -> None:
+    setting = recorded(by_hand([0, 1], [0, 1]), by_hand([4, 5, 6, 7], [8, 8]))
+    evaluation = HeldOutJudge(setting, max_steps=2).evaluate(np.ones((9, 2, 9), dtype=bool))
+    assert evaluation.aihtr == pytest.approx((2 + 1) / 2 * -0.8)
+    assert evaluation.expected_length == 2.0
+
+
+def test_the_report_holds_the_policy_and_the_references() -> None:
+    world = small_world()
+    setting = recorded(drawn(world.kernel, 300), drawn(world.kernel, 80, seed=1))
+    judge = HeldOutJudge(setting)
+    chains = np.random.default_rng(0).random((9, 2, 9)) < 0.3
+    report = judge.report(chains)
+    assert (report["tracks"], report["learned_from"]) == (80, 300)
+    assert set(report["figures"]) == {"policy", "all on", "no sensors", ESTIMATED}
+    assert report["figures"]["all on"]["aihtr"]["mean"] < report["figures"]["policy"]["aihtr"]["mean"]
+    assert report["figures"]["policy"]["aihtr"]["mean"] == pytest.approx(judge.evaluate(chains).aihtr)
+    for figures in report["figures"].values():
+        assert all(each["low"] <= each["mean"] <= each["high"] for each in figures.values())
+
+
+def test_the_estimated_kernel_is_that_of_the_tracks() -> None:
+    world = small_world(exit_probability=0.05)
+    many = estimated_kernel(drawn(world.kernel, 20_000), 3)
+    assert np.abs(many - world.kernel).max() < 0.01
+    exits = estimated_kernel(drawn(world.kernel, 20_000), 3).sum(axis=1)
+    stopped = drawn(world.kernel, 20_000)
+    cut = Tracks(stopped.cells, stopped.first, np.zeros(20_000, dtype=bool), stopped.names)
+    assert exits == pytest.approx(np.full(9, 0.95), abs=0.01)
+    assert (estimated_kernel(cut, 3).sum(axis=1) > 0.999).all()  # where the recording stopped nobody left
+
+
+def test_q_mdp_of_the_estimated_kernel_is_that_of_the_kernel() -> None:
+    """The price is .2, the probabilities .6 and .3: none is so near to it that the estimate would matter."""
+    kernel = 0.6 * np.roll(np.eye(9), 2, axis=1) + 0.3 * np.roll(np.eye(9), 1, axis=1)
+    setting = recorded(drawn(kernel, 5_000), by_hand([0, 1]))
+    world = World(3, setting.reward, setting.cost, setting.safe_cost, setting.t_max, kernel)
+    assert np.array_equal(HeldOutJudge(setting).references()[ESTIMATED], qmdp.solve(world))
+
+
+FILE = drawn(small_world(exit_probability=0.05).kernel, 60)
+WORDS = ("kernel=tracks", "kernel.min_length=1")
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return write(tmp_path / "tracks.csv", FILE)
+
+
+def run(folder: Path, file: Path, *words: str, algo: str = "hindsight") -> dict[str, Any]:
+    train_run(folder, *WORDS, f"kernel.path={file}", *words, algo=algo)
+    summary: dict[str, Any] = json.loads((folder / "summary.json").read_text())
+    return summary
+
+
+def test_a_run_says_nothing_that_takes_a_kernel(file: Path, tmp_path: Path) -> None:
+    summary = run(tmp_path / "run", file)
+    assert (summary["qmdp"], summary["optimal"], summary["regret_per_step"]) == (None, None, None)
+    assert set(summary["bounds"].values()) == {None}
+    assert summary["held_out"]["tracks"] == 12
+    assert summary["held_out"]["learned_from"] == 48
+    figures = summary["held_out"]["figures"]["policy"]
+    assert figures["aihtr"]["mean"] == pytest.approx(summary["policy"]["aihtr"])
+    judged = [row for row in metrics(tmp_path / "run") if row["aihtr"]]
+    assert {row["regret_per_step"] for row in metrics(tmp_path / "run")} == {""}
+    assert float(judged[-1]["aihtr"]) == summary["policy"]["aihtr"]
+    assert not (tmp_path / "run" / "kernel.npy").exists()
+    described = json.loads((tmp_path / "run" / "tracks.json").read_text())
+    assert (described["learned_from"]["tracks"], described["held_out"]["tracks"]) == (48, 12)
+
+
+@pytest.mark.parametrize("algo", SMALL)
+def test_held_out_tracks_are_never_learned_from(algo: str, file: Path, tmp_path: Path) -> None:
+    """Other cells in the held-out tracks, and the run learns the same; in the others, and it does not."""
+    run(tmp_path / "clean", file, algo=algo)
+    _, first = checkpoints(tmp_path / "clean")
+    names = held_out_names(file)
+    held = np.repeat(np.isin(FILE.names, names), FILE.lengths)
+    for name, poisoned in (("held_out", held), ("learned", ~held)):
+        cells = np.where(poisoned, 8 - FILE.cells, FILE.cells)
+        other = write(tmp_path / f"{name}.csv", replace(FILE, cells=cells))
+        run(tmp_path / name, other, algo=algo)
+        keys, second = checkpoints(tmp_path / name)
+        assert all(same(first[key], second[key]) for key in keys) == (name == "held_out")
+    learned = [strip(row) for row in metrics(tmp_path / "clean")]
+    assert learned == [strip(row) for row in metrics(tmp_path / "held_out")]
+
+
+def held_out_names(file: Path) -> Any:
+    return split(load_tracks(file, 3, exits=True), 0.2, 0)[1].names
+
+
+def checkpoints(folder: Path) -> tuple[list[str], dict[str, Any]]:
+    state = tensors(checkpoint.load(checkpoint.newest(folder))["algorithm"])
+    return list(state), state
+
+
+def same(one: Any, other: Any) -> bool:
+    return torch.equal(one, other) if isinstance(one, torch.Tensor) else one == other
+
+
+def strip(row: dict[str, str]) -> dict[str, str]:
+    return {key: row[key] for key in row if key not in ("aihtr", "accuracy", "sensors_per_step")}
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_every_algorithm_learns_from_tracks(name: str) -> None:
+    setting = recorded(drawn(small_world().kernel, 200))
+    learner: Any = algorithm(name, setting)  # type: ignore[arg-type]
+    for batch in collect(setting, learner.policy, 32, 32).split(8, dim=1):  # type: ignore[arg-type]
+        learner.step(batch)
+    for _ in range(learner.iterations - 4 if name == "hindsight" else 0):
+        learner.step(None)
+    chains = chains_of(learner.actor, setting.task)
+    assert np.isfinite(HeldOutJudge(setting).score(chains).evaluation.aihtr)

@@ -1,0 +1,62 @@
+"""What is said and written of a policy that is judged on held-out tracks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from trackmdp.reports.picture import draw
+from trackmdp.solvers.chains import sets_of
+from trackmdp.training.display import table
+from trackmdp.training.held_out import HeldOutJudge
+from trackmdp.training.metrics import write_json, write_text
+from trackmdp.world.tracks import Recorded
+
+__all__ = ["run", "show_held_out"]
+
+
+def run(
+    world: Recorded,
+    max_steps: int | None,
+    chains: np.ndarray,
+    subject: str,
+    folder: Path,
+    console: Console,
+    seed: int,
+) -> float:
+    """Write `evaluation.json`, `sets.json` and `picture.txt` to `folder`; returns the mean reward of a track."""
+    judge = HeldOutJudge(world, max_steps)
+    report = judge.report(chains)
+    value = judge.evaluate(chains).value
+    content = {"policy": subject, "value": value.tolist(), "held_out": report, "regret_per_step": None}
+    write_json(folder / "evaluation.json", content)
+    if chains.dtype == np.bool_:
+        write_json(folder / "sets.json", sets_of(chains))
+        write_text(folder / "picture.txt", draw(world, chains, seed=seed))
+    show_held_out(console, subject, report)
+    console.print(f"results in {folder}")
+    return float(report["figures"]["policy"]["aihtr"]["mean"])
+
+
+def show_held_out(console: Console, subject: str, report: dict[str, Any]) -> None:
+    """The figures of a policy beside those of the references, with their intervals."""
+    rows = [
+        [
+            subject if name == "policy" else name,
+            _shown(figures["aihtr"], 2),
+            _shown(figures["reward_per_step"], 4),
+            _shown(figures["accuracy"], 2, 100.0, " %"),
+            _shown(figures["sensors_per_step"], 2),
+        ]
+        for name, figures in report["figures"].items()
+    ]
+    title = f"{report['tracks']} held-out tracks, mean and 95 % interval"
+    console.print(table(title, ["policy", "AIHTR", "reward per step", "accuracy", "sensors per step"], rows))
+
+
+def _shown(interval: dict[str, float], digits: int, scale: float = 1.0, unit: str = "") -> str:
+    mean, low, high = (f"{scale * interval[key]:,.{digits}f}" for key in ("mean", "low", "high"))
+    return f"{mean}{unit} ({low} ... {high})"
