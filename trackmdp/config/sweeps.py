@@ -12,7 +12,19 @@ from trackmdp.config.checks import leaves
 from trackmdp.config.options import option, refuse
 from trackmdp.errors import UserError
 
-__all__ = ["PLUGINS", "Basic", "Blocks", "Launcher", "Sweeper", "plugin"]
+__all__ = [
+    "PLUGINS",
+    "Basic",
+    "Blocks",
+    "Joblib",
+    "Launcher",
+    "Ray",
+    "Submitit",
+    "SubmititLocal",
+    "SubmititSlurm",
+    "Sweeper",
+    "plugin",
+]
 
 T = TypeVar("T")
 
@@ -74,3 +86,54 @@ class Launcher:
 @dataclass(kw_only=True)
 class Basic(Launcher):
     """One run after the other, on this machine."""
+
+
+@_offered("launcher", "joblib")
+@dataclass(kw_only=True)
+class Joblib(Launcher):
+    """Several runs at once, on this machine."""
+
+    n_jobs: int | None = option("runs at once; null = one for each core", unit="runs", ge=1, le=1024)
+
+
+@dataclass(kw_only=True)
+class Submitit(Launcher):
+    """Base of the launchers that write a submission for each run."""
+
+    timeout_min: int = option("a run is stopped after this long, and goes on where requeued", unit="min", ge=1)
+    cpus_per_task: int = option("cores of a run", unit="cores", ge=1)
+
+
+@_offered("launcher", "submitit_local")
+@dataclass(kw_only=True)
+class SubmititLocal(Submitit):
+    """As submitit_slurm, but on this machine: to try out what a cluster will do."""
+
+    n_jobs: int | None = option("runs at once; null = as many as there are cores for", unit="runs", ge=1, le=1024)
+
+
+@_offered("launcher", "submitit_slurm")
+@dataclass(kw_only=True)
+class SubmititSlurm(Submitit):
+    """On the nodes of a SLURM cluster, as one job array; the folder must be one that every node sees."""
+
+    mem_gb: float | None = option("memory of a run; null = the cluster's default", unit="GB", gt=0)
+    gpus_per_node: int | None = option("GPUs of a run; null = none asked for", unit="GPUs", ge=0)
+    array_parallelism: int = option("runs at once", unit="runs", ge=1)
+    max_num_timeout: int = option("how often a run that is out of time is requeued", ge=0)
+    signal_delay_s: int = option("a run is told to save this long before its time is out", unit="s", ge=1)
+    partition: str | None = option("partition; null = the cluster's default", expects="its name")
+    account: str | None = option("account; null = the user's default", expects="its name")
+    setup: list[str] | None = option("lines of shell before each run, such as `module load ...`", expects="a line")
+    additional_parameters: dict[str, str] | None = option("further `#SBATCH` parameters", expects="{name: value}")
+
+
+@_offered("launcher", "ray")
+@dataclass(kw_only=True)
+class Ray(Launcher):
+    """On a Ray cluster that is joined, or one that is started on this machine."""
+
+    address: str | None = option("cluster to join; null = start one here", expects="auto, or host:port")
+    num_cpus: int | None = option("cores of a cluster started here; null = all", unit="cores", ge=1)
+    cpus_per_run: float = option("cores of a run", unit="cores", gt=0)
+    gpus_per_run: float = option("GPUs of a run", unit="GPUs", ge=0)

@@ -10,6 +10,7 @@ from pathlib import Path
 from trackmdp.config import TrainConfig
 from trackmdp.errors import USER_MISTAKE
 from trackmdp.outputs import remove_if_empty
+from trackmdp.prepare import say
 from trackmdp.sweep.apart import Outcome, run_apart
 from trackmdp.sweep.plan import Job
 from trackmdp.sweep.state import DONE, FAILED, SUMMARY, run_of
@@ -63,9 +64,11 @@ def stop_signal(sweep: Path) -> int:
 
 
 def _done(job: Job, outcome: Outcome) -> None:
-    if isinstance(job.cfg, TrainConfig) and (job.folder / SUMMARY).is_file():
-        return
-    write_json(job.folder / DONE, {"value": outcome.value})
+    if not (isinstance(job.cfg, TrainConfig) and (job.folder / SUMMARY).is_file()):
+        write_json(job.folder / DONE, {"value": outcome.value})
+    if job.aside and job.cfg is not None and not job.cfg.quiet:
+        value = f": AIHTR {outcome.value:,.3f}" if outcome.value is not None else ""
+        say(f"({job.label}) {job.name} done{value}")
 
 
 def _is_free(job: Job) -> bool:

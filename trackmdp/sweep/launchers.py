@@ -1,17 +1,31 @@
-"""Where the jobs of a sweep are run: one after the other here, or several at once here or elsewhere."""
+"""Where the jobs of a sweep are run: one after the other here, or several at once here or elsewhere.
+
+A launcher reports nothing: what became of each run stands in its folder, in whatever process it ran.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import importlib.util
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
 
-from trackmdp.config.sweeps import Basic, Launcher
+from trackmdp.config import TrainConfig
+from trackmdp.config.sweeps import Basic, Joblib, Launcher, Ray, Submitit
+from trackmdp.errors import UserError
+from trackmdp.sweep.apart import context_for
 from trackmdp.sweep.job import run_job
 from trackmdp.sweep.plan import Job
 
-__all__ = ["Launch", "make_launcher"]
+__all__ = ["Launch", "make_launcher", "threads_of"]
 
 Launch = Callable[[Sequence[Job]], None]
 """Runs jobs, and comes back once none is running any more."""
+
+_EXTRAS = {"joblib": "sweep", "submitit": "slurm", "ray": "ray"}
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def make_launcher(cfg: Launcher) -> Launch:
@@ -20,10 +34,56 @@ def make_launcher(cfg: Launcher) -> Launch:
     Raises:
         UserError: what it needs is not installed.
     """
-    assert isinstance(cfg, Basic)
-    return _basic
+    if isinstance(cfg, Basic):
+        return _basic
+    launch = _parallel(cfg)
+    return lambda jobs: launch([replace(job, aside=True) for job in jobs])
+
+
+def _parallel(cfg: Launcher) -> Launch:
+    if isinstance(cfg, Joblib):
+        _require("joblib", cfg.name)
+        return partial(_joblib, cfg)
+    if isinstance(cfg, Submitit):
+        _require("submitit", cfg.name)
+        from trackmdp.sweep import cluster
+
+        return cluster.launcher(cfg)
+    assert isinstance(cfg, Ray)
+    _require("ray", cfg.name)
+    from trackmdp.sweep import on_ray
+
+    return partial(on_ray.launch, cfg)
+
+
+@contextmanager
+def threads_of(jobs: Sequence[Job]) -> Iterator[None]:
+    """Processes started inside have as many threads as the runs ask for, where nothing else was asked for."""
+    most = max((job.cfg.threads for job in jobs if isinstance(job.cfg, TrainConfig)), default=1)
+    unset = [name for name in _THREADS if name not in os.environ]
+    os.environ.update(dict.fromkeys(unset, str(most)))
+    try:
+        yield
+    finally:
+        for name in unset:
+            os.environ.pop(name, None)
+
+
+def _require(module: str, name: str) -> None:
+    if importlib.util.find_spec(module) is None:
+        extra = _EXTRAS[module]
+        raise UserError(f"hydra/launcher={name}: needs {module}, which pip install 'trackmdp[{extra}]' adds")
 
 
 def _basic(jobs: Sequence[Job]) -> None:
     for job in jobs:
         run_job(job)
+
+
+def _joblib(cfg: Joblib, jobs: Sequence[Job]) -> None:
+    """Threads will do: each only waits for the process of its run."""
+    from joblib import Parallel, delayed
+
+    context_for(jobs[0].command)
+    at_once = cfg.n_jobs or len(os.sched_getaffinity(0))
+    Parallel(n_jobs=at_once, backend="threading", batch_size=1)(delayed(run_job)(job) for job in jobs)

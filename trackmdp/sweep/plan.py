@@ -40,6 +40,7 @@ class Job:
         cfg: its checked config; None where it was refused.
         refusal: why.
         label: place in the sweep, for the terminal: ``3/60``.
+        aside: it runs beside others, and says what it says in a file of its own.
     """
 
     command: str
@@ -49,6 +50,7 @@ class Job:
     cfg: CommandConfig | None
     refusal: str = ""
     label: str = ""
+    aside: bool = False
 
     @property
     def folder(self) -> Path:

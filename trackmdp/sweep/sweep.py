@@ -17,7 +17,7 @@ from trackmdp.errors import Preempted, UserError
 from trackmdp.prepare import shown
 from trackmdp.sweep.apart import Outcome
 from trackmdp.sweep.job import STOP, fail
-from trackmdp.sweep.launchers import Launch
+from trackmdp.sweep.launchers import Launch, threads_of
 from trackmdp.sweep.plan import Job
 from trackmdp.sweep.state import DONE, FAILED, SUMMARY, Run, run_of, runs_of, write_plan
 from trackmdp.sweep.table import show, status_of, write_table
@@ -49,7 +49,7 @@ def sweep(folder: Path, command: str, line: str, jobs: Sequence[Job], launch: La
         skipped = {job.folder for job in jobs if _is_finished(job)}
         waiting = [job for job in jobs if job.folder not in skipped]
         console.print(_opening(jobs, skipped, folder), markup=False)
-        with _Stop(folder) as stop:
+        with _Stop(folder) as stop, threads_of(waiting):
             for job in waiting:
                 _forget(job)
             _launch(waiting, launch, stop)
