@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.helpers import collect, small_world
+from tests.helpers import algorithm, collect, small_world
 from tests.tracks import by_hand, drawn, recorded
 from trackmdp.algos.segments import SegmentBuffer
 from trackmdp.policies.fixed import AllOn
+from trackmdp.solvers.recorded import replay
+from trackmdp.training.evaluate import chains_of
 
 M = 9
 SETTING = recorded(drawn(small_world(exit_probability=0.2).kernel, 300))
@@ -115,6 +119,7 @@ def test_moves_are_all_of_the_segments() -> None:
 
 
 @given(st.integers(0, 2**31), st.integers(1, 5), st.integers(1, 12))
+@settings(max_examples=30)
 def test_segments_are_pieces_of_tracks(seed: int, steps: int, time: int) -> None:
     tracks = drawn(small_world(exit_probability=0.2).kernel, 20, seed)
     made = buffer(steps)
@@ -134,3 +139,31 @@ def test_a_saved_buffer_goes_on_the_same() -> None:
         made.extend(batch[:, 17:])
     assert segments(one) == segments(other)
     assert torch.equal(one.paths(50, 3), other.paths(50, 3))
+
+
+def test_what_depends_on_more_than_the_cell_is_learned_from_whole_paths_only() -> None:
+    """The target goes 3, 4, 5, 4, 3, 4 ...: two steps after 3 it is in 5, as moves alone do not tell.
+
+    Sensing 4 costs nearly as much as it earns. Whole paths say: leave 4 out and wait in 5 (and 3), .4 in two steps.
+    Put together from moves, 5 is as likely as 3, and at .5 neither is worth .6: what is left is 4, at .1 a step.
+    """
+    rng = np.random.default_rng(0)
+    lengths = rng.geometric(0.02, size=400) + 3
+    tracks = by_hand(*[([3, 4, 5, 4] * length)[2 * (length % 2) :][:length] for length in lengths])
+    cost = np.full(9, 0.6)
+    cost[4] = 0.9
+    earned = {}
+    for markov in (False, True):
+        setting = replace(recorded(tracks, markov=markov), cost=cost, safe_cost=5.0)
+        words = ["algo.updates=300", "algo.updates_per_iteration=100", "algo.batch_size=2048", "algo.hidden=32"]
+        learner = algorithm("hindsight", setting, *words)
+        for part in collect(setting, learner.policy, 32, 128).split(8, dim=1):
+            learner.step(part)
+        while learner.step(None)["updates"] < 300:
+            pass
+        chains = chains_of(learner.actor, setting.task)
+        earned[markov] = replay(setting, tracks, chains).intervals()["reward_per_step"].mean
+        if not markov:
+            assert chains[[3, 5]].nonzero()[1].tolist() == [1, 1]
+    assert earned[False] > 0.19
+    assert earned[True] < 0.11

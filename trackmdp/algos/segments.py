@@ -54,29 +54,32 @@ class SegmentBuffer:
 
         The first moves are stratified: out of each cell the paths leave in the proportions of the moves seen.
         """
-        order, first, seen = self._index = self._index or self._sort()
-        device, m = order.device, self.num_cells
+        segments, first, seen = self._index = self._index or self._sort()
+        device, m = segments.device, self.num_cells
         place = torch.arange(count, device=device)
         offset = torch.randint(m, (1,), generator=self._generator, device=device)
         draws = torch.rand(count, generator=self._generator, device=device)
         same_start = (m - 1 + count - place % m).div(m, rounding_mode="floor")
         start = (place + offset) % m
         share = (place // m + draws) / same_start
-        chosen = order.index_select(0, (share * seen[start]).long() + first[start])
-        # The last column stands for the cells in which no segment begins.
-        cells = pad(self._segments[: steps + 1], (0, 1), value=m).index_select(1, chosen).long()
+        chosen = (share * seen[start]).long() + first[start]
+        cells = segments[: steps + 1].index_select(1, chosen).long()
         cells[0] = start
         return cells
 
     def _sort(self) -> tuple[Tensor, Tensor, Tensor]:
-        """All segments in the order of their first cells, and per cell where its own begin and how many they are."""
+        """All segments in the order of their first moves, and per cell where its own begin and how many they are.
+
+        One more, of M alone, stands for the cells in which no segment begins.
+        """
         m = self.num_cells
         start, end = self._segments[:2].long()
-        order = torch.cat([(start * (m + 1) + end).argsort(stable=True), start.new_tensor([len(self)])])
+        order = (start * (m + 1) + end).argsort(stable=True)
         seen = torch.bincount(start, minlength=m)
         first = torch.where(seen > 0, seen.cumsum(0) - seen, len(self))
         # Half a float's spacing below the count, so that a draw close to 1 does not round up to the next cell's.
-        return order, first, seen.clamp(min=1).float() * (1.0 - 2.0**-24)
+        share = seen.clamp(min=1).float() * (1.0 - 2.0**-24)
+        return pad(self._segments.index_select(1, order), (0, 1), value=m), first, share
 
     def state_dict(self) -> dict[str, Any]:
         """The segments, and the end of the last batch; the generator is its owner's to save."""

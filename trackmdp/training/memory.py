@@ -47,7 +47,8 @@ def needs(cfg: TrainConfig, task: Task) -> dict[str, int]:
         parts["algo.buffer_size"] = cfg.algo.buffer_size * (transition + priority)
     if isinstance(cfg.algo, Hindsight):
         moves = min(cfg.algo.buffer_size, cfg.collector.total_frames)
-        parts["algo.buffer_size"] = moves * (4 + 5 * _INDEX)  # two cells of 16 bits, and their sorting
+        cells = 2 if task.markov else 2 * (task.t_max + 3)  # of 16 bits; whole paths are kept a second time, sorted
+        parts["algo.buffer_size"] = moves * (2 * cells + 5 * _INDEX)  # and what sorting them takes
     if isinstance(cfg.algo, (A2c, Ppo, Dqn, Hindsight)):
         inputs = task.num_cells * (2 * task.num_choices + 3) + task.num_choices + 1
         with_moments = 4 * _NUMBER * (inputs + task.num_cells)
