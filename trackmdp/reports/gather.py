@@ -193,18 +193,18 @@ def _missing_seeds(grouped: Study) -> list[Problem]:
 
 
 def _policies(folder: Path, grouped: Study) -> tuple[dict[str, policy.Policy], list[Problem]]:
-    """Of each world and method the policy of the run in the middle."""
-    found, problems = {}, []
-    for world in grouped.worlds:
-        for method in grouped.methods:
-            runs = sorted(grouped.of(world, method), key=lambda run: (run.figure("aihtr"), run.seed))
-            if not runs:
-                continue
-            name = runs[(len(runs) - 1) // 2].name
+    """Of each world and method the policy of the run in the middle, or of the one next to it that can be read."""
+    found: dict[str, policy.Policy] = {}
+    problems = []
+    for runs in grouped.groups.values():
+        ranked = sorted(runs, key=lambda run: (run.figure("aihtr"), run.seed))
+        middle = (len(ranked) - 1) / 2
+        for _, run in sorted(enumerate(ranked), key=lambda item: abs(item[0] - middle)):
             try:
-                found[name] = policy.read(folder / name / policy.FILE)
+                found[run.name] = policy.read(folder / run.name / policy.FILE)
+                break
             except UserError as error:
-                problems.append(Problem(name, str(error).removeprefix(f"{folder / name}/")))
+                problems.append(Problem(run.name, str(error).removeprefix(f"{folder / run.name}/")))
     return found, problems
 
 

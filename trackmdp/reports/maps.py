@@ -72,8 +72,8 @@ def value_map(name: str, where: str, policy: Policy, motion: Motion) -> Figure |
         return None
     layers = {
         "value V(x)": policy.value,
-        "missing to the clocked bound": motion.clocked - policy.value,
-        "the same, Q_MDP": motion.clocked - motion.qmdp,
+        "missing to the clocked bound": _rounded(motion.clocked - policy.value),
+        "the same, Q_MDP": _rounded(motion.clocked - motion.qmdp),
     }
 
     def paint(figure: Canvas) -> None:
@@ -109,6 +109,11 @@ def value_map(name: str, where: str, policy: Policy, motion: Motion) -> Figure |
     return draw(f"value-{name}", title, f"{text}.", Table(f"value-{name}", title, columns, rows), 2.1, paint)
 
 
+def _rounded(values: Array) -> Array:
+    """Without what is rounding only."""
+    return np.where(np.abs(values) < 1e-9, 0.0, values)
+
+
 def _possible(policy: Policy, motion: Motion, steps: int) -> list[BoolArray]:
     """`[M, M]` each: where the target may be after n misses and one more move."""
     mass = motion.kernel.toarray()
@@ -121,6 +126,7 @@ def _possible(policy: Policy, motion: Motion, steps: int) -> list[BoolArray]:
 
 def _tiles(axes: Axes, on: BoolArray, possible: BoolArray, size: int, reach: int) -> None:
     """One tile per located cell, `2 reach + 1` cells wide; cells farther away that are possible widen all tiles."""
+    on = on & possible.any(axis=1, keepdims=True)  # elsewhere it never comes to this
     reach = max(reach, _farthest(possible | on, size))
     side = 2 * reach + 2
     groups: dict[str, list[tuple[float, float]]] = {ON: [], OFF: [], IDLE: []}

@@ -8,14 +8,16 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from trackmdp.durable import whole_file
 from trackmdp.errors import UserError
 from trackmdp.world.model import Array, BoolArray
 
-__all__ = ["FILE", "Policy", "pack", "pack_all", "read", "unpack_all", "write"]
+__all__ = ["FILE", "Policy", "arrays", "pack", "pack_all", "read", "unpack_all", "write"]
 
 FILE = "policy.npz"
 
@@ -41,17 +43,30 @@ def pack(policy: Policy) -> bytes:
     return stream.getvalue()
 
 
+def arrays(content: bytes, *keys: str) -> list[npt.NDArray[Any]]:
+    """The arrays of a `.npz`; code in it is not run.
+
+    Raises:
+        ValueError, KeyError: the bytes are something else.
+    """
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as stored:
+            return [stored[key] for key in keys]
+    except (EOFError, TypeError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(str(error)) from error
+
+
 def pack_all(policies: Mapping[str, Policy]) -> bytes:
     """The bytes of a file with many policies, each under a name."""
     every = list(policies.values())
-    arrays = {
+    packed = {
         "names": np.array(list(policies), dtype=np.str_),
         "shapes": np.array([policy.chains.shape for policy in every], dtype=np.int64).reshape(-1, 3),
         "chains": np.packbits(np.concatenate([policy.chains.ravel() for policy in every] or [np.zeros(0, bool)])),
         "values": np.concatenate([policy.value for policy in every] or [np.zeros(0)]),
     }
     stream = io.BytesIO()
-    np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
+    np.savez_compressed(stream, **packed)  # type: ignore[arg-type]
     return stream.getvalue()
 
 
@@ -61,11 +76,7 @@ def unpack_all(content: bytes) -> dict[str, Policy]:
     Raises:
         ValueError, KeyError: the bytes are something else.
     """
-    try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as stored:
-            names, shapes, bits, values = (stored[key] for key in ("names", "shapes", "chains", "values"))
-    except (EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(str(error)) from error
+    names, shapes, bits, values = arrays(content, "names", "shapes", "chains", "values")
     sizes = shapes.prod(axis=1)
     flat = np.unpackbits(bits, count=int(sizes.sum())).astype(np.bool_)
     chains = np.split(flat, np.cumsum(sizes)[:-1]) if len(names) else []
@@ -86,12 +97,11 @@ def read(file: Path) -> Policy:
         UserError: the file is missing or damaged, or holds something else.
     """
     try:
-        with np.load(io.BytesIO(file.read_bytes()), allow_pickle=False) as stored:
-            bits, shape, value = (stored[key] for key in ("chains", "shape", "value"))
+        bits, shape, value = arrays(file.read_bytes(), "chains", "shape", "value")
         m, choices, sensors = map(int, shape)
         if sensors != m or value.shape != (m,) or bits.size != (m * choices * m + 7) // 8:
             raise ValueError("arrays that do not belong together")
         chains = np.unpackbits(bits, count=m * choices * m).astype(np.bool_).reshape(m, choices, m)
         return Policy(chains, np.asarray(value, dtype=np.float64))
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(f"{file}: not the policy of a run ({' '.join(str(error).split())})") from error

@@ -19,7 +19,7 @@ from scipy import sparse
 
 from trackmdp.durable import whole_file
 from trackmdp.errors import UserError
-from trackmdp.reports.policy import Policy, pack_all, unpack_all
+from trackmdp.reports.policy import Policy, arrays, pack_all, unpack_all
 from trackmdp.world.model import Array
 
 __all__ = ["FIGURES", "FORMAT", "Motion", "Point", "Problem", "Results", "Run", "is_stored", "load", "save"]
@@ -232,7 +232,7 @@ def _value(text: str) -> Any:
 def _pack_motions(motions: Mapping[str, Motion]) -> bytes:
     names = sorted(motions)
     each = [motions[name] for name in names]
-    arrays = {
+    packed = {
         "runs": np.array(names, dtype=np.str_),
         "cells": np.array([len(m.qmdp) for m in each], dtype=np.int64),
         "entries": np.array([m.kernel.nnz for m in each], dtype=np.int64),
@@ -243,21 +243,21 @@ def _pack_motions(motions: Mapping[str, Motion]) -> bytes:
         "clocked": np.concatenate([m.clocked for m in each] or [np.zeros(0)]),
     }
     stream = io.BytesIO()
-    np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
+    np.savez_compressed(stream, **packed)  # type: ignore[arg-type]
     return stream.getvalue()
 
 
 def _unpack_motions(content: bytes) -> dict[str, Motion]:
-    with np.load(io.BytesIO(content), allow_pickle=False) as stored:
-        arrays = {key: stored[key] for key in stored.files}
+    keys = ("runs", "cells", "entries", "data", "indices", "indptr", "qmdp", "clocked")
+    stored = dict(zip(keys, arrays(content, *keys), strict=True))
     found, cell, entry = {}, 0, 0
-    for place, name in enumerate(arrays["runs"]):
-        m, nnz = int(arrays["cells"][place]), int(arrays["entries"][place])
+    for place, name in enumerate(stored["runs"]):
+        m, nnz = int(stored["cells"][place]), int(stored["entries"][place])
         inner, outer = slice(entry, entry + nnz), slice(cell + place, cell + place + m + 1)
-        rows = (arrays["data"][inner], arrays["indices"][inner], arrays["indptr"][outer])
+        rows = (stored["data"][inner], stored["indices"][inner], stored["indptr"][outer])
         cells = slice(cell, cell + m)
         kernel = sparse.csr_array(rows, shape=(m, m))
-        found[str(name)] = Motion(kernel, arrays["qmdp"][cells], arrays["clocked"][cells])
+        found[str(name)] = Motion(kernel, stored["qmdp"][cells], stored["clocked"][cells])
         cell, entry = cell + m, entry + nnz
     return found
 

@@ -129,7 +129,19 @@ def draw(name: str, title: str, text: str, table: Table, height: float, paint: C
 
 
 def tidy(axes: Axes) -> None:
-    """Light grid, no box."""
+    """Light grid, no box; letters between powers of ten only where there are few powers."""
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+    for axis, scale, (low, high) in (
+        (axes.xaxis, axes.get_xscale(), axes.get_xlim()),
+        (axes.yaxis, axes.get_yscale(), axes.get_ylim()),
+    ):
+        if scale == "log" and high > 50 * low:
+            axis.set_minor_formatter(NullFormatter())
+        elif scale == "log":
+            axis.set_minor_locator(LogLocator(subs=(2, 5)))
+            for form in (axis.set_major_formatter, axis.set_minor_formatter):
+                form(StrMethodFormatter("{x:g}"))
     axes.grid(True, color=LINE, linewidth=0.5)
     axes.set_axisbelow(True)
     for side in ("top", "right"):

@@ -1,0 +1,90 @@
+"""Sweeps as `train -m` leaves them, without learning: policies are the clocked one, some sensors switched over."""
+
+from __future__ import annotations
+
+import copy
+import csv
+import functools
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tests.helpers import train_config
+from trackmdp.build import make_world
+from trackmdp.config import PaperCost, TrainConfig
+from trackmdp.config.resume import config_text, digest
+from trackmdp.reports import policy
+from trackmdp.solvers import clocked
+from trackmdp.training.judge import Judge, figures
+
+VERSIONS = {"trackmdp": "0.1.0", "torch": "2.13.0"}
+MACHINE = {"processor": "a processor", "cores": 2}
+
+
+@functools.cache
+def _composed(*overrides: str) -> TrainConfig:
+    return train_config("quiet=true", *overrides)
+
+
+def write_run(
+    folder: Path,
+    *overrides: str,
+    cost: float = 0.16,
+    seed: int = 0,
+    wrong: int = 0,
+    versions: dict[str, str] | None = None,
+) -> dict[str, Any]:
+    """A finished run with `wrong` sensors switched over; returns its summary."""
+    folder.mkdir(parents=True)
+    cfg = copy.deepcopy(_composed(*overrides))
+    assert isinstance(cfg.cost, PaperCost)
+    cfg.cost.sensor, cfg.seed = cost, seed
+    world = make_world(cfg)
+    judge = Judge(world)
+    chains = clocked.solve(world)
+    rng = np.random.default_rng(cfg.seed)
+    chains.flat[rng.choice(chains.size, wrong, replace=False)] ^= True
+    verdict = judge.score(chains)
+    summary = {
+        "algo": cfg.algo.name,
+        "seed": cfg.seed,
+        "frames": 4000,
+        "wall_seconds": 2.0,
+        "cpu_seconds": 1.5,
+        "policy": figures(verdict.evaluation),
+        "qmdp": figures(judge.qmdp),
+        "bounds": judge.bounds,
+        "optimal": {"lower": judge.upper - 0.01, "upper": judge.upper, "certified": True},
+        "regret_per_step": verdict.regret_per_step,
+        "versions": versions or VERSIONS,
+        "machine": MACHINE,
+        "config_sha256": digest(cfg),
+    }
+    (folder / "config.yaml").write_text(config_text(cfg), encoding="utf-8")
+    (folder / "summary.json").write_text(json.dumps(summary), encoding="utf-8")
+    np.save(folder / "kernel.npy", world.kernel)
+    policy.write(folder / policy.FILE, policy.Policy(chains, verdict.evaluation.value))
+    write_curve(folder, np.linspace(-100.0, verdict.evaluation.aihtr, 40))
+    return summary
+
+
+def write_curve(folder: Path, aihtr: np.ndarray) -> None:
+    """A `metrics.csv` that is judged at every second iteration."""
+    with (folder / "metrics.csv").open("w", newline="") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(["iteration", "frames", "aihtr", "seconds"])
+        for place, value in enumerate(aihtr, start=1):
+            writer.writerow([2 * place - 1, 200 * place - 100, "", 0.1 * place - 0.05])
+            writer.writerow([2 * place, 200 * place, value, 0.1 * place])
+
+
+def write_sweep(folder: Path) -> Path:
+    """Two prices, two algorithms, three seeds, on a small grid."""
+    for cost in (0.16, 0.22):
+        for algo, wrong in (("a2c", 9), ("hindsight", 1)):
+            for seed in range(3):
+                name = f"{algo}-{cost}-{seed}"
+                write_run(folder / name, "grid.size=3", f"algo={algo}", cost=cost, seed=seed, wrong=wrong + seed)
+    return folder

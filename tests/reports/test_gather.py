@@ -1,0 +1,186 @@
+"""From a sweep's folder to its results and back; what is wrong in there is named, and the rest is used."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.reports.sweeps import VERSIONS, write_curve, write_run, write_sweep
+from trackmdp.build import make_world
+from trackmdp.errors import UserError
+from trackmdp.reports import policy, results
+from trackmdp.reports.gather import MOST_POINTS, gather
+from trackmdp.reports.results import Results
+from trackmdp.solvers import bounds, qmdp
+from trackmdp.solvers.chains import evaluate
+from trackmdp.training.metrics import write_json
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_sweep(tmp_path_factory.mktemp("sweep"))
+
+
+@pytest.fixture
+def sweep(whole: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(whole, tmp_path / "sweep"))
+
+
+def problems(found: Results) -> dict[str, str]:
+    return {problem.run: problem.text for problem in found.problems}
+
+
+def plan(folder: Path, *names: str) -> None:
+    jobs = [{"folder": name, "overrides": []} for name in names]
+    write_json(
+        folder / "sweep.json", {"command": "train", "line": "trackmdp train -m hydra.sweep.dir=/x", "jobs": jobs}
+    )
+
+
+def test_every_figure_of_a_run_is_read(whole: Path) -> None:
+    found = gather(whole, make_world)
+    assert len(found.runs) == 12
+    assert not found.problems
+    run = next(run for run in found.runs if run.name == "a2c-0.22-1")
+    summary = json.loads((whole / run.name / "summary.json").read_text())
+    assert (run.algo, run.seed, run.settings["cost.sensor"]) == ("a2c", 1, 0.22)
+    assert run.figure("aihtr") == summary["policy"]["aihtr"]
+    assert run.figure("qmdp_accuracy") == summary["qmdp"]["accuracy"]
+    assert run.figure("bound_paper") == summary["bounds"]["paper"]
+    assert run.figure("optimal_upper") == summary["optimal"]["upper"]
+    assert run.config_sha256 == summary["config_sha256"]
+    assert found.manifest["wall_seconds"] == 24.0
+    assert found.manifest["versions"] == [{"runs": 12, **VERSIONS}]
+
+
+def test_one_policy_per_group_is_kept_that_of_the_run_in_the_middle(whole: Path) -> None:
+    found = gather(whole, make_world)
+    assert len(found.policies) == 4
+    for name, kept in found.policies.items():
+        group = [run for run in found.runs if run.name.rsplit("-", 1)[0] == name.rsplit("-", 1)[0]]
+        assert kept.value.mean() == pytest.approx(np.median([run.figure("aihtr") for run in group]))
+        assert np.array_equal(kept.chains, policy.read(whole / name / "policy.npz").chains)
+
+
+def test_motion_and_references_are_kept_per_world(whole: Path) -> None:
+    found = gather(whole, make_world)
+    assert sorted(found.motions) == ["a2c-0.16-0", "a2c-0.22-0"]
+    from trackmdp.config import load_run
+
+    world = make_world(load_run(whole / "a2c-0.22-0"))
+    motion = found.motions["a2c-0.22-0"]
+    assert np.array_equal(motion.kernel.toarray(), world.kernel)
+    assert np.array_equal(motion.clocked, bounds.clocked(world))
+    assert np.array_equal(motion.qmdp, evaluate(world, qmdp.solve(world)).value)
+
+
+def test_stored_results_read_back_the_same_and_are_small(whole: Path, tmp_path: Path) -> None:
+    found = gather(whole, make_world)
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+    results.save(found, tmp_path / "a")
+    assert results.is_stored(tmp_path / "a")
+    assert not results.is_stored(whole)
+    read = results.load(tmp_path / "a")
+    assert [(r.name, dict(r.settings), dict(r.figures)) for r in read.runs] == [
+        (r.name, dict(r.settings), dict(r.figures)) for r in found.runs
+    ]
+    results.save(read, tmp_path / "b")
+    for file in sorted((tmp_path / "a").iterdir()):
+        assert file.read_bytes() == (tmp_path / "b" / file.name).read_bytes(), file.name
+    assert sum(file.stat().st_size for file in (tmp_path / "a").iterdir()) < 20_000
+
+
+def test_no_path_of_the_machine_is_kept(sweep: Path, tmp_path: Path) -> None:
+    plan(sweep, "a2c-0.16-0")
+    (tmp_path / "out").mkdir()
+    results.save(gather(sweep, make_world), tmp_path / "out")
+    for file in ("manifest.json", "runs.csv"):
+        assert str(tmp_path) not in (tmp_path / "out" / file).read_text()
+    assert results.load(tmp_path / "out").manifest["line"] == "trackmdp train -m"
+
+
+def test_a_curve_keeps_its_ends_and_few_points(sweep: Path) -> None:
+    values = np.linspace(-5.0, 5.0, 300)
+    write_curve(sweep / "a2c-0.16-0", values)
+    curve = gather(sweep, make_world).curves["a2c-0.16-0"]
+    assert len(curve) <= MOST_POINTS
+    assert (curve[0].aihtr, curve[-1].aihtr, curve[-1].iteration) == (values[0], values[-1], 600)
+    gaps = np.diff([point.iteration for point in curve])
+    assert gaps[0] < gaps[-1]
+
+
+def test_what_is_wrong_with_a_run_is_named(sweep: Path) -> None:
+    (sweep / "a2c-0.16-0/summary.json").unlink()
+    (sweep / "a2c-0.16-1/summary.json").write_text('{"frames": 3')
+    (sweep / "a2c-0.16-2/summary.json").write_text('{"frames": 3}')
+    (sweep / "a2c-0.22-0/config.yaml").write_text("a: [")
+    write_json(sweep / "a2c-0.22-1/failed.json", {"reason": "out of luck"})
+    (sweep / "hindsight-0.16-1/metrics.csv").write_text("iteration,frames\n1,x\n")
+    for seed in range(3):
+        (sweep / f"hindsight-0.22-{seed}/policy.npz").write_bytes(b"nothing")
+    (sweep / "hindsight-0.16-0/kernel.npy").unlink()
+    found = gather(sweep, make_world)
+    said = problems(found)
+    assert len(found.runs) == 7
+    assert said["a2c-0.16-0"] == "cut: it has no summary.json"
+    assert said["a2c-0.16-1"].startswith("its summary.json cannot be read")
+    assert said["a2c-0.16-2"].startswith("its summary.json cannot be read")
+    assert "config.yaml" in said["a2c-0.22-0"]
+    assert said["a2c-0.22-1"] == "failed: out of luck"
+    assert said["hindsight-0.16-1"] == "no learning curve"
+    assert said["hindsight-0.22-1"].startswith("policy.npz: not the policy of a run")
+    assert said["hindsight-0.16-0"].startswith("its world cannot be built")
+    assert said["a2c, Z=5, c=0.16"] == "no run"  # a2c has one left, at the other price
+    assert sorted(found.policies)[0] == "a2c-0.22-2"
+    assert len(found.policies) == 2
+
+
+def test_a_missing_seed_is_named(sweep: Path) -> None:
+    shutil.rmtree(sweep / "a2c-0.16-1")
+    assert problems(gather(sweep, make_world)) == {"a2c, Z=5, c=0.16": "seed 1 missing"}
+
+
+def test_what_was_planned_and_is_not_there_is_named(sweep: Path) -> None:
+    names = sorted(path.name for path in sweep.iterdir())
+    plan(sweep, *names, "ppo-0.16-0")
+    found = gather(sweep, make_world)
+    assert problems(found) == {"ppo-0.16-0": "not started"}
+    assert found.manifest["planned"] == 13
+
+
+def test_runs_of_other_versions_and_repeated_runs_are_named(sweep: Path) -> None:
+    shutil.rmtree(sweep / "a2c-0.16-1")
+    write_run(sweep / "a2c-0.16-1", "grid.size=3", "algo=a2c", seed=1, versions=VERSIONS | {"torch": "1.0"})
+    shutil.copytree(sweep / "a2c-0.22-0", sweep / "z")
+    found = gather(sweep, make_world)
+    assert problems(found) == {
+        "a2c-0.16-1": "other versions: torch 1.0, most have 2.13.0",
+        "z": "the same config as a2c-0.22-0, which counts",
+    }
+    assert len(found.runs) == 12
+
+
+@pytest.mark.parametrize("content", [None, "runs/notes.txt"])
+def test_a_folder_without_runs_is_refused(content: str | None, tmp_path: Path) -> None:
+    if content:
+        (tmp_path / content).parent.mkdir()
+        (tmp_path / content).touch()
+    with pytest.raises(UserError, match="no runs in there"):
+        gather(tmp_path, make_world)
+
+
+@pytest.mark.parametrize(
+    ("file", "content"),
+    [("runs.csv", "run\nx\n"), ("policies.npz", "PK"), ("worlds.npz", ""), ("curves.csv", "run,iteration\n99,1\n")],
+)
+def test_damaged_stored_results_are_refused_in_one_line(file: str, content: str, whole: Path, tmp_path: Path) -> None:
+    results.save(gather(whole, make_world), tmp_path)
+    (tmp_path / file).write_text(content)
+    with pytest.raises(UserError, match="stored results that cannot be read") as caught:
+        results.load(tmp_path)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,50 @@
+"""Tables as HTML, CSV and LaTeX."""
+
+from __future__ import annotations
+
+import csv
+import io
+
+from trackmdp.reports.tables import Column, Table
+
+TABLE = Table(
+    "a",
+    "Policies & <prices>",
+    [Column("policy"), Column("AIHTR", 2), Column("share", 1, "%"), Column("n"), Column("good", judged=True)],
+    [["Q_MDP <b>", 1234.5678, 1 / 3, 5, True], ["none", -0.001, float("nan"), None, False]],
+)
+
+
+def test_csv_keeps_every_digit() -> None:
+    rows = list(csv.reader(io.StringIO(TABLE.csv())))
+    assert rows[0] == ["policy", "AIHTR", "share (%)", "n", "good"]
+    assert [float(rows[1][1]), float(rows[1][2])] == [1234.5678, 1 / 3]
+    assert rows[2][2:4] == ["", ""]
+
+
+def test_cells_are_shown_to_the_digits_asked_for() -> None:
+    shown = [[column.text(value) for column, value in zip(TABLE.columns, row, strict=True)] for row in TABLE.rows]
+    assert shown == [["Q_MDP <b>", "1,234.57", "0.3", "5", "yes"], ["none", "0.00", "–", "–", "no"]]
+    assert Column("x", 2).text(-1.5) == "−1.50"
+
+
+def test_html_escapes_what_it_shows_and_sorts_by_what_it_hides() -> None:
+    text = TABLE.html()
+    assert "<b>" not in text
+    assert "Q_MDP &lt;b&gt;" in text
+    assert 'data-v="1234.5678">1,234.57<' in text
+    assert text.count('<th scope="col"') == text.count('<button type="button">') == 5
+    assert '<td class="yes">yes</td>' in text
+    assert "<caption>Policies &amp; &lt;prices&gt;</caption>" in text
+    plain = Table("b", "", [Column("good")], [[True]]).html()
+    assert 'class="yes"' not in plain
+
+
+def test_latex_escapes_and_has_as_many_cells_as_columns() -> None:
+    lines = TABLE.latex().splitlines()
+    assert lines[1] == r"\begin{tabular}{lrrrl}"
+    rows = [line for line in lines if line.endswith(r"\\")]
+    assert len(rows) == 3
+    assert all(row.count(" & ") == 4 for row in rows)
+    assert r"Q\_MDP" in rows[1]
+    assert r"share (\%)" in rows[0]
