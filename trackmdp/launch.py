@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 import importlib
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hydra import version
 from hydra._internal.hydra import Hydra
@@ -22,11 +22,14 @@ from omegaconf import DictConfig, OmegaConf
 
 from trackmdp.config import CommandConfig, TrainConfig, conf_dir, register
 from trackmdp.config.resume import continued, run_folder
-from trackmdp.config.sweeps import plugin
+from trackmdp.config.sweeps import Blocks, Optuna, Sweeper, plugin
 from trackmdp.diagnose import diagnose
 from trackmdp.errors import RunError, UserError
 from trackmdp.outputs import make_folder, remove_if_empty
 from trackmdp.prepare import announce, check_files, typed_config
+
+if TYPE_CHECKING:
+    from trackmdp.sweep.plan import Job
 
 __all__ = ["launch"]
 
@@ -74,27 +77,45 @@ def _run_once(command: str, args: argparse.Namespace, hydra: Hydra) -> int:
 
 def _sweep(command: str, args: argparse.Namespace, hydra: Hydra) -> int:
     from trackmdp.sweep.launchers import make_launcher
-    from trackmdp.sweep.plan import combinations, of_task, plan, sweep_name
+    from trackmdp.sweep.plan import of_task, sweep_name
     from trackmdp.sweep.sweep import sweep
     from trackmdp.training.display import make_console
 
     cfg = _compose(command, args, hydra, RunMode.MULTIRUN)
-    typed, blocks = of_task(args.overrides), plugin("sweeper", cfg.hydra.sweeper).blocks or []
+    typed, sweeper = of_task(args.overrides), plugin("sweeper", cfg.hydra.sweeper)
     launch_jobs = make_launcher(plugin("launcher", cfg.hydra.launcher))
-    OmegaConf.register_new_resolver("sweep_name", lambda: sweep_name(command, typed, blocks), replace=True)
+    grids = (sweeper.blocks or []) if isinstance(sweeper, Blocks) else [sweeper.name]
+    OmegaConf.register_new_resolver("sweep_name", lambda: sweep_name(command, typed, grids), replace=True)
     folder = Path(cfg.hydra.sweep.dir)
+    batches = _batches(command, args, hydra, sweeper, folder.absolute())
+    line = shlex.join(["trackmdp", command, "-m", *args.overrides])
+    made = make_folder("hydra.sweep.dir", folder)
+    try:
+        return sweep(folder.absolute(), command, line, batches, launch_jobs, make_console(cfg.quiet))
+    finally:
+        remove_if_empty(made)
+
+
+def _batches(
+    command: str, args: argparse.Namespace, hydra: Hydra, sweeper: Sweeper, folder: Path
+) -> Iterable[Sequence[Job]]:
+    """The jobs of a sweep: all at once, or as a search asks for them."""
+    from trackmdp.sweep.plan import combinations, of_task, plan
+    from trackmdp.sweep.trials import trials
 
     def composed(words: Sequence[str]) -> DictConfig:
         alone = argparse.Namespace(**{**vars(args), "overrides": list(words)})
         return _compose(command, alone, hydra, RunMode.RUN)
 
-    jobs = plan(command, combinations(blocks, typed), folder.absolute(), composed)
-    line = shlex.join(["trackmdp", command, "-m", *args.overrides])
-    made = make_folder("hydra.sweep.dir", folder)
-    try:
-        return sweep(folder.absolute(), command, line, jobs, launch_jobs, make_console(cfg.quiet))
-    finally:
-        remove_if_empty(made)
+    typed = of_task(args.overrides)
+    if isinstance(sweeper, Blocks):
+        return [plan(command, combinations(sweeper.blocks or [], typed), folder, composed)]
+    assert isinstance(sweeper, Optuna)
+
+    def planned(words: Sequence[str], telling: set[str]) -> Job:
+        return plan(command, [words], folder, composed, telling)[0]
+
+    return trials(sweeper, typed, folder, planned)
 
 
 @dataclass

@@ -18,6 +18,7 @@ __all__ = [
     "Blocks",
     "Joblib",
     "Launcher",
+    "Optuna",
     "Ray",
     "Submitit",
     "SubmititLocal",
@@ -64,15 +65,34 @@ class Sweeper:
     """Base of the group `hydra/sweeper`: which runs a sweep has."""
 
     name: ClassVar[str]
-    blocks: list[str] | None = option(
-        "grids whose union is the sweep; null = one of the typed words", expects="a line of words"
-    )
 
 
 @_offered("sweeper", "blocks")
 @dataclass(kw_only=True)
 class Blocks(Sweeper):
     """Every combination of the values in each block; what is typed is added to each, or replaces its words."""
+
+    blocks: list[str] | None = option(
+        "grids whose union is the sweep; null = one of the typed words", expects="a line of words"
+    )
+
+
+@_offered("sweeper", "optuna")
+@dataclass(kw_only=True)
+class Optuna(Sweeper):
+    """A search: the words with several values, `range(a,b)` or `interval(a,b)` say what is searched."""
+
+    n_trials: int = option("runs of the whole study, those of earlier calls among them", unit="runs", ge=1)
+    objective: str = option(
+        "what is searched for: the largest AIHTR, the least regret", choices=("aihtr", "regret_per_step")
+    )
+    sampler: str = option("how the next run is chosen", choices=("tpe", "random"))
+    seed: int = option("every choice derives from it", ge=0)
+    batch: int = option("runs chosen at once, for launchers that run several", unit="runs", ge=1)
+    study: str = option("name of the study in its storage", expects="a name")
+    storage: str | None = option(
+        "data base of the study; null = study.db in the sweep's folder", expects="a URL such as sqlite:///studies.db"
+    )
 
 
 @dataclass(kw_only=True)

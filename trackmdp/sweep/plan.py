@@ -7,7 +7,7 @@ import itertools
 import json
 import re
 import shlex
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -90,6 +90,7 @@ def plan(
     grid: Sequence[Sequence[str]],
     sweep: Path,
     compose: Callable[[Sequence[str]], DictConfig],
+    telling: Collection[str] = (),
 ) -> list[Job]:
     """The jobs of a sweep, those that come out the same only once.
 
@@ -101,11 +102,12 @@ def plan(
         grid: the words of each run.
         sweep: the sweep's folder.
         compose: the config of some words.
+        telling: options that tell the runs apart; if none are named, those whose values differ in the grid.
 
     Raises:
         UserError: words that do not make a config; a config that is refused is kept, as a job that fails.
     """
-    telling, known = _varying(grid), _folders(sweep)
+    telling, known = telling or _varying(grid), _folders(sweep)
     jobs: dict[str, Job] = {}
     for words in grid:
         cfg: CommandConfig | None
@@ -146,11 +148,16 @@ def _folders(sweep: Path) -> dict[str, str]:
 
 def _slug(words: Iterable[str], prefix: Sequence[str] = ()) -> str:
     """Words as a readable part of a folder's name."""
-    named = {_key(word): word.partition("=")[2] for word in words if _key(word) not in _UNNAMED}
+    named = {_key(word): _short(word.partition("=")[2]) for word in words if _key(word) not in _UNNAMED}
     short = [key.split(".")[-1] for key in named]
     pairs = {key if short.count(last) > 1 else last: named[key] for key, last in zip(named, short, strict=True)}
     parts = [*prefix, *(f"{key}_{value}" for key, value in pairs.items())]
     return "-".join(re.sub(r"[^\w.+-]+", "_", part).strip("_") for part in parts)[:80].strip("-._")
+
+
+def _short(value: str) -> str:
+    """A number of many digits in a few; the digest tells it from others."""
+    return f"{float(value):.4g}" if re.fullmatch(r"-?\d*\.\d{5,}(e-?\d+)?", value) else value
 
 
 def _told(words: Iterable[str]) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from types import FrameType, TracebackType
 
@@ -29,14 +29,16 @@ _ROUNDS = 3
 """How often what a broken launcher left undone is launched."""
 
 
-def sweep(folder: Path, command: str, line: str, jobs: Sequence[Job], launch: Launch, console: Console) -> int:
+def sweep(
+    folder: Path, command: str, line: str, batches: Iterable[Sequence[Job]], launch: Launch, console: Console
+) -> int:
     """Run what is not finished, and show what came of all; returns the exit status.
 
     Args:
         folder: of the sweep.
         command: what is run.
         line: what was typed.
-        jobs: the plan.
+        batches: the plan, in parts; the next one is asked for once the runs of one are over.
         launch: runs jobs.
         console: where the table is shown.
 
@@ -44,22 +46,32 @@ def sweep(folder: Path, command: str, line: str, jobs: Sequence[Job], launch: La
         UserError: the folder is in use.
         Preempted: a signal ended the sweep; it can go on.
     """
-    with locked(folder, "hydra.sweep.dir"):
-        write_plan(folder, command, line, [(job.name, job.words) for job in jobs])
-        skipped = {job.folder for job in jobs if _is_finished(job)}
-        waiting = [job for job in jobs if job.folder not in skipped]
-        console.print(_opening(jobs, skipped, folder), markup=False)
-        with _Stop(folder) as stop, threads_of(waiting):
-            for job in waiting:
-                _forget(job)
-            _launch(waiting, launch, stop)
+    jobs: dict[str, Job] = {}
+    skipped: set[Path] = set()
+    with locked(folder, "hydra.sweep.dir"), _Stop(folder) as stop:
+        for batch in batches:
+            jobs |= {job.name: job for job in batch}
+            write_plan(folder, command, line, [(job.name, job.words) for job in jobs.values()])
+            done = {job.folder for job in batch if _is_finished(job)}
+            console.print(_opening(batch, done, folder), markup=False)
+            _run([job for job in batch if job.folder not in done], launch, stop)
+            skipped |= done
+            if stop.received:
+                break
         runs = runs_of(folder)
         write_table(folder, runs)
         show(console, runs, skipped, folder)
-        if stop.received:
-            raise Preempted(stop.received)
-        _tell_failures(command, runs)
-        return status_of(runs)
+    if stop.received:
+        raise Preempted(stop.received)
+    _tell_failures(command, runs)
+    return status_of(runs)
+
+
+def _run(jobs: Sequence[Job], launch: Launch, stop: _Stop) -> None:
+    for job in jobs:
+        _forget(job)
+    with threads_of(jobs):
+        _launch(jobs, launch, stop)
 
 
 def _is_finished(job: Job) -> bool:

@@ -18,7 +18,7 @@ from trackmdp.sweep.state import FAILED, Run, read_json
 from trackmdp.training.display import table
 from trackmdp.training.metrics import write_text
 
-__all__ = ["TABLE", "show", "status_of", "write_table"]
+__all__ = ["TABLE", "figures", "show", "status_of", "write_table"]
 
 TABLE = "runs.csv"
 
@@ -52,8 +52,8 @@ def write_table(sweep: Path, runs: Sequence[Run]) -> None:
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(["folder", "state", *_FIGURES, "reason", *keys])
     for run, pairs in zip(runs, words, strict=True):
-        figures = _figures(run)
-        row = [run.folder.name, run.state, *(figures.get(name) for name in _FIGURES), run.reason]
+        found = figures(run)
+        row = [run.folder.name, run.state, *(found.get(name) for name in _FIGURES), run.reason]
         writer.writerow([*row, *(pairs.get(key) for key in keys)])
     write_text(sweep / TABLE, stream.getvalue())
 
@@ -71,7 +71,7 @@ def _state(run: Run, skipped: Collection[Path]) -> str:
     return "skipped" if run.folder in skipped and run.state == "done" else run.state
 
 
-def _figures(run: Run) -> dict[str, Any]:
+def figures(run: Run) -> dict[str, Any]:
     """The figures of a training run; of another command's the one value that it returns."""
     if "policy" not in run.result:
         return {"aihtr": run.result.get("value")}
@@ -79,8 +79,8 @@ def _figures(run: Run) -> dict[str, Any]:
 
 
 def _short(run: Run) -> list[str]:
-    figures = _figures(run)
-    aihtr, regret = figures.get("aihtr"), figures.get("regret_per_step")
+    found = figures(run)
+    aihtr, regret = found.get("aihtr"), found.get("regret_per_step")
     return [f"{aihtr:,.3f}" if aihtr is not None else "", f"{round(regret, 4) + 0.0:.4f}" if regret is not None else ""]
 
 
