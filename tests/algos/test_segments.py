@@ -79,6 +79,26 @@ def test_a_step_that_was_not_fully_sensed_breaks_a_segment() -> None:
     assert segments(made) == [(0, 1, 2, 3), (1, 2, 3, 4), (5, 6, 7, 8)]
 
 
+def test_nothing_is_read_that_was_not_sensed() -> None:
+    """Where the target and the recording are, rewards, histories, and cells after steps that did not sense all."""
+    rng = torch.Generator().manual_seed(0)
+    batch = collect(SETTING, AllOn(M), 16, 40)
+    batch["action"] &= torch.rand(*batch.shape, 1, generator=rng) < 0.8
+    poisoned = batch.clone()
+    for place in (poisoned, poisoned["next"]):
+        for key in ("target", "point"):
+            place[key] = torch.randint_like(place[key], 9, generator=rng)
+        place["action_history"] = torch.rand(place["action_history"].shape, generator=rng) < 0.5
+    poisoned["next", "reward"] = torch.randn(16, 40, 1, generator=rng)
+    missed = ~batch["action"].all(-1)
+    poisoned["next", "last_cell"][missed] = torch.randint(9, (int(missed.sum()),), generator=rng)
+    clean, other = buffer(), buffer()
+    clean.extend(batch)
+    other.extend(poisoned)
+    assert segments(clean) == segments(other)
+    assert len(clean) > 100
+
+
 def test_paths_start_everywhere_and_are_whole_segments() -> None:
     made = buffer()
     made.extend(collect(SETTING, AllOn(M), 16, 60))

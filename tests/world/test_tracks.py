@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,17 @@ def test_lines_of_several_tracks_may_be_mixed(tmp_path: Path) -> None:
     assert not tracks.exits.any()
     file.write_text("track,cell\n7,3\n-3,0\n7,4\n-3,1\n7,5\n")
     assert load_tracks(file, 3, exits=True).cells.tolist() == [0, 1, 3, 4, 5]
+
+
+def test_a_file_that_has_changed_is_read_again(tmp_path: Path) -> None:
+    file = tmp_path / "t.csv"
+    for cell in (1, 2):
+        file.unlink(missing_ok=True)
+        file.write_text(f"track,cell\n0,{cell}\n")
+        os.utime(file, ns=(cell, cell))
+        assert load_tracks(file, 3, exits=True).cells.tolist() == [cell]
+        assert load_tracks(file, 3, exits=True) is load_tracks(file, 3, exits=True)
+        assert not load_tracks(file, 3, exits=False).exits.any()
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TypeAlias
 
@@ -118,6 +119,14 @@ def load_tracks(path: str | Path, size: int, *, exits: bool) -> Tracks:
     Raises:
         UserError: the file is not of that form, a cell lies outside the grid, or a step is missing or there twice.
     """
+    file = Path(path)
+    stamp = (file.stat().st_mtime_ns, file.stat().st_size, file.stat().st_ino) if file.is_file() else None
+    return _load(path, size, exits, stamp)
+
+
+@lru_cache(maxsize=1)  # a run is checked before its folder is made, and asks again after
+def _load(path: str | Path, size: int, exits: bool, stamp: tuple[int, ...] | None) -> Tracks:  # noqa: ARG001
+    """See `load_tracks`; `stamp` tells the file from what it was before."""
     source, columns = f"kernel.path={path}", read_columns("kernel.path", path)
     if set(columns) not in _COLUMNS:
         raise UserError(f"{source}: columns {', '.join(columns)}, expected {_FORMAT}")
