@@ -21,6 +21,7 @@ __all__ = [
     "MultiSync",
     "Ppo",
     "Prioritized",
+    "RayWorkers",
     "Schedule",
     "Single",
     "Tensorboard",
@@ -170,6 +171,16 @@ class MultiSync(Workers):
 @dataclass(kw_only=True)
 class MultiAsync(Workers):
     """In worker processes; a batch is what one of them has ready. A resumed run starts new episodes."""
+
+
+@choice("collector", "ray")
+@dataclass(kw_only=True)
+class RayWorkers(Workers):
+    """In workers of a Ray cluster, for a run larger than one machine; otherwise as multi_sync."""
+
+    address: str | None = option("cluster to join; null = start one on this machine", expects="auto, or host:port")
+    cpus_per_worker: float = option("cores of each worker", unit="cores", gt=0)
+    gpus_per_worker: float = option("GPUs of each worker", unit="GPUs", ge=0)
 
 
 @dataclass(kw_only=True)

@@ -38,12 +38,12 @@ def launch(cfg: Ray, jobs: Sequence[Job]) -> None:
 
 
 def _join(cfg: Ray, ray: Any) -> None:
-    quiet: dict[str, Any] = {"logging_level": "warning", "include_dashboard": False}
+    quiet: dict[str, Any] = {"logging_level": "error", "include_dashboard": False}
     if cfg.address is None:
         ray.init(num_cpus=cfg.num_cpus, object_store_memory=_STORE, **quiet)
         return
     try:
-        ray.init(address=cfg.address, logging_level="warning")
+        ray.init(address=cfg.address, logging_level="error")
     except (ConnectionError, ValueError, RuntimeError) as error:
         reason = " ".join(str(error).split())
         raise UserError(f"hydra.launcher.address={cfg.address}: expected a Ray cluster ({reason})") from error

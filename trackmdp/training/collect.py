@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import BaseCollector, Collector, MultiAsyncCollector, MultiSyncCollector
 
 from trackmdp.config.learning import Collector as CollectorConfig
-from trackmdp.config.learning import MultiAsync, MultiSync
+from trackmdp.config.learning import MultiAsync, MultiSync, RayWorkers
 from trackmdp.seeding import derive
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.tracks import Setting
@@ -50,12 +50,25 @@ def make_collector(
         workers = [partial(_worker_env, world, f"{worker}-{done}", env) for worker in range(cfg.workers)]
         kind = MultiSyncCollector if isinstance(cfg, MultiSync) else MultiAsyncCollector
         return kind(workers, policy, num_threads=torch.get_num_threads(), num_sub_threads=cfg.threads, **common)
+    if isinstance(cfg, RayWorkers):
+        from trackmdp.training import on_ray
+
+        places = [f"{worker}-{done}" for worker in range(cfg.workers)]
+        return on_ray.make_collector(
+            [partial(_remote_env, world, at, env, cfg.threads) for at in places], policy, cfg, common
+        )
     return Collector(TrackEnv(world, **env), policy, track_traj_ids=False, **common)
 
 
 def _worker_env(world: Setting, worker: str, env: dict[str, Any]) -> TrackEnv:
     """Built in a worker process: its own stream for the targets, and for the actions sampled there."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the workers as well; the learner tells them to end
+    torch.manual_seed(derive(env["seed"], "torch", worker))
+    return TrackEnv(world, stream=f"world-{worker}", **env)
+
+
+def _remote_env(world: Setting, worker: str, env: dict[str, Any], threads: int) -> TrackEnv:
+    torch.set_num_threads(threads)
     torch.manual_seed(derive(env["seed"], "torch", worker))
     return TrackEnv(world, stream=f"world-{worker}", **env)
 

@@ -1,0 +1,86 @@
+"""Collecting in the workers of a Ray cluster."""
+
+from __future__ import annotations
+
+import importlib.util
+import signal
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.collectors import BaseCollector
+from torchrl.collectors.distributed import RayCollector
+
+from trackmdp.config.learning import RayWorkers
+from trackmdp.errors import UserError
+from trackmdp.world.env import TrackEnv
+
+__all__ = ["make_collector"]
+
+_STORE = 2**30
+"""Bytes for the batches on their way, of a cluster that is started here."""
+
+
+def make_collector(
+    envs: list[Callable[[], TrackEnv]], policy: TensorDictModuleBase, cfg: RayWorkers, common: dict[str, Any]
+) -> BaseCollector:
+    """A collector whose batches `[B, time]` hold the rows of all workers, one after the other.
+
+    Args:
+        envs: makes the environments of each worker.
+        policy: gets new weights at `update_policy_weights_`.
+        cfg: the cluster, and what each worker takes of it.
+        common: the options that every collector has.
+
+    Raises:
+        UserError: Ray is not installed, or there is no such cluster.
+    """
+    if importlib.util.find_spec("ray") is None:
+        raise UserError("collector=ray: needs ray, which pip install 'trackmdp[ray]' adds")
+    register = common.pop("auto_register_policy_transforms")
+    before = signal.getsignal(signal.SIGTERM)  # Ray takes it over, and a scheduler's signal must reach the run
+    try:
+        made = _Collector(
+            envs,
+            policy,
+            sync=True,
+            ray_init_config=_cluster(cfg),
+            remote_configs={"num_cpus": cfg.cpus_per_worker, "num_gpus": cfg.gpus_per_worker},
+            collector_kwargs={"auto_register_policy_transforms": register, "track_traj_ids": False},
+            postproc=_rows,
+            **common,
+        )
+    except (ConnectionError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise UserError(f"collector.address={cfg.address}: expected a Ray cluster ({reason})") from error
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    made.update_policy_weights_()
+    return made
+
+
+class _Collector(RayCollector):
+    """Says in the terms of the other collectors that a worker was lost."""
+
+    def iterator(self) -> Iterator[TensorDictBase]:
+        from ray.exceptions import RayError
+
+        try:
+            yield from super().iterator()
+        except RayError as error:
+            raise RuntimeError(f"a worker was lost: {str(error).splitlines()[0]}") from error
+
+
+def _rows(batch: TensorDictBase) -> TensorDictBase:
+    """`[workers, envs, time]` as `[workers * envs, time]`."""
+    return batch.flatten(0, 1)
+
+
+def _cluster(cfg: RayWorkers) -> dict[str, Any]:
+    """Arguments of `ray.init`; a cluster that is joined has its own resources."""
+    quiet: dict[str, Any] = {"logging_level": "error", "log_to_driver": False}
+    if cfg.address is not None:
+        return {"address": cfg.address, **quiet}
+    cpus = max(1, round(cfg.workers * cfg.cpus_per_worker))
+    return {"num_cpus": cpus, "object_store_memory": _STORE, "include_dashboard": False, **quiet}
