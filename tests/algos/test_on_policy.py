@@ -60,16 +60,25 @@ def test_the_advantage_at_the_end_of_an_episode(name: str, flag: str) -> None:
 
 @pytest.mark.parametrize("name", ON_POLICY)
 def test_forced_steps_get_no_credit_and_count_for_nothing(name: str) -> None:
-    """T_max = 1, so the step at n = 2 is forced; the others are normalised among themselves."""
+    """T_max = 1, so the step at n = 2 is forced; the one at n = 1 is alone, which tells nothing."""
     batch = frames([0, 0, 0, 1], [0] * 4, misses=[0, 1, 2, 0])
     data, _ = constant_critic(name).prepare(batch)
-    raw = batch["advantage"].flatten()[[0, 1, 3]]
-    assert data["advantage"][2] == 0.0
-    normalised = data["advantage"].flatten()[[0, 1, 3]]
-    assert normalised.mean().item() == pytest.approx(0.0, abs=1e-6)
-    ratio = (raw - raw.mean()) / normalised
-    torch.testing.assert_close(ratio, ratio[0].expand(3))
-    assert ratio[0] > 0
+    raw, normalised = batch["advantage"].flatten(), data["advantage"].flatten()
+    assert normalised[1] == normalised[2] == 0.0
+    half = 2**-0.5  # two values with mean 0 and variance 1
+    expected = half if raw[0] > raw[3] else -half
+    torch.testing.assert_close(normalised[[0, 3]], torch.tensor([expected, -expected]))
+
+
+@pytest.mark.parametrize("name", ON_POLICY)
+def test_the_advantage_is_normalised_at_each_n_by_itself(name: str) -> None:
+    batch = frames([0, 0, 0, 1], [0] * 4, misses=[0, 1, 0, 1])
+    data, _ = constant_critic(name).prepare(batch)
+    raw, normalised = batch["advantage"].flatten(), data["advantage"].flatten()
+    for rows in ([0, 2], [1, 3]):
+        torch.testing.assert_close(normalised[rows].abs(), torch.full((2,), 2**-0.5))
+        assert normalised[rows].sum().item() == pytest.approx(0.0, abs=1e-6)
+        assert (normalised[rows[0]] > 0) == (raw[rows[0]] > raw[rows[1]])
 
 
 @pytest.mark.parametrize("name", ON_POLICY)

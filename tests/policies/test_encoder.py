@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn.functional import one_hot
 
 from tests.helpers import random_state, small_world
-from trackmdp.policies.encoder import StateEncoder, StateNetwork
+from trackmdp.policies.encoder import RelativeBias, StateEncoder, StateNetwork
 from trackmdp.world.model import World
 
 
@@ -64,3 +64,21 @@ def test_every_state_has_features_of_its_own() -> None:
     seen = encoder(cell, n, torch.zeros(27, 2, 9, dtype=torch.bool)).detach()
     distance = torch.cdist(seen, seen) + torch.eye(27)
     assert distance.min() > 1e-3
+
+
+def test_the_relative_bias_is_shared_by_all_cells_and_ends_at_the_border() -> None:
+    world = small_world(size=3, t_max=1)
+    bias = RelativeBias(world.task)
+    right = 2 * 5 + 3  # no row further, one column further, in a table of 5 x 5 displacements
+    with torch.no_grad():
+        bias.table[1, right] = 2.0
+    at = bias(torch.arange(9), torch.ones(9, dtype=torch.int64))
+    expected = torch.zeros(9, 9)
+    for cell, neighbour in ((0, 1), (1, 2), (3, 4), (4, 5), (6, 7), (7, 8)):
+        expected[cell, neighbour] = 2.0
+    torch.testing.assert_close(at, expected, rtol=0, atol=0)
+    assert not bias(torch.arange(9), torch.zeros(9, dtype=torch.int64)).any()
+    assert bias(torch.tensor([[0, 4]]), torch.tensor([[1, 1]])).shape == (1, 2, 9)
+    at.sum().backward()
+    assert bias.table.grad is not None
+    assert bias.table.grad[1, right] == 6  # the pairs of cells that are so placed

@@ -43,7 +43,8 @@ class OnPolicy:
     def prepare(self, batch: TensorDictBase | None) -> tuple[TensorDictBase, dict[str, float]]:
         """Set this iteration's schedules and return the batch as `[frames]` rows with a normalised advantage.
 
-        On forced steps the safe action replaces the policy's, which therefore gets no credit for them.
+        The advantage is normalised at each n by itself: near the safe action returns spread wider than elsewhere. On
+        forced steps that action replaces the policy's, which therefore gets no credit for them.
         """
         if batch is None:
             raise ValueError("an on-policy algorithm learns from fresh frames only")
@@ -57,8 +58,7 @@ class OnPolicy:
             self.advantage(batch)
         fit = explained_variance(batch["state_value"], batch["value_target"]).item()
         data = batch.select(*_KEPT).reshape(-1)
-        free = (data["steps_since_detection"] <= self._t_max).unsqueeze(-1)
-        data["advantage"] = _normalised(data["advantage"], free)
+        data["advantage"] = _normalised(data["advantage"], data["steps_since_detection"].unsqueeze(-1), self._t_max)
         return data, {"learning_rate": rate, "entropy_coef": entropy, "explained_variance": fit}
 
     def state_dict(self) -> dict[str, Any]:
@@ -78,9 +78,15 @@ class OnPolicy:
         self.iteration = state["iteration"]
 
 
-def _normalised(advantage: Tensor, counted: Tensor) -> Tensor:
-    """`advantage` with mean 0 and variance 1 over the `counted` rows, 0 elsewhere; one row alone tells nothing."""
-    chosen = advantage[counted]
-    if len(chosen) < 2:
-        return torch.zeros_like(advantage)
-    return (advantage - chosen.mean()) / (chosen.std() + 1e-8) * counted
+def _normalised(advantage: Tensor, misses: Tensor, t_max: int) -> Tensor:
+    """`advantage` with mean 0 and variance 1 over the rows of each n up to `t_max`, 0 elsewhere.
+
+    One row alone tells nothing.
+    """
+    normalised = torch.zeros_like(advantage)
+    for n in range(t_max + 1):
+        counted = misses == n
+        chosen = advantage[counted]
+        if len(chosen) > 1:
+            normalised[counted] = (chosen - chosen.mean()) / (chosen.std() + 1e-8)
+    return normalised

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch import distributions as dist
 from torchrl.modules import ProbabilisticActor, ValueOperator
 
-from trackmdp.policies.encoder import StateNetwork
+from trackmdp.policies.encoder import RelativeBias, StateNetwork
 from trackmdp.world.model import Task
 
 __all__ = ["STATE_KEYS", "SubsetDistribution", "make_actor", "make_critic"]
@@ -53,13 +53,25 @@ def make_actor(task: Task, hidden: int, initial_logit: float) -> ProbabilisticAc
     head = nn.Linear(hidden, task.num_cells)
     nn.init.orthogonal_(head.weight, gain=0.01)
     nn.init.constant_(head.bias, initial_logit)
-    network = StateNetwork(task, hidden, head)
+    network = _Logits(StateNetwork(task, hidden, head), RelativeBias(task))
     return ProbabilisticActor(
         TensorDictModule(network, in_keys=STATE_KEYS, out_keys=["logits"]),
         in_keys=["logits"],
         distribution_class=SubsetDistribution,
         return_log_prob=True,
     )
+
+
+class _Logits(nn.Module):
+    """A network's logits on top of those that all cells share."""
+
+    def __init__(self, network: StateNetwork, shared: RelativeBias) -> None:
+        super().__init__()
+        self.network, self.shared = network, shared
+
+    def forward(self, last_cell: Tensor, steps_since_detection: Tensor, action_history: Tensor) -> Tensor:
+        own = self.network(last_cell, steps_since_detection, action_history)
+        return own + self.shared(last_cell, steps_since_detection)
 
 
 def make_critic(task: Task, hidden: int) -> ValueOperator:

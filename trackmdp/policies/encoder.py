@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from trackmdp.world.model import Task
 
-__all__ = ["StateEncoder", "StateNetwork"]
+__all__ = ["RelativeBias", "StateEncoder", "StateNetwork"]
 
 
 class StateEncoder(nn.Module):
@@ -50,3 +50,27 @@ class StateNetwork(nn.Module):
     def forward(self, last_cell: Tensor, steps_since_detection: Tensor, action_history: Tensor) -> Tensor:
         """`[..., head.out_features]` of a batch of states of shape `[...]`."""
         return self.head(self.encoder(last_cell, steps_since_detection, action_history))
+
+
+class RelativeBias(nn.Module):
+    """A number per sensor by n and by where the sensor stands, as seen from the last located cell; zero at first.
+
+    It is shared by all cells: that sensors far away are of no use is learned once, not once per cell. (The name is that
+    of the relative position bias of Shaw et al. 2018.)
+    """
+
+    _index: Tensor
+
+    def __init__(self, task: Task) -> None:
+        super().__init__()
+        side, m = 2 * task.size - 1, task.num_cells
+        self.table = nn.Parameter(torch.zeros(task.t_max + 2, side**2))
+        cell = torch.arange(m)
+        code = cell // task.size * side + cell % task.size
+        self.register_buffer("_index", code - code.unsqueeze(-1) + side**2 // 2, persistent=False)
+
+    def forward(self, last_cell: Tensor, steps_since_detection: Tensor) -> Tensor:
+        """`[..., M]` of a batch of any shape `[...]`."""
+        m = len(self._index)
+        rows = self.table[:, self._index].view(-1, m)
+        return nn.functional.embedding(steps_since_detection * m + last_cell, rows)
