@@ -16,7 +16,7 @@ import pytest
 from tests.config.cases import composed, of_command
 from tests.typed import refused, stub
 from trackmdp.cli import COMMANDS, main
-from trackmdp.config import GROUPS, ROOTS, options
+from trackmdp.config import GROUPS, ROOTS, SELECTORS, options
 from trackmdp.errors import Preempted, RunError, UserError
 
 ROOT = Path(__file__).parents[1]
@@ -49,6 +49,14 @@ def test_unknown_choices_are_refused_naming_the_known_ones(group: str, capsys: p
         assert (
             refused(capsys, command, f"{group}={bad}") == f"{group}={bad}: expected one of {', '.join(GROUPS[group])}"
         )
+
+
+@pytest.mark.parametrize("algo", ["hindsight", "dqn"])
+@pytest.mark.parametrize("bad", ["nothing_of_the_kind", "null", "3"])
+def test_unknown_credit_is_refused(algo: str, bad: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert (
+        refused(capsys, "train", f"algo={algo}", f"credit={bad}") == f"credit={bad}: expected one of joint, per_sensor"
+    )
 
 
 @pytest.mark.parametrize(
@@ -180,6 +188,9 @@ def test_help_names_every_option_with_range_unit_and_default(command: str, capsy
     for group in set(options(ROOTS[command])) & set(GROUPS):
         for name in GROUPS[group]:
             assert f"  {group}={name}: " in text
+    for name, selector in SELECTORS.items():
+        offered = selector.group in options(ROOTS[command])
+        assert all((f"  {name}={choice}: {about}" in text) == offered for choice, about in selector.choices.items())
 
 
 def test_help_shows_the_values_of_conf(capsys: pytest.CaptureFixture[str]) -> None:

@@ -114,18 +114,21 @@ def make_device(name: str, key: str = "device") -> torch.device:
 
 def make_algorithm(cfg: TrainConfig, world: Setting, device: torch.device) -> Algorithm:
     """The learner; it is given the task, never the motion."""
-    from trackmdp.algos import a2c, dqn, hindsight, learned_kernel, ppo
-    from trackmdp.config import A2c, Dqn, Hindsight, LearnedKernel, Ppo
+    from trackmdp import config
+    from trackmdp.algos import a2c, dqn, hindsight, learned_kernel, per_sensor, ppo
 
     task, batches = world.task, -(-cfg.collector.total_frames // cfg.collector.frames_per_batch)
     makers: dict[type[Any], Callable[[Any], Algorithm]] = {
-        Hindsight: lambda c: hindsight.Hindsight(task, c, iterations=batches, seed=cfg.seed, device=device),
-        LearnedKernel: lambda c: learned_kernel.LearnedKernel(
+        config.Hindsight: lambda c: hindsight.Hindsight(task, c, iterations=batches, seed=cfg.seed, device=device),
+        config.A2cPerSensor: lambda c: per_sensor.A2C(task, c, iterations=batches, seed=cfg.seed, device=device),
+        config.PpoPerSensor: lambda c: per_sensor.PPO(task, c, iterations=batches, seed=cfg.seed, device=device),
+        config.DqnPerSensor: lambda c: per_sensor.DQN(task, c, iterations=batches, seed=cfg.seed, device=device),
+        config.LearnedKernel: lambda c: learned_kernel.LearnedKernel(
             task, c, iterations=batches, seed=cfg.seed, device=device
         ),
-        A2c: lambda c: a2c.A2C(task, c, iterations=batches, device=device),
-        Ppo: lambda c: ppo.PPO(task, c, iterations=batches, seed=cfg.seed, device=device),
-        Dqn: lambda c: dqn.DQN(task, c, iterations=batches, seed=cfg.seed, device=device),
+        config.A2c: lambda c: a2c.A2C(task, c, iterations=batches, device=device),
+        config.Ppo: lambda c: ppo.PPO(task, c, iterations=batches, seed=cfg.seed, device=device),
+        config.Dqn: lambda c: dqn.DQN(task, c, iterations=batches, seed=cfg.seed, device=device),
     }
     return makers[type(cfg.algo)](cfg.algo)
 

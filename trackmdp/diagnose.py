@@ -12,7 +12,7 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from trackmdp.config import GROUPS, ROOTS, Option, options, suggestion
+from trackmdp.config import GROUPS, ROOTS, SELECTORS, Option, options, suggestion
 from trackmdp.errors import UserError
 
 __all__ = ["diagnose"]
@@ -39,7 +39,7 @@ def diagnose(error: Exception, command: str, words: Sequence[str], compose: Comp
     sweeps = [override.input_line for override in parsed if override.is_sweep_override()]
     if "multirun" in str(error).lower() and sweeps:
         return UserError(f"{sweeps[0]}: expected one value; add -m to run once for each")
-    groups = [override for override in parsed if _group(override, command) in GROUPS]
+    groups = [override for override in parsed if _group(override, command)]
     files = [override for override in parsed if _is_choice(override, command)]
     for override in files:
         if refusal := _bad_file(override, error):
@@ -60,14 +60,17 @@ def diagnose(error: Exception, command: str, words: Sequence[str], compose: Comp
 def _group(override: Override, command: str) -> str:
     """The group a word chooses from, `""` if it sets a value."""
     key = override.key_or_group
-    return key if key in GROUPS and key in options(ROOTS[command]) else ""
+    chosen = SELECTORS[key].group if key in SELECTORS else key
+    return key if chosen in GROUPS and chosen in options(ROOTS[command]) else ""
 
 
 def _bad_choice(override: Override, group: str, error: Exception) -> UserError | None:
     """The refusal of a choice that Hydra did not find."""
+    known = SELECTORS[group].choices if group in SELECTORS else GROUPS[group]
     for value in _values(override):
-        if f"Could not find '{group}/{value}'" in str(error) or not isinstance(value, str):
-            return UserError(f"{group}={_shown(value)}: expected one of {', '.join(GROUPS[group])}")
+        absent = value not in known and f"Could not find '{group}/{value}" in str(error)
+        if absent or not isinstance(value, str):
+            return UserError(f"{group}={_shown(value)}: expected one of {', '.join(known)}")
     return None
 
 

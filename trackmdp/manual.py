@@ -11,7 +11,7 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from trackmdp.config import GROUPS, ROOTS, Option, conf_dir, options
+from trackmdp.config import GROUPS, ROOTS, SELECTORS, Option, conf_dir, options
 
 __all__ = ["manual"]
 
@@ -43,6 +43,7 @@ def manual(command: str) -> str:
             continue
         if key in GROUPS:
             lines += _group(folder, key, chosen.get(key))
+            lines += _selectors(key, chosen)
         else:
             lines += ["", f"{key}: {_about(item)}", *_entries(item, values.get(key), f"{key}.")]
     return "\n".join([*lines, ""])
@@ -54,6 +55,13 @@ def _group(folder: Path, group: str, default: str | None) -> Iterator[str]:
     for name, schema in GROUPS[group].items():
         yield f"  {group}={name}: {_about(schema)}"
         yield from (f"  {line}" for line in _entries(schema, _values(folder, group, name), f"{group}."))
+
+
+def _selectors(group: str, chosen: dict[str, str | None]) -> Iterator[str]:
+    for name, selector in SELECTORS.items():
+        if selector.group == group and name in chosen:
+            yield from ("", f"{name}={'|'.join(selector.choices)}   (default: {chosen[name]}) {selector.about}")
+            yield from (f"  {name}={choice}: {text}" for choice, text in selector.choices.items())
 
 
 def _entries(schema: type[Any], values: Any, prefix: str) -> Iterator[str]:
@@ -82,6 +90,8 @@ def _values(folder: Path, group: str, name: str) -> dict[str, Any]:
     for entry in values.get("defaults", []):
         if isinstance(entry, dict):
             (target, choice), *_ = entry.items()
+            for selector, item in SELECTORS.items():
+                choice = choice.replace(f"${{{selector}}}", next(iter(item.choices)))
             values |= _values(folder, target.strip("/").split("@")[0], choice)
     return values
 

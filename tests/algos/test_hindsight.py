@@ -13,7 +13,9 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from tests.helpers import algorithm, collect, hop_world, small_world
-from trackmdp.algos.hindsight_loss import HindsightLoss, decision_loss
+from trackmdp.algos.actor_loss import Decision, Poisson, PolicyGradient, Surrogate, decision_loss
+from trackmdp.algos.hindsight_loss import HindsightLoss
+from trackmdp.config import GROUPS, PerSensor, Schedule
 from trackmdp.errors import UserError
 from trackmdp.solvers import optimal
 from trackmdp.solvers.chains import evaluate, regret_per_step
@@ -30,8 +32,11 @@ def batches(world: World, count: int = 16, *, envs: int = 32, seed: int = 0) -> 
     return list(collect(world, algorithm("hindsight", world).policy, envs, time, seed=seed).split(8, dim=1))
 
 
-def learn(world: World, data: list[Any], *overrides: str) -> Any:
-    learner = algorithm("hindsight", world, *overrides)
+PER_SENSOR = [name for name, schema in GROUPS["algo"].items() if issubclass(schema, PerSensor)]
+
+
+def learn(world: World, data: list[Any], *overrides: str, name: str = "hindsight") -> Any:
+    learner = algorithm(name, world, *overrides)
     for batch in [*data, *[None] * (learner.iterations - len(data))]:
         learner.step(batch)
     return learner
@@ -58,11 +63,34 @@ def test_decision_loss_stops_pulling_at_large_logits() -> None:
     assert logits.grad.tolist() == [0.0, 0.0]
 
 
-def written_out(loss: HindsightLoss, world: World, cells: Tensor, on: Tensor, blend: float) -> dict[str, Tensor]:
+BETA = Schedule(start=0.3, end=0.3, begin=0.0, until=1.0)
+FORMS = {
+    "decision": Decision,
+    "policy gradient": lambda: PolicyGradient(BETA),
+    "surrogate": lambda: Surrogate(BETA, clip=0.2, minibatches=1, generator=None),
+    "poisson": Poisson,
+}
+
+
+def of_one_path(form: str, z: Tensor, cost: Tensor, y: int, gain: Tensor) -> Tensor:
+    """The loss of one path at one clock, which it reaches unlocated and leaves for y: what every sensor adds to it."""
+    softplus, one = torch.nn.functional.softplus, torch.nn.functional.one_hot(torch.tensor(y), len(z))
+    if form == "decision":
+        return (cost * softplus(z)).sum() + gain.clamp(min=0) * softplus(-z[y]) + (-gain).clamp(min=0) * softplus(z[y])
+    if form == "poisson":
+        return (cost * z.exp()).sum() - gain * z[y]
+    on = z.sigmoid()  # the surrogate has the same slope where the old policy is this one
+    entropy = -(on * on.log() + (1 - on) * (1 - on).log())
+    return (-on * (one * gain - cost) - 0.3 * entropy).sum()
+
+
+def written_out(
+    loss: HindsightLoss, world: World, cells: Tensor, on: Tensor, blend: float, form: str
+) -> dict[str, Tensor]:
     """The losses one path, clock and sensor at a time, as the theory writes them (whole grid, no normalisation)."""
     m, last, g = world.num_cells, world.num_choices, loss.discount
     cost, safe = world.cost / world.reward, 1.0 - world.safe_cost / world.reward
-    softplus = torch.nn.functional.softplus
+    price = torch.as_tensor(cost, dtype=torch.float32)
     actor, clocked_actor = loss.actor(), loss.clocked_actor()
     value = [*loss.critic().flatten(), torch.tensor(0.0)]
     clocked = [*loss.clocked_critic().squeeze(-1), torch.zeros(last + 1)]
@@ -79,10 +107,6 @@ def written_out(loss: HindsightLoss, world: World, cells: Tensor, on: Tensor, bl
         after = 1.0 + g * value[y].detach() if chosen[y] else g * follow(path, n + 1)
         return after - float((chosen.numpy() * cost).sum())
 
-    def decide(z: Tensor, y: int, gain: Tensor) -> Tensor:
-        paid = sum(float(cost[j]) * softplus(z[j]) for j in range(m))
-        return paid + gain.clamp(min=0) * softplus(-z[y]) + (-gain).clamp(min=0) * softplus(z[y])
-
     total = {name: torch.tensor(0.0) for name in ("actor", "critic", "clocked_actor", "clocked_critic")}
     for path in cells.T.tolist():
         x, y = path[:2]
@@ -98,34 +122,39 @@ def written_out(loss: HindsightLoss, world: World, cells: Tensor, on: Tensor, bl
                 aim = 1.0 + g * u[y][0] if chosen[y] else g * u[y][n + 1]
                 aim = aim - float((chosen.numpy() * cost).sum())
                 gain = 1.0 + g * (u[y][0] - u[y][n + 1]).detach()
-                total["clocked_actor"] = total["clocked_actor"] + decide(clocked_actor[x, n], y, gain)
+                total["clocked_actor"] = total["clocked_actor"] + of_one_path(
+                    "decision", clocked_actor[x, n], price, y, gain
+                )
             total["clocked_critic"] = total["clocked_critic"] + (u[x][n] - aim.detach()).square()
         for n in range(last):
             y = path[n + 1]
             if y == m:
                 break
             trust = (1 - blend) * (u[y][0] - u[y][n + 1]) + blend * (value[y] - follow(path, n + 1))
-            total["actor"] = total["actor"] + decide(actor[x, n], y, (1.0 + g * trust).detach())
+            gain = (1.0 + g * trust).detach()
+            total["actor"] = total["actor"] + of_one_path(form, actor[x, n], price, y, gain)
             if on[x, n, y]:
                 break
     return total
 
 
-@pytest.mark.parametrize("t_max", [0, 1, 2])
-@pytest.mark.parametrize("blend", [0.0, 0.6, 1.0])
-def test_summed_up_losses_are_those_of_every_path_apart(t_max: int, blend: float) -> None:
+SETTINGS = [("decision", t_max, blend) for t_max in (0, 1, 2) for blend in (0.0, 0.6, 1.0)]
+
+
+@pytest.mark.parametrize(("form", "t_max", "blend"), [*SETTINGS, *((form, 2, 0.6) for form in FORMS)])
+def test_summed_up_losses_are_those_of_every_path_apart(form: str, t_max: int, blend: float) -> None:
     """Gradients agree with autograd through the formulas; clocks are weighed apart, so each is compared by direction.
 
     Targets do not carry the constant part of a squared error, hence gradients and not values.
     """
     world = replace(small_world(t_max=t_max), cost=np.linspace(0.1, 0.5, 9), reward=2.0)
     rng = torch.Generator().manual_seed(1)
-    loss = HindsightLoss(world.task, reach=2, hidden=6, discount=0.7, generator=rng)
+    loss = HindsightLoss(world.task, FORMS[form](), reach=2, hidden=6, discount=0.7, generator=rng)
     cells = torch.randint(10, (t_max + 3, 60), generator=rng)
     cells[0] %= 9
     cells = torch.where((cells == 9).cummax(0).values, 9, cells)
     on = torch.rand(9, t_max + 1, 9, generator=rng) < 0.3
-    summed, apart = loss(cells, on, blend), written_out(loss, world, cells, on, blend)
+    summed, apart = loss(cells, on, blend), written_out(loss, world, cells, on, blend, form)
     for name in ("critic", "clocked_critic"):
         ours, theirs = (gradient(part[name], getattr(loss, name)) for part in (summed, apart))
         torch.testing.assert_close(ours * cells.shape[1], theirs, rtol=1e-3, atol=1e-3)
@@ -146,29 +175,50 @@ def rows(loss: Tensor, net: Any) -> Tensor:
     return torch.autograd.grad(loss, net.pair, retain_graph=True)[0]
 
 
+VARIANTS = [
+    *((name, ()) for name in PER_SENSOR if name != "hindsight"),
+    ("ppo_per_sensor", ("algo.surrogate=sampled",)),
+]
+
+
 @pytest.mark.parametrize("t_max", [0, 2])
 def test_reaches_the_optimum_of_a_small_world(t_max: int) -> None:
+    assert_it_learns("hindsight", (), t_max)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("t_max", [0, 2])
+@pytest.mark.parametrize(("name", "words"), VARIANTS)
+def test_every_actor_loss_reaches_the_optimum_of_a_small_world(name: str, words: tuple[str, ...], t_max: int) -> None:
+    assert_it_learns(name, words, t_max)
+
+
+def assert_it_learns(name: str, words: tuple[str, ...], t_max: int) -> None:
     world = small_world(t_max=t_max, exit_probability=0.02)
-    learner = learn(world, batches(world, 32), *SOLVES, "algo.total_frames=8192")
+    learner = learn(world, batches(world, 32), *SOLVES, "algo.total_frames=8192", *words, name=name)
     best = optimal.solve(world, time_limit=5.0)
     assert regret_per_step(best.upper, evaluate(world, policy(learner, world))) < 0.01
 
 
-def test_prices_are_per_cell() -> None:
+@pytest.mark.parametrize("name", PER_SENSOR)
+def test_prices_are_per_cell(name: str) -> None:
     """The hopping target is worth sensing in the cheap cells only; r = 2, and a miss costs D in the end."""
     world = replace(hop_world(0, safe_cost=0.1), cost=np.array([0.1, 9.0, 0.1, 9.0]))
-    chains = policy(learn(world, batches(world), *SOLVES), world)
+    chains = policy(learn(world, batches(world), *SOLVES, name=name), world)
     assert chains[:, 0].astype(int).tolist() == [[0, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 0], [1, 0, 0, 0]]
 
 
-def test_the_unit_of_reward_does_not_matter() -> None:
+@pytest.mark.parametrize("name", PER_SENSOR)
+def test_the_unit_of_reward_does_not_matter(name: str) -> None:
     world = small_world()
     data = batches(world)
     scaled = replace(world, reward=world.reward * 1024, cost=world.cost * 1024, safe_cost=world.safe_cost * 1024)
-    assert np.array_equal(policy(learn(world, data, *SHORT), world), policy(learn(scaled, data, *SHORT), world))
+    one, other = (policy(learn(each, data, *SHORT, name=name), each) for each in (world, scaled))
+    assert np.array_equal(one, other)
 
 
-def test_reads_nothing_that_was_not_sensed() -> None:
+@pytest.mark.parametrize("name", PER_SENSOR)
+def test_reads_nothing_that_was_not_sensed(name: str) -> None:
     """Positions after steps that did not sense everything, the true cell and the reward may be anything."""
     world = small_world()
     rng = torch.Generator().manual_seed(0)
@@ -183,7 +233,7 @@ def test_reads_nothing_that_was_not_sensed() -> None:
             place["action_history"] = torch.rand(place["action_history"].shape, generator=rng) < 0.5
         batch["next", "reward"] = torch.randn(batch["next", "reward"].shape, generator=rng)
         batch["next", "last_cell"][missed] = torch.randint(9, (int(missed.sum()),), generator=rng)
-    clean, other = learn(world, data, *SHORT), learn(world, poisoned, *SHORT)
+    clean, other = (learn(world, each, *SHORT, name=name) for each in (data, poisoned))
     assert_same(clean.state_dict(), other.state_dict())
 
 
@@ -196,18 +246,21 @@ def test_the_same_seed_learns_the_same_and_another_does_not() -> None:
         assert_same(first, third)
 
 
-@pytest.mark.parametrize("saved_at", [3, 16, 17])
-def test_a_resumed_run_ends_as_the_unbroken_one(saved_at: int) -> None:
+RESUMED = [*(("hindsight", (), saved_at) for saved_at in (3, 16, 17)), *((*variant, 17) for variant in VARIANTS)]
+
+
+@pytest.mark.parametrize(("name", "words", "saved_at"), RESUMED)
+def test_a_resumed_run_ends_as_the_unbroken_one(name: str, words: tuple[str, ...], saved_at: int) -> None:
     world = small_world()
     data = batches(world)
-    whole, begun = learn(world, data, *SHORT), algorithm("hindsight", world, *SHORT)
+    whole, begun = learn(world, data, *SHORT, *words, name=name), algorithm(name, world, *SHORT, *words)
     steps = [*data, *[None] * (begun.iterations - len(data))]
     for batch in steps[:saved_at]:
         begun.step(batch)
     file = io.BytesIO()
     torch.save(begun.state_dict(), file)
     file.seek(0)
-    resumed = algorithm("hindsight", world, *SHORT, "seed=5")
+    resumed = algorithm(name, world, *SHORT, *words, "seed=5")
     resumed.load_state_dict(torch.load(file, weights_only=True))
     for batch in steps[saved_at:]:
         resumed.step(batch)

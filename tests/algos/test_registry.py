@@ -16,6 +16,7 @@ import torch
 from tests.helpers import ALGORITHMS, algorithm, collect, small_world, train_config
 from trackmdp.build import make_world
 from trackmdp.commands.train import run
+from trackmdp.config import GROUPS, PerSensor
 from trackmdp.solvers import optimal
 from trackmdp.training import checkpoint
 from trackmdp.training.evaluate import chains_of
@@ -40,6 +41,11 @@ BUDGETS = {
     "algo.epsilon.start=0.2 algo.epsilon.end=0.1 algo.gamma=0.5",
     "hindsight": "algo.hidden=64 algo.total_frames=20000 algo.frames_per_batch=20000 algo.envs=100 "
     "algo.batch_size=4096 algo.updates=150",
+    **dict.fromkeys(
+        ("a2c_per_sensor", "ppo_per_sensor", "dqn_per_sensor"),
+        "algo.hidden=64 algo.total_frames=20000 algo.frames_per_batch=20000 algo.envs=100 "
+        "algo.batch_size=4096 algo.updates=250",
+    ),
     "learned_kernel": "algo.total_frames=20000 algo.frames_per_batch=4000 algo.envs=100",
 }
 """Seconds each; an algorithm that is not here is tried with the options of conf/."""
@@ -73,7 +79,10 @@ def different(first: Any, second: Any) -> list[str]:
     return [k for k in a if not (equal(a[k], b[k]) if isinstance(a[k], torch.Tensor) else a[k] == b[k])]
 
 
-VARIANTS = dict.fromkeys(ALGORITHMS, ()) | {"dqn-prioritized": ("algo.prioritized.enabled=true", "algo.n_step=3")}
+VARIANTS = dict.fromkeys(ALGORITHMS, ()) | {
+    "dqn-prioritized": ("algo.prioritized.enabled=true", "algo.n_step=3"),
+    "ppo_per_sensor-sampled": ("algo.surrogate=sampled",),
+}
 
 
 def learner_of(variant: str) -> Any:
@@ -108,7 +117,8 @@ def test_it_goes_on_from_its_state_as_if_nothing_had_happened(variant: str) -> N
 def tiny(name: str) -> list[str]:
     """A run of a second."""
     small = {"a2c": "algo.hidden=16", "ppo": "algo.hidden=16", "dqn": "algo.batch_size=64 algo.buffer_size=5000"}
-    small["hindsight"] = "algo.updates=6 algo.batch_size=256 algo.hidden=16"
+    if issubclass(GROUPS["algo"][name], PerSensor):
+        small[name] = "algo.updates=6 algo.batch_size=256 algo.hidden=16"
     budget = ["algo.total_frames=3072", "algo.frames_per_batch=1024", "algo.envs=64"]
     return [*QUIET, *WORLD, *budget, *small.get(name, "").split()]
 

@@ -11,7 +11,7 @@ import pytest
 from tests.config.cases import composed
 from tests.helpers import BASELINES
 from tests.reads import record_reads, unread
-from trackmdp.config import GROUPS, conf_dir
+from trackmdp.config import GROUPS, PerSensor, conf_dir
 
 SHORT = "quiet=true grid.size=3 collector.total_frames=2048 collector.frames_per_batch=1024 collector.envs=64"
 DEFAULTS = {
@@ -33,7 +33,13 @@ def never_read(command: str, words: str, folder: Path) -> set[str]:
 @pytest.mark.parametrize("algo", GROUPS["algo"])
 def test_train_reads_every_option(algo: str, tmp_path: Path) -> None:
     words = f"algo={algo} {SHORT} optimal.time_limit=1"
-    words += " algo.updates=2" if algo == "hindsight" else " algo.prioritized.enabled=true" if algo == "dqn" else ""
+    words += (
+        " algo.updates=2"
+        if issubclass(GROUPS["algo"][algo], PerSensor)
+        else " algo.prioritized.enabled=true"
+        if algo == "dqn"
+        else ""
+    )
     assert not never_read("train", words, tmp_path)
 
 

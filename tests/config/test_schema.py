@@ -12,12 +12,17 @@ from omegaconf import OmegaConf
 
 from tests.config.cases import REFUSED, composed, files_of
 from tests.reads import record_reads, unread
-from trackmdp.config import GROUPS, ROOTS, Option, TrainConfig, conf_dir, load, options, to_yaml
+from trackmdp.config import GROUPS, ROOTS, SELECTORS, Option, TrainConfig, conf_dir, load, options, to_yaml
 from trackmdp.config.sweeps import PLUGINS
 from trackmdp.errors import UserError
 
 CONF = Path(conf_dir())
 CHOICES = [(group, name) for group, names in GROUPS.items() for name in names]
+
+
+CREDITED = ("a2c", "dqn", "ppo")
+SELECTED = (*CREDITED, *(f"{name}_per_sensor" for name in CREDITED))
+"""Algorithms whose options are where `credit` says."""
 
 
 def read(file: Path) -> dict[str, Any]:
@@ -37,7 +42,13 @@ def test_yaml_of_a_choice_holds_exactly_the_options_of_its_schema(group: str, na
         assert values == {"defaults": [{"/baseline@_here_": name}]}
         return
     schema = GROUPS[group][name]
-    assert values["defaults"] == [f"base_{name}"]
+    if name in SELECTED:
+        [(target, chosen)] = values["defaults"][0].items()
+        assert (target, len(values)) == ("/credit@_here_", 1)
+        values = read(CONF / "credit" / f"{chosen.replace('${credit}', 'joint')}.yaml")
+        assert values["defaults"] == [f"/algo/base_{name}@_here_"]
+    else:
+        assert values["defaults"] == [f"base_{name}"]
     assert keys(values) == set(options(schema))
     for key, item in options(schema).items():
         if not isinstance(item, Option):
@@ -61,6 +72,8 @@ def test_every_yaml_file_belongs_to_a_schema() -> None:
     found = {str(file.relative_to(CONF)) for file in CONF.rglob("*.yaml") if file.parent.name != "experiment"}
     expected = {f"{group}/{name}.yaml" for group, name in CHOICES} | {f"{command}.yaml" for command in ROOTS}
     expected |= {f"hydra/{group}/{name}.yaml" for group, members in PLUGINS.items() for name in members}
+    expected |= {f"credit/{name}.yaml" for name in SELECTORS["credit"].choices}
+    expected |= {f"credit/{name}/{algo}.yaml" for name in SELECTORS["credit"].choices for algo in CREDITED}
     assert found - {"hydra/folders.yaml"} == expected
 
 

@@ -110,6 +110,7 @@ def test_no_run_starts_anew_where_every_checkpoint_is_damaged(half: Path, capsys
         ("algo.clip=0.25", "algo.clip: the run has 0.2, typed was 0.25"),
         ("seed=1", "seed: the run has 0, typed was 1"),
         ("algo=a2c", "algo: the run has ppo, typed was a2c"),
+        ("credit=per_sensor", "algo: the run has ppo, typed was ppo_per_sensor"),
         ("collector.envs=64", "collector.envs: the run has 32, typed was 64"),
         ("grid.max_steps=9", "grid.max_steps: the run has null, typed was 9"),
     ],
@@ -119,6 +120,16 @@ def test_another_option_is_refused(word: str, told: str, half: Path, capsys: pyt
     assert typed(half, "resume=auto", word) == 2
     assert capsys.readouterr().err == f"trackmdp train: {told}; it cannot change on resume\n"
     assert files(half) == before
+
+
+def test_another_credit_is_refused_where_the_algorithm_is_not_typed(
+    half: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["train", *QUICK, f"hydra.run.dir={half}", "resume=auto"]
+    assert main([*words, "credit=per_sensor"]) == 2
+    told = "credit: the run has joint, typed was per_sensor; it cannot change on resume"
+    assert capsys.readouterr().err == f"trackmdp train: {told}\n"
+    assert main([*words, "credit=joint"]) == 0
 
 
 def test_budget_logging_and_saving_may_change(half: Path) -> None:

@@ -16,11 +16,12 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from trackmdp.algos.actor_loss import ActorLoss, Decision
 from trackmdp.algos.common import Averages, set_learning_rate
 from trackmdp.algos.hindsight_loss import HindsightLoss
 from trackmdp.algos.moves import MoveBuffer
 from trackmdp.algos.segments import SegmentBuffer
-from trackmdp.config.learning import Hindsight as HindsightConfig
+from trackmdp.config.per_sensor import PerSensor
 from trackmdp.errors import UserError
 from trackmdp.policies.fixed import AllOn, ChainPolicy
 from trackmdp.seeding import generator
@@ -31,10 +32,10 @@ __all__ = ["Hindsight", "budget"]
 _LOSSES = ("clocked_actor", "clocked_critic", "actor", "critic")
 
 
-def budget(task: Task, cfg: HindsightConfig) -> tuple[int, int]:
+def budget(task: Task, cfg: PerSensor) -> tuple[int, int]:
     """Updates and hidden units: as configured, else by the number of rows (x, n) that the actor has to get right."""
     few = task.num_cells * task.num_choices <= 300
-    return cfg.updates or (500 if few else 800), cfg.hidden or (128 if few else 256)
+    return cfg.updates or round(cfg.effort * (500 if few else 800)), cfg.hidden or (128 if few else 256)
 
 
 class Hindsight:
@@ -43,7 +44,7 @@ class Hindsight:
     The nets see the target's neighbourhood as far as the frames have shown it to move, so they are made after those.
     """
 
-    def __init__(self, task: Task, cfg: HindsightConfig, *, iterations: int, seed: int, device: torch.device) -> None:
+    def __init__(self, task: Task, cfg: PerSensor, *, iterations: int, seed: int, device: torch.device) -> None:
         self.task, self.cfg, self.device = task, cfg, device
         self.updates, self.hidden = budget(task, cfg)
         self._collecting, self._iteration, self._update = iterations, 0, 0
@@ -65,6 +66,7 @@ class Hindsight:
             learner = self._learner = self._learner or self._make_learner(self._reach())
             for _ in range(min(cfg.updates_per_iteration, self.updates - self._update)):
                 progress = self._update / self.updates
+                learner.loss.actor_loss.prepare(self._update, progress)
                 cells = self._buffer.paths(cfg.batch_size, self.task.t_max + 2)
                 averages.add(**learner.update(cells, cfg.learning_rate.at(progress), cfg.blend.at(progress)))
                 self._update += 1
@@ -97,9 +99,17 @@ class Hindsight:
 
     def _make_learner(self, reach: int) -> _Learner:
         loss = HindsightLoss(
-            self.task, reach=reach, hidden=self.hidden, discount=self.cfg.gamma, generator=self._generator
+            self.task,
+            self._actor_loss(),
+            reach=reach,
+            hidden=self.hidden,
+            discount=self.cfg.gamma,
+            generator=self._generator,
         )
         return _Learner(loss, self.cfg.average)
+
+    def _actor_loss(self) -> ActorLoss:
+        return Decision()
 
     def _reach(self) -> int:
         """The farthest the target was seen to move in one step, in rows or in columns.

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import pad, softplus
+from torch.nn.functional import pad
 
+from trackmdp.algos.actor_loss import ActorLoss, SensorCredit, decision_loss
 from trackmdp.algos.gains import chain_returns, clocked_advantage, sensing_gain
+from trackmdp.algos.tables import look, total
 from trackmdp.policies.chain_table import CellClockNet, Neighbourhood
 from trackmdp.world.model import Task
 
-__all__ = ["HindsightLoss", "decision_loss"]
+__all__ = ["HindsightLoss"]
 
-_LARGEST_LOGIT = 20.0
 _GAIN_SCALE_RATE = 0.1
 _FEWEST_ROWS = 20
 _LEAST_GAIN = 0.2
@@ -26,6 +27,7 @@ class HindsightLoss(nn.Module):
 
     Args:
         task: grid, rewards and costs.
+        actor_loss: of the actor; the clocked actor always has the decision loss.
         reach: the target gets no farther in one step, in rows and in columns.
         hidden: hidden units of each net.
         discount: γ of the credit.
@@ -36,7 +38,16 @@ class HindsightLoss(nn.Module):
     clocks: Tensor
     gain_scale: Tensor
 
-    def __init__(self, task: Task, *, reach: int, hidden: int, discount: float, generator: torch.Generator) -> None:
+    def __init__(
+        self,
+        task: Task,
+        actor_loss: ActorLoss,
+        *,
+        reach: int,
+        hidden: int,
+        discount: float,
+        generator: torch.Generator,
+    ) -> None:
         super().__init__()
         m, choices, device = task.num_cells, task.num_choices, generator.device
         self.near = Neighbourhood(task.size, reach, device)
@@ -49,6 +60,8 @@ class HindsightLoss(nn.Module):
         self.critic = net(1, 1, 0.0)
         self.clocked_actor = net(choices, self.near.width, -1.0)
         self.clocked_critic = net(choices + 1, 1, 0.0)
+        actor_loss.allocate((m, choices, self.view.width), device)
+        self.actor_loss = actor_loss
         self.discount, self.safe = discount, 1.0 - task.safe_cost / task.reward
         cost = torch.as_tensor(task.cost / task.reward, dtype=torch.float32, device=device)
         self.register_buffer("cost", pad(cost, (0, 1)))
@@ -75,7 +88,7 @@ class HindsightLoss(nn.Module):
         m, k = near.cells.shape
         start, end = cells[0], cells[1]
         logits = self.clocked_actor()
-        moves = _sum((end < m).float(), start * k + near.index(start, end), m * k).view(m, 1, k)
+        moves = total((end < m).float(), start * k + near.index(start, end), m * k).view(m, 1, k)
         stays, visits = moves.sum(-1), torch.bincount(start, minlength=m).unsqueeze(-1)
         gain = moves * sensing_gain(advantage[:, near.cells].transpose(0, 1), reward=1.0, discount=self.discount)
         chosen = logits.detach() > 0
@@ -84,8 +97,10 @@ class HindsightLoss(nn.Module):
         free = following[:, 1:] + (gain * chosen).sum(-1) - spent
         target = torch.cat([free, following[:, :1] + self.safe * stays], dim=1) / visits.clamp(min=1)
         error = visits * (clocked - target).square()
+        plus, minus = gain.clamp(min=0), gain.clamp(max=0).neg()
+        loss = decision_loss(logits, plus, minus, stays.unsqueeze(-1) * self.cost[near.cells].unsqueeze(1))
         return {
-            "clocked_actor": self._decide(0, logits, gain.clamp(min=0), gain.clamp(max=0).neg(), stays, near),
+            "clocked_actor": self._balanced(0, loss, stays, plus + minus),
             "clocked_critic": error.sum() / cells.shape[1],
         }
 
@@ -97,60 +112,30 @@ class HindsightLoss(nn.Module):
         logits, value = self.actor(), self.critic().view(m)
         row = start * choices + self.clocks
         entry = row * k + view.index(start, end)
-        hits, inside = _look(on, entry) & (end < m), moves < m
-        located = _look(pad(value.detach(), (0, 1)), moves)
-        spent = _look((on * self.cost[view.cells].unsqueeze(1)).sum(-1), row)
+        hits, inside = look(on, entry) & (end < m), moves < m
+        located = look(pad(value.detach(), (0, 1)), moves)
+        spent = look((on * self.cost[view.cells].unsqueeze(1)).sum(-1), row)
         returns = chain_returns(hits, inside, spent, located, reward=1.0, safe_cost=1.0 - self.safe, discount=discount)
-        clocked = _look(advantage, self.clocks * (m + 1) + end)
+        clocked = look(advantage, self.clocks * (m + 1) + end)
         gain = sensing_gain(clocked, located[:-1] - returns[1:], reward=1.0, discount=discount, blend=blend)
         alive = inside[:-1].clone()
         for n in range(1, choices):
             alive[n] &= alive[n - 1] & ~hits[n - 1]
-        gain = gain * alive
-        sums = _sum(gain.abs(), entry + logits.numel() * (gain < 0), 2 * logits.numel())
-        plus, minus = sums.view(2, m, choices, k)
-        arrivals = _sum(alive.float(), row, m * choices).view(m, choices)
+        arrivals = total(alive.float(), row, m * choices).view(m, choices)
+        price = arrivals.unsqueeze(-1) * self.cost[view.cells].unsqueeze(1)
+        credit = SensorCredit(entry, gain * alive, arrivals, price)
+        loss = self.actor_loss(logits, credit)
         visits = torch.bincount(start, minlength=m)
-        error = visits * (value - _sum(returns[0], start, m) / visits.clamp(min=1)).square()
+        error = visits * (value - total(returns[0], start, m) / visits.clamp(min=1)).square()
         return {
-            "actor": self._decide(1, logits, plus, minus, arrivals, view),
+            "actor": self._balanced(1, loss, arrivals, credit.plus + credit.minus),
             "critic": error.sum() / cells.shape[1],
         }
 
-    def _decide(
-        self, which: int, logits: Tensor, plus: Tensor, minus: Tensor, arrivals: Tensor, view: Neighbourhood
-    ) -> Tensor:
-        """Decision loss, each clock by its own number of rows and its running mean gain, so that rare clocks count."""
-        count = arrivals.expand(-1, logits.shape[1]).sum(0)
-        mean = (plus + minus).sum((0, 2)) / count.clamp(min=1)
+    def _balanced(self, which: int, loss: Tensor, arrivals: Tensor, gains: Tensor) -> Tensor:
+        """Sum of a loss, each clock by its own number of rows and its running mean gain, so that rare clocks count."""
+        count = arrivals.expand(-1, loss.shape[1]).sum(0)
+        mean = gains.sum((0, 2)) / count.clamp(min=1)
         self.gain_scale[which].lerp_(mean, _GAIN_SCALE_RATE)
         weight = 1.0 / (count.clamp(min=_FEWEST_ROWS) * self.gain_scale[which].clamp(min=_LEAST_GAIN))
-        price = arrivals.unsqueeze(-1) * self.cost[view.cells].unsqueeze(1)
-        return (decision_loss(logits, plus, minus, price).sum((0, 2)) * weight).sum()
-
-
-def decision_loss(logits: Tensor, plus: Tensor, minus: Tensor, price: Tensor) -> Tensor:
-    """Cost-sensitive logistic loss of each sensor: (c + G⁻) softplus(z) + G⁺ softplus(-z).
-
-    Its minimum over z is at log(G⁺ / (c + G⁻)), positive exactly where sensing pays: G⁺ - G⁻ > c. On the log scale a
-    cell where the target seldom is needs no more accuracy than one where it often is.
-
-    Args:
-        logits: z.
-        plus: G⁺, sum of the positive gains.
-        minus: G⁻, minus the sum of the negative ones.
-        price: c, what having the sensor on costs in sum.
-    """
-    # Beyond the clamp nothing is left to learn, and without it logits run off to where floats lose precision.
-    logits = logits.clamp(-_LARGEST_LOGIT, _LARGEST_LOGIT)
-    return (price + minus + plus) * softplus(logits) - plus * logits
-
-
-def _look(table: Tensor, index: Tensor) -> Tensor:
-    """`table.flatten()[index]`, the fastest way."""
-    return table.reshape(-1).index_select(0, index.reshape(-1)).view(index.shape)
-
-
-def _sum(values: Tensor, index: Tensor, length: int) -> Tensor:
-    """`[length]`, the sums of the `values` that share an `index`."""
-    return values.new_zeros(length).scatter_add_(0, index.reshape(-1), values.reshape(-1))
+        return (loss.sum((0, 2)) * weight).sum()

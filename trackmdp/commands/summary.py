@@ -35,6 +35,7 @@ def summarize(
     """The content of `summary.json`; on held-out tracks there are no bounds, no Q_MDP and no regret."""
     return {
         "algo": cfg.algo.name,
+        "credit": cfg.algo.credit,
         "seed": cfg.seed,
         "frames": frames,
         **times,

@@ -21,7 +21,6 @@ from trackmdp.config.learning import (
     Collector,
     Csv,
     Dqn,
-    Hindsight,
     Log,
     Mcap,
     MultiAsync,
@@ -33,7 +32,8 @@ from trackmdp.config.learning import (
     Single,
     Tensorboard,
 )
-from trackmdp.config.options import GROUPS, Option, options
+from trackmdp.config.options import GROUPS, SELECTORS, Option, options
+from trackmdp.config.per_sensor import A2cPerSensor, DqnPerSensor, Hindsight, PerSensor, PpoPerSensor
 from trackmdp.config.roots import (
     ROOTS,
     BenchmarkConfig,
@@ -56,7 +56,9 @@ from trackmdp.config.world import Cost, Drift, Grid, Kernel, PaperCost, RandomSu
 __all__ = [
     "GROUPS",
     "ROOTS",
+    "SELECTORS",
     "A2c",
+    "A2cPerSensor",
     "Algo",
     "AllOn",
     "Baseline",
@@ -68,13 +70,14 @@ __all__ = [
     "Cost",
     "Csv",
     "Dqn",
-    "Hindsight",
+    "DqnPerSensor",
     "Drift",
     "EvaluateConfig",
     "Evaluation",
     "ExportConfig",
     "Fcr",
     "Grid",
+    "Hindsight",
     "Kernel",
     "LearnedKernel",
     "Log",
@@ -88,8 +91,10 @@ __all__ = [
     "OptimalBound",
     "Option",
     "PaperCost",
+    "PerSensor",
     "Playback",
     "Ppo",
+    "PpoPerSensor",
     "Prioritized",
     "Qmdp",
     "RandomK",

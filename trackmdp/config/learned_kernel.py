@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from trackmdp.config.learning import Algo
 from trackmdp.config.options import choice, option
@@ -15,6 +16,7 @@ __all__ = ["LearnedKernel"]
 class LearnedKernel(Algo):
     """Estimate the motion from detections, then plan with the estimate; no networks."""
 
+    credit: ClassVar[str | None] = None
     sensing: str = option("all sensors on, or sets chosen by posterior sampling", choices=("all", "chosen"))
     warm_up: int = option("with chosen sets: env steps with all sensors on before them", unit="frames", ge=0)
     prior: float = option("the pooled motion counts as much as this many moves out of each cell", unit="moves", gt=0)

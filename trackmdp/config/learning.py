@@ -14,7 +14,6 @@ __all__ = [
     "Collector",
     "Csv",
     "Dqn",
-    "Hindsight",
     "Log",
     "Mcap",
     "MultiAsync",
@@ -52,6 +51,7 @@ class Algo:
     """Base of the group `algo`: how a policy is learned. The three budgets are what `collector` takes by default."""
 
     name: ClassVar[str]
+    credit: ClassVar[str | None] = "joint"
     total_frames: int = option("env steps the algorithm needs", unit="frames", ge=1)
     frames_per_batch: int = option("env steps per collected batch", unit="frames", ge=1)
     envs: int = option("environments stepped together", ge=1)
@@ -114,24 +114,6 @@ class Dqn(Algo):
     hidden: int = option("units of the hidden layer", unit="units", ge=1, le=4096)
     reward_scale: float = option("factor on rewards while learning", gt=0)
     prioritized: Prioritized
-
-
-@choice("algo", "hindsight")
-@dataclass(kw_only=True)
-class Hindsight(Algo):
-    """Collect with all sensors on, then learn from those paths what any policy would have found and missed on them."""
-
-    gamma: float = option("discount inside the credit; policies are judged undiscounted", ge=0, lt=1)
-    learning_rate: Schedule
-    blend: Schedule
-    average: float = option("share of the old in the running average of the actor, which is judged", ge=0, lt=1)
-    batch_size: int = option("path segments per update", unit="segments", ge=1)
-    updates: int | None = option("updates of the whole run; null: by the size of the problem", ge=1)
-    updates_per_iteration: int = option("updates from one evaluation, log row or checkpoint to the next at most", ge=1)
-    hidden: int | None = option(
-        "units of each net's hidden layer; null: by the size of the problem", unit="units", ge=1, le=4096
-    )
-    buffer_size: int = option("path segments kept for replay", unit="segments", ge=1)
 
 
 @dataclass(kw_only=True)

@@ -14,14 +14,29 @@ from typing import Any, TypeVar
 
 from trackmdp.errors import UserError
 
-__all__ = ["GROUPS", "Option", "choice", "option", "options"]
+__all__ = ["GROUPS", "SELECTORS", "Option", "Selector", "choice", "option", "options"]
 
 T = TypeVar("T")
 
 GROUPS: dict[str, dict[str, type[Any]]] = {}
 """Group -> option of the group -> its dataclass, for example ``GROUPS["kernel"]["drift"]``."""
 
+SELECTORS: dict[str, Selector] = {}
+"""Name -> a group without options of its own, which only picks among those of another one."""
+
 _KINDS: dict[Any, str] = {int: "an integer", float: "a number", bool: "true or false", str: "a text"}
+
+
+@dataclass(frozen=True)
+class Selector:
+    """Picks, for some choices of `group`, which of its options they stand for; `choices` come with their help.
+
+    Each option of the group has the choice that it stands for under the selector's name.
+    """
+
+    group: str
+    about: str
+    choices: dict[str, str]
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from trackmdp.config.checks import validate
+from trackmdp.config.options import SELECTORS
 from trackmdp.config.roots import TrainConfig
 from trackmdp.config.tree import load_run, to_yaml
 from trackmdp.errors import UserError
@@ -90,6 +91,8 @@ def continued(cfg: TrainConfig, folder: Path, words: Sequence[str]) -> TrainConf
         if key.split(".")[0] in ("hydra", "resume"):
             continue
         old, new = _look(saved, key), _look(cfg, key)
+        if key in SELECTORS:
+            old, new = _look(saved, f"{SELECTORS[key].group}.{key}"), word.partition("=")[2]
         if _same(old, new):
             continue
         if not any(key == allowed or key.startswith(f"{allowed}.") for allowed in CHANGEABLE):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from trackmdp.config import learned_kernel, per_sensor  # noqa: F401  (more algorithms to choose from)
 from trackmdp.config.baselines import Baseline
 from trackmdp.config.learning import Algo, Collector, Log
 from trackmdp.config.options import GROUPS, option

@@ -1,0 +1,211 @@
+"""Losses of an actor that has one logit z per sensor, all four from the same gains of sensing.
+
+Each pushes z up exactly where sensing pays, G⁺ - G⁻ > c, and z > 0 is on. They differ in how far a gain reaches: what
+the policy-gradient forms learn is scaled by σ(z)(1-σ(z)), what the two others learn is not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import logsigmoid, softplus
+
+from trackmdp.algos.tables import look, total
+from trackmdp.config.learning import Schedule
+
+__all__ = ["ActorLoss", "Decision", "PolicyGradient", "Poisson", "SensorCredit", "Surrogate", "decision_loss"]
+
+_LARGEST_LOGIT = 20.0
+_LARGEST_LOG_RATIO = 6.0
+_SOFT_LIMIT = 4.0
+_PULL = 0.1
+
+
+@dataclass(frozen=True)
+class SensorCredit:
+    """What replayed paths say of every sensor at every row (x, n) of the policy's table.
+
+    Attributes:
+        entry: int64 `[T+1, B]`, for each path and clock the place in `[M, T+1, K]` of the sensor the target moved to.
+        gain: `[T+1, B]`, what having that sensor on gains; 0 where the path did not get to the clock unlocated.
+        arrivals: `[M, T+1]`, paths at each row.
+        price: `[M, T+1, K]`, what having a sensor on costs on all of them.
+    """
+
+    entry: Tensor
+    gain: Tensor
+    arrivals: Tensor
+    price: Tensor
+
+    @cached_property
+    def _sums(self) -> Tensor:
+        size = self.price.numel()
+        negative = self.entry + size * (self.gain < 0)
+        return total(self.gain.abs(), negative, 2 * size).view(2, *self.price.shape)
+
+    @property
+    def plus(self) -> Tensor:
+        """G⁺ `[M, T+1, K]`, the sum of the positive gains."""
+        return self._sums[0]
+
+    @property
+    def minus(self) -> Tensor:
+        """G⁻ `[M, T+1, K]`, minus the sum of the negative ones."""
+        return self._sums[1]
+
+    @cached_property
+    def advantage(self) -> Tensor:
+        """Δ = G⁺ - G⁻ - c `[M, T+1, K]`, what having a sensor on is worth more than having it off."""
+        return self.plus - self.minus - self.price
+
+    def sampled(self, on: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Δ `[M, T+1, K]` of the paths on which a sensor was drawn on, and of those on which it was off.
+
+        Every path draws its own set. The sensors a path does not move to differ only in their cost there, so that of
+        them it is enough to know how many paths drew them.
+
+        Args:
+            on: `[M, T+1, K]`, probabilities.
+            generator: draws the sets.
+        """
+        size, shape = on.numel(), on.shape
+        moved = self.gain != 0
+        drawn = torch.rand(self.gain.shape, generator=generator, device=on.device) < look(on, self.entry)
+        moves, gains = total(moved.float(), self.entry, size), total(self.gain, self.entry, size)
+        moves_on = total((moved & drawn).float(), self.entry, size).view(shape)
+        gains_on = total(self.gain * drawn, self.entry, size).view(shape)
+        arrivals = self.arrivals.unsqueeze(-1)
+        paths_on = moves_on + torch.binomial(arrivals - moves.view(shape), on, generator=generator)
+        unit = self.price / arrivals.clamp(min=1)
+        return gains_on - unit * paths_on, gains.view(shape) - gains_on - unit * (arrivals - paths_on)
+
+
+class ActorLoss(nn.Module):
+    """Base: the loss of every sensor at every row. Sums over paths; the caller weighs them."""
+
+    def allocate(self, shape: tuple[int, int, int], device: torch.device) -> None:
+        """Make what depends on the shape (M, T+1, K) of the logits; called once."""
+
+    def prepare(self, update: int, progress: float) -> None:
+        """Set what changes in the course of a run, before update number `update`."""
+
+    def forward(self, logits: Tensor, credit: SensorCredit) -> Tensor:
+        """`[M, T+1, K]` losses of `logits` z `[M, T+1, K]`."""
+        raise NotImplementedError
+
+
+class Decision(ActorLoss):
+    """Cost-sensitive classification, `decision_loss`; hindsight's own."""
+
+    def forward(self, logits: Tensor, credit: SensorCredit) -> Tensor:
+        """(c + G⁻) softplus(z) + G⁺ softplus(-z)."""
+        return decision_loss(logits, credit.plus, credit.minus, credit.price)
+
+
+class PolicyGradient(ActorLoss):
+    """A2C over all actions: -σ(z)Δ - βH(σ(z)), the expected advantage of each sensor instead of a sampled one's.
+
+    Beyond |z| = 4 z is pulled back: where σ(z)(1-σ(z)) vanishes, a sensor would not learn that its gain has changed.
+
+    Args:
+        entropy: β, in units of r.
+    """
+
+    def __init__(self, entropy: Schedule) -> None:
+        super().__init__()
+        self._schedule, self._entropy = entropy, entropy.start
+
+    def prepare(self, update: int, progress: float) -> None:  # noqa: ARG002
+        """Set β."""
+        self._entropy = self._schedule.at(progress)
+
+    def forward(self, logits: Tensor, credit: SensorCredit) -> Tensor:
+        """-(objective) - β n H(σ(z)) + n/10 (|z| - 4)²₊, where n paths arrive."""
+        on = logits.sigmoid()
+        entropy = -(on * logsigmoid(logits) + (1 - on) * logsigmoid(-logits))
+        beyond = (logits.abs() - _SOFT_LIMIT).clamp(min=0)
+        held = _PULL * beyond.square() - self._entropy * entropy
+        return credit.arrivals.unsqueeze(-1) * held - self.objective(logits, credit)
+
+    def objective(self, logits: Tensor, credit: SensorCredit) -> Tensor:
+        """What the policy gains, to be maximised."""
+        return logits.sigmoid() * credit.advantage
+
+
+class Surrogate(PolicyGradient):
+    """PPO per sensor: ratio ρ, advantage and clip belong to one sensor being on (ρ₁, σ) or off (ρ₀, 1-σ).
+
+    Σ_b min(ρ_b A_b, clip(ρ_b) A_b) with A₁ = (1-p)Δ₁ and A₀ = -pΔ₀, where p is the old policy's probability and Δ_b is
+    summed over the paths with the sensor on or off: in expectation (Δ₁ = pΔ, Δ₀ = (1-p)Δ), or as the old policy draws.
+
+    Args:
+        entropy: β, in units of r.
+        clip: how far a ratio may leave 1.
+        minibatches: updates from one renewal of the old policy to the next.
+        generator: draws the sensors; None for the expectation.
+    """
+
+    old: Tensor
+
+    def __init__(self, entropy: Schedule, *, clip: float, minibatches: int, generator: torch.Generator | None) -> None:
+        super().__init__(entropy)
+        self._clip, self._minibatches, self._generator, self._renew = clip, minibatches, generator, True
+
+    def allocate(self, shape: tuple[int, int, int], device: torch.device) -> None:
+        """Room for the old policy's logits."""
+        self.register_buffer("old", torch.zeros(shape, device=device))
+
+    def prepare(self, update: int, progress: float) -> None:
+        """Set β, and whether the old policy is renewed."""
+        super().prepare(update, progress)
+        self._renew = update % self._minibatches == 0
+
+    def objective(self, logits: Tensor, credit: SensorCredit) -> Tensor:
+        """Σ_b min(ρ_b A_b, clip(ρ_b) A_b)."""
+        if self._renew:
+            self.old.copy_(logits.detach())
+        p = self.old.sigmoid()
+        if self._generator is None:
+            on, off = p * credit.advantage, (1 - p) * credit.advantage
+        else:
+            on, off = credit.sampled(p, self._generator)
+        up = (logsigmoid(logits) - logsigmoid(self.old)).exp()
+        down = (logsigmoid(-logits) - logsigmoid(-self.old)).exp()
+        return self._clipped(up, (1 - p) * on) + self._clipped(down, -p * off)
+
+    def _clipped(self, ratio: Tensor, advantage: Tensor) -> Tensor:
+        near = ratio.clamp(1 - self._clip, 1 + self._clip)
+        return torch.minimum(ratio * advantage, near * advantage)
+
+
+class Poisson(ActorLoss):
+    """DQN: the Q that adds up over the sensors, Q = b + Σ a_j q_j with q = c(e^z - 1), by the loss c e^z - (G⁺ - G⁻)z.
+
+    At its minimum c e^z is the gain of the sensor and q what it is worth more on than off. A squared error would have
+    to tell gains from costs where both are tiny; on the log scale cells where the target seldom is are no harder.
+    """
+
+    def forward(self, logits: Tensor, credit: SensorCredit) -> Tensor:
+        """C e^z - (G⁺ - G⁻) z, z no larger than what any gain comes to."""
+        z = logits.clamp(-_LARGEST_LOGIT, _LARGEST_LOG_RATIO)
+        return credit.price * z.exp() - (credit.plus - credit.minus) * z
+
+
+def decision_loss(logits: Tensor, plus: Tensor, minus: Tensor, price: Tensor) -> Tensor:
+    """Cost-sensitive logistic loss of each sensor: (c + G⁻) softplus(z) + G⁺ softplus(-z).
+
+    Its minimum over z is at log(G⁺ / (c + G⁻)), positive exactly where sensing pays: G⁺ - G⁻ > c. On the log scale a
+    cell where the target seldom is needs no more accuracy than one where it often is.
+
+    Args:
+        logits: z.
+        plus: G⁺, sum of the positive gains.
+        minus: G⁻, minus the sum of the negative ones.
+        price: c, what having the sensor on costs in sum.
+    """
+    # Beyond the clamp nothing is left to learn, and without it logits run off to where floats lose precision.
+    logits = logits.clamp(-_LARGEST_LOGIT, _LARGEST_LOGIT)
+    return (price + minus + plus) * softplus(logits) - plus * logits

@@ -1,0 +1,36 @@
+"""A2C, PPO and DQN with a credit per sensor: hindsight learning with the actor losses of these algorithms."""
+
+from __future__ import annotations
+
+from trackmdp.algos.actor_loss import ActorLoss, Poisson, PolicyGradient, Surrogate
+from trackmdp.algos.hindsight import Hindsight
+from trackmdp.config.per_sensor import A2cPerSensor, PpoPerSensor
+
+__all__ = ["A2C", "DQN", "PPO"]
+
+
+class A2C(Hindsight):
+    """The policy gradient over both actions of every sensor."""
+
+    cfg: A2cPerSensor
+
+    def _actor_loss(self) -> ActorLoss:
+        return PolicyGradient(self.cfg.entropy)
+
+
+class PPO(Hindsight):
+    """The clipped surrogate of every sensor, over both actions or over sets drawn from the old policy."""
+
+    cfg: PpoPerSensor
+
+    def _actor_loss(self) -> ActorLoss:
+        cfg = self.cfg
+        rng = self._generator if cfg.surrogate == "sampled" else None
+        return Surrogate(cfg.entropy, clip=cfg.clip, minibatches=cfg.minibatches, generator=rng)
+
+
+class DQN(Hindsight):
+    """A Q that adds up over the sensors."""
+
+    def _actor_loss(self) -> ActorLoss:
+        return Poisson()

@@ -1,0 +1,77 @@
+"""Schema of the algorithms with a credit per sensor: hindsight, and A2C, PPO and DQN with the same gains."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from trackmdp.config.learning import Algo, Schedule
+from trackmdp.config.options import SELECTORS, Selector, choice, option
+
+__all__ = ["A2cPerSensor", "DqnPerSensor", "Hindsight", "PerSensor", "PolicyGradient", "PpoPerSensor"]
+
+SELECTORS["credit"] = Selector(
+    group="algo",
+    about="what a2c, ppo and dqn learn from; hindsight and learned_kernel have a credit of their own",
+    choices={
+        "joint": "the reward of the whole set of sensors, as in the paper",
+        "per_sensor": "what each sensor gains on fully sensed paths, as in hindsight",
+    },
+)
+
+
+@dataclass(kw_only=True)
+class PerSensor(Algo):
+    """What the algorithms with a credit per sensor have in common."""
+
+    credit: ClassVar[str | None] = "per_sensor"
+    effort: ClassVar[float] = 1.0
+    gamma: float = option("discount inside the credit; policies are judged undiscounted", ge=0, lt=1)
+    learning_rate: Schedule
+    blend: Schedule
+    average: float = option("share of the old in the running average of the actor, which is judged", ge=0, lt=1)
+    batch_size: int = option("path segments per update", unit="segments", ge=1)
+    updates: int | None = option("updates of the whole run; null: by the size of the problem", ge=1)
+    updates_per_iteration: int = option("updates from one evaluation, log row or checkpoint to the next at most", ge=1)
+    hidden: int | None = option(
+        "units of each net's hidden layer; null: by the size of the problem", unit="units", ge=1, le=4096
+    )
+    buffer_size: int = option("path segments kept for replay", unit="segments", ge=1)
+
+
+@choice("algo", "hindsight")
+@dataclass(kw_only=True)
+class Hindsight(PerSensor):
+    """Collect with all sensors on, then learn from those paths what any policy would have found and missed on them."""
+
+
+@dataclass(kw_only=True)
+class PolicyGradient(PerSensor):
+    """What A2C and PPO with a credit per sensor have in common."""
+
+    effort: ClassVar[float] = 1.6
+    entropy: Schedule
+
+
+@choice("algo", "a2c_per_sensor")
+@dataclass(kw_only=True)
+class A2cPerSensor(PolicyGradient):
+    """Hindsight with the policy gradient of A2C, over both actions of every sensor (algo=a2c credit=per_sensor)."""
+
+
+@choice("algo", "ppo_per_sensor")
+@dataclass(kw_only=True)
+class PpoPerSensor(PolicyGradient):
+    """Hindsight with the clipped surrogate of PPO, per sensor (algo=ppo credit=per_sensor)."""
+
+    clip: float = option("how far a sensor's probability ratio may leave 1", gt=0, lt=1)
+    minibatches: int = option("parts of a batch: updates until the old policy of the ratio is renewed", ge=1)
+    surrogate: str = option(
+        "over both actions of every sensor, or over sets drawn from the old policy", choices=("all_action", "sampled")
+    )
+
+
+@choice("algo", "dqn_per_sensor")
+@dataclass(kw_only=True)
+class DqnPerSensor(PerSensor):
+    """Hindsight with a Q that adds up over the sensors, for DQN (algo=dqn credit=per_sensor)."""
