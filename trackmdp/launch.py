@@ -101,7 +101,6 @@ def _batches(
 ) -> Iterable[Sequence[Job]]:
     """The jobs of a sweep: all at once, or as a search asks for them."""
     from trackmdp.sweep.plan import combinations, of_task, plan
-    from trackmdp.sweep.trials import trials
 
     def composed(words: Sequence[str]) -> DictConfig:
         alone = argparse.Namespace(**{**vars(args), "overrides": list(words)})
@@ -111,6 +110,7 @@ def _batches(
     if isinstance(sweeper, Blocks):
         return [plan(command, combinations(sweeper.blocks or [], typed), folder, composed)]
     assert isinstance(sweeper, Optuna)
+    from trackmdp.sweep.trials import trials
 
     def planned(words: Sequence[str], telling: set[str]) -> Job:
         return plan(command, [words], folder, composed, telling)[0]

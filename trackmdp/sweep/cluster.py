@@ -23,7 +23,7 @@ __all__ = ["launcher"]
 SUBMISSIONS = ".submissions"
 """Folder, in that of the sweep, of what the scheduler is given and says."""
 
-_POLL = 0.5
+_POLL, _ASK = 0.5, 60.0
 
 
 class Submission:
@@ -106,7 +106,11 @@ def _submissions(jobs: Sequence[Job]) -> Path:
 
 def _wait(submitted: Sequence[Any]) -> None:
     """Come back once all are over; how they ended stands in the folders of the runs."""
-    while not all(each.done() for each in submitted):
+    asked = time.monotonic()
+    while left := [each for each in submitted if not each.done()]:
+        if time.monotonic() - asked > _ASK:  # one that was killed leaves no file by which it would be known
+            left[0].done(force_check=True)
+            asked = time.monotonic()
         time.sleep(_POLL)
 
 
