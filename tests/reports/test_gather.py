@@ -130,14 +130,24 @@ def test_what_is_wrong_with_a_run_is_named(sweep: Path) -> None:
     assert said["a2c-0.16-0"] == "cut: it has no summary.json"
     assert said["a2c-0.16-1"].startswith("its summary.json cannot be read")
     assert said["a2c-0.16-2"].startswith("its summary.json cannot be read")
-    assert "config.yaml" in said["a2c-0.22-0"]
+    assert said["a2c-0.22-0"] == "its config.yaml cannot be read"
     assert said["a2c-0.22-1"] == "failed: out of luck"
     assert said["hindsight-0.16-1"] == "no learning curve"
     assert said["hindsight-0.22-1"].startswith("policy.npz: not the policy of a run")
     assert said["hindsight-0.16-0"].startswith("its world cannot be built")
-    assert said["a2c, Z=5, c=0.16"] == "no run"  # a2c has one left, at the other price
+    assert said["a2c"] == "no run in 1 of 2 worlds: Z=5, c=0.16"
     assert sorted(found.policies)[0] == "a2c-0.22-2"
     assert len(found.policies) == 2
+
+
+def test_a_run_of_a_version_with_other_options_counts(sweep: Path) -> None:
+    file = sweep / "a2c-0.16-0/config.yaml"
+    file.write_text(
+        file.read_text().replace("  radius: 1\n", "  radius: 1\n  later: 3\n").replace("algo:", "algo:\n  x: 1")
+    )
+    found = gather(sweep, make_world)
+    assert len(found.runs) == 12
+    assert "a2c-0.16-0" in found.motions
 
 
 def test_a_missing_seed_is_named(sweep: Path) -> None:

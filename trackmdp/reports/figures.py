@@ -23,6 +23,7 @@ __all__ = [
     "FLOOR",
     "Panel",
     "against_cost",
+    "axis_break",
     "estimate_columns",
     "panels",
     "parts",
@@ -76,7 +77,7 @@ def against_cost(study: Study, panel: Panel, resamples: int) -> Figure:
     exact = {"Q_MDP": _exact(study, panel, "qmdp_aihtr")}
     exact |= {label: _exact(study, panel, key) for label, key in BOUNDS.items()}
     exact = {label: values for label, values in exact.items() if not all(map(math.isnan, values))}
-    split = _split([e.mean for row in learned.values() for e in row] + [v for row in exact.values() for v in row])
+    split = axis_break([e.mean for row in learned.values() for e in row] + [v for row in exact.values() for v in row])
 
     def paint(figure: Canvas) -> None:
         split_axes = figure.subplots(2, 1, sharex=True, height_ratios=[4, 1]) if split else [figure.subplots()]
@@ -116,7 +117,7 @@ def regret_against_cost(study: Study, panel: Panel, resamples: int) -> Figure:
         for level in ALLOWED:
             axes.axhline(level, color=INK, linewidth=0.6, linestyle=(0, (1, 2)))
             axes.annotate(
-                f"{level:g}", (1, level), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=7
+                f"{level:g}", (1.01, level), xycoords=("axes fraction", "data"), va="center", fontsize=7, clip_on=False
             )
         axes.set_yscale("log")
         axes.set_ylabel("regret per step")
@@ -184,7 +185,7 @@ def _learned_lines(
         )
 
 
-def _split(values: Sequence[float]) -> tuple[float, float, float, float] | None:
+def axis_break(values: Sequence[float]) -> tuple[float, float, float, float] | None:
     """Where to break the axis: (lowest, end of the lower part, start of the upper one, highest), None if nowhere.
 
     It breaks where the widest gap between neighbouring values takes more than half of the axis.
@@ -204,7 +205,7 @@ def _break(upper: Axes, lower: Axes, bottom: float, lower_end: float, upper_star
     upper.set_ylim(upper_start - margin, top + margin)
     small = max(0.25 * (lower_end - bottom), margin)
     lower.set_ylim(bottom - small, lower_end + small)
-    lower.locator_params(axis="y", nbins=3)
+    lower.locator_params(axis="y", nbins=2, integer=True)
     upper.spines["bottom"].set_visible(False)
     upper.tick_params(bottom=False)
     marks = {"marker": [(-1, -0.6), (1, 0.6)], "markersize": 7, "linestyle": "none", "color": INK, "clip_on": False}

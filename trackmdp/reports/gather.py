@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from omegaconf import OmegaConf
 
-from trackmdp.config import Table, TrainConfig, load_run, to_dict
+from trackmdp.config import Table, WorldConfig, world_of
 from trackmdp.errors import UserError
 from trackmdp.reports import policy
 from trackmdp.reports.grouping import Study, study, world_key
@@ -21,13 +22,13 @@ from trackmdp.solvers import bounds, horizon, qmdp
 from trackmdp.solvers.chains import evaluate
 from trackmdp.world.model import World
 
-__all__ = ["gather", "planned", "run_folders"]
+__all__ = ["flatten", "gather", "planned", "run_folders"]
 
 MOST_POINTS = 20
 """Points kept of a learning curve: evenly spaced in the logarithm of the iteration."""
 
 
-def gather(folder: Path, make_world: Callable[[TrainConfig], World]) -> Results:
+def gather(folder: Path, make_world: Callable[[WorldConfig], World]) -> Results:
     """Read every run below `folder`.
 
     Args:
@@ -104,12 +105,12 @@ def _read_run(folder: Path, name: str) -> tuple[Run, Mapping[str, Any]] | Proble
         return Problem(name, "not started")
     if not (place / "summary.json").is_file():
         return Problem(name, "cut: it has no summary.json")
+    settings = flatten(_config(place))
+    if not settings.keys() >= {"algo.name", "seed", "grid.size", "kernel.name"}:
+        return Problem(name, "its config.yaml cannot be read")
     try:
-        cfg = load_run(place)
         summary = json.loads((place / "summary.json").read_text(encoding="utf-8"))
-        return Run(name, flatten(to_dict(cfg)), _figures(summary), str(summary["config_sha256"])), summary
-    except UserError as error:
-        return Problem(name, str(error).removeprefix(f"run={place}: "))
+        return Run(name, settings, _figures(summary), str(summary["config_sha256"])), summary
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         return Problem(name, f"its summary.json cannot be read ({' '.join(str(error).split())})")
 
@@ -119,6 +120,15 @@ def _reason(file: Path) -> str:
         return str(json.loads(file.read_text(encoding="utf-8"))["reason"])
     except (OSError, ValueError, KeyError, TypeError):
         return "no reason given"
+
+
+def _config(place: Path) -> Mapping[str, Any]:
+    """The plain config of a run, which another version may have written; empty where it cannot be read."""
+    try:
+        plain = OmegaConf.to_container(OmegaConf.load(place / "config.yaml"))
+    except Exception:  # yaml and OmegaConf raise many kinds
+        return {}
+    return {str(key): value for key, value in plain.items()} if isinstance(plain, Mapping) else {}
 
 
 def flatten(plain: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -179,16 +189,19 @@ def _mixed(runs: Sequence[Run], summaries: Sequence[Mapping[str, Any]]) -> list[
 
 
 def _missing_seeds(grouped: Study) -> list[Problem]:
-    """Seeds that a method has in one world and not in another."""
+    """Seeds, or all runs, that a method has in one world and not in another."""
     found = []
     for method in grouped.methods:
         groups = {world: grouped.of(world, method) for world in grouped.worlds}
         seeds = {run.seed for runs in groups.values() for run in runs}
         for world, runs in groups.items():
             missing = sorted(seeds - {run.seed for run in runs})
-            if missing:
-                text = f"seed {', '.join(map(str, missing))} missing" if runs else "no run"
-                found.append(Problem(f"{method}, {world}", text))
+            if runs and missing:
+                found.append(Problem(f"{method}, {world}", f"seed {', '.join(map(str, missing))} missing"))
+        without = [world for world, runs in groups.items() if not runs]
+        if without:
+            text = f"no run in {len(without)} of {len(groups)} worlds: {'; '.join(without)}"
+            found.append(Problem(method, text))
     return found
 
 
@@ -209,7 +222,7 @@ def _policies(folder: Path, grouped: Study) -> tuple[dict[str, policy.Policy], l
 
 
 def _motions(
-    folder: Path, runs: Iterable[Run], make_world: Callable[[TrainConfig], World]
+    folder: Path, runs: Iterable[Run], make_world: Callable[[WorldConfig], World]
 ) -> tuple[dict[str, Motion], list[Problem]]:
     """Motion and references of each world, from the `kernel.npy` of its first run."""
     found: dict[str, Motion] = {}
@@ -221,17 +234,24 @@ def _motions(
         if run.settings["kernel.name"] == "tracks":
             continue  # no motion is known there
         try:
-            cfg = load_run(folder / run.name)
-            stored = Table(path=str(folder / run.name / "kernel.npy"))
-            world = make_world(dataclasses.replace(cfg, kernel=stored))
+            world = make_world(_world_config(folder / run.name))
         except UserError as error:
             problems.append(Problem(run.name, f"its world cannot be built ({error})"))
             continue
-        limit, simple = cfg.grid.max_steps, qmdp.solve(world)
+        limit, simple = run.settings.get("grid.max_steps"), qmdp.solve(world)
         value = evaluate(world, simple) if limit is None else horizon.evaluate(world, simple, limit)
         bound = bounds.clocked(world) if limit is None else horizon.clocked(world, limit)
         found[run.name] = Motion(world.transition, value.value, bound)
     return found, problems
+
+
+def _world_config(place: Path) -> WorldConfig:
+    """A run's world with the motion that it stored as its table, whatever made the motion."""
+    plain = _config(place)
+    kernel: dict[str, Any] = {field.name: False for field in dataclasses.fields(Table)}
+    kernel |= {"name": "table", "path": str(place / "kernel.npy")}
+    parts = {key: plain.get(key) for key in ("grid", "cost")}
+    return world_of(OmegaConf.to_yaml(OmegaConf.create({"quiet": True, "kernel": kernel, **parts})))
 
 
 def _manifest(plan: Mapping[str, Any] | None, summaries: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -15,6 +15,8 @@ __all__ = ["Study", "study", "world_key"]
 ORDER = ("a2c", "hindsight", "ppo", "dqn", "learned_kernel")
 SHORT = {"kernel.support_size": "Z", "cost.sensor": "c", "grid.size": "N", "grid.t_max": "T_max"}
 WORLD = ("grid.", "kernel.", "cost.")
+TOLD = "kernel.homogeneous"
+"""What a learner is told of the motion; it is the method's, not the world's."""
 NOT_METHOD = ("seed", "quiet", "device", "threads", "resume", "init_from")
 NOT_METHOD_GROUPS = ("log.", "checkpoint.", "evaluation.", "optimal.")
 
@@ -79,7 +81,11 @@ def study(runs: Sequence[Run]) -> Study:
 
 def world_key(run: Run) -> str:
     """The same for runs in the same world."""
-    return json.dumps({key: value for key, value in run.settings.items() if key.startswith(WORLD)}, sort_keys=True)
+    return json.dumps({key: value for key, value in run.settings.items() if _of_world(key)}, sort_keys=True)
+
+
+def _of_world(key: str) -> bool:
+    return key.startswith(WORLD) and key != TOLD
 
 
 def _varied(runs: Sequence[Run]) -> list[str]:
@@ -87,12 +93,12 @@ def _varied(runs: Sequence[Run]) -> list[str]:
     values: dict[str, dict[str, set[str]]] = {}
     for run in runs:
         for key, value in run.settings.items():
-            owner = "" if key.startswith(WORLD) else run.algo
+            owner = "" if _of_world(key) else run.algo
             values.setdefault(key, {}).setdefault(owner, set()).add(json.dumps(value))
     found = [key for key, owned in values.items() if any(len(each) > 1 for each in owned.values())]
     found = [key for key in found if key not in NOT_METHOD and not key.startswith(NOT_METHOD_GROUPS)]
     kept: list[str] = []
-    for key in sorted(found, key=lambda key: (not key.startswith(WORLD), key not in SHORT, key)):
+    for key in sorted(found, key=lambda key: (not _of_world(key), key not in SHORT, key)):
         if key != "algo.name" and not any(_follows(runs, key, other) for other in kept):
             kept.append(key)
     return kept
@@ -100,7 +106,7 @@ def _varied(runs: Sequence[Run]) -> list[str]:
 
 def _follows(runs: Iterable[Run], key: str, other: str) -> bool:
     """Whether the value of `other` says that of `key`, both of the world or both of the method."""
-    if key.startswith(WORLD) != other.startswith(WORLD):
+    if _of_world(key) != _of_world(other):
         return False
     seen: dict[str, str] = {}
     pairs = [(run.algo + json.dumps(run.settings.get(other)), json.dumps(run.settings.get(key))) for run in runs]
@@ -109,21 +115,21 @@ def _follows(runs: Iterable[Run], key: str, other: str) -> bool:
 
 def _world_label(run: Run, varied: Sequence[str]) -> str:
     always = ["kernel.support_size", "cost.sensor"]
-    keys = [*always, *(key for key in varied if key.startswith(WORLD) and key not in always)]
+    keys = [*always, *(key for key in varied if _of_world(key) and key not in always)]
     named = [f"{_short(key)}={_text(run.settings[key])}" for key in keys if run.settings.get(key) is not None]
     kernel = run.settings.get("kernel.name")
     return ", ".join(named if kernel == "random_support" else [str(kernel), *named])
 
 
 def _method_label(run: Run, varied: Sequence[str]) -> str:
-    keys = [key for key in varied if not key.startswith(WORLD) and key in run.settings]
+    keys = [key for key in varied if not _of_world(key) and key in run.settings]
     return ", ".join([run.algo, *(f"{_short(key)}={_text(run.settings[key])}" for key in keys)])
 
 
 def _order(run: Run, varied: Sequence[str]) -> tuple[Any, Any]:
-    world = [_sortable(run.settings.get(key)) for key in [*SHORT, *varied] if key in SHORT or key.startswith(WORLD)]
+    world = [_sortable(run.settings.get(key)) for key in [*SHORT, *varied] if key in SHORT or _of_world(key)]
     place = ORDER.index(run.algo) if run.algo in ORDER else len(ORDER)
-    method = [_sortable(run.settings.get(key)) for key in varied if not key.startswith(WORLD)]
+    method = [_sortable(run.settings.get(key)) for key in varied if not _of_world(key)]
     return world, (place, run.algo, method)
 
 

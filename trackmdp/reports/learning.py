@@ -19,7 +19,7 @@ from trackmdp.world.model import Array
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
-__all__ = ["curves", "profiles"]
+__all__ = ["curves", "profiles", "value_at"]
 
 
 def curves(study: Study, points: Mapping[str, Sequence[Point]], by: str, resamples: int) -> Figure | None:
@@ -33,7 +33,7 @@ def curves(study: Study, points: Mapping[str, Sequence[Point]], by: str, resampl
             continue
         start, end = (float(f([curve[i, 0] for curve in everything])) for f, i in ((max, 0), (max, -1)))
         grid = np.geomspace(max(start, 1e-2), max(end, start * 1.001), 40)
-        values = [[np.array([_at(curve, x) for x in grid]) for curve in group] for group in known]
+        values = [[np.array([value_at(curve, x) for x in grid]) for curve in group] for group in known]
         row = [
             estimate([[v[i] for v in g] for g in values], "learning", by, method, str(i), resamples=resamples)
             for i in range(len(grid))
@@ -117,7 +117,7 @@ def _steps(study: Study, run: Run, world: str, curves: Mapping[str, Sequence[Poi
     return np.array(sorted(last.items()))
 
 
-def _at(curve: Array, x: float) -> float:
+def value_at(curve: Array, x: float) -> float:
     """The regret of the last policy judged at or before x; before the first, the first's."""
     place = int(np.searchsorted(curve[:, 0], x * (1 + 1e-9), side="right")) - 1
     return float(curve[max(place, 0), 1])

@@ -188,7 +188,7 @@ def _openings(report: Report, grouped: Study, chosen: dict[tuple[int, float], st
         "sweep keeps T_max = 1 and renormalize, this project's defaults.</p>"
     )
     report.section(
-        "calibration",
+        "worlds",
         "The worlds, calibrated",
         f"<p>{html.escape(settings.RULE)}</p>",
         settings.calibration_figure(openings.candidates),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import io
+import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -40,7 +41,8 @@ PALETTE = {
     "#dcebf4": "pale",
 }
 """Colours of the files, and their names in the style sheet of the page, where they change with the scheme."""
-_DPI = 200
+_DPI = 160
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 @dataclass(frozen=True)
@@ -115,28 +117,35 @@ def canvas(height: float, name: str, width: float = WIDTH) -> Iterator[Canvas]:
     from matplotlib.figure import Figure as New
 
     with matplotlib.rc_context(_settings(name)):
-        yield New(figsize=(width, height), layout="constrained")
+        yield New(figsize=(width, height), dpi=_DPI, layout="constrained")
 
 
 def draw(name: str, title: str, text: str, table: Table, height: float, paint: Callable[[Canvas], None]) -> Figure:
     """Paint and write one figure."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+
     svg, png = io.BytesIO(), io.BytesIO()
     with canvas(height, name) as figure:
         paint(figure)
-        figure.savefig(svg, format="svg", metadata={"Date": None, "Creator": None})
-        figure.savefig(png, format="png", dpi=_DPI, metadata={"Software": None})
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")  # what has been laid out need not be again for each format
+        # savefig would lay out and draw twice more each time
+        FigureCanvasAgg(figure).print_png(png, metadata={"Software": None})  # type: ignore[no-untyped-call]
+        FigureCanvasSVG(figure).print_svg(svg, metadata={"Date": None, "Creator": None})  # type: ignore[no-untyped-call]
     return Figure(name, title, text, table, svg.getvalue(), png.getvalue())
 
 
 def tidy(axes: Axes) -> None:
     """Light grid, no box; letters between powers of ten only where there are few powers."""
-    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, StrMethodFormatter
 
     for axis, scale, (low, high) in (
         (axes.xaxis, axes.get_xscale(), axes.get_xlim()),
         (axes.yaxis, axes.get_yscale(), axes.get_ylim()),
     ):
         if scale == "log" and high > 50 * low:
+            axis.set_major_formatter(FuncFormatter(_power))
             axis.set_minor_formatter(NullFormatter())
         elif scale == "log":
             axis.set_minor_locator(LogLocator(subs=(2, 5)))
@@ -146,6 +155,11 @@ def tidy(axes: Axes) -> None:
     axes.set_axisbelow(True)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
+
+
+def _power(value: float, _place: int | None = None) -> str:
+    """A power of ten, in letters that need no formula."""
+    return f"10{f'{math.log10(value):.0f}'.translate(_RAISED)}"
 
 
 def legend(figure: Canvas, axes: Axes, columns: int = 3, first: Sequence[str] = ()) -> None:
@@ -198,6 +212,8 @@ def _inline(svg: str, name: str, title: str, text: str) -> str:
     for colour, variable in PALETTE.items():
         rest = rest.replace(colour, f"var(--{variable})")
     rest = re.sub(r"\n\s*", "\n", rest)
+    used = set(re.findall(r'(?:url\(|href=")#([^")]+)', rest))  # the other names would be there once per figure
+    rest = re.sub(r' id="([^"]+)"', lambda found: found[0] if found[1] in used else "", rest)
     head = (
         f'<svg class="chart" role="img" viewBox="{view[1]}" xmlns="http://www.w3.org/2000/svg" '
         f'xmlns:xlink="http://www.w3.org/1999/xlink" aria-labelledby="{name}-t {name}-d">'

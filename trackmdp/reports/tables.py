@@ -14,6 +14,8 @@ __all__ = ["Cell", "Column", "Table"]
 
 Cell: TypeAlias = "float | int | str | bool | None"
 
+LONG = 60
+"""Letters of a cell that may be broken over lines."""
 _LATEX = {"&": r"\&", "%": r"\%", "#": r"\#", "_": r"\_", "≤": r"$\le$", "±": r"$\pm$", "–": "--", "²": "$^2$"}
 
 
@@ -109,6 +111,7 @@ class Table:
         for place, (column, value) in enumerate(zip(self.columns, row, strict=True)):
             text = html.escape(column.text(value))
             mark = f' class="{text}"' if isinstance(value, bool) and column.judged else ""
+            mark = mark or (' class="wide"' if len(text) > LONG else "")
             number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
             sort = f' data-v="{value!r}"' if number else ""
             cells.append(f"<td{mark or self._side(place)}{sort}>{text}</td>")

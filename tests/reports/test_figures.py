@@ -1,0 +1,166 @@
+"""Figures: their numbers, their words, and the same bytes each time."""
+
+from __future__ import annotations
+
+import re
+import sys
+
+import numpy as np
+import pytest
+
+from tests.reports.sweeps import write_sweep
+from trackmdp.build import make_world
+from trackmdp.errors import UserError
+from trackmdp.reports import figures, learning, maps, style
+from trackmdp.reports.figures import Panel
+from trackmdp.reports.gather import gather
+from trackmdp.reports.grouping import Study, study
+from trackmdp.reports.results import Results
+from trackmdp.reports.statistics import iqm
+
+RESAMPLES = 100
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
+    return gather(write_sweep(tmp_path_factory.mktemp("sweep")), make_world)
+
+
+@pytest.fixture(scope="module")
+def grouped(results: Results) -> Study:
+    return study(results.runs)
+
+
+@pytest.fixture(scope="module")
+def panel(grouped: Study) -> Panel:
+    (panel,) = figures.panels(grouped)
+    return panel
+
+
+def test_worlds_that_differ_in_price_make_a_panel(panel: Panel) -> None:
+    assert (panel.title, panel.costs) == ("Z=5", [0.16, 0.22])
+    assert panel.worlds == ["Z=5, c=0.16", "Z=5, c=0.22"]
+
+
+@pytest.mark.parametrize(
+    ("values", "split"),
+    [
+        ([100.0, 90.0, 80.0, -800.0], (-800.0, -800.0, 80.0, 100.0)),
+        ([100.0, -700.0, 90.0, -800.0], (-800.0, -700.0, 90.0, 100.0)),
+        ([100.0, 90.0, 50.0, 20.0], None),
+        ([1.0, 1.0, 1.0], None),
+        ([1.0, 2.0, float("nan")], None),
+    ],
+)
+def test_an_axis_breaks_where_one_gap_takes_more_than_half_of_it(values: list[float], split: object) -> None:
+    assert figures.axis_break(values) == split
+
+
+def test_the_numbers_of_a_figure_are_those_of_the_runs(grouped: Study, panel: Panel) -> None:
+    figure = figures.against_cost(grouped, panel, RESAMPLES)
+    world = "Z=5, c=0.22"
+    runs = grouped.of(world, "a2c")
+    rows = {row[1]: row for row in figure.table.rows if row[0] == 0.22}
+    values = [run.figure("aihtr") for run in runs]
+    assert rows["a2c"][2:] == [float(iqm(np.array(values))), *rows["a2c"][3:5], 3]
+    assert min(values) <= rows["a2c"][3] <= rows["a2c"][4] <= max(values)  # type: ignore[operator]
+    assert rows["Q_MDP"][2] == runs[0].figure("qmdp_aihtr")
+    assert rows["printed bound"][2] == runs[0].figure("bound_paper")
+    assert rows["optimum"][2] == grouped.lower(world)
+    assert f"a2c: {figure.table.rows[0][2]:.1f}, {rows['a2c'][2]:.1f}" in figure.text
+    assert "a2c n = 3" in figure.title
+
+
+def test_regret_is_to_the_proved_bound(grouped: Study, panel: Panel) -> None:
+    figure = figures.regret_against_cost(grouped, panel, RESAMPLES)
+    rows = {(row[0], row[1]): row[2] for row in figure.table.rows}
+    assert rows[0.16, "hindsight"] == float(iqm(np.array(grouped.regrets("Z=5, c=0.16", "hindsight"))))
+    run = grouped.of("Z=5, c=0.16", "a2c")[0]
+    expected = (run.figure("optimal_upper") - run.figure("qmdp_aihtr")) / run.figure("expected_length")
+    assert rows[0.16, "Q_MDP"] == pytest.approx(expected)
+
+
+def test_a_learning_curve_ends_where_the_runs_do(results: Results, grouped: Study) -> None:
+    figure = learning.curves(grouped, results.curves, "frames", RESAMPLES)
+    assert figure
+    last = [row for row in figure.table.rows if row[0] == "a2c"][-1]
+    regrets = [value for world in grouped.worlds for value in grouped.regrets(world, "a2c")]
+    assert last[1] == pytest.approx(8000.0)
+    assert last[2] == pytest.approx(float(iqm(np.array(regrets))))
+    assert last[5] == 6
+
+
+def test_a_curve_is_a_staircase() -> None:
+    curve = np.array([[10.0, 3.0], [20.0, 2.0], [40.0, 1.0]])
+    assert [learning.value_at(curve, x) for x in (5, 10, 19, 20, 39, 40, 99)] == [3, 3, 3, 2, 2, 1, 1]
+
+
+def test_profiles_count_runs(grouped: Study) -> None:
+    figure = learning.profiles(grouped, RESAMPLES)
+    assert figure
+    row = next(row for row in figure.table.rows if row[0] == "a2c")
+    regrets = [value for world in grouped.worlds for value in grouped.regrets(world, "a2c")]
+    marks = (0.001, 0.005, 0.01, 0.02, 0.05, 0.1)
+    assert row[1:] == [6, *(sum(value <= mark for value in regrets) / 6 for mark in marks)]
+
+
+def test_a_map_draws_what_can_happen(results: Results) -> None:
+    name = "hindsight-0.16-0"
+    kept = next(policy for run, policy in results.policies.items() if run.startswith("hindsight-0.16"))
+    motion = results.motions["a2c-0.16-0"]
+    figure = maps.policy_map(name, "here", kept, motion)
+    assert figure
+    for located, n, on, possible, cells in figure.table.rows:
+        assert on == kept.chains[located, n].sum() == len(str(cells).split())  # type: ignore[index]
+        if n == 0:
+            assert possible == (motion.kernel.toarray()[located] > 0).sum()  # type: ignore[call-overload]
+    first = [row for row in figure.table.rows if row[1] == 0]
+    assert len(first) == 9
+    everything = type(kept)(np.ones_like(kept.chains), kept.value)
+    drawn = maps.policy_map(name, "here", everything, motion)
+    assert drawn
+    assert {row[1] for row in drawn.table.rows} == {0}  # no miss can happen, so there is no second set
+
+
+def test_a_value_map_holds_every_cell(results: Results) -> None:
+    name, kept = next(iter(results.policies.items()))
+    motion = results.motions["a2c-0.16-0"]
+    figure = maps.value_map(name, "here", kept, motion)
+    assert figure
+    assert [row[3] for row in figure.table.rows] == kept.value.tolist()
+    assert figure.table.rows[5][:3] == [5, 2, 3]
+    large = type(kept)(np.zeros((900, 1, 900), dtype=bool), np.zeros(900))
+    assert maps.value_map(name, "here", large, motion) is None
+
+
+def test_the_same_figure_has_the_same_bytes_and_no_date(grouped: Study, panel: Panel) -> None:
+    one, two = (figures.against_cost(grouped, panel, RESAMPLES) for _ in range(2))
+    assert (one.svg, one.png) == (two.svg, two.png)
+    assert b"date" not in one.svg.lower()
+    assert one.png.startswith(b"\x89PNG")
+
+
+def test_in_the_page_a_figure_has_a_text_alternative_and_the_colours_of_the_page(grouped: Study, panel: Panel) -> None:
+    figure = figures.regret_against_cost(grouped, panel, RESAMPLES)
+    text = figure.html()
+    assert 'role="img"' in text
+    label = re.search(r'aria-labelledby="(\S+) (\S+)"', text)
+    assert label
+    assert f'<title id="{label[1]}">{figure.title}</title>' in text
+    assert f'<desc id="{label[2]}">At c = 0.16, 0.22.' in text
+    drawing = text[: text.index("<figcaption>")]
+    assert not re.findall(r"#[0-9a-f]{6}", drawing), "a colour that does not change with the scheme"
+    assert "<style" not in drawing
+    assert "<image" not in drawing
+    assert text.count("<table") == 1
+
+
+def test_without_matplotlib_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(UserError, match=r"trackmdp\[report\]"):
+        style.require()
+
+
+def test_files_are_named_after_what_they_show() -> None:
+    assert figures.slug("a2c, gamma=0.9-Z=5, c=0.16") == "a2c-gamma-0-9-z-5-c-0-16"
+    assert "/" not in figures.slug("kernel=table, path=/a/b")
