@@ -53,8 +53,9 @@ def make_recorded(cfg: WorldConfig) -> Recorded:
     check_tracks(tracks, shortest, f"kernel.path={kernel.path}")
     mine, held_out = split(tracks, kernel.held_out, kernel.seed)
     reward, price, safe = _costs(cfg.cost, size**2)
+    assumed = {"markov": kernel.markov, "homogeneous": kernel.homogeneous}
     anywhere = kernel.starts == "anywhere"
-    return Recorded(size, reward, price, safe, t_max, mine, held_out, anywhere=anywhere, markov=kernel.markov)
+    return Recorded(size, reward, price, safe, t_max, mine, held_out, anywhere=anywhere, **assumed)
 
 
 def make_world(cfg: WorldConfig) -> World:
@@ -64,11 +65,15 @@ def make_world(cfg: WorldConfig) -> World:
         UserError: a file is missing or malformed, or the kernel breaks a rule (`kernels.check_table`).
     """
     size = cfg.grid.size
-    table = KERNELS[type(cfg.kernel)](size, **_values(cfg.kernel))
+    motion = _values(cfg.kernel)
+    homogeneous = motion.pop("homogeneous")
+    table = KERNELS[type(cfg.kernel)](size, **motion)
     source = f"kernel.path={cfg.kernel.path}" if isinstance(cfg.kernel, Table) else f"kernel={cfg.kernel.name}"
     kernel = kernels.check_table(table, size, truncates=cfg.grid.max_steps is not None, source=source)
+    if homogeneous:
+        kernels.check_homogeneous(kernel, size, source)
     reward, price, safe = _costs(cfg.cost, size**2)
-    return World(size=size, reward=reward, cost=price, safe_cost=safe, t_max=cfg.grid.t_max, kernel=kernel)
+    return World(size, reward, price, safe, cfg.grid.t_max, kernel, homogeneous=homogeneous)
 
 
 def _values(node: Any) -> dict[str, Any]:

@@ -17,9 +17,10 @@ from trackmdp.algos.actor_loss import Decision, Poisson, PolicyGradient, Surroga
 from trackmdp.algos.hindsight_loss import HindsightLoss
 from trackmdp.config import GROUPS, PerSensor, Schedule
 from trackmdp.errors import UserError
-from trackmdp.solvers import optimal
+from trackmdp.solvers import bounds, optimal
 from trackmdp.solvers.chains import evaluate, regret_per_step
 from trackmdp.training.evaluate import chains_of
+from trackmdp.world.kernels import random_walk
 from trackmdp.world.model import World
 
 SHORT = ("algo.updates=30", "algo.updates_per_iteration=10", "algo.batch_size=512", "algo.hidden=16")
@@ -307,3 +308,36 @@ def test_frames_without_a_move_are_refused_in_one_line() -> None:
         learner.step(batch)
     with pytest.raises(UserError, match=r"^algo\.total_frames: .*$"):
         learner.step(None)
+
+
+def test_where_the_target_moves_alike_few_frames_are_enough() -> None:
+    """144 cells and 12,000 frames: too few for each cell alone, plenty for all of them together."""
+    kernel = random_walk(12, stay=0.2, diagonal=False, exit_probability=0.02, border="renormalize")
+    alone = World(12, 1.0, np.full(144, 0.16), 144 * 0.16, 1, kernel)
+    together = replace(alone, homogeneous=True)
+    data = batches(alone, 47)
+    upper = float(bounds.clocked(alone).mean())
+    words = ("algo.updates=150", "algo.updates_per_iteration=150", "algo.batch_size=4096", "algo.hidden=32")
+    regrets = [
+        regret_per_step(upper, evaluate(world, policy(learn(world, data, "algo.total_frames=12032", *words), world)))
+        for world in (alone, together)
+    ]
+    assert regrets[1] < 0.5 * regrets[0]
+    assert regrets[1] < 0.02
+
+
+def test_what_to_sense_is_shared_only_where_it_can_be() -> None:
+    large, small = small_world(6, t_max=0), small_world(3, t_max=0)
+    uneven = replace(large, cost=np.linspace(0.1, 0.2, 36))
+
+    def shares(world: World) -> bool:
+        rng = torch.Generator().manual_seed(0)
+        loss = HindsightLoss(
+            replace(world, homogeneous=True).task, Decision(), reach=1, hidden=4, discount=0.8, generator=rng
+        )
+        assert loss.critic.groups is loss.clocked_critic.groups is None
+        return loss.actor.groups is not None and loss.clocked_actor.groups is not None
+
+    assert shares(large)
+    assert not shares(uneven)
+    assert not shares(small)  # its outputs stand for cells

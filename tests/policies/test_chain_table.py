@@ -45,3 +45,41 @@ def test_rows_see_their_own_cell_and_clock_alone() -> None:
         net.pair[2, 1] += 1.0
     changed = (net() != before).any(-1)
     assert changed.nonzero().tolist() == [[2, 1]]
+
+
+def test_cells_of_a_group_see_the_same_border() -> None:
+    """6 x 6 cells, radius 1: four corners, four edges, one inside."""
+    groups = Neighbourhood(6, 1, CPU).groups().view(6, 6)
+    assert int(groups.max()) == 8
+    inside = groups[1:5, 1:5]
+    assert (inside == inside[0, 0]).all()
+    assert len(set(groups.flatten().tolist())) == 9
+    for edge in (groups[0, 1:5], groups[5, 1:5], groups[1:5, 0], groups[1:5, 5]):
+        assert (edge == edge[0]).all()
+        assert edge[0] != inside[0, 0]
+
+
+@given(st.integers(3, 9), st.integers(0, 4))
+def test_a_group_has_the_same_window(size: int, radius: int) -> None:
+    view = Neighbourhood(size, radius, CPU)
+    if not view.moves_along:
+        return
+    groups, inside = view.groups(), view.cells < size**2
+    for group in groups.unique():
+        windows = inside[groups == group]
+        assert (windows == windows[0]).all()
+
+
+def test_cells_of_a_group_share_all_weights() -> None:
+    generator = torch.Generator().manual_seed(0)
+    groups = torch.tensor([0, 1, 1, 0])
+    net = CellClockNet(4, 2, hidden=8, outputs=3, bias=0.0, generator=generator, groups=groups)
+    rows = net()
+    assert rows.shape == (4, 2, 3)
+    assert (rows[0] == rows[3]).all()
+    assert (rows[1] == rows[2]).all()
+    assert not (rows[0] == rows[1]).any()
+    rows[0].sum().backward()
+    assert net.cell.grad is not None
+    assert net.cell.grad[0].any()
+    assert not net.cell.grad[1].any()

@@ -18,7 +18,7 @@ from tests.helpers import BORDERS, KERNELS, configured
 from trackmdp.build import make_world
 from trackmdp.errors import UserError
 from trackmdp.world import kernels
-from trackmdp.world.kernels import check_table, drift, load_table, random_support, random_walk
+from trackmdp.world.kernels import check_homogeneous, check_table, drift, load_table, random_support, random_walk
 
 
 def paper(size: int = 5, **changes: Any) -> np.ndarray:
@@ -339,5 +339,31 @@ def test_rounding_of_a_row_sum_is_forgiven() -> None:
 
 
 def test_all_kernels_are_listed() -> None:
-    made = set(kernels.__all__) - {"Border", "load_table", "check_table"}
+    made = set(kernels.__all__) - {"Border", "load_table", "check_homogeneous", "check_table"}
     assert made == set(KERNELS)
+
+
+@pytest.mark.parametrize("border", BORDERS)
+@pytest.mark.parametrize("kernel", ["random_walk", "drift"])
+def test_walks_and_drifts_are_homogeneous_with_every_border(kernel: str, border: str) -> None:
+    cfg = configured("train", f"kernel={kernel}", f"kernel.border={border}", "grid.size=6")
+    assert cfg.kernel.homogeneous
+    assert make_world(cfg).task.homogeneous
+
+
+def test_a_kernel_that_only_claims_to_be_homogeneous_is_refused() -> None:
+    with pytest.raises(
+        UserError, match=r"kernel=random_support: kernel.homogeneous=true, but from cell \d+ the target"
+    ):
+        make_world(configured("train", "kernel.homogeneous=true"))
+
+
+def test_one_changed_row_is_found() -> None:
+    table = random_walk(6, stay=0.4, diagonal=False, exit_probability=0.01, border="clip")
+    check_homogeneous(table, 6, "kernel")
+    at_the_border = table.copy()
+    at_the_border[3] = 0.0
+    check_homogeneous(at_the_border, 6, "kernel")
+    table[14, 14], table[14, 15] = table[14, 15], table[14, 14]
+    with pytest.raises(UserError, match=r"from cell 14 the target moves otherwise than from cell 7"):
+        check_homogeneous(table, 6, "kernel")

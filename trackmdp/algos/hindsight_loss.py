@@ -53,13 +53,20 @@ class HindsightLoss(nn.Module):
         self.near = Neighbourhood(task.size, reach, device)
         self.view = Neighbourhood(task.size, choices * reach, device)
 
-        def net(clocks: int, outputs: int, bias: float) -> CellClockNet:
-            return CellClockNet(m, clocks, hidden=hidden, outputs=outputs, bias=bias, generator=generator)
+        # Where the target moves alike and sensors cost alike, what to sense is learned once for all such cells; values
+        # stay each cell's own.
+        alike = task.homogeneous and bool((task.cost == task.cost[0]).all())
 
-        self.actor = net(choices, self.view.width, -1.0)
-        self.critic = net(1, 1, 0.0)
-        self.clocked_actor = net(choices, self.near.width, -1.0)
-        self.clocked_critic = net(choices + 1, 1, 0.0)
+        def net(clocks: int, outputs: int, bias: float, groups: Tensor | None = None) -> CellClockNet:
+            return CellClockNet(
+                m, clocks, hidden=hidden, outputs=outputs, bias=bias, generator=generator, groups=groups
+            )
+
+        def decisions(seen: Neighbourhood) -> CellClockNet:
+            return net(choices, seen.width, -1.0, self.view.groups() if alike and seen.moves_along else None)
+
+        self.actor, self.critic = decisions(self.view), net(1, 1, 0.0)
+        self.clocked_actor, self.clocked_critic = decisions(self.near), net(choices + 1, 1, 0.0)
         actor_loss.allocate((m, choices, self.view.width), device)
         self.actor_loss = actor_loss
         self.discount, self.safe = discount, 1.0 - task.safe_cost / task.reward

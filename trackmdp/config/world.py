@@ -28,6 +28,10 @@ class Kernel:
     """Base of the group `kernel`: how the target moves."""
 
     name: ClassVar[str]
+    homogeneous: bool = option(
+        "the target moves alike from all cells away from the border, so that hindsight learns one policy for them all; "
+        "checked where there is a kernel"
+    )
 
 
 @choice("kernel", "random_support")

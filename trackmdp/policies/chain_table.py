@@ -6,6 +6,8 @@ the policy is a table of chains, one per located cell, and a net may be run on a
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 
@@ -22,12 +24,27 @@ class CellClockNet(nn.Module):
         outputs: numbers per row.
         bias: value of the outputs' bias at the start.
         generator: draws the initial weights, on its device.
+        groups: int64 `[M]`, the group of each cell, numbered from 0; cells of one group share all weights. None: each
+            cell is its own.
     """
 
+    groups: Tensor | None
+
     def __init__(
-        self, num_cells: int, num_clocks: int, *, hidden: int, outputs: int, bias: float, generator: torch.Generator
+        self,
+        num_cells: int,
+        num_clocks: int,
+        *,
+        hidden: int,
+        outputs: int,
+        bias: float,
+        generator: torch.Generator,
+        groups: Tensor | None = None,
     ) -> None:
         super().__init__()
+        self.register_buffer("groups", groups, persistent=False)
+        if groups is not None:
+            num_cells = int(groups.max()) + 1
 
         def normal(*shape: int, std: float) -> nn.Parameter:
             return nn.Parameter(std * torch.randn(shape, generator=generator, device=generator.device))
@@ -40,7 +57,8 @@ class CellClockNet(nn.Module):
 
     def forward(self) -> Tensor:
         """`[M, num_clocks, outputs]`, the outputs of every row."""
-        return (self.cell + self.clock + self.pair).relu() @ self.weight + self.bias
+        rows = (self.cell + self.clock + self.pair).relu() @ self.weight + self.bias
+        return rows if self.groups is None else rows.index_select(0, self.groups)
 
 
 class Neighbourhood(nn.Module):
@@ -83,6 +101,18 @@ class Neighbourhood(nn.Module):
         # The output for cell y seen from x is code[y] - center[x].
         self.register_buffer("_code", torch.cat([code, code[:1]]), persistent=False)
         self.register_buffer("_center", center, persistent=False)
+
+    @property
+    def moves_along(self) -> bool:
+        """Whether an output stands for a displacement, not for a cell."""
+        return self.width < len(self.cells)
+
+    def groups(self) -> Tensor:
+        """`[M]` int64, the same number for cells from which the border looks alike within the radius."""
+        size, cell = math.isqrt(len(self.cells)), torch.arange(len(self.cells), device=self.cells.device)
+        row, column = cell // size, cell % size
+        margins = torch.stack([row, size - 1 - row, column, size - 1 - column], dim=1).clamp(max=self.radius)
+        return torch.unique(margins, dim=0, return_inverse=True)[1]
 
     def index(self, start: Tensor, cell: Tensor) -> Tensor:
         """`[*L, B]`, the output for `cell` `[*L, B]` seen from `start` `[B]`, int64; any where `cell` is M."""

@@ -16,7 +16,7 @@ from trackmdp.errors import UserError
 from trackmdp.world.files import read_numbers
 from trackmdp.world.model import Array
 
-__all__ = ["Border", "random_support", "random_walk", "drift", "load_table", "check_table"]
+__all__ = ["Border", "random_support", "random_walk", "drift", "load_table", "check_homogeneous", "check_table"]
 
 Border: TypeAlias = Literal["renormalize", "inside", "clip", "exit"]
 
@@ -106,6 +106,29 @@ def check_table(table: Array, size: int, *, truncates: bool, source: str) -> Arr
             f"{source}: from cell {_first(trapped)} the target never exits, so no episode ends; set grid.max_steps"
         )
     return table
+
+
+def check_homogeneous(kernel: Array, size: int, source: str) -> None:
+    """See that the target moves alike from all cells whose moves stay clear of the border.
+
+    Raises:
+        UserError: from two such cells it does not; `source` is named at the start of the message.
+    """
+    cell, (start, end) = np.arange(size**2), kernel.nonzero()
+    row, column = cell // size, cell % size
+    reach = max(np.abs(row[start] - row[end]).max(initial=0), np.abs(column[start] - column[end]).max(initial=0))
+    inner = cell[(np.minimum(row, column) >= reach) & (np.maximum(row, column) < size - reach)]
+    if not len(inner):
+        return
+    around = (np.arange(-reach, reach + 1)[:, None] * size + np.arange(-reach, reach + 1)).ravel()
+    moves = kernel[inner[:, None], inner[:, None] + around]
+    differs = np.abs(moves - moves[0]).max(axis=1) > 1e-9
+    if differs.any():
+        other = inner[_first(differs)]
+        raise UserError(
+            f"{source}: kernel.homogeneous=true, but from cell {other} the target moves otherwise than from cell "
+            f"{inner[0]}; expected alike away from the border"
+        )
 
 
 def _window(radius: int) -> np.ndarray:

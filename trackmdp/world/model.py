@@ -32,6 +32,7 @@ class Task:
         t_max: T_max; the controller chooses freely at n = 0 ... t_max.
         markov: whether the next move depends on the target's cell alone, so that a learner may put paths together from
             moves seen on different ones.
+        homogeneous: whether the target moves alike from all cells away from the border.
     """
 
     size: int
@@ -40,6 +41,7 @@ class Task:
     safe_cost: float
     t_max: int
     markov: bool = field(default=True, kw_only=True)
+    homogeneous: bool = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
         if self.cost.shape != (self.num_cells,):
@@ -60,7 +62,8 @@ class Task:
     @property
     def task(self) -> Task:
         """The same task without the motion."""
-        return Task(self.size, self.reward, self.cost, self.safe_cost, self.t_max, markov=self.markov)
+        known = {"markov": self.markov, "homogeneous": self.homogeneous}
+        return Task(self.size, self.reward, self.cost, self.safe_cost, self.t_max, **known)
 
 
 @dataclass(frozen=True, eq=False)
