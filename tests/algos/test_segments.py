@@ -62,6 +62,16 @@ def test_batches_in_pieces_give_what_they_give_in_one(cut: int) -> None:
     assert len(whole) > 500
 
 
+def test_rows_of_workers_are_rows() -> None:
+    """Collectors with worker processes stack their batches."""
+    batch = collect(SETTING, AllOn(M), 16, 40)
+    one, stacked = buffer(), buffer()
+    one.extend(batch)
+    for part in batch.split(8, dim=1):
+        stacked.extend(torch.stack([part[:8], part[8:]]))
+    assert segments(stacked) == segments(one)
+
+
 def test_rows_that_are_others_are_not_joined() -> None:
     first, second = collect(SETTING, AllOn(M), 16, 8, seed=0), collect(SETTING, AllOn(M), 16, 8, seed=1)
     made, apart = buffer(), [buffer(), buffer()]

@@ -36,8 +36,12 @@ class SegmentBuffer:
         return self._segments.shape[1]
 
     def extend(self, batch: TensorDictBase) -> None:
-        """Add the segments of a collected batch `[B, time]`; its rows go on where those of the last batch ended."""
-        frames = {key: value.to(self._segments.device) for key, value in _frames(batch, self.num_cells).items()}
+        """Add the segments of a collected batch `[B, time]` or `[workers, B, time]`.
+
+        Its rows go on where those of the batch before ended.
+        """
+        rows = _frames(batch.reshape(-1, batch.shape[-1]), self.num_cells)
+        frames = {key: value.to(self._segments.device) for key, value in rows.items()}
         if self._tail and _goes_on(self._tail, frames):
             frames = {key: torch.cat([self._tail[key], frames[key]], dim=1) for key in frames}
         fresh = _segments(frames, self.steps, self.num_cells)
