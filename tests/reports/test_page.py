@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -139,6 +140,24 @@ def test_the_printed_bound_is_shown_to_be_none(report: Report, results: Results)
 def test_a_sweep_without_finished_runs_still_says_what_is_missing() -> None:
     page = build(Results([], problems=[Problem("a", "cut: it has no summary.json")]), None, resamples=100).html()
     assert "cut: it has no summary.json" in page
+
+
+def test_runs_on_recorded_tracks_have_neither_bound_nor_regret(tmp_path: Path) -> None:
+    for cost in (0.16, 0.22):
+        place = tmp_path / str(cost)
+        write_run(place, "grid.size=3", cost=cost)
+        summary = json.loads((place / "summary.json").read_text())
+        summary |= {"qmdp": None, "bounds": dict.fromkeys(("paper", "valid", "clocked")), "optimal": None}
+        (place / "summary.json").write_text(json.dumps(summary))
+        config = (place / "config.yaml").read_text()
+        (place / "config.yaml").write_text(config.replace("name: random_support", "name: tracks"))
+    found = gather(tmp_path, make_world)
+    assert not found.problems
+    assert not found.motions
+    made = build(found, None, resamples=100)
+    assert [figure.name for figure in made.figures] == ["aihtr-tracks-z-5"]
+    table = next(table for table in made.tables if table.name == "methods")
+    assert "nan" not in table.html()
 
 
 @pytest.fixture

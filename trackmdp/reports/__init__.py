@@ -1,1 +1,1 @@
-"""What is made of results: pictures."""
+"""What is made of results: pictures, and reports on whole sweeps."""

@@ -15,7 +15,7 @@ from trackmdp.solvers import bounds, qmdp
 from trackmdp.solvers.chains import evaluate
 from trackmdp.world.kernels import Border
 
-__all__ = ["BORDER", "SEEDS", "T_MAX", "Candidate", "Setting", "Spread", "candidates", "chosen", "sensitivity"]
+__all__ = ["BORDER", "DRAWS", "SEEDS", "T_MAX", "Candidate", "Setting", "Spread", "candidates", "chosen", "sensitivity"]
 
 BORDER: Border = "renormalize"
 T_MAX = 1

@@ -24,21 +24,8 @@ __all__ = ["curves", "profiles", "value_at"]
 
 def curves(study: Study, points: Mapping[str, Sequence[Point]], by: str, resamples: int) -> Figure | None:
     """Regret per step while learning, over all worlds, against `frames` or `seconds`."""
-    found: dict[str, tuple[Array, list[Estimate]]] = {}
-    for method in study.methods:
-        groups = [[_steps(study, run, world, points, by) for run in study.of(world, method)] for world in study.worlds]
-        known = [[curve for curve in group if len(curve)] for group in groups]
-        everything = [curve for group in known for curve in group]
-        if not everything:
-            continue
-        start, end = (float(f([curve[i, 0] for curve in everything])) for f, i in ((max, 0), (max, -1)))
-        grid = np.geomspace(max(start, 1e-2), max(end, start * 1.001), 40)
-        values = [[np.array([value_at(curve, x) for x in grid]) for curve in group] for group in known]
-        row = [
-            estimate([[v[i] for v in g] for g in values], "learning", by, method, str(i), resamples=resamples)
-            for i in range(len(grid))
-        ]
-        found[method] = grid, row
+    averaged = {method: _averaged(study, method, points, by, resamples) for method in study.methods}
+    found = {method: curve for method, curve in averaged.items() if curve is not None}
     if not found:
         return None
     unit = {"frames": "env steps", "seconds": "wall seconds of learning"}[by]
@@ -60,7 +47,11 @@ def curves(study: Study, points: Mapping[str, Sequence[Point]], by: str, resampl
         legend(figure, axes)
 
     columns = [Column("method"), Column(unit, 1 if by == "seconds" else 0), *estimate_columns("regret per step", 5)]
-    rows = [[m, float(x), *parts(e)] for m, (grid, row) in found.items() for x, e in list(zip(grid, row))[::3]]  # noqa: B905
+    rows = [
+        [method, float(grid[place]), *parts(row[place])]
+        for method, (grid, row) in found.items()
+        for place in range(0, len(grid), 3)
+    ]
     counts = ", ".join(f"{method} n = {row[0].n}" for method, (_, row) in found.items())
     title = (
         f"Regret while learning against {unit}: interquartile mean over worlds and seeds with 95 % interval; {counts}"
@@ -68,6 +59,27 @@ def curves(study: Study, points: Mapping[str, Sequence[Point]], by: str, resampl
     ends = ", ".join(f"{m} {row[-1].mean:.4f} after {grid[-1]:,.0f}" for m, (grid, row) in found.items())
     table = Table(f"learning-{by}", title, columns, rows)
     return draw(f"learning-{by}", title, f"Regret per step at the end: {ends} {unit}.", table, 3.3, paint)
+
+
+def _averaged(
+    study: Study, method: str, points: Mapping[str, Sequence[Point]], by: str, resamples: int
+) -> tuple[Array, list[Estimate]] | None:
+    """Positions `[G]` and the estimates there over all runs of a method; None where no curve is known.
+
+    The positions begin where every run has been judged, and end with the longest.
+    """
+    groups = [[_steps(study, run, world, points, by) for run in study.of(world, method)] for world in study.worlds]
+    known = [[curve for curve in group if len(curve)] for group in groups]
+    everything = [curve for group in known for curve in group]
+    if not everything:
+        return None
+    start, end = (float(max(curve[place, 0] for curve in everything)) for place in (0, -1))
+    grid = np.geomspace(max(start, 1e-2), max(end, start * 1.001), 40)
+    values = [[np.array([value_at(curve, x) for x in grid]) for curve in group] for group in known]
+    return grid, [
+        estimate([[v[i] for v in g] for g in values], "learning", by, method, str(i), resamples=resamples)
+        for i in range(len(grid))
+    ]
 
 
 def profiles(study: Study, resamples: int) -> Figure | None:

@@ -77,24 +77,9 @@ def value_map(name: str, where: str, policy: Policy, motion: Motion) -> Figure |
     }
 
     def paint(figure: Canvas) -> None:
-        from matplotlib import colormaps
-        from matplotlib.ticker import MaxNLocator
-
-        parts = figure.subplots(1, 3)
-        for axes, (label, values) in zip(parts, layers.items(), strict=True):
-            colours = colormaps["viridis" if axes is parts[0] else "magma_r"].resampled(LEVELS)
-            shade = axes.pcolormesh(values.reshape(size, size), cmap=colours)
-            axes.invert_yaxis()
-            axes.set_aspect("equal")
-            axes.set_xticks([])
-            axes.set_yticks([])
+        for place, (axes, (label, values)) in enumerate(zip(figure.subplots(1, 3), layers.items(), strict=True)):
+            _shade(figure, axes, values.reshape(size, size), "viridis" if place == 0 else "magma_r")
             axes.set_title(label, fontsize=6.8)
-            bar = figure.colorbar(shade, ax=axes, orientation="horizontal", pad=0.03, fraction=0.07)
-            bar.ax.tick_params(labelsize=6.5)
-            assert bar.solids is not None
-            bar.solids.set_rasterized(False)  # a page takes no pictures
-            bar.locator = MaxNLocator(3)
-            bar.update_ticks()
 
     columns = [Column("start cell"), Column("row"), Column("column"), *(Column(label, 3) for label in layers)]
     rows = [
@@ -107,6 +92,24 @@ def value_map(name: str, where: str, policy: Policy, motion: Motion) -> Figure |
         for label, values in layers.items()
     )
     return draw(f"value-{name}", title, f"{text}.", Table(f"value-{name}", title, columns, rows), 2.1, paint)
+
+
+def _shade(figure: Canvas, axes: Axes, values: Array, colours: str) -> None:
+    """A square of shaded cells with its scale."""
+    from matplotlib import colormaps
+    from matplotlib.ticker import MaxNLocator
+
+    shade = axes.pcolormesh(values, cmap=colormaps[colours].resampled(LEVELS))
+    axes.invert_yaxis()
+    axes.set_aspect("equal")
+    axes.set_xticks([])
+    axes.set_yticks([])
+    bar = figure.colorbar(shade, ax=axes, orientation="horizontal", pad=0.03, fraction=0.07)
+    bar.ax.tick_params(labelsize=6.5)
+    assert bar.solids is not None
+    bar.solids.set_rasterized(False)  # a page takes no pictures
+    bar.locator = MaxNLocator(3)
+    bar.update_ticks()
 
 
 def _rounded(values: Array) -> Array:

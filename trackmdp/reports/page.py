@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import html
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 from typing import Any
 
 from trackmdp.reports import critique, figures, learning, maps, settings, verdicts
+from trackmdp.reports.calibration import DRAWS
 from trackmdp.reports.grouping import Study, study
 from trackmdp.reports.openings import Openings
 from trackmdp.reports.paper import pairs
@@ -144,7 +146,8 @@ def _against_cost(report: Report, grouped: Study, chosen: dict[tuple[int, float]
         "bounds and the optimum are exact. Below, the distance to the proved upper bound tells the best apart.</p>"
     )
     above = [figures.against_cost(grouped, panel, resamples) for panel in found]
-    below = [figures.regret_against_cost(grouped, panel, resamples) for panel in found]
+    bounded = [panel for panel in found if not any(math.isnan(grouped.upper(world)) for world in panel.worlds)]
+    below = [figures.regret_against_cost(grouped, panel, resamples) for panel in bounded]
     report.section("figures", heading, note, above, below)
 
 
@@ -184,8 +187,8 @@ def _openings(report: Report, grouped: Study, chosen: dict[tuple[int, float], st
     border, t_max, *_, worst = best.rows[0]
     note = (
         f"<p>Nothing in the paper tells the settings apart but the printed accuracy of Q_MDP. Of those tried, border "
-        f"{border} with T_max = {t_max} fits it best (within {worst:.2f} points for every Z, with 30 draws only); the "
-        "sweep keeps T_max = 1 and renormalize, this project's defaults.</p>"
+        f"{border} with T_max = {t_max} fits it best (within {worst:.2f} points for every Z, with {len(DRAWS)} draws "
+        "only); the sweep keeps T_max = 1 and renormalize, this project's defaults.</p>"
     )
     report.section(
         "worlds",

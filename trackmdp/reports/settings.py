@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from trackmdp.reports.calibration import BORDER, SEEDS, T_MAX, Candidate, Setting, Spread, chosen
+from trackmdp.reports.calibration import BORDER, DRAWS, SEEDS, T_MAX, Candidate, Setting, Spread, chosen
 from trackmdp.reports.paper import COSTS, PRINTED_QMDP, SUPPORTS
 from trackmdp.reports.style import INK, LOOKS, Figure, draw, legend, tidy
 from trackmdp.reports.tables import Cell, Column, Table
+from trackmdp.world.model import Array
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Canvas
 
 __all__ = ["RULE", "calibration_figure", "candidates_table", "fit_table", "sensitivity_figures", "sensitivity_table"]
@@ -68,7 +70,7 @@ def fit_table(settings: Sequence[Setting]) -> Table:
     ordered = sorted(fits.items(), key=lambda item: max(item[1].values()))
     rows: list[list[Cell]] = [[*setting, *(fit[z] for z in SUPPORTS), max(fit.values())] for setting, fit in ordered]
     columns = [Column("border"), Column("T_max"), *(Column(f"Z = {z}", 2, "points") for z in SUPPORTS)]
-    caption = "Smallest deviation from the printed Q_MDP accuracy among 30 draws, by setting"
+    caption = f"Smallest deviation from the printed Q_MDP accuracy among {len(DRAWS)} draws, by setting"
     return Table("fit", caption, [*columns, Column("worst of the three", 2, "points")], rows)
 
 
@@ -81,7 +83,9 @@ def sensitivity_table(settings: Sequence[Setting]) -> Table:
         [s.border, s.t_max, s.support_size, s.cost, *(v for spread in _spreads(s) for v in vars(spread).values())]
         for s in settings
     ]
-    return Table("sensitivity", "Median and range over 30 draws of the kernel, by setting and pair", columns, rows)
+    return Table(
+        "sensitivity", f"Median and range over {len(DRAWS)} draws of the kernel, by setting and pair", columns, rows
+    )
 
 
 def sensitivity_figures(settings: Sequence[Setting]) -> list[Figure]:
@@ -107,37 +111,43 @@ def _ranges(
 
     def paint(figure: Canvas) -> None:
         axes = figure.subplots()
-        for offset, (support_size, style) in zip((-0.24, 0.0, 0.24), COLOURS.items(), strict=True):
-            spread = {(s.border, s.t_max): of(s) for s in settings if s.support_size == support_size}
-            y = np.arange(len(rows)) + offset
-            middle = np.array([spread[row].median for row in rows])
-            low, high = (np.array([getattr(spread[row], side) for row in rows]) for side in ("low", "high"))
-            bars = np.stack([middle - low, high - middle])
-            axes.errorbar(
-                middle,
-                y,
-                xerr=bars,
-                fmt=style.marker,
-                color=style.colour,
-                markersize=3.5,
-                elinewidth=1.2,
-                label=f"Z = {support_size}",
-            )
+        for offset, support_size in zip((-0.24, 0.0, 0.24), COLOURS, strict=True):
+            spreads = [of(s) for s in settings if s.support_size == support_size]
+            _bars(axes, support_size, np.arange(len(rows), dtype=np.float64) + offset, spreads)
             if printed:
-                axes.axvline(PRINTED_QMDP[support_size, COSTS[0]], color=style.colour, linewidth=0.8, linestyle=":")
+                colour = COLOURS[support_size].colour
+                axes.axvline(PRINTED_QMDP[support_size, COSTS[0]], color=colour, linewidth=0.8, linestyle=":")
         axes.set_yticks(range(len(rows)), [f"{border}, T_max {t_max}" for border, t_max in rows])
         axes.invert_yaxis()
         axes.set_xlabel(label)
         tidy(axes)
         legend(figure, axes)
 
-    title = f"{label} under the paper's unstated settings, c = {settings[0].cost:g}: median and range, n = 30 draws"
+    under = f"under the paper's unstated settings, c = {settings[0].cost:g}"
+    title = f"{label} {under}: median and range, n = {len(DRAWS)} draws"
     ends = [of(setting).median for setting in settings]
     text = f"Medians from {min(ends):.1f} to {max(ends):.1f}." + (" Dotted: the printed values." if printed else "")
     columns = [Column("border"), Column("T_max"), Column("Z"), Column("median", 2), Column("low", 2), Column("high", 2)]
     numbers: list[list[Cell]] = [[s.border, s.t_max, s.support_size, *vars(of(s)).values()] for s in settings]
     table = Table(f"sensitivity-{name}", title, columns, numbers)
     return draw(f"sensitivity-{name}", title, text, table, 4.2, paint)
+
+
+def _bars(axes: Axes, support_size: int, y: Array, spreads: Sequence[Spread]) -> None:
+    """Median and range, one row each."""
+    style = COLOURS[support_size]
+    middle, low, high = (np.array([getattr(spread, part) for spread in spreads]) for part in ("median", "low", "high"))
+    bars = np.stack([middle - low, high - middle])
+    axes.errorbar(
+        middle,
+        y,
+        xerr=bars,
+        fmt=style.marker,
+        color=style.colour,
+        markersize=3.5,
+        elinewidth=1.2,
+        label=f"Z = {support_size}",
+    )
 
 
 def _spreads(setting: Setting) -> tuple[Spread, Spread, Spread]:
