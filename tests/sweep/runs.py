@@ -6,6 +6,7 @@ import csv
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -39,9 +40,22 @@ def swept(*words: str, dir: str = "all") -> int:
     return main(["train", "-m", *TINY, *words, f"hydra.sweep.dir={dir}"])
 
 
+_started: list[subprocess.Popen[str]] = []
+
+
+@pytest.fixture(autouse=True)
+def nothing_left() -> Iterator[None]:
+    """Whatever a test started ends with it."""
+    yield
+    while _started:
+        process = _started.pop()
+        process.kill()
+        process.communicate()
+
+
 def started(folder: Path, *words: str, **kwargs: Any) -> subprocess.Popen[str]:
     """The command as typed in a shell, in `folder`."""
-    return subprocess.Popen(
+    process = subprocess.Popen(
         [sys.executable, "-m", "trackmdp.cli", *words],
         cwd=folder,
         env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
@@ -50,6 +64,8 @@ def started(folder: Path, *words: str, **kwargs: Any) -> subprocess.Popen[str]:
         text=True,
         **kwargs,
     )
+    _started.append(process)
+    return process
 
 
 def table(folder: Path) -> list[dict[str, str]]:

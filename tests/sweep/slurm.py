@@ -37,7 +37,7 @@ def begin(task: int | None) -> None:
 
 
 def srun(*words: str) -> None:
-    command = words[next(place for place, word in enumerate(words) if not word.startswith("-")) :]
+    command = words[next(place for place, word in enumerate(words) if Path(word).name.startswith("python")) :]
     (STATE / f"{os.environ['SLURM_JOB_ID']}.pid").write_text(str(os.getpid()))
     os.execvp(command[0], command)
 

@@ -12,12 +12,12 @@ from typing import Any
 
 import pytest
 
-from tests.sweep.runs import TINY, here, started, states, swept, table
+from tests.sweep.runs import TINY, here, nothing_left, started, states, swept, table
 from tests.typed import stub
 from trackmdp.cli import main
 from trackmdp.sweep.state import run_of, runs_of
 
-__all__ = ["here"]
+__all__ = ["here", "nothing_left"]
 
 SLOW = ("algo.updates=100000", "algo.updates_per_iteration=10", "checkpoint.seconds=null")
 """A run that goes on until it is stopped."""
@@ -108,7 +108,7 @@ def test_slurm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, basic: Path) -> 
     finish(tmp_path, "submitit_slurm", *words, status=2)
     assert (tmp_path / "all/runs.csv").read_bytes() == (basic / "runs.csv").read_bytes()
     script = (state / "script").read_text()
-    for line in ("--array=0-3%256", "--partition=short", "--mem=2GB", "--time=30", "--cpus-per-task=1"):
+    for line in ("--array=0-3%4", "--partition=short", "--mem=2GB", "--time=30", "--cpus-per-task=1"):
         assert f"#SBATCH {line}\n" in script
     assert "#SBATCH --signal=USR2@120\n" in script
 

@@ -92,7 +92,7 @@ def _forget(job: Job) -> None:
 
 def _launch(jobs: Sequence[Job], launch: Launch, stop: _Stop) -> None:
     """Launch `jobs`, and once more what a launcher that broke down left undone."""
-    reason = "it was not run"
+    reason = "it was launched, and left nothing"
     for _ in range(_ROUNDS):
         if not jobs or stop.received:
             return
