@@ -89,6 +89,14 @@ def test_stored_results_read_back_the_same_and_are_small(whole: Path, tmp_path: 
     assert [(r.name, dict(r.settings), dict(r.figures)) for r in read.runs] == [
         (r.name, dict(r.settings), dict(r.figures)) for r in found.runs
     ]
+    assert read.curves.keys() == found.curves.keys()
+    for name, kept in found.policies.items():
+        assert np.array_equal(read.policies[name].chains, kept.chains)
+        assert np.array_equal(read.policies[name].value, kept.value)
+    for name, motion in found.motions.items():
+        assert np.array_equal(read.motions[name].kernel.toarray(), motion.kernel.toarray())
+        assert np.array_equal(read.motions[name].qmdp, motion.qmdp)
+        assert np.array_equal(read.motions[name].clocked, motion.clocked)
     results.save(read, tmp_path / "b")
     for file in sorted((tmp_path / "a").iterdir()):
         assert file.read_bytes() == (tmp_path / "b" / file.name).read_bytes(), file.name

@@ -24,7 +24,7 @@ from trackmdp.world.model import World
 
 __all__ = ["flatten", "gather", "planned", "run_folders"]
 
-MOST_POINTS = 20
+MOST_POINTS = 16
 """Points kept of a learning curve: evenly spaced in the logarithm of the iteration."""
 
 

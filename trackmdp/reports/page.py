@@ -46,7 +46,8 @@ class Report:
             else:
                 each = [part] if isinstance(part, Figure) else list(part)
                 self.figures += each
-                shown.append(f'<div class="figures">{"".join(figure.html() for figure in each)}</div>')
+                kind = "figures" if len(each) % 3 == 0 else "figures two"
+                shown.append(f'<div class="{kind}">{"".join(figure.html() for figure in each)}</div>')
         self.sections.append((anchor, heading, "\n".join(shown)))
 
     def html(self) -> str:

@@ -1,0 +1,60 @@
+"""The paper's sweep as it was run: what is kept of it, and that the report is made from that again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from trackmdp.cli import main
+from trackmdp.reports import openings, results
+from trackmdp.reports.calibration import chosen
+from trackmdp.reports.grouping import Study, study
+from trackmdp.reports.paper import PRINTED_QMDP, pairs
+from trackmdp.reports.verdicts import goals
+
+KEPT = Path(__file__).parents[1] / "data/paper"
+
+pytestmark = pytest.mark.skipif(not results.is_stored(KEPT), reason="the paper's sweep is not kept here")
+
+
+@pytest.fixture(scope="module")
+def grouped() -> Study:
+    return study(results.load(KEPT).runs)
+
+
+def test_it_is_small() -> None:
+    assert sum(file.stat().st_size for file in KEPT.iterdir()) < 300_000
+
+
+def test_every_pair_was_run_with_five_seeds_of_both(grouped: Study) -> None:
+    assert pairs(grouped).keys() == PRINTED_QMDP.keys()
+    for world in pairs(grouped).values():
+        for method in ("a2c", "hindsight"):
+            assert [run.seed for run in grouped.of(world, method)] == list(range(5)), (world, method)
+        assert grouped.of(world, "ppo")
+        assert grouped.of(world, "dqn")
+
+
+def test_its_kernels_are_those_of_the_rule(grouped: Study) -> None:
+    known = openings.load(KEPT)
+    assert known
+    seeds = chosen(known.candidates)
+    for (support_size, _), world in pairs(grouped).items():
+        assert {run.settings["kernel.seed"] for run in grouped.in_world(world)} == {seeds[support_size]}
+
+
+def test_the_default_comes_close_in_every_pair(grouped: Study) -> None:
+    default = goals(grouped, pairs(grouped), resamples=100)[2]
+    assert (default.pairs, default.met, default.missed) == (12, 12, [])
+
+
+@pytest.mark.slow
+def test_the_report_is_made_again_from_what_is_kept(tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        words = [f"sweep={KEPT}", f"hydra.run.dir={tmp_path / name}", "quiet=true", "resamples=200"]
+        assert main(["report", *words]) == 0
+    pages = [(tmp_path / name / "report.html").read_bytes() for name in ("one", "two")]
+    assert pages[0] == pages[1]
+    for file in KEPT.iterdir():
+        assert file.read_bytes() == (tmp_path / "one" / file.name).read_bytes(), file.name
