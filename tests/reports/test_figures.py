@@ -129,6 +129,8 @@ def test_a_value_map_holds_every_cell(results: Results) -> None:
     assert figure
     assert [row[3] for row in figure.table.rows] == kept.value.tolist()
     assert figure.table.rows[5][:3] == [5, 2, 3]
+    assert [row[4] for row in figure.table.rows] == pytest.approx(motion.clocked - kept.value)
+    assert [row[5] for row in figure.table.rows] == pytest.approx(motion.clocked - motion.qmdp)
     large = type(kept)(np.zeros((900, 1, 900), dtype=bool), np.zeros(900))
     assert maps.value_map(name, "here", large, motion) is None
 

@@ -17,6 +17,7 @@ from trackmdp.reports.gather import MOST_POINTS, gather
 from trackmdp.reports.results import Results
 from trackmdp.solvers import bounds, qmdp
 from trackmdp.solvers.chains import evaluate
+from trackmdp.training.lock import locked
 from trackmdp.training.metrics import write_json
 
 
@@ -156,6 +157,12 @@ def test_a_run_of_a_version_with_other_options_counts(sweep: Path) -> None:
     found = gather(sweep, make_world)
     assert len(found.runs) == 12
     assert "a2c-0.16-0" in found.motions
+
+
+def test_a_run_under_way_is_not_called_cut(sweep: Path) -> None:
+    (sweep / "a2c-0.16-0/summary.json").unlink()
+    with locked(sweep / "a2c-0.16-0"):
+        assert problems(gather(sweep, make_world))["a2c-0.16-0"] == "still running"
 
 
 def test_a_missing_seed_is_named(sweep: Path) -> None:

@@ -20,6 +20,7 @@ from trackmdp.reports.grouping import Study, study, world_key
 from trackmdp.reports.results import FIGURES, Motion, Point, Problem, Results, Run
 from trackmdp.solvers import bounds, horizon, qmdp
 from trackmdp.solvers.chains import evaluate
+from trackmdp.sweep.state import run_of
 from trackmdp.world.model import World
 
 __all__ = ["flatten", "gather", "planned", "run_folders"]
@@ -104,7 +105,8 @@ def _read_run(folder: Path, name: str) -> tuple[Run, Mapping[str, Any]] | Proble
     if not place.is_dir() or not (place / "config.yaml").is_file():
         return Problem(name, "not started")
     if not (place / "summary.json").is_file():
-        return Problem(name, "cut: it has no summary.json")
+        running = run_of(place).state == "running"
+        return Problem(name, "still running" if running else "cut: it has no summary.json")
     settings = flatten(_config(place))
     if not settings.keys() >= {"algo.name", "seed", "grid.size", "kernel.name"}:
         return Problem(name, "its config.yaml cannot be read")
