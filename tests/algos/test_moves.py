@@ -1,11 +1,15 @@
 from __future__ import annotations
 
+import numpy as np
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
+from tests.helpers import collect, small_world
 from trackmdp.algos.moves import MoveBuffer, sensed_moves
+from trackmdp.policies.fixed import AllOnOrChain
+from trackmdp.world.model import World
 
 M = 9
 
@@ -98,6 +102,38 @@ def test_outside_is_for_good_and_ends_paths_from_unseen_cells() -> None:
 def test_the_oldest_moves_go_first() -> None:
     buffer = filled([0, 1, 2], [0, 0, 0], capacity=2)
     assert sorted(buffer.moves()[0].tolist()) == [1, 2]
+
+
+def deviations(start: torch.Tensor, end: torch.Tensor, world: World) -> torch.Tensor:
+    """`[M, M + 1]` by how many standard errors the moves seen out of each cell miss the motion; 0 where it has none."""
+    m = world.num_cells
+    kernel = torch.as_tensor(np.column_stack([world.kernel, 1.0 - world.kernel.sum(1)]))
+    counts = torch.bincount(start * (m + 1) + end, minlength=m * (m + 1)).view(m, m + 1)
+    seen = counts.sum(1, keepdim=True)
+    error = (kernel * (1 - kernel) / seen).sqrt()
+    assert (counts[kernel < 1e-12] == 0).all()
+    return torch.where(kernel > 1e-12, (counts / seen - kernel).abs() / error, 0.0)
+
+
+def test_a_mixture_shows_the_motion_as_it_is() -> None:
+    """The chains look where the target is likeliest, so what is located at all is far from the motion.
+
+    What is sensed whole is not, since the coin for it falls before the target moves.
+    """
+    world = small_world()
+    chains = np.zeros((9, 2, 9), dtype=bool)
+    chains[np.arange(9), 0, world.kernel.argmax(1)] = True
+    policy = AllOnOrChain(chains)
+    policy.explore.fill_(0.3)
+    torch.manual_seed(0)
+    frames = collect(world, policy, 128, 800)
+    whole = deviations(*sensed_moves(frames, 9), world)
+    assert whole.max() < 5
+    after, exited = frames["next"], frames["next", "terminated"].squeeze(-1)
+    located = (frames["steps_since_detection"] == 0) & ((after["steps_since_detection"] == 0) | exited)
+    end = torch.where(exited, 9, after["last_cell"])
+    naive = deviations(frames["last_cell"][located], end[located], world)
+    assert naive.max(1).values.median() > 10
 
 
 @given(st.integers(1, 60), st.integers(1, 100), st.integers(1, 4), st.integers(0, 2**31))

@@ -34,7 +34,7 @@ def never_read(command: str, words: str, folder: Path) -> set[str]:
 def test_train_reads_every_option(algo: str, tmp_path: Path) -> None:
     words = f"algo={algo} {SHORT} optimal.time_limit=1"
     words += (
-        " algo.updates=2"
+        " algo.updates=2 algo.collect=mixed collector.frames_per_batch=512 algo.explore.until=0.9"
         if issubclass(GROUPS["algo"][algo], PerSensor)
         else " algo.prioritized.enabled=true"
         if algo == "dqn"

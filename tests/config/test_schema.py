@@ -156,6 +156,7 @@ RULES = [
     ("train", "cost.sensor=prices.txt", "cost.sensor=prices.txt: expected a number >= 0"),
     ("train", "algo=ppo collector.envs=100", "collector.frames_per_batch=4096: expected a multiple of 100"),
     ("train", "algo=ppo collector.total_frames=4095", "collector.total_frames=4095: expected at least"),
+    ("train", "algo.explore.start=1.5", "algo.explore.start=1.5: expected a number from 0 to 1"),
     ("train", "algo=ppo algo.minibatches=3", "algo.minibatches=3: expected a divisor"),
     ("train", "algo=dqn algo.buffer_size=1000", "algo.buffer_size=1000: expected at least"),
     (

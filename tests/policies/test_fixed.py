@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDict
 
 from tests.helpers import random_state, small_world
-from trackmdp.policies.fixed import AllOn, ChainPolicy, RandomK, RandomSubset
+from trackmdp.policies.fixed import AllOn, AllOnOrChain, ChainPolicy, RandomK, RandomSubset
 
 
 @pytest.mark.parametrize("on", [True, False])
@@ -25,6 +25,21 @@ def test_a_chain_is_looked_up_by_cell_and_misses() -> None:
     on = [cells.nonzero().flatten().tolist() for cells in action]
     assert on == [[2], [3], [0], [], [3]]
     assert action.dtype == torch.bool
+
+
+@pytest.mark.parametrize("explore", [0.0, 0.25, 1.0])
+def test_everything_is_sensed_now_and_then_and_only_where_the_target_is_located(explore: float) -> None:
+    chains = np.zeros((4, 2, 4), dtype=bool)
+    chains[1, 0, 2] = chains[1, 1, 3] = True
+    policy = AllOnOrChain(chains)
+    policy.explore.fill_(explore)
+    torch.manual_seed(0)
+    rows = {"last_cell": torch.full((8000,), 1), "steps_since_detection": torch.arange(8000) % 2}
+    action = policy(TensorDict(rows, [8000]))["action"]
+    assert (action[1::2] == torch.tensor([False, False, False, True])).all()
+    everything = action[::2].all(-1)
+    assert (action[::2][~everything] == torch.tensor([False, False, True, False])).all()
+    assert everything.float().mean().item() == pytest.approx(explore, abs=5 * (explore * (1 - explore) / 4000) ** 0.5)
 
 
 @pytest.mark.parametrize("k", [0, 1, 3, 9])

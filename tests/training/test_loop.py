@@ -1,9 +1,18 @@
-"""When the loop saves."""
+"""When the loop saves, and what collecting has cost."""
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
+import numpy as np
 import pytest
 
+from tests.helpers import train_config
+from tests.training.runs import QUICK, rows, train
+from trackmdp.build import make_world
+from trackmdp.solvers.chains import evaluate
+from trackmdp.training.judge import Judge
 from trackmdp.training.loop import Intervals, Position, _due
 
 
@@ -29,3 +38,23 @@ def test_saved_by_frames_or_by_time_but_not_most_of_the_time(
 def test_neither_by_frames_nor_by_time() -> None:
     every = Intervals(evaluate=1, log=1, save_frames=0, save_seconds=None)
     assert not _due(Position(), Position(10, 10**9, 10.0**9), 0.0, every)
+
+
+def test_what_collecting_costs_is_in_the_log(tmp_path: Path) -> None:
+    """All sensors on: each frame of an episode costs 9 c but for the exit, and earns r where the target is sensed."""
+    train(tmp_path, algo="hindsight")
+    table, summary = rows(tmp_path), json.loads((tmp_path / "summary.json").read_text())
+    earned = [float(row["reward_per_frame"]) for row in table if row["reward_per_frame"]]
+    assert len(earned) == 8
+    world = make_world(train_config(*QUICK))
+    everything = np.ones((9, 2, 9), dtype=bool)
+    exact = evaluate(world, everything)
+    assert np.mean(earned) == pytest.approx(exact.aihtr / exact.expected_length, rel=0.02)
+    best = Judge(world).upper / exact.expected_length
+    regrets = [float(row["regret_while_collecting"]) for row in table]
+    running = np.cumsum(earned) / np.arange(1, 9)
+    assert regrets[:8] == pytest.approx(list(best - running), abs=1e-6)
+    assert regrets[8:] == [regrets[7]] * (len(regrets) - 8)
+    cost = summary["while_collecting"]
+    assert cost["reward_per_frame"] == pytest.approx(running[-1])
+    assert cost["regret_per_frame"] == pytest.approx(best - running[-1])

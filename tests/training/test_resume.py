@@ -27,6 +27,13 @@ RECIPES = {
         "algo.n_step=3",
         "algo.prioritized.enabled=true",
     ],
+    "hindsight-mixed": [
+        "algo=hindsight",
+        "algo.collect=mixed",
+        "algo.updates=120",
+        "algo.batch_size=1024",
+        "algo.updates_per_iteration=4",
+    ],
     "hindsight": ["algo=hindsight", "algo.updates=120", "algo.batch_size=1024", "algo.updates_per_iteration=4"],
 }
 SMALL = ["grid.size=3", "optimal.enabled=false", "evaluation.every=4", "collector.total_frames=61440"]

@@ -1,7 +1,7 @@
 """Hindsight: learn the sensing policy from fully sensed paths, on which every policy can be replayed.
 
-Sensing never moves the target. While collecting, all sensors are on, so every path shows what any policy would have
-found and missed on it. Nothing else is read: neither the kernel nor a position that was not sensed. The clocked actor
+Sensing never moves the target. With all sensors on, every path shows what any policy would have found and missed
+on it. Nothing else is read: neither the kernel nor a position that was not sensed. The clocked actor
 and critic only lend credit: they say what a detection is worth while the actor's own chains are not yet worth judging.
 """
 
@@ -23,7 +23,7 @@ from trackmdp.algos.moves import MoveBuffer
 from trackmdp.algos.segments import SegmentBuffer
 from trackmdp.config.per_sensor import PerSensor
 from trackmdp.errors import UserError
-from trackmdp.policies.fixed import AllOn, ChainPolicy
+from trackmdp.policies.fixed import AllOn, AllOnOrChain, ChainPolicy
 from trackmdp.seeding import generator
 from trackmdp.world.model import Task
 
@@ -39,38 +39,50 @@ def budget(task: Task, cfg: PerSensor) -> tuple[int, int]:
 
 
 class Hindsight:
-    """Collects with all sensors on; once the frames are in, learns from them alone.
+    """Collects with all sensors on, then learns from those frames alone; with `collect=mixed` both at once.
 
-    The nets see the target's neighbourhood as far as the frames have shown it to move, so they are made after those.
+    The nets see the target's neighbourhood as far as the frames have shown it to move, so they are made after those, or
+    after the frames that come before the mixture. A target that goes farther later counts as gone, for the nets have no
+    output for where it is.
     """
 
     def __init__(self, task: Task, cfg: PerSensor, *, iterations: int, seed: int, device: torch.device) -> None:
         self.task, self.cfg, self.device = task, cfg, device
         self.updates, self.hidden = budget(task, cfg)
         self._collecting, self._iteration, self._update = iterations, 0, 0
-        self.iterations = iterations + -(-self.updates // cfg.updates_per_iteration)
+        self._mixed = cfg.collect == "mixed"
+        share = cfg.explore.begin if self._mixed else 1.0
+        self._collect_first = max(1, round(share * iterations))
+        alongside = (iterations - self._collect_first) * cfg.updates_per_iteration
+        self.iterations = iterations + max(0, -(-(self.updates - alongside) // cfg.updates_per_iteration))
         self._generator = generator(seed, "hindsight", device=device)
         self._buffer = _buffer(task, cfg.buffer_size, self._generator)
         self._learner: _Learner | None = None
-        self.policy = AllOn(task.num_cells)
-        shape = (task.num_cells, task.num_choices, task.num_cells)
-        self.actor = ChainPolicy(np.zeros(shape, dtype=bool), device=device)
+        self._seen: int | None = None
+        nothing = np.zeros((task.num_cells, task.num_choices, task.num_cells), dtype=bool)
+        self.policy = AllOnOrChain(nothing, device) if self._mixed else AllOn(task.num_cells)
+        self.actor = ChainPolicy(nothing, device)
 
     def step(self, batch: TensorDictBase | None) -> dict[str, float]:
-        """Store one batch `[B, time]`; after the last one, `updates_per_iteration` updates."""
+        """Store one batch `[B, time]`, then `updates_per_iteration` updates if enough batches are in."""
         self._iteration += 1
         if batch is not None:
             self._buffer.extend(batch)
+            self._seen = None
         averages, cfg = Averages(), self.cfg
-        if self._iteration >= self._collecting + 1:
-            learner = self._learner = self._learner or self._make_learner(self._reach())
+        if self._iteration > self._collect_first:
+            reach = self._reach()
+            learner = self._learner = self._learner or self._make_learner(reach)
+            farther = reach > learner.loss.near.radius
             for _ in range(min(cfg.updates_per_iteration, self.updates - self._update)):
                 progress = self._update / self.updates
                 learner.loss.actor_loss.prepare(self._update, progress)
                 cells = self._buffer.paths(cfg.batch_size, self.task.t_max + 2)
+                cells = _within(cells, learner.loss.near.radius, self.task.size) if farther else cells
                 averages.add(**learner.update(cells, cfg.learning_rate.at(progress), cfg.blend.at(progress)))
                 self._update += 1
             self.actor.chains.copy_(learner.chains())
+            self._renew_policy()
         losses = averages.means() or dict.fromkeys(_LOSSES, math.nan)
         return {"moves": len(self._buffer), "updates": self._update} | {f"loss_{k}": v for k, v in losses.items()}
 
@@ -90,12 +102,20 @@ class Hindsight:
         """Continue from a `state_dict`."""
         self._iteration, self._update = state["iteration"], state["update"]
         self._buffer.load_state_dict(state["buffer"])
+        self._seen = None
         self.actor.chains.copy_(state["chains"])
         self._learner = None
         if state["learner"] is not None:
             self._learner = self._make_learner(state["learner"]["reach"])
             self._learner.load_state_dict(state["learner"])
+            self._renew_policy()
         self._generator.set_state(state["generator"].cpu())
+
+    def _renew_policy(self) -> None:
+        """What the next batch is collected with."""
+        if isinstance(self.policy, AllOnOrChain):
+            self.policy.chains.copy_(self.actor.chains)
+            self.policy.explore.fill_(self.cfg.explore.at(self._iteration / self._collecting))
 
     def _make_learner(self, reach: int) -> _Learner:
         loss = HindsightLoss(
@@ -119,9 +139,9 @@ class Hindsight:
         """
         if not len(self._buffer):
             raise UserError("algo.total_frames: in none of them was a target located and sensed again; expected more")
-        size, (start, end) = self.task.size, self._buffer.moves()
-        moved = torch.maximum((start // size - end // size).abs(), (start % size - end % size).abs())
-        return int(moved.masked_fill_(end == self.task.num_cells, 0).max())
+        if self._seen is None:
+            self._seen = int(_distance(*self._buffer.moves(), self.task.size).max())
+        return self._seen
 
 
 def _buffer(task: Task, capacity: int, rng: torch.Generator) -> MoveBuffer | SegmentBuffer:
@@ -129,6 +149,18 @@ def _buffer(task: Task, capacity: int, rng: torch.Generator) -> MoveBuffer | Seg
     if task.markov:
         return MoveBuffer(task.num_cells, capacity, rng)
     return SegmentBuffer(task.num_cells, task.t_max + 2, capacity, rng)
+
+
+def _distance(start: Tensor, end: Tensor, size: int) -> Tensor:
+    """How far moves go, in rows or in columns; 0 where they end outside, in M."""
+    moved = torch.maximum((start // size - end // size).abs(), (start % size - end % size).abs())
+    return moved.masked_fill_(end == size**2, 0)
+
+
+def _within(cells: Tensor, reach: int, size: int) -> Tensor:
+    """Paths `[steps + 1, B]` on which the target is outside, M, from its first move of more than `reach` on."""
+    gone = (_distance(cells[:-1], cells[1:], size) > reach).cummax(0).values
+    return torch.cat([cells[:1], cells[1:].masked_fill(gone, size**2)])
 
 
 class _Learner:

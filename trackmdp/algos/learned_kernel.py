@@ -42,7 +42,7 @@ class LearnedKernel:
         self._estimate = KernelEstimate(task.size, weight=cfg.prior, exit_weight=cfg.exit_prior)
         self._rng = np.random.default_rng(derive(seed, "learned_kernel"))
         self._chooses, self._warm_up = cfg.sensing == "chosen", cfg.warm_up
-        self._iteration, self._spent = 0, np.zeros(3)
+        self._iteration, self._spent = 0, np.zeros(2)
         shape = (task.num_cells, task.num_choices, task.num_cells)
         self.policy = ChainPolicy(np.ones(shape, dtype=bool), device)
         self.actor = ChainPolicy(np.ones(shape, dtype=bool), device)
@@ -52,7 +52,7 @@ class LearnedKernel:
         self._iteration += 1
         if batch is not None:
             self._estimate.add(observed_paths(batch, self.task.num_cells))
-            self._spent += [batch.numel(), *_spent(batch)]
+            self._spent += [batch.numel(), _sensors_on(batch)]
         self._estimate.fit(self.cfg.rounds_at_end if self._iteration == self.iterations else self.cfg.rounds)
         chains = search.solve(self._world(self._estimate.mean()))
         self.actor.chains.copy_(torch.as_tensor(chains))
@@ -70,12 +70,11 @@ class LearnedKernel:
         """What the plan is believed to be worth, how sure that is, and what learning has cost so far."""
         drawn = [self._world(self._estimate.sample(self._rng)) for _ in range(self.cfg.samples)]
         believed = np.array([evaluate(world, chains).aihtr for world in drawn])
-        frames, reward, sensors = self._spent
+        frames, sensors = self._spent
         return {
             "believed_aihtr": evaluate(self._world(self._estimate.mean()), chains).aihtr,
             "believed_deviation": float(believed.std()),
             "least_visits": float(self._estimate.visits.min()),
-            "reward_per_frame": reward / max(frames, 1.0),
             "sensors_per_frame": sensors / max(frames, 1.0),
         }
 
@@ -112,10 +111,10 @@ def observed_paths(batch: TensorDictBase, num_cells: int) -> Paths:
     return Paths(*(part[ended].cpu().numpy() for part in parts))
 
 
-def _spent(batch: TensorDictBase) -> tuple[float, float]:
-    """Reward, and sensors switched on by choice, in a batch."""
+def _sensors_on(batch: TensorDictBase) -> float:
+    """Sensors switched on by choice in a batch."""
     free = batch["steps_since_detection"] < batch["action_history"].shape[-2]
-    return batch["next", "reward"].sum().item(), (batch["action"].sum(-1) * free).sum().item()
+    return (batch["action"].sum(-1) * free).sum().item()
 
 
 def _rng_state(rng: np.random.Generator) -> dict[str, Any]:

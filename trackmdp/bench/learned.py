@@ -58,7 +58,7 @@ def _run(folder: Path) -> dict[str, Any]:
         "regret": summary["regret_per_step"],
         "cpu_seconds": summary["cpu_seconds"],
         "sensors_per_frame": float(curve[-1]["sensors_per_frame"]),
-        "reward_per_frame": float(curve[-1]["reward_per_frame"]),
+        "reward_per_frame": summary["while_collecting"]["reward_per_frame"],
         "curve": {"frames": [int(row["frames"]) for row in curve], "regret": [_number(row) for row in curve]},
     }
 

@@ -16,7 +16,8 @@ from trackmdp.config.resume import digest
 from trackmdp.solvers.optimal import Solution
 from trackmdp.training.display import table
 from trackmdp.training.held_out import HeldOutJudge
-from trackmdp.training.judge import Judge, Verdict, figures
+from trackmdp.training.judge import Judge, Verdict, figures, while_collecting
+from trackmdp.training.loop import Position
 
 __all__ = ["show", "summarize"]
 
@@ -28,7 +29,7 @@ def summarize(
     judge: Judge | HeldOutJudge,
     verdict: Verdict,
     solution: Solution | None,
-    frames: int,
+    end: Position,
     times: dict[str, float],
     held_out: dict[str, Any] | None,
 ) -> dict[str, Any]:
@@ -37,7 +38,7 @@ def summarize(
         "algo": cfg.algo.name,
         "credit": cfg.algo.credit,
         "seed": cfg.seed,
-        "frames": frames,
+        "frames": end.frames,
         **times,
         "policy": figures(verdict.evaluation),
         "qmdp": figures(judge.qmdp) if isinstance(judge, Judge) else None,
@@ -46,6 +47,7 @@ def summarize(
         if solution
         else None,
         "regret_per_step": verdict.regret_per_step,
+        "while_collecting": while_collecting(judge.upper, verdict.evaluation, end.reward, end.frames),
         "held_out": held_out,
         "versions": {"trackmdp": __version__, "python": platform.python_version()}
         | {name: version(name) for name in _PACKAGES},

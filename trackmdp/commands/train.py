@@ -64,7 +64,7 @@ def _run(cfg: TrainConfig, folder: Path) -> float:
         "cpu_seconds": time.process_time() - used,
     }
     policy.write(folder / policy.FILE, policy.Policy(session.chains(), verdict.evaluation.value))
-    write_json(folder / "summary.json", summarize(cfg, judge, verdict, solution, end.frames, times, held_out))
+    write_json(folder / "summary.json", summarize(cfg, judge, verdict, solution, end, times, held_out))
     if isinstance(judge, Judge):
         show(console, cfg, judge, verdict, solution)
     elif held_out is not None:

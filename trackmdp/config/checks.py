@@ -12,6 +12,7 @@ from typing import Any
 from trackmdp.config.baselines import AllOn, NoSensors, Playback, RandomK
 from trackmdp.config.learning import Collector, Dqn, Mcap, Ppo, Schedule, Workers
 from trackmdp.config.options import Option, options, refuse
+from trackmdp.config.per_sensor import PerSensor
 from trackmdp.config.roots import (
     BenchmarkConfig,
     CommandConfig,
@@ -164,6 +165,10 @@ def _check_learning(cfg: TrainConfig) -> None:
     algo, frames = cfg.algo, cfg.collector.frames_per_batch
     if isinstance(algo, Ppo) and frames % algo.minibatches:
         raise refuse("algo.minibatches", algo.minibatches, f"a divisor of collector.frames_per_batch={frames}")
+    if isinstance(algo, PerSensor):
+        for end in ("start", "end"):
+            if (probability := getattr(algo.explore, end)) > 1:
+                raise refuse(f"algo.explore.{end}", probability, "a number from 0 to 1, a probability")
     if isinstance(algo, Dqn) and algo.buffer_size < max(frames, algo.batch_size):
         expected = f"at least collector.frames_per_batch={frames} and algo.batch_size={algo.batch_size}"
         raise refuse("algo.buffer_size", algo.buffer_size, expected)

@@ -22,10 +22,19 @@ SELECTORS["credit"] = Selector(
 
 @dataclass(kw_only=True)
 class PerSensor(Algo):
-    """What the algorithms with a credit per sensor have in common."""
+    """What the algorithms with a credit per sensor have in common.
+
+    `explore`, read with `collect=mixed`: the probability of sensing everything where the target is located, in the
+    course of the frames. Learning starts where it begins to change.
+    """
 
     credit: ClassVar[str | None] = "per_sensor"
     effort: ClassVar[float] = 1.0
+    collect: str = option(
+        "all sensors on; or mixed with the policy learned so far, which costs less and shows less",
+        choices=("all_on", "mixed"),
+    )
+    explore: Schedule
     gamma: float = option("discount inside the credit; policies are judged undiscounted", ge=0, lt=1)
     learning_rate: Schedule
     blend: Schedule

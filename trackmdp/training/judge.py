@@ -12,7 +12,7 @@ from trackmdp.solvers import bounds, horizon, qmdp
 from trackmdp.solvers.chains import Evaluation, evaluate, regret_per_step
 from trackmdp.world.model import Task, World
 
-__all__ = ["Judge", "Scoring", "Verdict", "figures"]
+__all__ = ["Judge", "Scoring", "Verdict", "figures", "while_collecting"]
 
 _PER_CELL = ("value", "steps", "detections", "sensors", "safe_actions")
 
@@ -80,6 +80,15 @@ class Judge:
         """Take a proved upper bound into account, from now on and in `verdict`."""
         self.upper = min(self.upper, upper)
         return Verdict(verdict.evaluation, regret_per_step(self.upper, verdict.evaluation))
+
+
+def while_collecting(upper: float, evaluation: Evaluation, reward: float, frames: int) -> dict[str, float]:
+    """What the frames of a run have earned on average, and how far that is below the best rate known.
+
+    That rate is `upper` over the expected length of an episode, which no policy changes; `reward` is the frames' sum.
+    """
+    earned = reward / frames
+    return {"reward_per_frame": earned, "regret_per_frame": upper / evaluation.expected_length - earned}
 
 
 def figures(evaluation: Evaluation) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
@@ -14,7 +14,7 @@ from trackmdp.algos.common import Algorithm
 from trackmdp.errors import Preempted, RunError
 from trackmdp.training.display import Display
 from trackmdp.training.evaluate import chains_of
-from trackmdp.training.judge import Scoring, Verdict
+from trackmdp.training.judge import Scoring, Verdict, while_collecting
 from trackmdp.training.metrics import MetricsLog
 from trackmdp.training.signals import Signals
 from trackmdp.training.workers import Watch
@@ -44,11 +44,12 @@ class Intervals:
 
 @dataclass(frozen=True)
 class Position:
-    """How far a run is: iterations done, frames collected, seconds spent."""
+    """How far a run is: iterations done, frames collected, seconds spent, and the sum of the frames' rewards."""
 
     iteration: int = 0
     frames: int = 0
     seconds: float = 0.0
+    reward: float = 0.0
 
 
 def train(
@@ -106,10 +107,11 @@ class _Loop:
         with Signals() as self._signals, Watch(self.collector) as self._watch:
             for iteration in range(self.at.iteration + 1, last + 1):
                 batch = self._collect(iteration)
+                frames, earned = (0, 0.0) if batch is None else (batch.numel(), batch["next", "reward"].sum().item())
                 diagnostics = self._learn(batch, iteration)
-                frames = self.at.frames + (batch.numel() if batch is not None else 0)
-                self.at = Position(iteration, frames, time.monotonic() - began)
-                self._account(diagnostics)
+                before, elapsed = self.at, time.monotonic() - began
+                self.at = Position(iteration, before.frames + frames, elapsed, before.reward + earned)
+                self._account(diagnostics, earned / frames if frames else None)
                 if self._signals.received and iteration < last:
                     raise Preempted(self._signals.received)
         return self._verdict, replace(self.at, seconds=time.monotonic() - began)
@@ -136,8 +138,8 @@ class _Loop:
                 self.collector.update_policy_weights_()
         return diagnostics
 
-    def _account(self, diagnostics: dict[str, float]) -> None:
-        """Judge, log, save and show what is due after an iteration."""
+    def _account(self, diagnostics: dict[str, float], earned: float | None) -> None:
+        """Judge, log, save and show what is due after an iteration; `earned` per frame of its batch, if it had one."""
         at, every = self.at, self.every
         last = at.iteration == self.algorithm.iterations
         judged = last or at.iteration == 1 or at.iteration % every.evaluate == 0
@@ -147,7 +149,9 @@ class _Loop:
             if self.on_judged is not None:
                 self.on_judged(at.iteration, chains)
         if last or at.iteration % every.log == 0:
-            self.metrics.write(_row(at, self._verdict if judged else None, diagnostics))
+            so_far = while_collecting(self.judge.upper, self._verdict.evaluation, at.reward, at.frames)
+            spent = {"reward_per_frame": earned, "regret_while_collecting": so_far["regret_per_frame"]}
+            self.metrics.write(_row(at, self._verdict if judged else None, spent | diagnostics))
         if last or self._signals.received or _due(self._saved, at, self._rest, every):
             begin = time.monotonic()
             self.save(at, self._verdict)
@@ -178,7 +182,9 @@ def _due(saved: Position, at: Position, rest: float, every: Intervals) -> bool:
     return bool(frames or seconds)
 
 
-def _row(at: Position, verdict: Verdict | None, diagnostics: dict[str, float]) -> dict[str, float | int | None]:
+def _row(
+    at: Position, verdict: Verdict | None, diagnostics: Mapping[str, float | None]
+) -> dict[str, float | int | None]:
     """Counters, exact figures (empty between evaluations), diagnostics, and last the columns that time decides."""
     evaluation = verdict.evaluation if verdict else None
     return {
