@@ -98,3 +98,18 @@ def test_a_finished_sweep_is_watched_at_once(sweep: Path, capsys: pytest.Capture
     assert len(lines) == 13
     assert lines[-1] == "12 runs: 12 done"
     assert all(", gap " in line for line in lines[:-1])
+
+
+@pytest.mark.slow
+def test_a_sweep_as_typed_is_reported_with_what_failed(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["seed=0,1", "grid.size=3,2", "algo.updates=2", "algo.total_frames=2000", "algo.frames_per_batch=1000"]
+    assert main(["train", "-m", *words, "quiet=true", "hydra.sweep.dir=all"]) == 2
+    capsys.readouterr()
+    assert main(["report", "sweep=all", "resamples=100"]) == 0, capsys.readouterr().err
+    lines = capsys.readouterr().out.splitlines()
+    assert "failed: grid.size=2: expected an integer from 3 to 64 (cells) and 1 more" in lines[0]
+    assert lines[1].startswith("2 runs; report in")
+    page = Path("all/report/report.html").read_text(encoding="utf-8")
+    assert "2 of 4 planned runs" in page
+    assert "trackmdp train -m seed=0,1 grid.size=3,2" in page
+    assert str(Path.cwd()) not in page

@@ -42,7 +42,7 @@ def finish(place: Path) -> None:
 def test_every_state_is_read_from_the_folder(tmp_path: Path) -> None:
     sweep = sweep_of(tmp_path / "s", "a", "b", "c", "d", "e")
     finish(begin(sweep / "a"))
-    begin(sweep / "b", "20,2000,30.0,4.0\n25,2500,,5.0\n26,26")  # the last row is being written
+    begin(sweep / "b", "20,2000,30.0,4.0\n25,2500,,5.0\n26,2600,,5")  # the last row is being written
     begin(sweep / "c", "50,5000,45.0,10.0\n")
     (sweep / "d").mkdir()
     write_json(sweep / "d/failed.json", {"reason": "out of luck"})
