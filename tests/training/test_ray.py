@@ -1,0 +1,56 @@
+"""Collecting in the workers of a Ray cluster; skipped where Ray is not installed."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("ray", reason="ray is not installed")
+
+from tests.commands.test_reads import SHORT, never_read
+from tests.helpers import train_config
+from tests.training.runs import at_iteration, rows
+from trackmdp.commands.train import run
+from trackmdp.errors import RunError, UserError
+
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # Ray's own, of many kinds
+WORDS = "algo=ppo collector=ray optimal.enabled=false " + SHORT
+
+
+def test_learns_from_the_frames_of_all_workers(tmp_path: Path) -> None:
+    aihtr = run(
+        train_config(*WORDS.split(), "collector.total_frames=65536", "collector.frames_per_batch=4096"), tmp_path
+    )
+    first, last = rows(tmp_path)[0], rows(tmp_path)[-1]
+    assert (int(first["frames"]), int(last["frames"])) == (4096, 65536)
+    assert aihtr > float(first["aihtr"]) + 10
+
+
+def test_reads_every_option(tmp_path: Path) -> None:
+    assert not never_read("train", f"{WORDS} optimal.enabled=true optimal.time_limit=1", tmp_path)
+
+
+def test_a_worker_that_is_killed_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def kill() -> None:
+        workers = [path for path in Path("/proc").iterdir() if path.name.isdigit() and _is_worker(path)]
+        os.kill(int(workers[0].name), signal.SIGKILL)
+
+    at_iteration(monkeypatch, 2, kill)
+    with pytest.raises(RunError, match="iteration 3: collecting broke down"):
+        run(train_config(*WORDS.split(), "collector.total_frames=16384"), tmp_path)
+
+
+def test_a_cluster_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="expected a Ray cluster"):
+        run(train_config(*WORDS.split(), "collector.address=auto"), tmp_path)
+
+
+def _is_worker(process: Path) -> bool:
+    try:
+        return re.match(rb"ray::\w*Collector", (process / "cmdline").read_bytes()) is not None
+    except OSError:
+        return False
