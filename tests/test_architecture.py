@@ -17,7 +17,7 @@ ARROW = [
     ["trackmdp.config"],
     ["trackmdp.world"],
     ["trackmdp.policies", "trackmdp.solvers"],
-    ["trackmdp.training.collect"],
+    ["trackmdp.training.collect", "trackmdp.training.on_ray"],
     ["trackmdp.algos"],
     ["trackmdp.training"],
     ["trackmdp.sweep.state"],

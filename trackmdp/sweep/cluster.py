@@ -14,8 +14,7 @@ from typing import Any
 from trackmdp.config.sweeps import Submitit, SubmititLocal, SubmititSlurm
 from trackmdp.errors import FAILED, UserError
 from trackmdp.sweep import apart
-from trackmdp.sweep.job import fail, run_job, stop_signal
-from trackmdp.sweep.launchers import Launch
+from trackmdp.sweep.job import Launch, fail, run_job, stop_signal
 from trackmdp.sweep.plan import Job
 
 __all__ = ["launcher"]

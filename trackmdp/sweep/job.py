@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from trackmdp.config import TrainConfig
@@ -16,7 +17,10 @@ from trackmdp.sweep.plan import Job
 from trackmdp.sweep.state import DONE, FAILED, SUMMARY, run_of
 from trackmdp.training.metrics import write_json
 
-__all__ = ["STOP", "fail", "run_job", "stop_signal"]
+__all__ = ["STOP", "Launch", "fail", "run_job", "stop_signal"]
+
+Launch = Callable[[Sequence[Job]], None]
+"""Runs jobs, and comes back once none is running any more."""
 
 STOP = ".stop"
 """File in a sweep's folder that holds the number of the signal by which all its runs are asked to stop."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -16,13 +16,10 @@ from trackmdp.config import TrainConfig
 from trackmdp.config.sweeps import Basic, Joblib, Launcher, Ray, Submitit
 from trackmdp.errors import UserError
 from trackmdp.sweep.apart import context_for
-from trackmdp.sweep.job import run_job
+from trackmdp.sweep.job import Launch, run_job
 from trackmdp.sweep.plan import Job
 
-__all__ = ["Launch", "make_launcher", "threads_of"]
-
-Launch = Callable[[Sequence[Job]], None]
-"""Runs jobs, and comes back once none is running any more."""
+__all__ = ["make_launcher", "threads_of"]
 
 _EXTRAS = {"joblib": "sweep", "submitit": "slurm", "ray": "ray"}
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")

@@ -16,8 +16,8 @@ from trackmdp.errors import FAILED as FAILED_STATUS
 from trackmdp.errors import Preempted, UserError
 from trackmdp.prepare import shown
 from trackmdp.sweep.apart import Outcome
-from trackmdp.sweep.job import STOP, fail
-from trackmdp.sweep.launchers import Launch, threads_of
+from trackmdp.sweep.job import STOP, Launch, fail
+from trackmdp.sweep.launchers import threads_of
 from trackmdp.sweep.plan import Job
 from trackmdp.sweep.state import DONE, FAILED, SUMMARY, Run, run_of, runs_of, write_plan
 from trackmdp.sweep.table import show, status_of, write_table
