@@ -53,7 +53,7 @@ def calibration_figure(every: Sequence[Candidate]) -> Figure:
             label, at = f"seed {best.seed}", (best.deviation, place)
             axes.annotate(label, at, (-8, 0), textcoords="offset points", ha="right", va="center", fontsize=8)
         axes.set_xscale("log")
-        axes.margins(x=0.2)
+        axes.margins(x=0.3)
         axes.set_yticks(list(COLOURS), [f"Z = {support_size}" for support_size in COLOURS])
         axes.set_xlabel("largest deviation from the printed accuracy (points)")
         tidy(axes)
