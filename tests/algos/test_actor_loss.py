@@ -147,14 +147,14 @@ def test_the_old_policy_is_renewed_once_per_batch() -> None:
     assert seen == [0, 0, 0, 3, 3, 3, 6]
 
 
-def paths(count: int, seed: int) -> tuple[SensorCredit, Tensor]:
+def paths(count: int, seed: int, unit: tuple[float, float, float] = (0.1, 0.2, 0.3)) -> tuple[SensorCredit, Tensor]:
     """Rows of three sensors at two clocks, most paths at the first one, with gains of either sign."""
     rng = torch.Generator().manual_seed(seed)
     entry = torch.randint(3, (2, count), generator=rng) + torch.tensor([[0], [3]])
     alive = torch.rand(2, count, generator=rng) < torch.tensor([[1.0], [0.4]])
     gain = (torch.randn(2, count, generator=rng) + 1.0) * alive
     arrivals = alive.sum(1).float().view(1, 2)
-    price = arrivals.unsqueeze(-1) * torch.tensor([0.1, 0.2, 0.3])
+    price = arrivals.unsqueeze(-1) * torch.tensor(unit)
     return SensorCredit(entry, gain, arrivals, price), torch.rand(1, 2, 3, generator=rng)
 
 
@@ -176,17 +176,17 @@ def test_sampled_credit_is_right_on_average() -> None:
     assert bool((error < 5 * draws.std(0) / 1000**0.5).all())
 
 
-def test_sampled_credit_varies_as_paths_that_draw_their_own_sets_do() -> None:
+@pytest.mark.parametrize("unit", [(0.1, 0.2, 0.3), (1.0, 2.0, 3.0)])
+def test_sampled_credit_varies_as_paths_that_draw_their_own_sets_do(unit: tuple[float, float, float]) -> None:
     """Against drawing every path's whole set: the same variances, within sampling error."""
-    credit, on = paths(50, 4)
+    credit, on = paths(50, 4, unit)
     rng = torch.Generator().manual_seed(5)
-    unit = torch.tensor([0.1, 0.2, 0.3])
     alive = credit.gain != 0
 
     def dense() -> Tensor:
         drawn = torch.rand(2, 50, 3, generator=rng) < on.view(2, 1, 3)
         moved = torch.nn.functional.one_hot(credit.entry % 3, 3) * credit.gain.unsqueeze(-1)
-        return ((moved - unit * alive.unsqueeze(-1)) * drawn).sum(1)
+        return ((moved - torch.tensor(unit) * alive.unsqueeze(-1)) * drawn).sum(1)
 
     ours = torch.stack([credit.sampled(on, rng)[0] for _ in range(1000)]).var(0).view(2, 3)
     theirs = torch.stack([dense() for _ in range(1000)]).var(0)

@@ -202,6 +202,14 @@ def assert_it_learns(name: str, words: tuple[str, ...], t_max: int) -> None:
     assert regret_per_step(best.upper, evaluate(world, policy(learner, world))) < 0.01
 
 
+def test_ppo_draws_sets_only_where_it_is_asked_to() -> None:
+    world = small_world()
+    data = batches(world)
+    drawn = [learn(world, data, *SHORT, *words, name="ppo_per_sensor") for words in ((), ("algo.surrogate=sampled",))]
+    expected, sampled = (learner._learner.loss.actor.weight for learner in drawn)
+    assert not torch.equal(expected, sampled)
+
+
 @pytest.mark.parametrize("name", PER_SENSOR)
 def test_prices_are_per_cell(name: str) -> None:
     """The hopping target is worth sensing in the cheap cells only; r = 2, and a miss costs D in the end."""

@@ -58,3 +58,11 @@ def test_what_collecting_costs_is_in_the_log(tmp_path: Path) -> None:
     cost = summary["while_collecting"]
     assert cost["reward_per_frame"] == pytest.approx(running[-1])
     assert cost["regret_per_frame"] == pytest.approx(best - running[-1])
+
+
+def test_rewards_are_logged_as_the_world_pays_them(tmp_path: Path) -> None:
+    """Before a learner scales them."""
+    for scale in ("0.1", "1"):
+        train(tmp_path / scale, f"algo.reward_scale={scale}", "collector.total_frames=256")
+    first, other = (rows(tmp_path / scale)[0]["reward_per_frame"] for scale in ("0.1", "1"))
+    assert first == other != "0.0"
