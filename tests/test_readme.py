@@ -78,7 +78,9 @@ def test_named_files_and_choices_exist() -> None:
 
 def few(line: str) -> list[str]:
     """What makes the paper's sweep one of a single pair and seed."""
-    return ["kernel.support_size=5", "kernel.seed=39", "cost.sensor=0.22", "seed=0"] if "experiment=paper" in line else []
+    return (
+        ["kernel.support_size=5", "kernel.seed=39", "cost.sensor=0.22", "seed=0"] if "experiment=paper" in line else []
+    )
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from tests.config.cases import REFUSED, composed, files_of
+from tests.helpers import configured
 from tests.reads import record_reads, unread
 from trackmdp.config import GROUPS, ROOTS, SELECTORS, Option, TrainConfig, conf_dir, load, options, to_yaml
 from trackmdp.config.sweeps import PLUGINS
@@ -210,3 +211,12 @@ def test_recorded_reads_are_those_that_happened() -> None:
     assert "algo.learning_rate.end" not in unread(cfg, reads)
     assert cfg.seed == 0
     assert reads == {"algo.learning_rate.start", "algo.learning_rate.end"}
+
+
+@pytest.mark.parametrize("choice", ["algo=hindsight", "algo=a2c credit=per_sensor", "algo=dqn credit=per_sensor"])
+@pytest.mark.parametrize(("size", "frames"), [(3, 27_000), (10, 300_000), (40, 4_800_000)])
+def test_the_budget_grows_with_the_number_of_cells(choice: str, size: int, frames: int) -> None:
+    cfg = configured("train", *choice.split(), f"grid.size={size}")
+    assert cfg.algo.total_frames == cfg.collector.total_frames == cfg.algo.buffer_size == frames
+    typed = configured("train", *choice.split(), f"grid.size={size}", "algo.total_frames=20000")
+    assert typed.collector.total_frames == typed.algo.buffer_size == 20_000

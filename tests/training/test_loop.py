@@ -66,3 +66,9 @@ def test_rewards_are_logged_as_the_world_pays_them(tmp_path: Path) -> None:
         train(tmp_path / scale, f"algo.reward_scale={scale}", "collector.total_frames=256")
     first, other = (rows(tmp_path / scale)[0]["reward_per_frame"] for scale in ("0.1", "1"))
     assert first == other != "0.0"
+
+
+def test_a_budget_is_made_up_to_whole_batches(tmp_path: Path) -> None:
+    """Without a word about it at the terminal: warnings are errors here."""
+    train(tmp_path, "collector.total_frames=600")
+    assert int(rows(tmp_path)[-1]["frames"]) == 768

@@ -54,6 +54,7 @@ def conf_dir() -> str:
 def register() -> None:
     """Make every schema known to Hydra as `base_<name>`, for the `defaults` lists in `conf/`."""
     OmegaConf.register_new_resolver("first", _first_given, replace=True)
+    OmegaConf.register_new_resolver("per_cell", lambda count, size: count * size**2, replace=True)
     store = ConfigStore.instance()
     for command, root in ROOTS.items():
         store.store(name=f"base_{command}", node=root)

@@ -34,12 +34,12 @@ def make_collector(
     """A collector of batches `[B, time]` on `device` (the learner's); its frames are env steps.
 
     The environment's own `_step_and_maybe_reset` and the flags below make the collector as fast as a loop by hand.
-    Of `cfg.total_frames`, the `done` frames of an earlier process are not collected again.
+    Of `cfg.total_frames`, made up to whole batches, the `done` frames of an earlier process are not collected again.
     """
     env: dict[str, Any] = {"num_envs": cfg.envs, "seed": seed, "max_steps": max_steps, "device": env_device}
     common: dict[str, Any] = {
         "frames_per_batch": cfg.frames_per_batch,
-        "total_frames": cfg.total_frames - done,
+        "total_frames": -(-(cfg.total_frames - done) // cfg.frames_per_batch) * cfg.frames_per_batch,
         "auto_register_policy_transforms": False,
         "env_device": env_device,
         "policy_device": device,
