@@ -17,7 +17,7 @@ def test_one_step_descends_the_printed_loss() -> None:
     learner = algorithm("a2c", world, entropy, "algo.critic_coef=0.5")
     batch = collect(world, learner.policy, 32, 8)
     with torch.no_grad():
-        learner.policy.module[0].module.head.weight.normal_(std=0.1)  # off the policy that collected
+        learner.policy.module[0].module.network.head.weight.normal_(std=0.1)  # off the policy that collected
     data, _ = learner.prepare(batch.clone())
     learner.iteration -= 1
     subsets = SubsetDistribution(learner.policy.module[0](data.clone())["logits"])

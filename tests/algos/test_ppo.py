@@ -20,7 +20,7 @@ def test_the_clipped_objective() -> None:
     learner = algorithm("ppo", world, *ONCE)
     batch = collect(world, learner.policy, 32, 8)
     with torch.no_grad():
-        learner.policy.module[0].module.head.weight.normal_(std=0.3)  # off the policy that collected
+        learner.policy.module[0].module.network.head.weight.normal_(std=0.3)  # off the policy that collected
     data, _ = learner.prepare(batch.clone())
     learner.iteration -= 1
     with torch.no_grad():

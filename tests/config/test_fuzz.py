@@ -36,7 +36,8 @@ def bad_values(item: Option) -> list[str]:
     if item.kind is str and (item.choices or item.expects.startswith("cpu")):
         bad += ["elsewhere", "[cpu]"]
     if item.kind in (list[int], list[str]):
-        bad += ["elsewhere", "[]", "[elsewhere]", "[1.5]", "[null]"] + (["[-1]"] if item.ge == 0 else [])
+        bad += ["elsewhere", "[]", "[1.5]", "[null]"] + (["[-1]"] if item.ge == 0 else [])
+        bad += ["[elsewhere]"] if item.choices or item.kind == list[int] else []
     if item.kind is Any:
         bad += ["-1", "words", "{a: 1}", "nan", "[1,2]"]
     return bad

@@ -157,7 +157,7 @@ def test_blocks_of_an_experiment_are_the_sweep(here: Path, capfd: pytest.Capture
     assert main([*line, "grid.sise=3"]) == 2
     assert capfd.readouterr().err.startswith("trackmdp train: grid.sise: unknown option, did you mean grid.size?")
     assert main([*line[:-1], "experiment=fwe"]) == 2
-    assert capfd.readouterr().err == "trackmdp train: experiment=fwe: expected one of few\n"
+    assert capfd.readouterr().err == "trackmdp train: experiment=fwe: expected one of few, paper\n"
 
 
 def test_the_plan_is_on_disk_before_the_first_run(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:

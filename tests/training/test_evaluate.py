@@ -106,7 +106,7 @@ def test_exact_and_simulated_figures_agree_for_a_learned_actor() -> None:
     torch.manual_seed(0)
     actor = algorithm("ppo", world).actor
     with torch.no_grad():
-        actor.module[0].module.head.weight.normal_(std=0.3)
+        actor.module[0].module.network.head.weight.normal_(std=0.3)
     simulation = simulate(world, actor, episodes=20_000, seed=0)
     assert simulation.safe_per_episode.mean > 0.05
     assert 0.2 < simulation.accuracy.mean < 0.9

@@ -152,7 +152,8 @@ class BenchmarkConfig(WorldConfig):
         "`peers`: folder with the scripts <name>_peer.py to run beside ours", expects="the folder of the scripts"
     )
     peers_python: list[str] | None = option(
-        "`peers`: the interpreter of each script, in the order of their names; null: this one"
+        "`peers`: the interpreter of each script, in the order of their names; null: this one",
+        expects="a path to a Python interpreter",
     )
 
 
