@@ -27,13 +27,12 @@ def test_it_is_small() -> None:
     assert sum(file.stat().st_size for file in KEPT.iterdir()) < 300_000
 
 
-def test_every_pair_was_run_with_five_seeds_of_both(grouped: Study) -> None:
+def test_every_pair_was_run_with_every_algorithm(grouped: Study) -> None:
     assert pairs(grouped).keys() == PRINTED_QMDP.keys()
     for world in pairs(grouped).values():
-        for method in ("a2c", "hindsight"):
-            assert [run.seed for run in grouped.of(world, method)] == list(range(5)), (world, method)
-        assert grouped.of(world, "ppo")
-        assert grouped.of(world, "dqn")
+        assert [run.seed for run in grouped.of(world, "hindsight")] == list(range(5)), world
+        for method in ("a2c", "ppo"):
+            assert grouped.of(world, method), (world, method)
 
 
 def test_its_kernels_are_those_of_the_rule(grouped: Study) -> None:
@@ -44,9 +43,12 @@ def test_its_kernels_are_those_of_the_rule(grouped: Study) -> None:
         assert {run.settings["kernel.seed"] for run in grouped.in_world(world)} == {seeds[support_size]}
 
 
-def test_the_default_comes_close_in_every_pair(grouped: Study) -> None:
-    default = goals(grouped, pairs(grouped), resamples=100)[2]
-    assert (default.pairs, default.met, default.missed) == (12, 12, [])
+def test_the_default_comes_close_in_every_pair_and_a2c_is_above_qmdp(grouped: Study) -> None:
+    above, _, default = goals(grouped, pairs(grouped), resamples=100)
+    assert (above.pairs, above.met, above.by_all) == (12, 12, 12)
+    assert (default.pairs, default.met, default.by_all, default.missed) == (12, 12, 12, [])
+    per_sensor = [grouped.regrets(world, "a2c_per_sensor") for world in pairs(grouped).values()]
+    assert all(regrets and max(regrets) < 0.001 for regrets in per_sensor)
 
 
 @pytest.mark.slow
