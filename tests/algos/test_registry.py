@@ -163,4 +163,5 @@ def test_a_run_is_the_same_in_another_process(name: str, tmp_path: Path) -> None
         environment = {**os.environ, "OMP_NUM_THREADS": "1"}
         done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path, env=environment)
         assert done.returncode == 0, done.stderr
-    assert_same_run(tmp_path / "alone", tmp_path / "sweep" / "1")
+    (again,) = (tmp_path / "sweep").glob("*seed_0-*")
+    assert_same_run(tmp_path / "alone", again)

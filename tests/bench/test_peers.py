@@ -32,23 +32,21 @@ def peers(folder: Path) -> Path:
 @pytest.mark.slow
 def test_ours_and_the_peers_take_turns(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     world = ["kernel.support_size=4", "cost.sensor=0.2", "grid.t_max=0"]
-    words = ["part=peers", "seeds=[3,4]", f"peers={peers(tmp_path / 'peers')}", *world]
+    words = ["part=peers", "seeds=[3]", f"peers={peers(tmp_path / 'peers')}", *world]
     assert main(["benchmark", *words, f"hydra.run.dir={tmp_path}/run"]) == 0
     rows = json.loads((tmp_path / "run" / "benchmark.json").read_text())["rows"]
-    assert [(row["learner"].split()[0], row["seed"]) for row in rows] == [
-        (learner, seed) for seed in (3, 4) for learner in ("trackmdp", "good", "lost")
-    ]
-    for ours, good, lost in (rows[:3], rows[3:]):
-        assert ours["times_our_wall"] == ours["times_our_cpu"] == 1
-        assert ours["last_regret"] < 0.005 < ours["goal"] == 0.02
-        assert 0 < ours["frames"] <= 300_000
-        assert good["frames"] == 20
-        assert good["times_our_wall"] == pytest.approx(good["wall_seconds"] / ours["wall_seconds"])
-        # Start and end of the process count, which took less than the seconds that the script claims.
-        assert 0 < good["wall_seconds"] < 2 < ours["wall_seconds"]
-        assert good["curve"]["seconds"][-1] == pytest.approx(good["wall_seconds"])
-        assert lost["frames"] is lost["wall_seconds"] is lost["times_our_cpu"] is None
-        assert lost["last_regret"] == 0.3
+    assert [(row["learner"].split()[0], row["seed"]) for row in rows] == [("trackmdp", 3), ("good", 3), ("lost", 3)]
+    ours, good, lost = rows
+    assert ours["times_our_wall"] == ours["times_our_cpu"] == 1
+    assert ours["last_regret"] < 0.005 < ours["goal"] == 0.02
+    assert 0 < ours["frames"] <= 300_000
+    assert good["frames"] == 20
+    assert good["times_our_wall"] == pytest.approx(good["wall_seconds"] / ours["wall_seconds"])
+    # Start and end of the process count, which took less than the seconds that the script claims.
+    assert 0 < good["wall_seconds"] < 2 < ours["wall_seconds"]
+    assert good["curve"]["seconds"][-1] == pytest.approx(good["wall_seconds"])
+    assert lost["frames"] is lost["wall_seconds"] is lost["times_our_cpu"] is None
+    assert lost["last_regret"] == 0.3
     out = capfd.readouterr().out
     assert "said to nobody" not in out
     assert "t trackmdp hindsight, g good ppo, l lost ppo" in out

@@ -10,6 +10,7 @@ from trackmdp.bench import learned, solver
 from trackmdp.build import make_world
 
 
+@pytest.mark.slow
 def test_growth_gives_a_row_per_world(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(solver, "PAIRS", ((5, 0.22),))
     monkeypatch.setattr(solver, "SIZES", (3, 4))

@@ -55,6 +55,7 @@ def test_a_search_finds_better_runs_than_it_began_with(here: Path, monkeypatch: 
     assert max(values) > 15.9
 
 
+@pytest.mark.slow
 def test_the_study_goes_on_to_the_number_asked_for(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stub(monkeypatch, "train", peak)
     for number in (3, 5, 5):

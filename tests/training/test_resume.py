@@ -76,6 +76,7 @@ def resumes_exactly(folder: Path, recipe: str, kills: int) -> None:
     assert_same_run(folder / "whole", folder / "cut")
 
 
+@pytest.mark.slow
 def test_a_kill_changes_nothing(tmp_path: Path) -> None:
     resumes_exactly(tmp_path, "dqn-prioritized", kills=1)
 
