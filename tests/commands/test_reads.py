@@ -22,6 +22,9 @@ DEFAULTS = {
 """Option -> the option it takes its value from, unless typed: reading the first reads the second."""
 
 
+MIXED = " algo.updates=2 algo.collect=mixed collector.frames_per_batch=512 algo.explore.until=0.9"
+
+
 def never_read(command: str, words: str, folder: Path) -> set[str]:
     cfg = composed(command, *words.split())
     run = importlib.import_module(f"trackmdp.commands.{command}").run
@@ -34,7 +37,7 @@ def never_read(command: str, words: str, folder: Path) -> set[str]:
 def test_train_reads_every_option(algo: str, tmp_path: Path) -> None:
     words = f"algo={algo} {SHORT} optimal.time_limit=1"
     words += (
-        " algo.updates=2 algo.collect=mixed collector.frames_per_batch=512 algo.explore.until=0.9"
+        MIXED
         if issubclass(GROUPS["algo"][algo], PerSensor)
         else " algo.prioritized.enabled=true"
         if algo == "dqn"
@@ -46,7 +49,7 @@ def test_train_reads_every_option(algo: str, tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("collector", ["multi_sync", "multi_async"])
 def test_collectors_with_workers_read_every_option(collector: str, tmp_path: Path) -> None:
-    assert not never_read("train", f"collector={collector} {SHORT}", tmp_path)
+    assert not never_read("train", f"collector={collector} {SHORT}{MIXED}", tmp_path)
 
 
 @pytest.mark.parametrize("baseline", BASELINES)
