@@ -75,6 +75,8 @@ LAUNCHERS = [
     pytest.param("submitit_local", ["hydra.launcher.n_jobs=2"], marks=needs["submitit"]),
     pytest.param("ray", ["hydra.launcher.num_cpus=2"], marks=needs["ray"]),
 ]
+OFTEN = [pytest.mark.slow, pytest.mark.long, pytest.mark.long]
+"""What takes as long as all of them together is run by hand for the last two."""
 
 
 @pytest.mark.slow
@@ -87,8 +89,13 @@ def test_every_launcher_has_the_results_of_the_basic_one(
     assert (tmp_path / "all/runs.csv").read_bytes() == (basic / "runs.csv").read_bytes()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("launcher", "words"), [pytest.param("basic", []), *LAUNCHERS])
+@pytest.mark.parametrize(
+    ("launcher", "words"),
+    [
+        pytest.param("basic", [], marks=pytest.mark.slow),
+        *(pytest.param(*item.values, marks=[*item.marks, often]) for item, often in zip(LAUNCHERS, OFTEN, strict=True)),
+    ],
+)
 def test_a_run_that_is_killed_leaves_the_others(launcher: str, words: list[str], tmp_path: Path, basic: Path) -> None:
     process = begin(tmp_path, launcher, *words, "seed=0,1,2,-1", "algo.updates=300", "algo.updates_per_iteration=1")
     wait_for(lambda: (tmp_path / "all/sweep.json").is_file())
@@ -151,9 +158,14 @@ def slurm(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return state
 
 
-@pytest.mark.slow
+SLOW_AND_LONG = [
+    pytest.param("basic", marks=pytest.mark.slow),
+    pytest.param("joblib", marks=[needs["joblib"], pytest.mark.long]),
+]
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("launcher", ["basic", pytest.param("joblib", marks=needs["joblib"])])
+@pytest.mark.parametrize("launcher", SLOW_AND_LONG)
 def test_a_signal_stops_the_sweep_in_order(launcher: str, number: int, tmp_path: Path) -> None:
     process = begin(tmp_path, launcher, *SLOW, "seed=range(4)")
     wait_for(lambda: (tmp_path / "all/sweep.json").is_file())
@@ -169,8 +181,7 @@ def test_a_signal_stops_the_sweep_in_order(launcher: str, number: int, tmp_path:
     assert not (tmp_path / "all/.stop").exists()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("launcher", ["basic", pytest.param("joblib", marks=needs["joblib"])])
+@pytest.mark.parametrize("launcher", SLOW_AND_LONG)
 def test_a_sweep_killed_three_times_has_the_results_of_one_never_killed(launcher: str, tmp_path: Path) -> None:
     words = ["seed=range(3)", "algo.updates=300", "algo.updates_per_iteration=1", "checkpoint.seconds=0.2"]
     whole, cut = tmp_path / "whole", tmp_path / "cut"
