@@ -94,7 +94,7 @@ def test_the_commands_run_in_this_order(tmp_path: Path) -> None:
             typed = [sys.executable, *shlex.split(line)[1:]]
         result = subprocess.run(typed, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
         assert (result.returncode, result.stderr) == (0, ""), line
-    assert len(list(tmp_path.glob("multirun/a/*/summary.json"))) == 8
+    assert len(list(tmp_path.glob("multirun/a/*/summary.json"))) == 4
     assert len(list(tmp_path.glob("multirun/*/*algo_*credit_*/summary.json"))) == 4
     for sweep in ("a", "paper"):
         assert (tmp_path / "multirun" / sweep / "report" / "report.html").is_file()
