@@ -95,7 +95,7 @@ def test_the_commands_run_in_this_order(tmp_path: Path) -> None:
         result = subprocess.run(typed, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
         assert (result.returncode, result.stderr) == (0, ""), line
     assert len(list(tmp_path.glob("multirun/a/*/summary.json"))) == 4
-    assert len(list(tmp_path.glob("multirun/*/*algo_*credit_*/summary.json"))) == 4
+    assert len(list(tmp_path.glob("multirun/train-algo_a2c_ppo-*/*/summary.json"))) == 4
     for sweep in ("a", "paper"):
         assert (tmp_path / "multirun" / sweep / "report" / "report.html").is_file()
     assert (tmp_path / "runs/a/evaluation.json").is_file()
