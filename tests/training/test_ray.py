@@ -17,10 +17,11 @@ from tests.training.runs import at_iteration, rows
 from trackmdp.commands.train import run
 from trackmdp.errors import RunError, UserError
 
-pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # Ray's own, of many kinds
+pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's own, of many kinds
 WORDS = "algo=ppo collector=ray optimal.enabled=false " + SHORT
 
 
+@pytest.mark.slow
 def test_learns_from_the_frames_of_all_workers(tmp_path: Path) -> None:
     aihtr = run(
         train_config(*WORDS.split(), "collector.total_frames=65536", "collector.frames_per_batch=4096"), tmp_path
@@ -30,10 +31,12 @@ def test_learns_from_the_frames_of_all_workers(tmp_path: Path) -> None:
     assert aihtr > float(first["aihtr"]) + 10
 
 
+@pytest.mark.long
 def test_reads_every_option(tmp_path: Path) -> None:
     assert not never_read("train", f"{WORDS} optimal.enabled=true optimal.time_limit=1", tmp_path)
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_killed_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def kill() -> None:
         workers = [path for path in Path("/proc").iterdir() if path.name.isdigit() and _is_worker(path)]
@@ -44,6 +47,7 @@ def test_a_worker_that_is_killed_is_named(tmp_path: Path, monkeypatch: pytest.Mo
         run(train_config(*WORDS.split(), "collector.total_frames=16384"), tmp_path)
 
 
+@pytest.mark.long
 def test_a_cluster_that_is_not_there_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="expected a Ray cluster"):
         run(train_config(*WORDS.split(), "collector.address=auto"), tmp_path)
