@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse, stats
+from scipy import sparse
 from scipy.sparse.linalg import spsolve_triangular
+from scipy.special import stdtrit
 
 from trackmdp.solvers.chains import Evaluation, pool
 from trackmdp.solvers.renewal import IndexArray
@@ -138,5 +139,5 @@ def _interval(part: Array, whole: Array) -> Interval:
     if count < 2:
         return Interval(ratio, np.nan, np.nan)
     error = (part - ratio * whole).std(ddof=1) / (total / count * np.sqrt(count))
-    margin = float(stats.t.ppf(0.975, count - 1) * error)
+    margin = float(stdtrit(count - 1, 0.975) * error)
     return Interval(ratio, ratio - margin, ratio + margin)
