@@ -10,9 +10,10 @@ import pytest
 
 from trackmdp.config import conf_dir
 from trackmdp.reports.calibration import Candidate, candidates, chosen, sensitivity
-from trackmdp.reports.paper import COSTS, PRINTED_QMDP, PRINTED_TMDP, SUPPORTS, draw_kernel, world_of
+from trackmdp.reports.paper import PRINTED_QMDP, PRINTED_TMDP
 from trackmdp.solvers import bounds, qmdp
 from trackmdp.solvers.chains import evaluate
+from trackmdp.world.paper import COSTS, SUPPORTS, paper_kernel, paper_world
 
 PAPER = Path(conf_dir()) / "experiment/paper.yaml"
 
@@ -62,7 +63,7 @@ def test_the_sensitivity_is_the_range_over_the_draws() -> None:
     settings = list(sensitivity(draws=[0, 1, 2]))
     assert len({(s.border, s.t_max, s.support_size, s.cost) for s in settings}) == len(settings) == 4 * 3 * 12
     (one,) = [s for s in settings if (s.border, s.t_max, s.support_size, s.cost) == ("clip", 2, 4, 0.2)]
-    worlds = [world_of(draw_kernel(4, seed, "clip"), 0.2, 2) for seed in range(3)]
+    worlds = [paper_world(paper_kernel(4, seed, "clip"), 0.2, 2) for seed in range(3)]
     exact = [evaluate(world, qmdp.solve(world)) for world in worlds]
     accuracy = sorted(100 * e.accuracy for e in exact)
     assert vars(one.accuracy) == {"median": accuracy[1], "low": accuracy[0], "high": accuracy[2]}

@@ -13,6 +13,7 @@ from trackmdp.solvers import bounds, clocked, optimal, qmdp, remarks, theorems
 from trackmdp.solvers.chains import evaluate
 from trackmdp.solvers.optimal import Solution
 from trackmdp.solvers.theorems import Check
+from trackmdp.world import paper
 from trackmdp.world.kernels import random_walk
 from trackmdp.world.model import BoolArray, World
 
@@ -73,14 +74,14 @@ def test_with_a_cheap_safe_action_being_overdue_is_worth_more_than_being_located
 def test_the_remark_on_worlds_where_qmdp_is_optimal() -> None:
     rows = {row.name: row for row in remarks.check(1e-9)}
     assert rows["remark, c = 0.14, Z = 4"].holds
-    world = remarks.paper_world(4, 0.14, 1)
+    world = paper_world(4, 0.14, 1)
     np.testing.assert_array_equal(qmdp.solve(world)[:, 0], world.kernel > 0)
     assert evaluate(world, optimal.solve(world).chains).accuracy == pytest.approx(1.0)
 
 
 def test_the_printed_bound_is_exceeded() -> None:
     (row,) = [row for row in remarks.check(1e-9) if row.name == "the printed bound"]
-    world = remarks.paper_world(5, 0.16, 5, border="inside")
+    world = paper.paper_world(paper.paper_kernel(5, 5, "inside"), 0.16, 5)
     attained = evaluate(world, clocked.solve(world)).aihtr
     assert attained > bounds.paper(world).mean() + 0.5
     assert attained <= bounds.valid(world).mean()

@@ -14,10 +14,10 @@ import torch
 
 from trackmdp.config import BenchmarkConfig, PaperCost, RandomSupport, load_run
 from trackmdp.world.model import World
+from trackmdp.world.paper import COSTS, SUPPORTS
 
 __all__ = ["learned_kernel"]
 
-SUPPORTS, COSTS = (3, 4, 5), (0.16, 0.18, 0.2, 0.22)
 VARIANTS = (("all", 30_000), ("all", 100_000), ("chosen", 100_000))
 
 

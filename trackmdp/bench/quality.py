@@ -10,11 +10,12 @@ from hydra.core.hydra_config import HydraConfig
 from trackmdp.bench.process import Trained, trained
 from trackmdp.config import BenchmarkConfig
 from trackmdp.world.model import World
+from trackmdp.world.paper import COSTS, SUPPORTS
 
 __all__ = ["growth", "histogram", "pairs", "quality"]
 
 THRESHOLDS = (0.05, 0.02, 0.005)
-SUPPORTS, COSTS, T_MAX = (3, 4, 5), (0.16, 0.18, 0.2, 0.22), (0, 1, 2, 3, 5)
+T_MAX = (0, 1, 2, 3, 5)
 SIZES, CHOICES = (5, 10, 20, 30, 40), (0, 1, 2, 3, 4, 5)
 _WORLD = ("grid", "kernel", "cost")
 _BINS = (0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05)

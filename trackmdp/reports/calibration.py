@@ -10,10 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trackmdp.reports.paper import COSTS, PRINTED_QMDP, SUPPORTS, draw_kernel, world_of
+from trackmdp.reports.paper import PRINTED_QMDP
 from trackmdp.solvers import bounds, qmdp
 from trackmdp.solvers.chains import evaluate
 from trackmdp.world.kernels import Border
+from trackmdp.world.paper import COSTS, SUPPORTS, paper_kernel, paper_world
 
 __all__ = ["BORDER", "DRAWS", "SEEDS", "T_MAX", "Candidate", "Setting", "Spread", "candidates", "chosen", "sensitivity"]
 
@@ -97,8 +98,8 @@ def sensitivity(draws: Sequence[int] = DRAWS) -> Iterator[Setting]:
 
 
 def _candidate(support_size: int, seed: int, border: Border, t_max: int) -> Candidate:
-    kernel = draw_kernel(support_size, seed, border)
-    worlds = [world_of(kernel, cost, t_max) for cost in COSTS]
+    kernel = paper_kernel(support_size, seed, border)
+    worlds = [paper_world(kernel, cost, t_max) for cost in COSTS]
     accuracy = tuple(100.0 * evaluate(world, qmdp.solve(world)).accuracy for world in worlds)
     return Candidate(support_size, seed, accuracy, _deviation(support_size, accuracy))
 
@@ -111,9 +112,9 @@ def _deviation(support_size: int, accuracy: Iterable[float]) -> float:
 def _settings(border: Border, t_max: int, support_size: int, draws: Sequence[int]) -> Iterator[Setting]:
     figures = np.empty((len(draws), len(COSTS), 3))
     for row, seed in enumerate(draws):
-        kernel = draw_kernel(support_size, seed, border)
+        kernel = paper_kernel(support_size, seed, border)
         for column, cost in enumerate(COSTS):
-            world = world_of(kernel, cost, t_max)
+            world = paper_world(kernel, cost, t_max)
             value = evaluate(world, qmdp.solve(world))
             figures[row, column] = 100.0 * value.accuracy, value.aihtr, bounds.clocked(world).mean()
     deviation = min(_deviation(support_size, accuracy) for accuracy in figures[:, :, 0])

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 from trackmdp.reports.grouping import Study
-from trackmdp.reports.paper import COSTS, draw_kernel, world_of
 from trackmdp.reports.tables import Cell, Column, Table
 from trackmdp.solvers import optimal, remarks, theorems
 from trackmdp.solvers.theorems import Check
+from trackmdp.world.paper import COSTS, paper_kernel, paper_world
 
 __all__ = ["bounds_table", "checks", "checks_table", "points"]
 
@@ -18,7 +18,7 @@ HARDEST = 5
 
 def checks(seed: int, *, border: str, t_max: int) -> list[Check]:
     """The paper's theorems on the world with Z = 5 at the lowest price, and the two remarks."""
-    world = world_of(draw_kernel(HARDEST, seed, border), COSTS[0], t_max)  # type: ignore[arg-type]
+    world = paper_world(paper_kernel(HARDEST, seed, border), COSTS[0], t_max)  # type: ignore[arg-type]
     solution = optimal.solve(world, tolerance=TOLERANCE)
     return [*theorems.check(world, solution, TOLERANCE), *remarks.check(TOLERANCE)]
 

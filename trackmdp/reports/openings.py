@@ -21,8 +21,8 @@ from trackmdp.reports.calibration import (
     chosen,
     sensitivity,
 )
-from trackmdp.reports.paper import SUPPORTS
 from trackmdp.solvers.theorems import Check
+from trackmdp.world.paper import SUPPORTS
 
 __all__ = ["FILE", "Openings", "compute", "load", "save"]
 

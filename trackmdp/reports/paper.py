@@ -1,21 +1,15 @@
-"""The paper's experiments (Section VII): its worlds, and the numbers it prints."""
+"""The paper's experiments (Section VII): the numbers it prints, and the runs that are of its worlds."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from trackmdp.reports.grouping import Study
 from trackmdp.reports.results import Run
-from trackmdp.world.kernels import Border, random_support
-from trackmdp.world.model import Array, World
+from trackmdp.world.paper import COSTS, EXIT_PROBABILITY, LOW_PROBABILITY, RADIUS, REWARD, SIZE
 
-__all__ = ["COSTS", "PRINTED_QMDP", "PRINTED_TMDP", "SUPPORTS", "draw_kernel", "pair_of", "pairs", "world_of"]
-
-SUPPORTS = (3, 4, 5)
-COSTS = (0.16, 0.18, 0.2, 0.22)
+__all__ = ["PRINTED_QMDP", "PRINTED_TMDP", "pair_of", "pairs"]
 
 PRINTED_QMDP: Mapping[tuple[int, float], float] = {
     **{(3, c): 90.74 for c in COSTS},
@@ -33,34 +27,16 @@ PRINTED_TMDP: Mapping[tuple[int, float], float] = {
 """Table II, accuracy of the paper's learned policy in per cent, by (Z, c)."""
 
 _FIXED = {
-    "grid.size": 10,
+    "grid.size": SIZE,
     "grid.max_steps": None,
     "kernel.name": "random_support",
-    "kernel.radius": 1,
-    "kernel.low_probability": 0.15,
-    "kernel.exit_probability": 0.005,
-    "cost.reward": 1,
+    "kernel.radius": RADIUS,
+    "kernel.low_probability": LOW_PROBABILITY,
+    "kernel.exit_probability": EXIT_PROBABILITY,
+    "cost.reward": REWARD,
     "cost.safe": None,
 }
-"""What the paper says of its worlds; T_max, the border rule and the draw of the kernel it does not."""
-
-
-def draw_kernel(support_size: int, seed: int, border: Border) -> Array:
-    """`[100, 100]` one draw of the paper's kernel with Z = `support_size`."""
-    return random_support(
-        10,
-        support_size=support_size,
-        radius=1,
-        low_probability=0.15,
-        exit_probability=0.005,
-        border=border,
-        seed=seed,
-    )
-
-
-def world_of(kernel: Array, cost: float, t_max: int) -> World:
-    """The paper's world with this kernel: N = 10, r = 1, D = N² c."""
-    return World(10, 1.0, np.full(100, cost), 100 * cost, t_max, kernel)
+"""What the paper says of its worlds."""
 
 
 def pair_of(settings: Mapping[str, Any]) -> tuple[int, float] | None:

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from trackmdp.reports.calibration import BORDER, DRAWS, SEEDS, T_MAX, Candidate, Setting, Spread, chosen
-from trackmdp.reports.paper import COSTS, PRINTED_QMDP, SUPPORTS
+from trackmdp.reports.paper import PRINTED_QMDP
 from trackmdp.reports.style import INK, LOOKS, Figure, draw, legend, tidy
 from trackmdp.reports.tables import Cell, Column, Table
 from trackmdp.world.model import Array
+from trackmdp.world.paper import COSTS, SUPPORTS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -4,29 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import numpy as np
-
 from trackmdp.solvers import bounds, clocked, optimal, qmdp
 from trackmdp.solvers.chains import evaluate
 from trackmdp.solvers.theorems import Check
-from trackmdp.world.kernels import Border, random_support
-from trackmdp.world.model import World
+from trackmdp.world.paper import paper_kernel, paper_world
 
-__all__ = ["check", "paper_world"]
-
-
-def paper_world(support_size: int, cost: float, t_max: int, border: Border = "renormalize") -> World:
-    """The world of Section VII, N = 10, r = 1, D = N² c, the kernel drawn with seed Z."""
-    kernel = random_support(
-        10,
-        support_size=support_size,
-        radius=1,
-        low_probability=0.15,
-        exit_probability=0.005,
-        border=border,
-        seed=support_size,
-    )
-    return World(10, 1.0, np.full(100, cost), 100 * cost, t_max, kernel)
+__all__ = ["check"]
 
 
 def check(tolerance: float) -> Iterator[Check]:
@@ -36,7 +19,7 @@ def check(tolerance: float) -> Iterator[Check]:
 
 
 def _support(tolerance: float) -> Check:
-    world = paper_world(4, 0.14, 1)
+    world = paper_world(paper_kernel(4, seed=4, border="renormalize"), 0.14, 1)
     support = world.kernel > 0
     best, simple = optimal.solve(world), qmdp.solve(world)
     wrong = sum(int((chains[:, 0] != support).sum()) for chains in (best.chains, simple))
@@ -47,7 +30,7 @@ def _support(tolerance: float) -> Check:
 
 
 def _printed_bound(tolerance: float) -> Check:
-    world = paper_world(5, 0.16, 5, border="inside")
+    world = paper_world(paper_kernel(5, seed=5, border="inside"), 0.16, 5)
     printed, achieved = bounds.paper(world).mean(), evaluate(world, clocked.solve(world)).aihtr
     note = f"bound {printed:.2f}, a policy attains {achieved:.2f} (border inside, Z = 5, c = 0.16, t_max 5)"
     statement = "no policy exceeds the printed bound"
