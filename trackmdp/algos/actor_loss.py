@@ -6,7 +6,7 @@ the policy-gradient forms learn is scaled by σ(z)(1-σ(z)), what the two others
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import torch
@@ -33,12 +33,14 @@ class SensorCredit:
         gain: `[T+1, B]`, what having that sensor on gains; 0 where the path did not get to the clock unlocated.
         arrivals: `[M, T+1]`, paths at each row.
         price: `[M, T+1, K]`, what having a sensor on costs on all of them.
+        rows: the located cells that these tables are of, where they are a part of all M.
     """
 
     entry: Tensor
     gain: Tensor
     arrivals: Tensor
     price: Tensor
+    rows: slice = field(default_factory=lambda: slice(None))
 
     @cached_property
     def _sums(self) -> Tensor:
@@ -165,15 +167,16 @@ class Surrogate(PolicyGradient):
 
     def objective(self, logits: Tensor, credit: SensorCredit) -> Tensor:
         """Σ_b min(ρ_b A_b, clip(ρ_b) A_b)."""
+        old = self.old[credit.rows]
         if self._renew:
-            self.old.copy_(logits.detach())
-        p = self.old.sigmoid()
+            old.copy_(logits.detach())
+        p = old.sigmoid()
         if self._generator is None:
             on, off = p * credit.advantage, (1 - p) * credit.advantage
         else:
             on, off = credit.sampled(p, self._generator)
-        up = (logsigmoid(logits) - logsigmoid(self.old)).exp()
-        down = (logsigmoid(-logits) - logsigmoid(-self.old)).exp()
+        up = (logsigmoid(logits) - logsigmoid(old)).exp()
+        down = (logsigmoid(-logits) - logsigmoid(-old)).exp()
         return self._clipped(up, (1 - p) * on) + self._clipped(down, -p * off)
 
     def _clipped(self, ratio: Tensor, advantage: Tensor) -> Tensor:

@@ -125,6 +125,7 @@ class Hindsight:
             hidden=self.hidden,
             discount=self.cfg.gamma,
             generator=self._generator,
+            max_entries=self.cfg.max_entries,
         )
         return _Learner(loss, self.cfg.average)
 
@@ -174,9 +175,11 @@ class _Learner:
     def update(self, cells: Tensor, rate: float, blend: float) -> dict[str, Tensor]:
         """One gradient step on paths `cells` `[T+3, B]`; returns the losses."""
         set_learning_rate(self.optimizer, rate)
-        losses = self.loss(cells, self._on(), blend)
         self.optimizer.zero_grad()
-        torch.stack(list(losses.values())).sum().backward()
+        losses: dict[str, Tensor] = {}
+        for part in self.loss.parts(cells, self._on(), blend):
+            torch.stack(list(part.values())).sum().backward()
+            losses |= {name: loss.detach() + losses.get(name, 0.0) for name, loss in part.items()}
         self.optimizer.step()
         # At first the average forgets faster, or it would stay with the initial weights.
         decay = min(self._decay, (1 + self._count) / (10 + self._count))
@@ -189,7 +192,7 @@ class _Learner:
     @torch.no_grad()
     def _on(self) -> Tensor:
         """`[M, T+1, K]`, the sensors on, as the actor's outputs."""
-        return self.average() > 0
+        return torch.cat([self.average(rows) > 0 for rows in self.loss.slices()])
 
     def chains(self) -> Tensor:
         """`[M, T+1, M]` bool, the policy."""

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
@@ -19,6 +22,32 @@ _FEWEST_ROWS = 20
 _LEAST_GAIN = 0.2
 
 
+@dataclass(frozen=True)
+class _Replayed:
+    """What the policy's own chains come to on every path.
+
+    Attributes:
+        row: `[T+1, B]`, the place in `[M, T+1]` of the path's first cell.
+        entry: `[T+1, B]`, the place in `[M, T+1, K]` of the sensor the target moved to.
+        alive: bool `[T+1, B]`, whether the target is in the grid and was not yet located.
+        gain: `[T+1, B]`, what having that sensor on gains, 0 where not alive.
+        target: `[M]`, mean return of the paths from each cell.
+    """
+
+    row: Tensor
+    entry: Tensor
+    alive: Tensor
+    gain: Tensor
+    target: Tensor
+
+    def of(self, chosen: slice | Tensor, first_row: int, first_entry: int) -> tuple[Tensor, ...]:
+        """Row, entry, alive and gain of the `chosen` paths, the places in tables that begin later."""
+        if isinstance(chosen, slice):
+            return self.row, self.entry, self.alive, self.gain
+        row, entry = self.row[:, chosen] - first_row, self.entry[:, chosen] - first_entry
+        return row, entry, self.alive[:, chosen], self.gain[:, chosen]
+
+
 class HindsightLoss(nn.Module):
     """Losses of the actor, the critic V and the clocked actor and critic, from fully sensed paths.
 
@@ -32,6 +61,8 @@ class HindsightLoss(nn.Module):
         hidden: hidden units of each net.
         discount: γ of the credit.
         generator: draws the initial weights.
+        max_entries: entries (x, n, sensor) of a table at most, where that leaves one cell; what has more is gone
+            through in parts, a few cells at a time. The losses are the same, up to rounding.
     """
 
     cost: Tensor
@@ -47,6 +78,7 @@ class HindsightLoss(nn.Module):
         hidden: int,
         discount: float,
         generator: torch.Generator,
+        max_entries: int = 2**62,
     ) -> None:
         super().__init__()
         m, choices, device = task.num_cells, task.num_choices, generator.device
@@ -70,79 +102,129 @@ class HindsightLoss(nn.Module):
         actor_loss.allocate((m, choices, self.view.width), device)
         self.actor_loss = actor_loss
         self.discount, self.safe = discount, 1.0 - task.safe_cost / task.reward
+        self._cells_at_once = max(1, max_entries // (choices * self.view.width))
         cost = torch.as_tensor(task.cost / task.reward, dtype=torch.float32, device=device)
         self.register_buffer("cost", pad(cost, (0, 1)))
         self.register_buffer("clocks", torch.arange(choices, device=device).unsqueeze(-1))
         self.register_buffer("gain_scale", torch.ones(2, choices, device=device))
 
     def forward(self, cells: Tensor, on: Tensor, blend: float) -> dict[str, Tensor]:
-        """The losses, each under the name of the net that it trains.
+        """The losses, each under the name of the net that it trains: those of all `parts` added up."""
+        losses: dict[str, Tensor] = {}
+        for part in self.parts(cells, on, blend):
+            losses |= {name: losses[name] + loss if name in losses else loss for name, loss in part.items()}
+        return losses
+
+    def parts(self, cells: Tensor, on: Tensor, blend: float) -> Iterator[dict[str, Tensor]]:
+        """The losses of a few located cells after the others', with the critics' at the end; each can be let go of.
 
         Args:
             cells: int64 `[T+3, B]`, paths: the located cell, then the cells sensed next, M once outside.
             on: bool `[M, T+1, K]`, the sensors that the replayed policy switches on, as the actor's outputs.
             blend: λ of the gain.
         """
-        clocked = self.clocked_critic().squeeze(-1)
+        clocked, value = self.clocked_critic().squeeze(-1), self.critic().view(-1)
         # U(x, T+1) holds r - D for certain; the net learns the rest.
         clocked = torch.cat([clocked[:, :-1], clocked[:, -1:] + self.safe], dim=1)
         advantage = pad(clocked_advantage(clocked.detach()), (0, 1))
-        return self._clocked(cells, clocked, advantage) | self._own(cells, on, advantage, blend)
+        replayed = self._replay(cells, on, advantage, value.detach(), blend)
+        weights = (
+            self._weights(0, *self._first_gains(cells[1], advantage)),
+            self._weights(1, replayed.alive.sum(1), replayed.gain.abs().sum(1)),
+        )
+        known, targets = pad(clocked.detach(), (0, 0, 0, 1)), []
+        slices = self.slices()
+        for rows in slices:
+            chosen = self._paths_from(cells[0], rows)
+            loss, target = self._clocked(cells[:2, chosen], rows, advantage, known)
+            own = self._own(replayed, rows, chosen)
+            targets.append(target)
+            losses = {"actor": (own * weights[1]).sum(), "clocked_actor": (loss * weights[0]).sum()}
+            if rows is slices[-1]:
+                visits = torch.bincount(cells[0], minlength=len(value))
+                losses["critic"] = _squared_error(value, replayed.target, visits) / cells.shape[1]
+                error = _squared_error(clocked, torch.cat(targets), visits.unsqueeze(-1))
+                losses["clocked_critic"] = error / cells.shape[1]
+            yield losses
 
-    def _clocked(self, cells: Tensor, clocked: Tensor, advantage: Tensor) -> dict[str, Tensor]:
-        """From the first move of each path, at every clock: the position is revealed after every action."""
-        near, known = self.near, pad(clocked.detach(), (0, 0, 0, 1))
-        m, k = near.cells.shape
-        start, end = cells[0], cells[1]
-        logits = self.clocked_actor()
-        moves = total((end < m).float(), start * k + near.index(start, end), m * k).view(m, 1, k)
-        stays, visits = moves.sum(-1), torch.bincount(start, minlength=m).unsqueeze(-1)
-        gain = moves * sensing_gain(advantage[:, near.cells].transpose(0, 1), reward=1.0, discount=self.discount)
-        chosen = logits.detach() > 0
-        spent = stays * (chosen * self.cost[near.cells].unsqueeze(1)).sum(-1)
-        following = self.discount * torch.bmm(moves, known[near.cells]).squeeze(1)
-        free = following[:, 1:] + (gain * chosen).sum(-1) - spent
+    def slices(self) -> list[slice]:
+        """The located cells, as many at once as `max_entries` allows."""
+        m, step = len(self.view.cells), self._cells_at_once
+        return [slice(begin, begin + step) for begin in range(0, m, step)] if step < m else [slice(None)]
+
+    def _paths_from(self, start: Tensor, rows: slice) -> slice | Tensor:
+        """Which paths start in the cells `rows`."""
+        if rows == slice(None):
+            return rows
+        return ((start >= rows.start) & (start < rows.stop)).nonzero().squeeze(1)
+
+    def _first_gains(self, end: Tensor, advantage: Tensor) -> tuple[Tensor, Tensor]:
+        """How many paths stay in the grid for a move, and the sum of what sensing gains there, `[T+1]`."""
+        arrived = torch.bincount(end, minlength=advantage.shape[1])[:-1].float()
+        gain = sensing_gain(advantage[:, :-1], reward=1.0, discount=self.discount)
+        return arrived.sum(), gain.abs() @ arrived
+
+    def _clocked(self, moves: Tensor, rows: slice, advantage: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
+        """From the moves `[2, B]` out of the cells `rows`, at every clock: the position is revealed after every action.
+
+        Returns:
+            The clocked actor's losses summed per clock, `[T+1]`, and the clocked critic's targets `[rows, T+2]`.
+        """
+        near, m = self.near, len(self.near.cells)
+        nearby, logits = near.cells[rows], self.clocked_actor(rows)
+        count, k = nearby.shape
+        start, end = moves
+        first = rows.start or 0
+        place = start * k + near.index(start, end) - first * k
+        moved = total((end < m).float(), place, count * k).view(count, 1, k)
+        stays, visits = moved.sum(-1), torch.bincount(start - first, minlength=count).unsqueeze(-1)
+        gain = moved * sensing_gain(advantage[:, nearby].transpose(0, 1), reward=1.0, discount=self.discount)
+        chosen, cost = logits.detach() > 0, self.cost[nearby].unsqueeze(1)
+        following = self.discount * torch.bmm(moved, known[nearby]).squeeze(1)
+        free = following[:, 1:] + (gain * chosen).sum(-1) - stays * (chosen * cost).sum(-1)
         target = torch.cat([free, following[:, :1] + self.safe * stays], dim=1) / visits.clamp(min=1)
-        error = visits * (clocked - target).square()
-        plus, minus = gain.clamp(min=0), gain.clamp(max=0).neg()
-        loss = decision_loss(logits, plus, minus, stays.unsqueeze(-1) * self.cost[near.cells].unsqueeze(1))
-        return {
-            "clocked_actor": self._balanced(0, loss, stays, plus + minus),
-            "clocked_critic": error.sum() / cells.shape[1],
-        }
+        loss = decision_loss(logits, gain.clamp(min=0), gain.clamp(max=0).neg(), stays.unsqueeze(-1) * cost)
+        return loss.sum((0, 2)), target
 
-    def _own(self, cells: Tensor, on: Tensor, advantage: Tensor, blend: float) -> dict[str, Tensor]:
+    def _replay(self, cells: Tensor, on: Tensor, advantage: Tensor, value: Tensor, blend: float) -> _Replayed:
         """From whole paths: the policy's chain is followed from their first cell until it detects or is forced."""
-        view, discount = self.view, self.discount
         m, choices, k = on.shape
         start, moves, end = cells[0], cells[1:], cells[1:-1]
-        logits, value = self.actor(), self.critic().view(m)
         row = start * choices + self.clocks
-        entry = row * k + view.index(start, end)
+        entry = row * k + self.view.index(start, end)
         hits, inside = look(on, entry) & (end < m), moves < m
-        located = look(pad(value.detach(), (0, 1)), moves)
-        spent = look((on * self.cost[view.cells].unsqueeze(1)).sum(-1), row)
-        returns = chain_returns(hits, inside, spent, located, reward=1.0, safe_cost=1.0 - self.safe, discount=discount)
+        located = look(pad(value, (0, 1)), moves)
+        spent = look(torch.cat([self._set_cost(on[rows], rows) for rows in self.slices()]), row)
+        discount, safe_cost = self.discount, 1.0 - self.safe
+        returns = chain_returns(hits, inside, spent, located, reward=1.0, safe_cost=safe_cost, discount=discount)
         clocked = look(advantage, self.clocks * (m + 1) + end)
         gain = sensing_gain(clocked, located[:-1] - returns[1:], reward=1.0, discount=discount, blend=blend)
         alive = inside[:-1].clone()
         for n in range(1, choices):
             alive[n] &= alive[n - 1] & ~hits[n - 1]
-        arrivals = total(alive.float(), row, m * choices).view(m, choices)
-        price = arrivals.unsqueeze(-1) * self.cost[view.cells].unsqueeze(1)
-        credit = SensorCredit(entry, gain * alive, arrivals, price)
-        loss = self.actor_loss(logits, credit)
         visits = torch.bincount(start, minlength=m)
-        error = visits * (value - total(returns[0], start, m) / visits.clamp(min=1)).square()
-        return {
-            "actor": self._balanced(1, loss, arrivals, credit.plus + credit.minus),
-            "critic": error.sum() / cells.shape[1],
-        }
+        return _Replayed(row, entry, alive, gain * alive, total(returns[0], start, m) / visits.clamp(min=1))
 
-    def _balanced(self, which: int, loss: Tensor, arrivals: Tensor, gains: Tensor) -> Tensor:
-        """Sum of a loss, each clock by its own number of rows and its running mean gain, so that rare clocks count."""
-        count = arrivals.expand(-1, loss.shape[1]).sum(0)
-        mean = gains.sum((0, 2)) / count.clamp(min=1)
-        self.gain_scale[which].lerp_(mean, _GAIN_SCALE_RATE)
-        weight = 1.0 / (count.clamp(min=_FEWEST_ROWS) * self.gain_scale[which].clamp(min=_LEAST_GAIN))
-        return (loss.sum((0, 2)) * weight).sum()
+    def _set_cost(self, on: Tensor, rows: slice) -> Tensor:
+        """C(A) `[rows, T+1]` of the sets `on` of the cells `rows`."""
+        return (on * self.cost[self.view.cells[rows]].unsqueeze(1)).sum(-1)
+
+    def _own(self, replayed: _Replayed, rows: slice, chosen: slice | Tensor) -> Tensor:
+        """`[T+1]`, the actor's losses per clock, on the `chosen` paths, those from the cells `rows`."""
+        logits = self.actor(rows)
+        count, choices, k = logits.shape
+        first = (rows.start or 0) * choices
+        row, entry, alive, gain = replayed.of(chosen, first, first * k)
+        arrivals = total(alive.float(), row, count * choices).view(count, choices)
+        price = arrivals.unsqueeze(-1) * self.cost[self.view.cells[rows]].unsqueeze(1)
+        credit = SensorCredit(entry, gain, arrivals, price, rows)
+        return self.actor_loss(logits, credit).sum((0, 2))
+
+    def _weights(self, which: int, count: Tensor, gain: Tensor) -> Tensor:
+        """`[T+1]`: each clock by its own number of rows and its running mean gain, so that rare clocks count."""
+        self.gain_scale[which].lerp_(gain / count.clamp(min=1), _GAIN_SCALE_RATE)
+        return 1.0 / (count.clamp(min=_FEWEST_ROWS) * self.gain_scale[which].clamp(min=_LEAST_GAIN))
+
+
+def _squared_error(values: Tensor, targets: Tensor, visits: Tensor) -> Tensor:
+    return (visits * (values - targets).square()).sum()

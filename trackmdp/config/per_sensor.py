@@ -46,6 +46,11 @@ class PerSensor(Algo):
         "units of each net's hidden layer; null: by the size of the problem", unit="units", ge=1, le=4096
     )
     buffer_size: int = option("path segments kept for replay", unit="segments", ge=1)
+    max_entries: int = option(
+        "entries (located cell, misses, sensor) of the losses' tables at once; larger ones are gone through in parts",
+        unit="entries",
+        ge=1,
+    )
 
 
 @choice("algo", "hindsight")

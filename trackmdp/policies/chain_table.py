@@ -55,10 +55,13 @@ class CellClockNet(nn.Module):
         self.weight = normal(hidden, outputs, std=hidden**-0.5)
         self.bias = nn.Parameter(torch.full((outputs,), bias, device=generator.device))
 
-    def forward(self) -> Tensor:
-        """`[M, num_clocks, outputs]`, the outputs of every row."""
-        rows = (self.cell + self.clock + self.pair).relu() @ self.weight + self.bias
-        return rows if self.groups is None else rows.index_select(0, self.groups)
+    def forward(self, cells: slice = slice(None)) -> Tensor:
+        """`[M, num_clocks, outputs]`, the outputs of every row, or of the rows of some `cells` alone."""
+        embedding = self.cell + self.clock + self.pair
+        if self.groups is None and cells != slice(None):
+            embedding = embedding[cells]
+        rows = embedding.relu() @ self.weight + self.bias
+        return rows if self.groups is None else rows.index_select(0, self.groups[cells])
 
 
 class Neighbourhood(nn.Module):
