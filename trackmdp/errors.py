@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-__all__ = ["FAILED", "INTERRUPTED", "USER_MISTAKE", "Preempted", "RunError", "UserError"]
+import importlib.util
+
+__all__ = ["FAILED", "INTERRUPTED", "USER_MISTAKE", "Preempted", "RunError", "UserError", "require"]
 
 FAILED, USER_MISTAKE, INTERRUPTED = 1, 2, 130
 """Exit statuses of a command: a bug or a run that broke down, a user's mistake, Ctrl-C."""
@@ -33,3 +35,13 @@ class Preempted(BaseException):
     def __init__(self, signal: int) -> None:
         super().__init__(f"stopped by signal {signal}")
         self.signal = signal
+
+
+def require(module: str, extra: str, option: str) -> None:
+    """Refuse `option` where the third-party `module`, which comes with the extra `trackmdp[extra]`, is not installed.
+
+    Raises:
+        UserError: it is not.
+    """
+    if importlib.util.find_spec(module) is None:
+        raise UserError(f"{option}: needs {module}, which pip install 'trackmdp[{extra}]' adds")

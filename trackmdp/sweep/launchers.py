@@ -5,7 +5,6 @@ A launcher reports nothing: what became of each run stands in its folder, in wha
 
 from __future__ import annotations
 
-import importlib.util
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -14,14 +13,13 @@ from functools import partial
 
 from trackmdp.config import TrainConfig
 from trackmdp.config.sweeps import Basic, Joblib, Launcher, Ray, Submitit
-from trackmdp.errors import UserError
+from trackmdp.errors import require
 from trackmdp.sweep.apart import context_for
 from trackmdp.sweep.job import Launch, run_job
 from trackmdp.sweep.plan import Job
 
 __all__ = ["make_launcher", "threads_of"]
 
-_EXTRAS = {"joblib": "sweep", "submitit": "slurm", "ray": "ray"}
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -38,16 +36,17 @@ def make_launcher(cfg: Launcher) -> Launch:
 
 
 def _parallel(cfg: Launcher) -> Launch:
+    option = f"hydra/launcher={cfg.name}"
     if isinstance(cfg, Joblib):
-        _require("joblib", cfg.name)
+        require("joblib", "sweep", option)
         return partial(_joblib, cfg)
     if isinstance(cfg, Submitit):
-        _require("submitit", cfg.name)
+        require("submitit", "slurm", option)
         from trackmdp.sweep import cluster
 
         return cluster.launcher(cfg)
     assert isinstance(cfg, Ray)
-    _require("ray", cfg.name)
+    require("ray", "ray", option)
     from trackmdp.sweep import on_ray
 
     return partial(on_ray.launch, cfg)
@@ -64,12 +63,6 @@ def threads_of(jobs: Sequence[Job]) -> Iterator[None]:
     finally:
         for name in unset:
             os.environ.pop(name, None)
-
-
-def _require(module: str, name: str) -> None:
-    if importlib.util.find_spec(module) is None:
-        extra = _EXTRAS[module]
-        raise UserError(f"hydra/launcher={name}: needs {module}, which pip install 'trackmdp[{extra}]' adds")
 
 
 def _basic(jobs: Sequence[Job]) -> None:

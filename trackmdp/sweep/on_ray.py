@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import signal
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Any
 
 from trackmdp.config.sweeps import Ray
 from trackmdp.errors import UserError
 from trackmdp.sweep.job import run_job
 from trackmdp.sweep.plan import Job
+from trackmdp.training.signals import kept_sigterm
 
 __all__ = ["launch"]
 
@@ -26,7 +25,7 @@ def launch(cfg: Ray, jobs: Sequence[Job]) -> None:
     """
     import ray
 
-    with _kept_handlers():
+    with kept_sigterm():  # which asks the sweep to stop
         _join(cfg, ray)
     try:
         task = ray.remote(num_cpus=cfg.cpus_per_run, num_gpus=cfg.gpus_per_run, max_retries=0)(run_job)
@@ -47,13 +46,3 @@ def _join(cfg: Ray, ray: Any) -> None:
     except (ConnectionError, ValueError, RuntimeError) as error:
         reason = " ".join(str(error).split())
         raise UserError(f"hydra.launcher.address={cfg.address}: expected a Ray cluster ({reason})") from error
-
-
-@contextmanager
-def _kept_handlers() -> Iterator[None]:
-    """Ray takes over SIGTERM, which asks the sweep to stop."""
-    before = signal.getsignal(signal.SIGTERM)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)

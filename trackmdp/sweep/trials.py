@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -13,7 +12,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import IntervalSweep, Override, RangeSweep
 
 from trackmdp.config.sweeps import Optuna
-from trackmdp.errors import UserError
+from trackmdp.errors import UserError, require
 from trackmdp.seeding import derive
 from trackmdp.sweep.plan import Job
 from trackmdp.sweep.state import run_of
@@ -42,8 +41,7 @@ def trials(
     Raises:
         UserError: Optuna is not installed, there is nothing to search, or the study is one of another search.
     """
-    if importlib.util.find_spec("optuna") is None:
-        raise UserError("hydra/sweeper=optuna: needs optuna, which pip install 'trackmdp[optuna]' adds")
+    require("optuna", "optuna", "hydra/sweeper=optuna")
     parsed = [OverridesParser.create().parse_override(word) for word in words]
     searched = {each.get_key_element(): each for each in parsed if each.is_sweep_override()}
     fixed = [word for word, each in zip(words, parsed, strict=True) if not each.is_sweep_override()]

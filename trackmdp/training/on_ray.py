@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-import signal
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -13,7 +11,8 @@ from torchrl.collectors import BaseCollector
 from torchrl.collectors.distributed import RayCollector
 
 from trackmdp.config.learning import RayWorkers
-from trackmdp.errors import UserError
+from trackmdp.errors import UserError, require
+from trackmdp.training.signals import kept_sigterm
 from trackmdp.world.env import TrackEnv
 
 __all__ = ["make_collector"]
@@ -36,26 +35,23 @@ def make_collector(
     Raises:
         UserError: Ray is not installed, or there is no such cluster.
     """
-    if importlib.util.find_spec("ray") is None:
-        raise UserError("collector=ray: needs ray, which pip install 'trackmdp[ray]' adds")
+    require("ray", "ray", "collector=ray")
     register = common.pop("auto_register_policy_transforms")
-    before = signal.getsignal(signal.SIGTERM)  # Ray takes it over, and a scheduler's signal must reach the run
     try:
-        made = _Collector(
-            envs,
-            policy,
-            sync=True,
-            ray_init_config=_cluster(cfg),
-            remote_configs={"num_cpus": cfg.cpus_per_worker, "num_gpus": cfg.gpus_per_worker},
-            collector_kwargs={"auto_register_policy_transforms": register, "track_traj_ids": False},
-            postproc=_rows,
-            **common,
-        )
+        with kept_sigterm():  # a scheduler's signal must reach the run
+            made = _Collector(
+                envs,
+                policy,
+                sync=True,
+                ray_init_config=_cluster(cfg),
+                remote_configs={"num_cpus": cfg.cpus_per_worker, "num_gpus": cfg.gpus_per_worker},
+                collector_kwargs={"auto_register_policy_transforms": register, "track_traj_ids": False},
+                postproc=_rows,
+                **common,
+            )
     except (ConnectionError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise UserError(f"collector.address={cfg.address}: expected a Ray cluster ({reason})") from error
-    finally:
-        signal.signal(signal.SIGTERM, before)
     made.update_policy_weights_()
     return made
 

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import signal
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType, TracebackType
+from typing import Self
 
-__all__ = ["Signals"]
+__all__ = ["Signals", "kept_sigterm"]
 
 _HEARD = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
 
@@ -20,7 +23,7 @@ class Signals:
     def __init__(self) -> None:
         self.received = 0
 
-    def __enter__(self) -> Signals:
+    def __enter__(self) -> Self:
         self._before = {}
         if threading.current_thread() is threading.main_thread():
             self._before = {number: signal.signal(number, self._note) for number in _HEARD}
@@ -35,3 +38,13 @@ class Signals:
     def _note(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
         self.received = number
         signal.signal(number, self._before[signal.Signals(number)])
+
+
+@contextmanager
+def kept_sigterm() -> Iterator[None]:
+    """Afterwards SIGTERM acts as before, though what is done inside takes it over, as Ray does when it starts."""
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
