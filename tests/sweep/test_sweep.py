@@ -7,16 +7,21 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 
 from tests.sweep.runs import ROOT, TINY, here, states, swept, table
 from tests.typed import stub
 from trackmdp.cli import main
 from trackmdp.errors import Preempted, RunError
+from trackmdp.sweep.job import stop_signal
+from trackmdp.sweep.plan import Job
 from trackmdp.sweep.state import read_plan, run_of, runs_of
+from trackmdp.sweep.sweep import sweep
 from trackmdp.training.lock import locked
 
 __all__ = ["here"]
@@ -204,6 +209,21 @@ def test_states_of_a_run(tmp_path: Path) -> None:
     assert (run_of(folder).state, run_of(folder).reason) == ("failed", "no luck")
     (folder / "summary.json").write_text('{"policy": {}}')
     assert run_of(folder).state == "done"
+
+
+def test_a_signal_is_told_to_the_runs_and_ends_the_sweep(tmp_path: Path) -> None:
+    one, two = (Job("train", tmp_path, name, (), None) for name in ("one", "two"))
+    before, seen = signal.getsignal(signal.SIGTERM), []
+
+    def launch(jobs: Sequence[Job]) -> None:
+        signal.raise_signal(signal.SIGTERM)
+        seen.append(([job.name for job in jobs], stop_signal(tmp_path), signal.getsignal(signal.SIGTERM)))
+
+    with pytest.raises(Preempted) as told:
+        sweep(tmp_path, "train", "a line", [[one], [two]], launch, Console(quiet=True))
+    assert seen == [(["one"], signal.SIGTERM, before)]
+    assert (told.value.signal, stop_signal(tmp_path), signal.getsignal(signal.SIGTERM)) == (signal.SIGTERM, 0, before)
+    assert states(tmp_path) == ["waiting"]
 
 
 def test_skipping_imports_nothing_heavy(here: Path) -> None:

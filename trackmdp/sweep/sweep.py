@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from types import FrameType, TracebackType
+from typing import Self
 
 from rich.console import Console
 
@@ -22,6 +22,7 @@ from trackmdp.sweep.plan import Job
 from trackmdp.sweep.state import DONE, FAILED, SUMMARY, Run, run_of, runs_of, write_plan
 from trackmdp.sweep.table import show, status_of, write_table
 from trackmdp.training.lock import locked
+from trackmdp.training.signals import Signals
 
 __all__ = ["sweep"]
 
@@ -119,28 +120,26 @@ def _tell_failures(command: str, runs: Sequence[Run]) -> None:
         sys.stderr.write(f"trackmdp {command}: {len(failed)} of {len(runs)} runs failed\n")
 
 
-class _Stop:
-    """While entered, a signal asks all runs to save and end; a second one of its kind acts as it did before."""
+class _Stop(Signals):
+    """A signal also asks the runs, in whatever process they are, to save and end."""
 
     def __init__(self, folder: Path) -> None:
+        super().__init__()
         self._file = folder / STOP
-        self.received = 0
 
-    def __enter__(self) -> _Stop:
+    def __enter__(self) -> Self:
         self._file.unlink(missing_ok=True)
-        heard = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
-        self._before = {number: signal.signal(number, self._note) for number in heard}
-        return self
+        return super().__enter__()
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
+        super().__exit__(kind, error, traceback)
         if kind is None:  # else jobs elsewhere may still be about to look
             self._file.unlink(missing_ok=True)
 
-    def _note(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
-        self.received = number
-        self._file.write_text(str(number), encoding="ascii")
-        signal.signal(number, self._before[signal.Signals(number)])
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        try:
+            self._file.write_text(str(number), encoding="ascii")
+        finally:
+            super()._note(number, frame)
