@@ -6,6 +6,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from trackmdp.algos.paths import CellIndex, sensed_steps, stratified_starts
+
 __all__ = ["MoveBuffer", "sensed_moves"]
 
 
@@ -25,7 +27,7 @@ class MoveBuffer:
         self.num_cells, self._capacity, self._generator = num_cells, capacity, generator
         # Oldest first; no grid has more cells than 16 bits count.
         self._moves = torch.empty(2, 0, dtype=torch.int16, device=generator.device)
-        self._index: tuple[Tensor, Tensor, Tensor] | None = None
+        self._index: tuple[Tensor, CellIndex] | None = None
 
     def __len__(self) -> int:
         return self._moves.shape[1]
@@ -46,32 +48,22 @@ class MoveBuffer:
 
         The first moves are stratified: out of each cell the paths leave in the proportions of the moves seen.
         """
-        ends, first, seen = self._index = self._index or self._sort()
-        device, m = ends.device, self.num_cells
-        order = torch.arange(count, device=device)
-        offset = torch.randint(m, (1,), generator=self._generator, device=device)
-        draws = torch.rand(steps, count, generator=self._generator, device=device)
-        same_start = (m - 1 + count - order % m).div(m, rounding_mode="floor")
-        draws[0] = (order // m + draws[0]) / same_start
-        cells = [(order + offset) % m]
-        for share in draws:
-            at = cells[-1]
-            chosen = (share * seen.index_select(0, at)).long() + first.index_select(0, at)
-            cells.append(ends.index_select(0, chosen))
+        ends, index = self._index = self._index or self._sort()
+        start, draws = stratified_starts(count, steps, self.num_cells, self._generator)
+        cells = [start]
+        for draw in draws:
+            cells.append(ends.index_select(0, index.pick(cells[-1], draw)))
         return torch.stack(cells)
 
-    def _sort(self) -> tuple[Tensor, Tensor, Tensor]:
-        """All ends in the order of (start, end), and per cell where its own begin and how many they are.
+    def _sort(self) -> tuple[Tensor, CellIndex]:
+        """All ends in the order of (start, end), and where those of each cell are.
 
         M leads to M, and so does a cell out of which no move was seen.
         """
         m = self.num_cells
         start, end = self.moves()
         ends = torch.cat([(start * (m + 1) + end).sort().values % (m + 1), end.new_tensor([m])])
-        seen = torch.bincount(start, minlength=m + 1)
-        first = torch.where(seen > 0, seen.cumsum(0) - seen, len(start))
-        # Half a float's spacing below the count, so that a draw close to 1 does not round up to the next cell's moves.
-        return ends, first, seen.clamp(min=1).float() * (1.0 - 2.0**-24)
+        return ends, CellIndex.of(start, m)
 
     def state_dict(self) -> dict[str, Tensor]:
         """The moves; the generator is its owner's to save."""
@@ -83,17 +75,10 @@ class MoveBuffer:
 
 
 def sensed_moves(batch: TensorDictBase, num_cells: int) -> tuple[Tensor, Tensor]:
-    """Cells before and after each fully sensed step of a located target, in a collected batch `[B, time]`.
-
-    Read is only what the tracker saw: where it located the target, and that it left the grid. Steps that did not sense
-    every cell are passed over, also where they detected: to keep the detections alone would favour the sensed cells.
+    """Cells before and after each of the `sensed_steps` of a collected batch `[B, time]`.
 
     Returns:
         Two int64 `[K]`; an end of M stands for outside.
     """
-    after = batch["next"]
-    exited = after["terminated"].squeeze(-1)
-    located = (after["steps_since_detection"] == 0) | exited
-    whole = batch["action"].all(-1) & (batch["steps_since_detection"] == 0) & located
-    end = torch.where(exited, num_cells, after["last_cell"])
+    whole, end = sensed_steps(batch, num_cells)
     return batch["last_cell"][whole], end[whole]

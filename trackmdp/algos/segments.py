@@ -9,6 +9,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.functional import pad
 
+from trackmdp.algos.paths import CellIndex, sensed_steps, stratified_starts
+
 __all__ = ["SegmentBuffer"]
 
 
@@ -30,7 +32,7 @@ class SegmentBuffer:
         # Oldest first; no grid has more cells than 16 bits count.
         self._segments = torch.empty(steps + 1, 0, dtype=torch.int16, device=generator.device)
         self._tail: dict[str, Tensor] = {}
-        self._index: tuple[Tensor, Tensor, Tensor] | None = None
+        self._index: tuple[Tensor, CellIndex] | None = None
 
     def __len__(self) -> int:
         return self._segments.shape[1]
@@ -58,32 +60,21 @@ class SegmentBuffer:
 
         The first moves are stratified: out of each cell the paths leave in the proportions of the moves seen.
         """
-        segments, first, seen = self._index = self._index or self._sort()
-        device, m = segments.device, self.num_cells
-        place = torch.arange(count, device=device)
-        offset = torch.randint(m, (1,), generator=self._generator, device=device)
-        draws = torch.rand(count, generator=self._generator, device=device)
-        same_start = (m - 1 + count - place % m).div(m, rounding_mode="floor")
-        start = (place + offset) % m
-        share = (place // m + draws) / same_start
-        chosen = (share * seen[start]).long() + first[start]
-        cells = segments[: steps + 1].index_select(1, chosen).long()
+        segments, index = self._index = self._index or self._sort()
+        start, (draws,) = stratified_starts(count, 1, self.num_cells, self._generator)
+        cells = segments[: steps + 1].index_select(1, index.pick(start, draws)).long()
         cells[0] = start
         return cells
 
-    def _sort(self) -> tuple[Tensor, Tensor, Tensor]:
-        """All segments in the order of their first moves, and per cell where its own begin and how many they are.
+    def _sort(self) -> tuple[Tensor, CellIndex]:
+        """All segments in the order of their first moves, and where those of each cell are.
 
         One more, of M alone, stands for the cells in which no segment begins.
         """
         m = self.num_cells
         start, end = self._segments[:2].long()
         order = (start * (m + 1) + end).argsort(stable=True)
-        seen = torch.bincount(start, minlength=m)
-        first = torch.where(seen > 0, seen.cumsum(0) - seen, len(self))
-        # Half a float's spacing below the count, so that a draw close to 1 does not round up to the next cell's.
-        share = seen.clamp(min=1).float() * (1.0 - 2.0**-24)
-        return pad(self._segments.index_select(1, order), (0, 1), value=m), first, share
+        return pad(self._segments.index_select(1, order), (0, 1), value=m), CellIndex.of(start, m)
 
     def state_dict(self) -> dict[str, Any]:
         """The segments, and the end of the last batch; the generator is its owner's to save."""
@@ -97,20 +88,13 @@ class SegmentBuffer:
 
 
 def _frames(batch: TensorDictBase, num_cells: int) -> dict[str, Tensor]:
-    """`[B, time]` of a collected batch: the cell before and after each step, whether it was sensed, whether it ended.
-
-    Read is only what the tracker saw, as in `sensed_moves`.
-    """
-    after = batch["next"]
-    exited = after["terminated"].squeeze(-1)
-    located = (after["steps_since_detection"] == 0) | exited
-    whole = batch["action"].all(-1) & (batch["steps_since_detection"] == 0) & located
-    end = torch.where(exited, num_cells, after["last_cell"])
+    """`[B, time]` of a collected batch: the cells around each step, whether it was sensed, whether it ended."""
+    whole, end = sensed_steps(batch, num_cells)
     return {
         "start": batch["last_cell"].to(torch.int16),
         "end": end.to(torch.int16),
         "whole": whole,
-        "done": after["done"].squeeze(-1),
+        "done": batch["next", "done"].squeeze(-1),
     }
 
 

@@ -1,0 +1,63 @@
+"""What the buffers of sensed paths share: which steps count, and how paths are drawn from each cell alike."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+__all__ = ["CellIndex", "sensed_steps", "stratified_starts"]
+
+
+class CellIndex(NamedTuple):
+    """Where those of each cell begin, among entries in the order of the cell they start in.
+
+    Attributes:
+        first: `[M + 1]` int64; of a cell without entries, the place after the last one.
+        share: `[M + 1]` float, how many they are, at least one, less what keeps a draw close to 1 among them.
+    """
+
+    first: Tensor
+    share: Tensor
+
+    @classmethod
+    def of(cls, start: Tensor, num_cells: int) -> CellIndex:
+        """Index entries `[K]` by the cells they start in, in whatever order they come."""
+        seen = torch.bincount(start, minlength=num_cells + 1)
+        first = torch.where(seen > 0, seen.cumsum(0) - seen, len(start))
+        # Half a float's spacing below the count, so that a draw close to 1 does not round up to the next cell's.
+        return cls(first, seen.clamp(min=1).float() * (1.0 - 2.0**-24))
+
+    def pick(self, cells: Tensor, draws: Tensor) -> Tensor:
+        """Places of entries of `cells`, one for each draw from [0, 1)."""
+        return (draws * self.share.index_select(0, cells)).long() + self.first.index_select(0, cells)
+
+
+def stratified_starts(count: int, steps: int, num_cells: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Cells `[count]` that paths start in, all equally often, and the draws `[steps, count]` that pick their moves.
+
+    The draws of the first step are stratified: those of one cell are spread evenly over [0, 1).
+    """
+    device, m = generator.device, num_cells
+    order = torch.arange(count, device=device)
+    offset = torch.randint(m, (1,), generator=generator, device=device)
+    draws = torch.rand(steps, count, generator=generator, device=device)
+    same_start = (m - 1 + count - order % m).div(m, rounding_mode="floor")
+    draws[0] = (order // m + draws[0]) / same_start
+    return (order + offset) % m, draws
+
+
+def sensed_steps(batch: TensorDictBase, num_cells: int) -> tuple[Tensor, Tensor]:
+    """Which steps of a collected batch `[B, time]` count, and the cell after each of those, M for outside.
+
+    Fully sensed steps of a located target count. Read is only what the tracker saw: where it located the target, and
+    that it left the grid. Steps that did not sense every cell are passed over, also where they detected: to keep the
+    detections alone would favour the sensed cells.
+    """
+    after = batch["next"]
+    exited = after["terminated"].squeeze(-1)
+    located = (after["steps_since_detection"] == 0) | exited
+    whole = batch["action"].all(-1) & (batch["steps_since_detection"] == 0) & located
+    return whole, torch.where(exited, num_cells, after["last_cell"])
