@@ -123,6 +123,15 @@ def test_a_curve_keeps_its_ends_and_few_points(sweep: Path) -> None:
     assert gaps[0] < gaps[-1]
 
 
+@pytest.mark.parametrize("text", ["{", "[]", "{}"])
+def test_a_failure_or_a_plan_that_says_nothing_is_no_obstacle(sweep: Path, text: str) -> None:
+    for name in ("a2c-0.16-0/failed.json", "sweep.json"):
+        (sweep / name).write_text(text)
+    found = gather(sweep, make_world)
+    assert problems(found)["a2c-0.16-0"] == "failed: no reason given"
+    assert found.manifest["planned"] is None
+
+
 def test_what_is_wrong_with_a_run_is_named(sweep: Path) -> None:
     (sweep / "a2c-0.16-0/summary.json").unlink()
     (sweep / "a2c-0.16-1/summary.json").write_text('{"frames": 3')

@@ -20,7 +20,7 @@ from trackmdp.reports.grouping import Study, study, world_key
 from trackmdp.reports.results import FIGURES, Motion, Point, Problem, Results, Run
 from trackmdp.solvers import bounds, horizon, qmdp
 from trackmdp.solvers.chains import evaluate
-from trackmdp.sweep.state import run_of
+from trackmdp.sweep.state import FAILED, PLAN, SUMMARY, read_json, run_of
 from trackmdp.world.model import World
 
 __all__ = ["flatten", "gather", "planned", "run_folders"]
@@ -69,18 +69,15 @@ def gather(folder: Path, make_world: Callable[[WorldConfig], World]) -> Results:
 
 def planned(folder: Path) -> Mapping[str, Any] | None:
     """The content of `sweep.json`, where there is a readable one."""
-    try:
-        plan = json.loads((folder / "sweep.json").read_text(encoding="utf-8"))
-        return plan if isinstance(plan, dict) and isinstance(plan.get("jobs"), list) else None
-    except (OSError, ValueError):
-        return None
+    plan = read_json(folder / PLAN)
+    return plan if isinstance(plan.get("jobs"), list) else None
 
 
 def run_folders(folder: Path, plan: Mapping[str, Any] | None) -> list[str]:
     """The runs' folders, relative to the sweep's, in a fixed order: those that were planned, and those found."""
     listed = [str(job["folder"]) for job in plan["jobs"] if isinstance(job, dict) and "folder" in job] if plan else []
     named = {_relative(folder, name) for name in listed}
-    marks = ("config.yaml", "failed.json", "summary.json")
+    marks = ("config.yaml", FAILED, SUMMARY)
     found = {file.parent.relative_to(folder).as_posix() for mark in marks for file in folder.rglob(mark)}
     return sorted((named | found) - {"."}, key=_natural)
 
@@ -100,28 +97,21 @@ def _natural(name: str) -> list[tuple[int, str]]:
 def _read_run(folder: Path, name: str) -> tuple[Run, Mapping[str, Any]] | Problem:
     """A run and its summary, or why there is none."""
     place = folder / name
-    if (place / "failed.json").is_file():
-        return Problem(name, f"failed: {_reason(place / 'failed.json')}")
+    if (place / FAILED).is_file():
+        return Problem(name, f"failed: {read_json(place / FAILED).get('reason', 'no reason given')}")
     if not place.is_dir() or not (place / "config.yaml").is_file():
         return Problem(name, "not started")
-    if not (place / "summary.json").is_file():
+    if not (place / SUMMARY).is_file():
         running = run_of(place).state == "running"
-        return Problem(name, "still running" if running else "cut: it has no summary.json")
+        return Problem(name, "still running" if running else f"cut: it has no {SUMMARY}")
     settings = flatten(_config(place))
     if not settings.keys() >= {"algo.name", "seed", "grid.size", "kernel.name"}:
         return Problem(name, "its config.yaml cannot be read")
     try:
-        summary = json.loads((place / "summary.json").read_text(encoding="utf-8"))
+        summary = json.loads((place / SUMMARY).read_text(encoding="utf-8"))
         return Run(name, settings, _figures(summary), str(summary["config_sha256"])), summary
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        return Problem(name, f"its summary.json cannot be read ({' '.join(str(error).split())})")
-
-
-def _reason(file: Path) -> str:
-    try:
-        return str(json.loads(file.read_text(encoding="utf-8"))["reason"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return "no reason given"
+        return Problem(name, f"its {SUMMARY} cannot be read ({' '.join(str(error).split())})")
 
 
 def _config(place: Path) -> Mapping[str, Any]:

@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from trackmdp.durable import whole_file
 from trackmdp.errors import UserError
 from trackmdp.reports import critique
 from trackmdp.reports.calibration import (
@@ -22,6 +21,7 @@ from trackmdp.reports.calibration import (
     sensitivity,
 )
 from trackmdp.solvers.theorems import Check
+from trackmdp.training.metrics import write_text
 from trackmdp.world.paper import SUPPORTS
 
 __all__ = ["FILE", "Openings", "compute", "load", "save"]
@@ -52,8 +52,7 @@ def compute(say: Callable[[str], None]) -> Openings:
 
 def save(openings: Openings, folder: Path) -> None:
     """Write `paper.json`."""
-    with whole_file(folder / FILE) as stream:
-        stream.write((json.dumps(_packed(openings), separators=(",", ":"), ensure_ascii=False) + "\n").encode())
+    write_text(folder / FILE, json.dumps(_packed(openings), separators=(",", ":"), ensure_ascii=False) + "\n")
 
 
 def load(folder: Path) -> Openings | None:

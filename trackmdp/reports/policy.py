@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from trackmdp.durable import whole_file
 from trackmdp.errors import UserError
+from trackmdp.training.metrics import write_bytes
 from trackmdp.world.model import Array, BoolArray
 
 __all__ = ["FILE", "Policy", "arrays", "pack", "pack_all", "read", "unpack_all", "write"]
@@ -86,8 +86,7 @@ def unpack_all(content: bytes) -> dict[str, Policy]:
 
 def write(file: Path, policy: Policy) -> None:
     """Write the policy, whole or not at all."""
-    with whole_file(file) as stream:
-        stream.write(pack(policy))
+    write_bytes(file, pack(policy))
 
 
 def read(file: Path) -> Policy:

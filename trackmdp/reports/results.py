@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from trackmdp.durable import whole_file
 from trackmdp.errors import UserError
 from trackmdp.reports.policy import Policy, arrays, pack_all, unpack_all
+from trackmdp.training.metrics import write_bytes, write_text
 from trackmdp.world.model import Array
 
 __all__ = ["FIGURES", "FORMAT", "Motion", "Point", "Problem", "Results", "Run", "is_stored", "load", "save"]
@@ -152,15 +152,15 @@ def save(results: Results, folder: Path) -> None:
         ]
         for run in results.runs
     ]
-    _write(folder / "runs.csv", _csv(["run", *varied, *FIGURES], rows))
+    write_bytes(folder / "runs.csv", _csv(["run", *varied, *FIGURES], rows))
     points = [
         [index[name], point.iteration, point.frames, f"{point.seconds:.4g}", f"{point.aihtr:.7g}"]
         for name, curve in sorted(results.curves.items(), key=lambda item: index[item[0]])
         for point in curve
     ]
-    _write(folder / "curves.csv", _csv(["run", "iteration", "frames", "seconds", "aihtr"], points))
-    _write(folder / "policies.npz", pack_all({name: results.policies[name] for name in sorted(results.policies)}))
-    _write(folder / "worlds.npz", _pack_motions(results.motions))
+    write_bytes(folder / "curves.csv", _csv(["run", "iteration", "frames", "seconds", "aihtr"], points))
+    write_bytes(folder / "policies.npz", pack_all({name: results.policies[name] for name in sorted(results.policies)}))
+    write_bytes(folder / "worlds.npz", _pack_motions(results.motions))
     manifest = {
         "format": FORMAT,
         **results.manifest,
@@ -168,7 +168,7 @@ def save(results: Results, folder: Path) -> None:
         "settings": common,
         "config_sha256": {run.name: run.config_sha256 for run in results.runs},
     }
-    _write(folder / "manifest.json", (json.dumps(manifest, indent=1, ensure_ascii=False) + "\n").encode())
+    write_text(folder / "manifest.json", json.dumps(manifest, indent=1, ensure_ascii=False) + "\n")
 
 
 def load(folder: Path) -> Results:
@@ -273,8 +273,3 @@ def _csv(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> bytes:
     writer.writerow(head)
     writer.writerows(rows)
     return stream.getvalue().encode()
-
-
-def _write(file: Path, content: bytes) -> None:
-    with whole_file(file) as stream:
-        stream.write(content)
