@@ -38,8 +38,8 @@ def _variant(seeds: list[int], sensing: str, frames: int) -> list[dict[str, Any]
         f"cost.sensor={','.join(map(str, COSTS))}",
     ]
     with tempfile.TemporaryDirectory() as folder:
-        sweep = [f"hydra.sweep.dir={folder}", "hydra.sweep.subdir=${hydra.job.num}"]
-        subprocess.run([sys.executable, "-m", "trackmdp.cli", "train", "-m", *words, *sweep], check=True)
+        line = ["train", "-m", *words, f"hydra.sweep.dir={folder}"]
+        subprocess.run([sys.executable, "-m", "trackmdp.cli", *line], check=True)
         runs = [_run(Path(file).parent) for file in sorted(Path(folder).glob("*/summary.json"))]
     pairs = [(support, cost) for support in SUPPORTS for cost in COSTS]
     return [_row(sensing, pair, [run for run in runs if run["pair"] == pair]) for pair in pairs]

@@ -26,6 +26,15 @@ BUDGET = 300
 
 
 @dataclass(frozen=True)
+class Instance:
+    """Of the paper's worlds the one that all learn in."""
+
+    support_size: int
+    cost: float
+    t_max: int
+
+
+@dataclass(frozen=True)
 class Run:
     """One learner's way to the goal, by the time of its whole process: imports and compilation count."""
 
@@ -57,7 +66,7 @@ def peers(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[dict
     runs = []
     with on_one_core():
         for seed in cfg.seeds:
-            runs.append(_ours(cfg, seed, device))
+            runs.append(_ours(cfg, instance, seed, device))
             runs += [_peer(script, python, instance, seed, cfg.threads) for script, python in scripts]
     return [_row(run, _first(runs, run.seed)) for run in runs]
 
@@ -78,19 +87,16 @@ def _scripts(cfg: BenchmarkConfig) -> list[tuple[Path, str]]:
     return list(zip(scripts, pythons, strict=True))
 
 
-def _instance(cfg: BenchmarkConfig) -> list[str]:
+def _instance(cfg: BenchmarkConfig) -> Instance:
     kernel, cost = cfg.kernel, cfg.cost
-    paper = isinstance(kernel, RandomSupport) and kernel.seed == kernel.support_size and cfg.grid.size == 10
-    if not (paper and isinstance(kernel, RandomSupport) and isinstance(cost, PaperCost)):
+    z = kernel.support_size if isinstance(kernel, RandomSupport) and kernel.seed == kernel.support_size else None
+    if z is None or not isinstance(cost, PaperCost) or cfg.grid.size != 10:
         raise UserError("part=peers: the peers know the default kernel on a 10x10 grid with one price for all sensors")
-    return ["--z", str(kernel.support_size), "--c", str(cost.sensor), "--t-max", str(cfg.grid.t_max)]
+    return Instance(z, cost.sensor, cfg.grid.t_max)
 
 
-def _ours(cfg: BenchmarkConfig, seed: int, device: torch.device) -> Run:
-    kernel, cost = cfg.kernel, cfg.cost
-    assert isinstance(kernel, RandomSupport)
-    assert isinstance(cost, PaperCost)
-    world = [f"kernel.support_size={kernel.support_size}", f"cost.sensor={cost.sensor}", f"grid.t_max={cfg.grid.t_max}"]
+def _ours(cfg: BenchmarkConfig, at: Instance, seed: int, device: torch.device) -> Run:
+    world = [f"kernel.support_size={at.support_size}", f"cost.sensor={at.cost}", f"grid.t_max={at.t_max}"]
     run = trained(*world, f"seed={seed}", f"threads={cfg.threads}", f"device={device}", "evaluation.every=1")
     reached, curve, usage = run.settled(GOAL), run.curve, run.usage
     # What came after the goal is known; all else, before the loop and after it, counts.
@@ -110,11 +116,12 @@ def _ours(cfg: BenchmarkConfig, seed: int, device: torch.device) -> Run:
     )
 
 
-def _peer(script: Path, python: str, instance: list[str], seed: int, threads: int) -> Run:
+def _peer(script: Path, python: str, at: Instance, seed: int, threads: int) -> Run:
     with tempfile.TemporaryDirectory() as folder:
         file = f"{folder}/peer.json"
         limits = ["--stop-regret", str(GOAL), "--budget-seconds", str(BUDGET), "--threads", str(threads)]
-        words = ["--algo", "ppo", *instance, "--seed", str(seed), *limits, "--json", file]
+        world = ["--z", str(at.support_size), "--c", str(at.cost), "--t-max", str(at.t_max)]
+        words = ["--algo", "ppo", *world, "--seed", str(seed), *limits, "--json", file]
         usage = measured(*words, script=str(script), python=python, quiet=True)
         result = json.loads(Path(file).read_text())
     reached, curve = result["final_regret"] <= GOAL, result["curve"]

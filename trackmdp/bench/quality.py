@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import torch
@@ -45,13 +46,10 @@ def pairs(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[Row]
     """
     words = [*_typed("kernel.border", "grid.size"), *_common(cfg, device)]
     rows = []
-    for algo in cfg.algos:
-        for t_max in T_MAX:
-            for support in SUPPORTS:
-                for cost in COSTS:
-                    pair = [f"kernel.support_size={support}", f"cost.sensor={cost}", f"grid.t_max={t_max}"]
-                    runs = [trained(f"algo={algo}", f"seed={seed}", *pair, *words) for seed in cfg.seeds]
-                    rows.append({"part": "pairs", "algo": algo, "T_max": t_max, "Z": support, "c": cost, **_over(runs)})
+    for algo, t_max, support, cost in itertools.product(cfg.algos, T_MAX, SUPPORTS, COSTS):
+        pair = [f"kernel.support_size={support}", f"cost.sensor={cost}", f"grid.t_max={t_max}"]
+        runs = [trained(f"algo={algo}", f"seed={seed}", *pair, *words) for seed in cfg.seeds]
+        rows.append({"part": "pairs", "algo": algo, "T_max": t_max, "Z": support, "c": cost, **_over(runs)})
     return rows
 
 

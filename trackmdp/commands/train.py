@@ -53,17 +53,17 @@ def _run(cfg: TrainConfig, folder: Path) -> float:
         return reached
     with Session(cfg, folder, console) as session:
         verdict, end = session.train()
-    judge, solution, held_out = session.judge, None, None
+    judge, chains, solution, held_out = session.judge, session.chains(), None, None
     if isinstance(judge, Judge):
         solution = _solve(cfg, judge.world, console)
         verdict = judge.tighten(solution.upper, verdict) if solution is not None else verdict
     else:
-        held_out = judge.report(session.chains())
+        held_out = judge.report(chains)
     times = {
         "wall_seconds": time.monotonic() - started + session.start.seconds,
         "cpu_seconds": time.process_time() - used,
     }
-    policy.write(folder / policy.FILE, policy.Policy(session.chains(), verdict.evaluation.value))
+    policy.write(folder / policy.FILE, policy.Policy(chains, verdict.evaluation.value))
     write_json(folder / "summary.json", summarize(cfg, judge, verdict, solution, end, times, held_out))
     if isinstance(judge, Judge):
         show(console, cfg, judge, verdict, solution)
