@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import pickle
-import zipfile
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,22 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.helpers import BORDERS, KERNELS, configured
+from tests.world.kernels import paper
 from trackmdp.build import make_world
-from trackmdp.errors import UserError
 from trackmdp.world import kernels
-from trackmdp.world.kernels import check_homogeneous, check_table, drift, load_table, random_support, random_walk
-
-
-def paper(size: int = 5, **changes: Any) -> np.ndarray:
-    options: dict[str, Any] = {
-        "support_size": 5,
-        "radius": 1,
-        "low_probability": 0.15,
-        "exit_probability": 0.005,
-        "border": "renormalize",
-        "seed": 0,
-    }
-    return random_support(size, **(options | changes))
+from trackmdp.world.kernels import check_table, drift, random_walk
 
 
 def window_of(size: int, cell: int, radius: int = 1) -> np.ndarray:
@@ -204,140 +187,6 @@ def test_the_drift_heads_where_it_is_told(direction: float) -> None:
     assert row[cells] @ away == pytest.approx(0, abs=1e-9)
 
 
-@pytest.mark.parametrize("suffix", [".npy", ".npz", ".csv"])
-def test_a_table_comes_back_from_a_file(tmp_path: Path, suffix: str) -> None:
-    table, file = paper(3), tmp_path / f"kernel{suffix}"
-    if suffix == ".npy":
-        np.save(file, table)
-    elif suffix == ".npz":
-        np.savez(file, anything=table)
-    else:
-        np.savetxt(file, table, delimiter=",", fmt="%.18e")
-    assert np.array_equal(load_table(file), table)
-    cfg = configured("train", "grid.size=3", "kernel=table", f"kernel.path={file}")
-    assert np.array_equal(make_world(cfg).kernel, table)
-
-
-def test_of_many_arrays_the_one_called_kernel_is_read(tmp_path: Path) -> None:
-    np.savez(tmp_path / "many.npz", other=np.ones(3), kernel=paper(3))
-    assert np.array_equal(load_table(tmp_path / "many.npz"), paper(3))
-
-
-def _trap(file: Path) -> None:
-    class Trap:
-        def __reduce__(self) -> tuple[Any, ...]:
-            return (file.with_name("executed").write_text, ("x",))
-
-    array = np.empty(1, dtype=object)
-    array[0] = Trap()
-    np.save(file, array, allow_pickle=True)
-    file.with_name("executed").unlink(missing_ok=True)
-
-
-def _npz(file: Path, **arrays: np.ndarray) -> None:
-    with file.open("wb") as stream:
-        np.savez(stream, **arrays)
-
-
-def _cut(file: Path) -> None:
-    _npz(file, kernel=np.eye(9))
-    file.write_bytes(file.read_bytes()[:200])
-
-
-def _broken_member(file: Path) -> None:
-    with zipfile.ZipFile(file, "w") as archive:
-        archive.writestr("kernel.npy", b"no array")
-
-
-UNREADABLE: dict[str, tuple[str, Callable[[Path], Any], str]] = {
-    "missing": ("k.npy", lambda file: None, "no such file"),
-    "folder": ("k.npy", lambda file: file.mkdir(), "no such file"),
-    "suffix": ("k.txt", lambda file: file.write_text("1"), "expected a .npy, .npz or .csv file"),
-    "garbage": ("k.npy", lambda file: file.write_bytes(b"garbage"), "not a table of numbers"),
-    "empty": ("k.npy", lambda file: file.touch(), "not a table of numbers"),
-    "pickle": ("k.npy", lambda file: file.write_bytes(pickle.dumps([1])), "not a table of numbers"),
-    "objects": ("k.npy", _trap, "not a table of numbers"),
-    "texts": ("k.npy", lambda file: np.save(file, np.array([["a"]])), "not a table of numbers"),
-    "complex": ("k.npy", lambda file: np.save(file, np.full((9, 9), 1j)), "not a table of numbers"),
-    "no array": ("k.npz", _npz, "expected one array or one called 'kernel'"),
-    "two arrays": ("k.npz", lambda file: _npz(file, a=np.eye(9), b=np.eye(9)), "expected one array or one called"),
-    "no zip": ("k.npz", lambda file: file.write_bytes(b"garbage"), "not a table of numbers"),
-    "cut zip": ("k.npz", _cut, "not a table of numbers"),
-    "broken member": ("k.npz", _broken_member, "not a table of numbers"),
-    "one array, not a zip": ("k.npz", lambda file: _as_npy(file), "not a table of numbers"),
-    "words": ("k.csv", lambda file: file.write_text("0.1,zero\n0.2,0.3\n"), "not a table of numbers"),
-    "ragged": ("k.csv", lambda file: file.write_text("0.1,0.2\n0.3\n"), "not a table of numbers"),
-    "no rows": ("k.csv", lambda file: file.touch(), "not a table of numbers"),
-    "bytes": ("k.csv", lambda file: file.write_bytes(b"\xff\xfe\x00"), "not a table of numbers"),
-}
-
-
-def _as_npy(file: Path) -> None:
-    buffer = io.BytesIO()
-    np.save(buffer, np.eye(9))
-    file.write_bytes(buffer.getvalue())
-
-
-@pytest.mark.parametrize("case", UNREADABLE)
-def test_a_file_that_holds_no_table_is_refused_in_one_line(tmp_path: Path, case: str) -> None:
-    name, write, rule = UNREADABLE[case]
-    write(tmp_path / name)
-    with pytest.raises(UserError) as refused:
-        load_table(tmp_path / name)
-    message = str(refused.value)
-    assert "\n" not in message
-    assert message.startswith(f"kernel.path={tmp_path / name}: ")
-    assert rule in message
-    assert not (tmp_path / "executed").exists()
-
-
-def _changed(row: int, column: int, value: float) -> np.ndarray:
-    table = paper(3).copy()
-    table[row, column] = value
-    return table
-
-
-BROKEN: dict[str, tuple[np.ndarray, str]] = {
-    "a vector": (np.ones(9), r"expected a square table, got shape \(9,\)"),
-    "not square": (np.ones((9, 8)), r"expected a square table, got shape \(9, 8\)"),
-    "another grid": (np.eye(4) / 2, "4 rows, but grid.size=3 has 9 cells"),
-    "nan": (_changed(7, 2, np.nan), "row 7 holds a value that is not finite"),
-    "inf": (_changed(6, 2, np.inf), "row 6 holds a value that is not finite"),
-    "negative": (_changed(5, 8, -1e-9), "row 5 holds a negative probability"),
-    "too much": (_changed(2, 2, 1.5), "row 2 sums to .*, expected at most 1"),
-    "absorbing": (paper(3, exit_probability=0.0), "from cell 0 the target never exits"),
-}
-
-
-@pytest.mark.parametrize("case", BROKEN)
-def test_a_table_that_is_no_kernel_is_refused_with_row_and_rule(case: str) -> None:
-    table, rule = BROKEN[case]
-    with pytest.raises(UserError, match=rule) as refused:
-        check_table(table, 3, truncates=False, source="kernel.path=mine.npy")
-    assert str(refused.value).startswith("kernel.path=mine.npy: ")
-    assert "\n" not in str(refused.value)
-
-
-def test_a_table_that_traps_the_target_needs_a_time_limit() -> None:
-    """Cells 0 ... 2 lead to the exit, the pair (7, 8) never does; 3 may go either way."""
-    table = np.zeros((9, 9))
-    table[0, 1] = table[1, 2] = 1.0
-    table[2, 0] = table[3, 7] = table[3, 0] = 0.5
-    table[7, 8] = table[8, 7] = 1.0
-    for cell in (4, 5, 6):
-        table[cell, 0] = 1.0
-    with pytest.raises(UserError, match=r"from cell 7 .* set grid.max_steps"):
-        check_table(table, 3, truncates=False, source="kernel")
-    assert check_table(table, 3, truncates=True, source="kernel") is table
-
-
-def test_rounding_of_a_row_sum_is_forgiven() -> None:
-    table = np.full((9, 9), 1 / 9)
-    table[0] *= 0.5
-    table[4] += 1e-11
-    assert check_table(table, 3, truncates=False, source="kernel") is table
-
-
 def test_all_kernels_are_listed() -> None:
     made = set(kernels.__all__) - {"Border", "load_table", "check_homogeneous", "check_table"}
     assert made == set(KERNELS)
@@ -349,21 +198,3 @@ def test_walks_and_drifts_are_homogeneous_with_every_border(kernel: str, border:
     cfg = configured("train", f"kernel={kernel}", f"kernel.border={border}", "grid.size=6")
     assert cfg.kernel.homogeneous
     assert make_world(cfg).task.homogeneous
-
-
-def test_a_kernel_that_only_claims_to_be_homogeneous_is_refused() -> None:
-    with pytest.raises(
-        UserError, match=r"kernel=random_support: kernel.homogeneous=true, but from cell \d+ the target"
-    ):
-        make_world(configured("train", "kernel.homogeneous=true"))
-
-
-def test_one_changed_row_is_found() -> None:
-    table = random_walk(6, stay=0.4, diagonal=False, exit_probability=0.01, border="clip")
-    check_homogeneous(table, 6, "kernel")
-    at_the_border = table.copy()
-    at_the_border[3] = 0.0
-    check_homogeneous(at_the_border, 6, "kernel")
-    table[14, 14], table[14, 15] = table[14, 15], table[14, 14]
-    with pytest.raises(UserError, match=r"from cell 14 the target moves otherwise than from cell 7"):
-        check_homogeneous(table, 6, "kernel")

@@ -1,0 +1,57 @@
+"""Runs of the learners from hindsight, small enough for a test."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tensordict import TensorDict
+from torch import Tensor
+
+from tests.helpers import algorithm, collect, small_world
+from trackmdp.solvers import optimal
+from trackmdp.solvers.chains import evaluate, regret_per_step
+from trackmdp.training.evaluate import chains_of
+from trackmdp.world.model import World
+
+SHORT = ("algo.updates=30", "algo.updates_per_iteration=10", "algo.batch_size=512", "algo.hidden=16")
+SOLVES = ("algo.updates=300", "algo.updates_per_iteration=100", "algo.batch_size=2048", "algo.hidden=32")
+
+
+def batches(world: World, count: int = 16, *, envs: int = 32, seed: int = 0) -> list[Any]:
+    """What the collector hands over with `tests.helpers.algorithm`'s budget."""
+    time = 8 * count
+    return list(collect(world, algorithm("hindsight", world).policy, envs, time, seed=seed).split(8, dim=1))
+
+
+def learn(world: World, data: list[Any], *overrides: str, name: str = "hindsight") -> Any:
+    learner = algorithm(name, world, *overrides)
+    for batch in [*data, *[None] * (learner.iterations - len(data))]:
+        learner.step(batch)
+    return learner
+
+
+def policy(learner: Any, world: World) -> Any:
+    return chains_of(learner.actor, world)
+
+
+def assert_it_learns(name: str, words: tuple[str, ...], t_max: int) -> None:
+    world = small_world(t_max=t_max, exit_probability=0.02)
+    learner = learn(world, batches(world, 32), *SOLVES, "algo.total_frames=8192", *words, name=name)
+    best = optimal.solve(world, time_limit=5.0)
+    assert regret_per_step(best.upper, evaluate(world, policy(learner, world))) < 0.01
+
+
+def assert_same(first: Any, second: Any) -> None:
+    """Equal to the last bit, through all containers."""
+    if isinstance(first, dict):
+        assert first.keys() == second.keys()
+        for key in first:
+            assert_same(first[key], second[key])
+    elif isinstance(first, (list, tuple)):
+        assert len(first) == len(second)
+        for one, other in zip(first, second, strict=True):
+            assert_same(one, other)
+    elif isinstance(first, Tensor | TensorDict):
+        assert bool((first == second).all())
+    else:
+        assert first == second

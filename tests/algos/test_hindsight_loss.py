@@ -1,0 +1,165 @@
+"""The losses, against the formulas written out one path at a time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from tests.helpers import small_world
+from trackmdp.algos.actor_loss import Decision, Poisson, PolicyGradient, Surrogate, decision_loss
+from trackmdp.algos.hindsight_loss import HindsightLoss
+from trackmdp.config import Schedule
+from trackmdp.world.model import World
+
+
+@given(st.floats(-5, 5), st.floats(0, 3), st.floats(0, 3), st.floats(0.01, 2))
+def test_decision_loss_is_least_where_sensing_pays(logit: float, plus: float, minus: float, price: float) -> None:
+    """Its slope is (c + G⁻ + G⁺)σ(z) - G⁺, zero at z = log(G⁺ / (c + G⁻))."""
+    z = torch.tensor(logit, dtype=torch.float64, requires_grad=True)
+    parts = [torch.tensor(part, dtype=torch.float64) for part in (plus, minus, price)]
+    decision_loss(z, *parts).backward()
+    assert z.grad is not None
+    assert z.grad.item() == pytest.approx((price + minus + plus) * torch.sigmoid(z).item() - plus, abs=1e-9)
+
+
+def test_decision_loss_stops_pulling_at_large_logits() -> None:
+    logits = torch.tensor([-30.0, 30.0], requires_grad=True)
+    decision_loss(logits, torch.ones(2), torch.zeros(2), torch.ones(2)).sum().backward()
+    assert logits.grad is not None
+    assert logits.grad.tolist() == [0.0, 0.0]
+
+
+BETA = Schedule(start=0.3, end=0.3, begin=0.0, until=1.0)
+FORMS = {
+    "decision": Decision,
+    "policy gradient": lambda: PolicyGradient(BETA),
+    "surrogate": lambda: Surrogate(BETA, clip=0.2, minibatches=1, generator=None),
+    "poisson": Poisson,
+}
+
+
+def of_one_path(form: str, z: Tensor, cost: Tensor, y: int, gain: Tensor) -> Tensor:
+    """The loss of one path at one clock, which it reaches unlocated and leaves for y: what every sensor adds to it."""
+    softplus, one = torch.nn.functional.softplus, torch.nn.functional.one_hot(torch.tensor(y), len(z))
+    if form == "decision":
+        return (cost * softplus(z)).sum() + gain.clamp(min=0) * softplus(-z[y]) + (-gain).clamp(min=0) * softplus(z[y])
+    if form == "poisson":
+        return (cost * z.exp()).sum() - gain * z[y]
+    on = z.sigmoid()  # the surrogate has the same slope where the old policy is this one
+    entropy = -(on * on.log() + (1 - on) * (1 - on).log())
+    return (-on * (one * gain - cost) - 0.3 * entropy).sum()
+
+
+def written_out(
+    loss: HindsightLoss, world: World, cells: Tensor, on: Tensor, blend: float, form: str
+) -> dict[str, Tensor]:
+    """The losses one path, clock and sensor at a time, as the theory writes them (whole grid, no normalisation)."""
+    m, last, g = world.num_cells, world.num_choices, loss.discount
+    cost, safe = world.cost / world.reward, 1.0 - world.safe_cost / world.reward
+    price = torch.as_tensor(cost, dtype=torch.float32)
+    actor, clocked_actor = loss.actor(), loss.clocked_actor()
+    value = [*loss.critic().flatten(), torch.tensor(0.0)]
+    clocked = [*loss.clocked_critic().squeeze(-1), torch.zeros(last + 1)]
+    u = [[clocked[x][n] + (safe if n == last and x < m else 0.0) for n in range(last + 1)] for x in range(m + 1)]
+
+    def follow(path: list[int], n: int) -> Tensor:
+        """G_n: the return of the chain from step n on."""
+        y = path[n + 1]
+        if y == m:
+            return torch.tensor(0.0)
+        if n == last:
+            return safe + g * value[y].detach()
+        chosen = on[path[0], n]
+        after = 1.0 + g * value[y].detach() if chosen[y] else g * follow(path, n + 1)
+        return after - float((chosen.numpy() * cost).sum())
+
+    total = {name: torch.tensor(0.0) for name in ("actor", "critic", "clocked_actor", "clocked_critic")}
+    for path in cells.T.tolist():
+        x, y = path[:2]
+        target = follow(path, 0)
+        total["critic"] = total["critic"] + (value[x] - target).square()
+        for n in range(last + 1):
+            if y == m:
+                aim = torch.tensor(0.0)
+            elif n == last:
+                aim = safe + g * u[y][0]
+            else:
+                chosen = clocked_actor[x, n] > 0
+                aim = 1.0 + g * u[y][0] if chosen[y] else g * u[y][n + 1]
+                aim = aim - float((chosen.numpy() * cost).sum())
+                gain = 1.0 + g * (u[y][0] - u[y][n + 1]).detach()
+                total["clocked_actor"] = total["clocked_actor"] + of_one_path(
+                    "decision", clocked_actor[x, n], price, y, gain
+                )
+            total["clocked_critic"] = total["clocked_critic"] + (u[x][n] - aim.detach()).square()
+        for n in range(last):
+            y = path[n + 1]
+            if y == m:
+                break
+            trust = (1 - blend) * (u[y][0] - u[y][n + 1]) + blend * (value[y] - follow(path, n + 1))
+            gain = (1.0 + g * trust).detach()
+            total["actor"] = total["actor"] + of_one_path(form, actor[x, n], price, y, gain)
+            if on[x, n, y]:
+                break
+    return total
+
+
+SETTINGS = [("decision", t_max, blend) for t_max in (0, 1, 2) for blend in (0.0, 0.6, 1.0)]
+
+
+@pytest.mark.parametrize(("form", "t_max", "blend"), [*SETTINGS, *((form, 2, 0.6) for form in FORMS)])
+def test_summed_up_losses_are_those_of_every_path_apart(form: str, t_max: int, blend: float) -> None:
+    """Gradients agree with autograd through the formulas; clocks are weighed apart, so each is compared by direction.
+
+    Targets do not carry the constant part of a squared error, hence gradients and not values.
+    """
+    world = replace(small_world(t_max=t_max), cost=np.linspace(0.1, 0.5, 9), reward=2.0)
+    rng = torch.Generator().manual_seed(1)
+    loss = HindsightLoss(world.task, FORMS[form](), reach=2, hidden=6, discount=0.7, generator=rng)
+    cells = torch.randint(10, (t_max + 3, 60), generator=rng)
+    cells[0] %= 9
+    cells = torch.where((cells == 9).cummax(0).values, 9, cells)
+    on = torch.rand(9, t_max + 1, 9, generator=rng) < 0.3
+    summed, apart = loss(cells, on, blend), written_out(loss, world, cells, on, blend, form)
+    for name in ("critic", "clocked_critic"):
+        ours, theirs = (gradient(part[name], getattr(loss, name)) for part in (summed, apart))
+        torch.testing.assert_close(ours * cells.shape[1], theirs, rtol=1e-3, atol=1e-3)
+    for name in ("actor", "clocked_actor"):
+        ours, theirs = (rows(part[name], getattr(loss, name)) for part in (summed, apart))
+        for n in range(t_max + 1):
+            ratio = ours[:, n].norm() / theirs[:, n].norm()
+            torch.testing.assert_close(ours[:, n], theirs[:, n] * ratio, rtol=1e-3, atol=1e-6)
+
+
+def gradient(loss: Tensor, net: torch.nn.Module) -> Tensor:
+    parts = torch.autograd.grad(loss, list(net.parameters()), retain_graph=True)
+    return torch.cat([part.flatten() for part in parts])
+
+
+def rows(loss: Tensor, net: Any) -> Tensor:
+    """`[M, C, hidden]` gradient of every row, through the embedding that belongs to it alone."""
+    return torch.autograd.grad(loss, net.pair, retain_graph=True)[0]
+
+
+def test_what_to_sense_is_shared_only_where_it_can_be() -> None:
+    large, small = small_world(6, t_max=0), small_world(3, t_max=0)
+    uneven = replace(large, cost=np.linspace(0.1, 0.2, 36))
+
+    def shares(world: World) -> bool:
+        rng = torch.Generator().manual_seed(0)
+        loss = HindsightLoss(
+            replace(world, homogeneous=True).task, Decision(), reach=1, hidden=4, discount=0.8, generator=rng
+        )
+        assert loss.critic.groups is loss.clocked_critic.groups is None
+        return loss.actor.groups is not None and loss.clocked_actor.groups is not None
+
+    assert shares(large)
+    assert not shares(uneven)
+    assert not shares(small)  # its outputs stand for cells

@@ -1,0 +1,88 @@
+"""Learning while the policy learned so far collects."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+import torch
+
+from tests.algos.hindsight import SHORT, SOLVES, assert_same, batches, learn, policy
+from tests.helpers import algorithm, collect, small_world
+from trackmdp.solvers import optimal
+from trackmdp.solvers.chains import evaluate, regret_per_step
+
+MIXED = ("algo.collect=mixed", "algo.explore.begin=0.25", "algo.explore.until=0.75", "algo.explore.end=0.1")
+
+
+def test_mixed_learns_while_it_collects() -> None:
+    """Of 16 batches 4 are sensed whole; the 12 others come with 10 updates each, and 20 are left."""
+    world = small_world()
+    learner = algorithm("hindsight", world, *SHORT, *MIXED, "algo.updates=140")
+    assert learner.iterations == 16 + 2
+    explore, updates = [], []
+    for batch in [*batches(world), None, None]:
+        updates.append(learner.step(batch)["updates"])
+        explore.append(learner.policy.explore.item())
+        if updates[-1]:
+            assert torch.equal(learner.policy.chains, learner.actor.chains)
+    assert updates == [0] * 4 + list(range(10, 150, 10))
+    assert explore[:4] == [1.0] * 4
+    assert explore[4:12] == pytest.approx(np.linspace(1, 0.1, 9)[1:], abs=1e-6)
+    assert explore[12:] == pytest.approx([0.1] * 6)
+
+
+def test_mixed_reaches_the_optimum_of_a_small_world() -> None:
+    """Each batch is collected with the policy learned so far."""
+    world = small_world(exit_probability=0.02)
+    learner = algorithm("hindsight", world, *SOLVES, *MIXED, "algo.updates_per_iteration=25", "algo.total_frames=8192")
+    torch.manual_seed(0)
+    earned = []
+    for number in range(learner.iterations):
+        frames = collect(world, learner.policy, 32, 8, seed=number) if number < 32 else None
+        earned += [] if frames is None else [frames["next", "reward"].mean().item()]
+        learner.step(frames)
+    best = optimal.solve(world, time_limit=5.0)
+    assert regret_per_step(best.upper, evaluate(world, policy(learner, world))) < 0.01
+    assert np.mean(earned[-8:]) > np.mean(earned[:8]) + 0.5
+
+
+@pytest.mark.parametrize("saved_at", [3, 8, 17])
+def test_a_resumed_mixture_goes_on_with_the_same_policy(saved_at: int) -> None:
+    world, words = small_world(), (*SHORT, *MIXED, "algo.updates=130")
+    data = [*batches(world), None]
+    whole, begun, resumed = (algorithm("hindsight", world, *words) for _ in range(3))
+    for batch in data:
+        whole.step(batch)
+    for batch in data[:saved_at]:
+        begun.step(batch)
+    file = io.BytesIO()
+    torch.save(begun.state_dict(), file)
+    file.seek(0)
+    resumed.load_state_dict(torch.load(file, weights_only=True))
+    assert_same(begun.policy.state_dict(), resumed.policy.state_dict())
+    for batch in data[saved_at:]:
+        resumed.step(batch)
+    assert_same(whole.state_dict(), resumed.state_dict())
+    assert_same(whole.policy.state_dict(), resumed.policy.state_dict())
+
+
+def test_the_first_frames_of_a_mixture_decide_how_far_the_nets_see() -> None:
+    """Later the target jumps from the upper half of the grid to its last cell: learning goes on as if it had left."""
+    world = small_world(size=5)
+    jumps, leaves = batches(world), batches(world)
+    for number in range(16):
+        first = jumps[number]["last_cell"]
+        far = (first < 12) & (number >= 5)
+        near = torch.where(first % 5 < 4, first + 1, first - 1)
+        jumps[number]["next", "last_cell"] = torch.where(far, 24, near)
+        leaves[number]["next", "last_cell"] = near
+        for batch, exits in ((jumps[number], torch.zeros_like(far)), (leaves[number], far)):
+            batch["next", "terminated"] = exits.unsqueeze(-1)
+    words = (*SHORT, *MIXED, "algo.hidden=8")
+    one, other = learn(world, jumps, *words), learn(world, leaves, *words)
+    assert [learner._reach() for learner in (one, other)] == [4, 1]
+    assert np.array_equal(policy(one, world), policy(other, world))
+    parts = zip(one._learner.loss.parameters(), other._learner.loss.parameters(), strict=True)
+    assert all(torch.equal(mine, theirs) for mine, theirs in parts)
