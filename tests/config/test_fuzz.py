@@ -36,8 +36,9 @@ def bad_values(item: Option) -> list[str]:
     if item.kind is str and (item.choices or item.expects.startswith("cpu")):
         bad += ["elsewhere", "[cpu]"]
     if item.kind in (list[int], list[str]):
-        bad += ["elsewhere", "[]", "[1.5]", "[null]"] + (["[-1]"] if item.ge == 0 else [])
-        bad += ["[elsewhere]"] if item.choices or item.kind == list[int] else []
+        bad += ["elsewhere", "[]", "[null]"] + (["[-1]"] if item.ge == 0 else [])
+        # A text of one's own may be a number.
+        bad += ["[1.5]", "[elsewhere]"] if item.choices or item.kind == list[int] else []
     if item.kind is Any:
         bad += ["-1", "words", "{a: 1}", "nan", "[1,2]"]
     return bad
