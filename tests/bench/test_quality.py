@@ -56,6 +56,19 @@ def bench(folder: Path, *words: str) -> list[dict[str, object]]:
     return rows
 
 
+def test_what_was_measured_before_ctrl_c_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def trained(*words: str) -> Trained:
+        if "seed=2" in words:
+            raise KeyboardInterrupt
+        return Trained({"frames": 1, "regret_per_step": 0.25}, [], Usage(1.0, 1.0, 1.0))
+
+    monkeypatch.setattr(quality, "trained", trained)
+    words = ["part=quality", "algos=[hindsight]", "seeds=[0,1,2]", "quiet=true", f"hydra.run.dir={tmp_path}/b"]
+    assert main(["benchmark", *words]) == 130
+    rows = json.loads((tmp_path / "b" / "benchmark.json").read_text())["rows"]
+    assert [(row["seed"], row["regret_per_step"]) for row in rows] == [(0, 0.25), (1, 0.25)]
+
+
 @pytest.mark.slow
 def test_pairs_and_growth_and_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(quality, "SUPPORTS", (3,))

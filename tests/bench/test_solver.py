@@ -30,7 +30,7 @@ def test_the_learned_kernel_gives_a_row_per_pair(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(learned, "SUPPORTS", (3, 5))
     monkeypatch.setattr(learned, "COSTS", (0.16,))
     cfg = configured("benchmark", "part=learned_kernel", "seeds=[0,1]")
-    rows = learned.learned_kernel(cfg, make_world(cfg), torch.device("cpu"))
+    rows = list(learned.learned_kernel(cfg, make_world(cfg), torch.device("cpu")))
     assert [(row["Z"], row["c"], row["frames"]) for row in rows] == [(3, 0.16, 10_000), (5, 0.16, 10_000)]
     for row in rows:
         assert 0 < row["mean_regret"] <= row["worst_regret"] < 0.1

@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,10 @@ __all__ = ["learned_kernel"]
 VARIANTS = (("all", 30_000), ("all", 100_000), ("chosen", 100_000))
 
 
-def learned_kernel(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[dict[str, Any]]:  # noqa: ARG001
+def learned_kernel(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator[dict[str, Any]]:  # noqa: ARG001
     """One row per variant, support size and cost: regrets over the seeds, price of learning, one learning curve."""
-    return [row for sensing, frames in VARIANTS for row in _variant(cfg.seeds, sensing, frames)]
+    for sensing, frames in VARIANTS:
+        yield from _variant(cfg.seeds, sensing, frames)
 
 
 def _variant(seeds: list[int], sensing: str, frames: int) -> list[dict[str, Any]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 from typing import Any
 
 import torch
@@ -24,45 +25,37 @@ _BINS = (0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05)
 Row = dict[str, Any]
 
 
-def quality(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[Row]:  # noqa: ARG001
+def quality(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator[Row]:  # noqa: ARG001
     """One row per algorithm and seed: the final regret per step, and when it was below each threshold for good.
 
     `wall_seconds` runs from pressing Enter to the end of the process, the solver included; the `below_` columns count
     seconds of collecting, learning and evaluating.
     """
     words = [*_typed(*_WORLD), *_common(cfg, device)]
-    return [
-        {"part": "quality", "algo": algo, "seed": seed, **_below(run), **run.figures()}
-        for algo in cfg.algos
-        for seed in cfg.seeds
-        for run in [trained(f"algo={algo}", f"seed={seed}", *words)]
-    ]
+    for algo, seed in itertools.product(cfg.algos, cfg.seeds):
+        run = trained(f"algo={algo}", f"seed={seed}", *words)
+        yield {"part": "quality", "algo": algo, "seed": seed, **_below(run), **run.figures()}
 
 
-def pairs(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[Row]:  # noqa: ARG001
+def pairs(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator[Row]:  # noqa: ARG001
     """One row per algorithm, T_max and pair of the paper (Section VII): regret per seed, and the longest run.
 
     The regret is to the upper end of the optimum's bracket, whose width per step stands beside it.
     """
     words = [*_typed("kernel.border", "grid.size"), *_common(cfg, device)]
-    rows = []
     for algo, t_max, support, cost in itertools.product(cfg.algos, T_MAX, SUPPORTS, COSTS):
         pair = [f"kernel.support_size={support}", f"cost.sensor={cost}", f"grid.t_max={t_max}"]
         runs = [trained(f"algo={algo}", f"seed={seed}", *pair, *words) for seed in cfg.seeds]
-        rows.append({"part": "pairs", "algo": algo, "T_max": t_max, "Z": support, "c": cost, **_over(runs)})
-    return rows
+        yield {"part": "pairs", "algo": algo, "T_max": t_max, "Z": support, "c": cost, **_over(runs)}
 
 
-def growth(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[Row]:  # noqa: ARG001
+def growth(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator[Row]:  # noqa: ARG001
     """One row per algorithm and grid size, and per T_max: regret, time and memory as the problem grows."""
     words = [*_typed("kernel", "cost"), *_common(cfg, device), f"seed={cfg.seeds[0]}"]
     worlds = [(size, cfg.grid.t_max) for size in SIZES] + [(cfg.grid.size, t_max) for t_max in CHOICES]
-    return [
-        {"part": "growth", "algo": algo, "N": size, "T_max": t_max, **_gap(run), **run.figures()}
-        for algo in cfg.algos
-        for size, t_max in dict.fromkeys(worlds)
-        for run in [trained(f"algo={algo}", f"grid.size={size}", f"grid.t_max={t_max}", *words)]
-    ]
+    for algo, (size, t_max) in itertools.product(cfg.algos, dict.fromkeys(worlds)):
+        run = trained(f"algo={algo}", f"grid.size={size}", f"grid.t_max={t_max}", *words)
+        yield {"part": "growth", "algo": algo, "N": size, "T_max": t_max, **_gap(run), **run.figures()}
 
 
 def histogram(rows: list[Row]) -> list[tuple[str, str, int]]:

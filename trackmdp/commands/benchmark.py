@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from trackmdp.world.model import World
 
 __all__ = ["PARTS", "run"]
 
-PARTS: dict[str, Callable[[BenchmarkConfig, World, torch.device], list[dict[str, Any]]]] = {
+PARTS: dict[str, Callable[[BenchmarkConfig, World, torch.device], Iterable[dict[str, Any]]]] = {
     "env": speed.env_speed,
     "collector": speed.collector_speed,
     "train": speed.train_speed,
@@ -34,14 +34,17 @@ PARTS: dict[str, Callable[[BenchmarkConfig, World, torch.device], list[dict[str,
 
 
 def run(cfg: BenchmarkConfig, folder: Path) -> None:
-    """Measure `cfg.part` and write `benchmark.json` to `folder`."""
+    """Measure `cfg.part` and write `benchmark.json` to `folder`, row by row as they come."""
     console = make_console(cfg.quiet)
     torch.set_num_threads(cfg.threads)
     device = make_device(cfg.device)
     where = machine()
-    with console.status(f"measuring {cfg.part}"):
-        rows = PARTS[cfg.part](cfg, make_world(cfg), device)
-    write_json(folder / "benchmark.json", {"machine": where, "rows": rows})
+    rows: list[dict[str, Any]] = []
+    with console.status(f"measuring {cfg.part}") as status:
+        for row in PARTS[cfg.part](cfg, make_world(cfg), device):
+            rows.append(row)
+            write_json(folder / "benchmark.json", {"machine": where, "rows": rows})
+            status.update(f"measuring {cfg.part}: {len(rows)} rows so far, in {folder}")
     shown = [key for key in rows[0] if not isinstance(rows[0][key], dict)]
     title = f"{where['processor']}, {where['cores']} cores, {cfg.threads} torch threads, {device}"
     console.print(table(title, shown, [[_text(row[key]) for key in shown] for row in rows]))
