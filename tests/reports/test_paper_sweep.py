@@ -24,15 +24,14 @@ def grouped() -> Study:
 
 
 def test_it_is_small() -> None:
-    assert sum(file.stat().st_size for file in KEPT.iterdir()) < 300_000
+    assert sum(file.stat().st_size for file in KEPT.iterdir()) < 350_000
 
 
 def test_every_pair_was_run_with_every_algorithm(grouped: Study) -> None:
     assert pairs(grouped).keys() == PRINTED_QMDP.keys()
     for world in pairs(grouped).values():
-        assert [run.seed for run in grouped.of(world, "hindsight")] == list(range(5)), world
-        for method in ("a2c", "ppo"):
-            assert grouped.of(world, method), (world, method)
+        for method, seeds in (("hindsight", 5), ("a2c", 5), ("a2c_per_sensor", 5), ("ppo", 2), ("dqn", 1)):
+            assert sorted(run.seed for run in grouped.of(world, method)) == list(range(seeds)), (world, method)
 
 
 def test_its_kernels_are_those_of_the_rule(grouped: Study) -> None:
@@ -48,7 +47,7 @@ def test_the_default_comes_close_in_every_pair_and_a2c_is_above_qmdp(grouped: St
     assert (above.pairs, above.met, above.by_all) == (12, 12, 12)
     assert (default.pairs, default.met, default.by_all, default.missed) == (12, 12, 12, [])
     per_sensor = [grouped.regrets(world, "a2c_per_sensor") for world in pairs(grouped).values()]
-    assert all(regrets and max(regrets) < 0.001 for regrets in per_sensor)
+    assert all(max(regrets) < 0.005 for regrets in per_sensor)
 
 
 @pytest.mark.slow
