@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from tensordict import TensorDict
 from torch import Tensor
 
 from tests.helpers import algorithm, collect, small_world
+from trackmdp.algos.actor_loss import ActorLoss, Decision, Poisson, PolicyGradient, Surrogate
+from trackmdp.config import Schedule
 from trackmdp.solvers import optimal
 from trackmdp.solvers.chains import evaluate, regret_per_step
 from trackmdp.training.evaluate import chains_of
@@ -15,6 +18,14 @@ from trackmdp.world.model import World
 
 SHORT = ("algo.updates=30", "algo.updates_per_iteration=10", "algo.batch_size=512", "algo.hidden=16")
 SOLVES = ("algo.updates=300", "algo.updates_per_iteration=100", "algo.batch_size=2048", "algo.hidden=32")
+
+BETA = Schedule(start=0.3, end=0.3, begin=0.0, until=1.0)
+FORMS: dict[str, Callable[[], ActorLoss]] = {
+    "decision": Decision,
+    "policy gradient": lambda: PolicyGradient(BETA),
+    "surrogate": lambda: Surrogate(BETA, clip=0.2, minibatches=2, generator=None),
+    "poisson": Poisson,
+}
 
 
 def batches(world: World, count: int = 16, *, envs: int = 32, seed: int = 0) -> list[Any]:

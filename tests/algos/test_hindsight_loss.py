@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
+from tests.algos.hindsight import FORMS
 from tests.helpers import small_world
-from trackmdp.algos.actor_loss import Decision, Poisson, PolicyGradient, Surrogate, decision_loss
+from trackmdp.algos.actor_loss import Decision, decision_loss
 from trackmdp.algos.hindsight_loss import HindsightLoss
-from trackmdp.config import Schedule
 from trackmdp.world.model import World
 
 
@@ -34,15 +34,6 @@ def test_decision_loss_stops_pulling_at_large_logits() -> None:
     decision_loss(logits, torch.ones(2), torch.zeros(2), torch.ones(2)).sum().backward()
     assert logits.grad is not None
     assert logits.grad.tolist() == [0.0, 0.0]
-
-
-BETA = Schedule(start=0.3, end=0.3, begin=0.0, until=1.0)
-FORMS = {
-    "decision": Decision,
-    "policy gradient": lambda: PolicyGradient(BETA),
-    "surrogate": lambda: Surrogate(BETA, clip=0.2, minibatches=1, generator=None),
-    "poisson": Poisson,
-}
 
 
 def of_one_path(form: str, z: Tensor, cost: Tensor, y: int, gain: Tensor) -> Tensor:

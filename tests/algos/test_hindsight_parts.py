@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -10,20 +9,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.algos.hindsight import FORMS
 from tests.helpers import algorithm, small_world
-from trackmdp.algos.actor_loss import ActorLoss, Decision, Poisson, PolicyGradient, Surrogate
 from trackmdp.algos.hindsight_loss import HindsightLoss
-from trackmdp.config import Schedule
 from trackmdp.world.kernels import random_walk
 from trackmdp.world.model import World
 
-BETA = Schedule(start=0.3, end=0.3, begin=0.0, until=1.0)
-FORMS: dict[str, Callable[[], ActorLoss]] = {
-    "decision": Decision,
-    "policy gradient": lambda: PolicyGradient(BETA),
-    "surrogate": lambda: Surrogate(BETA, clip=0.2, minibatches=2, generator=None),
-    "poisson": Poisson,
-}
 ENTRIES = 5 * 3 * 25
 """Five located cells of a 5x5 grid with three clocks, each output standing for a cell."""
 

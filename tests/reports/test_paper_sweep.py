@@ -24,7 +24,7 @@ def grouped() -> Study:
 
 
 def test_it_is_small() -> None:
-    assert sum(file.stat().st_size for file in KEPT.iterdir()) < 350_000
+    assert sum(file.stat().st_size for file in KEPT.iterdir()) < 325_000
 
 
 def test_every_pair_was_run_with_every_algorithm(grouped: Study) -> None:
@@ -47,7 +47,7 @@ def test_the_default_comes_close_in_every_pair_and_a2c_is_above_qmdp(grouped: St
     assert (above.pairs, above.met, above.by_all) == (12, 12, 12)
     assert (default.pairs, default.met, default.by_all, default.missed) == (12, 12, 12, [])
     per_sensor = [grouped.regrets(world, "a2c_per_sensor") for world in pairs(grouped).values()]
-    assert all(max(regrets) < 0.005 for regrets in per_sensor)
+    assert all(max(regrets) < 0.0025 for regrets in per_sensor)
 
 
 @pytest.mark.slow
