@@ -2,7 +2,7 @@
 
 import sys
 
-from trackmdp.cli import main
+from trackmdp.app.cli import main
 
 if __name__ == "__main__":
     sys.exit(main(["verify", *sys.argv[1:]]))

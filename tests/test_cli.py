@@ -15,7 +15,7 @@ import pytest
 
 from tests.config.cases import composed, of_command
 from tests.typed import refused, stub
-from trackmdp.cli import COMMANDS, main
+from trackmdp.app.cli import COMMANDS, main
 from trackmdp.config import GROUPS, ROOTS, SELECTORS, options
 from trackmdp.errors import Preempted, RunError, UserError
 
@@ -33,7 +33,7 @@ def empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def typed(*words: str, **kwargs: Any) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "trackmdp.cli", *words],
+        [sys.executable, "-m", "trackmdp.app.cli", *words],
         capture_output=True,
         text=True,
         env=ENVIRONMENT,
@@ -264,11 +264,11 @@ def test_scripts_are_the_commands() -> None:
 def test_help_and_first_line_import_nothing_heavy() -> None:
     code = """
 import sys
-from trackmdp.cli import main
-import trackmdp.prepare
+from trackmdp.app.cli import main
+import trackmdp.app.prepare
 def say(line):
     sys.exit(str(sorted({"torch", "torchrl", "scipy"} & set(sys.modules))))
-trackmdp.prepare.say = say
+trackmdp.app.prepare.say = say
 main(["train", "--help"])
 main(["train"])
 """
@@ -279,10 +279,10 @@ main(["train"])
 def test_ctrl_c_ends_in_one_line_and_130(empty_folder: Path) -> None:
     code = """
 import sys, types, threading
-module = types.ModuleType("trackmdp.commands.train")
+module = types.ModuleType("trackmdp.app.commands.train")
 module.run = lambda cfg, folder: threading.Event().wait(60)
 sys.modules[module.__name__] = module
-from trackmdp.cli import main
+from trackmdp.app.cli import main
 sys.exit(main(["train"]))
 """
     process = subprocess.Popen(

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from trackmdp.cli import main
+from trackmdp.app.cli import main
 from trackmdp.config import GROUPS
 
 ROOT = Path(__file__).parents[1]
@@ -89,7 +89,7 @@ def test_the_commands_run_in_this_order(tmp_path: Path) -> None:
     for line in COMMANDS:
         if line in OURS:
             command, *words = words_of(line)
-            typed = [sys.executable, "-m", "trackmdp.cli", command, *words, *SHORT.get(command, []), *few(line)]
+            typed = [sys.executable, "-m", "trackmdp.app.cli", command, *words, *SHORT.get(command, []), *few(line)]
         else:
             typed = [sys.executable, *shlex.split(line)[1:]]
         result = subprocess.run(typed, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)

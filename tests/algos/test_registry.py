@@ -14,8 +14,8 @@ import pytest
 import torch
 
 from tests.helpers import ALGORITHMS, algorithm, collect, small_world, train_config
+from trackmdp.app.commands.train import run
 from trackmdp.build import make_world
-from trackmdp.commands.train import run
 from trackmdp.config import GROUPS, PerSensor
 from trackmdp.solvers import optimal
 from trackmdp.training import checkpoint

@@ -13,15 +13,15 @@ import pytest
 from tests.episodes.browser import CHROMIUM, Browser
 from tests.reports.sweeps import write_run
 from trackmdp.build import make_world
-from trackmdp.reports.calibration import candidates, sensitivity
-from trackmdp.reports.critique import checks
+from trackmdp.paper.calibration import candidates, sensitivity
+from trackmdp.paper.critique import checks
+from trackmdp.paper.openings import Openings
+from trackmdp.paper.printed import pairs
+from trackmdp.paper.verdicts import Goal, acceptance_table, accuracy_table, goals
 from trackmdp.reports.gather import gather
 from trackmdp.reports.grouping import study
-from trackmdp.reports.openings import Openings
 from trackmdp.reports.page import Report, build
-from trackmdp.reports.paper import pairs
 from trackmdp.reports.results import Problem, Results
-from trackmdp.reports.verdicts import Goal, acceptance_table, accuracy_table, goals
 
 PAIRS = ((3, 0.22), (5, 0.16), (5, 0.22))
 WRONG = {"a2c": 40, "hindsight": 1}

@@ -6,12 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from trackmdp.cli import main
-from trackmdp.reports import openings, results
-from trackmdp.reports.calibration import chosen
+from trackmdp.app.cli import main
+from trackmdp.paper import openings
+from trackmdp.paper.calibration import chosen
+from trackmdp.paper.printed import PRINTED_QMDP, pairs
+from trackmdp.paper.verdicts import goals
+from trackmdp.reports import results
 from trackmdp.reports.grouping import Study, study
-from trackmdp.reports.paper import PRINTED_QMDP, pairs
-from trackmdp.reports.verdicts import goals
 
 KEPT = Path(__file__).parents[1] / "data/paper"
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.helpers import small_world, train_config
-from trackmdp.commands import train
+from trackmdp.app.commands import train
 from trackmdp.errors import UserError
 from trackmdp.reports import policy
 from trackmdp.reports.policy import Policy

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from tests.helpers import train_config
-from trackmdp.commands.train import run
+from trackmdp.app.commands.train import run
 from trackmdp.training import checkpoint
 from trackmdp.training.metrics import MetricsLog
 

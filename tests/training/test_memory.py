@@ -10,7 +10,7 @@ import torch
 
 from tests.helpers import collect, small_world, train_config
 from trackmdp.algos.dqn import DQN
-from trackmdp.cli import main
+from trackmdp.app.cli import main
 from trackmdp.config import Dqn
 from trackmdp.errors import UserError
 from trackmdp.training.memory import available, check, needs

@@ -11,10 +11,10 @@ import pytest
 
 pytest.importorskip("ray", reason="ray is not installed")
 
-from tests.commands.test_reads import SHORT, never_read
+from tests.app.commands.test_reads import SHORT, never_read
 from tests.helpers import train_config
 from tests.training.runs import at_iteration, rows
-from trackmdp.commands.train import run
+from trackmdp.app.commands.train import run
 from trackmdp.errors import RunError, UserError
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's own, of many kinds

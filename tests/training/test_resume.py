@@ -41,7 +41,7 @@ BATCHES = ["collector.frames_per_batch=2048", "collector.envs=64"]
 
 
 def command(folder: Path, *words: str) -> list[str]:
-    return [sys.executable, "-m", "trackmdp.cli", "train", f"hydra.run.dir={folder}", *words]
+    return [sys.executable, "-m", "trackmdp.app.cli", "train", f"hydra.run.dir={folder}", *words]
 
 
 def train(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:

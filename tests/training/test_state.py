@@ -13,7 +13,7 @@ import torch
 from tests.helpers import train_config
 from tests.training.runs import BUDGET, QUICK, SMALL, assert_same_run, at_iteration, rows, train
 from tests.training.test_checkpoint import corrupted
-from trackmdp.cli import main
+from trackmdp.app.cli import main
 from trackmdp.config import load_run
 from trackmdp.errors import RunError, UserError
 from trackmdp.training import checkpoint

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from omegaconf import OmegaConf
 
+from trackmdp.app.sweep.state import FAILED, PLAN, SUMMARY, read_json, run_of
 from trackmdp.config import Table, WorldConfig, world_of
 from trackmdp.errors import UserError
 from trackmdp.reports import policy
@@ -20,7 +21,6 @@ from trackmdp.reports.grouping import Study, study, world_key
 from trackmdp.reports.results import FIGURES, Motion, Point, Problem, Results, Run
 from trackmdp.solvers import bounds, horizon, qmdp
 from trackmdp.solvers.chains import evaluate
-from trackmdp.sweep.state import FAILED, PLAN, SUMMARY, read_json, run_of
 from trackmdp.world.model import World
 
 __all__ = ["flatten", "gather", "planned", "run_folders"]

@@ -9,11 +9,12 @@ from dataclasses import dataclass, field
 from importlib.resources import files
 from typing import Any
 
-from trackmdp.reports import critique, figures, learning, maps, settings, verdicts
-from trackmdp.reports.calibration import DRAWS
+from trackmdp.paper import critique, settings, verdicts
+from trackmdp.paper.calibration import DRAWS
+from trackmdp.paper.openings import Openings
+from trackmdp.paper.printed import pairs
+from trackmdp.reports import figures, learning, maps
 from trackmdp.reports.grouping import Study, study
-from trackmdp.reports.openings import Openings
-from trackmdp.reports.paper import pairs
 from trackmdp.reports.results import Results
 from trackmdp.reports.style import Figure
 from trackmdp.reports.tables import Table

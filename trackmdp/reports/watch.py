@@ -13,9 +13,9 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from trackmdp.app.sweep.state import read_json, run_of
 from trackmdp.errors import UserError
 from trackmdp.reports.gather import planned, run_folders
-from trackmdp.sweep.state import read_json, run_of
 
 __all__ = ["Status", "look", "watch"]
 

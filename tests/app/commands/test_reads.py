@@ -1,0 +1,66 @@
+"""An option that nothing reads is a bug: every recipe reads every one of its options."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from pathlib import Path
+
+import pytest
+
+from tests.config.cases import composed
+from tests.helpers import BASELINES
+from tests.reads import record_reads, unread
+from trackmdp.config import GROUPS, PerSensor, conf_dir
+
+SHORT = "quiet=true grid.size=3 collector.total_frames=2048 collector.frames_per_batch=1024 collector.envs=64"
+DEFAULTS = {
+    f"{file.parent.name}.{key}": source
+    for file in Path(conf_dir()).glob("*/*.yaml")
+    for key, source in re.findall(r"^(\w+): \$\{([\w.]+)\}", file.read_text(encoding="utf-8"), flags=re.MULTILINE)
+}
+"""Option -> the option it takes its value from, unless typed: reading the first reads the second."""
+
+
+MIXED = " algo.updates=2 algo.collect=mixed collector.frames_per_batch=512 algo.explore.until=0.9"
+
+
+def never_read(command: str, words: str, folder: Path) -> set[str]:
+    cfg = composed(command, *words.split())
+    run = importlib.import_module(f"trackmdp.app.commands.{command}").run
+    with record_reads(cfg) as reads:
+        run(cfg, folder)
+    return unread(cfg, reads | {source for key, source in DEFAULTS.items() if key in reads})
+
+
+@pytest.mark.parametrize("algo", GROUPS["algo"])
+def test_train_reads_every_option(algo: str, tmp_path: Path) -> None:
+    words = f"algo={algo} {SHORT} optimal.time_limit=1"
+    words += (
+        MIXED
+        if issubclass(GROUPS["algo"][algo], PerSensor)
+        else " algo.prioritized.enabled=true"
+        if algo == "dqn"
+        else ""
+    )
+    assert not never_read("train", words, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("collector", ["multi_sync", "multi_async"])
+def test_collectors_with_workers_read_every_option(collector: str, tmp_path: Path) -> None:
+    assert not never_read("train", f"collector={collector} {SHORT}{MIXED}", tmp_path)
+
+
+@pytest.mark.parametrize("baseline", BASELINES)
+def test_evaluate_reads_every_option(baseline: str, tmp_path: Path) -> None:
+    assert not never_read("evaluate", f"baseline={baseline} grid.size=3 quiet=true episodes=10", tmp_path)
+
+
+@pytest.mark.parametrize("solver", GROUPS["solver"])
+def test_solve_reads_every_option(solver: str, tmp_path: Path) -> None:
+    assert not never_read("solve", f"solver={solver} grid.size=3 quiet=true", tmp_path)
+
+
+def test_verify_reads_every_option(tmp_path: Path) -> None:
+    assert not never_read("verify", "grid.size=3 quiet=true", tmp_path)

@@ -1,0 +1,346 @@
+"""`log=mcap`, `replay` and `baseline=playback` as they are typed."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import errno
+import importlib
+import json
+import os
+import pty
+import resource
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.config.cases import composed
+from tests.reads import record_reads, unread
+from trackmdp.app.cli import main
+from trackmdp.app.commands.playback import reissued
+from trackmdp.config import world_of
+from trackmdp.episodes import schema
+from trackmdp.episodes.episode import Episode, first_difference
+from trackmdp.episodes.frame import frame, sentence
+from trackmdp.episodes.log import EpisodeLog
+from trackmdp.episodes.player import Playing
+from trackmdp.episodes.reader import EpisodeReader
+from trackmdp.episodes.writer import EpisodeWriter
+
+ROOT = Path(__file__).parents[3]
+WORLD = ["grid.size=4", "kernel.exit_probability=0.05", "cost.sensor=0.3"]
+TRAIN = [*WORLD, "algo=a2c", "collector.total_frames=4096", "collector.frames_per_batch=256", "collector.envs=32"]
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("run") / "a"
+    words = ["evaluate", "baseline=qmdp", *WORLD, "log=mcap", "log.layout=true", "episodes=30", "quiet=true", "seed=3"]
+    assert main([*words, f"hydra.run.dir={folder}"]) == 0
+    return folder / "episodes.mcap"
+
+
+def replay(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
+    status = main(["replay", *words])
+    said = capsys.readouterr()
+    return status, said.out, said.err
+
+
+def test_evaluate_logs_as_many_episodes_as_it_simulates(log: Path) -> None:
+    with EpisodeReader(log) as reader:
+        assert len(reader) == 30
+        assert reader.run["seed"] == "3"
+        assert world_of(reader.attachment("config.yaml").decode()).grid.size == 4
+    layout = json.loads((log.parent / "episodes.layout.json").read_text())
+    maps = [panel for panel in layout["configById"].values() if "topics" in panel]
+    assert {panel["topics"]["/grid"]["colorField"] for panel in maps} == {"belief", "policy"}
+    assert all(panel["topics"]["/grid"]["visible"] for panel in maps)
+
+
+def test_the_same_seed_gives_the_same_file(log: Path, tmp_path: Path) -> None:
+    words = ["evaluate", "baseline=qmdp", *WORLD, "log=mcap", "log.layout=true", "episodes=30", "quiet=true"]
+    assert main([*words, "seed=3", f"hydra.run.dir={tmp_path / 'a'}"]) == 0
+    assert (tmp_path / "a/episodes.mcap").read_bytes() == log.read_bytes()
+    assert main([*words, "seed=4", f"hydra.run.dir={tmp_path / 'b'}"]) == 0
+    assert (tmp_path / "b/episodes.mcap").read_bytes() != log.read_bytes()
+
+
+@pytest.mark.parametrize("baseline", ["random_k", "clocked"])
+def test_every_kind_of_policy_verifies(baseline: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["evaluate", f"baseline={baseline}", *WORLD, "grid.max_steps=20", "log=mcap", "episodes=15"]
+    assert main([*words, "quiet=true", f"hydra.run.dir={tmp_path}"]) == 0
+    status, said, _ = replay(capsys, f"file={tmp_path}/episodes.mcap", "verify=true")
+    assert (status, "15 episodes" in said, "the same to the bit" in said) == (0, True, True)
+
+
+def test_training_logs_the_first_the_kth_and_the_last_evaluation(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["train", *TRAIN, "evaluation.every=2", "log=mcap", "log.evaluations=3", "log.episodes=4", "quiet=true"]
+    assert main([*words, f"hydra.run.dir={tmp_path / 'a'}"]) == 0
+    with EpisodeReader(tmp_path / "a/episodes.mcap") as reader:
+        labels = [policy["label"] for policy in reader.policies]
+        assert labels == [f"iteration {k}" for k in (1, 6, 12, 16)]
+        assert [row["policy"] for row in reader.rows] == [0] * 4 + [1] * 4 + [2] * 4 + [3] * 4
+        assert len({row["seed"] for row in reader.rows}) == 16
+    assert replay(capsys, f"file={tmp_path}/a/episodes.mcap", "verify=true")[0] == 0
+    assert len((tmp_path / "a/metrics.csv").read_text().splitlines()) == 17
+
+
+def test_every_option_is_read(log: Path, tmp_path: Path) -> None:
+    words = ("quiet=true", "log=mcap", "evaluation.every=2", "log.evaluations=1", *TRAIN)
+    cfg = composed("train", *words)
+    with record_reads(cfg) as reads:
+        importlib.import_module("trackmdp.app.commands.train").run(cfg, tmp_path)
+    assert {key for key in unread(cfg, reads) if key.startswith("log")} == set()
+    cfg = composed("replay", f"file={log}", "quiet=true", "episode=2")
+    with record_reads(cfg) as reads:
+        importlib.import_module("trackmdp.app.commands.replay").run(cfg, tmp_path)
+    assert unread(cfg, reads) == set()
+    playback = ("baseline=playback", f"baseline.file={log}", *WORLD, "quiet=true", "episodes=5")
+    for words in (playback, ("baseline=qmdp", "log=mcap", *WORLD, "quiet=true", "episodes=5")):
+        cfg = composed("evaluate", *words)
+        with record_reads(cfg) as reads:
+            importlib.import_module("trackmdp.app.commands.evaluate").run(cfg, tmp_path)
+        of_training = {"log.every", "log.evaluations", "log.episodes"}
+        assert unread(cfg, reads) - of_training == set()
+
+
+def test_listing_and_playing_as_plain_text(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, said, _ = replay(capsys, f"file={log}")
+    assert (status, "30 episodes, " in said, "4x4 grid, T_max 1, seed 3" in said) == (0, True, True)
+    with EpisodeReader(log) as reader:
+        episode, task = reader.read(7), reader.world().task
+    status, said, _ = replay(capsys, f"file={log}", "episode=7")
+    assert status == 0
+    assert said.count("┌") == len(episode)
+    assert "\x1b" not in said
+    for t in (0, len(episode) - 1):
+        assert f"{sentence(episode, t, task)}\n{frame(episode, t, task)}\n" in said
+
+
+def test_tables_hold_every_step(log: Path, tmp_path: Path) -> None:
+    assert main(["replay", f"file={log}", f"csv={tmp_path}/t", f"html={tmp_path}/a.html", "quiet=true"]) == 0
+    with (tmp_path / "t/steps.csv").open() as stream, EpisodeReader(log) as reader:
+        rows = list(csv.DictReader(stream))
+        assert len(rows) == sum(row["length"] for row in reader.rows)
+        mine = [row for row in rows if row["episode"] == "5"]
+        episode = reader.read(5)
+        assert [float(row["reward"]) for row in mine] == episode.reward.tolist()
+        assert [row["active"] for row in mine] == [
+            " ".join(map(str, np.flatnonzero(action))) for action in episode.action
+        ]
+    assert (tmp_path / "a.html").stat().st_size > 10_000
+
+
+def changed(log: Path, target: Path, change: Callable[[Episode], Episode], run: dict[str, str] | None = None) -> Path:
+    """The log with episode 4 changed, all checksums right."""
+    with EpisodeReader(log) as reader:
+        tables = {name: reader.attachment(name) for name in ("config.yaml", "kernel.npy", "cost.npy")}
+        writer = EpisodeWriter.copy(target, reader.run | (run or {}), tables)
+        facts = {key: value for key, value in reader.policies[0].items() if key != "table.sha256"}
+        writer.copy_policy(facts, reader.policy_table(0))
+        for episode in reader.episodes():
+            writer.add(change(episode) if episode.number == 4 else episode)
+    return writer.finish()
+
+
+def test_verify_names_the_first_difference(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def dearer(episode: Episode) -> Episode:
+        reward = episode.reward.copy()
+        reward[2] = np.nextafter(reward[2], np.float32(9))
+        return dataclasses.replace(episode, reward=reward)
+
+    file = changed(log, tmp_path / "a.mcap", dearer)
+    status, said, error = replay(capsys, f"file={file}", "verify=true")
+    assert (status, said) == (1, "")
+    assert error.startswith(f"trackmdp replay: file={file}: episode 4, step 2, reward: logged ")
+    assert len(error.splitlines()) == 1
+    assert replay(capsys, f"file={file}", "verify=true", "episode=3")[0] == 0
+
+
+def test_logs_of_other_versions_are_told_and_may_differ_in_belief_only(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def believed(by: float) -> Callable[[Episode], Episode]:
+        return lambda episode: dataclasses.replace(episode, belief=episode.belief + np.float32(by))
+
+    other = {"torch": "2.12.0", "trackmdp": "0.0.1"}
+    file = changed(log, tmp_path / "a.mcap", believed(1e-7), other)
+    status, said, _ = replay(capsys, f"file={file}", "verify=true")
+    assert status == 0
+    told = schema.versions()
+    assert said.splitlines()[0] == (
+        f"made by other versions: trackmdp 0.0.1 (here {told['trackmdp']}), torch 2.12.0 (here {told['torch']})"
+    )
+    file = changed(log, tmp_path / "b.mcap", believed(1e-3), other)
+    status, _, error = replay(capsys, f"file={file}", "verify=true")
+    assert (status, "belief of cell" in error, "made by other versions: trackmdp 0.0.1" in error) == (1, True, True)
+
+
+def test_verify_names_a_kernel_that_its_config_does_not_describe(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with EpisodeReader(log) as reader:
+        config = reader.attachment("config.yaml").decode().replace("exit_probability: 0.05", "exit_probability: 0.06")
+        writer = EpisodeWriter(tmp_path / "a.mcap", reader.world(), facts={}, config=config)
+    writer.finish()
+    status, _, error = replay(capsys, f"file={tmp_path}/a.mcap", "verify=true")
+    assert (status, "kernel from cell 0 to " in error, "the config gives" in error) == (1, True, True)
+
+
+def test_recover_as_typed(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    part = tmp_path / "episodes.mcap.part"
+    part.write_bytes(log.read_bytes()[:-1000])
+    assert "recover=true saves every episode" in replay(capsys, f"file={part}")[2]
+    status, said, _ = replay(capsys, f"file={part}", "recover=true", "verify=true")
+    assert (status, said.splitlines()[0]) == (0, f"30 episodes -> {tmp_path}/episodes.recovered.mcap")
+    assert "the same to the bit" in said
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("file=none.mcap", "file={here}/none.mcap: no such file or directory, expected an MCAP file"),
+        ("file={log} episode=999", "episode=999: {log} holds 30 episodes (0 to 29)"),
+        ("file={log} html=no/such/a.html", "html={here}/no/such/a.html: cannot be written (no such file or directory)"),
+        ("", "file: missing, expected a file written with log=mcap"),
+    ],
+)
+def test_mistakes_end_in_one_line(
+    words: str,
+    message: str,
+    log: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    status, said, error = replay(capsys, *words.format(log=log).split())
+    assert (status, said, error) == (2, "", f"trackmdp replay: {message.format(log=log, here=tmp_path)}\n")
+    assert not list(tmp_path.iterdir())
+
+
+def test_playback_issues_the_actions_again(log: Path, tmp_path: Path) -> None:
+    words = ["evaluate", "baseline=playback", f"baseline.file={log}", "baseline.episode=6", *WORLD, "quiet=true"]
+    assert main([*words, "episodes=50", f"hydra.run.dir={tmp_path}"]) == 0
+    said = json.loads((tmp_path / "evaluation.json").read_text())
+    with EpisodeReader(log) as reader:
+        episode = reader.read(6)
+        again = reissued(reader.world(), episode, None)
+    assert first_difference(episode, again) is None
+    assert said["return"] == said["logged_return"] == episode.returns[-1]
+    assert said["simulated"]["episodes"] == 50
+
+
+def test_playback_needs_a_grid_of_its_size(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["evaluate", "baseline=playback", f"baseline.file={log}", "grid.size=5", "quiet=true"]
+    assert main([*words, f"hydra.run.dir={tmp_path / 'a'}"]) == 2
+    assert "recorded on a grid of size 4, expected grid.size=5" in capsys.readouterr().err
+
+
+def test_a_full_disk_stops_the_log_and_is_said_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    added = EpisodeWriter.add
+
+    def full(writer: EpisodeWriter, episode: Episode) -> None:
+        if episode.number >= 6:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        added(writer, episode)
+
+    monkeypatch.setattr(EpisodeWriter, "add", full)
+    words = ["train", *TRAIN, "evaluation.every=2", "log=mcap", "log.evaluations=1", "log.episodes=4", "quiet=true"]
+    assert main([*words, f"hydra.run.dir={tmp_path / 'a'}"]) == 0
+    part = tmp_path / "a/episodes.mcap.part"
+    error = capsys.readouterr().err
+    assert error == f"trackmdp train: {part}: no space left on device; no more episodes are logged\n"
+    assert (tmp_path / "a/summary.json").is_file()
+    assert part.is_file()
+    assert not (tmp_path / "a/episodes.mcap").exists()
+
+
+def test_an_evaluation_outlives_its_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(writer: EpisodeWriter) -> Path:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(EpisodeWriter, "finish", full)
+    words = ["evaluate", "baseline=qmdp", *WORLD, "log=mcap", "episodes=5", f"hydra.run.dir={tmp_path}"]
+    assert main(words) == 0
+    said = capsys.readouterr()
+    assert said.err.endswith("no space left on device; no more episodes are logged\n")
+    assert "episodes in " not in said.out
+    assert (tmp_path / "evaluation.json").is_file()
+
+
+def test_a_file_that_may_not_grow_leaves_what_was_flushed(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from trackmdp.episodes.recover import recover
+    from trackmdp.episodes.verify import acting_of
+
+    with EpisodeReader(log) as reader:
+        world, acting = reader.world(), acting_of(reader, 0)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    mine = EpisodeLog(tmp_path, world, seed=0, config="", max_steps=None, layout=False, command="train")
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+        for _ in range(3):
+            mine.record(acting, {}, 300)
+        mine.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    error = capsys.readouterr().err
+    assert error == f"trackmdp train: {tmp_path}/episodes.mcap.part: file too large; no more episodes are logged\n"
+    assert 0 < recover(tmp_path / "episodes.mcap.part").episodes < 300
+
+
+def test_keys_of_the_player() -> None:
+    state = Playing(steps=5, speed=4)
+    state.tick()
+    assert (state.t, state.paused) == (1, False)
+    for key, t in (("\x1b[C", 2), ("\x1b[D", 1), ("l", 2), ("\x1b[F", 4), ("l", 4), ("\x1b[H", 0), ("h", 0)):
+        state.press(key)
+        assert (state.t, state.paused) == (t, True), key
+    state.tick()
+    assert state.t == 0
+    state.press(" ")
+    for _ in range(9):
+        state.tick()
+    assert (state.t, state.paused) == (4, True)
+    state.press(" ")
+    assert (state.t, state.paused) == (0, False)
+    state.press("+")
+    assert state.speed == 8
+    state.press("-")
+    assert (state.speed, state.over) == (4, False)
+    state.press("q")
+    assert state.over
+
+
+@pytest.mark.slow
+def test_playing_at_a_terminal(log: Path) -> None:
+    """In a terminal of its own: the first step is drawn, an arrow steps on, q ends it."""
+    ours, theirs = pty.openpty()
+    words = [sys.executable, "-m", "trackmdp.app.cli", "replay", f"file={log}", "episode=7", "speed=0.01"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "TERM": "xterm-256color", "COLUMNS": "120", "LINES": "40"}
+    process = subprocess.Popen(words, stdin=theirs, stdout=theirs, stderr=theirs, env=environment)
+    os.close(theirs)
+    shown = b""
+    for wanted, key in ((b"step 1 of", b"\x1b[C"), (b"step 2 of", b"q")):
+        while wanted not in shown:
+            shown += os.read(ours, 4096)
+        os.write(ours, key)
+    try:
+        while os.read(ours, 4096):
+            pass
+    except OSError:  # the other end is closed
+        pass
+    assert process.wait() == 0
+    os.close(ours)

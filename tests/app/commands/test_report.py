@@ -1,0 +1,115 @@
+"""`report` as a user types it."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.reports.sweeps import write_sweep
+from tests.typed import refused
+from trackmdp.app.cli import main
+from trackmdp.reports.gather import run_folders
+
+
+@pytest.fixture(scope="module")
+def sweep(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_sweep(tmp_path_factory.mktemp("sweep"))
+
+
+@pytest.fixture(autouse=True)
+def empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    return tmp_path / "here"
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
+def test_a_report_holds_page_figures_tables_and_what_it_was_made_from(
+    sweep: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["report", f"sweep={sweep}", "resamples=100"]) == 0
+    assert capsys.readouterr().out == f"12 runs; report in {sweep / 'report/report.html'}\n"
+    made = contents(sweep / "report")
+    kept = {"runs.csv", "curves.csv", "policies.npz", "worlds.npz", "manifest.json"}
+    assert made.keys() >= kept | {"report.html", "tables/methods.csv", "tables/methods.tex", "tables/runs.csv"}
+    assert made.keys() >= {f"figures/aihtr-z-5.{ending}" for ending in ("svg", "png", "csv")}
+    rows = list(csv.DictReader(made["runs.csv"].decode().splitlines()))
+    assert len(rows) == 12
+    manifest = json.loads(made["manifest.json"])
+    assert manifest["config_sha256"].keys() == {row["run"] for row in rows}
+    assert b"the paper" not in made["report.html"].lower()
+
+    # from what it keeps, and from nothing else, the same report is made again
+    assert main(["report", f"sweep={sweep / 'report'}", "resamples=100", "hydra.run.dir=two", "quiet=true"]) == 0
+    assert capsys.readouterr().out == ""
+    assert contents(Path("two")) == made
+    assert len(run_folders(sweep, None)) == 12  # the report that lies there is no run
+
+
+def test_what_is_missing_is_said_in_one_line_and_in_the_page(
+    sweep: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cut = write_sweep(tmp_path / "cut")
+    (cut / "a2c-0.16-0/summary.json").unlink()
+    (cut / "a2c-0.16-1/summary.json").write_text("{")
+    assert main(["report", f"sweep={cut}", "resamples=100"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "missing or mixed: a2c-0.16-0: cut: it has no summary.json and 2 more"
+    assert lines[1].startswith("10 runs; report in")
+    page = (cut / "report/report.html").read_text(encoding="utf-8")
+    assert "a2c-0.16-1" in page
+    assert "seed 0, 1 missing" in page
+
+
+def test_a_sweep_in_which_nothing_finished_is_reported_as_well(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "s/a").mkdir(parents=True)
+    (tmp_path / "s/a/failed.json").write_text('{"reason": "out of luck"}')
+    assert main(["report", f"sweep={tmp_path / 's'}"]) == 0
+    assert "a: failed: out of luck" in capsys.readouterr().out
+    assert "out of luck" in (tmp_path / "s/report/report.html").read_text(encoding="utf-8")
+
+
+def test_mistakes_end_in_one_line(
+    sweep: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "empty").mkdir()
+    assert refused(capsys, "report") == "sweep: missing, expected the folder of a sweep or an earlier report"
+    assert refused(capsys, "report", "sweep=nowhere") == f"sweep={Path.cwd() / 'nowhere'}: no such folder"
+    assert "no runs in there" in refused(capsys, "report", "sweep=../empty")
+    assert "no runs in there" in refused(capsys, "report", "sweep=../empty", "watch=true")
+    assert not list((tmp_path / "empty").iterdir())
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert "trackmdp[report]" in refused(capsys, "report", f"sweep={sweep}", "hydra.run.dir=../out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_finished_sweep_is_watched_at_once(sweep: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["report", f"sweep={sweep}", "watch=true"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 13
+    assert lines[-1] == "12 runs: 12 done"
+    assert all(", gap " in line for line in lines[:-1])
+
+
+@pytest.mark.slow
+def test_a_sweep_as_typed_is_reported_with_what_failed(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["seed=0,1", "grid.size=3,2", "algo.updates=2", "algo.total_frames=2000", "algo.frames_per_batch=1000"]
+    assert main(["train", "-m", *words, "quiet=true", "hydra.sweep.dir=all"]) == 2
+    capsys.readouterr()
+    assert main(["report", "sweep=all", "resamples=100"]) == 0, capsys.readouterr().err
+    lines = capsys.readouterr().out.splitlines()
+    assert "failed: grid.size=2: expected an integer from 3 to 64 (cells) and 1 more" in lines[0]
+    assert lines[1].startswith("2 runs; report in")
+    page = Path("all/report/report.html").read_text(encoding="utf-8")
+    assert "2 of 4 planned runs" in page
+    assert "trackmdp train -m seed=0,1 grid.size=3,2" in page
+    assert str(Path.cwd()) not in page

@@ -1,0 +1,103 @@
+"""`solve` and `verify` as they are typed."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.solvers.worlds import paper_world
+from trackmdp.app.cli import main
+from trackmdp.solvers import bounds
+from trackmdp.solvers.chains import evaluate
+
+
+def read(folder: Path, name: str) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads((folder / name).read_text(encoding="utf-8"))
+    return content
+
+
+def chains_of(policy: dict[str, Any], cells: int) -> np.ndarray:
+    chains = np.zeros((cells, policy["t_max"] + 1, cells), dtype=bool)
+    for x, chain in policy["sets"].items():
+        for n, sensed in enumerate(chain):
+            chains[int(x), n, sensed] = True
+    return chains
+
+
+def test_solution_json_holds_the_certified_optimum(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["solve", "cost.sensor=0.22", "grid.t_max=2", f"hydra.run.dir={tmp_path / 'a'}"]) == 0
+    solution = read(tmp_path / "a", "solution.json")
+    world = paper_world(5, 0.22, 2)
+    assert solution["certified"] is True
+    assert solution["lower"] == pytest.approx(90.48447403756, abs=1e-8)
+    assert solution["lower"] <= solution["upper"] <= solution["lower"] + 1e-4
+    np.testing.assert_allclose(np.mean(solution["value"]), solution["lower"])
+    policy = evaluate(world, chains_of(solution["policy"], 100))
+    np.testing.assert_allclose(policy.value, solution["value"], atol=1e-9)
+    assert solution["bounds"]["clocked"] == pytest.approx(bounds.clocked(world).mean())
+    assert solution["seconds"] > 0
+    assert solution["nodes"] > 0
+    assert "certified: bracket 90.484474" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("solver", ["qmdp", "fcr", "lookahead", "clocked"])
+def test_other_solvers_are_bracketed_by_the_clocked_bound(tmp_path: Path, solver: str) -> None:
+    assert main(["solve", f"solver={solver}", "grid.size=4", "quiet=true", f"hydra.run.dir={tmp_path / 'a'}"]) == 0
+    solution = read(tmp_path / "a", "solution.json")
+    assert solution["lower"] <= solution["upper"] == pytest.approx(solution["bounds"]["clocked"])
+
+
+def test_quiet_says_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["solve", "grid.size=3", "quiet=true", f"hydra.run.dir={tmp_path / 'a'}"]) == 0
+    assert capsys.readouterr().out == ""
+
+
+def test_verify_prints_and_writes_every_check(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["verify", "grid.size=4", f"hydra.run.dir={tmp_path / 'a'}"]) == 0
+    checks = read(tmp_path / "a", "verification.json")["checks"]
+    names = {check["name"] for check in checks}
+    assert {"Theorem 1", "Theorem 2", "Lemma 1, first", "Theorem 3, exact form", "Q_MDP", "the printed bound"} <= names
+    assert all(check["passed"] for check in checks)
+    printed = capsys.readouterr().out
+    assert "13 of 13 claims hold" in printed
+    assert "does not hold" in printed
+
+
+def test_solve_verify(tmp_path: Path) -> None:
+    words = ["solve", "grid.size=3", "verify=true", "quiet=true", f"hydra.run.dir={tmp_path / 'a'}"]
+    assert main(words) == 0
+    assert (tmp_path / "a" / "solution.json").exists()
+    assert read(tmp_path / "a", "verification.json")["optimum"]["certified"]
+
+
+@pytest.mark.parametrize("command", ["solve", "verify"])
+def test_cut_episodes_are_refused(tmp_path: Path, command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([command, "grid.max_steps=10", f"hydra.run.dir={tmp_path / 'a'}"]) == 2
+    assert capsys.readouterr().err.startswith(f"trackmdp {command}: grid.max_steps=10: ")
+    assert not (tmp_path / "a").exists()
+
+
+def test_ctrl_c_prints_and_saves_the_bracket(tmp_path: Path) -> None:
+    world = ["kernel=random_walk", "kernel.diagonal=true", "grid.t_max=3", "solver.time_limit=500"]
+    words = [sys.executable, "-m", "trackmdp.app.cli", "solve", *world, f"hydra.run.dir={tmp_path / 'a'}"]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if "bracket" in line:  # the search is on
+                process.send_signal(signal.SIGINT)
+                break
+        printed, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "interrupted: bracket" in printed
+    assert errors == "trackmdp solve: interrupted\n"
+    solution = read(tmp_path / "a", "solution.json")
+    assert solution["interrupted"] is True
+    assert solution["certified"] is False
+    assert solution["lower"] < solution["upper"]

@@ -1,0 +1,208 @@
+"""`kernel=tracks` as a user types it: train, evaluate, export, resume, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.config.cases import composed
+from tests.helpers import small_world
+from tests.reads import record_reads, unread
+from tests.tracks import drawn, write
+from tests.training.runs import assert_same_run, at_iteration
+from tests.typed import refused
+from trackmdp.app.cli import main
+from trackmdp.app.commands.train import run
+from trackmdp.config import GROUPS
+from trackmdp.world.tracks import load_tracks, split
+
+TRACKS = drawn(small_world(exit_probability=0.05).kernel, 60)
+WORDS = ["kernel=tracks", "kernel.path=../tracks.csv", "kernel.min_length=1", "grid.size=3", "quiet=true"]
+SMALL = [
+    "collector.total_frames=2048",
+    "collector.frames_per_batch=256",
+    "collector.envs=32",
+    "evaluation.every=4",
+    "checkpoint.every=256",
+    "checkpoint.seconds=null",
+]
+LEARN = ["algo.hidden=16", "algo.batch_size=64", "algo.updates=8", "algo.updates_per_iteration=2"]
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder to type in, beside `tracks.csv`."""
+    write(tmp_path / "tracks.csv", TRACKS)
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    return here
+
+
+def train(run: str, *words: str) -> int:
+    return main(["train", *WORDS, *SMALL, *LEARN, f"hydra.run.dir={run}", *words])
+
+
+def test_train_then_evaluate_then_export(folder: Path) -> None:
+    assert train("a") == 0
+    summary = json.loads((folder / "a/summary.json").read_text())
+    assert main(["evaluate", "run=a", "quiet=true"]) == 0
+    evaluation = json.loads((folder / "a/evaluation.json").read_text())
+    assert evaluation["held_out"] == summary["held_out"]
+    assert evaluation["regret_per_step"] is None
+    assert len(evaluation["value"]) == 9
+    assert "●" in (folder / "a/picture.txt").read_text() or "○" in (folder / "a/picture.txt").read_text()
+    written = json.loads((folder / "a/sets.json").read_text())
+    assert main(["export", "run=a", "format=sets", "quiet=true"]) == 0
+    assert json.loads((folder / "a/sets.json").read_text()) == written
+
+
+def test_the_picture_follows_a_held_out_track(folder: Path) -> None:
+    assert main(["evaluate", *WORDS, "baseline=all_on", "hydra.run.dir=p", "seed=2"]) == 0
+    lines = (folder / "p/picture.txt").read_text().splitlines()
+    rows = [line.split("   ") for line in lines[1:4]]
+    drawn_cells = [
+        row * 3 + frame[row].split().index("●")
+        for frame in zip(*rows, strict=True)
+        for row in range(3)
+        if "●" in frame[row]
+    ]
+    held_out = split(load_tracks(folder.parent / "tracks.csv", 3, exits=True), 0.2, 0)[1]
+    paths = [held_out.cells[a:b].tolist() for a, b in zip(held_out.first[:-1], held_out.first[1:], strict=True)]
+    assert any(path[1:7] == drawn_cells for path in paths)
+
+
+@pytest.mark.parametrize(("baseline", "sensors"), [("all_on", 9.0), ("none", 0.0), ("random_k", 2.0)])
+def test_what_needs_no_motion_model_is_judged(baseline: str, sensors: float, folder: Path) -> None:
+    words = ["baseline.k=2"] if baseline == "random_k" else []
+    assert main(["evaluate", *WORDS, f"baseline={baseline}", "hydra.run.dir=b", *words]) == 0
+    figures = json.loads((folder / "b/evaluation.json").read_text())["held_out"]["figures"]
+    free = 1.0 if baseline == "all_on" else figures["policy"]["sensors_per_step"]["mean"] / sensors if sensors else 1.0
+    assert 0 < free <= 1  # the safe action's sensors are not counted
+    if baseline == "all_on":
+        assert figures["policy"] == figures["all on"]
+    assert (folder / "b/sets.json").exists() == (baseline != "random_k")
+
+
+def test_the_table_shows_what_can_be_judged(capsys: pytest.CaptureFixture[str]) -> None:
+    assert train("a", "quiet=false") == 0
+    shown = capsys.readouterr().out
+    for words in ("12 held-out tracks", "learned (hindsight)", "all on", "no sensors", "Q_MDP of the estimated kernel"):
+        assert words in shown
+    assert "nan" not in shown
+    assert "gap" not in shown
+    assert "optimum" not in shown
+
+
+NEEDS_THE_MODEL = sorted(set(GROUPS["baseline"]) - {"all_on", "none", "random_k"})
+
+
+@pytest.mark.parametrize(
+    ("command", "words", "message"),
+    [
+        ("solve", "", "kernel=tracks: expected a motion model"),
+        ("verify", "", "kernel=tracks: expected a motion model"),
+        ("benchmark", "", "kernel=tracks: expected a motion model"),
+        ("train", "log=mcap", "log=mcap: expected csv or tensorboard with kernel=tracks"),
+        ("evaluate", "baseline=all_on log=mcap", "log=mcap: expected csv or tensorboard with kernel=tracks"),
+        ("train", "kernel.held_out=0.001", "kernel.held_out=0.001: leaves, of 60 tracks, none to judge on"),
+        ("train", "kernel.held_out=0.999", "kernel.held_out=0.999: leaves, of 60 tracks, none to learn from"),
+        ("train", "kernel.held_out=0", "kernel.held_out=0.0: expected a number > 0 and < 1"),
+        ("train", "kernel.path=no.csv", "kernel.path="),
+        ("train", "grid.size=4 kernel.min_length=null", "kernel.path="),
+        *(
+            ("evaluate", f"baseline={name}", f"baseline={name}: expected all_on, none or random_k with kernel=tracks")
+            for name in NEEDS_THE_MODEL
+            if name != "playback"
+        ),
+    ],
+)
+def test_what_cannot_be_is_refused(command: str, words: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    given = ["kernel=tracks", "kernel.path=../tracks.csv", "kernel.min_length=1", "grid.size=3", *words.split()]
+    assert refused(capsys, command, *dict.fromkeys(given)).startswith(message)
+
+
+BAD = {
+    "gap": ("track,step,cell\n0,0,1\n0,1,1\n0,3,1\n0,4,1\n", "track 0 has a gap: step 3 follows step 1"),
+    "outside": ("track,cell\n0,1\n0,9\n0,1\n0,1\n", "cell of entry 2 is 9"),
+    "twice": ("track,step,cell\n0,0,1\n0,1,1\n0,1,2\n0,2,1\n", "track 0 has step 1 twice"),
+    "fraction": ("track,cell\n0,1\n0,0.5\n0,1\n0,1\n", "cell of entry 2 is 0.5, expected an integer"),
+    "short": ("track,cell\n0,1\n0,0\n0,1\n1,1\n1,1\n1,1\n1,1\n", "track 0 has 3 cells, expected at least 4"),
+    "empty": ("track,cell\n", "no tracks"),
+    "nothing": ("", "columns"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+@pytest.mark.parametrize("command", ["train", "evaluate"])
+def test_a_bad_file_is_refused_before_anything_is_written(
+    command: str, case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text, message = BAD[case]
+    (tmp_path / "bad.csv").write_text(text)
+    words = ["kernel=tracks", "kernel.path=../bad.csv", "grid.size=3", *(["baseline=none"] * (command == "evaluate"))]
+    line = refused(capsys, command, *words)
+    assert line.startswith(f"kernel.path={tmp_path / 'here'}/../bad.csv: {message}")
+
+
+def test_a_pickled_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    objects: Any = np.array([{}], dtype=object)
+    np.savez(tmp_path / "bad.npz", track=objects, cell=objects, allow_pickle=True)
+    line = refused(capsys, "train", "kernel=tracks", "kernel.path=../bad.npz", "grid.size=3")
+    assert "not a table of numbers" in line
+
+
+@pytest.mark.parametrize("algo", ["hindsight", "ppo"])
+def test_a_run_that_was_cut_goes_on_exactly(algo: str, folder: Path) -> None:
+    words = [*WORDS, *SMALL, *(LEARN if algo == "hindsight" else ["algo.hidden=16"]), f"algo={algo}"]
+    assert main(["train", *words, "hydra.run.dir=whole"]) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        at_iteration(patch, 5, lambda: (_ for _ in ()).throw(KeyboardInterrupt()))
+        assert main(["train", *words, "hydra.run.dir=cut"]) != 0
+    assert not (folder / "cut/summary.json").exists()
+    assert main(["train", *words, "hydra.run.dir=cut", "resume=auto"]) == 0
+    assert_same_run(folder / "whole", folder / "cut")
+    whole, cut = (json.loads((folder / name / "summary.json").read_text()) for name in ("whole", "cut"))
+    assert whole["held_out"] == cut["held_out"]
+
+
+def test_a_run_does_not_go_on_with_other_tracks(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        at_iteration(patch, 5, lambda: (_ for _ in ()).throw(KeyboardInterrupt()))
+        assert train("a") != 0
+    write(folder.parent / "tracks.csv", replace(TRACKS, cells=8 - TRACKS.cells))
+    capsys.readouterr()
+    assert train("a", "resume=auto") == 2
+    assert "tracks.json: the run's recording is not the one that its config describes now" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("ends", ["exit", "cut"])
+@pytest.mark.parametrize("starts", ["first", "anywhere"])
+def test_ends_and_starts_are_options(ends: str, starts: str, folder: Path) -> None:
+    write(folder.parent / "tracks.csv", TRACKS.select(TRACKS.lengths > 1))
+    assert train("a", f"kernel.ends={ends}", f"kernel.starts={starts}", "algo.updates=2") == 0
+    summary = json.loads((folder / "a/summary.json").read_text())
+    length = summary["policy"]["expected_length"]
+    held_out = split(load_tracks(folder.parent / "tracks.csv", 3, exits=True), 0.2, 0)[1]
+    assert length == pytest.approx(held_out.lengths.mean() - (ends == "cut"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("collector", ["multi_sync", "multi_async"])
+def test_workers_replay_tracks_too(collector: str, folder: Path) -> None:
+    assert train("a", f"collector={collector}", "collector.workers=2") == 0
+    assert json.loads((folder / "a/summary.json").read_text())["frames"] == 2048
+
+
+def test_every_option_of_the_tracks_is_read(folder: Path) -> None:
+    cfg = composed("train", *WORDS, *SMALL, *LEARN)
+    cfg.kernel.path = "../tracks.csv"
+    (folder / "a").mkdir()
+    with record_reads(cfg) as reads:
+        run(cfg, folder / "a")
+    assert not {key for key in unread(cfg, reads) if key.startswith("kernel.")}

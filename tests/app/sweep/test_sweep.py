@@ -1,0 +1,239 @@
+"""A sweep as a user types it: what it leaves, skips, retries and says."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from tests.app.sweep.runs import ROOT, TINY, here, states, swept, table
+from tests.typed import stub
+from trackmdp.app.cli import main
+from trackmdp.app.sweep.job import stop_signal
+from trackmdp.app.sweep.plan import Job
+from trackmdp.app.sweep.state import read_plan, run_of, runs_of
+from trackmdp.app.sweep.sweep import sweep
+from trackmdp.errors import Preempted, RunError
+from trackmdp.training.lock import locked
+
+__all__ = ["here"]
+
+
+def test_the_same_line_again_skips_what_is_done(here: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    line = ["train", "-m", *TINY, "seed=0,1"]
+    assert main(line) == 0
+    (sweep,) = (here / "multirun").iterdir()
+    assert states(sweep) == ["done", "done"]
+    before = {file: file.stat().st_mtime_ns for file in sweep.rglob("*") if file.is_file()}
+    first = (sweep / "runs.csv").read_bytes()
+    capfd.readouterr()
+    assert main(line) == 0
+    said = capfd.readouterr().out
+    assert "2 runs, 2 of them done before -> multirun/train-" in said
+    assert "2 skipped; " in said
+    assert (sweep / "runs.csv").read_bytes() == first
+    after = {file: file.stat().st_mtime_ns for file in sweep.rglob("*") if file.is_file()}
+    assert {file.name for file in after if after[file] != before.get(file)} == {"sweep.json", "runs.csv", ".lock"}
+
+
+def test_the_table_holds_the_figures_of_each_run(here: Path) -> None:
+    assert swept("seed=0,1", "quiet=true") == 0
+    for row, seed in zip(table(here / "all"), "01", strict=True):
+        summary = json.loads((here / "all" / row["folder"] / "summary.json").read_text())
+        assert (row["seed"], row["state"], row["grid.size"]) == (seed, "done", "3")
+        assert float(row["aihtr"]) == summary["policy"]["aihtr"]
+        assert float(row["regret_per_step"]) == summary["regret_per_step"]
+        assert int(row["frames"]) == 2048
+
+
+def test_a_run_of_a_sweep_is_the_run_typed_alone(here: Path) -> None:
+    assert swept("seed=3", "quiet=true") == 0
+    assert main(["train", *TINY, "seed=3", "quiet=true", "hydra.run.dir=alone"]) == 0
+    (row,) = table(here / "all")
+    assert float(row["aihtr"]) == json.loads((here / "alone/summary.json").read_text())["policy"]["aihtr"]
+
+
+def test_a_mistake_in_one_run_is_told_and_the_others_go_on(here: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert swept("grid.size=3,2,4,99") == 2
+    assert states(here / "all") == ["done", "failed", "done", "failed"]
+    captured = capfd.readouterr()
+    reason = "grid.size=2: expected an integer from 3 to 64 (cells)"
+    said = captured.err.splitlines()
+    assert said[0].startswith("trackmdp train: size_2-")
+    assert said[0].endswith(f" failed: {reason}")
+    assert said[-1] == "trackmdp train: 2 of 4 runs failed"
+    assert "2 done, 2 failed; all/runs.csv" in captured.out
+    failed = runs_of(here / "all")[1]
+    assert (failed.state, failed.reason) == ("failed", reason)
+    assert [path.name for path in failed.folder.iterdir()] == ["failed.json"]
+
+
+@pytest.mark.parametrize(
+    ("end", "status", "reason"),
+    [
+        (lambda: sys.exit(3), 1, "SystemExit: 3"),
+        (lambda: os._exit(3), 1, "its process ended with status 3"),
+        (lambda: os.kill(os.getpid(), signal.SIGKILL), 1, "killed by SIGKILL, perhaps for lack of memory"),
+    ],
+)
+def test_nothing_that_ends_a_run_ends_the_others(
+    end: Any, status: int, reason: str, here: Path, monkeypatch: Any
+) -> None:
+    def run(cfg: Any, folder: Path) -> float:
+        if cfg.seed == 1:
+            end()
+        return float(cfg.seed)
+
+    stub(monkeypatch, "train", run)
+    assert swept("seed=0,1,2", "quiet=true") == status
+    assert states(here / "all") == ["done", "failed", "done"]
+    assert table(here / "all")[1]["reason"] == reason
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (MemoryError(), "MemoryError"),
+        (ZeroDivisionError("a bug"), "ZeroDivisionError: a bug"),
+        (RunError("iteration 3: the loss\nis not finite"), "iteration 3: the loss is not finite"),
+        (Preempted(15), "stopped by signal 15"),
+    ],
+)
+def test_nothing_that_a_run_raises_ends_the_others(
+    error: BaseException, reason: str, here: Path, monkeypatch: Any, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def run(cfg: Any, folder: Path) -> float:
+        if cfg.seed == 1:
+            raise error
+        return float(cfg.seed)
+
+    stub(monkeypatch, "train", run)
+    assert swept("seed=0,1,2", "quiet=true") == 1
+    assert [row["reason"] for row in table(here / "all")] == ["", reason, ""]
+    said = capfd.readouterr().err
+    assert ("Traceback" in said) == (type(error) in (MemoryError, ZeroDivisionError))
+
+
+def test_a_failed_run_is_retried(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        stub(patch, "train", lambda cfg, folder: 1 / cfg.seed)
+        assert swept("seed=0,1", "quiet=true") == 1
+    assert states(here / "all") == ["failed", "done"]
+    assert swept("seed=0,1", "quiet=true") == 0
+    assert states(here / "all") == ["done", "done"]
+    assert not list(here.rglob("failed.json"))
+
+
+def test_the_summary_of_another_config_does_not_count(here: Path) -> None:
+    assert swept("seed=0", "quiet=true") == 0
+    (run,) = runs_of(here / "all")
+    summary = json.loads((run.folder / "summary.json").read_text())
+    (run.folder / "summary.json").write_text(json.dumps(summary | {"config_sha256": "0", "policy": {"aihtr": 7.0}}))
+    assert swept("seed=0", "quiet=true") == 0
+    assert json.loads((run.folder / "summary.json").read_text())["policy"] == summary["policy"]
+
+
+def test_blocks_of_an_experiment_are_the_sweep(here: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    (here / "mine/experiment").mkdir(parents=True)
+    (here / "mine/experiment/few.yaml").write_text(
+        "# @package _global_\ngrid: {size: 3}\nalgo: {updates: 4, hidden: 8}\n"
+        "collector: {total_frames: 2048, frames_per_batch: 1024, envs: 64}\n"
+        "hydra: {sweeper: {blocks: ['kernel.support_size=3 seed=0,1', 'kernel.support_size=4 kernel.seed=7']}}\n"
+    )
+    line = ["train", "-m", "--config-dir", "mine", "experiment=few"]
+    assert main([*line, "quiet=true"]) == 0
+    (sweep,) = (here / "multirun").iterdir()
+    assert sweep.name.startswith("few-")
+    assert [row["folder"].rpartition("-")[0] for row in table(sweep)] == [
+        "support_size_3-seed_0",
+        "support_size_3-seed_1",
+        "support_size_4-seed_7",
+    ]
+    assert main(line) == 0
+    assert "3 runs, 3 of them done before" in capfd.readouterr().out
+    assert main([*line, "grid.sise=3"]) == 2
+    assert capfd.readouterr().err.startswith("trackmdp train: grid.sise: unknown option, did you mean grid.size?")
+    assert main([*line[:-1], "experiment=fwe"]) == 2
+    assert capfd.readouterr().err == "trackmdp train: experiment=fwe: expected one of few, paper\n"
+
+
+def test_the_plan_is_on_disk_before_the_first_run(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def run(cfg: Any, folder: Path) -> float:
+        (folder / "config.yaml").touch()
+        with locked(folder):
+            shown = runs_of(folder.parent)
+        assert [each.state for each in shown] == (["running", "waiting"] if cfg.seed == 0 else ["done", "running"])
+        return 1.0
+
+    stub(monkeypatch, "train", run)
+    assert swept("seed=0,1", "quiet=true") == 0
+    content = read_plan(here / "all")
+    assert content["command"] == "train"
+    assert content["line"].startswith("trackmdp train -m grid.size=3 ")
+    assert [job["overrides"][-2] for job in content["jobs"]] == ["seed=0", "seed=1"]
+
+
+def test_a_sweep_that_is_running_is_not_started_twice(here: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    (here / "all").mkdir()
+    with locked(here / "all"):
+        assert swept("seed=0", "quiet=true") == 2
+    assert capfd.readouterr().err == (
+        f"trackmdp train: hydra.sweep.dir={here / 'all'}: another process is running in this folder\n"
+    )
+
+
+def test_another_command_has_its_value_in_the_table(here: Path) -> None:
+    line = ["evaluate", "-m", "grid.size=3", "baseline=qmdp,none", "episodes=0", "quiet=true", "hydra.sweep.dir=all"]
+    assert main(line) == 0
+    exact = [json.loads((run.folder / "evaluation.json").read_text())["exact"] for run in runs_of(here / "all")]
+    assert [float(row["aihtr"]) for row in table(here / "all")] == [each["aihtr"] for each in exact]
+
+
+def test_states_of_a_run(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    assert run_of(folder).state == "waiting"
+    folder.mkdir()
+    (folder / "config.yaml").touch()
+    assert run_of(folder).state == "cut"
+    with locked(folder):
+        assert run_of(folder).state == "running"
+    (folder / "failed.json").write_text('{"reason": "no luck"}')
+    assert (run_of(folder).state, run_of(folder).reason) == ("failed", "no luck")
+    (folder / "summary.json").write_text('{"policy": {}}')
+    assert run_of(folder).state == "done"
+
+
+def test_a_signal_is_told_to_the_runs_and_ends_the_sweep(tmp_path: Path) -> None:
+    one, two = (Job("train", tmp_path, name, (), None) for name in ("one", "two"))
+    before, seen = signal.getsignal(signal.SIGTERM), []
+
+    def launch(jobs: Sequence[Job]) -> None:
+        signal.raise_signal(signal.SIGTERM)
+        seen.append(([job.name for job in jobs], stop_signal(tmp_path), signal.getsignal(signal.SIGTERM)))
+
+    with pytest.raises(Preempted) as told:
+        sweep(tmp_path, "train", "a line", [[one], [two]], launch, Console(quiet=True))
+    assert seen == [(["one"], signal.SIGTERM, before)]
+    assert (told.value.signal, stop_signal(tmp_path), signal.getsignal(signal.SIGTERM)) == (signal.SIGTERM, 0, before)
+    assert states(tmp_path) == ["waiting"]
+
+
+def test_skipping_imports_nothing_heavy(here: Path) -> None:
+    assert swept("seed=0", "quiet=true") == 0
+    code = f"""
+import sys
+from trackmdp.app.cli import main
+status = main({["train", "-m", *TINY, "seed=0", "hydra.sweep.dir=all"]})
+sys.exit(str((status, sorted({{"torch", "torchrl", "scipy"}} & set(sys.modules)))))
+"""
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)
+    assert result.stderr == "(0, [])\n"

@@ -1,0 +1,96 @@
+"""The paper's theorems as checks: they hold where they are claimed, and a wrong policy is found out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+
+from tests.solvers.worlds import paper_world, tiny_worlds
+from trackmdp.paper import remarks, theorems, worlds
+from trackmdp.paper.theorems import Check
+from trackmdp.solvers import bounds, clocked, optimal, qmdp
+from trackmdp.solvers.chains import evaluate
+from trackmdp.solvers.optimal import Solution
+from trackmdp.world.kernels import random_walk
+from trackmdp.world.model import BoolArray, World
+
+
+def checks(world: World, solution: Solution | None = None) -> dict[tuple[str, str], Check]:
+    solved = optimal.solve(world, tolerance=1e-9, time_limit=20) if solution is None else solution
+    return {(row.name, row.statement): row for row in theorems.check(world, solved, 1e-8)}
+
+
+def named(rows: dict[tuple[str, str], Check], name: str) -> list[Check]:
+    return [row for (own, _), row in rows.items() if own == name]
+
+
+@settings(max_examples=25)
+@given(tiny_worlds(most_t_max=2))
+def test_every_claim_holds(world: World) -> None:
+    for row in checks(world).values():
+        assert row.passed, row
+        assert not np.isnan(row.deviation)
+
+
+def test_every_claim_holds_where_beliefs_spread() -> None:
+    rows = checks(paper_world(5, 0.22, 2))
+    assert all(row.passed for row in rows.values())
+    (printed,) = named(rows, "Theorem 3, as printed")
+    assert not printed.holds
+    assert not printed.expected
+
+
+def _solution(world: World, chains: BoolArray) -> Solution:
+    value = evaluate(world, chains).value
+    return replace(optimal.solve(world), chains=chains, value=value)
+
+
+def test_a_policy_without_the_track_property_is_found_out() -> None:
+    """One sensor of the support switched off: p = 0.2113 there, so p r - c p_in = 0.2113 - 0.16 * 0.995."""
+    world = paper_world(5, 0.16, 1)
+    chains = optimal.solve(world).chains.copy()
+    cell = 44
+    off = int(np.argmax(world.kernel[cell]))
+    chains[cell, 0, off] = False
+    rows = checks(world, _solution(world, chains))
+    (sharp,) = named(rows, "Theorem 1, sharp")
+    assert not sharp.passed
+    assert sharp.deviation >= world.kernel[cell, off] - 0.16 * 0.995 - 1e-12
+
+
+def test_with_a_cheap_safe_action_being_overdue_is_worth_more_than_being_located() -> None:
+    """Lemma 1 needs D >= the price of all sensors: at D = 0 and c > r, only the safe action earns anything."""
+    kernel = np.full((4, 4), 0.2)
+    world = World(2, 1.0, np.full(4, 1.5), 0.0, 1, kernel)
+    (row,) = named(checks(world), "Lemma 1, first")
+    assert not row.holds
+    assert not row.expected
+    assert row.deviation > 0.1
+
+
+def test_the_remark_on_worlds_where_qmdp_is_optimal() -> None:
+    rows = {row.name: row for row in remarks.check(1e-9)}
+    assert rows["remark, c = 0.14, Z = 4"].holds
+    world = paper_world(4, 0.14, 1)
+    np.testing.assert_array_equal(qmdp.solve(world)[:, 0], world.kernel > 0)
+    assert evaluate(world, optimal.solve(world).chains).accuracy == pytest.approx(1.0)
+
+
+def test_the_printed_bound_is_exceeded() -> None:
+    (row,) = [row for row in remarks.check(1e-9) if row.name == "the printed bound"]
+    world = worlds.paper_world(worlds.paper_kernel(5, 5, "inside"), 0.16, 5)
+    attained = evaluate(world, clocked.solve(world)).aihtr
+    assert attained > bounds.paper(world).mean() + 0.5
+    assert attained <= bounds.valid(world).mean()
+    assert not row.holds
+    assert row.deviation == pytest.approx(attained - bounds.paper(world).mean())
+
+
+def test_ties_do_not_look_like_failures() -> None:
+    """A walk on nine cells, each as likely: from an inner cell p r = c p_in exactly, to sense or not is the same."""
+    kernel = random_walk(4, stay=1 / 9, diagonal=True, exit_probability=0.1, border="renormalize")
+    world = World(4, 1.0, np.full(16, 1 / 9), 16 / 9, 1, kernel)
+    assert all(row.passed for row in checks(world).values())

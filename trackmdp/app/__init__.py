@@ -1,0 +1,1 @@
+"""The command line: composing, checking, launching and sweeping commands with Hydra."""

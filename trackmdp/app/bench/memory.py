@@ -1,0 +1,30 @@
+"""What training takes of the memory, beside what it was expected to take."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+
+from trackmdp.app.bench.process import trained
+from trackmdp.app.bench.speed import train_config
+from trackmdp.build import make_world
+from trackmdp.config import BenchmarkConfig
+from trackmdp.training.memory import needs
+from trackmdp.world.model import World
+
+__all__ = ["memory"]
+
+SIZES, FRAMES = (5, 10, 20), 300_000
+
+
+def memory(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator[dict[str, Any]]:  # noqa: ARG001
+    """One row per algorithm and grid size: peak of the whole process, Python and torch included, of 300 k frames."""
+    for algo, size in itertools.product(cfg.algos, SIZES):
+        words = [f"algo={algo}", f"grid.size={size}", f"collector.total_frames={FRAMES}", "optimal.enabled=false"]
+        train = train_config(words)
+        expected = sum(needs(train, make_world(train).task).values())
+        peak = trained(*words, f"threads={cfg.threads}", f"device={device}").usage.peak_mib
+        yield {"part": "memory", "algo": algo, "N": size, "expected_mib": expected / 2**20, "peak_mib": peak}

@@ -1,0 +1,118 @@
+"""A program measured as a whole: from its start to its end, with the memory it took."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+__all__ = ["Trained", "Usage", "measured", "on_one_core", "trained"]
+
+_WRAPPER = """
+import json, re, resource, runpy, sys
+from pathlib import Path
+report, kind, sys.argv = sys.argv[1], sys.argv[2], sys.argv[3:]
+try:
+    if kind == "module":
+        runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
+    else:
+        sys.path[0] = str(Path(sys.argv[0]).parent)
+        runpy.run_path(sys.argv[0], run_name="__main__")
+finally:
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    own = Path("/proc/self/status")  # ru_maxrss starts at the peak of the process that started this one
+    peak = int(re.search(r"VmHWM:\\s+(\\d+)", own.read_text())[1]) if own.is_file() else usage.ru_maxrss
+    used = {"cpu_seconds": usage.ru_utime + usage.ru_stime, "peak_mib": peak / 1024}
+    Path(report).write_text(json.dumps(used))
+"""
+
+
+@dataclass(frozen=True)
+class Usage:
+    """What a process took: seconds from its start to its end, CPU seconds, and its peak memory."""
+
+    wall_seconds: float
+    cpu_seconds: float
+    peak_mib: float
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A training run: its `summary.json`, the rows of `metrics.csv` that were judged, and what it took."""
+
+    summary: dict[str, Any]
+    curve: list[dict[str, str]]
+    usage: Usage
+
+    def settled(self, threshold: float) -> float | None:
+        """Seconds of collecting and learning after which the regret stays below `threshold`; None if it never does."""
+        since = None
+        for row in self.curve:
+            if float(row["regret_per_step"]) > threshold:
+                since = None
+            elif since is None:
+                since = float(row["seconds"])
+        return since
+
+    def figures(self) -> dict[str, float]:
+        """Frames, final regret and usage, as the columns of a table."""
+        return {
+            "frames": self.summary["frames"],
+            "regret_per_step": self.summary["regret_per_step"],
+            **asdict(self.usage),
+        }
+
+
+def measured(*words: str, script: str | None = None, python: str = sys.executable, quiet: bool = False) -> Usage:
+    """Run `trackmdp words...`, or `python script words...`, in a process of its own.
+
+    Args:
+        words: what is typed.
+        script: a Python file; None for this package.
+        python: the interpreter of `script`.
+        quiet: throw away what it prints.
+
+    Raises:
+        CalledProcessError: it failed.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        report = Path(folder, "usage.json")
+        program = ("module", "trackmdp.app.cli") if script is None else ("script", script)
+        output = subprocess.DEVNULL if quiet else None
+        started = time.perf_counter()
+        subprocess.run([python, "-c", _WRAPPER, str(report), *program, *words], check=True, stdout=output)
+        wall = time.perf_counter() - started
+        return Usage(wall, **json.loads(report.read_text()))
+
+
+def trained(*words: str) -> Trained:
+    """Run `trackmdp train words...` in a process of its own."""
+    with tempfile.TemporaryDirectory() as folder:
+        usage = measured("train", *words, "quiet=true", f"hydra.run.dir={folder}/run")
+        summary = json.loads(Path(folder, "run", "summary.json").read_text())
+        with Path(folder, "run", "metrics.csv").open() as stream:
+            curve = [row for row in csv.DictReader(stream) if row["regret_per_step"]]
+    return Trained(summary, curve, usage)
+
+
+@contextmanager
+def on_one_core() -> Iterator[None]:
+    """Meanwhile this process, and those it starts, run on one and the same core, where the system lets them."""
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    cores: Sequence[int] = sorted(os.sched_getaffinity(0))
+    os.sched_setaffinity(0, {cores[-1]})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, cores)

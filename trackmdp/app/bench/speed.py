@@ -1,0 +1,103 @@
+"""Frames per second: the environment alone, the collector, and training."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra import compose
+from tensordict.nn import TensorDictModuleBase
+from torchrl.collectors import Collector
+
+from trackmdp.app.bench.machine import rate
+from trackmdp.build import make_algorithm, make_collector
+from trackmdp.config import GROUPS, BenchmarkConfig, TrainConfig, from_hydra
+from trackmdp.policies.actor_critic import make_actor
+from trackmdp.policies.fixed import AllOn, RandomSubset
+from trackmdp.seeding import generator
+from trackmdp.world.env import TrackEnv
+from trackmdp.world.model import World
+
+__all__ = ["collector_speed", "env_speed", "train_speed"]
+
+Row = dict[str, Any]
+
+
+def env_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[Row]:
+    """Steps with random subsets drawn inside the loop, resets included, nothing stored."""
+    rows = []
+    for envs in (1, 64, 1024, 8192):
+        env = TrackEnv(world, envs, seed=cfg.seed, max_steps=cfg.grid.max_steps, device=device)
+        policy = RandomSubset(world.num_cells, generator(cfg.seed, "benchmark", device=device))
+        state = env.reset()
+
+        def step(env: TrackEnv = env, policy: TensorDictModuleBase = policy) -> int:
+            nonlocal state
+            for _ in range(20):
+                _, state = env.step_and_maybe_reset(policy(state))
+            return 20 * env.num_envs
+
+        rows.append({"part": "env", "envs": envs, **rate(step, cfg.seconds, device)})
+    return rows
+
+
+def collector_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[Row]:
+    """Frames of the collector that training uses, 32 steps a batch, for policies from free to a network."""
+    policies: dict[str, TensorDictModuleBase] = {
+        "random": RandomSubset(world.num_cells, generator(cfg.seed, "benchmark", device=device)),
+        "all_on": AllOn(world.num_cells),
+        "actor": make_actor(world.task, 128, 0.0).to(device),
+    }
+    rows = []
+    for name, policy in policies.items():
+        for envs in (64, 1024):
+            env = TrackEnv(world, envs, seed=cfg.seed, max_steps=cfg.grid.max_steps, device=device)
+            collector = Collector(
+                env,
+                policy,
+                frames_per_batch=32 * envs,
+                total_frames=-1,
+                track_traj_ids=False,
+                auto_register_policy_transforms=False,
+            )
+            batches = iter(collector)
+
+            def batch(batches: Any = batches) -> int:
+                return next(batches).numel()
+
+            figures = rate(batch, cfg.seconds, device)
+            collector.shutdown()
+            rows.append({"part": "collector", "policy": name, "envs": envs, **figures})
+    return rows
+
+
+def train_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[Row]:
+    """Frames per second of collecting and learning, for each algorithm as its config stands.
+
+    Each is run for five times `seconds`, or to its end where that comes first (`whole`): then the updates that follow
+    the last frame count as well.
+    """
+    rows = []
+    for name in GROUPS["algo"]:
+        train = train_config([f"algo={name}", f"seed={cfg.seed}", f"threads={cfg.threads}"])
+        train.grid, train.kernel, train.cost = cfg.grid, cfg.kernel, cfg.cost
+        algorithm = make_algorithm(train, world, device)
+        collector = make_collector(train, world, algorithm, device)
+        batches, frames, done = iter(collector), 0, 0
+        wall, cpu = time.perf_counter(), time.process_time()
+        while done < algorithm.iterations and time.perf_counter() - wall < 5 * cfg.seconds:
+            batch = next(batches, None)
+            frames, done = frames + (batch.numel() if batch is not None else 0), done + 1
+            algorithm.step(batch)
+        spent, used = time.perf_counter() - wall, time.process_time() - cpu
+        collector.shutdown()
+        figures = {"per_second": frames / spent, "cpu_us_each": 1e6 * used / frames}
+        rows.append({"part": "train", "algo": name, "whole": done == algorithm.iterations, **figures})
+    return rows
+
+
+def train_config(overrides: list[str]) -> TrainConfig:
+    """The config that `trackmdp train` would run with these overrides."""
+    return from_hydra(compose("train", overrides=overrides), TrainConfig, Path.cwd())

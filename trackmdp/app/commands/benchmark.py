@@ -1,0 +1,62 @@
+"""`benchmark`: measure speed and quality on this machine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from trackmdp.app.bench import learned, log, memory, peers, quality, solver, speed
+from trackmdp.app.bench.machine import machine
+from trackmdp.build import make_device, make_world
+from trackmdp.config import BenchmarkConfig
+from trackmdp.training.display import make_console, table
+from trackmdp.training.metrics import write_json
+from trackmdp.world.model import World
+
+__all__ = ["PARTS", "run"]
+
+PARTS: dict[str, Callable[[BenchmarkConfig, World, torch.device], Iterable[dict[str, Any]]]] = {
+    "env": speed.env_speed,
+    "collector": speed.collector_speed,
+    "train": speed.train_speed,
+    "quality": quality.quality,
+    "pairs": quality.pairs,
+    "growth": quality.growth,
+    "memory": memory.memory,
+    "peers": peers.peers,
+    "solver": solver.solver,
+    "learned_kernel": learned.learned_kernel,
+    "log": log.log_speed,
+}
+
+
+def run(cfg: BenchmarkConfig, folder: Path) -> None:
+    """Measure `cfg.part` and write `benchmark.json` to `folder`, row by row as they come."""
+    console = make_console(cfg.quiet)
+    torch.set_num_threads(cfg.threads)
+    device = make_device(cfg.device)
+    where = machine()
+    rows: list[dict[str, Any]] = []
+    with console.status(f"measuring {cfg.part}") as status:
+        for row in PARTS[cfg.part](cfg, make_world(cfg), device):
+            rows.append(row)
+            write_json(folder / "benchmark.json", {"machine": where, "rows": rows})
+            status.update(f"measuring {cfg.part}: {len(rows)} rows so far, in {folder}")
+    shown = [key for key in rows[0] if not isinstance(rows[0][key], dict)]
+    title = f"{where['processor']}, {where['cores']} cores, {cfg.threads} torch threads, {device}"
+    console.print(table(title, shown, [[_text(row[key]) for key in shown] for row in rows]))
+    if cfg.part == "quality":
+        counted = [[algo, text, str(runs), "#" * runs] for algo, text, runs in quality.histogram(rows)]
+        console.print(table("runs by regret per step", ["algo", "regret", "runs", ""], counted))
+    if cfg.part == "peers":
+        console.print(peers.chart(rows, cfg.seeds[0]), markup=False, highlight=False)
+    console.print(f"results in {folder}")
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:,.3g}" if abs(value) < 1000 else f"{value:,.0f}"
+    return "never" if value is None else str(value)

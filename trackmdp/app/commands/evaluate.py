@@ -1,0 +1,138 @@
+"""`evaluate`: value a trained policy or a baseline, exactly and by simulation."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.console import Console
+from tensordict.nn import TensorDictModuleBase
+
+from trackmdp.app.commands import held_out, playback
+from trackmdp.app.commands.trained import trained
+from trackmdp.build import make_baseline, make_device, make_setting
+from trackmdp.config import EvaluateConfig, Mcap, Playback, RandomK, load_run, to_yaml
+from trackmdp.episodes.log import EpisodeLog
+from trackmdp.episodes.record import Chains, RandomSets
+from trackmdp.policies import fixed
+from trackmdp.policies.fixed import ChainPolicy
+from trackmdp.reports.picture import draw
+from trackmdp.seeding import generator
+from trackmdp.solvers import estimator
+from trackmdp.solvers.chains import sets_of
+from trackmdp.training.display import make_console, table
+from trackmdp.training.evaluate import Simulation, simulate
+from trackmdp.training.judge import Judge, Verdict, figures
+from trackmdp.training.metrics import write_json, write_text
+from trackmdp.world.model import World
+from trackmdp.world.tracks import Recorded, Setting
+
+__all__ = ["run"]
+
+
+def run(cfg: EvaluateConfig, folder: Path) -> float:
+    """Write `evaluation.json`, `sets.json` and `picture.txt` to `folder`; returns the exact AIHTR."""
+    console = make_console(cfg.quiet)
+    torch.set_num_threads(cfg.threads)
+    device = make_device(cfg.device)
+    if cfg.run is None and isinstance(cfg.baseline, Playback):
+        return playback.run(cfg, folder, console, device)
+    world, max_steps, chains, subject = _trained(cfg, device) if cfg.run else _baseline(cfg)
+    if isinstance(world, Recorded):
+        return held_out.run(world, max_steps, chains, subject, folder, console, cfg.seed)
+    judge = Judge(world, max_steps)
+    verdict = judge.score(chains)
+    simulation = None
+    if cfg.episodes:
+        policy: TensorDictModuleBase = ChainPolicy(chains, device)
+        if isinstance(cfg.baseline, RandomK):
+            draws = generator(cfg.seed, "evaluation", "policy", device=device)
+            policy = fixed.RandomK(world.num_cells, cfg.baseline.k, draws)
+        simulation = simulate(world, policy, episodes=cfg.episodes, seed=cfg.seed, max_steps=max_steps, device=device)
+    estimate = estimator.accuracy(world, chains) if chains.dtype == np.bool_ and max_steps is None else None
+    report = _report(subject, judge, verdict, simulation) | {"estimator": asdict(estimate) if estimate else None}
+    write_json(folder / "evaluation.json", report)
+    if chains.dtype == np.bool_:
+        write_json(folder / "sets.json", sets_of(chains))
+        write_text(folder / "picture.txt", draw(world, chains, seed=cfg.seed))
+    _show(console, subject, judge, verdict, simulation, folder)
+    if cfg.log is not None:
+        _log_episodes(cfg, world, max_steps, chains, subject, folder, console)
+    if estimate is not None:
+        shares = (
+            f"from Q {estimate.exact:.2%} (printed form {estimate.paper:.2%}), from the belief {estimate.bayes:.2%}"
+        )
+        console.print(f"missed steps whose position is estimated right: {shares}")
+    return verdict.evaluation.aihtr
+
+
+def _log_episodes(
+    cfg: EvaluateConfig,
+    world: World,
+    max_steps: int | None,
+    chains: np.ndarray,
+    subject: str,
+    folder: Path,
+    console: Console,
+) -> None:
+    """Write `episodes.mcap`: as many episodes as are simulated, each from a generator of its own."""
+    assert isinstance(cfg.log, Mcap)
+    described = to_yaml(load_run(cfg.run) if cfg.run else cfg)
+    log = EpisodeLog(
+        folder, world, seed=cfg.seed, config=described, max_steps=max_steps, layout=cfg.log.layout, command="evaluate"
+    )
+    if isinstance(cfg.baseline, RandomK):
+        log.record(RandomSets(world.num_cells, cfg.baseline.k), {"label": subject}, cfg.episodes)
+    else:
+        log.record(Chains(chains), {"label": subject}, cfg.episodes)
+    if log.close():
+        console.print(f"{log.episodes} episodes in {log.file}", markup=False)
+
+
+def _trained(cfg: EvaluateConfig, device: torch.device) -> tuple[Setting, int | None, np.ndarray, str]:
+    assert cfg.run is not None
+    policy = trained(cfg.run, device)
+    return policy.world, policy.max_steps, policy.chains, policy.subject
+
+
+def _baseline(cfg: EvaluateConfig) -> tuple[Setting, int | None, np.ndarray, str]:
+    assert cfg.baseline is not None
+    world = make_setting(cfg)
+    return world, cfg.grid.max_steps, make_baseline(cfg.baseline, world), cfg.baseline.name
+
+
+def _report(subject: str, judge: Judge, verdict: Verdict, simulation: Simulation | None) -> dict[str, Any]:
+    return {
+        "policy": subject,
+        "exact": figures(verdict.evaluation),
+        "value": verdict.evaluation.value.tolist(),
+        "simulated": asdict(simulation) if simulation else None,
+        "qmdp": figures(judge.qmdp),
+        "bounds": judge.bounds,
+        "regret_per_step": verdict.regret_per_step,
+    }
+
+
+def _show(
+    console: Console, subject: str, judge: Judge, verdict: Verdict, simulation: Simulation | None, folder: Path
+) -> None:
+    names = {
+        "aihtr": "AIHTR",
+        "accuracy": "accuracy",
+        "sensors_per_step": "sensors per step",
+        "safe_per_episode": "safe actions per episode",
+        "expected_length": "steps per episode",
+    }
+    exact, qmdp = figures(verdict.evaluation), figures(judge.qmdp)
+    rows = []
+    for key, label in names.items():
+        estimate = getattr(simulation, key) if simulation else None
+        simulated = f"{estimate.mean:,.4f} ± {estimate.standard_error:.4f}" if estimate else ""
+        rows.append([label, f"{exact[key]:,.4f}", simulated, f"{qmdp[key]:,.4f}"])
+    title = f"simulated, {simulation.episodes} episodes ± s.e." if simulation else "simulated"
+    console.print(table(subject, ["figure", "exact", title, "Q_MDP exact"], rows))
+    regret = round(verdict.regret_per_step, 4) + 0.0
+    console.print(f"upper bound (clocked) {judge.upper:,.4f}; regret per step {regret:.4f}; results in {folder}")

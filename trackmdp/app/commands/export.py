@@ -1,0 +1,118 @@
+"""`export`: a learned policy as a file that runs without this package.
+
+A deterministic policy is a table: the sensors to switch on n steps after the target was detected in cell x.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from trackmdp import __version__
+from trackmdp.app.commands.trained import trained
+from trackmdp.config import ExportConfig
+from trackmdp.errors import UserError
+from trackmdp.solvers.chains import sets_of
+from trackmdp.training.display import make_console
+from trackmdp.training.metrics import write_bytes, write_json
+from trackmdp.world.model import BoolArray
+
+__all__ = ["run", "to_onnx", "to_torch"]
+
+FILES = {"torch_export": "policy.pt2", "onnx": "policy.onnx", "sets": "sets.json"}
+_INPUTS = ("last_cell", "steps_since_detection")
+
+
+def run(cfg: ExportConfig, folder: Path) -> None:
+    """Write `policy.pt2`, `policy.onnx` or `sets.json` to `folder`.
+
+    The first two take int64 `last_cell` `[B]` and `steps_since_detection` `[B]` and give bool `action` `[B, M]`: the
+    sensors to switch on, all of them once the target has been missed more than t_max times.
+
+    Raises:
+        UserError: there is no such run, or a package that `cfg.format` needs is missing.
+    """
+    policy = trained(cfg.run, torch.device("cpu"), best=cfg.checkpoint == "best")
+    task, file = policy.world.task, folder / FILES[cfg.format]
+    about = {
+        "trackmdp": __version__,
+        "policy": policy.subject,
+        "grid_size": str(task.size),
+        "t_max": str(task.t_max),
+    }
+    if cfg.format == "sets":
+        write_json(file, sets_of(policy.chains))
+    else:
+        forms: dict[str, Callable[[BoolArray, dict[str, str]], bytes]] = {"torch_export": to_torch, "onnx": to_onnx}
+        write_bytes(file, forms[cfg.format](policy.chains, about))
+    make_console(cfg.quiet).print(f"{policy.subject} -> {file}")
+
+
+def to_torch(chains: BoolArray, about: dict[str, str]) -> bytes:
+    """What `torch.export.load` reads; `about` stands beside it as text."""
+    batch = torch.export.Dim("batch")
+    states = tuple(torch.zeros(2, dtype=torch.int64) for _ in _INPUTS)
+    program = torch.export.export(_Table(chains), states, dynamic_shapes=({0: batch}, {0: batch}))
+    buffer = io.BytesIO()
+    torch.export.save(program, buffer, extra_files={"about.txt": "\n".join(f"{k}: {v}" for k, v in about.items())})
+    return buffer.getvalue()
+
+
+def to_onnx(chains: BoolArray, about: dict[str, str]) -> bytes:
+    """An ONNX model that looks the action up; `about` are its metadata.
+
+    Raises:
+        UserError: the package onnx is not installed.
+    """
+    try:
+        import onnx
+        from onnx import TensorProto, helper, numpy_helper
+    except ImportError:
+        raise UserError("format=onnx: needs the package onnx, as in pip install 'trackmdp[onnx]'") from None
+
+    table = _table(chains)
+    constants = {"table": table, "last_row": np.array(table.shape[1] - 1), "column": np.array([1])}
+    nodes = [
+        helper.make_node("Min", ["steps_since_detection", "last_row"], ["row"]),
+        helper.make_node("Unsqueeze", ["last_cell", "column"], ["cells"]),
+        helper.make_node("Unsqueeze", ["row", "column"], ["rows"]),
+        helper.make_node("Concat", ["cells", "rows"], ["index"], axis=1),
+        helper.make_node("GatherND", ["table", "index"], ["action"]),
+    ]
+    graph = helper.make_graph(
+        nodes,
+        "policy",
+        [helper.make_tensor_value_info(name, TensorProto.INT64, ["batch"]) for name in _INPUTS],
+        [helper.make_tensor_value_info("action", TensorProto.BOOL, ["batch", table.shape[2]])],
+        [numpy_helper.from_array(value, name) for name, value in constants.items()],
+    )
+    model = helper.make_model(
+        graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8, producer_name="trackmdp"
+    )
+    helper.set_model_props(model, about)
+    onnx.checker.check_model(model, full_check=True)
+    return bytes(model.SerializeToString())
+
+
+class _Table(nn.Module):
+    """Looks the action up."""
+
+    table: Tensor
+
+    def __init__(self, chains: BoolArray) -> None:
+        super().__init__()
+        self.register_buffer("table", torch.as_tensor(_table(chains)))
+
+    def forward(self, last_cell: Tensor, steps_since_detection: Tensor) -> Any:
+        return self.table[last_cell, steps_since_detection.clamp(max=self.table.shape[1] - 1)]
+
+
+def _table(chains: BoolArray) -> BoolArray:
+    """`[M, t_max+2, M]`, the sets and after them the forced safe action."""
+    return np.concatenate([chains, np.ones_like(chains[:, :1])], axis=1)

@@ -1,0 +1,126 @@
+"""`solve`: solve the world with its motion model."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from trackmdp.app.commands.verify import show_checks, write_checks
+from trackmdp.build import make_baseline, make_world
+from trackmdp.config import Optimal, SolveConfig
+from trackmdp.errors import UserError
+from trackmdp.solvers import bounds, optimal, qmdp
+from trackmdp.solvers.chains import Evaluation, evaluate, regret_per_step, sets_of
+from trackmdp.solvers.optimal import Progress, Solution
+from trackmdp.training.display import make_console, table
+from trackmdp.training.judge import figures
+from trackmdp.training.metrics import write_json
+from trackmdp.world.model import World
+
+__all__ = ["run", "solve_world"]
+
+_SECONDS_BETWEEN_LINES = 2.0
+
+
+def run(cfg: SolveConfig, folder: Path) -> float:
+    """Write `solution.json` (and `verification.json`) to `folder`; returns the AIHTR.
+
+    Ctrl-C ends a search early: the bracket reached so far is printed and saved.
+    """
+    console = make_console(cfg.quiet)
+    if cfg.grid.max_steps is not None:
+        raise UserError(f"grid.max_steps={cfg.grid.max_steps}: only whole episodes are solved, expected null")
+    world = make_world(cfg)
+    with _SearchDisplay(console, f"solve {cfg.solver.name}") as display:
+        solution = solve_world(cfg, world, display.update)
+    evaluation = evaluate(world, solution.chains)
+    write_json(folder / "solution.json", _report(cfg, world, solution, evaluation))
+    _show(console, cfg, world, solution, evaluation, folder)
+    if solution.interrupted:
+        raise KeyboardInterrupt
+    if cfg.verify:
+        checks = write_checks(world, 1e-9, folder)
+        show_checks(console, checks, folder)
+    return solution.lower
+
+
+def solve_world(cfg: SolveConfig, world: World, on_progress: Callable[[Progress], None]) -> Solution:
+    """The policy of `cfg.solver` with the bracket it proves: its own for `optimal`, else up to the clocked bound."""
+    if isinstance(cfg.solver, Optimal):
+        limit, tolerance = cfg.solver.time_limit, cfg.solver.tolerance
+        return optimal.solve(world, time_limit=limit, tolerance=tolerance, on_progress=on_progress)
+    started = time.monotonic()
+    chains = make_baseline(cfg.solver, world)
+    return optimal.bracketed(world, chains, time.monotonic() - started)
+
+
+def _report(cfg: SolveConfig, world: World, solution: Solution, evaluation: Evaluation) -> dict[str, Any]:
+    return {
+        "solver": cfg.solver.name,
+        "lower": solution.lower,
+        "upper": solution.upper,
+        "certified": solution.certified,
+        "interrupted": solution.interrupted,
+        "seconds": solution.seconds,
+        "nodes": solution.nodes,
+        "regret_per_step": regret_per_step(solution.upper, evaluation),
+        "figures": figures(evaluation),
+        "bounds": _bounds(world),
+        "value": solution.value.tolist(),
+        "upper_value": solution.bound.tolist(),
+        "policy": sets_of(solution.chains),
+    }
+
+
+def _bounds(world: World) -> dict[str, float]:
+    every = {"paper": bounds.paper, "valid": bounds.valid, "clocked": bounds.clocked}
+    return {name: float(bound(world).mean()) for name, bound in every.items()}
+
+
+def _show(
+    console: Console, cfg: SolveConfig, world: World, solution: Solution, evaluation: Evaluation, folder: Path
+) -> None:
+    rows = [
+        [name, f"{e.aihtr:,.6f}", f"{100 * e.accuracy:.2f} %", f"{e.sensors_per_step:.3f}", f"{e.safe_per_episode:.3f}"]
+        for name, e in ((cfg.solver.name, evaluation), ("Q_MDP", evaluate(world, qmdp.solve(world))))
+    ]
+    rows.append(["upper bound proved", f"{solution.upper:,.6f}", "", "", ""])
+    rows += [[f"{name} bound", f"{value:,.6f}", "", "", ""] for name, value in _bounds(world).items()]
+    columns = ["policy", "AIHTR", "accuracy", "sensors per step", "safe actions per episode"]
+    console.print(table("exact values", columns, rows))
+    state = "certified" if solution.certified else "interrupted" if solution.interrupted else "not closed"
+    regret = max(regret_per_step(solution.upper, evaluation), 0.0)
+    console.print(
+        f"{state}: bracket {solution.lower:,.6f} ... {solution.upper:,.6f}, {regret:.2g} per step, after "
+        f"{solution.seconds:.1f} s and {solution.nodes:,} nodes; results in {folder}"
+    )
+
+
+class _SearchDisplay:
+    """The bracket while a search goes on: one changing line at a terminal, a plain line now and then when piped."""
+
+    def __init__(self, console: Console, title: str) -> None:
+        self._console, self._title = console, title
+        self._status = console.status(title)
+        self._last_line = time.monotonic()
+
+    def __enter__(self) -> _SearchDisplay:
+        self._status.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._status.stop()
+
+    def update(self, progress: Progress) -> None:
+        """Show how far the search has come."""
+        bracket = f"bracket {progress.lower:,.4f} ... {progress.upper:,.4f}"
+        line = f"{self._title}: {progress.seconds:.0f} s  {bracket}  {progress.nodes:,} nodes"
+        if self._console.is_terminal:
+            self._status.update(line)
+        elif time.monotonic() - self._last_line >= _SECONDS_BETWEEN_LINES:
+            self._last_line = time.monotonic()
+            self._console.print(line)

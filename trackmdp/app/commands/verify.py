@@ -1,0 +1,73 @@
+"""`verify`: check the paper's theorems on a world."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from trackmdp.build import make_world
+from trackmdp.config import VerifyConfig
+from trackmdp.errors import UserError
+from trackmdp.paper import remarks, theorems
+from trackmdp.paper.theorems import Check
+from trackmdp.solvers import optimal
+from trackmdp.training.display import make_console
+from trackmdp.training.metrics import write_json
+from trackmdp.world.model import World
+
+__all__ = ["run", "show_checks", "write_checks"]
+
+TIME_LIMIT = 120.0
+"""Seconds for the optimum the theorems are about."""
+
+
+def run(cfg: VerifyConfig, folder: Path) -> float:
+    """Write `verification.json` to `folder`; returns the number of claims that fail (0 is what is expected)."""
+    console = make_console(cfg.quiet)
+    if cfg.grid.max_steps is not None:
+        raise UserError(f"grid.max_steps={cfg.grid.max_steps}: theorems are on whole episodes, expected null")
+    with console.status("checking the paper's theorems"):
+        checks = write_checks(make_world(cfg), cfg.tolerance, folder)
+    show_checks(console, checks, folder)
+    return float(sum(not check.passed for check in checks))
+
+
+def write_checks(world: World, tolerance: float, folder: Path) -> list[Check]:
+    """Solve the world, run every check, and write `verification.json`."""
+    solution = optimal.solve(world, time_limit=TIME_LIMIT, tolerance=tolerance)
+    if solution.interrupted:
+        raise KeyboardInterrupt
+    checks = [*theorems.check(world, solution, tolerance), *remarks.check(tolerance)]
+    content = {
+        "optimum": {"lower": solution.lower, "upper": solution.upper, "certified": solution.certified},
+        "tolerance": tolerance,
+        "checks": [asdict(check) | {"passed": check.passed} for check in checks],
+    }
+    write_json(folder / "verification.json", content)
+    return checks
+
+
+def show_checks(console: Console, checks: list[Check], folder: Path) -> None:
+    """The table of all checks, and how many claims hold."""
+    shown = Table(title="the paper's theorems", title_justify="left")
+    for column in ("theorem", "statement", "largest deviation", "verdict", "note"):
+        shown.add_column(column)
+    for check in checks:
+        shown.add_row(check.name, check.statement, _deviation(check), _verdict(check), check.note)
+    console.print(shown)
+    claims = [check for check in checks if check.expected]
+    console.print(f"{sum(check.holds for check in claims)} of {len(claims)} claims hold; results in {folder}")
+
+
+def _deviation(check: Check) -> str:
+    return "no case" if np.isneginf(check.deviation) else f"{check.deviation:.2g}"
+
+
+def _verdict(check: Check) -> str:
+    if check.expected:
+        return "pass" if check.holds else "FAIL"
+    return "holds here" if check.holds else "does not hold"

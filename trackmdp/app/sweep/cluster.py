@@ -1,0 +1,123 @@
+"""Sweeps by submissions, to SLURM or to processes of this machine."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from trackmdp.app.sweep import apart
+from trackmdp.app.sweep.job import Launch, fail, run_job, stop_signal
+from trackmdp.app.sweep.plan import Job
+from trackmdp.config.sweeps import Submitit, SubmititLocal, SubmititSlurm
+from trackmdp.errors import FAILED, UserError
+
+__all__ = ["launcher"]
+
+SUBMISSIONS = ".submissions"
+"""Folder, in that of the sweep, of what the scheduler is given and says."""
+
+_POLL, _ASK = 0.5, 60.0
+
+
+class Submission:
+    """What is submitted; where it is preempted or out of time, it is submitted once more and the run goes on."""
+
+    def __call__(self, job: Job) -> None:
+        """Run `job`."""
+        from submitit.core.utils import UncompletedJobError
+
+        try:
+            run_job(job)
+        except UncompletedJobError as error:  # raised by the scheduler's signal
+            apart.end_all()
+            fail(job, apart.Outcome(FAILED, reason=f"stopped by the scheduler: {error}"))
+
+    def checkpoint(self, job: Job) -> Any:
+        """Let the run save, and return what is to be submitted next."""
+        from submitit.helpers import DelayedSubmission
+
+        apart.end_all()
+        return DelayedSubmission(self, job)
+
+
+def launcher(cfg: Submitit) -> Launch:
+    """The launcher of `cfg`.
+
+    Raises:
+        UserError: there is no SLURM here.
+    """
+    if isinstance(cfg, SubmititLocal):
+        return partial(_local, cfg)
+    assert isinstance(cfg, SubmititSlurm)
+    import submitit
+
+    if submitit.SlurmExecutor.affinity() < 0:
+        raise UserError("hydra/launcher=submitit_slurm: expected a machine from which jobs can be submitted (no srun)")
+    return partial(_slurm, cfg)
+
+
+def _local(cfg: SubmititLocal, jobs: Sequence[Job]) -> None:
+    import submitit
+
+    executor = submitit.LocalExecutor(_submissions(jobs))
+    executor.update_parameters(timeout_min=cfg.timeout_min, signal_delay_s=30)
+    at_once = cfg.n_jobs or max(1, len(os.sched_getaffinity(0)) // cfg.cpus_per_task)
+    running: list[Any] = []
+    for job in jobs:
+        while sum(not each.done() for each in running) >= at_once:
+            time.sleep(_POLL)
+        if stop_signal(job.sweep):
+            break
+        with _deaf():
+            running.append(executor.submit(Submission(), job))
+    _wait(running)
+
+
+def _slurm(cfg: SubmititSlurm, jobs: Sequence[Job]) -> None:
+    import submitit
+
+    executor = submitit.AutoExecutor(_submissions(jobs), cluster="slurm", slurm_max_num_timeout=cfg.max_num_timeout)
+    executor.update_parameters(
+        name=f"trackmdp_{jobs[0].command}",
+        timeout_min=cfg.timeout_min,
+        cpus_per_task=cfg.cpus_per_task,
+        mem_gb=cfg.mem_gb,
+        gpus_per_node=cfg.gpus_per_node,
+        slurm_array_parallelism=cfg.array_parallelism,
+        slurm_signal_delay_s=cfg.signal_delay_s,
+        slurm_partition=cfg.partition,
+        slurm_account=cfg.account,
+        slurm_setup=cfg.setup,
+        slurm_additional_parameters=cfg.additional_parameters,
+    )
+    _wait(executor.map_array(Submission(), list(jobs)))
+
+
+def _submissions(jobs: Sequence[Job]) -> Path:
+    return jobs[0].sweep / SUBMISSIONS
+
+
+def _wait(submitted: Sequence[Any]) -> None:
+    """Come back once all are over; how they ended stands in the folders of the runs."""
+    asked = time.monotonic()
+    while left := [each for each in submitted if not each.done()]:
+        if time.monotonic() - asked > _ASK:  # one that was killed leaves no file by which it would be known
+            left[0].done(force_check=True)
+            asked = time.monotonic()
+        time.sleep(_POLL)
+
+
+@contextmanager
+def _deaf() -> Iterator[None]:
+    """Processes started inside do not hear Ctrl-C, which the sweep hears."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)

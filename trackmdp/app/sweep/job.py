@@ -1,0 +1,90 @@
+"""One job of a sweep, in whatever process a launcher calls it: it always comes back, and leaves its state on disk."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from trackmdp.app.outputs import remove_if_empty
+from trackmdp.app.prepare import say
+from trackmdp.app.sweep.apart import Outcome, run_apart
+from trackmdp.app.sweep.plan import Job
+from trackmdp.app.sweep.state import DONE, FAILED, SUMMARY, run_of
+from trackmdp.config import TrainConfig
+from trackmdp.errors import USER_MISTAKE
+from trackmdp.training.metrics import write_json
+
+__all__ = ["STOP", "Launch", "fail", "run_job", "stop_signal"]
+
+Launch = Callable[[Sequence[Job]], None]
+"""Runs jobs, and comes back once none is running any more."""
+
+STOP = ".stop"
+"""File in a sweep's folder that holds the number of the signal by which all its runs are asked to stop."""
+
+_PATIENCE = 60.0
+"""Seconds for which a run's folder may still be held by a process that is about to save and end."""
+
+
+def run_job(job: Job) -> None:
+    """Run `job`, unless the sweep has been asked to stop; what comes of it stands in the run's folder."""
+    if stop_signal(job.sweep):
+        return
+    job.folder.mkdir(parents=True, exist_ok=True)
+    if not _is_free(job):
+        _say(job, "is run by another process")
+        return
+    (job.folder / FAILED).unlink(missing_ok=True)
+    (job.folder / DONE).unlink(missing_ok=True)
+    if job.cfg is None:
+        fail(job, Outcome(USER_MISTAKE, reason=job.refusal))
+        return
+    outcome = run_apart(job, lambda: stop_signal(job.sweep))
+    if outcome.status == 0:
+        _done(job, outcome)
+    elif outcome.reason:
+        fail(job, outcome)
+    elif not stop_signal(job.sweep):
+        fail(job, Outcome(outcome.status, reason=f"stopped by signal {outcome.status - 128}"))
+    remove_if_empty([job.folder])
+
+
+def fail(job: Job, outcome: Outcome) -> None:
+    """Leave in the run's folder why it failed, and say so."""
+    job.folder.mkdir(parents=True, exist_ok=True)
+    write_json(job.folder / FAILED, {"reason": outcome.reason, "status": outcome.status})
+    _say(job, f"failed: {outcome.reason}")
+
+
+def stop_signal(sweep: Path) -> int:
+    """The signal by which the sweep was asked to stop; 0 for none."""
+    try:
+        return int((sweep / STOP).read_text(encoding="ascii") or 0)
+    except (OSError, ValueError):
+        return 0
+
+
+def _done(job: Job, outcome: Outcome) -> None:
+    if not (isinstance(job.cfg, TrainConfig) and (job.folder / SUMMARY).is_file()):
+        write_json(job.folder / DONE, {"value": outcome.value})
+    if job.aside and job.cfg is not None and not job.cfg.quiet:
+        value = f": AIHTR {outcome.value:,.3f}" if outcome.value is not None else ""
+        say(f"({job.label}) {job.name} done{value}")
+
+
+def _is_free(job: Job) -> bool:
+    """Whether no process runs in the folder; one that lost its sweep is waited for, while it saves."""
+    until = time.monotonic() + _PATIENCE
+    while run_of(job.folder).state == "running":
+        if time.monotonic() > until or stop_signal(job.sweep):
+            return False
+        time.sleep(0.1)
+    return True
+
+
+def _say(job: Job, what: str) -> None:
+    with contextlib.suppress(OSError):
+        sys.stderr.write(f"trackmdp {job.command}: {job.name} {what}\n")

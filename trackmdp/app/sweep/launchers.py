@@ -1,0 +1,79 @@
+"""Where the jobs of a sweep are run: one after the other here, or several at once here or elsewhere.
+
+A launcher reports nothing: what became of each run stands in its folder, in whatever process it ran.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+
+from trackmdp.app.sweep.apart import context_for
+from trackmdp.app.sweep.job import Launch, run_job
+from trackmdp.app.sweep.plan import Job
+from trackmdp.config import TrainConfig
+from trackmdp.config.sweeps import Basic, Joblib, Launcher, Ray, Submitit
+from trackmdp.errors import require
+
+__all__ = ["make_launcher", "threads_of"]
+
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def make_launcher(cfg: Launcher) -> Launch:
+    """The launcher that `hydra/launcher=NAME` chose.
+
+    Raises:
+        UserError: what it needs is not installed.
+    """
+    if isinstance(cfg, Basic):
+        return _basic
+    launch = _parallel(cfg)
+    return lambda jobs: launch([replace(job, aside=True) for job in jobs])
+
+
+def _parallel(cfg: Launcher) -> Launch:
+    option = f"hydra/launcher={cfg.name}"
+    if isinstance(cfg, Joblib):
+        require("joblib", "sweep", option)
+        return partial(_joblib, cfg)
+    if isinstance(cfg, Submitit):
+        require("submitit", "slurm", option)
+        from trackmdp.app.sweep import cluster
+
+        return cluster.launcher(cfg)
+    assert isinstance(cfg, Ray)
+    require("ray", "ray", option)
+    from trackmdp.app.sweep import on_ray
+
+    return partial(on_ray.launch, cfg)
+
+
+@contextmanager
+def threads_of(jobs: Sequence[Job]) -> Iterator[None]:
+    """Processes started inside have as many threads as the runs ask for, where nothing else was asked for."""
+    most = max((job.cfg.threads for job in jobs if isinstance(job.cfg, TrainConfig)), default=1)
+    unset = [name for name in _THREADS if name not in os.environ]
+    os.environ.update(dict.fromkeys(unset, str(most)))
+    try:
+        yield
+    finally:
+        for name in unset:
+            os.environ.pop(name, None)
+
+
+def _basic(jobs: Sequence[Job]) -> None:
+    for job in jobs:
+        run_job(job)
+
+
+def _joblib(cfg: Joblib, jobs: Sequence[Job]) -> None:
+    """Threads will do: each only waits for the process of its run."""
+    from joblib import Parallel, delayed
+
+    context_for(jobs[0].command)
+    at_once = cfg.n_jobs or len(os.sched_getaffinity(0))
+    Parallel(n_jobs=at_once, backend="threading", batch_size=1)(delayed(run_job)(job) for job in jobs)

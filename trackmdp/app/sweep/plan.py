@@ -1,0 +1,213 @@
+"""From the words of a sweep to its jobs: every combination, each checked and with a folder of its own."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import re
+import shlex
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
+from omegaconf import DictConfig
+
+from trackmdp.app.prepare import typed_config
+from trackmdp.config import CommandConfig, TrainConfig, to_dict
+from trackmdp.config.resume import CHANGEABLE
+from trackmdp.errors import UserError
+
+__all__ = ["Job", "combinations", "of_task", "plan", "sweep_name"]
+
+_UNNAMED = ("experiment", "quiet", "resume")
+"""Words that are no part of a folder's readable name: they say how a run is done, or stand for other words."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of a sweep: it can be handed to another process.
+
+    Attributes:
+        command: what is run.
+        sweep: the sweep's folder.
+        name: of the run's folder in it.
+        words: the overrides of this run.
+        cfg: its checked config; None where it was refused.
+        refusal: why.
+        label: place in the sweep, for the terminal: ``3/60``.
+        aside: it runs beside others, and says what it says in a file of its own.
+    """
+
+    command: str
+    sweep: Path
+    name: str
+    words: tuple[str, ...]
+    cfg: CommandConfig | None
+    refusal: str = ""
+    label: str = ""
+    aside: bool = False
+
+    @property
+    def folder(self) -> Path:
+        """Of the run."""
+        return self.sweep / self.name
+
+
+def of_task(words: Iterable[str]) -> list[str]:
+    """The words that say something of the runs, not of Hydra."""
+    return [word for word in words if not word.lstrip("+~").startswith(("hydra.", "hydra/"))]
+
+
+def combinations(blocks: Sequence[str], typed: Sequence[str]) -> list[list[str]]:
+    """The words of every run: each block is a grid, to which what is typed is added, or which it replaces.
+
+    Args:
+        blocks: lines of words such as ``algo=a2c,ppo seed=range(5)``; without any, the typed words are the grid.
+        typed: the words of the command line, without those to Hydra.
+
+    Raises:
+        UserError: a word is not `option=value`, or its values cannot be counted.
+    """
+    found: dict[tuple[str, ...], None] = {}
+    for block in list(blocks) or [""]:
+        axes: dict[str, list[str]] = {}
+        for word in [*shlex.split(block, posix=False), *typed]:
+            override = _parsed(word)
+            if override.key_or_group == "experiment" and override.is_sweep_override():
+                raise UserError(f"{word}: expected one experiment; each is a sweep of its own")
+            axes[override.key_or_group] = _values(override)
+        found |= dict.fromkeys(itertools.product(*axes.values()))
+    return [list(words) for words in found]
+
+
+def plan(
+    command: str,
+    grid: Sequence[Sequence[str]],
+    sweep: Path,
+    compose: Callable[[Sequence[str]], DictConfig],
+    telling: Collection[str] = (),
+) -> list[Job]:
+    """The jobs of a sweep, those that come out the same only once.
+
+    A run's folder is named by what tells it apart from the others, and by a digest of what was overridden and of the
+    config behind it. What may change when a run goes on (`CHANGEABLE`) counts only where it was overridden.
+
+    Args:
+        command: what is run.
+        grid: the words of each run.
+        sweep: the sweep's folder.
+        compose: the config of some words.
+        telling: options that tell the runs apart; if none are named, those whose values differ in the grid.
+
+    Raises:
+        UserError: words that do not make a config; a config that is refused is kept, as a job that fails.
+    """
+    telling, known = telling or _varying(grid), _folders(sweep)
+    jobs: dict[str, Job] = {}
+    for words in grid:
+        cfg: CommandConfig | None
+        composed = compose(words)
+        try:
+            cfg, refusal = _resumable(typed_config(command, composed, Path.cwd())), ""
+        except UserError as error:
+            cfg, refusal = None, str(error)
+        key = _digest(_told(words), _identity(cfg))
+        text = _slug([word for word in words if _key(word) in telling] or words)
+        name = known.get(key, f"{text}-{key}".lstrip("-"))
+        jobs.setdefault(key, Job(command, sweep, name, tuple(words), cfg, refusal))
+    return [replace(job, label=f"{place}/{len(jobs)}") for place, job in enumerate(jobs.values(), 1)]
+
+
+def sweep_name(command: str, words: Sequence[str], blocks: Sequence[str]) -> str:
+    """The name of a sweep's folder: the same for the same words, in whatever order; those with many values first."""
+    told = _told(words)
+    experiments = [word.partition("=")[2] for word in told if _key(word) == "experiment"]
+    text = _slug(sorted(told, key=lambda word: not _parsed(word).is_sweep_override()), experiments or [command])
+    return f"{text}-{_digest(command, told, list(blocks))}"
+
+
+def _varying(grid: Sequence[Sequence[str]]) -> set[str]:
+    """The options that tell the runs of a grid apart."""
+    values: dict[str, set[str]] = {}
+    for word in (word for words in grid for word in words):
+        values.setdefault(_key(word), set()).add(word)
+    shared = {key for key in values if all(any(_key(word) == key for word in words) for words in grid)}
+    return {key for key, found in values.items() if len(found) > 1 or key not in shared}
+
+
+def _folders(sweep: Path) -> dict[str, str]:
+    """Digest -> name of the folders that are there: a run is known by its digest, whatever else its name says."""
+    names = [path.name for path in sweep.iterdir() if path.is_dir()] if sweep.is_dir() else []
+    return {name.rpartition("-")[2]: name for name in sorted(names)}
+
+
+def _slug(words: Iterable[str], prefix: Sequence[str] = ()) -> str:
+    """Words as a readable part of a folder's name."""
+    named = {_key(word): _short(word.partition("=")[2]) for word in words if _key(word) not in _UNNAMED}
+    short = [key.split(".")[-1] for key in named]
+    pairs = {key if short.count(last) > 1 else last: named[key] for key, last in zip(named, short, strict=True)}
+    parts = [*prefix, *(f"{key}_{value}" for key, value in pairs.items())]
+    return "-".join(re.sub(r"[^\w.+-]+", "_", part).strip("_") for part in parts)[:80].strip("-._")
+
+
+def _short(value: str) -> str:
+    """A number of many digits in a few; the digest tells it from others."""
+    return f"{float(value):.4g}" if re.fullmatch(r"-?\d*\.\d{5,}(e-?\d+)?", value) else value
+
+
+def _told(words: Iterable[str]) -> list[str]:
+    return sorted(word for word in words if _key(word) not in ("quiet", "resume"))
+
+
+def _digest(*told: Any) -> str:
+    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:8]
+
+
+def _identity(cfg: CommandConfig | None) -> dict[str, Any]:
+    """What makes a config another one."""
+    if cfg is None:
+        return {}
+    plain = to_dict(cfg)
+    for key in (*CHANGEABLE, "resume") if isinstance(cfg, TrainConfig) else ("quiet",):
+        *parents, last = key.split(".")
+        node = plain
+        for name in parents:
+            node = node[name]
+        node.pop(last)
+    return plain
+
+
+def _resumable(cfg: CommandConfig) -> CommandConfig:
+    """The runs of a sweep go on where they were cut, each in its own folder."""
+    if not isinstance(cfg, TrainConfig):
+        return cfg
+    if cfg.resume not in (None, "auto"):
+        raise UserError(f"resume={cfg.resume}: expected null or auto in a sweep, whose runs go on in their own folders")
+    return replace(cfg, resume="auto")
+
+
+def _parsed(word: str) -> Override:
+    try:
+        return OverridesParser.create().parse_override(word)
+    except HydraException as error:
+        raise UserError(f"{word}: expected option=value (a value with blanks or commas needs quotes)") from error
+
+
+def _values(override: Override) -> list[str]:
+    key = override.get_key_element()
+    if not override.is_sweep_override():
+        return [
+            f"{key}={override.get_value_element_as_str()}" if not override.is_delete() else str(override.input_line)
+        ]
+    if not override.is_discrete_sweep():
+        raise UserError(f"{override.input_line}: expected values that can be counted; hydra/sweeper=optuna searches")
+    return [f"{key}={value}" for value in override.sweep_string_iterator()]
+
+
+def _key(word: str) -> str:
+    return word.lstrip("+~").partition("=")[0].replace("/", ".")

@@ -1,0 +1,145 @@
+"""A sweep from its plan to its table."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Collection, Iterable, Sequence
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Self
+
+from rich.console import Console
+
+from trackmdp.app.prepare import shown
+from trackmdp.app.sweep.apart import Outcome
+from trackmdp.app.sweep.job import STOP, Launch, fail
+from trackmdp.app.sweep.launchers import threads_of
+from trackmdp.app.sweep.plan import Job
+from trackmdp.app.sweep.state import DONE, FAILED, SUMMARY, Run, run_of, runs_of, write_plan
+from trackmdp.app.sweep.table import show, status_of, write_table
+from trackmdp.config import TrainConfig
+from trackmdp.config.resume import continued, finished
+from trackmdp.errors import FAILED as FAILED_STATUS
+from trackmdp.errors import Preempted, UserError
+from trackmdp.training.lock import locked
+from trackmdp.training.signals import Signals
+
+__all__ = ["sweep"]
+
+_ROUNDS = 3
+"""How often what a broken launcher left undone is launched."""
+
+
+def sweep(
+    folder: Path, command: str, line: str, batches: Iterable[Sequence[Job]], launch: Launch, console: Console
+) -> int:
+    """Run what is not finished, and show what came of all; returns the exit status.
+
+    Args:
+        folder: of the sweep.
+        command: what is run.
+        line: what was typed.
+        batches: the plan, in parts; the next one is asked for once the runs of one are over.
+        launch: runs jobs.
+        console: where the table is shown.
+
+    Raises:
+        UserError: the folder is in use.
+        Preempted: a signal ended the sweep; it can go on.
+    """
+    jobs: dict[str, Job] = {}
+    skipped: set[Path] = set()
+    with locked(folder, "hydra.sweep.dir"), _Stop(folder) as stop:
+        for batch in batches:
+            jobs |= {job.name: job for job in batch}
+            write_plan(folder, command, line, [(job.name, job.words) for job in jobs.values()])
+            done = {job.folder for job in batch if _is_finished(job)}
+            console.print(_opening(batch, done, folder), markup=False)
+            _run([job for job in batch if job.folder not in done], launch, stop)
+            skipped |= done
+            if stop.received:
+                break
+        runs = runs_of(folder)
+        write_table(folder, runs)
+        show(console, runs, skipped, folder)
+    if stop.received:
+        raise Preempted(stop.received)
+    _tell_failures(command, runs)
+    return status_of(runs)
+
+
+def _run(jobs: Sequence[Job], launch: Launch, stop: _Stop) -> None:
+    for job in jobs:
+        _forget(job)
+    with threads_of(jobs):
+        _launch(jobs, launch, stop)
+
+
+def _is_finished(job: Job) -> bool:
+    """Whether the run is done already, with the very config that is asked for."""
+    if not isinstance(job.cfg, TrainConfig) or run_of(job.folder).state != "done":
+        return False
+    try:
+        return finished(continued(job.cfg, job.folder, job.words), job.folder) is not None
+    except UserError:
+        return False
+
+
+def _forget(job: Job) -> None:
+    """Remove what an earlier call left of a run that is to be run now."""
+    for name in (FAILED, DONE, SUMMARY):
+        (job.folder / name).unlink(missing_ok=True)
+
+
+def _launch(jobs: Sequence[Job], launch: Launch, stop: _Stop) -> None:
+    """Launch `jobs`, and once more what a launcher that broke down left undone."""
+    reason = "it was launched, and left nothing"
+    for _ in range(_ROUNDS):
+        if not jobs or stop.received:
+            return
+        try:
+            launch(jobs)
+        except Exception as error:
+            reason = f"the launcher broke down: {type(error).__name__}: {' '.join(str(error).split())}"
+            sys.stderr.write(f"{reason}\n")
+        jobs = [job for job in jobs if run_of(job.folder).state in ("cut", "waiting")]
+    if stop.received:
+        return
+    for job in jobs:
+        fail(job, Outcome(FAILED_STATUS, reason=reason))
+
+
+def _opening(jobs: Sequence[Job], skipped: Collection[Path], folder: Path) -> str:
+    done = f", {len(skipped)} of them done before" if skipped else ""
+    return f"{len(jobs)} runs{done} -> {shown(folder)}"
+
+
+def _tell_failures(command: str, runs: Sequence[Run]) -> None:
+    failed = [run for run in runs if run.state == "failed"]
+    if failed:
+        sys.stderr.write(f"trackmdp {command}: {len(failed)} of {len(runs)} runs failed\n")
+
+
+class _Stop(Signals):
+    """A signal also asks the runs, in whatever process they are, to save and end."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__()
+        self._file = folder / STOP
+
+    def __enter__(self) -> Self:
+        self._file.unlink(missing_ok=True)
+        return super().__enter__()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        super().__exit__(kind, error, traceback)
+        if kind is None:  # else jobs elsewhere may still be about to look
+            self._file.unlink(missing_ok=True)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        try:
+            self._file.write_text(str(number), encoding="ascii")
+        finally:
+            super()._note(number, frame)

@@ -1,0 +1,89 @@
+"""What a sweep came to: a table at the terminal, and `runs.csv`."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+
+from trackmdp.app.prepare import shown
+from trackmdp.app.sweep.state import FAILED, Run, read_json
+from trackmdp.errors import FAILED as FAILED_STATUS
+from trackmdp.errors import USER_MISTAKE
+from trackmdp.training.display import table
+from trackmdp.training.metrics import write_text
+
+__all__ = ["TABLE", "figures", "show", "status_of", "write_table"]
+
+TABLE = "runs.csv"
+
+_FIGURES = ("aihtr", "regret_per_step", "accuracy", "sensors_per_step", "frames")
+
+
+def show(console: Console, runs: Sequence[Run], skipped: Collection[Path], sweep: Path) -> None:
+    """Every run with its state, AIHTR and regret per step, or why it failed."""
+    names = [run.folder.name.rpartition("-")[0] for run in runs]
+    if len(set(names)) < len(names):
+        names = [run.folder.name for run in runs]
+    rows = [
+        [name, _state(run, skipped), *_short(run), escape(run.reason)] for name, run in zip(names, runs, strict=True)
+    ]
+    made = table(f"{len(runs)} runs", ["run", "state", "AIHTR", "regret per step", "reason"], rows)
+    made.columns[1].justify = made.columns[4].justify = "left"
+    console.print(made)
+    states = [_state(run, skipped) for run in runs]
+    counts = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states))
+    console.print(f"{counts}; {shown(sweep) / TABLE}", markup=False)
+
+
+def write_table(sweep: Path, runs: Sequence[Run]) -> None:
+    """Write `runs.csv`: folder, state, figures, reason, and one column for every option that was overridden.
+
+    Nothing in it depends on time, or on how often a run was cut.
+    """
+    words = [dict(_pair(word) for word in run.overrides) for run in runs]
+    keys = [key for key in dict.fromkeys(key for pairs in words for key in pairs) if key != "quiet"]
+    stream = io.StringIO(newline="")
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(["folder", "state", *_FIGURES, "reason", *keys])
+    for run, pairs in zip(runs, words, strict=True):
+        found = figures(run)
+        row = [run.folder.name, run.state, *(found.get(name) for name in _FIGURES), run.reason]
+        writer.writerow([*row, *(pairs.get(key) for key in keys)])
+    write_text(sweep / TABLE, stream.getvalue())
+
+
+def status_of(runs: Sequence[Run]) -> int:
+    """The exit status: 0 if all is done, 2 if only mistakes of the user failed, else 1."""
+    if all(run.state == "done" for run in runs):
+        return 0
+    statuses = [read_json(run.folder / FAILED).get("status") for run in runs if run.state == "failed"]
+    unfinished = any(run.state not in ("done", "failed") for run in runs)
+    return FAILED_STATUS if unfinished or any(status != USER_MISTAKE for status in statuses) else USER_MISTAKE
+
+
+def _state(run: Run, skipped: Collection[Path]) -> str:
+    return "skipped" if run.folder in skipped and run.state == "done" else run.state
+
+
+def figures(run: Run) -> dict[str, Any]:
+    """The figures of a training run; of another command's the one value that it returns."""
+    if "policy" not in run.result:
+        return {"aihtr": run.result.get("value")}
+    return {**run.result["policy"], **{name: run.result.get(name) for name in ("regret_per_step", "frames")}}
+
+
+def _short(run: Run) -> list[str]:
+    found = figures(run)
+    aihtr, regret = found.get("aihtr"), found.get("regret_per_step")
+    return [f"{aihtr:,.3f}" if aihtr is not None else "", f"{round(regret, 4) + 0.0:.4f}" if regret is not None else ""]
+
+
+def _pair(word: str) -> tuple[str, str]:
+    key, _, value = word.partition("=")
+    return key, value

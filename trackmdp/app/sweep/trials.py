@@ -1,0 +1,155 @@
+"""Sweeps whose runs are chosen by Optuna, one batch after the other; the study is kept and goes on where it stopped."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import IntervalSweep, Override, RangeSweep
+
+from trackmdp.app.sweep.plan import Job
+from trackmdp.app.sweep.state import run_of
+from trackmdp.app.sweep.table import figures
+from trackmdp.config.sweeps import Optuna
+from trackmdp.errors import UserError, require
+from trackmdp.seeding import derive
+
+__all__ = ["STUDY", "trials"]
+
+STUDY = "study.db"
+"""File in the sweep's folder that holds the study, where no other storage is named."""
+
+_WORDS = "words"
+_DIRECTIONS = {"aihtr": "maximize", "regret_per_step": "minimize"}
+
+
+def trials(
+    cfg: Optuna, words: Sequence[str], folder: Path, planned: Callable[[Sequence[str], set[str]], Job]
+) -> Iterator[list[Job]]:
+    """Batches of jobs, until `cfg.n_trials` are done; once a batch has been run, its results are handed to the study.
+
+    Args:
+        cfg: of the study.
+        words: what was typed; words with several values, `range(a,b)` or `interval(a,b)` are searched.
+        folder: of the sweep.
+        planned: the job of some words, of which the options in the set tell it from others.
+
+    Raises:
+        UserError: Optuna is not installed, there is nothing to search, or the study is one of another search.
+    """
+    require("optuna", "optuna", "hydra/sweeper=optuna")
+    parsed = [OverridesParser.create().parse_override(word) for word in words]
+    searched = {each.get_key_element(): each for each in parsed if each.is_sweep_override()}
+    fixed = [word for word, each in zip(words, parsed, strict=True) if not each.is_sweep_override()]
+    if not searched:
+        raise UserError("hydra/sweeper=optuna: expected a word to search, such as algo.gamma=interval(0.9,0.99)")
+    with _study(cfg, folder) as study:
+        told = [trial.user_attrs.get(_WORDS, []) for trial in study.trials if trial.state == _states().COMPLETE]
+        earlier = [planned([*fixed, *chosen], set(searched)) for chosen in told]
+        if here := [job for job in earlier if run_of(job.folder).state == "done"]:
+            yield here
+        failed = 0
+        while missing := max(0, cfg.n_trials - _count(study, "COMPLETE") - failed):
+            asked = [_ask(cfg, study, searched, place) for place in range(min(cfg.batch, missing))]
+            jobs = [planned([*fixed, *chosen], set(searched)) for _, chosen in asked]
+            yield list({job.name: job for job in jobs}.values())
+            for (trial, _), job in zip(asked, jobs, strict=True):
+                failed += _tell(cfg, study, trial, job)
+
+
+def _ask(cfg: Optuna, study: Any, searched: dict[str, Override], place: int) -> tuple[Any, list[str]]:
+    """The next trial and its words. What is drawn depends on the seed and on what is known, not on who was cut when."""
+    study.sampler = _sampler(cfg, derive(cfg.seed, "optuna", _count(study, "COMPLETE"), place) % 2**32)
+    trial = study.ask()
+    try:
+        words = [f"{key}={_suggest(trial, key, override)}" for key, override in searched.items()]
+    except ValueError as error:
+        raise UserError(f"hydra.sweeper.storage: the study is one of another search ({error})") from error
+    trial.set_user_attr(_WORDS, words)
+    return trial, words
+
+
+def _sampler(cfg: Optuna, seed: int) -> Any:
+    from optuna.exceptions import ExperimentalWarning
+    from optuna.samplers import RandomSampler, TPESampler
+
+    if cfg.sampler == "random":
+        return RandomSampler(seed)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ExperimentalWarning)
+        return TPESampler(seed=seed, constant_liar=cfg.batch > 1)  # else a batch would be the same run many times
+
+
+def _suggest(trial: Any, key: str, override: Override) -> Any:
+    """A value for an option, in the notation of Hydra's sweeps."""
+    value = override.value()
+    if isinstance(value, IntervalSweep):
+        log = "log" in value.tags
+        draw = trial.suggest_int if isinstance(value.start, int) else trial.suggest_float
+        return draw(key, value.start, value.end, log=log)
+    if isinstance(value, RangeSweep):
+        steps: Any = override.sweep_iterator()
+        values = sorted(steps)
+        draw = trial.suggest_int if isinstance(values[0], int) else trial.suggest_float
+        return draw(key, values[0], values[-1], step=abs(value.step))
+    return trial.suggest_categorical(key, list(override.sweep_string_iterator()))
+
+
+def _tell(cfg: Optuna, study: Any, trial: Any, job: Job) -> int:
+    """Hand over what came of a job; 1 if it failed. One that was cut is taken up by the next call."""
+    run = run_of(job.folder)
+    value = figures(run).get(cfg.objective) if run.state == "done" else None
+    if value is not None:
+        study.tell(trial, value)
+        return 0
+    if run.state in ("done", "failed"):
+        study.tell(trial, state=_states().FAIL)
+        return 1
+    return 0
+
+
+@contextmanager
+def _study(cfg: Optuna, folder: Path) -> Iterator[Any]:
+    import optuna
+
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    try:
+        storage = optuna.storages.RDBStorage(cfg.storage or f"sqlite:///{folder / STUDY}")
+    except Exception as error:  # of many kinds, those of the data base's driver among them
+        reason = " ".join(str(error).split())
+        raise UserError(f"hydra.sweeper.storage={cfg.storage}: expected a data base's URL ({reason})") from error
+    try:
+        study = optuna.create_study(
+            study_name=cfg.study, storage=storage, direction=_DIRECTIONS[cfg.objective], load_if_exists=True
+        )
+        _take_up(study)
+        yield study
+    finally:
+        storage.remove_session()
+        storage.engine.dispose()
+
+
+def _take_up(study: Any) -> None:
+    """Ask first for the trials of an earlier call that were cut, or failed."""
+    done = [trial.params for trial in study.trials if trial.state == _states().COMPLETE]
+    queued = [trial.system_attrs.get("fixed_params") for trial in study.trials if trial.state == _states().WAITING]
+    for trial in study.trials:
+        if trial.state == _states().RUNNING:
+            study.tell(trial.number, state=_states().FAIL)
+        if trial.state in (_states().RUNNING, _states().FAIL) and trial.params not in [*done, *queued]:
+            study.enqueue_trial(trial.params)
+            queued.append(trial.params)
+
+
+def _count(study: Any, *names: str) -> int:
+    return len(study.get_trials(deepcopy=False, states=[_states()[name] for name in names]))
+
+
+def _states() -> Any:
+    from optuna.trial import TrialState
+
+    return TrialState

@@ -1,0 +1,61 @@
+"""The paper's experiments (Section VII): the numbers it prints, and the runs that are of its worlds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from trackmdp.paper.worlds import COSTS, EXIT_PROBABILITY, LOW_PROBABILITY, RADIUS, REWARD, SIZE
+from trackmdp.reports.grouping import Study
+from trackmdp.reports.results import Run
+
+__all__ = ["PRINTED_QMDP", "PRINTED_TMDP", "pair_of", "pairs"]
+
+PRINTED_QMDP: Mapping[tuple[int, float], float] = {
+    **{(3, c): 90.74 for c in COSTS},
+    **{(4, c): 88.82 for c in COSTS},
+    **{(5, c): 89.95 for c in COSTS[:3]},
+    (5, 0.22): 54.3,
+}
+"""Table II, accuracy of Q_MDP in per cent, by (Z, c)."""
+
+PRINTED_TMDP: Mapping[tuple[int, float], float] = {
+    **dict(zip([(3, c) for c in COSTS], (92.39, 92.06, 93.23, 87.18), strict=True)),
+    **dict(zip([(4, c) for c in COSTS], (94.28, 95.56, 89.7, 88.85), strict=True)),
+    **dict(zip([(5, c) for c in COSTS], (93.75, 94.94, 92.45, 90.21), strict=True)),
+}
+"""Table II, accuracy of the paper's learned policy in per cent, by (Z, c)."""
+
+_FIXED = {
+    "grid.size": SIZE,
+    "grid.max_steps": None,
+    "kernel.name": "random_support",
+    "kernel.radius": RADIUS,
+    "kernel.low_probability": LOW_PROBABILITY,
+    "kernel.exit_probability": EXIT_PROBABILITY,
+    "cost.reward": REWARD,
+    "cost.safe": None,
+}
+"""What the paper says of its worlds."""
+
+
+def pair_of(settings: Mapping[str, Any]) -> tuple[int, float] | None:
+    """(Z, c) of a run in one of the paper's worlds, else None."""
+    if any(settings.get(key) != value for key, value in _FIXED.items()):
+        return None
+    pair = settings.get("kernel.support_size"), settings.get("cost.sensor")
+    return pair if pair in PRINTED_QMDP else None  # type: ignore[return-value]
+
+
+def pairs(study: Study) -> dict[tuple[int, float], str]:
+    """The paper's (Z, c) -> the label of the world that stands for it, in the order of the figures.
+
+    Where several do (other T_max, border or kernel), it is the one with most runs.
+    """
+    found: dict[tuple[int, float], str] = {}
+    for world in study.worlds:
+        runs: list[Run] = study.in_world(world)
+        pair = pair_of(runs[0].settings)
+        if pair is not None and (pair not in found or len(study.in_world(found[pair])) < len(runs)):
+            found[pair] = world
+    return dict(sorted(found.items()))

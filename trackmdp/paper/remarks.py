@@ -1,0 +1,38 @@
+"""Two remarks of the paper on worlds of its own: where Q_MDP is optimal, and where its bound is none."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from trackmdp.paper.theorems import Check
+from trackmdp.paper.worlds import paper_kernel, paper_world
+from trackmdp.solvers import bounds, clocked, optimal, qmdp
+from trackmdp.solvers.chains import evaluate
+
+__all__ = ["check"]
+
+
+def check(tolerance: float) -> Iterator[Check]:
+    """Both remarks, each with its figures."""
+    yield _support(tolerance)
+    yield _printed_bound(tolerance)
+
+
+def _support(tolerance: float) -> Check:
+    world = paper_world(paper_kernel(4, seed=4, border="renormalize"), 0.14, 1)
+    support = world.kernel > 0
+    best, simple = optimal.solve(world), qmdp.solve(world)
+    wrong = sum(int((chains[:, 0] != support).sum()) for chains in (best.chains, simple))
+    missed = 1.0 - evaluate(world, best.chains).accuracy
+    deviation = max(float(wrong), missed)
+    statement = "optimum and Q_MDP sense exactly the support, accuracy 100 %: sensors that differ"
+    return Check("remark, c = 0.14, Z = 4", statement, deviation, deviation <= tolerance, note="N = 10, t_max 1")
+
+
+def _printed_bound(tolerance: float) -> Check:
+    world = paper_world(paper_kernel(5, seed=5, border="inside"), 0.16, 5)
+    printed, achieved = bounds.paper(world).mean(), evaluate(world, clocked.solve(world)).aihtr
+    note = f"bound {printed:.2f}, a policy attains {achieved:.2f} (border inside, Z = 5, c = 0.16, t_max 5)"
+    statement = "no policy exceeds the printed bound"
+    excess = float(achieved - printed)
+    return Check("the printed bound", statement, excess, excess <= tolerance, expected=False, note=note)

@@ -1,0 +1,157 @@
+"""The part of a report on what the paper leaves open: which kernels were chosen, and how much hangs on it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from trackmdp.paper.calibration import BORDER, DRAWS, SEEDS, T_MAX, Candidate, Setting, Spread, chosen
+from trackmdp.paper.printed import PRINTED_QMDP
+from trackmdp.paper.worlds import COSTS, SUPPORTS
+from trackmdp.reports.style import INK, LOOKS, Figure, draw, legend, tidy
+from trackmdp.reports.tables import Cell, Column, Table
+from trackmdp.world.model import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Canvas
+
+__all__ = ["RULE", "calibration_figure", "candidates_table", "fit_table", "sensitivity_figures", "sensitivity_table"]
+
+RULE = (
+    f"Of the kernels drawn with seeds {SEEDS[0]} to {SEEDS[-1]} (T_max = {T_MAX}, border {BORDER}), each Z takes the "
+    "one whose exact pooled accuracy of Q_MDP deviates least from the printed column, the largest deviation of the "
+    "four prices counting; ties go to the lower seed. What a learned policy does plays no part in it."
+)
+COLOURS = {3: LOOKS["a2c"], 4: LOOKS["ppo"], 5: LOOKS["hindsight"]}
+
+
+def candidates_table(every: Sequence[Candidate]) -> Table:
+    """All candidates of all Z, the best first."""
+    seeds = chosen(every)
+    columns = [Column("Z"), Column("seed"), Column("deviation", 2, "points")]
+    columns += [Column(f"accuracy at c = {cost:g}", 2, "%") for cost in COSTS]
+    ordered = sorted(every, key=lambda c: (c.support_size, c.deviation, c.seed))
+    rows = [[c.support_size, c.seed, c.deviation, *c.accuracy, seeds[c.support_size] == c.seed] for c in ordered]
+    return Table("calibration", f"All {len(rows)} candidate kernels", [*columns, Column("chosen")], rows)
+
+
+def calibration_figure(every: Sequence[Candidate]) -> Figure:
+    """Every candidate's deviation, the chosen one marked."""
+    seeds = chosen(every)
+
+    def paint(figure: Canvas) -> None:
+        axes = figure.subplots()
+        for support_size, style in COLOURS.items():
+            mine = sorted((c for c in every if c.support_size == support_size), key=lambda c: c.seed)
+            height = [support_size + 0.6 * (c.seed / len(mine) - 0.5) for c in mine]
+            axes.plot([c.deviation for c in mine], height, ".", color=style.colour, markersize=4, alpha=0.7)
+            best = next(c for c in mine if c.seed == seeds[support_size])
+            place = support_size + 0.6 * (best.seed / len(mine) - 0.5)
+            axes.plot([best.deviation], [place], "o", color=INK, markersize=8, markerfacecolor="none")
+            label, at = f"seed {best.seed}", (best.deviation, place)
+            axes.annotate(label, at, (-8, 0), textcoords="offset points", ha="right", va="center", fontsize=8)
+        axes.set_xscale("log")
+        axes.margins(x=0.3)
+        axes.set_yticks(list(COLOURS), [f"Z = {support_size}" for support_size in COLOURS])
+        axes.set_xlabel("largest deviation from the printed accuracy (points)")
+        tidy(axes)
+
+    title = f"Candidate kernels by their distance to the printed Q_MDP accuracy, n = {len(every) // 3} for each Z"
+    best = {c.support_size: c for c in every if seeds[c.support_size] == c.seed}
+    text = "; ".join(f"Z = {z}: seed {c.seed}, {c.deviation:.2f} points" for z, c in sorted(best.items()))
+    return draw("calibration", title, f"Chosen, {text}.", candidates_table(every), 2.8, paint)
+
+
+def fit_table(settings: Sequence[Setting]) -> Table:
+    """How well the best draw of each setting fits the printed column."""
+    fits: dict[tuple[str, int], dict[int, float]] = {}
+    for setting in settings:
+        fits.setdefault((setting.border, setting.t_max), {})[setting.support_size] = setting.deviation
+    ordered = sorted(fits.items(), key=lambda item: max(item[1].values()))
+    rows: list[list[Cell]] = [[*setting, *(fit[z] for z in SUPPORTS), max(fit.values())] for setting, fit in ordered]
+    columns = [Column("border"), Column("T_max"), *(Column(f"Z = {z}", 2, "points") for z in SUPPORTS)]
+    caption = f"Smallest deviation from the printed Q_MDP accuracy among {len(DRAWS)} draws, by setting"
+    return Table("fit", caption, [*columns, Column("worst of the three", 2, "points")], rows)
+
+
+def sensitivity_table(settings: Sequence[Setting]) -> Table:
+    """Median and range over draws of three figures, for every setting and pair."""
+    columns = [Column("border"), Column("T_max"), Column("Z"), Column("c", 2)]
+    for label, digits in (("Q_MDP accuracy %", 2), ("Q_MDP AIHTR", 1), ("clocked bound AIHTR", 1)):
+        columns += [Column(f"{label}, median", digits), Column("low", digits), Column("high", digits)]
+    rows = [
+        [s.border, s.t_max, s.support_size, s.cost, *(v for spread in _spreads(s) for v in vars(spread).values())]
+        for s in settings
+    ]
+    return Table(
+        "sensitivity", f"Median and range over {len(DRAWS)} draws of the kernel, by setting and pair", columns, rows
+    )
+
+
+def sensitivity_figures(settings: Sequence[Setting]) -> list[Figure]:
+    """Accuracy of Q_MDP, its AIHTR and the clocked bound under each setting, at the lowest price."""
+    cost = COSTS[0]
+    mine = [setting for setting in settings if setting.cost == cost]
+    return [
+        _ranges("accuracy", "Accuracy of Q_MDP (%)", mine, lambda s: s.accuracy, printed=True),
+        _ranges("qmdp", "AIHTR of Q_MDP", mine, lambda s: s.qmdp),
+        _ranges("clocked", "AIHTR of the clocked bound", mine, lambda s: s.clocked),
+    ]
+
+
+def _ranges(
+    name: str,
+    label: str,
+    settings: Sequence[Setting],
+    of: Callable[[Setting], Spread],
+    *,
+    printed: bool = False,
+) -> Figure:
+    rows = list(dict.fromkeys((s.border, s.t_max) for s in settings))
+
+    def paint(figure: Canvas) -> None:
+        axes = figure.subplots()
+        for offset, support_size in zip((-0.24, 0.0, 0.24), COLOURS, strict=True):
+            spreads = [of(s) for s in settings if s.support_size == support_size]
+            _bars(axes, support_size, np.arange(len(rows), dtype=np.float64) + offset, spreads)
+            if printed:
+                colour = COLOURS[support_size].colour
+                axes.axvline(PRINTED_QMDP[support_size, COSTS[0]], color=colour, linewidth=0.8, linestyle=":")
+        axes.set_yticks(range(len(rows)), [f"{border}, T_max {t_max}" for border, t_max in rows])
+        axes.invert_yaxis()
+        axes.set_xlabel(label)
+        tidy(axes)
+        legend(figure, axes)
+
+    under = f"under the paper's unstated settings, c = {settings[0].cost:g}"
+    title = f"{label} {under}: median and range, n = {len(DRAWS)} draws"
+    ends = [of(setting).median for setting in settings]
+    text = f"Medians from {min(ends):.1f} to {max(ends):.1f}." + (" Dotted: the printed values." if printed else "")
+    columns = [Column("border"), Column("T_max"), Column("Z"), Column("median", 2), Column("low", 2), Column("high", 2)]
+    numbers: list[list[Cell]] = [[s.border, s.t_max, s.support_size, *vars(of(s)).values()] for s in settings]
+    table = Table(f"sensitivity-{name}", title, columns, numbers)
+    return draw(f"sensitivity-{name}", title, text, table, 4.2, paint)
+
+
+def _bars(axes: Axes, support_size: int, y: Array, spreads: Sequence[Spread]) -> None:
+    """Median and range, one row each."""
+    style = COLOURS[support_size]
+    middle, low, high = (np.array([getattr(spread, part) for spread in spreads]) for part in ("median", "low", "high"))
+    bars = np.stack([middle - low, high - middle])
+    axes.errorbar(
+        middle,
+        y,
+        xerr=bars,
+        fmt=style.marker,
+        color=style.colour,
+        markersize=3.5,
+        elinewidth=1.2,
+        label=f"Z = {support_size}",
+    )
+
+
+def _spreads(setting: Setting) -> tuple[Spread, Spread, Spread]:
+    return setting.accuracy, setting.qmdp, setting.clocked
