@@ -7,7 +7,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from trackmdp.config import Cost, Drift, Kernel, PaperCost, RandomSupport, RandomWalk, Table, Tracks, WorldConfig
+from trackmdp.config import (
+    CostConfig,
+    DriftConfig,
+    KernelConfig,
+    PaperCostConfig,
+    RandomSupportConfig,
+    RandomWalkConfig,
+    TableConfig,
+    TracksConfig,
+    WorldConfig,
+)
 from trackmdp.errors import UserError
 from trackmdp.world import kernels
 from trackmdp.world.files import read_numbers
@@ -19,15 +29,15 @@ if TYPE_CHECKING:  # the world is built, and a config checked, before anything h
     from torchrl.collectors import BaseCollector
 
     from trackmdp.algos.common import Algorithm
-    from trackmdp.config import Baseline, TrainConfig
+    from trackmdp.config import BaselineConfig, TrainConfig
 
 __all__ = ["make_algorithm", "make_baseline", "make_collector", "make_device", "make_setting", "make_world"]
 
-KERNELS: dict[type[Kernel], Callable[..., Array]] = {
-    RandomSupport: kernels.random_support,
-    RandomWalk: kernels.random_walk,
-    Drift: kernels.drift,
-    Table: lambda size, *, path: kernels.load_table(path),  # a table has its own size, checked below
+KERNELS: dict[type[KernelConfig], Callable[..., Array]] = {
+    RandomSupportConfig: kernels.random_support,
+    RandomWalkConfig: kernels.random_walk,
+    DriftConfig: kernels.drift,
+    TableConfig: lambda size, *, path: kernels.load_table(path),  # a table has its own size, checked below
 }
 
 
@@ -37,7 +47,7 @@ def make_setting(cfg: WorldConfig) -> Setting:
     Raises:
         UserError: a file is missing or malformed, or the kernel or a track breaks a rule.
     """
-    return make_recorded(cfg) if isinstance(cfg.kernel, Tracks) else make_world(cfg)
+    return make_recorded(cfg) if isinstance(cfg.kernel, TracksConfig) else make_world(cfg)
 
 
 def make_recorded(cfg: WorldConfig) -> Recorded:
@@ -47,7 +57,7 @@ def make_recorded(cfg: WorldConfig) -> Recorded:
         UserError: the file is missing or malformed, a track is too short, or one of the two parts would be empty.
     """
     kernel, size, t_max = cfg.kernel, cfg.grid.size, cfg.grid.t_max
-    assert isinstance(kernel, Tracks)
+    assert isinstance(kernel, TracksConfig)
     tracks = load_tracks(kernel.path, size, exits=kernel.ends == "exit")
     shortest = max(kernel.min_length or t_max + 3, 1 if kernel.ends == "exit" else 2)  # a cut track of one has no step
     check_tracks(tracks, shortest, f"kernel.path={kernel.path}")
@@ -68,7 +78,7 @@ def make_world(cfg: WorldConfig) -> World:
     motion = _values(cfg.kernel)
     homogeneous = motion.pop("homogeneous")
     table = KERNELS[type(cfg.kernel)](size, **motion)
-    source = f"kernel.path={cfg.kernel.path}" if isinstance(cfg.kernel, Table) else f"kernel={cfg.kernel.name}"
+    source = f"kernel.path={cfg.kernel.path}" if isinstance(cfg.kernel, TableConfig) else f"kernel={cfg.kernel.name}"
     kernel = kernels.check_table(table, size, truncates=cfg.grid.max_steps is not None, source=source)
     if homogeneous:
         kernels.check_homogeneous(kernel, size, source)
@@ -81,9 +91,9 @@ def _values(node: Any) -> dict[str, Any]:
     return {name: getattr(node, name) for name in vars(node)}
 
 
-def _costs(cost: Cost, cells: int) -> tuple[float, Array, float]:
+def _costs(cost: CostConfig, cells: int) -> tuple[float, Array, float]:
     """r, c `[M]` and D of a cost config."""
-    assert isinstance(cost, PaperCost)
+    assert isinstance(cost, PaperCostConfig)
     price = _price_per_cell(cost.sensor, cells)
     return cost.reward, price, float(price.sum()) if cost.safe is None else cost.safe
 
@@ -124,16 +134,18 @@ def make_algorithm(cfg: TrainConfig, world: Setting, device: torch.device) -> Al
 
     task, batches = world.task, -(-cfg.collector.total_frames // cfg.collector.frames_per_batch)
     makers: dict[type[Any], Callable[[Any], Algorithm]] = {
-        config.Hindsight: lambda c: hindsight.Hindsight(task, c, iterations=batches, seed=cfg.seed, device=device),
-        config.A2cPerSensor: lambda c: per_sensor.A2C(task, c, iterations=batches, seed=cfg.seed, device=device),
-        config.PpoPerSensor: lambda c: per_sensor.PPO(task, c, iterations=batches, seed=cfg.seed, device=device),
-        config.DqnPerSensor: lambda c: per_sensor.DQN(task, c, iterations=batches, seed=cfg.seed, device=device),
-        config.LearnedKernel: lambda c: learned_kernel.LearnedKernel(
+        config.HindsightConfig: lambda c: hindsight.Hindsight(
             task, c, iterations=batches, seed=cfg.seed, device=device
         ),
-        config.A2c: lambda c: a2c.A2C(task, c, iterations=batches, device=device),
-        config.Ppo: lambda c: ppo.PPO(task, c, iterations=batches, seed=cfg.seed, device=device),
-        config.Dqn: lambda c: dqn.DQN(task, c, iterations=batches, seed=cfg.seed, device=device),
+        config.A2cPerSensorConfig: lambda c: per_sensor.A2C(task, c, iterations=batches, seed=cfg.seed, device=device),
+        config.PpoPerSensorConfig: lambda c: per_sensor.PPO(task, c, iterations=batches, seed=cfg.seed, device=device),
+        config.DqnPerSensorConfig: lambda c: per_sensor.DQN(task, c, iterations=batches, seed=cfg.seed, device=device),
+        config.LearnedKernelConfig: lambda c: learned_kernel.LearnedKernel(
+            task, c, iterations=batches, seed=cfg.seed, device=device
+        ),
+        config.A2cConfig: lambda c: a2c.A2C(task, c, iterations=batches, device=device),
+        config.PpoConfig: lambda c: ppo.PPO(task, c, iterations=batches, seed=cfg.seed, device=device),
+        config.DqnConfig: lambda c: dqn.DQN(task, c, iterations=batches, seed=cfg.seed, device=device),
     }
     return makers[type(cfg.algo)](cfg.algo)
 
@@ -156,15 +168,15 @@ def make_collector(
     )
 
 
-def make_baseline(cfg: Baseline, setting: Setting) -> np.ndarray:
+def make_baseline(cfg: BaselineConfig, setting: Setting) -> np.ndarray:
     """`[M, t_max+1, M]` chains of a policy that is not learned; probabilities for `random_k`, else bool."""
     from trackmdp import config
 
     shape = (setting.num_cells, setting.num_choices, setting.num_cells)
     makers: dict[type[Any], Callable[[Any], np.ndarray]] = {
-        config.AllOn: lambda c: np.ones(shape, dtype=bool),
-        config.NoSensors: lambda c: np.zeros(shape, dtype=bool),
-        config.RandomK: lambda c: np.full(shape, c.k / setting.num_cells),
+        config.AllOnConfig: lambda c: np.ones(shape, dtype=bool),
+        config.NoSensorsConfig: lambda c: np.zeros(shape, dtype=bool),
+        config.RandomKConfig: lambda c: np.full(shape, c.k / setting.num_cells),
     }
     if isinstance(setting, World):
         makers |= _planners(setting)
@@ -177,10 +189,10 @@ def _planners(world: World) -> dict[type[Any], Callable[[Any], np.ndarray]]:
     from trackmdp.solvers import clocked, fcr, lookahead, myopic, optimal, qmdp
 
     return {
-        config.Qmdp: lambda c: qmdp.solve(world, in_grid=c.in_grid),
-        config.Myopic: lambda c: myopic.solve(world, threshold=c.threshold),
-        config.Clocked: lambda c: clocked.solve(world),
-        config.Fcr: lambda c: fcr.solve(world, in_grid=c.in_grid),
-        config.Lookahead: lambda c: lookahead.solve(world, depth=c.depth, tail=c.tail),
-        config.Optimal: lambda c: optimal.solve(world, time_limit=c.time_limit, tolerance=c.tolerance).chains,
+        config.QmdpConfig: lambda c: qmdp.solve(world, in_grid=c.in_grid),
+        config.MyopicConfig: lambda c: myopic.solve(world, threshold=c.threshold),
+        config.ClockedConfig: lambda c: clocked.solve(world),
+        config.FcrConfig: lambda c: fcr.solve(world, in_grid=c.in_grid),
+        config.LookaheadConfig: lambda c: lookahead.solve(world, depth=c.depth, tail=c.tail),
+        config.OptimalConfig: lambda c: optimal.solve(world, time_limit=c.time_limit, tolerance=c.tolerance).chains,
     }

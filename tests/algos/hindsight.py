@@ -10,7 +10,7 @@ from torch import Tensor
 
 from tests.helpers import algorithm, collect, small_world
 from trackmdp.algos.actor_loss import ActorLoss, Decision, Poisson, PolicyGradient, Surrogate
-from trackmdp.config import Schedule
+from trackmdp.config import ScheduleConfig
 from trackmdp.solvers import optimal
 from trackmdp.solvers.chains import evaluate, regret_per_step
 from trackmdp.training.evaluate import chains_of
@@ -19,7 +19,7 @@ from trackmdp.world.model import World
 SHORT = ("algo.updates=30", "algo.updates_per_iteration=10", "algo.batch_size=512", "algo.hidden=16")
 SOLVES = ("algo.updates=300", "algo.updates_per_iteration=100", "algo.batch_size=2048", "algo.hidden=32")
 
-BETA = Schedule(start=0.3, end=0.3, begin=0.0, until=1.0)
+BETA = ScheduleConfig(start=0.3, end=0.3, begin=0.0, until=1.0)
 FORMS: dict[str, Callable[[], ActorLoss]] = {
     "decision": Decision,
     "policy gradient": lambda: PolicyGradient(BETA),

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from trackmdp.algos.actor_loss import ActorLoss, Decision, Poisson, PolicyGradient, SensorCredit, Surrogate
-from trackmdp.config import Schedule
+from trackmdp.config import ScheduleConfig
 
 LOSSES: dict[str, Callable[[], ActorLoss]] = {
     "decision": Decision,
@@ -20,8 +20,8 @@ LOSSES: dict[str, Callable[[], ActorLoss]] = {
 }
 
 
-def flat(value: float) -> Schedule:
-    return Schedule(start=value, end=value, begin=0.0, until=1.0)
+def flat(value: float) -> ScheduleConfig:
+    return ScheduleConfig(start=value, end=value, begin=0.0, until=1.0)
 
 
 def surrogate(entropy: float, *, clip: float = 0.2, sampled: bool = False, minibatches: int = 1) -> Surrogate:

@@ -11,9 +11,9 @@ import torch
 
 from tests.algos.hindsight import SHORT, SOLVES, assert_it_learns, assert_same, batches, learn, policy
 from tests.helpers import algorithm, hop_world, small_world
-from trackmdp.config import GROUPS, PerSensor
+from trackmdp.config import GROUPS, PerSensorConfig
 
-PER_SENSOR = [name for name, schema in GROUPS["algo"].items() if issubclass(schema, PerSensor)]
+PER_SENSOR = [name for name, schema in GROUPS["algo"].items() if issubclass(schema, PerSensorConfig)]
 VARIANTS = [
     *((name, ()) for name in PER_SENSOR if name != "hindsight"),
     ("ppo_per_sensor", ("algo.surrogate=sampled",)),

@@ -16,7 +16,7 @@ import torch
 from tests.helpers import ALGORITHMS, algorithm, collect, small_world, train_config
 from trackmdp.app.commands.train import run
 from trackmdp.build import make_world
-from trackmdp.config import GROUPS, PerSensor
+from trackmdp.config import GROUPS, PerSensorConfig
 from trackmdp.solvers import optimal
 from trackmdp.training import checkpoint
 from trackmdp.training.evaluate import chains_of
@@ -118,7 +118,7 @@ def test_it_goes_on_from_its_state_as_if_nothing_had_happened(variant: str) -> N
 def tiny(name: str) -> list[str]:
     """A run of a second."""
     small = {"a2c": "algo.hidden=16", "ppo": "algo.hidden=16", "dqn": "algo.batch_size=64 algo.buffer_size=5000"}
-    if issubclass(GROUPS["algo"][name], PerSensor):
+    if issubclass(GROUPS["algo"][name], PerSensorConfig):
         small[name] = "algo.updates=6 algo.batch_size=256 algo.hidden=16"
     budget = ["algo.total_frames=3072", "algo.frames_per_batch=1024", "algo.envs=64"]
     return [*QUIET, *WORLD, *budget, *small.get(name, "").split()]

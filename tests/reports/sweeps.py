@@ -13,7 +13,7 @@ import numpy as np
 
 from tests.helpers import train_config
 from trackmdp.build import make_world
-from trackmdp.config import PaperCost, TrainConfig
+from trackmdp.config import PaperCostConfig, TrainConfig
 from trackmdp.config.resume import config_text, digest
 from trackmdp.reports import policy
 from trackmdp.solvers import clocked
@@ -39,7 +39,7 @@ def write_run(
     """A finished run with `wrong` sensors switched over; returns its summary."""
     folder.mkdir(parents=True)
     cfg = copy.deepcopy(_composed(*overrides))
-    assert isinstance(cfg.cost, PaperCost)
+    assert isinstance(cfg.cost, PaperCostConfig)
     cfg.cost.sensor, cfg.seed = cost, seed
     world = make_world(cfg)
     judge = Judge(world)

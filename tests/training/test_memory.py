@@ -11,7 +11,7 @@ import torch
 from tests.helpers import collect, small_world, train_config
 from trackmdp.algos.dqn import DQN
 from trackmdp.app.cli import main
-from trackmdp.config import Dqn
+from trackmdp.config import DqnConfig
 from trackmdp.errors import UserError
 from trackmdp.training.memory import available, check, needs
 
@@ -39,7 +39,7 @@ def test_the_replay_buffer_takes_what_was_estimated(prioritized: bool, t_max: in
     world = small_world(size=4, t_max=t_max)
     words = ("algo=dqn", "algo.buffer_size=3000", "algo.updates=1", f"algo.prioritized.enabled={prioritized}")
     cfg = train_config(*words, "algo.batch_size=64", "collector.frames_per_batch=256")
-    assert isinstance(cfg.algo, Dqn)
+    assert isinstance(cfg.algo, DqnConfig)
     learner = DQN(world.task, cfg.algo, iterations=1, seed=0, device=CPU)
     learner.step(collect(world, learner.policy, 16, 4))
     held = learner.state_dict()["buffer"]

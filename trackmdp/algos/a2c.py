@@ -8,7 +8,7 @@ from torchrl.objectives import A2CLoss
 
 from trackmdp.algos.common import Averages, clipped_step
 from trackmdp.algos.on_policy import OnPolicy
-from trackmdp.config.learning import A2c
+from trackmdp.config.learning import A2cConfig
 from trackmdp.world.model import Task
 
 __all__ = ["A2C"]
@@ -17,7 +17,7 @@ __all__ = ["A2C"]
 class A2C(OnPolicy):
     """One gradient step per batch: log-probability of the whole subset times its advantage."""
 
-    def __init__(self, task: Task, cfg: A2c, *, iterations: int, device: torch.device) -> None:
+    def __init__(self, task: Task, cfg: A2cConfig, *, iterations: int, device: torch.device) -> None:
         super().__init__(task, cfg, iterations=iterations, device=device)
         self.cfg = cfg
         self.loss = A2CLoss(

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn.functional import logsigmoid, softplus
 
 from trackmdp.algos.tables import look, total
-from trackmdp.config.learning import Schedule
+from trackmdp.config.learning import ScheduleConfig
 
 __all__ = ["ActorLoss", "Decision", "PolicyGradient", "Poisson", "SensorCredit", "Surrogate", "decision_loss"]
 
@@ -116,7 +116,7 @@ class PolicyGradient(ActorLoss):
         entropy: β, in units of r.
     """
 
-    def __init__(self, entropy: Schedule) -> None:
+    def __init__(self, entropy: ScheduleConfig) -> None:
         super().__init__()
         self._schedule, self._entropy = entropy, entropy.start
 
@@ -152,7 +152,9 @@ class Surrogate(PolicyGradient):
 
     old: Tensor
 
-    def __init__(self, entropy: Schedule, *, clip: float, minibatches: int, generator: torch.Generator | None) -> None:
+    def __init__(
+        self, entropy: ScheduleConfig, *, clip: float, minibatches: int, generator: torch.Generator | None
+    ) -> None:
         super().__init__(entropy)
         self._clip, self._minibatches, self._generator, self._renew = clip, minibatches, generator, True
 

@@ -16,7 +16,7 @@ from torchrl.objectives import LossModule, SoftUpdate
 
 from trackmdp.algos.common import Averages, clipped_step, set_learning_rate
 from trackmdp.algos.prioritized import PrioritizedSampler
-from trackmdp.config.learning import Dqn
+from trackmdp.config.learning import DqnConfig
 from trackmdp.policies.actor_critic import STATE_KEYS
 from trackmdp.policies.qvalue import EpsilonFlip, joint_value, make_qvalue
 from trackmdp.seeding import generator
@@ -72,7 +72,7 @@ class _ZeroedStorage(LazyTensorStorage):
 class DQN:
     """Learns off policy from a replay buffer; explores by flipping sensors; the target network is what is judged."""
 
-    def __init__(self, task: Task, cfg: Dqn, *, iterations: int, seed: int, device: torch.device) -> None:
+    def __init__(self, task: Task, cfg: DqnConfig, *, iterations: int, seed: int, device: torch.device) -> None:
         self.cfg, self.iterations, self.iteration, self.device = cfg, iterations, 0, device
         qvalue = make_qvalue(task, cfg.hidden, cfg.reward_scale).to(device)
         self.explore = EpsilonFlip(cfg.epsilon.start).to(device)

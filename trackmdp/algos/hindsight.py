@@ -21,7 +21,7 @@ from trackmdp.algos.common import Averages, set_learning_rate
 from trackmdp.algos.hindsight_loss import HindsightLoss
 from trackmdp.algos.moves import MoveBuffer
 from trackmdp.algos.segments import SegmentBuffer
-from trackmdp.config.per_sensor import PerSensor
+from trackmdp.config.per_sensor import PerSensorConfig
 from trackmdp.errors import UserError
 from trackmdp.policies.fixed import AllOn, AllOnOrChain, ChainPolicy
 from trackmdp.seeding import generator
@@ -32,7 +32,7 @@ __all__ = ["Hindsight", "budget"]
 _LOSSES = ("clocked_actor", "clocked_critic", "actor", "critic")
 
 
-def budget(task: Task, cfg: PerSensor) -> tuple[int, int]:
+def budget(task: Task, cfg: PerSensorConfig) -> tuple[int, int]:
     """Updates and hidden units: as configured, else by the number of rows (x, n) that the actor has to get right."""
     few = task.num_cells * task.num_choices <= 300
     return cfg.updates or round(cfg.effort * (500 if few else 800)), cfg.hidden or (128 if few else 256)
@@ -46,7 +46,7 @@ class Hindsight:
     output for where it is.
     """
 
-    def __init__(self, task: Task, cfg: PerSensor, *, iterations: int, seed: int, device: torch.device) -> None:
+    def __init__(self, task: Task, cfg: PerSensorConfig, *, iterations: int, seed: int, device: torch.device) -> None:
         self.task, self.cfg, self.device = task, cfg, device
         self.updates, self.hidden = budget(task, cfg)
         self._collecting, self._iteration, self._update = iterations, 0, 0

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 
-from trackmdp.config.learned_kernel import LearnedKernel as LearnedKernelConfig
+from trackmdp.config.learned_kernel import LearnedKernelConfig
 from trackmdp.policies.fixed import ChainPolicy
 from trackmdp.seeding import derive
 from trackmdp.solvers import search

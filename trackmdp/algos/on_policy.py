@@ -12,7 +12,7 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.value import GAE
 
 from trackmdp.algos.common import explained_variance, set_learning_rate
-from trackmdp.config.learning import ActorCritic
+from trackmdp.config.learning import ActorCriticConfig
 from trackmdp.policies.actor_critic import STATE_KEYS, make_actor, make_critic
 from trackmdp.world.model import Task
 
@@ -26,7 +26,7 @@ class OnPolicy:
 
     loss: LossModule
 
-    def __init__(self, task: Task, cfg: ActorCritic, *, iterations: int, device: torch.device) -> None:
+    def __init__(self, task: Task, cfg: ActorCriticConfig, *, iterations: int, device: torch.device) -> None:
         self._settings, self._t_max = cfg, task.t_max
         self.iterations, self.iteration, self.device = iterations, 0, device
         self.policy = make_actor(task, cfg.hidden, cfg.initial_logit).to(device)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from trackmdp.algos.actor_loss import ActorLoss, Poisson, PolicyGradient, Surrogate
 from trackmdp.algos.hindsight import Hindsight
-from trackmdp.config.per_sensor import A2cPerSensor, PpoPerSensor
+from trackmdp.config.per_sensor import A2cPerSensorConfig, PpoPerSensorConfig
 
 __all__ = ["A2C", "DQN", "PPO"]
 
@@ -12,7 +12,7 @@ __all__ = ["A2C", "DQN", "PPO"]
 class A2C(Hindsight):
     """The policy gradient over both actions of every sensor."""
 
-    cfg: A2cPerSensor
+    cfg: A2cPerSensorConfig
 
     def _actor_loss(self) -> ActorLoss:
         return PolicyGradient(self.cfg.entropy)
@@ -21,7 +21,7 @@ class A2C(Hindsight):
 class PPO(Hindsight):
     """The clipped surrogate of every sensor, over both actions or over sets drawn from the old policy."""
 
-    cfg: PpoPerSensor
+    cfg: PpoPerSensorConfig
 
     def _actor_loss(self) -> ActorLoss:
         cfg = self.cfg

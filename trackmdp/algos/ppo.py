@@ -10,7 +10,7 @@ from torchrl.objectives import ClipPPOLoss
 
 from trackmdp.algos.common import Averages, clipped_step
 from trackmdp.algos.on_policy import OnPolicy
-from trackmdp.config.learning import Ppo
+from trackmdp.config.learning import PpoConfig
 from trackmdp.seeding import generator
 from trackmdp.world.model import Task
 
@@ -23,7 +23,7 @@ class PPO(OnPolicy):
     One Bernoulli per sensor; ratio and advantage belong to the whole subset.
     """
 
-    def __init__(self, task: Task, cfg: Ppo, *, iterations: int, seed: int, device: torch.device) -> None:
+    def __init__(self, task: Task, cfg: PpoConfig, *, iterations: int, seed: int, device: torch.device) -> None:
         super().__init__(task, cfg, iterations=iterations, device=device)
         self.cfg = cfg
         self.generator = generator(seed, "minibatches")

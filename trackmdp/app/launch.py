@@ -25,7 +25,7 @@ from trackmdp.app.outputs import make_folder, remove_if_empty
 from trackmdp.app.prepare import announce, check_files, typed_config
 from trackmdp.config import CommandConfig, TrainConfig, conf_dir, register
 from trackmdp.config.resume import continued, run_folder
-from trackmdp.config.sweeps import Blocks, Optuna, Sweeper, plugin
+from trackmdp.config.sweeps import BlocksConfig, OptunaConfig, SweeperConfig, plugin
 from trackmdp.errors import RunError, UserError
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ def _sweep(command: str, args: argparse.Namespace, hydra: Hydra) -> int:
     cfg = _compose(command, args, hydra, RunMode.MULTIRUN)
     typed, sweeper = of_task(args.overrides), plugin("sweeper", cfg.hydra.sweeper)
     launch_jobs = make_launcher(plugin("launcher", cfg.hydra.launcher))
-    grids = (sweeper.blocks or []) if isinstance(sweeper, Blocks) else [sweeper.name]
+    grids = (sweeper.blocks or []) if isinstance(sweeper, BlocksConfig) else [sweeper.name]
     OmegaConf.register_new_resolver("sweep_name", lambda: sweep_name(command, typed, grids), replace=True)
     folder = Path(cfg.hydra.sweep.dir)
     batches = _batches(command, args, hydra, sweeper, folder.absolute())
@@ -97,7 +97,7 @@ def _sweep(command: str, args: argparse.Namespace, hydra: Hydra) -> int:
 
 
 def _batches(
-    command: str, args: argparse.Namespace, hydra: Hydra, sweeper: Sweeper, folder: Path
+    command: str, args: argparse.Namespace, hydra: Hydra, sweeper: SweeperConfig, folder: Path
 ) -> Iterable[Sequence[Job]]:
     """The jobs of a sweep: all at once, or as a search asks for them."""
     from trackmdp.app.sweep.plan import combinations, of_task, plan
@@ -107,9 +107,9 @@ def _batches(
         return _compose(command, alone, hydra, RunMode.RUN)
 
     typed = of_task(args.overrides)
-    if isinstance(sweeper, Blocks):
+    if isinstance(sweeper, BlocksConfig):
         return [plan(command, combinations(sweeper.blocks or [], typed), folder, composed)]
-    assert isinstance(sweeper, Optuna)
+    assert isinstance(sweeper, OptunaConfig)
     from trackmdp.app.sweep.trials import trials
 
     def planned(words: Sequence[str], telling: set[str]) -> Job:

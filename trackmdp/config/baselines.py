@@ -11,22 +11,22 @@ from typing import ClassVar
 from trackmdp.config.options import choice, option
 
 __all__ = [
-    "AllOn",
-    "Baseline",
-    "Clocked",
-    "Fcr",
-    "Lookahead",
-    "Myopic",
-    "NoSensors",
-    "Optimal",
-    "Playback",
-    "Qmdp",
-    "RandomK",
+    "AllOnConfig",
+    "BaselineConfig",
+    "ClockedConfig",
+    "FcrConfig",
+    "LookaheadConfig",
+    "MyopicConfig",
+    "NoSensorsConfig",
+    "OptimalConfig",
+    "PlaybackConfig",
+    "QmdpConfig",
+    "RandomKConfig",
 ]
 
 
 @dataclass(kw_only=True)
-class Baseline:
+class BaselineConfig:
     """Base of the groups `baseline` and `solver`."""
 
     name: ClassVar[str]
@@ -35,7 +35,7 @@ class Baseline:
 @choice("baseline", "qmdp")
 @choice("solver", "qmdp")
 @dataclass(kw_only=True)
-class Qmdp(Baseline):
+class QmdpConfig(BaselineConfig):
     """Q_MDP: sense every cell whose predicted probability is worth the sensor's price."""
 
     in_grid: bool = option("threshold c·p_in/r instead of the printed c/r")
@@ -43,19 +43,19 @@ class Qmdp(Baseline):
 
 @choice("baseline", "all_on")
 @dataclass(kw_only=True)
-class AllOn(Baseline):
+class AllOnConfig(BaselineConfig):
     """All sensors on, always."""
 
 
 @choice("baseline", "none")
 @dataclass(kw_only=True)
-class NoSensors(Baseline):
+class NoSensorsConfig(BaselineConfig):
     """No sensor on until the safe action is forced."""
 
 
 @choice("baseline", "random_k")
 @dataclass(kw_only=True)
-class RandomK(Baseline):
+class RandomKConfig(BaselineConfig):
     """k sensors drawn at random each step."""
 
     k: int = option("sensors switched on, at most M", unit="sensors", ge=0)
@@ -63,7 +63,7 @@ class RandomK(Baseline):
 
 @choice("baseline", "myopic")
 @dataclass(kw_only=True)
-class Myopic(Baseline):
+class MyopicConfig(BaselineConfig):
     """Sense the cells whose belief, conditioned on the misses so far, exceeds a threshold."""
 
     threshold: float | None = option("predicted probability from which a cell is sensed; null = c·p_in/r", ge=0, le=1)
@@ -72,14 +72,14 @@ class Myopic(Baseline):
 @choice("baseline", "clocked")
 @choice("solver", "clocked")
 @dataclass(kw_only=True)
-class Clocked(Baseline):
+class ClockedConfig(BaselineConfig):
     """Sets read off the clocked bound."""
 
 
 @choice("baseline", "fcr")
 @choice("solver", "fcr")
 @dataclass(kw_only=True)
-class Fcr(Baseline):
+class FcrConfig(BaselineConfig):
     """First cost reduction: decide as if nothing were observed any more."""
 
     in_grid: bool = option("threshold c·p_in/r instead of c/r")
@@ -88,7 +88,7 @@ class Fcr(Baseline):
 @choice("baseline", "lookahead")
 @choice("solver", "lookahead")
 @dataclass(kw_only=True)
-class Lookahead(Baseline):
+class LookaheadConfig(BaselineConfig):
     """Plan some sets ahead, then count on a simpler value."""
 
     depth: int = option("sets planned ahead", unit="steps", ge=1, le=16)
@@ -98,7 +98,7 @@ class Lookahead(Baseline):
 @choice("baseline", "optimal")
 @choice("solver", "optimal")
 @dataclass(kw_only=True)
-class Optimal(Baseline):
+class OptimalConfig(BaselineConfig):
     """Policy iteration, search and branch and bound: the optimum with a certificate, or an honest bracket."""
 
     time_limit: float = option("stop closing the bracket after this long", unit="s", gt=0)
@@ -107,7 +107,7 @@ class Optimal(Baseline):
 
 @choice("baseline", "playback")
 @dataclass(kw_only=True)
-class Playback(Baseline):
+class PlaybackConfig(BaselineConfig):
     """The actions of a logged episode again, step by step, whatever is observed; none on after the last."""
 
     file: str = option("the log", expects="a file written with log=mcap")

@@ -9,10 +9,10 @@ from pathlib import Path
 from types import NoneType
 from typing import Any
 
-from trackmdp.config.baselines import AllOn, NoSensors, Playback, RandomK
-from trackmdp.config.learning import Collector, Dqn, Mcap, Ppo, Schedule, Workers
+from trackmdp.config.baselines import AllOnConfig, NoSensorsConfig, PlaybackConfig, RandomKConfig
+from trackmdp.config.learning import CollectorConfig, DqnConfig, McapConfig, PpoConfig, ScheduleConfig, WorkersConfig
 from trackmdp.config.options import Option, options, refuse
-from trackmdp.config.per_sensor import PerSensor
+from trackmdp.config.per_sensor import PerSensorConfig
 from trackmdp.config.roots import (
     BenchmarkConfig,
     CommandConfig,
@@ -24,7 +24,7 @@ from trackmdp.config.roots import (
     TrainConfig,
     WorldConfig,
 )
-from trackmdp.config.world import Cost, PaperCost, RandomSupport, Table, Tracks
+from trackmdp.config.world import CostConfig, PaperCostConfig, RandomSupportConfig, TableConfig, TracksConfig
 from trackmdp.errors import UserError
 
 __all__ = ["absolute_paths", "leaves", "validate"]
@@ -56,7 +56,7 @@ def validate(cfg: CommandConfig) -> None:
         if key.split(".")[-1] == "device":
             _check_device(key, value)
     for key, node in nodes(cfg):
-        if isinstance(node, Schedule) and node.until < node.begin:
+        if isinstance(node, ScheduleConfig) and node.until < node.begin:
             raise refuse(f"{key}.until", node.until, f"not less than {key}.begin={node.begin}")
     if not isinstance(cfg, WorldConfig):
         return
@@ -81,13 +81,13 @@ def absolute_paths(cfg: CommandConfig, folder: Path) -> None:
         cfg.sweep = str(folder / cfg.sweep)
     if not isinstance(cfg, WorldConfig):
         return
-    if isinstance(cfg.kernel, (Table, Tracks)):
+    if isinstance(cfg.kernel, (TableConfig, TracksConfig)):
         cfg.kernel.path = str(folder / cfg.kernel.path)
-    if isinstance(cfg.cost, PaperCost) and isinstance(cfg.cost.sensor, str):
+    if isinstance(cfg.cost, PaperCostConfig) and isinstance(cfg.cost.sensor, str):
         cfg.cost.sensor = str(folder / cfg.cost.sensor)
     if isinstance(cfg, EvaluateConfig) and cfg.run is not None:
         cfg.run = str(folder / cfg.run)
-    if isinstance(cfg, EvaluateConfig) and isinstance(cfg.baseline, Playback):
+    if isinstance(cfg, EvaluateConfig) and isinstance(cfg.baseline, PlaybackConfig):
         cfg.baseline.file = str(folder / cfg.baseline.file)
     if isinstance(cfg, TrainConfig):
         if cfg.resume not in (None, "auto"):
@@ -104,7 +104,7 @@ def _check_device(key: str, value: str) -> None:
 
 def _check_kernel(cfg: WorldConfig) -> None:
     kernel = cfg.kernel
-    if not isinstance(kernel, RandomSupport):
+    if not isinstance(kernel, RandomSupportConfig):
         return
     window = (2 * kernel.radius + 1) ** 2
     if kernel.support_size > window:
@@ -119,20 +119,22 @@ def _check_kernel(cfg: WorldConfig) -> None:
 
 def _check_tracks(cfg: WorldConfig) -> None:
     """Recorded tracks hold no motion model."""
-    if not isinstance(cfg.kernel, Tracks):
+    if not isinstance(cfg.kernel, TracksConfig):
         return
     if not isinstance(cfg, (TrainConfig, EvaluateConfig)):
         raise refuse("kernel", "tracks", "a motion model, which train and evaluate do without")
-    if isinstance(cfg.log, Mcap):
+    if isinstance(cfg.log, McapConfig):
         raise refuse("log", "mcap", "csv or tensorboard with kernel=tracks; episodes are logged with a motion model")
-    if isinstance(cfg, EvaluateConfig) and not isinstance(cfg.baseline, (AllOn, NoSensors, RandomK, NoneType)):
+    if isinstance(cfg, EvaluateConfig) and not isinstance(
+        cfg.baseline, (AllOnConfig, NoSensorsConfig, RandomKConfig, NoneType)
+    ):
         raise refuse(
             "baseline", cfg.baseline.name, "all_on, none or random_k with kernel=tracks, without a motion model"
         )
 
 
-def _check_cost(cost: Cost, cells: int) -> None:
-    if not isinstance(cost, PaperCost):
+def _check_cost(cost: CostConfig, cells: int) -> None:
+    if not isinstance(cost, PaperCostConfig):
         return
     price = cost.sensor
     expected = f"a number >= 0, a list of {cells} of them (one per cell), or a path to a .npy or .csv file"
@@ -150,8 +152,8 @@ def _check_cost(cost: Cost, cells: int) -> None:
             raise refuse(key, value, "a finite number >= 0" if isinstance(price, list) else expected)
 
 
-def _check_collector(collector: Collector) -> None:
-    workers = collector.workers if isinstance(collector, Workers) else 1
+def _check_collector(collector: CollectorConfig) -> None:
+    workers = collector.workers if isinstance(collector, WorkersConfig) else 1
     stepped = collector.envs * workers
     if collector.frames_per_batch % stepped:
         expected = f"a multiple of {stepped} (collector.envs" + (" x collector.workers)" if workers > 1 else ")")
@@ -163,13 +165,13 @@ def _check_collector(collector: Collector) -> None:
 
 def _check_learning(cfg: TrainConfig) -> None:
     algo, frames = cfg.algo, cfg.collector.frames_per_batch
-    if isinstance(algo, Ppo) and frames % algo.minibatches:
+    if isinstance(algo, PpoConfig) and frames % algo.minibatches:
         raise refuse("algo.minibatches", algo.minibatches, f"a divisor of collector.frames_per_batch={frames}")
-    if isinstance(algo, PerSensor):
+    if isinstance(algo, PerSensorConfig):
         for end in ("start", "end"):
             if (probability := getattr(algo.explore, end)) > 1:
                 raise refuse(f"algo.explore.{end}", probability, "a number from 0 to 1, a probability")
-    if isinstance(algo, Dqn) and algo.buffer_size < max(frames, algo.batch_size):
+    if isinstance(algo, DqnConfig) and algo.buffer_size < max(frames, algo.batch_size):
         expected = f"at least collector.frames_per_batch={frames} and algo.batch_size={algo.batch_size}"
         raise refuse("algo.buffer_size", algo.buffer_size, expected)
 
@@ -179,13 +181,13 @@ def _check_judged(cfg: EvaluateConfig | SolveConfig) -> None:
         if (cfg.run is None) == (cfg.baseline is None):
             given = "neither" if cfg.run is None else "both"
             raise UserError(f"expected exactly one of run=FOLDER and baseline=NAME, got {given}")
-        if cfg.log is not None and not isinstance(cfg.log, Mcap):
+        if cfg.log is not None and not isinstance(cfg.log, McapConfig):
             raise refuse("log", cfg.log.name, "mcap or null; an evaluation has no iterations")
-        if isinstance(cfg.baseline, Playback) and cfg.log is not None:
+        if isinstance(cfg.baseline, PlaybackConfig) and cfg.log is not None:
             raise refuse("log", cfg.log.name, "null with baseline=playback, whose episodes are logged already")
-        if isinstance(cfg.baseline, Playback) and cfg.episodes == 0:
+        if isinstance(cfg.baseline, PlaybackConfig) and cfg.episodes == 0:
             raise refuse("episodes", 0, "at least 1 with baseline=playback, which is only simulated")
-        if isinstance(cfg.baseline, RandomK) and cfg.baseline.k > cfg.grid.size**2:
+        if isinstance(cfg.baseline, RandomKConfig) and cfg.baseline.k > cfg.grid.size**2:
             cells = cfg.grid.size**2
             raise refuse(
                 "baseline.k", cfg.baseline.k, f"at most {cells}, the sensors of a grid.size={cfg.grid.size} grid"

@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from trackmdp.config.learning import Algo
+from trackmdp.config.learning import AlgoConfig
 from trackmdp.config.options import choice, option
 
-__all__ = ["LearnedKernel"]
+__all__ = ["LearnedKernelConfig"]
 
 
 @choice("algo", "learned_kernel")
 @dataclass(kw_only=True)
-class LearnedKernel(Algo):
+class LearnedKernelConfig(AlgoConfig):
     """Estimate the motion from detections, then plan with the estimate; no networks."""
 
     credit: ClassVar[str | None] = None

@@ -8,28 +8,28 @@ from typing import ClassVar
 from trackmdp.config.options import choice, option
 
 __all__ = [
-    "A2c",
-    "ActorCritic",
-    "Algo",
-    "Collector",
-    "Csv",
-    "Dqn",
-    "Log",
-    "Mcap",
-    "MultiAsync",
-    "MultiSync",
-    "Ppo",
-    "Prioritized",
-    "RayWorkers",
-    "Schedule",
-    "Single",
-    "Tensorboard",
-    "Workers",
+    "A2cConfig",
+    "ActorCriticConfig",
+    "AlgoConfig",
+    "CollectorConfig",
+    "CsvConfig",
+    "DqnConfig",
+    "LogConfig",
+    "McapConfig",
+    "MultiAsyncConfig",
+    "MultiSyncConfig",
+    "PpoConfig",
+    "PrioritizedConfig",
+    "RayWorkersConfig",
+    "ScheduleConfig",
+    "SingleConfig",
+    "TensorboardConfig",
+    "WorkersConfig",
 ]
 
 
 @dataclass(kw_only=True)
-class Schedule:
+class ScheduleConfig:
     """A number that is `start` up to the fraction `begin` of the run, `end` from `until`, and linear between."""
 
     start: float = option("value at the start", ge=0)
@@ -47,7 +47,7 @@ class Schedule:
 
 
 @dataclass(kw_only=True)
-class Algo:
+class AlgoConfig:
     """Base of the group `algo`: how a policy is learned. The three budgets are what `collector` takes by default."""
 
     name: ClassVar[str]
@@ -58,13 +58,13 @@ class Algo:
 
 
 @dataclass(kw_only=True)
-class ActorCritic(Algo):
+class ActorCriticConfig(AlgoConfig):
     """What A2C and PPO have in common."""
 
     gamma: float = option("discount while learning; policies are judged undiscounted", ge=0, le=1)
     lam: float = option("λ of the generalised advantage estimate", ge=0, le=1)
-    learning_rate: Schedule
-    entropy: Schedule
+    learning_rate: ScheduleConfig
+    entropy: ScheduleConfig
     critic_coef: float = option("weight of the value loss", ge=0)
     max_grad_norm: float = option("gradients are clipped to this norm", gt=0)
     hidden: int = option("units of the hidden layer, in the actor and in the critic", unit="units", ge=1, le=4096)
@@ -74,13 +74,13 @@ class ActorCritic(Algo):
 
 @choice("algo", "a2c")
 @dataclass(kw_only=True)
-class A2c(ActorCritic):
+class A2cConfig(ActorCriticConfig):
     """Advantage actor-critic, one Bernoulli per sensor, one joint advantage."""
 
 
 @choice("algo", "ppo")
 @dataclass(kw_only=True)
-class Ppo(ActorCritic):
+class PpoConfig(ActorCriticConfig):
     """Proximal policy optimisation, one Bernoulli per sensor, one joint advantage."""
 
     clip: float = option("how far the probability ratio may leave 1", gt=0, lt=1)
@@ -89,7 +89,7 @@ class Ppo(ActorCritic):
 
 
 @dataclass(kw_only=True)
-class Prioritized:
+class PrioritizedConfig:
     """Prioritised replay: transitions are drawn in proportion to |TD error|^alpha."""
 
     enabled: bool = option("prioritised instead of uniform replay")
@@ -99,12 +99,12 @@ class Prioritized:
 
 @choice("algo", "dqn")
 @dataclass(kw_only=True)
-class Dqn(Algo):
+class DqnConfig(AlgoConfig):
     """Double DQN with a Q that adds up over the sensors."""
 
     gamma: float = option("discount while learning; policies are judged undiscounted", ge=0, le=1)
-    learning_rate: Schedule
-    epsilon: Schedule
+    learning_rate: ScheduleConfig
+    epsilon: ScheduleConfig
     n_step: int = option("rewards summed before bootstrapping", unit="steps", ge=1, le=64)
     buffer_size: int = option("transitions kept for replay", unit="frames", ge=1)
     batch_size: int = option("transitions per update", unit="frames", ge=1)
@@ -113,11 +113,11 @@ class Dqn(Algo):
     max_grad_norm: float = option("gradients are clipped to this norm", gt=0)
     hidden: int = option("units of the hidden layer", unit="units", ge=1, le=4096)
     reward_scale: float = option("factor on rewards while learning", gt=0)
-    prioritized: Prioritized
+    prioritized: PrioritizedConfig
 
 
 @dataclass(kw_only=True)
-class Collector:
+class CollectorConfig:
     """Base of the group `collector`: where the frames come from. One frame is one env step of one environment."""
 
     name: ClassVar[str]
@@ -131,12 +131,12 @@ class Collector:
 
 @choice("collector", "single")
 @dataclass(kw_only=True)
-class Single(Collector):
+class SingleConfig(CollectorConfig):
     """In the process that learns."""
 
 
 @dataclass(kw_only=True)
-class Workers(Collector):
+class WorkersConfig(CollectorConfig):
     """What the two collectors with worker processes have more."""
 
     workers: int = option("worker processes", ge=1, le=256)
@@ -145,19 +145,19 @@ class Workers(Collector):
 
 @choice("collector", "multi_sync")
 @dataclass(kw_only=True)
-class MultiSync(Workers):
+class MultiSyncConfig(WorkersConfig):
     """In worker processes; every batch waits for all of them. A resumed run starts new episodes."""
 
 
 @choice("collector", "multi_async")
 @dataclass(kw_only=True)
-class MultiAsync(Workers):
+class MultiAsyncConfig(WorkersConfig):
     """In worker processes; a batch is what one of them has ready. A resumed run starts new episodes."""
 
 
 @choice("collector", "ray")
 @dataclass(kw_only=True)
-class RayWorkers(Workers):
+class RayWorkersConfig(WorkersConfig):
     """In workers of a Ray cluster, for a run larger than one machine; otherwise as multi_sync."""
 
     address: str | None = option("cluster to join; null = start one on this machine", expects="auto, or host:port")
@@ -166,7 +166,7 @@ class RayWorkers(Workers):
 
 
 @dataclass(kw_only=True)
-class Log:
+class LogConfig:
     """Base of the group `log`: what is written of each iteration, next to `summary.json`."""
 
     name: ClassVar[str]
@@ -175,19 +175,19 @@ class Log:
 
 @choice("log", "csv")
 @dataclass(kw_only=True)
-class Csv(Log):
+class CsvConfig(LogConfig):
     """`metrics.csv`."""
 
 
 @choice("log", "tensorboard")
 @dataclass(kw_only=True)
-class Tensorboard(Log):
+class TensorboardConfig(LogConfig):
     """`metrics.csv` and TensorBoard event files."""
 
 
 @choice("log", "mcap")
 @dataclass(kw_only=True)
-class Mcap(Log):
+class McapConfig(LogConfig):
     """`episodes.mcap`: simulated episodes, step by step, for `replay` and viewers; in training `metrics.csv` too."""
 
     evaluations: int = option(

@@ -5,10 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from trackmdp.config.learning import Algo, Schedule
+from trackmdp.config.learning import AlgoConfig, ScheduleConfig
 from trackmdp.config.options import SELECTORS, Selector, choice, option
 
-__all__ = ["A2cPerSensor", "DqnPerSensor", "Hindsight", "PerSensor", "PolicyGradient", "PpoPerSensor"]
+__all__ = [
+    "A2cPerSensorConfig",
+    "DqnPerSensorConfig",
+    "HindsightConfig",
+    "PerSensorConfig",
+    "PolicyGradientConfig",
+    "PpoPerSensorConfig",
+]
 
 SELECTORS["credit"] = Selector(
     group="algo",
@@ -21,7 +28,7 @@ SELECTORS["credit"] = Selector(
 
 
 @dataclass(kw_only=True)
-class PerSensor(Algo):
+class PerSensorConfig(AlgoConfig):
     """What the algorithms with a credit per sensor have in common.
 
     `explore`, read with `collect=mixed`: the probability of sensing everything where the target is located, in the
@@ -34,10 +41,10 @@ class PerSensor(Algo):
         "all sensors on; or mixed with the policy learned so far, which costs less and shows less",
         choices=("all_on", "mixed"),
     )
-    explore: Schedule
+    explore: ScheduleConfig
     gamma: float = option("discount inside the credit; policies are judged undiscounted", ge=0, lt=1)
-    learning_rate: Schedule
-    blend: Schedule
+    learning_rate: ScheduleConfig
+    blend: ScheduleConfig
     average: float = option("share of the old in the running average of the actor, which is judged", ge=0, lt=1)
     batch_size: int = option("path segments per update", unit="segments", ge=1)
     updates: int | None = option("updates of the whole run; null: by the size of the problem", ge=1)
@@ -55,27 +62,27 @@ class PerSensor(Algo):
 
 @choice("algo", "hindsight")
 @dataclass(kw_only=True)
-class Hindsight(PerSensor):
+class HindsightConfig(PerSensorConfig):
     """Collect with all sensors on, then learn from those paths what any policy would have found and missed on them."""
 
 
 @dataclass(kw_only=True)
-class PolicyGradient(PerSensor):
+class PolicyGradientConfig(PerSensorConfig):
     """What A2C and PPO with a credit per sensor have in common."""
 
     effort: ClassVar[float] = 1.6
-    entropy: Schedule
+    entropy: ScheduleConfig
 
 
 @choice("algo", "a2c_per_sensor")
 @dataclass(kw_only=True)
-class A2cPerSensor(PolicyGradient):
+class A2cPerSensorConfig(PolicyGradientConfig):
     """Hindsight with the policy gradient of A2C, over both actions of every sensor (algo=a2c credit=per_sensor)."""
 
 
 @choice("algo", "ppo_per_sensor")
 @dataclass(kw_only=True)
-class PpoPerSensor(PolicyGradient):
+class PpoPerSensorConfig(PolicyGradientConfig):
     """Hindsight with the clipped surrogate of PPO, per sensor (algo=ppo credit=per_sensor)."""
 
     clip: float = option("how far a sensor's probability ratio may leave 1", gt=0, lt=1)
@@ -87,5 +94,5 @@ class PpoPerSensor(PolicyGradient):
 
 @choice("algo", "dqn_per_sensor")
 @dataclass(kw_only=True)
-class DqnPerSensor(PerSensor):
+class DqnPerSensorConfig(PerSensorConfig):
     """Hindsight with a Q that adds up over the sensors, for DQN (algo=dqn credit=per_sensor)."""

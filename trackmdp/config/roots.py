@@ -5,20 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from trackmdp.config import learned_kernel, per_sensor  # noqa: F401  (more algorithms to choose from)
-from trackmdp.config.baselines import Baseline
-from trackmdp.config.learning import Algo, Collector, Log
+from trackmdp.config.baselines import BaselineConfig
+from trackmdp.config.learning import AlgoConfig, CollectorConfig, LogConfig
 from trackmdp.config.options import GROUPS, option
-from trackmdp.config.world import Cost, Grid, Kernel
+from trackmdp.config.world import CostConfig, GridConfig, KernelConfig
 
 __all__ = [
     "ROOTS",
     "BenchmarkConfig",
-    "Checkpoint",
+    "CheckpointConfig",
     "CommandConfig",
     "EvaluateConfig",
-    "Evaluation",
+    "EvaluationConfig",
     "ExportConfig",
-    "OptimalBound",
+    "OptimalBoundConfig",
     "ReplayConfig",
     "ReportConfig",
     "SolveConfig",
@@ -39,20 +39,20 @@ class CommandConfig:
 class WorldConfig(CommandConfig):
     """What every command has that takes place in a world."""
 
-    grid: Grid
-    kernel: Kernel
-    cost: Cost
+    grid: GridConfig
+    kernel: KernelConfig
+    cost: CostConfig
 
 
 @dataclass(kw_only=True)
-class Evaluation:
+class EvaluationConfig:
     """How often the policy is judged while it learns."""
 
     every: int = option("iterations from one exact evaluation to the next", unit="iterations", ge=1)
 
 
 @dataclass(kw_only=True)
-class OptimalBound:
+class OptimalBoundConfig:
     """The certified optimum beside the policy's figures."""
 
     enabled: bool = option("solve for the optimum at the end")
@@ -60,7 +60,7 @@ class OptimalBound:
 
 
 @dataclass(kw_only=True)
-class Checkpoint:
+class CheckpointConfig:
     """When the state of the run is saved."""
 
     every: int = option("frames from one checkpoint to the next; 0 = not counted in frames", unit="frames", ge=0)
@@ -79,12 +79,12 @@ class TrainConfig(WorldConfig):
     seed: int = option("every random draw of the run derives from it", ge=0)
     device: str = option("device the networks live on", expects="cpu, cuda, cuda:N or auto")
     threads: int = option("torch threads of the learning process", unit="threads", ge=1, le=256)
-    algo: Algo
-    collector: Collector
-    log: Log
-    evaluation: Evaluation
-    optimal: OptimalBound
-    checkpoint: Checkpoint
+    algo: AlgoConfig
+    collector: CollectorConfig
+    log: LogConfig
+    evaluation: EvaluationConfig
+    optimal: OptimalBoundConfig
+    checkpoint: CheckpointConfig
     resume: str | None = option(
         "go on with a run: auto = the one in hydra.run.dir, where there is one",
         expects="auto, a run's folder, a checkpoint",
@@ -99,8 +99,8 @@ class EvaluateConfig(WorldConfig):
     """Value a trained policy (run=) or a baseline (baseline=), exactly and by simulation."""
 
     run: str | None = option("folder of a training run; its world is taken from there", expects="the folder of a run")
-    baseline: Baseline | None
-    log: Log | None
+    baseline: BaselineConfig | None
+    log: LogConfig | None
     seed: int = option("seed of the simulated episodes", ge=0)
     device: str = option("device of the simulation", expects="cpu, cuda, cuda:N or auto")
     threads: int = option("torch threads", unit="threads", ge=1, le=256)
@@ -111,7 +111,7 @@ class EvaluateConfig(WorldConfig):
 class SolveConfig(WorldConfig):
     """Solve the world with its motion model."""
 
-    solver: Baseline
+    solver: BaselineConfig
     verify: bool = option("check the paper's theorems on this world as well")
 
 

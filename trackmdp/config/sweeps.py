@@ -14,16 +14,16 @@ from trackmdp.errors import UserError
 
 __all__ = [
     "PLUGINS",
-    "Basic",
-    "Blocks",
-    "Joblib",
-    "Launcher",
-    "Optuna",
-    "Ray",
-    "Submitit",
-    "SubmititLocal",
-    "SubmititSlurm",
-    "Sweeper",
+    "BasicConfig",
+    "BlocksConfig",
+    "JoblibConfig",
+    "LauncherConfig",
+    "OptunaConfig",
+    "RayConfig",
+    "SubmititConfig",
+    "SubmititLocalConfig",
+    "SubmititSlurmConfig",
+    "SweeperConfig",
     "plugin",
 ]
 
@@ -61,7 +61,7 @@ def plugin(group: str, node: Any) -> Any:
 
 
 @dataclass(kw_only=True)
-class Sweeper:
+class SweeperConfig:
     """Base of the group `hydra/sweeper`: which runs a sweep has."""
 
     name: ClassVar[str]
@@ -69,7 +69,7 @@ class Sweeper:
 
 @_offered("sweeper", "blocks")
 @dataclass(kw_only=True)
-class Blocks(Sweeper):
+class BlocksConfig(SweeperConfig):
     """Every combination of the values in each block; what is typed is added to each, or replaces its words."""
 
     blocks: list[str] | None = option(
@@ -79,7 +79,7 @@ class Blocks(Sweeper):
 
 @_offered("sweeper", "optuna")
 @dataclass(kw_only=True)
-class Optuna(Sweeper):
+class OptunaConfig(SweeperConfig):
     """A search: the words with several values, `range(a,b)` or `interval(a,b)` say what is searched."""
 
     n_trials: int = option("runs of the whole study, those of earlier calls among them", unit="runs", ge=1)
@@ -96,7 +96,7 @@ class Optuna(Sweeper):
 
 
 @dataclass(kw_only=True)
-class Launcher:
+class LauncherConfig:
     """Base of the group `hydra/launcher`: where the runs of a sweep take place."""
 
     name: ClassVar[str]
@@ -104,20 +104,20 @@ class Launcher:
 
 @_offered("launcher", "basic")
 @dataclass(kw_only=True)
-class Basic(Launcher):
+class BasicConfig(LauncherConfig):
     """One run after the other, on this machine."""
 
 
 @_offered("launcher", "joblib")
 @dataclass(kw_only=True)
-class Joblib(Launcher):
+class JoblibConfig(LauncherConfig):
     """Several runs at once, on this machine."""
 
     n_jobs: int | None = option("runs at once; null = one for each core", unit="runs", ge=1, le=1024)
 
 
 @dataclass(kw_only=True)
-class Submitit(Launcher):
+class SubmititConfig(LauncherConfig):
     """Base of the launchers that write a submission for each run."""
 
     timeout_min: int = option("a run is stopped after this long, and goes on where requeued", unit="min", ge=1)
@@ -126,7 +126,7 @@ class Submitit(Launcher):
 
 @_offered("launcher", "submitit_local")
 @dataclass(kw_only=True)
-class SubmititLocal(Submitit):
+class SubmititLocalConfig(SubmititConfig):
     """As submitit_slurm, but on this machine: to try out what a cluster will do."""
 
     n_jobs: int | None = option("runs at once; null = as many as there are cores for", unit="runs", ge=1, le=1024)
@@ -134,7 +134,7 @@ class SubmititLocal(Submitit):
 
 @_offered("launcher", "submitit_slurm")
 @dataclass(kw_only=True)
-class SubmititSlurm(Submitit):
+class SubmititSlurmConfig(SubmititConfig):
     """On the nodes of a SLURM cluster, as one job array; the folder must be one that every node sees."""
 
     mem_gb: float | None = option("memory of a run; null = the cluster's default", unit="GB", gt=0)
@@ -150,7 +150,7 @@ class SubmititSlurm(Submitit):
 
 @_offered("launcher", "ray")
 @dataclass(kw_only=True)
-class Ray(Launcher):
+class RayConfig(LauncherConfig):
     """On a Ray cluster that is joined, or one that is started on this machine."""
 
     address: str | None = option("cluster to join; null = start one here", expects="auto, or host:port")

@@ -7,13 +7,22 @@ from typing import Any, ClassVar
 
 from trackmdp.config.options import choice, option
 
-__all__ = ["Cost", "Drift", "Grid", "Kernel", "RandomSupport", "RandomWalk", "Table", "Tracks"]
+__all__ = [
+    "CostConfig",
+    "DriftConfig",
+    "GridConfig",
+    "KernelConfig",
+    "RandomSupportConfig",
+    "RandomWalkConfig",
+    "TableConfig",
+    "TracksConfig",
+]
 
 BORDERS = ("renormalize", "inside", "clip", "exit")
 
 
 @dataclass(kw_only=True)
-class Grid:
+class GridConfig:
     """The grid of cells, one sensor in each, and the limits on an episode."""
 
     size: int = option("N, cells along one side; M = N² cells and sensors", unit="cells", ge=3, le=64)
@@ -24,7 +33,7 @@ class Grid:
 
 
 @dataclass(kw_only=True)
-class Kernel:
+class KernelConfig:
     """Base of the group `kernel`: how the target moves."""
 
     name: ClassVar[str]
@@ -36,7 +45,7 @@ class Kernel:
 
 @choice("kernel", "random_support")
 @dataclass(kw_only=True)
-class RandomSupport(Kernel):
+class RandomSupportConfig(KernelConfig):
     """The paper's motion: Z random positions around each cell, one of low probability, the others equal."""
 
     support_size: int = option("Z, positions the target may move to, at most (2·radius+1)²", unit="cells", ge=1)
@@ -49,7 +58,7 @@ class RandomSupport(Kernel):
 
 @choice("kernel", "random_walk")
 @dataclass(kw_only=True)
-class RandomWalk(Kernel):
+class RandomWalkConfig(KernelConfig):
     """A lazy random walk on the 4 or 8 neighbours."""
 
     stay: float = option("probability of staying in the cell", unit="per step", ge=0, le=1)
@@ -60,7 +69,7 @@ class RandomWalk(Kernel):
 
 @choice("kernel", "drift")
 @dataclass(kw_only=True)
-class Drift(Kernel):
+class DriftConfig(KernelConfig):
     """A target that heads one way most of the time."""
 
     direction: float = option("heading, 0 = right, 90 = up", unit="degrees", ge=0, lt=360)
@@ -71,7 +80,7 @@ class Drift(Kernel):
 
 @choice("kernel", "table")
 @dataclass(kw_only=True)
-class Table(Kernel):
+class TableConfig(KernelConfig):
     """A table of your own: row i holds the probabilities of moving from cell i to each cell."""
 
     path: str = option("file with the M x M table", expects="a path to a .npy, .npz or .csv file")
@@ -79,7 +88,7 @@ class Table(Kernel):
 
 @choice("kernel", "tracks")
 @dataclass(kw_only=True)
-class Tracks(Kernel):
+class TracksConfig(KernelConfig):
     """No motion model but recorded tracks: learn from most of them, and judge on those held out."""
 
     path: str = option(
@@ -102,7 +111,7 @@ class Tracks(Kernel):
 
 
 @dataclass(kw_only=True)
-class Cost:
+class CostConfig:
     """Base of the group `cost`: what sensing earns and costs."""
 
     name: ClassVar[str]
@@ -110,7 +119,7 @@ class Cost:
 
 @choice("cost", "paper")
 @dataclass(kw_only=True)
-class PaperCost(Cost):
+class PaperCostConfig(CostConfig):
     """The paper's rewards: r for a detection, c per sensor switched on, D for the safe action."""
 
     reward: float = option("r, earned by a detection", unit="reward", gt=0)

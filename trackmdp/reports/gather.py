@@ -14,7 +14,7 @@ import numpy as np
 from omegaconf import OmegaConf
 
 from trackmdp.app.sweep.state import FAILED, PLAN, SUMMARY, read_json, run_of
-from trackmdp.config import Table, WorldConfig, world_of
+from trackmdp.config import TableConfig, WorldConfig, world_of
 from trackmdp.errors import UserError
 from trackmdp.reports import policy
 from trackmdp.reports.grouping import Study, study, world_key
@@ -240,7 +240,7 @@ def _motions(
 def _world_config(place: Path) -> WorldConfig:
     """A run's world with the motion that it stored as its table, whatever made the motion."""
     plain = _config(place)
-    kernel: dict[str, Any] = {field.name: False for field in dataclasses.fields(Table)}
+    kernel: dict[str, Any] = {field.name: False for field in dataclasses.fields(TableConfig)}
     kernel |= {"name": "table", "path": str(place / "kernel.npy")}
     parts = {key: plain.get(key) for key in ("grid", "cost")}
     return world_of(OmegaConf.to_yaml(OmegaConf.create({"quiet": True, "kernel": kernel, **parts})))

@@ -11,8 +11,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import BaseCollector, Collector, MultiAsyncCollector, MultiSyncCollector
 
-from trackmdp.config.learning import Collector as CollectorConfig
-from trackmdp.config.learning import MultiAsync, MultiSync, RayWorkers
+from trackmdp.config.learning import CollectorConfig, MultiAsyncConfig, MultiSyncConfig, RayWorkersConfig
 from trackmdp.seeding import derive
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.tracks import Setting
@@ -46,11 +45,11 @@ def make_collector(
         "storing_device": device,
         "trust_policy": True,  # a policy without parameters (all sensors on) lives on any device
     }
-    if isinstance(cfg, (MultiSync, MultiAsync)):
+    if isinstance(cfg, (MultiSyncConfig, MultiAsyncConfig)):
         workers = [partial(_worker_env, world, f"{worker}-{done}", env) for worker in range(cfg.workers)]
-        kind = MultiSyncCollector if isinstance(cfg, MultiSync) else MultiAsyncCollector
+        kind = MultiSyncCollector if isinstance(cfg, MultiSyncConfig) else MultiAsyncCollector
         return kind(workers, policy, num_threads=torch.get_num_threads(), num_sub_threads=cfg.threads, **common)
-    if isinstance(cfg, RayWorkers):
+    if isinstance(cfg, RayWorkersConfig):
         from trackmdp.training import on_ray
 
         places = [f"{worker}-{done}" for worker in range(cfg.workers)]

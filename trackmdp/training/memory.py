@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from trackmdp.config import A2c, Dqn, PerSensor, Ppo, TrainConfig
+from trackmdp.config import A2cConfig, DqnConfig, PerSensorConfig, PpoConfig, TrainConfig
 from trackmdp.errors import UserError
 from trackmdp.world.model import Task
 
@@ -41,15 +41,15 @@ def needs(cfg: TrainConfig, task: Task) -> dict[str, int]:
     state = 2 * _INDEX + task.num_choices * task.num_cells
     frame = 2 * (state + _INDEX + 3) + task.num_cells + _NUMBER * (task.num_cells + 2)
     parts = {"collector.frames_per_batch": 2 * cfg.collector.frames_per_batch * frame}  # collected, and handed over
-    if isinstance(cfg.algo, Dqn):
+    if isinstance(cfg.algo, DqnConfig):
         transition = 2 * state + task.num_cells + 2 * _NUMBER + 1 + _INDEX
         priority = 8 if cfg.algo.prioritized.enabled else 0
         parts["algo.buffer_size"] = cfg.algo.buffer_size * (transition + priority)
-    if isinstance(cfg.algo, PerSensor):
+    if isinstance(cfg.algo, PerSensorConfig):
         moves = min(cfg.algo.buffer_size, cfg.collector.total_frames)
         cells = 2 if task.markov else 2 * (task.t_max + 3)  # of 16 bits; whole paths are kept a second time, sorted
         parts["algo.buffer_size"] = moves * (2 * cells + 5 * _INDEX)  # and what sorting them takes
-    if isinstance(cfg.algo, (A2c, Ppo, Dqn, PerSensor)):
+    if isinstance(cfg.algo, (A2cConfig, PpoConfig, DqnConfig, PerSensorConfig)):
         inputs = task.num_cells * (2 * task.num_choices + 3) + task.num_choices + 1
         with_moments = 4 * _NUMBER * (inputs + task.num_cells)
         parts["algo.hidden"] = 2 * (cfg.algo.hidden or 256) * with_moments

@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import BaseCollector
 from torchrl.collectors.distributed import RayCollector
 
-from trackmdp.config.learning import RayWorkers
+from trackmdp.config.learning import RayWorkersConfig
 from trackmdp.errors import UserError, require
 from trackmdp.training.signals import kept_sigterm
 from trackmdp.world.env import TrackEnv
@@ -22,7 +22,7 @@ _STORE = 2**30
 
 
 def make_collector(
-    envs: list[Callable[[], TrackEnv]], policy: TensorDictModuleBase, cfg: RayWorkers, common: dict[str, Any]
+    envs: list[Callable[[], TrackEnv]], policy: TensorDictModuleBase, cfg: RayWorkersConfig, common: dict[str, Any]
 ) -> BaseCollector:
     """A collector whose batches `[B, time]` hold the rows of all workers, one after the other.
 
@@ -73,7 +73,7 @@ def _rows(batch: TensorDictBase) -> TensorDictBase:
     return batch.flatten(0, 1)
 
 
-def _cluster(cfg: RayWorkers) -> dict[str, Any]:
+def _cluster(cfg: RayWorkersConfig) -> dict[str, Any]:
     """Arguments of `ray.init`; a cluster that is joined has its own resources."""
     quiet: dict[str, Any] = {"logging_level": "error", "log_to_driver": False}
     if cfg.address is not None:

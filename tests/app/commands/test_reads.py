@@ -11,7 +11,7 @@ import pytest
 from tests.config.cases import composed
 from tests.helpers import BASELINES
 from tests.reads import record_reads, unread
-from trackmdp.config import GROUPS, PerSensor, conf_dir
+from trackmdp.config import GROUPS, PerSensorConfig, conf_dir
 
 SHORT = "quiet=true grid.size=3 collector.total_frames=2048 collector.frames_per_batch=1024 collector.envs=64"
 DEFAULTS = {
@@ -38,7 +38,7 @@ def test_train_reads_every_option(algo: str, tmp_path: Path) -> None:
     words = f"algo={algo} {SHORT} optimal.time_limit=1"
     words += (
         MIXED
-        if issubclass(GROUPS["algo"][algo], PerSensor)
+        if issubclass(GROUPS["algo"][algo], PerSensorConfig)
         else " algo.prioritized.enabled=true"
         if algo == "dqn"
         else ""

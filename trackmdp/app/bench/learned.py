@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from trackmdp.config import BenchmarkConfig, PaperCost, RandomSupport, load_run
+from trackmdp.config import BenchmarkConfig, PaperCostConfig, RandomSupportConfig, load_run
 from trackmdp.paper.worlds import COSTS, SUPPORTS
 from trackmdp.world.model import World
 
@@ -50,8 +50,8 @@ def _variant(seeds: list[int], sensing: str, frames: int) -> list[dict[str, Any]
 def _run(folder: Path) -> dict[str, Any]:
     summary = json.loads((folder / "summary.json").read_text())
     cfg = load_run(str(folder))
-    assert isinstance(cfg.kernel, RandomSupport)
-    assert isinstance(cfg.cost, PaperCost)
+    assert isinstance(cfg.kernel, RandomSupportConfig)
+    assert isinstance(cfg.cost, PaperCostConfig)
     with (folder / "metrics.csv").open() as stream:
         curve = list(csv.DictReader(stream))
     return {

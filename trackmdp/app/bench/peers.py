@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from trackmdp.app.bench.process import measured, on_one_core, trained
-from trackmdp.config import BenchmarkConfig, PaperCost, RandomSupport
+from trackmdp.config import BenchmarkConfig, PaperCostConfig, RandomSupportConfig
 from trackmdp.errors import UserError
 from trackmdp.world.model import World
 
@@ -89,8 +89,8 @@ def _scripts(cfg: BenchmarkConfig) -> list[tuple[Path, str]]:
 
 def _instance(cfg: BenchmarkConfig) -> Instance:
     kernel, cost = cfg.kernel, cfg.cost
-    z = kernel.support_size if isinstance(kernel, RandomSupport) and kernel.seed == kernel.support_size else None
-    if z is None or not isinstance(cost, PaperCost) or cfg.grid.size != 10:
+    z = kernel.support_size if isinstance(kernel, RandomSupportConfig) and kernel.seed == kernel.support_size else None
+    if z is None or not isinstance(cost, PaperCostConfig) or cfg.grid.size != 10:
         raise UserError("part=peers: the peers know the default kernel on a 10x10 grid with one price for all sensors")
     return Instance(z, cost.sensor, cfg.grid.t_max)
 

@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModuleBase
 from trackmdp.app.commands import held_out, playback
 from trackmdp.app.commands.trained import trained
 from trackmdp.build import make_baseline, make_device, make_setting
-from trackmdp.config import EvaluateConfig, Mcap, Playback, RandomK, load_run, to_yaml
+from trackmdp.config import EvaluateConfig, McapConfig, PlaybackConfig, RandomKConfig, load_run, to_yaml
 from trackmdp.episodes.log import EpisodeLog
 from trackmdp.episodes.record import Chains, RandomSets
 from trackmdp.policies import fixed
@@ -38,7 +38,7 @@ def run(cfg: EvaluateConfig, folder: Path) -> float:
     console = make_console(cfg.quiet)
     torch.set_num_threads(cfg.threads)
     device = make_device(cfg.device)
-    if cfg.run is None and isinstance(cfg.baseline, Playback):
+    if cfg.run is None and isinstance(cfg.baseline, PlaybackConfig):
         return playback.run(cfg, folder, console, device)
     world, max_steps, chains, subject = _trained(cfg, device) if cfg.run else _baseline(cfg)
     if isinstance(world, Recorded):
@@ -48,7 +48,7 @@ def run(cfg: EvaluateConfig, folder: Path) -> float:
     simulation = None
     if cfg.episodes:
         policy: TensorDictModuleBase = ChainPolicy(chains, device)
-        if isinstance(cfg.baseline, RandomK):
+        if isinstance(cfg.baseline, RandomKConfig):
             draws = generator(cfg.seed, "evaluation", "policy", device=device)
             policy = fixed.RandomK(world.num_cells, cfg.baseline.k, draws)
         simulation = simulate(world, policy, episodes=cfg.episodes, seed=cfg.seed, max_steps=max_steps, device=device)
@@ -79,12 +79,12 @@ def _log_episodes(
     console: Console,
 ) -> None:
     """Write `episodes.mcap`: as many episodes as are simulated, each from a generator of its own."""
-    assert isinstance(cfg.log, Mcap)
+    assert isinstance(cfg.log, McapConfig)
     described = to_yaml(load_run(cfg.run) if cfg.run else cfg)
     log = EpisodeLog(
         folder, world, seed=cfg.seed, config=described, max_steps=max_steps, layout=cfg.log.layout, command="evaluate"
     )
-    if isinstance(cfg.baseline, RandomK):
+    if isinstance(cfg.baseline, RandomKConfig):
         log.record(RandomSets(world.num_cells, cfg.baseline.k), {"label": subject}, cfg.episodes)
     else:
         log.record(Chains(chains), {"label": subject}, cfg.episodes)

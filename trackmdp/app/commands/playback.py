@@ -9,7 +9,7 @@ import torch
 from rich.console import Console
 
 from trackmdp.build import make_world
-from trackmdp.config import EvaluateConfig, Playback
+from trackmdp.config import EvaluateConfig, PlaybackConfig
 from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.episodes.record import Issued, record
@@ -28,7 +28,7 @@ def run(cfg: EvaluateConfig, folder: Path, console: Console, device: torch.devic
 
     Such a policy ignores what it observes, so that it has no chains and no exact value.
     """
-    assert isinstance(cfg.baseline, Playback)
+    assert isinstance(cfg.baseline, PlaybackConfig)
     world = make_world(cfg)
     with EpisodeReader(cfg.baseline.file) as reader:
         if int(reader.run["size"]) != world.size:

@@ -9,7 +9,7 @@ import numpy as np
 from rich.console import Console
 
 from trackmdp.build import make_world
-from trackmdp.config import ReplayConfig, Table, world_of
+from trackmdp.config import ReplayConfig, TableConfig, world_of
 from trackmdp.episodes.layout import write_layout
 from trackmdp.episodes.page import write_page
 from trackmdp.episodes.player import play
@@ -93,7 +93,7 @@ def _verify(console: Console, cfg: ReplayConfig, reader: EpisodeReader) -> None:
 def _kernel_difference(reader: EpisodeReader) -> str | None:
     """Where the kernel of the log is not the one its config describes; a table of the user's own is taken as it is."""
     cfg = world_of(reader.attachment("config.yaml").decode())
-    if isinstance(cfg.kernel, Table) or isinstance(getattr(cfg.cost, "sensor", None), str):
+    if isinstance(cfg.kernel, TableConfig) or isinstance(getattr(cfg.cost, "sensor", None), str):
         return None
     described, logged = make_world(cfg).kernel, reader.world().kernel
     if described.shape != logged.shape:

@@ -15,7 +15,7 @@ import torch
 from rich.console import Console
 
 from trackmdp.build import make_algorithm, make_collector, make_device, make_setting
-from trackmdp.config import Mcap, TrainConfig
+from trackmdp.config import McapConfig, TrainConfig
 from trackmdp.config.resume import config_text
 from trackmdp.episodes.log import EpisodeLog
 from trackmdp.episodes.record import Chains
@@ -130,7 +130,7 @@ class Session:
     def _record(self, iteration: int, chains: np.ndarray) -> None:
         """Log episodes of the evaluation after the first iteration, every k-th one, and the last."""
         log = self.cfg.log
-        if self.log is None or not isinstance(log, Mcap):
+        if self.log is None or not isinstance(log, McapConfig):
             return
         if (
             iteration in (1, self.algorithm.iterations)
@@ -141,7 +141,7 @@ class Session:
 
 def _episode_log(cfg: TrainConfig, world: Setting, folder: Path, policies: int | None) -> EpisodeLog | None:
     """The log of simulated episodes, where it is asked for."""
-    if not isinstance(cfg.log, Mcap):
+    if not isinstance(cfg.log, McapConfig):
         return None
     assert isinstance(world, World)
     return EpisodeLog(

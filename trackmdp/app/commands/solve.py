@@ -11,7 +11,7 @@ from rich.console import Console
 
 from trackmdp.app.commands.verify import show_checks, write_checks
 from trackmdp.build import make_baseline, make_world
-from trackmdp.config import Optimal, SolveConfig
+from trackmdp.config import OptimalConfig, SolveConfig
 from trackmdp.errors import UserError
 from trackmdp.solvers import bounds, optimal, qmdp
 from trackmdp.solvers.chains import Evaluation, evaluate, regret_per_step, sets_of
@@ -50,7 +50,7 @@ def run(cfg: SolveConfig, folder: Path) -> float:
 
 def solve_world(cfg: SolveConfig, world: World, on_progress: Callable[[Progress], None]) -> Solution:
     """The policy of `cfg.solver` with the bracket it proves: its own for `optimal`, else up to the clocked bound."""
-    if isinstance(cfg.solver, Optimal):
+    if isinstance(cfg.solver, OptimalConfig):
         limit, tolerance = cfg.solver.time_limit, cfg.solver.tolerance
         return optimal.solve(world, time_limit=limit, tolerance=tolerance, on_progress=on_progress)
     started = time.monotonic()

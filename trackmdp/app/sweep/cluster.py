@@ -14,7 +14,7 @@ from typing import Any
 from trackmdp.app.sweep import apart
 from trackmdp.app.sweep.job import Launch, fail, run_job, stop_signal
 from trackmdp.app.sweep.plan import Job
-from trackmdp.config.sweeps import Submitit, SubmititLocal, SubmititSlurm
+from trackmdp.config.sweeps import SubmititConfig, SubmititLocalConfig, SubmititSlurmConfig
 from trackmdp.errors import FAILED, UserError
 
 __all__ = ["launcher"]
@@ -46,15 +46,15 @@ class Submission:
         return DelayedSubmission(self, job)
 
 
-def launcher(cfg: Submitit) -> Launch:
+def launcher(cfg: SubmititConfig) -> Launch:
     """The launcher of `cfg`.
 
     Raises:
         UserError: there is no SLURM here.
     """
-    if isinstance(cfg, SubmititLocal):
+    if isinstance(cfg, SubmititLocalConfig):
         return partial(_local, cfg)
-    assert isinstance(cfg, SubmititSlurm)
+    assert isinstance(cfg, SubmititSlurmConfig)
     import submitit
 
     if submitit.SlurmExecutor.affinity() < 0:
@@ -62,7 +62,7 @@ def launcher(cfg: Submitit) -> Launch:
     return partial(_slurm, cfg)
 
 
-def _local(cfg: SubmititLocal, jobs: Sequence[Job]) -> None:
+def _local(cfg: SubmititLocalConfig, jobs: Sequence[Job]) -> None:
     import submitit
 
     executor = submitit.LocalExecutor(_submissions(jobs))
@@ -79,7 +79,7 @@ def _local(cfg: SubmititLocal, jobs: Sequence[Job]) -> None:
     _wait(running)
 
 
-def _slurm(cfg: SubmititSlurm, jobs: Sequence[Job]) -> None:
+def _slurm(cfg: SubmititSlurmConfig, jobs: Sequence[Job]) -> None:
     import submitit
 
     executor = submitit.AutoExecutor(_submissions(jobs), cluster="slurm", slurm_max_num_timeout=cfg.max_num_timeout)

@@ -15,7 +15,7 @@ from trackmdp.app.sweep.apart import context_for
 from trackmdp.app.sweep.job import Launch, run_job
 from trackmdp.app.sweep.plan import Job
 from trackmdp.config import TrainConfig
-from trackmdp.config.sweeps import Basic, Joblib, Launcher, Ray, Submitit
+from trackmdp.config.sweeps import BasicConfig, JoblibConfig, LauncherConfig, RayConfig, SubmititConfig
 from trackmdp.errors import require
 
 __all__ = ["make_launcher", "threads_of"]
@@ -23,29 +23,29 @@ __all__ = ["make_launcher", "threads_of"]
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
-def make_launcher(cfg: Launcher) -> Launch:
+def make_launcher(cfg: LauncherConfig) -> Launch:
     """The launcher that `hydra/launcher=NAME` chose.
 
     Raises:
         UserError: what it needs is not installed.
     """
-    if isinstance(cfg, Basic):
+    if isinstance(cfg, BasicConfig):
         return _basic
     launch = _parallel(cfg)
     return lambda jobs: launch([replace(job, aside=True) for job in jobs])
 
 
-def _parallel(cfg: Launcher) -> Launch:
+def _parallel(cfg: LauncherConfig) -> Launch:
     option = f"hydra/launcher={cfg.name}"
-    if isinstance(cfg, Joblib):
+    if isinstance(cfg, JoblibConfig):
         require("joblib", "sweep", option)
         return partial(_joblib, cfg)
-    if isinstance(cfg, Submitit):
+    if isinstance(cfg, SubmititConfig):
         require("submitit", "slurm", option)
         from trackmdp.app.sweep import cluster
 
         return cluster.launcher(cfg)
-    assert isinstance(cfg, Ray)
+    assert isinstance(cfg, RayConfig)
     require("ray", "ray", option)
     from trackmdp.app.sweep import on_ray
 
@@ -70,7 +70,7 @@ def _basic(jobs: Sequence[Job]) -> None:
         run_job(job)
 
 
-def _joblib(cfg: Joblib, jobs: Sequence[Job]) -> None:
+def _joblib(cfg: JoblibConfig, jobs: Sequence[Job]) -> None:
     """Threads will do: each only waits for the process of its run."""
     from joblib import Parallel, delayed
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from trackmdp.app.sweep.job import run_job
 from trackmdp.app.sweep.plan import Job
-from trackmdp.config.sweeps import Ray
+from trackmdp.config.sweeps import RayConfig
 from trackmdp.errors import UserError
 from trackmdp.training.signals import kept_sigterm
 
@@ -17,7 +17,7 @@ _STORE = 100 * 2**20
 """Bytes for the objects of a cluster started here; the runs hand over none."""
 
 
-def launch(cfg: Ray, jobs: Sequence[Job]) -> None:
+def launch(cfg: RayConfig, jobs: Sequence[Job]) -> None:
     """Run `jobs` as tasks of a Ray cluster, which is left, or ended where it was started here.
 
     Raises:
@@ -36,7 +36,7 @@ def launch(cfg: Ray, jobs: Sequence[Job]) -> None:
         ray.shutdown()
 
 
-def _join(cfg: Ray, ray: Any) -> None:
+def _join(cfg: RayConfig, ray: Any) -> None:
     quiet: dict[str, Any] = {"logging_level": "error", "include_dashboard": False}
     if cfg.address is None:
         ray.init(num_cpus=cfg.num_cpus, object_store_memory=_STORE, **quiet)

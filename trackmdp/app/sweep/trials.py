@@ -14,7 +14,7 @@ from hydra.core.override_parser.types import IntervalSweep, Override, RangeSweep
 from trackmdp.app.sweep.plan import Job
 from trackmdp.app.sweep.state import run_of
 from trackmdp.app.sweep.table import figures
-from trackmdp.config.sweeps import Optuna
+from trackmdp.config.sweeps import OptunaConfig
 from trackmdp.errors import UserError, require
 from trackmdp.seeding import derive
 
@@ -28,7 +28,7 @@ _DIRECTIONS = {"aihtr": "maximize", "regret_per_step": "minimize"}
 
 
 def trials(
-    cfg: Optuna, words: Sequence[str], folder: Path, planned: Callable[[Sequence[str], set[str]], Job]
+    cfg: OptunaConfig, words: Sequence[str], folder: Path, planned: Callable[[Sequence[str], set[str]], Job]
 ) -> Iterator[list[Job]]:
     """Batches of jobs, until `cfg.n_trials` are done; once a batch has been run, its results are handed to the study.
 
@@ -61,7 +61,7 @@ def trials(
                 failed += _tell(cfg, study, trial, job)
 
 
-def _ask(cfg: Optuna, study: Any, searched: dict[str, Override], place: int) -> tuple[Any, list[str]]:
+def _ask(cfg: OptunaConfig, study: Any, searched: dict[str, Override], place: int) -> tuple[Any, list[str]]:
     """The next trial and its words. What is drawn depends on the seed and on what is known, not on who was cut when."""
     study.sampler = _sampler(cfg, derive(cfg.seed, "optuna", _count(study, "COMPLETE"), place) % 2**32)
     trial = study.ask()
@@ -73,7 +73,7 @@ def _ask(cfg: Optuna, study: Any, searched: dict[str, Override], place: int) -> 
     return trial, words
 
 
-def _sampler(cfg: Optuna, seed: int) -> Any:
+def _sampler(cfg: OptunaConfig, seed: int) -> Any:
     from optuna.exceptions import ExperimentalWarning
     from optuna.samplers import RandomSampler, TPESampler
 
@@ -99,7 +99,7 @@ def _suggest(trial: Any, key: str, override: Override) -> Any:
     return trial.suggest_categorical(key, list(override.sweep_string_iterator()))
 
 
-def _tell(cfg: Optuna, study: Any, trial: Any, job: Job) -> int:
+def _tell(cfg: OptunaConfig, study: Any, trial: Any, job: Job) -> int:
     """Hand over what came of a job; 1 if it failed. One that was cut is taken up by the next call."""
     run = run_of(job.folder)
     value = figures(run).get(cfg.objective) if run.state == "done" else None
@@ -113,7 +113,7 @@ def _tell(cfg: Optuna, study: Any, trial: Any, job: Job) -> int:
 
 
 @contextmanager
-def _study(cfg: Optuna, folder: Path) -> Iterator[Any]:
+def _study(cfg: OptunaConfig, folder: Path) -> Iterator[Any]:
     import optuna
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
