@@ -1,0 +1,228 @@
+"""The one policy: what it says of each state, how it acts, and what becomes one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy import sparse
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from tests.helpers import ALGORITHMS, algorithm, random_state, small_world
+from trackmdp.errors import UserError
+from trackmdp.policies import lookup, policy
+from trackmdp.policies.policy import Policy, as_policy
+
+WORLD = small_world(t_max=2)
+M, CHOICES = WORLD.num_cells, WORLD.num_choices
+
+
+def table(seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).random((M, CHOICES, M)) < 0.4
+
+
+def everywhere() -> tuple[np.ndarray, np.ndarray]:
+    """Every pair of a located cell and a sensor."""
+    rows, cells = np.divmod(np.arange(M * M), M)
+    return rows, cells
+
+
+def three_by_history(last_cell: torch.Tensor, n: torch.Tensor, history: torch.Tensor) -> torch.Tensor:
+    """Senses its own cell, and later the cells after those it has sensed."""
+    own = torch.nn.functional.one_hot(last_cell, M).bool()
+    return own | history.any(1).roll(1, -1)
+
+
+def test_a_table_is_looked_up_by_cell_and_misses() -> None:
+    on = np.zeros((M, CHOICES, M), dtype=bool)
+    on[1, 0, 2] = on[1, 1, 3] = on[2, 1, 0] = on[1, 2, 7] = True
+    acting = Policy.from_dense(WORLD, on)
+    rows = {"last_cell": torch.tensor([1, 1, 2, 0, 1]), "steps_since_detection": torch.tensor([0, 1, 1, 1, 3])}
+    action = acting(TensorDict(rows, [5]))["action"]
+    assert [cells.nonzero().flatten().tolist() for cells in action] == [[2], [3], [0], [], [7]]
+    assert action.dtype == torch.bool
+    assert acting.deterministic
+    assert acting.num_draws == 0
+    assert acting.as_lists()["sets"]["1"] == [[2], [3], [7]]
+
+
+@pytest.mark.parametrize("dense_up_to", [0, policy._DENSE])
+def test_both_ways_of_looking_up_agree_with_the_table(dense_up_to: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(policy, "_DENSE", dense_up_to)
+    for on in (table(), table().astype(float) * 0.25):
+        acting = Policy.from_dense(WORLD, on)
+        state = random_state(WORLD, 60, seed=1).reshape(12, 5)
+        seen = acting.probabilities(state["last_cell"], state["steps_since_detection"])
+        n = state["steps_since_detection"].clamp_max(WORLD.t_max)
+        assert seen.shape == (12, 5, M)
+        assert (seen.numpy() == on[state["last_cell"].numpy(), n.numpy()]).all()
+        form = lookup.SparseTable if dense_up_to == 0 else lookup.DenseTable
+        assert isinstance(acting._lookup, form)
+
+
+@pytest.mark.parametrize("on", [table(), table() * np.random.default_rng(1).random((M, CHOICES, M))])
+def test_exact_evaluation_reads_the_table(on: np.ndarray) -> None:
+    read, (rows, cells) = Policy.from_dense(WORLD, on), everywhere()
+    price = np.random.default_rng(2).random(M)
+    for n in range(CHOICES):
+        assert (read.on(n, rows, cells).reshape(M, M) == on[:, n]).all()
+        assert read.spent(n, price) == pytest.approx(on[:, n] @ price, abs=1e-12)
+
+
+def test_an_empty_table_is_no_sensor_anywhere() -> None:
+    read, (rows, cells) = Policy.from_dense(WORLD, np.zeros((M, CHOICES, M), dtype=bool)), everywhere()
+    assert not read.on(0, rows, cells).any()
+    assert not read.spent(1, WORLD.cost).any()
+    assert not read(random_state(WORLD, 5, seed=0))["action"].any()
+
+
+@pytest.mark.parametrize(("made", "share"), [(Policy.all_on(WORLD), 1.0), (Policy.none(WORLD), 0.0)])
+def test_all_on_and_none(made: Policy, share: float) -> None:
+    rows, cells = everywhere()
+    assert made.deterministic
+    assert (made.on(1, rows, cells) == share).all()
+    assert made.spent(0, WORLD.cost) == pytest.approx(np.full(M, share * WORLD.cost.sum()))
+    assert made(random_state(WORLD, 5, seed=0))["action"].tolist() == [[share == 1.0] * M] * 5
+    assert (made.dense() == share).all()
+    assert made.as_lists() == Policy.from_dense(WORLD, made.dense()).as_lists()
+
+
+@pytest.mark.parametrize("k", [0, 1, 3, 9])
+def test_random_k_draws_exactly_k_from_its_own_generator(k: int) -> None:
+    state = {"last_cell": torch.zeros(20_000, dtype=torch.int64)}
+    state["steps_since_detection"] = state["last_cell"]
+    before, actions = torch.get_rng_state(), []
+    for _ in range(2):
+        drawing = Policy.random_k(WORLD, k)
+        drawing.generator = torch.Generator().manual_seed(0)
+        actions.append(drawing(TensorDict(state, [20_000]))["action"].clone())
+    assert torch.equal(*actions)
+    assert torch.equal(torch.get_rng_state(), before)
+    assert (actions[0].sum(-1) == k).all()
+    share = k / 9
+    assert (actions[0].double().mean(0) - share).abs().max() <= 5 * (share * (1 - share) / 20_000) ** 0.5
+    assert drawing.on(0, np.arange(M), np.arange(M)) == pytest.approx(np.full(M, share))
+    assert drawing.deterministic == (k in (0, 9))
+
+
+def test_probabilities_are_those_of_the_sensors_switched_on() -> None:
+    chances = np.random.default_rng(3).random((M, CHOICES, M)) * table()
+    drawing = Policy.from_dense(WORLD, chances)
+    assert not drawing.deterministic
+    state = {"last_cell": torch.full((20_000,), 4), "steps_since_detection": torch.full((20_000,), 1)}
+    torch.manual_seed(0)
+    seen = drawing(TensorDict(state, [20_000]))["action"].double().mean(0).numpy()
+    assert seen == pytest.approx(chances[4, 1], abs=5 * 0.5 / 20_000**0.5)
+    with pytest.raises(UserError, match="draws its sets"):
+        drawing.dense()
+
+
+def test_a_function_is_followed_along_its_own_history() -> None:
+    read = as_policy(WORLD, three_by_history).dense()
+    for x in range(M):
+        assert read[x].nonzero()[1].tolist() == [x, *sorted([x, (x + 1) % M]), *sorted([x, (x + 1) % M, (x + 2) % M])]
+
+
+@pytest.mark.parametrize("at_once", [1, 2 * CHOICES * M, 2**22])
+def test_blocks_of_located_cells_change_nothing(at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("trackmdp.policies.unroll._HISTORY_AT_ONCE", at_once)
+    asked = []
+
+    def counted(last_cell: torch.Tensor, n: torch.Tensor, history: torch.Tensor) -> torch.Tensor:
+        asked.append(len(last_cell))
+        return three_by_history(last_cell, n, history)
+
+    whole = Policy.from_dense(WORLD, as_policy(WORLD, three_by_history).dense())
+    assert (Policy.from_function(WORLD, counted, check=False).sets != whole.sets).nnz == 0
+    assert max(asked) * CHOICES * M <= max(at_once, CHOICES * M)
+    assert sum(asked) == CHOICES * M
+
+
+def test_a_function_may_write_to_what_it_is_given() -> None:
+    def spoils(last_cell: torch.Tensor, n: torch.Tensor, history: torch.Tensor) -> torch.Tensor:
+        action = three_by_history(last_cell, n, history)
+        last_cell.zero_(), n.zero_(), history.fill_(True)
+        return action
+
+    assert (as_policy(WORLD, spoils).dense() == as_policy(WORLD, three_by_history).dense()).all()
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_a_learner_s_actor_becomes_the_table_of_its_modes(name: str) -> None:
+    actor = algorithm(name, WORLD).actor
+    before = torch.get_rng_state()
+    read = as_policy(WORLD, actor)
+    assert torch.equal(torch.get_rng_state(), before)
+    first = {
+        "last_cell": torch.arange(M),
+        "steps_since_detection": torch.zeros(M, dtype=torch.int64),
+        "action_history": torch.zeros(M, CHOICES, M, dtype=torch.bool),
+    }
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        assert torch.equal(read(TensorDict(first, [M]))["action"], actor(TensorDict(first, [M]))["action"])
+
+
+SHARED = torch.Generator().manual_seed(0)
+DRAWING: dict[str, Any] = {
+    "torch": lambda x, n, h: torch.rand(len(x), M) < 0.5,
+    "torch, seldom": lambda x, n, h: torch.rand(len(x), M) < 1e-9,
+    "its own generator": lambda x, n, h: torch.rand(len(x), M, generator=SHARED) < 0.5,
+    "numpy": lambda x, n, h: np.random.random((len(x), M)) < 0.5,  # noqa: NPY002
+    "module": TensorDictModule(lambda x: torch.rand(*x.shape, M) < 0.5, in_keys=["last_cell"], out_keys=["action"]),
+    "dropout": TensorDictModule(
+        lambda x: torch.nn.functional.dropout(torch.ones(*x.shape, M)) > 0, in_keys=["last_cell"], out_keys=["action"]
+    ),
+}
+
+
+@pytest.mark.parametrize("name", DRAWING)
+def test_what_draws_is_refused_in_one_line(name: str) -> None:
+    with pytest.raises(UserError, match="draws at random") as refused:
+        as_policy(WORLD, DRAWING[name])
+    assert "\n" not in str(refused.value)
+
+
+def sequence(key: str) -> TensorDictModule:
+    return TensorDictModule(lambda x: torch.ones(len(x), M, dtype=torch.bool), in_keys=[key], out_keys=["action"])
+
+
+WRONG: dict[str, tuple[Any, str]] = {
+    "numbers": (lambda x, n, h: torch.zeros(len(x), M), r"returned float32 \[9, 9\], expected bool \[9, 9\]"),
+    "another width": (lambda x, n, h: torch.zeros(len(x), M + 1, dtype=torch.bool), r"bool \[9, 10\]"),
+    "recurrent": (sequence("hidden"), "reads hidden"),
+    "reads the target": (sequence("target"), "reads target"),
+    "no action": (TensorDictModule(torch.nn.Identity(), in_keys=["last_cell"], out_keys=["a"]), "writes no action"),
+    "a number": (3, "got int"),
+    "another world": (Policy.all_on(small_world(2, t_max=2)), "made for 4 cells"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_is_no_policy_is_refused_in_one_line(name: str) -> None:
+    given, message = WRONG[name]
+    with pytest.raises(UserError, match=message):
+        as_policy(WORLD, given)
+
+
+@pytest.mark.parametrize("wrong", [np.zeros((M, CHOICES, M + 1)), np.full((M, CHOICES, M), 1.5), -table().astype(int)])
+def test_a_table_that_is_none_is_refused(wrong: np.ndarray) -> None:
+    with pytest.raises(UserError, match="expected"):
+        Policy.from_dense(WORLD, wrong)
+
+
+def test_a_sparse_table_is_brought_into_order_and_left_alone() -> None:
+    on = table()
+    jumbled = sparse.csr_array(on.reshape(-1, M).astype(np.int8))
+    for begin, end in zip(jumbled.indptr[:-1], jumbled.indptr[1:], strict=True):
+        jumbled.indices[begin:end] = jumbled.indices[begin:end][::-1]
+    before = jumbled.indices.copy()
+    made = Policy(WORLD, jumbled)
+    assert made.sets is not None
+    assert made.sets.dtype == np.bool_
+    assert made.sets.has_sorted_indices
+    assert (made.dense() == on).all()
+    assert (jumbled.indices == before).all()

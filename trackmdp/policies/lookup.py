@@ -1,0 +1,56 @@
+"""Rows of a sparse table for a batch of states, on any device."""
+
+from __future__ import annotations
+
+import torch
+from scipy import sparse
+from torch import Tensor
+
+__all__ = ["DenseTable", "SparseTable"]
+
+
+class DenseTable:
+    """All rows written out: one indexing per batch, memory for every entry.
+
+    Args:
+        table: `[R, M]` bool or float64.
+        device: where rows are looked up.
+    """
+
+    def __init__(self, table: sparse.csr_array, device: torch.device) -> None:
+        self.device = device
+        dense = torch.as_tensor(table.toarray(), device=device)
+        self._rows = dense if dense.dtype == torch.bool else dense.float()
+
+    def __call__(self, row: Tensor) -> Tensor:
+        """`[*B, M]` of `row` `[*B]`: bool, or float32."""
+        return self._rows[row]
+
+
+class SparseTable:
+    """Rows put together from the entries stored, in memory that follows their number.
+
+    Args:
+        table: `[R, M]` bool or float64.
+        device: where rows are looked up.
+    """
+
+    def __init__(self, table: sparse.csr_array, device: torch.device) -> None:
+        self.device, self._columns = device, table.shape[1]
+        self._begin = torch.as_tensor(table.indptr, dtype=torch.int64, device=device)
+        self._index = torch.as_tensor(table.indices, dtype=torch.int64, device=device)
+        data = torch.as_tensor(table.data, device=device)
+        self._data = data if data.dtype == torch.bool else data.float()
+
+    def __call__(self, row: Tensor) -> Tensor:
+        """`[*B, M]` of `row` `[*B]`: bool, or float32."""
+        flat = row.reshape(-1)
+        begin, length = self._begin[flat], self._begin[flat + 1] - self._begin[flat]
+        # The entries of all rows of the batch, one row after another. Of rows with 2 and 3 entries that begin at 7 and
+        # 20: batch = 0 0 1 1 1, before = 0 0 2 2 2, entry = 7 8 20 21 22.
+        batch = torch.repeat_interleave(length)
+        before = (length.cumsum(0) - length)[batch]
+        entry = begin[batch] + torch.arange(len(batch), device=self.device) - before
+        rows = torch.zeros(len(flat), self._columns, dtype=self._data.dtype, device=self.device)
+        rows[batch, self._index[entry]] = self._data[entry]
+        return rows.reshape(*row.shape, self._columns)

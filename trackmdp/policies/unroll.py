@@ -1,0 +1,127 @@
+"""From anything that acts to a table: every state a policy can bring about is asked once.
+
+After a miss the next state is known in advance: the same located cell, n + 1, and the history with the set just chosen.
+So M * (t_max + 1) questions, put n by n, say all there is to say about a policy that does not draw.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+import numpy as np
+import torch
+from scipy import sparse
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from trackmdp.errors import UserError
+from trackmdp.seeding import preserved_global_rng
+from trackmdp.world.model import BoolArray, Task
+
+__all__ = ["Rule", "STATE_KEYS", "draws", "function_rule", "module_rule", "unrolled"]
+
+STATE_KEYS = ("last_cell", "steps_since_detection", "action_history")
+
+Rule: TypeAlias = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""`last_cell` `[B]`, `steps_since_detection` `[B]`, `action_history` `[B, t_max+1, M]` -> bool `[B, M]`."""
+
+_HISTORY_AT_ONCE = 2**22  # entries of the action history in one block; a net's activations follow from it
+
+
+def function_rule(task: Task, function: Callable[..., Any]) -> Rule:
+    """A user's function as a rule, what it returns checked.
+
+    Raises:
+        UserError: when asked, it returns something else than bool `[B, M]`.
+    """
+
+    def rule(last_cell: Tensor, steps_since_detection: Tensor, action_history: Tensor) -> Tensor:
+        action = torch.as_tensor(function(last_cell, steps_since_detection, action_history))
+        return _checked(action, (len(last_cell), task.num_cells), "the function returned")
+
+    return rule
+
+
+def module_rule(task: Task, module: TensorDictModuleBase) -> Rule:
+    """A TensorDict module as a rule; it reads the keys of a state and writes `action`.
+
+    Raises:
+        UserError: it reads or writes other keys, or its action has another form.
+    """
+    others = [str(key) for key in module.in_keys if key not in STATE_KEYS]
+    if others:
+        raise UserError(f"policy: the module reads {', '.join(others)}, expected {', '.join(STATE_KEYS)} at most")
+    if "action" not in module.out_keys:
+        raise UserError("policy: the module writes no action")
+
+    def rule(*state: Tensor) -> Tensor:
+        batch = TensorDict(dict(zip(STATE_KEYS, state, strict=True)), state[0].shape, device=state[0].device)
+        return _checked(module(batch)["action"], (len(state[0]), task.num_cells), "the module's action is")
+
+    return rule
+
+
+def _checked(action: Tensor, shape: tuple[int, int], what: str) -> Tensor:
+    if action.dtype != torch.bool or tuple(action.shape) != shape:
+        form = f"{str(action.dtype).removeprefix('torch.')} {list(action.shape)}"
+        raise UserError(f"policy: {what} {form}, expected bool {list(shape)}")
+    return action
+
+
+def unrolled(task: Task, rule: Rule, device: torch.device) -> sparse.csr_array:
+    """`[M * (t_max + 1), M]` bool, the sets of a rule; row x * (t_max + 1) + n as in `Policy.sets`.
+
+    A stochastic actor of TorchRL is taken at its mode. Torch's global generators are left as they were.
+    """
+    with preserved_global_rng():
+        return _table(task, rule, device)
+
+
+def draws(task: Task, rule: Rule, device: torch.device, sets: sparse.csr_array) -> bool:
+    """Whether a rule that was unrolled to `sets` draws: asked again it answers otherwise, or uses torch's generators.
+
+    The first test finds any source of randomness that changes some answer; the second also finds one that seldom does,
+    if it is one of torch's global generators, which TorchRL's modules draw from.
+    """
+    with preserved_global_rng():
+        torch.manual_seed(torch.initial_seed() + 1)  # another place in the random stream than the first time
+        before = _generator_states()
+        again = _table(task, rule, device)
+        moved = any(not torch.equal(*pair) for pair in zip(before, _generator_states(), strict=True))
+    same = np.array_equal(again.indptr, sets.indptr) and np.array_equal(again.indices, sets.indices)
+    return moved or not same
+
+
+@torch.no_grad()
+def _table(task: Task, rule: Rule, device: torch.device) -> sparse.csr_array:
+    m, choices = task.num_cells, task.num_choices
+    at_once = max(1, _HISTORY_AT_ONCE // (choices * m))
+    columns, lengths = [], []
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        for begin in range(0, m, at_once):
+            cells = torch.arange(begin, min(begin + at_once, m), device=device)
+            # The history [B, t_max+1, M] in row-major order is B * (t_max+1) rows of the table, in the table's order.
+            on = _followed(rule, cells, choices, m).reshape(-1, m)
+            columns.append(np.flatnonzero(on) % m)
+            lengths.append(np.count_nonzero(on, axis=1))
+    indptr = np.concatenate([[0], np.cumsum(np.concatenate(lengths))])
+    indices = np.concatenate(columns)
+    return sparse.csr_array((np.ones(len(indices), dtype=bool), indices, indptr), shape=(m * choices, m))
+
+
+def _followed(rule: Rule, cells: Tensor, choices: int, sensors: int) -> BoolArray:
+    """`[B, t_max+1, M]` the sets chosen at n = 0, 1, ... misses from located `cells` `[B]`."""
+    history = torch.zeros(len(cells), choices, sensors, dtype=torch.bool, device=cells.device)
+    for n in range(choices):
+        # Copies, for a rule may keep what it is given, or write to it.
+        history[:, n] = rule(cells.clone(), torch.full_like(cells, n), history.clone())
+    return history.cpu().numpy()
+
+
+def _generator_states() -> list[Tensor]:
+    """Of torch's global generators, the CPU's and those of all GPUs in use."""
+    gpus = torch.cuda.get_rng_state_all() if torch.cuda.is_available() and torch.cuda.is_initialized() else []
+    return [torch.get_rng_state(), *gpus]
