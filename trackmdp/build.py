@@ -132,22 +132,18 @@ def make_algorithm(cfg: TrainConfig, world: Setting, device: torch.device) -> Al
     from trackmdp import config
     from trackmdp.algos import a2c, dqn, hindsight, learned_kernel, per_sensor, ppo
 
-    task, batches = world.task, -(-cfg.collector.total_frames // cfg.collector.frames_per_batch)
-    makers: dict[type[Any], Callable[[Any], Algorithm]] = {
-        config.HindsightConfig: lambda c: hindsight.Hindsight(
-            task, c, iterations=batches, seed=cfg.seed, device=device
-        ),
-        config.A2cPerSensorConfig: lambda c: per_sensor.A2C(task, c, iterations=batches, seed=cfg.seed, device=device),
-        config.PpoPerSensorConfig: lambda c: per_sensor.PPO(task, c, iterations=batches, seed=cfg.seed, device=device),
-        config.DqnPerSensorConfig: lambda c: per_sensor.DQN(task, c, iterations=batches, seed=cfg.seed, device=device),
-        config.LearnedKernelConfig: lambda c: learned_kernel.LearnedKernel(
-            task, c, iterations=batches, seed=cfg.seed, device=device
-        ),
-        config.A2cConfig: lambda c: a2c.A2C(task, c, iterations=batches, device=device),
-        config.PpoConfig: lambda c: ppo.PPO(task, c, iterations=batches, seed=cfg.seed, device=device),
-        config.DqnConfig: lambda c: dqn.DQN(task, c, iterations=batches, seed=cfg.seed, device=device),
+    makers: dict[type[Any], Callable[..., Algorithm]] = {
+        config.HindsightConfig: hindsight.Hindsight,
+        config.A2cPerSensorConfig: per_sensor.PerSensorA2C,
+        config.PpoPerSensorConfig: per_sensor.PerSensorPPO,
+        config.DqnPerSensorConfig: per_sensor.PerSensorDQN,
+        config.LearnedKernelConfig: learned_kernel.LearnedKernel,
+        config.A2cConfig: a2c.A2C,
+        config.PpoConfig: ppo.PPO,
+        config.DqnConfig: dqn.DQN,
     }
-    return makers[type(cfg.algo)](cfg.algo)
+    batches = -(-cfg.collector.total_frames // cfg.collector.frames_per_batch)
+    return makers[type(cfg.algo)](world.task, cfg.algo, iterations=batches, seed=cfg.seed, device=device)
 
 
 def make_collector(

@@ -23,7 +23,7 @@ BETA = ScheduleConfig(start=0.3, end=0.3, begin=0.0, until=1.0)
 FORMS: dict[str, Callable[[], ActorLoss]] = {
     "decision": Decision,
     "policy gradient": lambda: PolicyGradient(BETA),
-    "surrogate": lambda: Surrogate(BETA, clip=0.2, minibatches=2, generator=None),
+    "surrogate": lambda: Surrogate(BETA, clip_epsilon=0.2, minibatches=2, generator=None),
     "poisson": Poisson,
 }
 

@@ -26,7 +26,7 @@ def flat(value: float) -> ScheduleConfig:
 
 def surrogate(entropy: float, *, clip: float = 0.2, sampled: bool = False, minibatches: int = 1) -> Surrogate:
     rng = torch.Generator().manual_seed(0) if sampled else None
-    loss = Surrogate(flat(entropy), clip=clip, minibatches=minibatches, generator=rng)
+    loss = Surrogate(flat(entropy), clip_epsilon=clip, minibatches=minibatches, generator=rng)
     loss.allocate((1, 1, 1), torch.device("cpu"))
     return loss
 
@@ -196,7 +196,7 @@ def test_sampled_credit_varies_as_paths_that_draw_their_own_sets_do(unit: tuple[
 def test_the_sampled_surrogate_has_the_slope_of_the_expected_one_on_average() -> None:
     """At the old policy; the baseline p is what makes an action drawn by chance no evidence for it."""
     credit, on = paths(50, 6)
-    loss = Surrogate(flat(0.0), clip=0.2, minibatches=1, generator=torch.Generator().manual_seed(7))
+    loss = Surrogate(flat(0.0), clip_epsilon=0.2, minibatches=1, generator=torch.Generator().manual_seed(7))
     loss.allocate((1, 2, 3), torch.device("cpu"))
     z = on.logit().requires_grad_()
     slopes = torch.stack([torch.autograd.grad(loss(z, credit).sum(), z)[0] for _ in range(800)])

@@ -59,13 +59,13 @@ def test_only_the_online_network_is_trained() -> None:
     assert all(p.grad is None for p in loss.target_qvalue_network_params.flatten_keys().values())
 
 
-def test_the_judged_network_follows_slowly() -> None:
+def test_the_evaluated_network_follows_slowly() -> None:
     torch.manual_seed(0)
     learner = algorithm("dqn", WORLD, "algo.updates=1", "algo.target_tau=0.25", "algo.batch_size=64")
     start = [p.detach().clone() for p in learner.parameters]
     learner.step(collect(WORLD, learner.policy, 32, 8))
-    judged = list(learner.actor.parameters())
-    for first, online, slow in zip(start, learner.parameters, judged, strict=True):
+    slowly = list(learner.actor.parameters())
+    for first, online, slow in zip(start, learner.parameters, slowly, strict=True):
         torch.testing.assert_close(slow, first + 0.25 * (online - first))
 
 

@@ -10,7 +10,7 @@ from tests.helpers import algorithm, collect, hop_world, small_world
 
 ON_POLICY = ["a2c", "ppo"]
 GAMMA, LAMBDA, SCALE, CONSTANT = 0.8, 0.5, 0.1, 3.0
-SETTINGS = (f"algo.gamma={GAMMA}", f"algo.lam={LAMBDA}", f"algo.reward_scale={SCALE}")
+SETTINGS = (f"algo.gamma={GAMMA}", f"algo.gae_lambda={LAMBDA}", f"algo.reward_scale={SCALE}")
 
 
 def frames(terminated: list[int], truncated: list[int], misses: list[int]) -> TensorDict:

@@ -10,7 +10,7 @@ import torch
 from tests.helpers import algorithm, collect, small_world
 from trackmdp.policies.actor_critic import SubsetDistribution
 
-ONCE = ("algo.epochs=1", "algo.minibatches=1", "algo.clip=0.1")
+ONCE = ("algo.epochs=1", "algo.minibatches=1", "algo.clip_epsilon=0.1")
 
 
 def test_the_clipped_objective() -> None:

@@ -17,7 +17,7 @@ from trackmdp.config import PaperCostConfig, TrainConfig
 from trackmdp.config.resume import config_text, digest
 from trackmdp.reports import policy
 from trackmdp.solvers import clocked
-from trackmdp.training.judge import Judge, figures
+from trackmdp.training.evaluator import ExactEvaluator, figures
 
 VERSIONS = {"trackmdp": "0.1.0", "torch": "2.13.0"}
 MACHINE = {"processor": "a processor", "cores": 2}
@@ -42,22 +42,22 @@ def write_run(
     assert isinstance(cfg.cost, PaperCostConfig)
     cfg.cost.sensor, cfg.seed = cost, seed
     world = make_world(cfg)
-    judge = Judge(world)
+    evaluator = ExactEvaluator(world)
     chains = clocked.solve(world)
     rng = np.random.default_rng(cfg.seed)
     chains.flat[rng.choice(chains.size, wrong, replace=False)] ^= True
-    verdict = judge.score(chains)
+    score = evaluator.score(chains)
     summary = {
         "algo": cfg.algo.name,
         "seed": cfg.seed,
         "frames": 4000,
         "wall_seconds": 2.0,
         "cpu_seconds": 1.5,
-        "policy": figures(verdict.evaluation),
-        "qmdp": figures(judge.qmdp),
-        "bounds": judge.bounds,
-        "optimal": {"lower": judge.upper - 0.01, "upper": judge.upper, "certified": True},
-        "regret_per_step": verdict.regret_per_step,
+        "policy": figures(score.evaluation),
+        "qmdp": figures(evaluator.qmdp),
+        "bounds": evaluator.bounds,
+        "optimal": {"lower": evaluator.upper - 0.01, "upper": evaluator.upper, "certified": True},
+        "regret_per_step": score.regret_per_step,
         "versions": versions or VERSIONS,
         "machine": MACHINE,
         "config_sha256": digest(cfg),
@@ -65,8 +65,8 @@ def write_run(
     (folder / "config.yaml").write_text(config_text(cfg), encoding="utf-8")
     (folder / "summary.json").write_text(json.dumps(summary), encoding="utf-8")
     np.save(folder / "kernel.npy", world.kernel)
-    policy.write(folder / policy.FILE, policy.Policy(chains, verdict.evaluation.value))
-    write_curve(folder, np.linspace(-100.0, verdict.evaluation.aihtr, 40))
+    policy.write(folder / policy.FILE, policy.Policy(chains, score.evaluation.value))
+    write_curve(folder, np.linspace(-100.0, score.evaluation.aihtr, 40))
     return summary
 
 

@@ -1,4 +1,4 @@
-"""Judging by chains and by simulation: the two agree, and neither disturbs what is judged."""
+"""Evaluating by chains and by simulation: the two agree, and neither disturbs what is evaluated."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.helpers import ALGORITHMS, BASELINES, algorithm, collect, evaluate_co
 from trackmdp.build import make_baseline, make_world
 from trackmdp.policies.fixed import AllOn, ChainPolicy, RandomK
 from trackmdp.training.evaluate import Simulation, chains_of, simulate
-from trackmdp.training.judge import Judge
+from trackmdp.training.evaluator import ExactEvaluator
 from trackmdp.world.model import World
 
 STATE = ["last_cell", "steps_since_detection", "action_history"]
@@ -63,7 +63,7 @@ def test_chains_are_what_the_actor_does_in_the_environment(name: str) -> None:
             for parameter in actor.parameters():
                 parameter.normal_(std=0.5)
     chains = torch.as_tensor(chains_of(actor, world.task))
-    batch = collect(world, _judged(actor), 100, 40)
+    batch = collect(world, _evaluated(actor), 100, 40)
     free = batch["steps_since_detection"] <= 2
     followed = chains[batch["last_cell"][free], batch["steps_since_detection"][free]]
     assert torch.equal(batch["action"][free], followed)
@@ -71,7 +71,7 @@ def test_chains_are_what_the_actor_does_in_the_environment(name: str) -> None:
         assert {0, 1, 2} <= set(batch["steps_since_detection"].unique().tolist())
 
 
-def _judged(actor: Any) -> Callable[[TensorDict], TensorDict]:
+def _evaluated(actor: Any) -> Callable[[TensorDict], TensorDict]:
     def act(rows: TensorDict) -> TensorDict:
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             return rows.set("action", actor(rows.select(*STATE))["action"])
@@ -81,7 +81,7 @@ def _judged(actor: Any) -> Callable[[TensorDict], TensorDict]:
 
 def assert_close(world: World, chains: np.ndarray, simulation: Simulation, max_steps: int | None = None) -> None:
     """Every figure within four standard errors of the exact one."""
-    exact = Judge(world, max_steps).evaluate(chains)
+    exact = ExactEvaluator(world, max_steps).evaluate(chains)
     for key in FIGURES:
         estimate, value = getattr(simulation, key), getattr(exact, key)
         assert abs(estimate.mean - value) <= 4 * estimate.standard_error + 1e-5 * (1 + abs(value)), key
@@ -168,15 +168,15 @@ def test_simulation_is_decided_by_its_seed() -> None:
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_judging_does_not_disturb_training(name: str) -> None:
+def test_evaluating_does_not_disturb_training(name: str) -> None:
     """Three iterations with and without chains and simulations between them: the same bits in every tensor."""
     world, states = small_world(), []
-    for judged in (False, True):
+    for evaluated in (False, True):
         torch.manual_seed(5)
         learner = algorithm(name, world)
         for seed in range(3):
             learner.step(collect(world, learner.policy, 32, 8, seed=seed))
-            if judged:
+            if evaluated:
                 chains_of(learner.actor, world.task)
                 simulate(world, learner.actor, episodes=20, seed=0)
                 simulate(world, learner.policy, episodes=20, seed=0)

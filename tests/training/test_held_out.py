@@ -1,4 +1,4 @@
-"""Judging on held-out tracks: by hand, beside references that know no more, and never part of learning."""
+"""Evaluating on held-out tracks: by hand, beside references that know no more, and never part of learning."""
 
 from __future__ import annotations
 
@@ -20,35 +20,35 @@ from tests.training.runs import train as train_run
 from trackmdp.solvers import qmdp
 from trackmdp.training import checkpoint
 from trackmdp.training.evaluate import chains_of
-from trackmdp.training.held_out import ESTIMATED, HeldOutJudge, estimated_kernel, make_judge
-from trackmdp.training.judge import Judge
+from trackmdp.training.evaluator import ExactEvaluator
+from trackmdp.training.held_out import ESTIMATED, HeldOutEvaluator, estimated_kernel, make_evaluator
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Tracks, load_tracks, split
 
 
-def test_the_setting_decides_who_judges() -> None:
+def test_the_setting_decides_who_evaluates() -> None:
     world = small_world()
-    assert type(make_judge(world)) is Judge
-    assert type(make_judge(recorded(drawn(world.kernel, 5)))) is HeldOutJudge
+    assert type(make_evaluator(world)) is ExactEvaluator
+    assert type(make_evaluator(recorded(drawn(world.kernel, 5)))) is HeldOutEvaluator
 
 
 def test_only_the_held_out_tracks_count() -> None:
     """All on: r - 9 c a step in the grid, nothing on the exit step."""
-    judge = HeldOutJudge(recorded(by_hand([0, 1, 2], [3, 3]), by_hand([4, 5], [4, 5, 6, 7], [8, 8])))
-    verdict = judge.score(np.ones((9, 2, 9), dtype=bool))
-    assert verdict.evaluation.aihtr == pytest.approx((1 + 3 + 1) / 3 * (1 - 1.8))
-    assert verdict.evaluation.expected_length == pytest.approx((2 + 4 + 2) / 3)
-    assert (verdict.evaluation.accuracy, verdict.evaluation.sensors_per_step) == (1.0, 9.0)
-    assert math.isnan(verdict.regret_per_step)
-    assert math.isnan(judge.upper)
-    value = verdict.evaluation.value
+    evaluator = HeldOutEvaluator(recorded(by_hand([0, 1, 2], [3, 3]), by_hand([4, 5], [4, 5, 6, 7], [8, 8])))
+    score = evaluator.score(np.ones((9, 2, 9), dtype=bool))
+    assert score.evaluation.aihtr == pytest.approx((1 + 3 + 1) / 3 * (1 - 1.8))
+    assert score.evaluation.expected_length == pytest.approx((2 + 4 + 2) / 3)
+    assert (score.evaluation.accuracy, score.evaluation.sensors_per_step) == (1.0, 9.0)
+    assert math.isnan(score.regret_per_step)
+    assert math.isnan(evaluator.upper)
+    value = score.evaluation.value
     assert value[[4, 8]] == pytest.approx([2 * -0.8, -0.8])
     assert np.isnan(np.delete(value, [4, 8])).all()
 
 
 def test_episodes_are_cut_where_the_limit_is() -> None:
     setting = recorded(by_hand([0, 1], [0, 1]), by_hand([4, 5, 6, 7], [8, 8]))
-    evaluation = HeldOutJudge(setting, max_steps=2).evaluate(np.ones((9, 2, 9), dtype=bool))
+    evaluation = HeldOutEvaluator(setting, max_steps=2).evaluate(np.ones((9, 2, 9), dtype=bool))
     assert evaluation.aihtr == pytest.approx((2 + 1) / 2 * -0.8)
     assert evaluation.expected_length == 2.0
 
@@ -56,13 +56,13 @@ def test_episodes_are_cut_where_the_limit_is() -> None:
 def test_the_report_holds_the_policy_and_the_references() -> None:
     world = small_world()
     setting = recorded(drawn(world.kernel, 300), drawn(world.kernel, 80, seed=1))
-    judge = HeldOutJudge(setting)
+    evaluator = HeldOutEvaluator(setting)
     chains = np.random.default_rng(0).random((9, 2, 9)) < 0.3
-    report = judge.report(chains)
+    report = evaluator.report(chains)
     assert (report["tracks"], report["learned_from"]) == (80, 300)
     assert set(report["figures"]) == {"policy", "all on", "no sensors", ESTIMATED}
     assert report["figures"]["all on"]["aihtr"]["mean"] < report["figures"]["policy"]["aihtr"]["mean"]
-    assert report["figures"]["policy"]["aihtr"]["mean"] == pytest.approx(judge.evaluate(chains).aihtr)
+    assert report["figures"]["policy"]["aihtr"]["mean"] == pytest.approx(evaluator.evaluate(chains).aihtr)
     for figures in report["figures"].values():
         assert all(each["low"] <= each["mean"] <= each["high"] for each in figures.values())
 
@@ -83,7 +83,7 @@ def test_q_mdp_of_the_estimated_kernel_is_that_of_the_kernel() -> None:
     kernel = 0.6 * np.roll(np.eye(9), 2, axis=1) + 0.3 * np.roll(np.eye(9), 1, axis=1)
     setting = recorded(drawn(kernel, 5_000), by_hand([0, 1]))
     world = World(3, setting.reward, setting.cost, setting.safe_cost, setting.t_max, kernel)
-    assert np.array_equal(HeldOutJudge(setting).references()[ESTIMATED], qmdp.solve(world))
+    assert np.array_equal(HeldOutEvaluator(setting).references()[ESTIMATED], qmdp.solve(world))
 
 
 FILE = drawn(small_world(exit_probability=0.05).kernel, 60)
@@ -109,9 +109,9 @@ def test_a_run_says_nothing_that_takes_a_kernel(file: Path, tmp_path: Path) -> N
     assert summary["held_out"]["learned_from"] == 48
     figures = summary["held_out"]["figures"]["policy"]
     assert figures["aihtr"]["mean"] == pytest.approx(summary["policy"]["aihtr"])
-    judged = [row for row in metrics(tmp_path / "run") if row["aihtr"]]
+    evaluated = [row for row in metrics(tmp_path / "run") if row["aihtr"]]
     assert {row["regret_per_step"] for row in metrics(tmp_path / "run")} == {""}
-    assert float(judged[-1]["aihtr"]) == summary["policy"]["aihtr"]
+    assert float(evaluated[-1]["aihtr"]) == summary["policy"]["aihtr"]
     assert not (tmp_path / "run" / "kernel.npy").exists()
     described = json.loads((tmp_path / "run" / "tracks.json").read_text())
     assert (described["learned_from"]["tracks"], described["held_out"]["tracks"]) == (48, 12)
@@ -160,4 +160,4 @@ def test_every_algorithm_learns_from_tracks(name: str) -> None:
     for _ in range(learner.iterations - 4 if name == "hindsight" else 0):
         learner.step(None)
     chains = chains_of(learner.actor, setting.task)
-    assert np.isfinite(HeldOutJudge(setting).score(chains).evaluation.aihtr)
+    assert np.isfinite(HeldOutEvaluator(setting).score(chains).evaluation.aihtr)

@@ -12,7 +12,7 @@ from tests.helpers import train_config
 from tests.training.runs import QUICK, rows, train
 from trackmdp.build import make_world
 from trackmdp.solvers.chains import evaluate
-from trackmdp.training.judge import Judge
+from trackmdp.training.evaluator import ExactEvaluator
 from trackmdp.training.loop import Intervals, Position, _due
 
 
@@ -50,7 +50,7 @@ def test_what_collecting_costs_is_in_the_log(tmp_path: Path) -> None:
     everything = np.ones((9, 2, 9), dtype=bool)
     exact = evaluate(world, everything)
     assert np.mean(earned) == pytest.approx(exact.aihtr / exact.expected_length, rel=0.02)
-    best = Judge(world).upper / exact.expected_length
+    best = ExactEvaluator(world).upper / exact.expected_length
     regrets = [float(row["regret_while_collecting"]) for row in table]
     running = np.cumsum(earned) / np.arange(1, 9)
     assert regrets[:8] == pytest.approx(list(best - running), abs=1e-6)

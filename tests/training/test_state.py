@@ -107,7 +107,7 @@ def test_no_run_starts_anew_where_every_checkpoint_is_damaged(half: Path, capsys
 @pytest.mark.parametrize(
     ("word", "told"),
     [
-        ("algo.clip=0.25", "algo.clip: the run has 0.2, typed was 0.25"),
+        ("algo.clip_epsilon=0.25", "algo.clip_epsilon: the run has 0.2, typed was 0.25"),
         ("seed=1", "seed: the run has 0, typed was 1"),
         ("algo=a2c", "algo: the run has ppo, typed was a2c"),
         ("credit=per_sensor", "algo: the run has ppo, typed was ppo_per_sensor"),
@@ -142,7 +142,7 @@ def test_budget_logging_and_saving_may_change(half: Path) -> None:
 
 def test_a_config_edited_by_hand_is_not_the_run(half: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = half / "config.yaml"
-    config.write_text(config.read_text().replace("lam: 0.5", "lam: 0.6"))
+    config.write_text(config.read_text().replace("gae_lambda: 0.5", "gae_lambda: 0.6"))
     assert main(["train", "resume=auto", f"hydra.run.dir={half}"]) == 2
     assert "belongs to a run with another config" in capsys.readouterr().err
 

@@ -17,7 +17,15 @@ __all__ = ["A2C"]
 class A2C(OnPolicy):
     """One gradient step per batch: log-probability of the whole subset times its advantage."""
 
-    def __init__(self, task: Task, cfg: A2cConfig, *, iterations: int, device: torch.device) -> None:
+    def __init__(
+        self,
+        task: Task,
+        cfg: A2cConfig,
+        *,
+        iterations: int,
+        seed: int,  # noqa: ARG002  every learner is made alike; this one draws from torch's global generator alone
+        device: torch.device,
+    ) -> None:
         super().__init__(task, cfg, iterations=iterations, device=device)
         self.cfg = cfg
         self.loss = A2CLoss(

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import logsigmoid, softplus
 
-from trackmdp.algos.tables import look, total
+from trackmdp.algos.tables import gather, scatter_add
 from trackmdp.config.learning import ScheduleConfig
 
 __all__ = ["ActorLoss", "Decision", "PolicyGradient", "Poisson", "SensorCredit", "Surrogate", "decision_loss"]
@@ -46,7 +46,7 @@ class SensorCredit:
     def _sums(self) -> Tensor:
         size = self.price.numel()
         negative = self.entry + size * (self.gain < 0)
-        return total(self.gain.abs(), negative, 2 * size).view(2, *self.price.shape)
+        return scatter_add(self.gain.abs(), negative, 2 * size).view(2, *self.price.shape)
 
     @property
     def plus(self) -> Tensor:
@@ -75,10 +75,10 @@ class SensorCredit:
         """
         size, shape = on.numel(), on.shape
         moved = self.gain != 0
-        drawn = torch.rand(self.gain.shape, generator=generator, device=on.device) < look(on, self.entry)
-        moves, gains = total(moved.float(), self.entry, size), total(self.gain, self.entry, size)
-        moves_on = total((moved & drawn).float(), self.entry, size).view(shape)
-        gains_on = total(self.gain * drawn, self.entry, size).view(shape)
+        drawn = torch.rand(self.gain.shape, generator=generator, device=on.device) < gather(on, self.entry)
+        moves, gains = scatter_add(moved.float(), self.entry, size), scatter_add(self.gain, self.entry, size)
+        moves_on = scatter_add((moved & drawn).float(), self.entry, size).view(shape)
+        gains_on = scatter_add(self.gain * drawn, self.entry, size).view(shape)
         arrivals = self.arrivals.unsqueeze(-1)
         paths_on = moves_on + torch.binomial(arrivals - moves.view(shape), on, generator=generator)
         unit = self.price / arrivals.clamp(min=1)
@@ -145,7 +145,7 @@ class Surrogate(PolicyGradient):
 
     Args:
         entropy: β, in units of r.
-        clip: how far a ratio may leave 1.
+        clip_epsilon: ε, how far a ratio may leave 1.
         minibatches: updates from one renewal of the old policy to the next.
         generator: draws the sensors; None for the expectation.
     """
@@ -153,10 +153,10 @@ class Surrogate(PolicyGradient):
     old: Tensor
 
     def __init__(
-        self, entropy: ScheduleConfig, *, clip: float, minibatches: int, generator: torch.Generator | None
+        self, entropy: ScheduleConfig, *, clip_epsilon: float, minibatches: int, generator: torch.Generator | None
     ) -> None:
         super().__init__(entropy)
-        self._clip, self._minibatches, self._generator, self._renew = clip, minibatches, generator, True
+        self._epsilon, self._minibatches, self._generator, self._renew = clip_epsilon, minibatches, generator, True
 
     def allocate(self, shape: tuple[int, int, int], device: torch.device) -> None:
         """Room for the old policy's logits."""
@@ -182,7 +182,7 @@ class Surrogate(PolicyGradient):
         return self._clipped(up, (1 - p) * on) + self._clipped(down, -p * off)
 
     def _clipped(self, ratio: Tensor, advantage: Tensor) -> Tensor:
-        near = ratio.clamp(1 - self._clip, 1 + self._clip)
+        near = ratio.clamp(1 - self._epsilon, 1 + self._epsilon)
         return torch.minimum(ratio * advantage, near * advantage)
 
 

@@ -26,7 +26,7 @@ class Algorithm(Protocol):
 
     @property
     def actor(self) -> TensorDictModuleBase:
-        """The deterministic policy that is judged."""
+        """The deterministic policy that is evaluated."""
         ...
 
     def step(self, batch: TensorDictBase | None) -> dict[str, float]:

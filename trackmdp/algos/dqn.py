@@ -70,7 +70,7 @@ class _ZeroedStorage(LazyTensorStorage):
 
 
 class DQN:
-    """Learns off policy from a replay buffer; explores by flipping sensors; the target network is what is judged."""
+    """Learns off policy from a replay buffer; explores by flipping sensors; the target network is what is evaluated."""
 
     def __init__(self, task: Task, cfg: DqnConfig, *, iterations: int, seed: int, device: torch.device) -> None:
         self.cfg, self.iterations, self.iteration, self.device = cfg, iterations, 0, device
@@ -79,7 +79,7 @@ class DQN:
         self.policy = TensorDictSequential(qvalue, self.explore)
         self.loss = AdditiveDQNLoss(qvalue)
         self.target = SoftUpdate(self.loss, tau=cfg.target_tau)
-        self.judged = make_qvalue(task, cfg.hidden, cfg.reward_scale).to(device)
+        self.slow = make_qvalue(task, cfg.hidden, cfg.reward_scale).to(device)
         self.parameters = list(qvalue.parameters())
         self.optimizer = torch.optim.Adam(self.parameters, lr=cfg.learning_rate.start, fused=True)
         per = cfg.prioritized
@@ -92,8 +92,8 @@ class DQN:
     @property
     def actor(self) -> TensorDictModuleBase:
         """Greedy in the slowly moving target network, which averages the updates' noise out."""
-        self.loss.target_qvalue_network_params.data.to_module(self.judged)
-        return TensorDictSequential(self.judged, EpsilonFlip(0.0).to(self.explore.epsilon.device))
+        self.loss.target_qvalue_network_params.data.to_module(self.slow)
+        return TensorDictSequential(self.slow, EpsilonFlip(0.0).to(self.explore.epsilon.device))
 
     def step(self, batch: TensorDictBase | None) -> dict[str, float]:
         """Store one batch `[B, time]`, then update `updates` times."""

@@ -18,7 +18,7 @@ def sensing_gain(
 ) -> Tensor:
     """The gain of having the target's sensor on: r + γ[(1-λ)(U(y,0) - U(y,n+1)) + λ(V(y) - G_{n+1})].
 
-    At λ = 0 the clocked values judge, which are optimistic about what follows a miss; at λ = 1 the policy's own
+    At λ = 0 the clocked values say it, which are optimistic about what follows a miss; at λ = 1 the policy's own
     continuation does. Taking λ slowly from 0 to 1 leads past optima that no change of a single sensor improves.
 
     Args:

@@ -2,7 +2,7 @@
 
 Sensing never moves the target. With all sensors on, every path shows what any policy would have found and missed
 on it. Nothing else is read: neither the kernel nor a position that was not sensed. The clocked actor
-and critic only lend credit: they say what a detection is worth while the actor's own chains are not yet worth judging.
+and critic only lend credit: they say what a detection is worth while the actor's own chains are still poor.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ class Hindsight:
             generator=self._generator,
             max_entries=self.cfg.max_entries,
         )
-        return _Learner(loss, self.cfg.average)
+        return _Learner(loss, self.cfg.ema_decay)
 
     def _actor_loss(self) -> ActorLoss:
         return Decision()
@@ -165,11 +165,11 @@ def _within(cells: Tensor, reach: int, size: int) -> Tensor:
 
 
 class _Learner:
-    """The nets, their optimizer, and the running average of the actor, which is replayed and judged."""
+    """The nets, their optimizer, and the exponential moving average of the actor, which is replayed and evaluated."""
 
-    def __init__(self, loss: HindsightLoss, average: float) -> None:
-        self.loss, self._decay, self._count = loss, average, 0
-        self.average = copy.deepcopy(loss.actor).requires_grad_(False)
+    def __init__(self, loss: HindsightLoss, ema_decay: float) -> None:
+        self.loss, self._decay, self._count = loss, ema_decay, 0
+        self.ema = copy.deepcopy(loss.actor).requires_grad_(False)
         self.optimizer = torch.optim.Adam(loss.parameters(), lr=0.0, betas=(0.9, 0.99), fused=True)
 
     def update(self, cells: Tensor, rate: float, blend: float) -> dict[str, Tensor]:
@@ -185,14 +185,14 @@ class _Learner:
         decay = min(self._decay, (1 + self._count) / (10 + self._count))
         self._count += 1
         with torch.no_grad():
-            for mean, weight in zip(self.average.parameters(), self.loss.actor.parameters(), strict=True):
+            for mean, weight in zip(self.ema.parameters(), self.loss.actor.parameters(), strict=True):
                 mean.lerp_(weight, 1.0 - decay)
         return losses
 
     @torch.no_grad()
     def _on(self) -> Tensor:
         """`[M, T+1, K]`, the sensors on, as the actor's outputs."""
-        return torch.cat([self.average(rows) > 0 for rows in self.loss.slices()])
+        return torch.cat([self.ema(rows) > 0 for rows in self.loss.slices()])
 
     def chains(self) -> Tensor:
         """`[M, T+1, M]` bool, the policy."""
@@ -202,13 +202,13 @@ class _Learner:
         return {
             "reach": self.loss.near.radius,
             "loss": self.loss.state_dict(),
-            "average": self.average.state_dict(),
+            "ema": self.ema.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "count": self._count,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.loss.load_state_dict(state["loss"])
-        self.average.load_state_dict(state["average"])
+        self.ema.load_state_dict(state["ema"])
         self.optimizer.load_state_dict(state["optimizer"])
         self._count = state["count"]

@@ -11,7 +11,7 @@ from torch.nn.functional import pad
 
 from trackmdp.algos.actor_loss import ActorLoss, SensorCredit, decision_loss
 from trackmdp.algos.gains import chain_returns, clocked_advantage, sensing_gain
-from trackmdp.algos.tables import look, total
+from trackmdp.algos.tables import gather, scatter_add
 from trackmdp.policies.chain_table import CellClockNet, Neighbourhood
 from trackmdp.world.model import Task
 
@@ -176,7 +176,7 @@ class HindsightLoss(nn.Module):
         start, end = moves
         first = rows.start or 0
         place = start * k + near.index(start, end) - first * k
-        moved = total((end < m).float(), place, count * k).view(count, 1, k)
+        moved = scatter_add((end < m).float(), place, count * k).view(count, 1, k)
         stays, visits = moved.sum(-1), torch.bincount(start - first, minlength=count).unsqueeze(-1)
         gain = moved * sensing_gain(advantage[:, nearby].transpose(0, 1), reward=1.0, discount=self.discount)
         chosen, cost = logits.detach() > 0, self.cost[nearby].unsqueeze(1)
@@ -192,18 +192,18 @@ class HindsightLoss(nn.Module):
         start, moves, end = cells[0], cells[1:], cells[1:-1]
         row = start * choices + self.clocks
         entry = row * k + self.view.index(start, end)
-        hits, inside = look(on, entry) & (end < m), moves < m
-        located = look(pad(value, (0, 1)), moves)
-        spent = look(torch.cat([self._set_cost(on[rows], rows) for rows in self.slices()]), row)
+        hits, inside = gather(on, entry) & (end < m), moves < m
+        located = gather(pad(value, (0, 1)), moves)
+        spent = gather(torch.cat([self._set_cost(on[rows], rows) for rows in self.slices()]), row)
         discount, safe_cost = self.discount, 1.0 - self.safe
         returns = chain_returns(hits, inside, spent, located, reward=1.0, safe_cost=safe_cost, discount=discount)
-        clocked = look(advantage, self.clocks * (m + 1) + end)
+        clocked = gather(advantage, self.clocks * (m + 1) + end)
         gain = sensing_gain(clocked, located[:-1] - returns[1:], reward=1.0, discount=discount, blend=blend)
         alive = inside[:-1].clone()
         for n in range(1, choices):
             alive[n] &= alive[n - 1] & ~hits[n - 1]
         visits = torch.bincount(start, minlength=m)
-        return _Replayed(row, entry, alive, gain * alive, total(returns[0], start, m) / visits.clamp(min=1))
+        return _Replayed(row, entry, alive, gain * alive, scatter_add(returns[0], start, m) / visits.clamp(min=1))
 
     def _set_cost(self, on: Tensor, rows: slice) -> Tensor:
         """C(A) `[rows, T+1]` of the sets `on` of the cells `rows`."""
@@ -215,7 +215,7 @@ class HindsightLoss(nn.Module):
         count, choices, k = logits.shape
         first = (rows.start or 0) * choices
         row, entry, alive, gain = replayed.of(chosen, first, first * k)
-        arrivals = total(alive.float(), row, count * choices).view(count, choices)
+        arrivals = scatter_add(alive.float(), row, count * choices).view(count, choices)
         price = arrivals.unsqueeze(-1) * self.cost[self.view.cells[rows]].unsqueeze(1)
         credit = SensorCredit(entry, gain, arrivals, price, rows)
         return self.actor_loss(logits, credit).sum((0, 2))

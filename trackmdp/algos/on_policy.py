@@ -33,11 +33,11 @@ class OnPolicy:
         self.critic = make_critic(task, cfg.hidden).to(device)
         self.parameters = [*self.policy.parameters(), *self.critic.parameters()]
         self.optimizer = torch.optim.Adam(self.parameters, lr=cfg.learning_rate.start, eps=1e-5, fused=True)
-        self.advantage = GAE(gamma=cfg.gamma, lmbda=cfg.lam, value_network=self.critic, deactivate_vmap=True)
+        self.advantage = GAE(gamma=cfg.gamma, lmbda=cfg.gae_lambda, value_network=self.critic, deactivate_vmap=True)
 
     @property
     def actor(self) -> TensorDictModuleBase:
-        """The policy itself; its mode is what is judged."""
+        """The policy itself; its mode is what is evaluated."""
         return self.policy
 
     def prepare(self, batch: TensorDictBase | None) -> tuple[TensorDictBase, dict[str, float]]:

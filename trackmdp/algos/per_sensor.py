@@ -6,10 +6,10 @@ from trackmdp.algos.actor_loss import ActorLoss, Poisson, PolicyGradient, Surrog
 from trackmdp.algos.hindsight import Hindsight
 from trackmdp.config.per_sensor import A2cPerSensorConfig, PpoPerSensorConfig
 
-__all__ = ["A2C", "DQN", "PPO"]
+__all__ = ["PerSensorA2C", "PerSensorDQN", "PerSensorPPO"]
 
 
-class A2C(Hindsight):
+class PerSensorA2C(Hindsight):
     """The policy gradient over both actions of every sensor."""
 
     cfg: A2cPerSensorConfig
@@ -18,7 +18,7 @@ class A2C(Hindsight):
         return PolicyGradient(self.cfg.entropy)
 
 
-class PPO(Hindsight):
+class PerSensorPPO(Hindsight):
     """The clipped surrogate of every sensor, over both actions or over sets drawn from the old policy."""
 
     cfg: PpoPerSensorConfig
@@ -26,10 +26,10 @@ class PPO(Hindsight):
     def _actor_loss(self) -> ActorLoss:
         cfg = self.cfg
         rng = self._generator if cfg.surrogate == "sampled" else None
-        return Surrogate(cfg.entropy, clip=cfg.clip, minibatches=cfg.minibatches, generator=rng)
+        return Surrogate(cfg.entropy, clip_epsilon=cfg.clip_epsilon, minibatches=cfg.minibatches, generator=rng)
 
 
-class DQN(Hindsight):
+class PerSensorDQN(Hindsight):
     """A Q that adds up over the sensors."""
 
     def _actor_loss(self) -> ActorLoss:

@@ -30,7 +30,7 @@ class PPO(OnPolicy):
         self.loss = ClipPPOLoss(
             self.policy,
             self.critic,
-            clip_epsilon=cfg.clip,
+            clip_epsilon=cfg.clip_epsilon,
             entropy_coeff=cfg.entropy.start,
             critic_coeff=cfg.critic_coef,
             loss_critic_type="l2",

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from torch import Tensor
 
-__all__ = ["look", "total"]
+__all__ = ["gather", "scatter_add"]
 
 
-def look(table: Tensor, index: Tensor) -> Tensor:
+def gather(table: Tensor, index: Tensor) -> Tensor:
     """`table.flatten()[index]`, the fastest way."""
     return table.reshape(-1).index_select(0, index.reshape(-1)).view(index.shape)
 
 
-def total(values: Tensor, index: Tensor, length: int) -> Tensor:
+def scatter_add(values: Tensor, index: Tensor, length: int) -> Tensor:
     """`[length]`, the sums of the `values` that share an `index`."""
     return values.new_zeros(length).scatter_add_(0, index.reshape(-1), values.reshape(-1))

@@ -15,7 +15,7 @@ from trackmdp.errors import FAILED, INTERRUPTED, USER_MISTAKE, Preempted, RunErr
 __all__ = ["COMMANDS", "main"]
 
 COMMANDS = {
-    "train": "learn a sensing policy without the motion model, and judge it exactly",
+    "train": "learn a sensing policy without the motion model, and evaluate it exactly",
     "evaluate": "value a trained policy or a baseline, exactly and by simulation",
     "solve": "solve a world with its motion model",
     "verify": "check the paper's theorems on a world",

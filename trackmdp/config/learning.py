@@ -61,8 +61,8 @@ class AlgoConfig:
 class ActorCriticConfig(AlgoConfig):
     """What A2C and PPO have in common."""
 
-    gamma: float = option("discount while learning; policies are judged undiscounted", ge=0, le=1)
-    lam: float = option("λ of the generalised advantage estimate", ge=0, le=1)
+    gamma: float = option("discount while learning; policies are evaluated undiscounted", ge=0, le=1)
+    gae_lambda: float = option("λ of the generalised advantage estimate", ge=0, le=1)
     learning_rate: ScheduleConfig
     entropy: ScheduleConfig
     critic_coef: float = option("weight of the value loss", ge=0)
@@ -83,7 +83,7 @@ class A2cConfig(ActorCriticConfig):
 class PpoConfig(ActorCriticConfig):
     """Proximal policy optimisation, one Bernoulli per sensor, one joint advantage."""
 
-    clip: float = option("how far the probability ratio may leave 1", gt=0, lt=1)
+    clip_epsilon: float = option("how far the probability ratio may leave 1", gt=0, lt=1)
     epochs: int = option("passes over each collected batch", ge=1, le=100)
     minibatches: int = option("parts each batch is cut into", ge=1)
 
@@ -102,7 +102,7 @@ class PrioritizedConfig:
 class DqnConfig(AlgoConfig):
     """Double DQN with a Q that adds up over the sensors."""
 
-    gamma: float = option("discount while learning; policies are judged undiscounted", ge=0, le=1)
+    gamma: float = option("discount while learning; policies are evaluated undiscounted", ge=0, le=1)
     learning_rate: ScheduleConfig
     epsilon: ScheduleConfig
     n_step: int = option("rewards summed before bootstrapping", unit="steps", ge=1, le=64)

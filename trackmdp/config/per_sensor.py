@@ -42,10 +42,10 @@ class PerSensorConfig(AlgoConfig):
         choices=("all_on", "mixed"),
     )
     explore: ScheduleConfig
-    gamma: float = option("discount inside the credit; policies are judged undiscounted", ge=0, lt=1)
+    gamma: float = option("discount inside the credit; policies are evaluated undiscounted", ge=0, lt=1)
     learning_rate: ScheduleConfig
     blend: ScheduleConfig
-    average: float = option("share of the old in the running average of the actor, which is judged", ge=0, lt=1)
+    ema_decay: float = option("decay of the exponential moving average of the actor, which is evaluated", ge=0, lt=1)
     batch_size: int = option("path segments per update", unit="segments", ge=1)
     updates: int | None = option("updates of the whole run; null: by the size of the problem", ge=1)
     updates_per_iteration: int = option("updates from one evaluation, log row or checkpoint to the next at most", ge=1)
@@ -85,7 +85,7 @@ class A2cPerSensorConfig(PolicyGradientConfig):
 class PpoPerSensorConfig(PolicyGradientConfig):
     """Hindsight with the clipped surrogate of PPO, per sensor (algo=ppo credit=per_sensor)."""
 
-    clip: float = option("how far a sensor's probability ratio may leave 1", gt=0, lt=1)
+    clip_epsilon: float = option("how far a sensor's probability ratio may leave 1", gt=0, lt=1)
     minibatches: int = option("parts of a batch: updates until the old policy of the ratio is renewed", ge=1)
     surrogate: str = option(
         "over both actions of every sensor, or over sets drawn from the old policy", choices=("all_action", "sampled")

@@ -46,7 +46,7 @@ class WorldConfig(CommandConfig):
 
 @dataclass(kw_only=True)
 class EvaluationConfig:
-    """How often the policy is judged while it learns."""
+    """How often the policy is evaluated while it learns."""
 
     every: int = option("iterations from one exact evaluation to the next", unit="iterations", ge=1)
 
@@ -74,7 +74,7 @@ class CheckpointConfig:
 
 @dataclass(kw_only=True)
 class TrainConfig(WorldConfig):
-    """Learn a policy without the motion model, and judge it exactly."""
+    """Learn a policy without the motion model, and evaluate it exactly."""
 
     seed: int = option("every random draw of the run derives from it", ge=0)
     device: str = option("device the networks live on", expects="cpu, cuda, cuda:N or auto")

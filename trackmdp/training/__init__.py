@@ -1,1 +1,1 @@
-"""From an algorithm to a run: collecting, judging, logging, saving."""
+"""From an algorithm to a run: collecting, evaluating, logging, saving."""

@@ -1,4 +1,4 @@
-"""Judging a policy: exactly, by its chains, and by simulation."""
+"""Evaluating a policy: exactly, by its chains, and by simulation."""
 
 from __future__ import annotations
 

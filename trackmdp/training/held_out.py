@@ -1,4 +1,4 @@
-"""Where a policy stands without a motion model: how it does on recorded tracks that no learner has seen."""
+"""Evaluation without a motion model: how a policy does on recorded tracks that no learner has seen."""
 
 from __future__ import annotations
 
@@ -13,44 +13,43 @@ from trackmdp.solvers import qmdp
 from trackmdp.solvers.chains import Evaluation
 from trackmdp.solvers.kernel_estimate import KernelEstimate
 from trackmdp.solvers.recorded import Interval, replay
-from trackmdp.training.judge import Judge, Verdict
+from trackmdp.training.evaluator import Evaluator, ExactEvaluator
 from trackmdp.world.model import BoolArray, World
 from trackmdp.world.tracks import Recorded, Setting, Tracks
 
-__all__ = ["ESTIMATED", "HeldOutJudge", "estimated_kernel", "make_judge"]
+__all__ = ["ESTIMATED", "HeldOutEvaluator", "estimated_kernel", "make_evaluator"]
 
 ESTIMATED = "Q_MDP of the estimated kernel"
 """Q_MDP for the motion as the tracks to learn from show it."""
 
 
-def make_judge(setting: Setting, max_steps: int | None = None) -> Judge | HeldOutJudge:
-    """Who judges policies there: exactly, or on the held-out tracks."""
-    return Judge(setting, max_steps) if isinstance(setting, World) else HeldOutJudge(setting, max_steps)
+def make_evaluator(setting: Setting, max_steps: int | None = None) -> Evaluator:
+    """Exact where there is a motion model, else on the held-out tracks."""
+    return ExactEvaluator(setting, max_steps) if isinstance(setting, World) else HeldOutEvaluator(setting, max_steps)
 
 
-class HeldOutJudge:
-    """Scores policies by their chains, on every held-out track from its first cell to its end.
+class HeldOutEvaluator(Evaluator):
+    """Evaluates on every held-out track, from its first cell to its end.
 
-    Without a motion model there are no bounds, no Q_MDP and no regret: `upper` and the verdicts' regrets are nan.
+    Without a motion model there are no bounds, no Q_MDP and no regret: `upper` and the scores' regrets are nan.
 
     Args:
         world: the task and its recorded tracks.
-        max_steps: tracks are cut after this many steps; None for never.
+        max_steps: tracks are truncated after this many steps; None for never.
     """
+
+    world: Recorded
 
     def __init__(self, world: Recorded, max_steps: int | None = None) -> None:
         self.world, self.max_steps = world, max_steps
         self.tracks = world.held_out.limited(max_steps)
-        self.upper = math.nan
+        self.upper, self.qmdp = math.nan, None
+        self.bounds = dict.fromkeys(("paper", "valid", "clocked"))
         self._starts = self.tracks.cells[self.tracks.first[:-1]]
 
     def evaluate(self, chains: npt.NDArray[np.generic]) -> Evaluation:
         """Figures on the held-out tracks of the policy with these `chains` `[M, t_max+1, M]`."""
         return replay(self.world, self.tracks, chains).evaluation(self._starts, self.world.num_cells)
-
-    def score(self, chains: npt.NDArray[np.generic]) -> Verdict:
-        """Figures on the held-out tracks."""
-        return Verdict(self.evaluate(chains), math.nan)
 
     def intervals(self, chains: npt.NDArray[np.generic]) -> dict[str, Interval]:
         """Figure -> its mean over the held-out tracks with a 95 % confidence interval."""

@@ -14,7 +14,7 @@ from trackmdp.algos.common import Algorithm
 from trackmdp.errors import Preempted, RunError
 from trackmdp.training.display import Display
 from trackmdp.training.evaluate import chains_of
-from trackmdp.training.judge import Scoring, Verdict, while_collecting
+from trackmdp.training.evaluator import Evaluator, Score, while_collecting
 from trackmdp.training.metrics import MetricsLog
 from trackmdp.training.signals import Signals
 from trackmdp.training.workers import Watch
@@ -27,7 +27,7 @@ _SAVING = 50  # seconds of training to one of saving, at least
 
 @dataclass(frozen=True)
 class Intervals:
-    """How often a run is judged, logged and saved.
+    """How often a run is evaluated, logged and saved.
 
     Attributes:
         evaluate: iterations from one exact evaluation to the next.
@@ -55,35 +55,35 @@ class Position:
 def train(
     algorithm: Algorithm,
     collector: BaseCollector,
-    judge: Scoring,
+    evaluator: Evaluator,
     metrics: MetricsLog,
     display: Display,
     every: Intervals,
-    save: Callable[[Position, Verdict], None],
+    save: Callable[[Position, Score], None],
     start: Position,
-    on_judged: Callable[[int, BoolArray], None] | None = None,
-) -> tuple[Verdict, Position]:
-    """Collect, learn, judge, log and save, until the algorithm's iterations are done.
+    on_evaluation: Callable[[int, BoolArray], None] | None = None,
+) -> tuple[Score, Position]:
+    """Collect, learn, evaluate, log and save, until the algorithm's iterations are done.
 
     Args:
-        algorithm: learns from each batch; its `actor` is judged.
+        algorithm: learns from each batch; its `actor` is evaluated.
         collector: yields batches `[B, time]` until its frames are spent.
-        judge: figures of the actor's chains.
+        evaluator: figures of the actor's chains.
         metrics: gets one row every `every.log` iterations, and the last.
         display: gets the figures of the last evaluation after each iteration.
         every: the intervals.
         save: writes a checkpoint of this moment, a boundary between two iterations.
         start: where an earlier process left the run.
-        on_judged: called with the iteration and the chains of each policy judged.
+        on_evaluation: called with the iteration and the chains of each policy evaluated.
 
     Returns:
-        The last verdict and position.
+        The last score and position.
 
     Raises:
         Preempted: a signal asked for the end; a checkpoint has been saved.
         RunError: the loss is not finite, or collecting broke down; the last checkpoint stands.
     """
-    return _Loop(algorithm, collector, judge, metrics, display, every, save, start, on_judged).run()
+    return _Loop(algorithm, collector, evaluator, metrics, display, every, save, start, on_evaluation).run()
 
 
 @dataclass
@@ -92,18 +92,18 @@ class _Loop:
 
     algorithm: Algorithm
     collector: BaseCollector
-    judge: Scoring
+    evaluator: Evaluator
     metrics: MetricsLog
     display: Display
     every: Intervals
-    save: Callable[[Position, Verdict], None]
+    save: Callable[[Position, Score], None]
     at: Position
-    on_judged: Callable[[int, BoolArray], None] | None
+    on_evaluation: Callable[[int, BoolArray], None] | None
 
-    def run(self) -> tuple[Verdict, Position]:
+    def run(self) -> tuple[Score, Position]:
         began, last = time.monotonic() - self.at.seconds, self.algorithm.iterations
         self._batches, self._saved, self._rest = iter(self.collector), self.at, 0.0
-        self._verdict = self.judge.score(self._chains())
+        self._score = self.evaluator.score(self._chains())
         with Signals() as self._signals, Watch(self.collector) as self._watch:
             for iteration in range(self.at.iteration + 1, last + 1):
                 batch = self._collect(iteration)
@@ -114,7 +114,7 @@ class _Loop:
                 self._account(diagnostics, earned / frames if frames else None)
                 if self._signals.received and iteration < last:
                     raise Preempted(self._signals.received)
-        return self._verdict, replace(self.at, seconds=time.monotonic() - began)
+        return self._score, replace(self.at, seconds=time.monotonic() - began)
 
     def _collect(self, iteration: int) -> TensorDictBase | None:
         """The next batch, None once all frames are in."""
@@ -124,7 +124,7 @@ class _Loop:
         except RunError:
             if not self._signals.received:
                 raise
-            self.save(self.at, self._verdict)  # the signal went to the workers too; nothing has been learned since
+            self.save(self.at, self._score)  # the signal went to the workers too; nothing has been learned since
             raise Preempted(self._signals.received) from None
 
     def _learn(self, batch: TensorDictBase | None, iteration: int) -> dict[str, float]:
@@ -139,28 +139,28 @@ class _Loop:
         return diagnostics
 
     def _account(self, diagnostics: dict[str, float], earned: float | None) -> None:
-        """Judge, log, save and show what is due after an iteration; `earned` per frame of its batch, if it had one."""
+        """Evaluate, log, save and show what is due after an iteration; `earned`: mean reward of its batch, if any."""
         at, every = self.at, self.every
         last = at.iteration == self.algorithm.iterations
-        judged = last or at.iteration == 1 or at.iteration % every.evaluate == 0
-        if judged:
+        due = last or at.iteration == 1 or at.iteration % every.evaluate == 0
+        if due:
             chains = self._chains()
-            self._verdict = self.judge.score(chains)
-            if self.on_judged is not None:
-                self.on_judged(at.iteration, chains)
+            self._score = self.evaluator.score(chains)
+            if self.on_evaluation is not None:
+                self.on_evaluation(at.iteration, chains)
         if last or at.iteration % every.log == 0:
-            so_far = while_collecting(self.judge.upper, self._verdict.evaluation, at.reward, at.frames)
+            so_far = while_collecting(self.evaluator.upper, self._score.evaluation, at.reward, at.frames)
             spent = {"reward_per_frame": earned, "regret_while_collecting": so_far["regret_per_frame"]}
-            self.metrics.write(_row(at, self._verdict if judged else None, spent | diagnostics))
+            self.metrics.write(_row(at, self._score if due else None, spent | diagnostics))
         if last or self._signals.received or _due(self._saved, at, self._rest, every):
             begin = time.monotonic()
-            self.save(at, self._verdict)
+            self.save(at, self._score)
             self._saved, self._rest = at, _SAVING * (time.monotonic() - begin)
-        aihtr = self._verdict.evaluation.aihtr
-        self.display.update(at.iteration, at.frames, aihtr, self.judge.upper - aihtr)
+        aihtr = self._score.evaluation.aihtr
+        self.display.update(at.iteration, at.frames, aihtr, self.evaluator.upper - aihtr)
 
     def _chains(self) -> BoolArray:
-        return chains_of(self.algorithm.actor, self.judge.world, self.algorithm.device)
+        return chains_of(self.algorithm.actor, self.evaluator.world, self.algorithm.device)
 
 
 @contextmanager
@@ -182,16 +182,14 @@ def _due(saved: Position, at: Position, rest: float, every: Intervals) -> bool:
     return bool(frames or seconds)
 
 
-def _row(
-    at: Position, verdict: Verdict | None, diagnostics: Mapping[str, float | None]
-) -> dict[str, float | int | None]:
+def _row(at: Position, score: Score | None, diagnostics: Mapping[str, float | None]) -> dict[str, float | int | None]:
     """Counters, exact figures (empty between evaluations), diagnostics, and last the columns that time decides."""
-    evaluation = verdict.evaluation if verdict else None
+    evaluation = score.evaluation if score else None
     return {
         "iteration": at.iteration,
         "frames": at.frames,
         "aihtr": evaluation.aihtr if evaluation else None,
-        "regret_per_step": verdict.regret_per_step if verdict else None,
+        "regret_per_step": score.regret_per_step if score else None,
         "accuracy": evaluation.accuracy if evaluation else None,
         "sensors_per_step": evaluation.sensors_per_step if evaluation else None,
         **diagnostics,

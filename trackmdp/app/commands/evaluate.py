@@ -25,7 +25,7 @@ from trackmdp.solvers import estimator
 from trackmdp.solvers.chains import sets_of
 from trackmdp.training.display import make_console, table
 from trackmdp.training.evaluate import Simulation, simulate
-from trackmdp.training.judge import Judge, Verdict, figures
+from trackmdp.training.evaluator import ExactEvaluator, Score, figures
 from trackmdp.training.metrics import write_json, write_text
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Recorded, Setting
@@ -43,8 +43,8 @@ def run(cfg: EvaluateConfig, folder: Path) -> float:
     world, max_steps, chains, subject = _trained(cfg, device) if cfg.run else _baseline(cfg)
     if isinstance(world, Recorded):
         return held_out.run(world, max_steps, chains, subject, folder, console, cfg.seed)
-    judge = Judge(world, max_steps)
-    verdict = judge.score(chains)
+    evaluator = ExactEvaluator(world, max_steps)
+    score = evaluator.score(chains)
     simulation = None
     if cfg.episodes:
         policy: TensorDictModuleBase = ChainPolicy(chains, device)
@@ -53,12 +53,12 @@ def run(cfg: EvaluateConfig, folder: Path) -> float:
             policy = fixed.RandomK(world.num_cells, cfg.baseline.k, draws)
         simulation = simulate(world, policy, episodes=cfg.episodes, seed=cfg.seed, max_steps=max_steps, device=device)
     estimate = estimator.accuracy(world, chains) if chains.dtype == np.bool_ and max_steps is None else None
-    report = _report(subject, judge, verdict, simulation) | {"estimator": asdict(estimate) if estimate else None}
+    report = _report(subject, evaluator, score, simulation) | {"estimator": asdict(estimate) if estimate else None}
     write_json(folder / "evaluation.json", report)
     if chains.dtype == np.bool_:
         write_json(folder / "sets.json", sets_of(chains))
         write_text(folder / "picture.txt", draw(world, chains, seed=cfg.seed))
-    _show(console, subject, judge, verdict, simulation, folder)
+    _show(console, subject, evaluator, score, simulation, folder)
     if cfg.log is not None:
         _log_episodes(cfg, world, max_steps, chains, subject, folder, console)
     if estimate is not None:
@@ -66,7 +66,7 @@ def run(cfg: EvaluateConfig, folder: Path) -> float:
             f"from Q {estimate.exact:.2%} (printed form {estimate.paper:.2%}), from the belief {estimate.bayes:.2%}"
         )
         console.print(f"missed steps whose position is estimated right: {shares}")
-    return verdict.evaluation.aihtr
+    return score.evaluation.aihtr
 
 
 def _log_episodes(
@@ -104,20 +104,20 @@ def _baseline(cfg: EvaluateConfig) -> tuple[Setting, int | None, np.ndarray, str
     return world, cfg.grid.max_steps, make_baseline(cfg.baseline, world), cfg.baseline.name
 
 
-def _report(subject: str, judge: Judge, verdict: Verdict, simulation: Simulation | None) -> dict[str, Any]:
+def _report(subject: str, evaluator: ExactEvaluator, score: Score, simulation: Simulation | None) -> dict[str, Any]:
     return {
         "policy": subject,
-        "exact": figures(verdict.evaluation),
-        "value": verdict.evaluation.value.tolist(),
+        "exact": figures(score.evaluation),
+        "value": score.evaluation.value.tolist(),
         "simulated": asdict(simulation) if simulation else None,
-        "qmdp": figures(judge.qmdp),
-        "bounds": judge.bounds,
-        "regret_per_step": verdict.regret_per_step,
+        "qmdp": figures(evaluator.qmdp),
+        "bounds": evaluator.bounds,
+        "regret_per_step": score.regret_per_step,
     }
 
 
 def _show(
-    console: Console, subject: str, judge: Judge, verdict: Verdict, simulation: Simulation | None, folder: Path
+    console: Console, subject: str, evaluator: ExactEvaluator, score: Score, simulation: Simulation | None, folder: Path
 ) -> None:
     names = {
         "aihtr": "AIHTR",
@@ -126,7 +126,7 @@ def _show(
         "safe_per_episode": "safe actions per episode",
         "expected_length": "steps per episode",
     }
-    exact, qmdp = figures(verdict.evaluation), figures(judge.qmdp)
+    exact, qmdp = figures(score.evaluation), figures(evaluator.qmdp)
     rows = []
     for key, label in names.items():
         estimate = getattr(simulation, key) if simulation else None
@@ -134,5 +134,5 @@ def _show(
         rows.append([label, f"{exact[key]:,.4f}", simulated, f"{qmdp[key]:,.4f}"])
     title = f"simulated, {simulation.episodes} episodes ± s.e." if simulation else "simulated"
     console.print(table(subject, ["figure", "exact", title, "Q_MDP exact"], rows))
-    regret = round(verdict.regret_per_step, 4) + 0.0
-    console.print(f"upper bound (clocked) {judge.upper:,.4f}; regret per step {regret:.4f}; results in {folder}")
+    regret = round(score.regret_per_step, 4) + 0.0
+    console.print(f"upper bound (clocked) {evaluator.upper:,.4f}; regret per step {regret:.4f}; results in {folder}")

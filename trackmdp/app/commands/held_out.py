@@ -1,4 +1,4 @@
-"""What is said and written of a policy that is judged on held-out tracks."""
+"""What is said and written of a policy that is evaluated on held-out tracks."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rich.console import Console
 from trackmdp.reports.picture import draw
 from trackmdp.solvers.chains import sets_of
 from trackmdp.training.display import table
-from trackmdp.training.held_out import HeldOutJudge
+from trackmdp.training.held_out import HeldOutEvaluator
 from trackmdp.training.metrics import write_json, write_text
 from trackmdp.world.tracks import Recorded
 
@@ -28,9 +28,9 @@ def run(
     seed: int,
 ) -> float:
     """Write `evaluation.json`, `sets.json` and `picture.txt` to `folder`; returns the mean reward of a track."""
-    judge = HeldOutJudge(world, max_steps)
-    report = judge.report(chains)
-    value = judge.evaluate(chains).value
+    evaluator = HeldOutEvaluator(world, max_steps)
+    report = evaluator.report(chains)
+    value = evaluator.evaluate(chains).value
     content = {"policy": subject, "value": value.tolist(), "held_out": report, "regret_per_step": None}
     write_json(folder / "evaluation.json", content)
     if chains.dtype == np.bool_:

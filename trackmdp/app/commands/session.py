@@ -24,8 +24,8 @@ from trackmdp.seeding import seed_global
 from trackmdp.training import checkpoint, memory
 from trackmdp.training.display import Display
 from trackmdp.training.evaluate import chains_of
-from trackmdp.training.held_out import make_judge
-from trackmdp.training.judge import Verdict
+from trackmdp.training.evaluator import Score
+from trackmdp.training.held_out import make_evaluator
 from trackmdp.training.loop import Intervals, Position, train
 from trackmdp.training.metrics import MetricsLog, write_bytes, write_json, write_text
 from trackmdp.training.state import capture, find, restore, take_weights
@@ -36,7 +36,7 @@ __all__ = ["Session"]
 
 
 class Session:
-    """World, learner, collector, judge and logs of one run; a context manager that ends what it began.
+    """World, learner, collector, evaluator and logs of one run; a context manager that ends what it began.
 
     Raises:
         UserError: the config asks for what is not there, for more memory than there is, or for a run that is not this.
@@ -63,11 +63,11 @@ class Session:
         done = state["position"]["frames"] if state else 0
         self.collector = make_collector(cfg, self.world, self.algorithm, self.device, done=done)
         opened.callback(self.collector.shutdown)
-        self.judge = make_judge(self.world, cfg.grid.max_steps)
+        self.evaluator = make_evaluator(self.world, cfg.grid.max_steps)
         self.start = self._start(state)
         self._best = state["best"] if state else -math.inf
         _write_inputs(cfg, self.world, folder, resumed=state is not None)
-        plan = {"iterations": self.algorithm.iterations, "upper_bound": self.judge.upper}
+        plan = {"iterations": self.algorithm.iterations, "upper_bound": self.evaluator.upper}
         write_json(folder / "plan.json", plan)  # for those who watch the run
         events, written = cfg.log.name == "tensorboard", state["metrics"] if state else 0
         self.metrics = MetricsLog(folder, tensorboard=events, position=written, frames=self.start.frames)
@@ -95,8 +95,8 @@ class Session:
     ) -> None:
         self._opened.close()
 
-    def train(self) -> tuple[Verdict, Position]:
-        """Run to the end; the last verdict and position."""
+    def train(self) -> tuple[Score, Position]:
+        """Run to the end; the last score and position."""
         cfg, start = self.cfg, self.start
         every = Intervals(cfg.evaluation.every, cfg.log.every, cfg.checkpoint.every, cfg.checkpoint.seconds)
         title = f"{cfg.algo.name} seed {cfg.seed}"
@@ -104,7 +104,7 @@ class Session:
             return train(
                 self.algorithm,
                 self.collector,
-                self.judge,
+                self.evaluator,
                 self.metrics,
                 display,
                 every,
@@ -117,9 +117,9 @@ class Session:
         """`[M, t_max + 1, M]` of the policy as it is now."""
         return chains_of(self.algorithm.actor, self.world.task, self.device)
 
-    def _save(self, at: Position, verdict: Verdict) -> None:
-        better = verdict.evaluation.aihtr > self._best
-        self._best = max(self._best, verdict.evaluation.aihtr)
+    def _save(self, at: Position, score: Score) -> None:
+        better = score.evaluation.aihtr > self._best
+        self._best = max(self._best, score.evaluation.aihtr)
         written = self.metrics.position
         recorded = self.log.policies if self.log is not None else None
         state = capture(

@@ -17,7 +17,7 @@ from trackmdp.solvers import bounds, optimal, qmdp
 from trackmdp.solvers.chains import Evaluation, evaluate, regret_per_step, sets_of
 from trackmdp.solvers.optimal import Progress, Solution
 from trackmdp.training.display import make_console, table
-from trackmdp.training.judge import figures
+from trackmdp.training.evaluator import figures
 from trackmdp.training.metrics import write_json
 from trackmdp.world.model import World
 

@@ -15,8 +15,7 @@ from trackmdp.config import TrainConfig
 from trackmdp.config.resume import digest
 from trackmdp.solvers.optimal import Solution
 from trackmdp.training.display import table
-from trackmdp.training.held_out import HeldOutJudge
-from trackmdp.training.judge import Judge, Verdict, figures, while_collecting
+from trackmdp.training.evaluator import Evaluator, ExactEvaluator, Score, figures, while_collecting
 from trackmdp.training.loop import Position
 
 __all__ = ["show", "summarize"]
@@ -26,8 +25,8 @@ _PACKAGES = ("torch", "torchrl", "tensordict", "hydra-core", "numpy", "scipy")
 
 def summarize(
     cfg: TrainConfig,
-    judge: Judge | HeldOutJudge,
-    verdict: Verdict,
+    evaluator: Evaluator,
+    score: Score,
     solution: Solution | None,
     end: Position,
     times: dict[str, float],
@@ -40,14 +39,14 @@ def summarize(
         "seed": cfg.seed,
         "frames": end.frames,
         **times,
-        "policy": figures(verdict.evaluation),
-        "qmdp": figures(judge.qmdp) if isinstance(judge, Judge) else None,
-        "bounds": judge.bounds if isinstance(judge, Judge) else dict.fromkeys(("paper", "valid", "clocked")),
+        "policy": figures(score.evaluation),
+        "qmdp": figures(evaluator.qmdp) if evaluator.qmdp else None,
+        "bounds": evaluator.bounds,
         "optimal": {"lower": solution.lower, "upper": solution.upper, "certified": solution.certified}
         if solution
         else None,
-        "regret_per_step": verdict.regret_per_step,
-        "while_collecting": while_collecting(judge.upper, verdict.evaluation, end.reward, end.frames),
+        "regret_per_step": score.regret_per_step,
+        "while_collecting": while_collecting(evaluator.upper, score.evaluation, end.reward, end.frames),
         "held_out": held_out,
         "versions": {"trackmdp": __version__, "python": platform.python_version()}
         | {name: version(name) for name in _PACKAGES},
@@ -56,21 +55,23 @@ def summarize(
     }
 
 
-def show(console: Console, cfg: TrainConfig, judge: Judge, verdict: Verdict, solution: Solution | None) -> None:
+def show(
+    console: Console, cfg: TrainConfig, evaluator: ExactEvaluator, score: Score, solution: Solution | None
+) -> None:
     """The learned policy beside Q_MDP, all sensors on, and the optimum where it was solved for."""
-    shape = (judge.world.num_cells, judge.world.num_choices, judge.world.num_cells)
+    shape = (evaluator.world.num_cells, evaluator.world.num_choices, evaluator.world.num_cells)
     policies = {
-        f"learned ({cfg.algo.name})": verdict.evaluation,
-        "Q_MDP": judge.qmdp,
-        "all on": judge.evaluate(np.ones(shape, dtype=bool)),
+        f"learned ({cfg.algo.name})": score.evaluation,
+        "Q_MDP": evaluator.qmdp,
+        "all on": evaluator.evaluate(np.ones(shape, dtype=bool)),
     }
     if solution is not None:
-        policies["optimum" if solution.certified else "best known"] = judge.evaluate(solution.chains)
+        policies["optimum" if solution.certified else "best known"] = evaluator.evaluate(solution.chains)
     rows = [
         [name, f"{e.aihtr:,.3f}", f"{100 * e.accuracy:.2f} %", f"{e.sensors_per_step:.2f}"]
         for name, e in policies.items()
     ]
-    rows.append(["upper bound", f"{judge.upper:,.3f}", "", ""])
+    rows.append(["upper bound", f"{evaluator.upper:,.3f}", "", ""])
     console.print(table("exact values", ["policy", "AIHTR", "accuracy", "sensors per step"], rows))
-    regret = round(verdict.regret_per_step, 4) + 0.0
+    regret = round(score.regret_per_step, 4) + 0.0
     console.print(f"regret per step {regret:.4f} to the upper bound")

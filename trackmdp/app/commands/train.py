@@ -1,4 +1,4 @@
-"""`train`: learn a policy without the motion model, and judge it exactly."""
+"""`train`: learn a policy without the motion model, and evaluator it exactly."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from trackmdp.reports import policy
 from trackmdp.solvers import optimal
 from trackmdp.solvers.optimal import Solution
 from trackmdp.training.display import make_console
-from trackmdp.training.judge import Judge
+from trackmdp.training.evaluator import ExactEvaluator
 from trackmdp.training.lock import locked
 from trackmdp.training.metrics import write_json
 from trackmdp.world.model import World
@@ -52,25 +52,25 @@ def _run(cfg: TrainConfig, folder: Path) -> float:
         console.print(f"finished before; results in {folder}")
         return reached
     with Session(cfg, folder, console) as session:
-        verdict, end = session.train()
-    judge, chains, solution, held_out = session.judge, session.chains(), None, None
-    if isinstance(judge, Judge):
-        solution = _solve(cfg, judge.world, console)
-        verdict = judge.tighten(solution.upper, verdict) if solution is not None else verdict
+        score, end = session.train()
+    evaluator, chains, solution, held_out = session.evaluator, session.chains(), None, None
+    if isinstance(evaluator, ExactEvaluator):
+        solution = _solve(cfg, evaluator.world, console)
+        score = evaluator.tighten(solution.upper, score) if solution is not None else score
     else:
-        held_out = judge.report(chains)
+        held_out = evaluator.report(chains)
     times = {
         "wall_seconds": time.monotonic() - started + session.start.seconds,
         "cpu_seconds": time.process_time() - used,
     }
-    policy.write(folder / policy.FILE, policy.Policy(chains, verdict.evaluation.value))
-    write_json(folder / "summary.json", summarize(cfg, judge, verdict, solution, end, times, held_out))
-    if isinstance(judge, Judge):
-        show(console, cfg, judge, verdict, solution)
+    policy.write(folder / policy.FILE, policy.Policy(chains, score.evaluation.value))
+    write_json(folder / "summary.json", summarize(cfg, evaluator, score, solution, end, times, held_out))
+    if isinstance(evaluator, ExactEvaluator):
+        show(console, cfg, evaluator, score, solution)
     elif held_out is not None:
         show_held_out(console, f"learned ({cfg.algo.name})", held_out)
     console.print(f"{times['wall_seconds']:.1f} s; results in {folder}")
-    return verdict.evaluation.aihtr
+    return score.evaluation.aihtr
 
 
 def _finished(cfg: TrainConfig, folder: Path) -> float | None:

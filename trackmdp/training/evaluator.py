@@ -1,0 +1,104 @@
+"""How good a policy is: its exact figures, the bounds, Q_MDP's figures, and its regret to the best bound."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from trackmdp.solvers import bounds, horizon, qmdp
+from trackmdp.solvers.chains import Evaluation, evaluate, regret_per_step
+from trackmdp.world.model import Task, World
+
+__all__ = ["Evaluator", "ExactEvaluator", "Score", "figures", "while_collecting"]
+
+_PER_CELL = ("value", "steps", "detections", "sensors", "safe_actions")
+
+
+@dataclass(frozen=True)
+class Score:
+    """A policy's figures and its regret per step to the best upper bound known, nan where there is none."""
+
+    evaluation: Evaluation
+    regret_per_step: float
+
+
+class Evaluator(ABC):
+    """Scores learned, fixed and solved policies alike, by their chains.
+
+    Attributes:
+        world: where policies are evaluated.
+        upper: the best upper bound known on the AIHTR; nan where there is none.
+        bounds: the upper bounds by name, None where the setting has no such bound.
+        qmdp: figures of the Q_MDP policy; None where there is no motion model to plan with.
+    """
+
+    world: Task
+    upper: float
+    bounds: dict[str, float | None]
+    qmdp: Evaluation | None
+
+    @abstractmethod
+    def evaluate(self, chains: npt.NDArray[np.generic]) -> Evaluation:
+        """Figures of the policy with these `chains` `[M, t_max+1, M]`."""
+
+    def score(self, chains: npt.NDArray[np.generic]) -> Score:
+        """Figures and the regret per step of the policy with these `chains` `[M, t_max+1, M]`."""
+        evaluation = self.evaluate(chains)
+        return Score(evaluation, regret_per_step(self.upper, evaluation))
+
+    def report(self, chains: npt.NDArray[np.generic]) -> dict[str, Any] | None:  # noqa: ARG002
+        """Figures with confidence intervals beside those of the references; None where all figures are exact."""
+        return None
+
+    def tighten(self, upper: float, score: Score) -> Score:
+        """Take a proved upper bound into account, from now on and in `score`."""
+        self.upper = min(self.upper, upper)
+        return Score(score.evaluation, regret_per_step(self.upper, score.evaluation))
+
+
+class ExactEvaluator(Evaluator):
+    """Evaluates with the motion model.
+
+    Args:
+        world: the task and the motion.
+        max_steps: episodes are truncated after this many steps, and so are all figures; None for never. The paper's
+            bound knows no such limit and is None then.
+    """
+
+    world: World
+    qmdp: Evaluation
+
+    def __init__(self, world: World, max_steps: int | None = None) -> None:
+        self.world, self.max_steps = world, max_steps
+        if max_steps is None:
+            paper, valid, clocked = (bound(world).mean() for bound in (bounds.paper, bounds.valid, bounds.clocked))
+            self.bounds = {"paper": float(paper), "valid": float(valid), "clocked": float(clocked)}
+        else:
+            valid, clocked = (bound(world, max_steps).mean() for bound in (horizon.valid, horizon.clocked))
+            self.bounds = {"paper": None, "valid": float(valid), "clocked": float(clocked)}
+        self.upper = float(clocked)
+        self.qmdp = self.evaluate(qmdp.solve(world))
+
+    def evaluate(self, chains: npt.NDArray[np.generic]) -> Evaluation:
+        """Exact figures of the policy with these `chains` `[M, t_max+1, M]`."""
+        if self.max_steps is None:
+            return evaluate(self.world, chains)
+        return horizon.evaluate(self.world, chains, self.max_steps)
+
+
+def while_collecting(upper: float, evaluation: Evaluation, reward: float, frames: int) -> dict[str, float]:
+    """What the frames of a run have earned on average, and how far that is below the best rate known.
+
+    That rate is `upper` over the expected length of an episode, which no policy changes; `reward` is the frames' sum.
+    """
+    earned = reward / frames
+    return {"reward_per_frame": earned, "regret_per_frame": upper / evaluation.expected_length - earned}
+
+
+def figures(evaluation: Evaluation) -> dict[str, Any]:
+    """The single figures of an evaluation, as they stand in `summary.json`."""
+    return {key: value for key, value in asdict(evaluation).items() if key not in _PER_CELL}
