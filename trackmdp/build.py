@@ -31,7 +31,7 @@ if TYPE_CHECKING:  # the world is built, and a config checked, before anything h
     from trackmdp.algos.common import Algorithm
     from trackmdp.config import BaselineConfig, TrainConfig
 
-__all__ = ["make_algorithm", "make_baseline", "make_collector", "make_device", "make_setting", "make_world"]
+__all__ = ["make_algorithm", "make_baseline", "make_collector", "make_setting", "make_world"]
 
 KERNELS: dict[type[KernelConfig], Callable[..., Array]] = {
     RandomSupportConfig: kernels.random_support,
@@ -110,23 +110,6 @@ def _price_per_cell(sensor: float | list[float] | str, cells: int) -> Array:
     return price
 
 
-def make_device(name: str, key: str = "device") -> torch.device:
-    """The torch device called `name`; `auto` is the first GPU where there is one.
-
-    Raises:
-        UserError: there is no such device here.
-    """
-    import torch
-
-    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    if name == "auto":
-        return torch.device("cuda:0" if count else "cpu")
-    device = torch.device(name)
-    if device.type == "cuda" and (device.index or 0) >= count:
-        raise UserError(f"{key}={name}: no such device here ({count} CUDA devices found); use cpu or auto")
-    return device
-
-
 def make_algorithm(cfg: TrainConfig, world: Setting, device: torch.device) -> Algorithm:
     """The learner; it is given the task, never the motion."""
     from trackmdp import config
@@ -151,6 +134,7 @@ def make_collector(
 ) -> BaseCollector:
     """The source of the frames that are left after the first `done`."""
     from trackmdp.training.collect import make_collector as make
+    from trackmdp.training.devices import make_device
 
     return make(
         world,

@@ -11,6 +11,7 @@ import pytest
 
 from tests.reports.sweeps import VERSIONS, write_curve, write_run, write_sweep
 from trackmdp.build import make_world
+from trackmdp.durable import write_json
 from trackmdp.errors import UserError
 from trackmdp.reports import policy, results
 from trackmdp.reports.gather import MOST_POINTS, gather
@@ -18,7 +19,6 @@ from trackmdp.reports.results import Results
 from trackmdp.solvers import bounds, qmdp
 from trackmdp.solvers.chains import evaluate
 from trackmdp.training.lock import locked
-from trackmdp.training.metrics import write_json
 
 
 @pytest.fixture(scope="module")

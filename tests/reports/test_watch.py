@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from trackmdp.durable import write_json
 from trackmdp.errors import UserError
 from trackmdp.reports import watch
 from trackmdp.reports.watch import Status, look
 from trackmdp.training.lock import locked
-from trackmdp.training.metrics import write_json
 
 HEAD = "iteration,frames,aihtr,seconds\n"
 

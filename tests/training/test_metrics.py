@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trackmdp.training.metrics import MetricsLog, write_json, write_text
+from trackmdp.durable import write_json, write_text
+from trackmdp.training.metrics import MetricsLog
 
 ROW = {"iteration": 1, "frames": 256, "aihtr": 0.1 + 0.2, "loss": 1e-300, "gap": -1 / 3}
 

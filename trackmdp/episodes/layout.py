@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from trackmdp.training.metrics import write_text
+from trackmdp.durable import write_text
 
 __all__ = ["layout", "write_layout"]
 

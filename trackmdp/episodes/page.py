@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from trackmdp.durable import write_text
 from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.solvers import bounds, horizon
-from trackmdp.training.metrics import write_text
 
 __all__ = ["MOST_CELLS", "MOST_STEPS", "page", "write_page"]
 

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from trackmdp.durable import write_text
 from trackmdp.errors import UserError
 from trackmdp.paper import critique
 from trackmdp.paper.calibration import (
@@ -22,7 +23,6 @@ from trackmdp.paper.calibration import (
 )
 from trackmdp.paper.theorems import Check
 from trackmdp.paper.worlds import SUPPORTS
-from trackmdp.training.metrics import write_text
 
 __all__ = ["FILE", "Openings", "compute", "load", "save"]
 

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from trackmdp.durable import write_bytes
 from trackmdp.errors import UserError
-from trackmdp.training.metrics import write_bytes
 from trackmdp.world.model import Array, BoolArray
 
 __all__ = ["FILE", "Policy", "arrays", "pack", "pack_all", "read", "unpack_all", "write"]

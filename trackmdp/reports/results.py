@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
+from trackmdp.durable import write_bytes, write_text
 from trackmdp.errors import UserError
 from trackmdp.reports.policy import Policy, arrays, pack_all, unpack_all
-from trackmdp.training.metrics import write_bytes, write_text
 from trackmdp.world.model import Array
 
 __all__ = ["FIGURES", "FORMAT", "Motion", "Point", "Problem", "Results", "Run", "is_stored", "load", "save"]

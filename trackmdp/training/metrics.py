@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
-from trackmdp.durable import whole_file
-
-__all__ = ["MetricsLog", "write_bytes", "write_json", "write_text"]
+__all__ = ["MetricsLog"]
 
 
 class MetricsLog:
@@ -63,29 +59,3 @@ class MetricsLog:
         self._file.close()
         if self._events is not None:
             self._events.close()
-
-
-def write_text(file: Path, text: str) -> None:
-    """Write a file whole or not at all."""
-    write_bytes(file, text.encode())
-
-
-def write_bytes(file: Path, content: bytes) -> None:
-    """Write a file whole or not at all."""
-    with whole_file(file) as stream:
-        stream.write(content)
-
-
-def write_json(file: Path, content: Mapping[str, Any]) -> None:
-    """Write JSON whole or not at all; a number that is not finite is written as null."""
-    write_text(file, json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
-
-
-def _finite(content: Any) -> Any:
-    if isinstance(content, Mapping):
-        return {str(key): _finite(value) for key, value in content.items()}
-    if isinstance(content, (list, tuple)):
-        return [_finite(value) for value in content]
-    if isinstance(content, float) and not math.isfinite(content):
-        return None
-    return content

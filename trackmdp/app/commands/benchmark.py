@@ -10,10 +10,11 @@ import torch
 
 from trackmdp.app.bench import learned, log, memory, peers, quality, solver, speed
 from trackmdp.app.bench.machine import machine
-from trackmdp.build import make_device, make_world
+from trackmdp.build import make_world
 from trackmdp.config import BenchmarkConfig
+from trackmdp.durable import write_json
+from trackmdp.training.devices import make_device
 from trackmdp.training.display import make_console, table
-from trackmdp.training.metrics import write_json
 from trackmdp.world.model import World
 
 __all__ = ["PARTS", "run"]

@@ -13,8 +13,9 @@ from tensordict.nn import TensorDictModuleBase
 
 from trackmdp.app.commands import held_out, playback
 from trackmdp.app.commands.trained import trained
-from trackmdp.build import make_baseline, make_device, make_setting
+from trackmdp.build import make_baseline, make_setting
 from trackmdp.config import EvaluateConfig, McapConfig, PlaybackConfig, RandomKConfig, load_run, to_yaml
+from trackmdp.durable import write_json, write_text
 from trackmdp.episodes.log import EpisodeLog
 from trackmdp.episodes.record import Chains, RandomSets
 from trackmdp.policies import fixed
@@ -23,10 +24,10 @@ from trackmdp.reports.picture import draw
 from trackmdp.seeding import generator
 from trackmdp.solvers import estimator
 from trackmdp.solvers.chains import sets_of
+from trackmdp.training.devices import make_device
 from trackmdp.training.display import make_console, table
 from trackmdp.training.evaluate import Simulation, simulate
 from trackmdp.training.evaluator import ExactEvaluator, Score, figures
-from trackmdp.training.metrics import write_json, write_text
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Recorded, Setting
 

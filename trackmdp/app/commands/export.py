@@ -17,10 +17,10 @@ from torch import Tensor, nn
 from trackmdp import __version__
 from trackmdp.app.commands.trained import trained
 from trackmdp.config import ExportConfig
+from trackmdp.durable import write_bytes, write_json
 from trackmdp.errors import UserError
 from trackmdp.solvers.chains import sets_of
 from trackmdp.training.display import make_console
-from trackmdp.training.metrics import write_bytes, write_json
 from trackmdp.world.model import BoolArray
 
 __all__ = ["run", "to_onnx", "to_torch"]

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from trackmdp.durable import write_json, write_text
 from trackmdp.reports.picture import draw
 from trackmdp.solvers.chains import sets_of
 from trackmdp.training.display import table
 from trackmdp.training.held_out import HeldOutEvaluator
-from trackmdp.training.metrics import write_json, write_text
 from trackmdp.world.tracks import Recorded
 
 __all__ = ["run", "show_held_out"]

@@ -10,6 +10,7 @@ from rich.console import Console
 
 from trackmdp.build import make_world
 from trackmdp.config import EvaluateConfig, PlaybackConfig
+from trackmdp.durable import write_json
 from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.episodes.record import Issued, record
@@ -17,7 +18,6 @@ from trackmdp.errors import UserError
 from trackmdp.policies import playback
 from trackmdp.training.display import table
 from trackmdp.training.evaluate import simulate
-from trackmdp.training.metrics import write_json
 from trackmdp.world.model import World
 
 __all__ = ["run"]

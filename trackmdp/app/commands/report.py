@@ -8,6 +8,7 @@ from rich.console import Console
 
 from trackmdp.build import make_world
 from trackmdp.config import ReportConfig
+from trackmdp.durable import write_bytes, write_text
 from trackmdp.paper import openings
 from trackmdp.paper.openings import Openings
 from trackmdp.paper.printed import pairs
@@ -17,7 +18,6 @@ from trackmdp.reports.grouping import study
 from trackmdp.reports.page import Report, build
 from trackmdp.reports.results import Results
 from trackmdp.training.display import make_console
-from trackmdp.training.metrics import write_bytes, write_text
 
 __all__ = ["run"]
 

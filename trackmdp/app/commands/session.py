@@ -14,20 +14,22 @@ import numpy as np
 import torch
 from rich.console import Console
 
-from trackmdp.build import make_algorithm, make_collector, make_device, make_setting
+from trackmdp.build import make_algorithm, make_collector, make_setting
 from trackmdp.config import McapConfig, TrainConfig
 from trackmdp.config.resume import config_text
+from trackmdp.durable import write_bytes, write_json, write_text
 from trackmdp.episodes.log import EpisodeLog
 from trackmdp.episodes.record import Chains
 from trackmdp.errors import UserError
 from trackmdp.seeding import seed_global
 from trackmdp.training import checkpoint, memory
+from trackmdp.training.devices import make_device
 from trackmdp.training.display import Display
 from trackmdp.training.evaluate import chains_of
 from trackmdp.training.evaluator import Score
 from trackmdp.training.held_out import make_evaluator
 from trackmdp.training.loop import Intervals, Position, train
-from trackmdp.training.metrics import MetricsLog, write_bytes, write_json, write_text
+from trackmdp.training.metrics import MetricsLog
 from trackmdp.training.state import capture, find, restore, take_weights
 from trackmdp.world.model import Array, BoolArray, World
 from trackmdp.world.tracks import Recorded, Setting

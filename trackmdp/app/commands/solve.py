@@ -12,13 +12,13 @@ from rich.console import Console
 from trackmdp.app.commands.verify import show_checks, write_checks
 from trackmdp.build import make_baseline, make_world
 from trackmdp.config import OptimalConfig, SolveConfig
+from trackmdp.durable import write_json
 from trackmdp.errors import UserError
 from trackmdp.solvers import bounds, optimal, qmdp
 from trackmdp.solvers.chains import Evaluation, evaluate, regret_per_step, sets_of
 from trackmdp.solvers.optimal import Progress, Solution
 from trackmdp.training.display import make_console, table
 from trackmdp.training.evaluator import figures
-from trackmdp.training.metrics import write_json
 from trackmdp.world.model import World
 
 __all__ = ["run", "solve_world"]

@@ -12,6 +12,7 @@ from trackmdp.app.commands.session import Session
 from trackmdp.app.commands.summary import show, summarize
 from trackmdp.config import TrainConfig
 from trackmdp.config.resume import finished
+from trackmdp.durable import write_json
 from trackmdp.errors import RunError
 from trackmdp.reports import policy
 from trackmdp.solvers import optimal
@@ -19,7 +20,6 @@ from trackmdp.solvers.optimal import Solution
 from trackmdp.training.display import make_console
 from trackmdp.training.evaluator import ExactEvaluator
 from trackmdp.training.lock import locked
-from trackmdp.training.metrics import write_json
 from trackmdp.world.model import World
 
 __all__ = ["run"]

@@ -11,12 +11,12 @@ from rich.table import Table
 
 from trackmdp.build import make_world
 from trackmdp.config import VerifyConfig
+from trackmdp.durable import write_json
 from trackmdp.errors import UserError
 from trackmdp.paper import remarks, theorems
 from trackmdp.paper.theorems import Check
 from trackmdp.solvers import optimal
 from trackmdp.training.display import make_console
-from trackmdp.training.metrics import write_json
 from trackmdp.world.model import World
 
 __all__ = ["run", "show_checks", "write_checks"]

@@ -14,8 +14,8 @@ from trackmdp.app.sweep.apart import Outcome, run_apart
 from trackmdp.app.sweep.plan import Job
 from trackmdp.app.sweep.state import DONE, FAILED, SUMMARY, run_of
 from trackmdp.config import TrainConfig
+from trackmdp.durable import write_json
 from trackmdp.errors import USER_MISTAKE
-from trackmdp.training.metrics import write_json
 
 __all__ = ["STOP", "Launch", "fail", "run_job", "stop_signal"]
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from trackmdp.durable import write_json
 from trackmdp.errors import UserError
-from trackmdp.training.metrics import write_json
 
 __all__ = ["DONE", "FAILED", "PLAN", "SUMMARY", "Run", "read_json", "read_plan", "run_of", "runs_of", "write_plan"]
 

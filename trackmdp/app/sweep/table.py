@@ -13,10 +13,10 @@ from rich.markup import escape
 
 from trackmdp.app.prepare import shown
 from trackmdp.app.sweep.state import FAILED, Run, read_json
+from trackmdp.durable import write_text
 from trackmdp.errors import FAILED as FAILED_STATUS
 from trackmdp.errors import USER_MISTAKE
 from trackmdp.training.display import table
-from trackmdp.training.metrics import write_text
 
 __all__ = ["TABLE", "figures", "show", "status_of", "write_table"]
 
