@@ -6,8 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from trackmdp.config.checks import nodes
-from trackmdp.config.options import Option, options
+from trackmdp.config.options import Option, nodes, options
 
 
 @contextmanager

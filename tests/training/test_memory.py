@@ -70,7 +70,7 @@ def test_a_run_says_what_it_takes(tmp_path: Path, capsys: pytest.CaptureFixture[
     budget = ["algo.updates=1", "optimal.enabled=false"]
     assert main(["train", *words, *budget, f"hydra.run.dir={tmp_path}"]) == 0
     (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("memory: "))
-    assert "collector.frames_per_batch 0.00 GiB, algo.buffer_size 0.00 GiB, algo.hidden 0.00 GiB" in line
+    assert "algo.buffer_size 0.00 GiB, algo.hidden 0.00 GiB, collector.frames_per_batch 0.00 GiB" in line
 
 
 @pytest.mark.parametrize(

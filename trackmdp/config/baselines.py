@@ -6,9 +6,10 @@ The group `baseline` (evaluate) offers all of them, the group `solver` (solve) t
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
-from trackmdp.config.options import choice, option
+from trackmdp.config.options import choice, option, refuse
+from trackmdp.config.schema import ChoiceConfig
 
 __all__ = [
     "AllOnConfig",
@@ -26,14 +27,17 @@ __all__ = [
 
 
 @dataclass(kw_only=True)
-class BaselineConfig:
-    """Base of the groups `baseline` and `solver`."""
+class BaselineConfig(ChoiceConfig):
+    """Base of the groups `baseline` and `solver`.
 
-    name: ClassVar[str]
+    What a choice makes is called with the world and the choice's options, and returns a `Policy` or a `Solution`.
+    """
+
+    reads_motion: ClassVar[bool] = True
 
 
-@choice("baseline", "qmdp")
-@choice("solver", "qmdp")
+@choice("baseline", "qmdp", makes="trackmdp.solvers.qmdp:solve")
+@choice("solver", "qmdp", makes="trackmdp.solvers.qmdp:solve")
 @dataclass(kw_only=True)
 class QmdpConfig(BaselineConfig):
     """Q_MDP: sense every cell whose predicted probability is worth the sensor's price."""
@@ -41,27 +45,38 @@ class QmdpConfig(BaselineConfig):
     in_grid: bool = option("threshold c·p_in/r instead of the printed c/r")
 
 
-@choice("baseline", "all_on")
+@choice("baseline", "all_on", makes="trackmdp.policies.policy:Policy.all_on")
 @dataclass(kw_only=True)
 class AllOnConfig(BaselineConfig):
     """All sensors on, always."""
 
+    reads_motion: ClassVar[bool] = False
 
-@choice("baseline", "none")
+
+@choice("baseline", "none", makes="trackmdp.policies.policy:Policy.none")
 @dataclass(kw_only=True)
 class NoSensorsConfig(BaselineConfig):
     """No sensor on until the safe action is forced."""
 
+    reads_motion: ClassVar[bool] = False
 
-@choice("baseline", "random_k")
+
+@choice("baseline", "random_k", makes="trackmdp.policies.policy:Policy.random_k")
 @dataclass(kw_only=True)
 class RandomKConfig(BaselineConfig):
     """k sensors drawn at random each step."""
 
+    reads_motion: ClassVar[bool] = False
     k: int = option("sensors switched on, at most M", unit="sensors", ge=0)
 
+    def check(self, key: str, root: Any) -> None:
+        """There are only M sensors."""
+        if self.k > root.grid.num_cells:
+            expected = f"at most {root.grid.num_cells}, the sensors of a grid.size={root.grid.size} grid"
+            raise refuse(f"{key}.k", self.k, expected)
 
-@choice("baseline", "myopic")
+
+@choice("baseline", "myopic", makes="trackmdp.solvers.myopic:solve")
 @dataclass(kw_only=True)
 class MyopicConfig(BaselineConfig):
     """Sense the cells whose belief, conditioned on the misses so far, exceeds a threshold."""
@@ -69,15 +84,15 @@ class MyopicConfig(BaselineConfig):
     threshold: float | None = option("predicted probability from which a cell is sensed; null = c·p_in/r", ge=0, le=1)
 
 
-@choice("baseline", "clocked")
-@choice("solver", "clocked")
+@choice("baseline", "clocked", makes="trackmdp.solvers.clocked:solve")
+@choice("solver", "clocked", makes="trackmdp.solvers.clocked:solve")
 @dataclass(kw_only=True)
 class ClockedConfig(BaselineConfig):
     """Sets read off the clocked bound."""
 
 
-@choice("baseline", "fcr")
-@choice("solver", "fcr")
+@choice("baseline", "fcr", makes="trackmdp.solvers.fcr:solve")
+@choice("solver", "fcr", makes="trackmdp.solvers.fcr:solve")
 @dataclass(kw_only=True)
 class FcrConfig(BaselineConfig):
     """First cost reduction: decide as if nothing were observed any more."""
@@ -85,8 +100,8 @@ class FcrConfig(BaselineConfig):
     in_grid: bool = option("threshold c·p_in/r instead of c/r")
 
 
-@choice("baseline", "lookahead")
-@choice("solver", "lookahead")
+@choice("baseline", "lookahead", makes="trackmdp.solvers.lookahead:solve")
+@choice("solver", "lookahead", makes="trackmdp.solvers.lookahead:solve")
 @dataclass(kw_only=True)
 class LookaheadConfig(BaselineConfig):
     """Plan some sets ahead, then count on a simpler value."""
@@ -95,8 +110,8 @@ class LookaheadConfig(BaselineConfig):
     tail: str = option("value counted on after them", choices=("qmdp", "clocked"))
 
 
-@choice("baseline", "optimal")
-@choice("solver", "optimal")
+@choice("baseline", "optimal", makes="trackmdp.solvers.optimal:solve")
+@choice("solver", "optimal", makes="trackmdp.solvers.optimal:solve")
 @dataclass(kw_only=True)
 class OptimalConfig(BaselineConfig):
     """Policy iteration, search and branch and bound: the optimum with a certificate, or an honest bracket."""
@@ -105,10 +120,17 @@ class OptimalConfig(BaselineConfig):
     tolerance: float = option("bracket that counts as closed, relative to the value", ge=0, lt=1)
 
 
-@choice("baseline", "playback")
+@choice("baseline", "playback", makes="trackmdp.policies.playback:Playback")
 @dataclass(kw_only=True)
 class PlaybackConfig(BaselineConfig):
     """The actions of a logged episode again, step by step, whatever is observed; none on after the last."""
 
-    file: str = option("the log", expects="a file written with log=mcap")
+    file: str = option("the log", expects="a file written with log=mcap", path=True)
     episode: int = option("which of its episodes", ge=0)
+
+    def check(self, key: str, root: Any) -> None:
+        """What is played back is simulated, and not logged a second time."""
+        if root.log is not None:
+            raise refuse("log", root.log.name, "null with baseline=playback, whose episodes are logged already")
+        if root.episodes == 0:
+            raise refuse("episodes", 0, "at least 1 with baseline=playback, which is only simulated")

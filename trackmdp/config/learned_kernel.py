@@ -11,7 +11,7 @@ from trackmdp.config.options import choice, option
 __all__ = ["LearnedKernelConfig"]
 
 
-@choice("algo", "learned_kernel")
+@choice("algo", "learned_kernel", makes="trackmdp.algos.learned_kernel:LearnedKernel")
 @dataclass(kw_only=True)
 class LearnedKernelConfig(AlgoConfig):
     """Estimate the motion from detections, then plan with the estimate; no networks."""

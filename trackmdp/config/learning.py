@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
-from trackmdp.config.options import choice, option
+from trackmdp.config.options import choice, option, refuse
+from trackmdp.config.schema import BYTES, ChoiceConfig, NodeConfig, Sizes
 
 __all__ = [
     "A2cConfig",
@@ -25,17 +26,28 @@ __all__ = [
     "SingleConfig",
     "TensorboardConfig",
     "WorkersConfig",
+    "DEVICE",
+    "networks",
+    "state_bytes",
 ]
+
+DEVICE = r"auto|cpu|cuda(:\d+)?"
+"""Names of devices."""
 
 
 @dataclass(kw_only=True)
-class ScheduleConfig:
+class ScheduleConfig(NodeConfig):
     """A number that is `start` up to the fraction `begin` of the run, `end` from `until`, and linear between."""
 
     start: float = option("value at the start", ge=0)
     end: float = option("value at the end", ge=0)
     begin: float = option("where the change begins", unit="fraction of the run", ge=0, le=1)
     until: float = option("where the change ends, not before begin", unit="fraction of the run", ge=0, le=1)
+
+    def check(self, key: str, root: Any) -> None:
+        """The change does not end before it begins."""
+        if self.until < self.begin:
+            raise refuse(f"{key}.until", self.until, f"not less than {key}.begin={self.begin}")
 
     def at(self, progress: float) -> float:
         """The value when the fraction `progress` of the run is over."""
@@ -47,10 +59,12 @@ class ScheduleConfig:
 
 
 @dataclass(kw_only=True)
-class AlgoConfig:
-    """Base of the group `algo`: how a policy is learned. The three budgets are what `collector` takes by default."""
+class AlgoConfig(ChoiceConfig):
+    """Base of the group `algo`: how a policy is learned. The three budgets are what `collector` takes by default.
 
-    name: ClassVar[str]
+    What a choice makes is called as ``Learner(task, cfg, iterations=..., seed=..., device=...)``.
+    """
+
     credit: ClassVar[str | None] = "joint"
     total_frames: int = option("env steps the algorithm needs", unit="frames", ge=1)
     frames_per_batch: int = option("env steps per collected batch", unit="frames", ge=1)
@@ -71,14 +85,18 @@ class ActorCriticConfig(AlgoConfig):
     initial_logit: float = option("actor's output bias at the start", unit="logits", ge=-20, le=20)
     reward_scale: float = option("factor on rewards while learning", gt=0)
 
+    def memory(self, task: Sizes, root: Any) -> dict[str, int]:
+        """The two networks and their optimiser."""
+        return {"algo.hidden": networks(task, self.hidden)}
 
-@choice("algo", "a2c")
+
+@choice("algo", "a2c", makes="trackmdp.algos.a2c:A2C")
 @dataclass(kw_only=True)
 class A2cConfig(ActorCriticConfig):
     """Advantage actor-critic, one Bernoulli per sensor, one joint advantage."""
 
 
-@choice("algo", "ppo")
+@choice("algo", "ppo", makes="trackmdp.algos.ppo:PPO")
 @dataclass(kw_only=True)
 class PpoConfig(ActorCriticConfig):
     """Proximal policy optimisation, one Bernoulli per sensor, one joint advantage."""
@@ -87,9 +105,16 @@ class PpoConfig(ActorCriticConfig):
     epochs: int = option("passes over each collected batch", ge=1, le=100)
     minibatches: int = option("parts each batch is cut into", ge=1)
 
+    def check(self, key: str, root: Any) -> None:
+        """The parts of a batch are of one size."""
+        frames = root.collector.frames_per_batch
+        if frames % self.minibatches:
+            expected = f"a divisor of collector.frames_per_batch={frames}"
+            raise refuse(f"{key}.minibatches", self.minibatches, expected)
+
 
 @dataclass(kw_only=True)
-class PrioritizedConfig:
+class PrioritizedConfig(NodeConfig):
     """Prioritised replay: transitions are drawn in proportion to |TD error|^alpha."""
 
     enabled: bool = option("prioritised instead of uniform replay")
@@ -97,7 +122,7 @@ class PrioritizedConfig:
     beta: float = option("how much the draw is corrected for", ge=0, le=1)
 
 
-@choice("algo", "dqn")
+@choice("algo", "dqn", makes="trackmdp.algos.dqn:DQN")
 @dataclass(kw_only=True)
 class DqnConfig(AlgoConfig):
     """Double DQN with a Q that adds up over the sensors."""
@@ -115,21 +140,57 @@ class DqnConfig(AlgoConfig):
     reward_scale: float = option("factor on rewards while learning", gt=0)
     prioritized: PrioritizedConfig
 
+    def check(self, key: str, root: Any) -> None:
+        """The replay buffer holds what is collected and what is drawn at once."""
+        frames = root.collector.frames_per_batch
+        if self.buffer_size < max(frames, self.batch_size):
+            expected = f"at least collector.frames_per_batch={frames} and {key}.batch_size={self.batch_size}"
+            raise refuse(f"{key}.buffer_size", self.buffer_size, expected)
+
+    def memory(self, task: Sizes, root: Any) -> dict[str, int]:
+        """The replay buffer, whose transitions hold two states; the networks."""
+        transition = 2 * state_bytes(task) + task.num_cells + 2 * BYTES["float32"] + 1 + BYTES["int64"]
+        priority = BYTES["float64"] if self.prioritized.enabled else 0
+        return {
+            "algo.buffer_size": self.buffer_size * (transition + priority),
+            "algo.hidden": networks(task, self.hidden),
+        }
+
 
 @dataclass(kw_only=True)
-class CollectorConfig:
+class CollectorConfig(ChoiceConfig):
     """Base of the group `collector`: where the frames come from. One frame is one env step of one environment."""
 
-    name: ClassVar[str]
     total_frames: int = option("env steps of the whole run", unit="frames", ge=1)
     frames_per_batch: int = option(
         "env steps per collected batch, a multiple of the number of environments", unit="frames", ge=1
     )
     envs: int = option("environments stepped together, in each worker", ge=1)
-    device: str = option("device the environments live on", expects="cpu, cuda, cuda:N or auto")
+    device: str = option("device the environments live on", expects="cpu, cuda, cuda:N or auto", pattern=DEVICE)
+
+    @property
+    def stepped(self) -> int:
+        """Environments stepped together, in all workers."""
+        return self.envs
+
+    def check(self, key: str, root: Any) -> None:
+        """A batch is a whole number of steps of all environments, and a run at least one batch."""
+        if self.frames_per_batch % self.stepped:
+            factors = f"{key}.envs" + (f" x {key}.workers" if self.stepped > self.envs else "")
+            expected = f"a multiple of {self.stepped} ({factors})"
+            raise refuse(f"{key}.frames_per_batch", self.frames_per_batch, expected)
+        if self.total_frames < self.frames_per_batch:
+            expected = f"at least {key}.frames_per_batch={self.frames_per_batch}"
+            raise refuse(f"{key}.total_frames", self.total_frames, expected)
+
+    def memory(self, task: Sizes, root: Any) -> dict[str, int]:
+        """Two batches: one is collected while the other is handed over."""
+        index, number = BYTES["int64"], BYTES["float32"]
+        frame = 2 * (state_bytes(task) + index + 3) + task.num_cells + number * (task.num_cells + 2)
+        return {"collector.frames_per_batch": 2 * self.frames_per_batch * frame}
 
 
-@choice("collector", "single")
+@choice("collector", "single", makes="trackmdp.training.collect:single")
 @dataclass(kw_only=True)
 class SingleConfig(CollectorConfig):
     """In the process that learns."""
@@ -142,20 +203,25 @@ class WorkersConfig(CollectorConfig):
     workers: int = option("worker processes", ge=1, le=256)
     threads: int = option("torch threads of each worker process", unit="threads", ge=1, le=256)
 
+    @property
+    def stepped(self) -> int:
+        """Environments stepped together, in all workers."""
+        return self.envs * self.workers
 
-@choice("collector", "multi_sync")
+
+@choice("collector", "multi_sync", makes="trackmdp.training.collect:multi_sync")
 @dataclass(kw_only=True)
 class MultiSyncConfig(WorkersConfig):
     """In worker processes; every batch waits for all of them. A resumed run starts new episodes."""
 
 
-@choice("collector", "multi_async")
+@choice("collector", "multi_async", makes="trackmdp.training.collect:multi_async")
 @dataclass(kw_only=True)
 class MultiAsyncConfig(WorkersConfig):
     """In worker processes; a batch is what one of them has ready. A resumed run starts new episodes."""
 
 
-@choice("collector", "ray")
+@choice("collector", "ray", makes="trackmdp.training.collect:ray")
 @dataclass(kw_only=True)
 class RayWorkersConfig(WorkersConfig):
     """In workers of a Ray cluster, for a run larger than one machine; otherwise as multi_sync."""
@@ -166,32 +232,45 @@ class RayWorkersConfig(WorkersConfig):
 
 
 @dataclass(kw_only=True)
-class LogConfig:
+class LogConfig(ChoiceConfig):
     """Base of the group `log`: what is written of each iteration, next to `summary.json`."""
 
-    name: ClassVar[str]
+    episodes_only: ClassVar[bool] = False
     every: int = option("iterations from one row to the next", unit="iterations", ge=1)
 
 
-@choice("log", "csv")
+@choice("log", "csv", makes="trackmdp.training.metrics:MetricsLog")
 @dataclass(kw_only=True)
 class CsvConfig(LogConfig):
     """`metrics.csv`."""
 
 
-@choice("log", "tensorboard")
+@choice("log", "tensorboard", makes="trackmdp.training.metrics:MetricsLog")
 @dataclass(kw_only=True)
 class TensorboardConfig(LogConfig):
     """`metrics.csv` and TensorBoard event files."""
 
 
-@choice("log", "mcap")
+@choice("log", "mcap", makes="trackmdp.episodes.log:EpisodeLog")
 @dataclass(kw_only=True)
 class McapConfig(LogConfig):
     """`episodes.mcap`: simulated episodes, step by step, for `replay` and viewers; in training `metrics.csv` too."""
 
+    episodes_only: ClassVar[bool] = True
     evaluations: int = option(
         "training: from one recorded evaluation to the next; the last is recorded too", unit="evaluations", ge=1
     )
     episodes: int = option("training: episodes recorded of each such evaluation", unit="episodes", ge=1)
     layout: bool = option("write a viewer's layout next to the log")
+
+
+def state_bytes(task: Sizes) -> int:
+    """Of one observation: located cell, misses, and the actions since the detection."""
+    return 2 * BYTES["int64"] + task.num_choices * task.num_cells
+
+
+def networks(task: Sizes, hidden: int | None) -> int:
+    """Bytes of two networks of one hidden layer (256 units where `hidden` is left open), with Adam's two moments."""
+    inputs = task.num_cells * (2 * task.num_choices + 3) + task.num_choices + 1
+    weights = (hidden or 256) * (inputs + task.num_cells)
+    return 2 * weights * 4 * BYTES["float32"]  # weight, gradient, two moments

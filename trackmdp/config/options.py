@@ -7,14 +7,16 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 import types
 import typing
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from trackmdp.errors import UserError
 
-__all__ = ["GROUPS", "SELECTORS", "Option", "Selector", "choice", "option", "options"]
+__all__ = ["GROUPS", "SELECTORS", "Option", "Selector", "choice", "leaves", "nodes", "option", "options", "refuse"]
 
 T = TypeVar("T")
 
@@ -51,6 +53,9 @@ class Option:
     lt: float | None = None
     choices: tuple[str, ...] = ()
     expects: str = ""
+    pattern: str = ""
+    path: bool = False
+    words: tuple[str, ...] = ()
     kind: Any = None
     nullable: bool = False
 
@@ -74,6 +79,8 @@ class Option:
             return False
         if self.choices:
             return value in self.choices
+        if self.pattern:
+            return re.fullmatch(self.pattern, value) is not None
         return not isinstance(value, (int, float)) or self._in_range(value)
 
     @property
@@ -110,6 +117,9 @@ def option(
     lt: float | None = None,
     choices: tuple[str, ...] = (),
     expects: str = "",
+    pattern: str = "",
+    path: bool = False,
+    words: tuple[str, ...] = (),
 ) -> Any:
     """A dataclass field without a default, described for `--help` and for `validate`.
 
@@ -122,8 +132,12 @@ def option(
         lt: see `le`.
         choices: the words allowed, for a text.
         expects: says in words what is allowed where type and range cannot.
+        pattern: regular expression that a text must match as a whole.
+        path: a text is a path, relative to where the command is typed.
+        words: texts that are no path although others are.
     """
-    return dataclasses.field(metadata={"option": Option(help, unit, ge, gt, le, lt, choices, expects)})
+    described = Option(help, unit, ge, gt, le, lt, choices, expects, pattern, path, words)
+    return dataclasses.field(metadata={"option": described})
 
 
 def options(schema: type[Any]) -> dict[str, Option | type[Any]]:
@@ -142,15 +156,45 @@ def options(schema: type[Any]) -> dict[str, Option | type[Any]]:
     return found
 
 
-def choice(group: str, name: str) -> typing.Callable[[type[T]], type[T]]:
-    """Class decorator: make a dataclass the option `name` of a config group."""
+def choice(group: str, name: str, *, makes: str) -> typing.Callable[[type[T]], type[T]]:
+    """Class decorator: make a dataclass the choice `name` of a config group.
+
+    Args:
+        group: ``kernel``, ``algo``, ``solver``, ...
+        name: what is typed: ``kernel=name``.
+        makes: ``module:attribute`` of what the choice stands for; imported when it is first made
+            (`trackmdp.config.registry.maker`), so that a schema loads neither torch nor scipy.
+
+    Raises:
+        UserError: another schema has this name.
+    """
 
     def register(schema: type[T]) -> type[T]:
-        schema.name = name  # type: ignore[attr-defined]
-        GROUPS.setdefault(group, {})[name] = schema
+        known = GROUPS.setdefault(group, {}).setdefault(name, schema)
+        if known is not schema:
+            raise UserError(f"{group}={name}: offered by {known.__module__} and by {schema.__module__}")
+        schema.name, schema.makes = name, makes  # type: ignore[attr-defined]
         return schema
 
     return register
+
+
+def nodes(cfg: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Every dataclass of a config with its dotted key, the outermost first."""
+    yield prefix, cfg
+    for name, value in vars(cfg).items():
+        if dataclasses.is_dataclass(value):
+            yield from nodes(value, f"{prefix}.{name}".lstrip("."))
+
+
+def leaves(cfg: Any, prefix: str = "") -> Iterator[tuple[str, Option, Any]]:
+    """Every option of a config with its dotted key and its value."""
+    for name, described in options(type(cfg)).items():
+        key, value = f"{prefix}{name}", vars(cfg)[name]
+        if isinstance(described, Option):
+            yield key, described, value
+        elif value is not None:
+            yield from leaves(value, f"{key}.")
 
 
 def refuse(key: str, value: object, expected: str) -> UserError:

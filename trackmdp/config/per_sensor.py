@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
-from trackmdp.config.learning import AlgoConfig, ScheduleConfig
-from trackmdp.config.options import SELECTORS, Selector, choice, option
+from trackmdp.config.learning import AlgoConfig, ScheduleConfig, networks
+from trackmdp.config.options import SELECTORS, Selector, choice, option, refuse
+from trackmdp.config.schema import BYTES, Sizes
 
 __all__ = [
     "A2cPerSensorConfig",
@@ -59,8 +60,27 @@ class PerSensorConfig(AlgoConfig):
         ge=1,
     )
 
+    def check(self, key: str, root: Any) -> None:
+        """`explore` is a probability."""
+        for end in ("start", "end"):
+            if (probability := getattr(self.explore, end)) > 1:
+                raise refuse(f"{key}.explore.{end}", probability, "a number from 0 to 1, a probability")
 
-@choice("algo", "hindsight")
+    def memory(self, task: Sizes, root: Any) -> dict[str, int]:
+        """The moves kept, with what sorting them takes; the networks.
+
+        A move is two cells of 16 bits. Where moves of different paths do not combine (`markov`), whole paths of
+        t_max + 3 cells are kept a second time, sorted.
+        """
+        moves = min(self.buffer_size, root.collector.total_frames)
+        cells = 2 if task.markov else 2 * (task.t_max + 3)
+        return {
+            "algo.buffer_size": moves * (cells * BYTES["int16"] + 5 * BYTES["int64"]),
+            "algo.hidden": networks(task, self.hidden),
+        }
+
+
+@choice("algo", "hindsight", makes="trackmdp.algos.hindsight:Hindsight")
 @dataclass(kw_only=True)
 class HindsightConfig(PerSensorConfig):
     """Collect with all sensors on, then learn from those paths what any policy would have found and missed on them."""
@@ -74,13 +94,13 @@ class PolicyGradientConfig(PerSensorConfig):
     entropy: ScheduleConfig
 
 
-@choice("algo", "a2c_per_sensor")
+@choice("algo", "a2c_per_sensor", makes="trackmdp.algos.per_sensor:A2C")
 @dataclass(kw_only=True)
 class A2cPerSensorConfig(PolicyGradientConfig):
     """Hindsight with the policy gradient of A2C, over both actions of every sensor (algo=a2c credit=per_sensor)."""
 
 
-@choice("algo", "ppo_per_sensor")
+@choice("algo", "ppo_per_sensor", makes="trackmdp.algos.per_sensor:PPO")
 @dataclass(kw_only=True)
 class PpoPerSensorConfig(PolicyGradientConfig):
     """Hindsight with the clipped surrogate of PPO, per sensor (algo=ppo credit=per_sensor)."""
@@ -92,7 +112,7 @@ class PpoPerSensorConfig(PolicyGradientConfig):
     )
 
 
-@choice("algo", "dqn_per_sensor")
+@choice("algo", "dqn_per_sensor", makes="trackmdp.algos.per_sensor:DQN")
 @dataclass(kw_only=True)
 class DqnPerSensorConfig(PerSensorConfig):
     """Hindsight with a Q that adds up over the sensors, for DQN (algo=dqn credit=per_sensor)."""

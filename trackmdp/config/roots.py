@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 from trackmdp.config import learned_kernel, per_sensor  # noqa: F401  (more algorithms to choose from)
 from trackmdp.config.baselines import BaselineConfig
-from trackmdp.config.learning import AlgoConfig, CollectorConfig, LogConfig
-from trackmdp.config.options import GROUPS, option
+from trackmdp.config.learning import DEVICE, AlgoConfig, CollectorConfig, LogConfig
+from trackmdp.config.options import GROUPS, option, refuse
+from trackmdp.config.schema import NodeConfig
 from trackmdp.config.world import CostConfig, GridConfig, KernelConfig
+from trackmdp.errors import UserError
 
 __all__ = [
     "ROOTS",
@@ -29,7 +32,7 @@ __all__ = [
 
 
 @dataclass(kw_only=True)
-class CommandConfig:
+class CommandConfig(NodeConfig):
     """What every command has."""
 
     quiet: bool = option("say nothing at the terminal but errors")
@@ -39,20 +42,21 @@ class CommandConfig:
 class WorldConfig(CommandConfig):
     """What every command has that takes place in a world."""
 
+    needs_motion: ClassVar[bool] = True
     grid: GridConfig
     kernel: KernelConfig
     cost: CostConfig
 
 
 @dataclass(kw_only=True)
-class EvaluationConfig:
+class EvaluationConfig(NodeConfig):
     """How often the policy is evaluated while it learns."""
 
     every: int = option("iterations from one exact evaluation to the next", unit="iterations", ge=1)
 
 
 @dataclass(kw_only=True)
-class OptimalBoundConfig:
+class OptimalBoundConfig(NodeConfig):
     """The certified optimum beside the policy's figures."""
 
     enabled: bool = option("solve for the optimum at the end")
@@ -60,7 +64,7 @@ class OptimalBoundConfig:
 
 
 @dataclass(kw_only=True)
-class CheckpointConfig:
+class CheckpointConfig(NodeConfig):
     """When the state of the run is saved."""
 
     every: int = option("frames from one checkpoint to the next; 0 = not counted in frames", unit="frames", ge=0)
@@ -76,8 +80,9 @@ class CheckpointConfig:
 class TrainConfig(WorldConfig):
     """Learn a policy without the motion model, and evaluate it exactly."""
 
+    needs_motion: ClassVar[bool] = False
     seed: int = option("every random draw of the run derives from it", ge=0)
-    device: str = option("device the networks live on", expects="cpu, cuda, cuda:N or auto")
+    device: str = option("device the networks live on", expects="cpu, cuda, cuda:N or auto", pattern=DEVICE)
     threads: int = option("torch threads of the learning process", unit="threads", ge=1, le=256)
     algo: AlgoConfig
     collector: CollectorConfig
@@ -88,9 +93,11 @@ class TrainConfig(WorldConfig):
     resume: str | None = option(
         "go on with a run: auto = the one in hydra.run.dir, where there is one",
         expects="auto, a run's folder, a checkpoint",
+        path=True,
+        words=("auto",),
     )
     init_from: str | None = option(
-        "start from the weights of another run, where shapes fit", expects="the folder of a run"
+        "start from the weights of another run, where shapes fit", expects="the folder of a run", path=True
     )
 
 
@@ -98,13 +105,24 @@ class TrainConfig(WorldConfig):
 class EvaluateConfig(WorldConfig):
     """Value a trained policy (run=) or a baseline (baseline=), exactly and by simulation."""
 
-    run: str | None = option("folder of a training run; its world is taken from there", expects="the folder of a run")
+    needs_motion: ClassVar[bool] = False
+    run: str | None = option(
+        "folder of a training run; its world is taken from there", expects="the folder of a run", path=True
+    )
     baseline: BaselineConfig | None
     log: LogConfig | None
     seed: int = option("seed of the simulated episodes", ge=0)
-    device: str = option("device of the simulation", expects="cpu, cuda, cuda:N or auto")
+    device: str = option("device of the simulation", expects="cpu, cuda, cuda:N or auto", pattern=DEVICE)
     threads: int = option("torch threads", unit="threads", ge=1, le=256)
     episodes: int = option("episodes simulated; 0 = exact figures only", unit="episodes", ge=0)
+
+    def check(self, key: str, root: Any) -> None:
+        """One policy is valued, and of its log only the episodes are written."""
+        if (self.run is None) == (self.baseline is None):
+            given = "neither" if self.run is None else "both"
+            raise UserError(f"expected exactly one of run=FOLDER and baseline=NAME, got {given}")
+        if self.log is not None and not self.log.episodes_only:
+            raise refuse("log", self.log.name, "mcap or null; an evaluation has no iterations")
 
 
 @dataclass(kw_only=True)
@@ -143,13 +161,15 @@ class BenchmarkConfig(WorldConfig):
         ),
     )
     seed: int = option("every random draw derives from it", ge=0)
-    device: str = option("device of environments and networks", expects="cpu, cuda, cuda:N or auto")
+    device: str = option("device of environments and networks", expects="cpu, cuda, cuda:N or auto", pattern=DEVICE)
     threads: int = option("torch threads", unit="threads", ge=1, le=256)
     seconds: float = option("least time spent on each figure of speed", unit="s", gt=0)
     algos: list[str] = option("algorithms that `quality`, `pairs`, `growth` train", choices=tuple(GROUPS["algo"]))
     seeds: list[int] = option("seeds that they and `peers` train with; `growth`: the first", ge=0)
     peers: str | None = option(
-        "`peers`: folder with the scripts <name>_peer.py to run beside ours", expects="the folder of the scripts"
+        "`peers`: folder with the scripts <name>_peer.py to run beside ours",
+        expects="the folder of the scripts",
+        path=True,
     )
     peers_python: list[str] | None = option(
         "`peers`: the interpreter of each script, in the order of their names; null: this one",
@@ -161,13 +181,15 @@ class BenchmarkConfig(WorldConfig):
 class ReplayConfig(CommandConfig):
     """Look at logged episodes, prove them, rebuild a damaged log; without more than file=, list what it holds."""
 
-    file: str = option("the log", expects="a file written with log=mcap")
+    file: str = option("the log", expects="a file written with log=mcap", path=True)
     episode: int | None = option("play this episode; for html= and csv= the one that is written", ge=0)
     verify: bool = option("re-simulate every episode and name the first difference")
     recover: bool = option("write every whole episode of a cut or damaged log to a new one beside it")
-    html: str | None = option("write one episode (by default the first) as a web page", expects="a file to write")
-    csv: str | None = option("write steps.csv and episodes.csv", expects="a folder")
-    layout: str | None = option("write the layout for viewers", expects="a file to write")
+    html: str | None = option(
+        "write one episode (by default the first) as a web page", expects="a file to write", path=True
+    )
+    csv: str | None = option("write steps.csv and episodes.csv", expects="a folder", path=True)
+    layout: str | None = option("write the layout for viewers", expects="a file to write", path=True)
     speed: float = option("speed of playing", unit="steps/s", gt=0, le=1000)
 
 
@@ -176,7 +198,7 @@ class ReportConfig(CommandConfig):
     """Make figures, tables and one web page of a sweep, or watch it run."""
 
     sweep: str = option(
-        "folder of the sweep, or of stored results", expects="the folder of a sweep or an earlier report"
+        "folder of the sweep, or of stored results", expects="the folder of a sweep or an earlier report", path=True
     )
     watch: bool = option("show all runs live until they are done, instead of a report")
     paper: bool | None = option("add what concerns the paper's settings; null = where the runs are in its worlds")
@@ -188,7 +210,7 @@ class ReportConfig(CommandConfig):
 class ExportConfig(CommandConfig):
     """Write a learned policy as a file that runs without this package."""
 
-    run: str = option("folder of a training run", expects="the folder of a run")
+    run: str = option("folder of a training run", expects="the folder of a run", path=True)
     format: str = option(
         "torch_export: policy.pt2, onnx: policy.onnx, sets: sets.json", choices=("torch_export", "onnx", "sets")
     )

@@ -8,8 +8,7 @@ from typing import Any, ClassVar, TypeVar
 
 from omegaconf import OmegaConf
 
-from trackmdp.config.checks import leaves
-from trackmdp.config.options import option, refuse
+from trackmdp.config.options import leaves, option, refuse
 from trackmdp.errors import UserError
 
 __all__ = [

@@ -17,6 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 from trackmdp.config.checks import absolute_paths, validate
 from trackmdp.config.options import GROUPS, Option, options
 from trackmdp.config.roots import ROOTS, CommandConfig, TrainConfig, WorldConfig
+from trackmdp.config.schema import ChoiceConfig
 from trackmdp.config.sweeps import PLUGINS
 from trackmdp.errors import UserError
 
@@ -182,7 +183,7 @@ def _first_given(*values: Any) -> Any:
 
 def _build(plain: Mapping[Any, Any], schema: type[Any], prefix: str, group: str = "") -> Any:
     values = dict(plain)
-    if group in GROUPS and hasattr(schema, "__annotations__") and "name" in schema.__annotations__:
+    if group in GROUPS and issubclass(schema, ChoiceConfig):
         name = values.pop("name", None)
         if name not in GROUPS[group]:
             raise UserError(f"{prefix}name={name}: expected one of {', '.join(GROUPS[group])}")

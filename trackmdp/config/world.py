@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar
 
-from trackmdp.config.options import choice, option
+from trackmdp.config.options import GROUPS, Option, choice, option, refuse
+from trackmdp.config.schema import ChoiceConfig, NodeConfig
+from trackmdp.errors import UserError
 
 __all__ = [
     "CostConfig",
@@ -22,7 +25,7 @@ BORDERS = ("renormalize", "inside", "clip", "exit")
 
 
 @dataclass(kw_only=True)
-class GridConfig:
+class GridConfig(NodeConfig):
     """The grid of cells, one sensor in each, and the limits on an episode."""
 
     size: int = option("N, cells along one side; M = N² cells and sensors", unit="cells", ge=3, le=64)
@@ -31,19 +34,32 @@ class GridConfig:
         "truncate an episode after so many steps; null = only the exit ends it", unit="steps", ge=1
     )
 
+    @property
+    def num_cells(self) -> int:
+        """M."""
+        return self.size**2
+
 
 @dataclass(kw_only=True)
-class KernelConfig:
-    """Base of the group `kernel`: how the target moves."""
+class KernelConfig(ChoiceConfig):
+    """Base of the group `kernel`: how the target moves.
 
-    name: ClassVar[str]
+    What a choice makes is called with the grid's size and the choice's options, and returns the `[M, M]` kernel.
+    """
+
+    is_motion: ClassVar[bool] = True
     homogeneous: bool = option(
         "the target moves alike from all cells away from the border, so that hindsight learns one policy for them all; "
         "checked where there is a kernel"
     )
 
+    @property
+    def source(self) -> str:
+        """What a message about the kernel begins with."""
+        return f"kernel={self.name}"
 
-@choice("kernel", "random_support")
+
+@choice("kernel", "random_support", makes="trackmdp.world.kernels:random_support")
 @dataclass(kw_only=True)
 class RandomSupportConfig(KernelConfig):
     """The paper's motion: Z random positions around each cell, one of low probability, the others equal."""
@@ -55,8 +71,18 @@ class RandomSupportConfig(KernelConfig):
     border: str = option("what becomes of positions outside the grid", choices=BORDERS)
     seed: int = option("seed of the random positions", ge=0)
 
+    def check(self, key: str, root: Any) -> None:
+        """The positions fit into the window, and their probabilities under one."""
+        window = (2 * self.radius + 1) ** 2
+        if self.support_size > window:
+            expected = f"an integer from 1 to {window} ({key}.radius={self.radius} gives {window} cells)"
+            raise refuse(f"{key}.support_size", self.support_size, expected)
+        if self.low_probability + self.exit_probability >= 1:
+            expected = f"less than 1 - {key}.exit_probability = {1 - self.exit_probability:g}"
+            raise refuse(f"{key}.low_probability", self.low_probability, expected)
 
-@choice("kernel", "random_walk")
+
+@choice("kernel", "random_walk", makes="trackmdp.world.kernels:random_walk")
 @dataclass(kw_only=True)
 class RandomWalkConfig(KernelConfig):
     """A lazy random walk on the 4 or 8 neighbours."""
@@ -67,7 +93,7 @@ class RandomWalkConfig(KernelConfig):
     border: str = option("what becomes of positions outside the grid", choices=BORDERS)
 
 
-@choice("kernel", "drift")
+@choice("kernel", "drift", makes="trackmdp.world.kernels:drift")
 @dataclass(kw_only=True)
 class DriftConfig(KernelConfig):
     """A target that heads one way most of the time."""
@@ -78,21 +104,29 @@ class DriftConfig(KernelConfig):
     border: str = option("what becomes of positions outside the grid", choices=BORDERS)
 
 
-@choice("kernel", "table")
+@choice("kernel", "table", makes="trackmdp.world.kernels:load_table")
 @dataclass(kw_only=True)
 class TableConfig(KernelConfig):
     """A table of your own: row i holds the probabilities of moving from cell i to each cell."""
 
-    path: str = option("file with the M x M table", expects="a path to a .npy, .npz or .csv file")
+    path: str = option("file with the M x M table", expects="a path to a .npy, .npz or .csv file", path=True)
+
+    @property
+    def source(self) -> str:
+        """What a message about the kernel begins with."""
+        return f"kernel.path={self.path}"
 
 
-@choice("kernel", "tracks")
+@choice("kernel", "tracks", makes="trackmdp.world.make:make_recorded")
 @dataclass(kw_only=True)
 class TracksConfig(KernelConfig):
     """No motion model but recorded tracks: learn from most of them, and judge on those held out."""
 
+    is_motion: ClassVar[bool] = False
     path: str = option(
-        "file with columns track, cell (or row, column) and, if wanted, step", expects="a path to a .csv or .npz file"
+        "file with columns track, cell (or row, column) and, if wanted, step",
+        expects="a path to a .csv or .npz file",
+        path=True,
     )
     ends: str = option(
         "what the end of a track is: exit = the target left the grid, cut = the recording stopped",
@@ -109,15 +143,29 @@ class TracksConfig(KernelConfig):
     )
     markov: bool = option("take the next move to depend on the cell alone, so that moves of different tracks combine")
 
+    def check(self, key: str, root: Any) -> None:
+        """Recorded tracks hold no motion model: nothing that reads one goes with them."""
+        if root.needs_motion:
+            raise refuse(key, self.name, "a motion model, which train and evaluate do without")
+        if root.log is not None and root.log.episodes_only:
+            expected = "csv or tensorboard with kernel=tracks; episodes are logged with a motion model"
+            raise refuse("log", root.log.name, expected)
+        baseline = getattr(root, "baseline", None)
+        if baseline is not None and baseline.reads_motion:
+            known = [name for name, schema in GROUPS["baseline"].items() if not schema.reads_motion]
+            expected = f"{', '.join(known[:-1])} or {known[-1]} with kernel=tracks, without a motion model"
+            raise refuse("baseline", baseline.name, expected)
+
 
 @dataclass(kw_only=True)
-class CostConfig:
-    """Base of the group `cost`: what sensing earns and costs."""
+class CostConfig(ChoiceConfig):
+    """Base of the group `cost`: what sensing earns and costs.
 
-    name: ClassVar[str]
+    What a choice makes is called with the grid's size and the choice's options, and returns r, c `[M]` and D.
+    """
 
 
-@choice("cost", "paper")
+@choice("cost", "paper", makes="trackmdp.world.make:paper_cost")
 @dataclass(kw_only=True)
 class PaperCostConfig(CostConfig):
     """The paper's rewards: r for a detection, c per sensor switched on, D for the safe action."""
@@ -127,7 +175,27 @@ class PaperCostConfig(CostConfig):
         "c, price of one sensor switched on for one step, for all cells or for each",
         unit="reward per sensor-step",
         expects="a number >= 0, a list of one per cell, or a path to a .npy or .csv file of one per cell",
+        path=True,
     )
     safe: float | None = option(
         "D, price of the safe action; null = the sum of all sensors' prices", unit="reward", ge=0
     )
+
+    def check(self, key: str, root: Any) -> None:
+        """One price for all sensors, or one for each; a file is read later."""
+        cells, price = root.grid.num_cells, self.sensor
+        expected = f"a number >= 0, a list of {cells} of them (one per cell), or a path to a .npy or .csv file"
+        if isinstance(price, str):
+            if Path(price).suffix not in (".npy", ".csv"):
+                raise refuse(f"{key}.sensor", price, expected)
+            return
+        number = Option("", ge=0, kind=float)
+        if not isinstance(price, list):
+            if price is None or not number.allows(price):
+                raise refuse(f"{key}.sensor", price, expected)
+            return
+        if len(price) != cells:
+            raise UserError(f"{key}.sensor: {len(price)} values, expected one number or {cells} (one per cell)")
+        for index, value in enumerate(price):
+            if value is None or not number.allows(value):
+                raise refuse(f"{key}.sensor[{index}]", value, "a finite number >= 0")

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import torch
 
-from trackmdp.config import A2cConfig, DqnConfig, PerSensorConfig, PpoConfig, TrainConfig
+from trackmdp.config import TrainConfig
+from trackmdp.config.options import nodes
 from trackmdp.errors import UserError
 from trackmdp.world.model import Task
 
 __all__ = ["available", "check", "needs"]
 
 _GIB = 2**30
-_NUMBER, _INDEX = 4, 8  # bytes of a float32 and of an int64
 _CGROUPS = (
     ("memory.max", "memory.current", "inactive_file"),
     ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
@@ -38,21 +38,9 @@ def check(cfg: TrainConfig, task: Task, device: torch.device) -> str:
 
 def needs(cfg: TrainConfig, task: Task) -> dict[str, int]:
     """Bytes of the replay buffer, of collected batches and of networks, by the option that they grow with."""
-    state = 2 * _INDEX + task.num_choices * task.num_cells
-    frame = 2 * (state + _INDEX + 3) + task.num_cells + _NUMBER * (task.num_cells + 2)
-    parts = {"collector.frames_per_batch": 2 * cfg.collector.frames_per_batch * frame}  # collected, and handed over
-    if isinstance(cfg.algo, DqnConfig):
-        transition = 2 * state + task.num_cells + 2 * _NUMBER + 1 + _INDEX
-        priority = 8 if cfg.algo.prioritized.enabled else 0
-        parts["algo.buffer_size"] = cfg.algo.buffer_size * (transition + priority)
-    if isinstance(cfg.algo, PerSensorConfig):
-        moves = min(cfg.algo.buffer_size, cfg.collector.total_frames)
-        cells = 2 if task.markov else 2 * (task.t_max + 3)  # of 16 bits; whole paths are kept a second time, sorted
-        parts["algo.buffer_size"] = moves * (2 * cells + 5 * _INDEX)  # and what sorting them takes
-    if isinstance(cfg.algo, (A2cConfig, PpoConfig, DqnConfig, PerSensorConfig)):
-        inputs = task.num_cells * (2 * task.num_choices + 3) + task.num_choices + 1
-        with_moments = 4 * _NUMBER * (inputs + task.num_cells)
-        parts["algo.hidden"] = 2 * (cfg.algo.hidden or 256) * with_moments
+    parts: dict[str, int] = {}
+    for _, node in nodes(cfg):
+        parts |= node.memory(task, cfg)
     return parts
 
 

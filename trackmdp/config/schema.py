@@ -1,0 +1,59 @@
+"""What every schema has: rules between its options, and an estimate of the memory that they ask for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol
+
+__all__ = ["BYTES", "ChoiceConfig", "NodeConfig", "Sizes"]
+
+BYTES = {"float32": 4, "int64": 8, "float64": 8, "int16": 2, "bool": 1}
+"""Bytes of one number of each kind, for `memory`."""
+
+
+class Sizes(Protocol):
+    """What `memory` may know of a task: a `trackmdp.world.model.Task` is one."""
+
+    @property
+    def num_cells(self) -> int:
+        """M."""
+
+    @property
+    def num_choices(self) -> int:
+        """t_max + 1."""
+
+    @property
+    def t_max(self) -> int:
+        """T_max."""
+
+    @property
+    def markov(self) -> bool:
+        """Whether moves of different paths combine."""
+
+
+@dataclass(kw_only=True)
+class NodeConfig:
+    """Base of every schema. A rule on one option is its `option(...)`; what concerns several is said here."""
+
+    def check(self, key: str, root: Any) -> None:
+        """Look after the rules between options of this node, and between them and those of the whole config.
+
+        Args:
+            key: where the node stands, such as ``algo``; what is refused is named ``{key}.{option}``.
+            root: the config of the command; its values have passed their own checks.
+
+        Raises:
+            UserError: a rule is broken.
+        """
+
+    def memory(self, task: Sizes, root: Any) -> dict[str, int]:
+        """Bytes that a run needs for what this node asks for, by the dotted option that they grow with."""
+        return {}
+
+
+@dataclass(kw_only=True)
+class ChoiceConfig(NodeConfig):
+    """Base of the config groups; `choice` gives each member its name and what it makes."""
+
+    name: ClassVar[str]
+    makes: ClassVar[str]
