@@ -9,11 +9,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from functools import cached_property
 from typing import Any, ClassVar, TypeAlias
 
-import numpy as np
-import numpy.typing as npt
 import torch
 from scipy import sparse
 from tensordict import TensorDictBase
@@ -22,18 +19,19 @@ from torch import Tensor
 
 from trackmdp.errors import UserError
 from trackmdp.policies.lookup import DenseTable, SparseTable
+from trackmdp.policies.table import PolicyTable
 from trackmdp.policies.unroll import STATE_KEYS, Rule, draws, function_rule, module_rule, unrolled
-from trackmdp.world.model import Array, BoolArray, Task
+from trackmdp.world.model import Task
 
 __all__ = ["Policy", "PolicyLike", "as_policy"]
 
-PolicyLike: TypeAlias = "Policy | TensorDictModuleBase | Callable[..., Any]"
-"""A policy, a TensorDict module, or a function as `Policy.from_function` takes it."""
+PolicyLike: TypeAlias = "PolicyTable | TensorDictModuleBase | Callable[..., Any]"
+"""A policy or its table, a TensorDict module, or a function as `Policy.from_function` takes it."""
 
 _DENSE = 2**24  # entries; a table of no more is looked up dense, the faster of the two ways to act
 
 
-class Policy(TensorDictModuleBase):
+class Policy(TensorDictModuleBase, PolicyTable):
     """A policy of a Track-MDP, and a TensorDict module that acts it out.
 
     Either `sets` or `probability` is given. What a policy learned, solved, recorded or written by hand has in common is
@@ -66,39 +64,16 @@ class Policy(TensorDictModuleBase):
         probability: float | None = None,
         k: int | None = None,
     ) -> None:
-        super().__init__()
-        if (sets is None) == (probability is None):
-            raise UserError("policy: expected either sets or one probability for all sensors")
-        if probability is not None and not 0.0 <= probability <= 1.0:
-            raise UserError(f"policy: expected a probability between 0 and 1, got {probability}")
-        self.task, self.probability, self.k = task.task, probability, k
-        self.sets = None if sets is None else _checked(task, sets)
-        self.deterministic = probability in (0.0, 1.0) if self.sets is None else self.sets.dtype == np.bool_
+        TensorDictModuleBase.__init__(self)
+        PolicyTable.__init__(self, task, sets, probability=probability)
+        self.k = k
         self.generator: torch.Generator | None = None
         self._lookup: DenseTable | SparseTable | None = None
-
-    @classmethod
-    def all_on(cls, task: Task) -> Policy:
-        """Every sensor on at every step."""
-        return cls(task, probability=1.0)
-
-    @classmethod
-    def none(cls, task: Task) -> Policy:
-        """No sensor ever on: the target is located by the safe action alone."""
-        return cls(task, probability=0.0)
 
     @classmethod
     def random_k(cls, task: Task, k: int) -> Policy:
         """Of the M sensors k, drawn anew at every step, each subset of that size equally likely."""
         return cls(task, probability=k / task.num_cells, k=k)
-
-    @classmethod
-    def from_dense(cls, task: Task, table: npt.NDArray[np.generic]) -> Policy:
-        """A policy from `[M, t_max + 1, M]`, bool or probabilities."""
-        expected = (task.num_cells, task.num_choices, task.num_cells)
-        if table.shape != expected:
-            raise UserError(f"policy: expected shape {expected} (M, t_max + 1, M), got {table.shape}")
-        return cls(task, sparse.csr_array(np.ascontiguousarray(table).reshape(-1, task.num_cells)))
 
     @classmethod
     def from_function(
@@ -136,60 +111,6 @@ class Policy(TensorDictModuleBase):
         if check and draws(task, rule, torch.device(device), sets):
             raise UserError("policy: draws at random, so that it has no exact value; simulate it, or take its mode")
         return cls(task, sets)
-
-    # What exact evaluation reads, for arrays of any E.
-
-    def on(self, n: int, rows: npt.NDArray[Any], cells: npt.NDArray[Any]) -> Array:
-        """`[E]` probability that sensor `cells` `[E]` is on, n misses after the target was located in `rows` `[E]`."""
-        if self.sets is None:
-            assert self.probability is not None
-            return np.full(len(rows), self.probability)
-        # Entry (row r, column j) of the table has the number r * M + j; the numbers of those stored are in order.
-        # With M = 4 and t_max = 1: located in 2, after 1 miss, sensor 3 is entry (2 * 2 + 1) * 4 + 3 = 23.
-        wanted = (np.asarray(rows, dtype=np.int64) * self.task.num_choices + n) * self.task.num_cells + cells
-        place = np.searchsorted(self._entries, wanted)
-        found: BoolArray = self._entries[place] == wanted
-        if self.deterministic:
-            return found.astype(np.float64)
-        return np.where(found, np.append(self.sets.data, 0.0)[place], 0.0)
-
-    def spent(self, n: int, price: Array) -> Array:
-        """`[M]` expected price of the sensors on, n misses after each located cell; `price` `[M]` is per sensor."""
-        if self.sets is None:
-            assert self.probability is not None
-            return np.full(self.task.num_cells, self.probability * price.sum())
-        rows = self.sets[n :: self.task.num_choices]
-        return rows.astype(np.float64) @ price
-
-    @cached_property
-    def _entries(self) -> npt.NDArray[np.int64]:
-        """`[nnz + 1]` numbers of the entries stored, in order; after them one that is larger than any."""
-        assert self.sets is not None
-        row = np.repeat(np.arange(self.sets.shape[0], dtype=np.int64), np.diff(self.sets.indptr))
-        return np.append(row * self.task.num_cells + self.sets.indices, np.iinfo(np.int64).max)
-
-    def dense(self) -> BoolArray:
-        """`[M, t_max + 1, M]`, the sets of a deterministic policy; M² (t_max + 1) bytes, so for small worlds alone.
-
-        Raises:
-            UserError: the policy draws its sets.
-        """
-        if not self.deterministic:
-            raise UserError("policy: draws its sets at random, so that there is no table of them")
-        shape = (self.task.num_cells, self.task.num_choices, self.task.num_cells)
-        if self.sets is None:
-            return np.full(shape, self.probability == 1.0)
-        return self.sets.toarray().reshape(shape)
-
-    def as_lists(self) -> dict[str, Any]:
-        """Plain lists, as `sets.json` has them: for each located cell the sensed cells at n = 0 ... t_max."""
-        m, choices = self.task.num_cells, self.task.num_choices
-        if self.sets is None:
-            each = list(range(m)) if self.probability == 1.0 else []
-            return {"t_max": self.task.t_max, "sets": {str(cell): [each] * choices for cell in range(m)}}
-        lists = [part.tolist() for part in np.split(self.sets.indices, self.sets.indptr[1:-1])]
-        sets = {str(cell): lists[cell * choices : (cell + 1) * choices] for cell in range(m)}
-        return {"t_max": self.task.t_max, "sets": sets}
 
     # Acting.
 
@@ -254,6 +175,8 @@ def as_policy(task: Task, policy: PolicyLike, *, device: torch.device | str | No
             theirs, ours = (f"{each.num_cells} cells, t_max {each.t_max}" for each in (policy.task, task))
             raise UserError(f"policy: made for {theirs}; expected {ours}")
         return policy
+    if isinstance(policy, PolicyTable):
+        return as_policy(task, Policy(policy.task, policy.sets, probability=policy.probability))
     if isinstance(policy, TensorDictModuleBase):
         weights = itertools.chain(policy.parameters(), policy.buffers())
         first = next(weights, None)
@@ -262,22 +185,3 @@ def as_policy(task: Task, policy: PolicyLike, *, device: torch.device | str | No
     if callable(policy):
         return Policy.from_function(task, policy, device=device or "cpu")
     raise UserError(f"policy: expected a Policy, a TensorDict module or a function, got {type(policy).__name__}")
-
-
-def _checked(task: Task, sets: sparse.csr_array) -> sparse.csr_array:
-    """The sets in canonical form: sorted, no entries of zero, bool where all entries are 0 or 1.
-
-    Raises:
-        UserError: another shape, or entries that are no probabilities.
-    """
-    expected = (task.num_cells * task.num_choices, task.num_cells)
-    if sets.shape != expected:
-        raise UserError(f"policy: expected sets of shape {expected} (M (t_max + 1), M), got {sets.shape}")
-    sets = sparse.csr_array(sets, copy=True)
-    if sets.dtype != np.bool_:
-        if not ((sets.data >= 0) & (sets.data <= 1)).all():
-            raise UserError("policy: expected probabilities between 0 and 1")
-        sets = sets.astype(np.bool_ if np.isin(sets.data, (0, 1)).all() else np.float64)
-    sets.sum_duplicates()  # sorts the columns of each row as well
-    sets.eliminate_zeros()
-    return sets

@@ -1,0 +1,136 @@
+"""What a policy does in every state, as a table: the part of a policy that planning and exact evaluation need.
+
+It loads without torch, so that solving a world from the command line does not wait for it; `Policy` adds the acting.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+from trackmdp.errors import UserError
+from trackmdp.world.model import Array, BoolArray, Task
+
+__all__ = ["PolicyTable"]
+
+
+class PolicyTable:
+    """Which sensors are on n misses after the target was located in x: the open-loop plan of every located cell.
+
+    Args:
+        task: grid, costs and limits.
+        sets: `[M * (t_max + 1), M]` sparse; row `x * (t_max + 1) + n` is the set at n misses after locating the target
+            in x. Bool entries are sensors on; entries in (0, 1] are the probabilities of switching them on,
+            independently of each other and of the history.
+        probability: the same for every sensor in every state, instead of `sets`.
+
+    Attributes:
+        deterministic: whether the policy is the same function of the state each time.
+
+    Raises:
+        UserError: the shape is not that of the task's states, or an entry is no probability.
+    """
+
+    def __init__(self, task: Task, sets: sparse.csr_array | None = None, *, probability: float | None = None) -> None:
+        if (sets is None) == (probability is None):
+            raise UserError("policy: expected either sets or one probability for all sensors")
+        if probability is not None and not 0.0 <= probability <= 1.0:
+            raise UserError(f"policy: expected a probability between 0 and 1, got {probability}")
+        self.task, self.probability = task.task, probability
+        self.sets = None if sets is None else _checked(task, sets)
+        self.deterministic = probability in (0.0, 1.0) if self.sets is None else self.sets.dtype == np.bool_
+
+    @classmethod
+    def all_on(cls, task: Task) -> Self:
+        """Every sensor on at every step."""
+        return cls(task, probability=1.0)
+
+    @classmethod
+    def none(cls, task: Task) -> Self:
+        """No sensor ever on: the target is located by the safe action alone."""
+        return cls(task, probability=0.0)
+
+    @classmethod
+    def from_dense(cls, task: Task, table: npt.NDArray[np.generic]) -> Self:
+        """A policy from `[M, t_max + 1, M]`, bool or probabilities."""
+        expected = (task.num_cells, task.num_choices, task.num_cells)
+        if table.shape != expected:
+            raise UserError(f"policy: expected shape {expected} (M, t_max + 1, M), got {table.shape}")
+        return cls(task, sparse.csr_array(np.ascontiguousarray(table).reshape(-1, task.num_cells)))
+
+    # What exact evaluation reads, for arrays of any E.
+
+    def on(self, n: int, rows: npt.NDArray[Any], cells: npt.NDArray[Any]) -> Array:
+        """`[E]` probability that sensor `cells` `[E]` is on, n misses after the target was located in `rows` `[E]`."""
+        if self.sets is None:
+            assert self.probability is not None
+            return np.full(len(rows), self.probability)
+        # Entry (row r, column j) of the table has the number r * M + j; the numbers of those stored are in order.
+        # With M = 4 and t_max = 1: located in 2, after 1 miss, sensor 3 is entry (2 * 2 + 1) * 4 + 3 = 23.
+        wanted = (np.asarray(rows, dtype=np.int64) * self.task.num_choices + n) * self.task.num_cells + cells
+        place = np.searchsorted(self._entries, wanted)
+        found: BoolArray = self._entries[place] == wanted
+        if self.deterministic:
+            return found.astype(np.float64)
+        return np.where(found, np.append(self.sets.data, 0.0)[place], 0.0)
+
+    def spent(self, n: int, price: Array) -> Array:
+        """`[M]` expected price of the sensors on, n misses after each located cell; `price` `[M]` is per sensor."""
+        if self.sets is None:
+            assert self.probability is not None
+            return np.full(self.task.num_cells, self.probability * price.sum())
+        rows = self.sets[n :: self.task.num_choices]
+        return rows.astype(np.float64) @ price
+
+    @cached_property
+    def _entries(self) -> npt.NDArray[np.int64]:
+        """`[nnz + 1]` numbers of the entries stored, in order; after them one that is larger than any."""
+        assert self.sets is not None
+        row = np.repeat(np.arange(self.sets.shape[0], dtype=np.int64), np.diff(self.sets.indptr))
+        return np.append(row * self.task.num_cells + self.sets.indices, np.iinfo(np.int64).max)
+
+    def dense(self) -> BoolArray:
+        """`[M, t_max + 1, M]`, the sets of a deterministic policy; M² (t_max + 1) bytes, so for small worlds alone.
+
+        Raises:
+            UserError: the policy draws its sets.
+        """
+        if not self.deterministic:
+            raise UserError("policy: draws its sets at random, so that there is no table of them")
+        shape = (self.task.num_cells, self.task.num_choices, self.task.num_cells)
+        if self.sets is None:
+            return np.full(shape, self.probability == 1.0)
+        return self.sets.toarray().reshape(shape)
+
+    def as_lists(self) -> dict[str, Any]:
+        """Plain lists, as `sets.json` has them: for each located cell the sensed cells at n = 0 ... t_max."""
+        m, choices = self.task.num_cells, self.task.num_choices
+        if self.sets is None:
+            each = list(range(m)) if self.probability == 1.0 else []
+            return {"t_max": self.task.t_max, "sets": {str(cell): [each] * choices for cell in range(m)}}
+        lists = [part.tolist() for part in np.split(self.sets.indices, self.sets.indptr[1:-1])]
+        sets = {str(cell): lists[cell * choices : (cell + 1) * choices] for cell in range(m)}
+        return {"t_max": self.task.t_max, "sets": sets}
+
+
+def _checked(task: Task, sets: sparse.csr_array) -> sparse.csr_array:
+    """The sets in canonical form: sorted, no entries of zero, bool where all entries are 0 or 1.
+
+    Raises:
+        UserError: another shape, or entries that are no probabilities.
+    """
+    expected = (task.num_cells * task.num_choices, task.num_cells)
+    if sets.shape != expected:
+        raise UserError(f"policy: expected sets of shape {expected} (M (t_max + 1), M), got {sets.shape}")
+    sets = sparse.csr_array(sets, copy=True)
+    if sets.dtype != np.bool_:
+        if not ((sets.data >= 0) & (sets.data <= 1)).all():
+            raise UserError("policy: expected probabilities between 0 and 1")
+        sets = sets.astype(np.bool_ if np.isin(sets.data, (0, 1)).all() else np.float64)
+    sets.sum_duplicates()  # sorts the columns of each row as well
+    sets.eliminate_zeros()
+    return sets
