@@ -13,7 +13,7 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 
 # config, world, policy, collector, loss, trainer, checkpoint and log, replay and report; build and the commands on top
 ARROW = [
-    ["trackmdp", "trackmdp.errors", "trackmdp.seeding", "trackmdp.durable"],
+    ["trackmdp", "trackmdp.errors", "trackmdp.seeding", "trackmdp.durable", "trackmdp.untrusted", "trackmdp.arrays"],
     ["trackmdp.config"],
     ["trackmdp.world"],
     ["trackmdp.policies", "trackmdp.solvers"],

@@ -1,40 +1,153 @@
-"""Files that are whole or absent, whatever happens while they are written."""
+"""Files that are whole or absent, whatever happens while they are written, and that never lead out of their folder.
+
+What a file system lacks is done without where that is safe, and said once: no hard links (exFAT, many network and FUSE
+mounts): a copy; no `fsync`: a power failure may then cost what was saved last, never what was saved before.
+"""
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
+import shutil
+import stat
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
-__all__ = ["sync_folder", "whole_file", "write_bytes", "write_json", "write_text"]
+from trackmdp.errors import UserError
+from trackmdp.untrusted import printable, sealed
+
+__all__ = [
+    "UNSUPPORTED",
+    "create",
+    "own_folder",
+    "reopen",
+    "say_lacking",
+    "second_name",
+    "sync",
+    "sync_folder",
+    "whole_file",
+    "write_bytes",
+    "write_json",
+    "write_sealed",
+    "write_text",
+]
+
+UNSUPPORTED = (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOLCK)
+"""What a file system answers to a call that it does not know. EIO and ENOSPC are failures, and stay so."""
+
+_NO_LINKS = (*UNSUPPORTED, errno.EPERM, errno.EXDEV, errno.EMLINK)
+_said: set[str] = set()
 
 
 @contextmanager
 def whole_file(file: Path) -> Iterator[BinaryIO]:
-    """Write to `file`, which appears under its name only once its bytes are on the disk; a failure leaves no trace."""
+    """Write to `file`, which appears under its name only once its bytes are on the disk; a failure leaves no trace.
+
+    Where `file` is a symbolic link, the link is replaced, and what it leads to stays as it is.
+    """
     part = file.with_name(f"{file.name}.part")
     try:
-        with part.open("wb") as stream:
+        with create(part) as stream:
             yield stream
-            stream.flush()
-            os.fsync(stream.fileno())
+            sync(stream, part)
         part.replace(file)
     except BaseException:
         part.unlink(missing_ok=True)
         raise
 
 
+def create(file: Path) -> BinaryIO:
+    """A new file, open for writing; whatever had its name, a link included, is removed first, not followed."""
+    file.unlink(missing_ok=True)
+    return os.fdopen(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666), "wb")
+
+
+def reopen(file: Path, mode: str) -> int:
+    """A descriptor of a file that is written in place, made if it is missing: `r+` keeps its content, `w` empties it.
+
+    Raises:
+        UserError: it is a symbolic link, which may lead out of the folder, or no ordinary file.
+    """
+    try:
+        descriptor = os.open(file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
+    except OSError as error:
+        if error.errno in (errno.ELOOP, errno.EISDIR, errno.ENXIO):
+            raise UserError(f"{file}: a link, a folder or a device, expected an ordinary file") from None
+        raise
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise UserError(f"{file}: a pipe or a device, expected an ordinary file")
+    if mode == "w":
+        os.ftruncate(descriptor, 0)
+    return descriptor
+
+
+def own_folder(folder: Path) -> None:
+    """Make a folder inside that of a run, unless it is there.
+
+    Raises:
+        UserError: its name is that of a link or of a file: what is written to it, and what is cleared away in it, would
+            be somebody else's.
+    """
+    if not folder.is_symlink():
+        try:
+            folder.mkdir(exist_ok=True)
+            return
+        except FileExistsError:
+            pass
+    raise UserError(f"{folder}: a link or a file, expected a folder of the run's own")
+
+
+def second_name(file: Path, name: Path) -> None:
+    """Give `file` another name as well, replacing what had it; where there are no hard links, by a copy."""
+    part = name.with_suffix(".part")
+    part.unlink(missing_ok=True)
+    try:
+        os.link(file, part)
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise
+        say_lacking(file.parent, "hard links", "best.pt and last.pt are copies")
+        with whole_file(name) as stream, file.open("rb") as source:
+            shutil.copyfileobj(source, stream)
+        return
+    part.replace(name)
+
+
+def sync(stream: BinaryIO, file: Path) -> None:
+    """Put the bytes written to `file` on the disk."""
+    stream.flush()
+    _fsync(stream.fileno(), file.parent)
+
+
 def sync_folder(folder: Path) -> None:
     """Make renames in `folder` survive a power failure."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
-        os.fsync(descriptor)
+        _fsync(descriptor, folder)
     finally:
         os.close(descriptor)
+
+
+def _fsync(descriptor: int, folder: Path) -> None:
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in UNSUPPORTED:
+            raise
+        say_lacking(folder, "fsync", "a power failure may cost what was saved last")
+
+
+def say_lacking(folder: Path, what: str, instead: str) -> None:
+    """Tell the user, once, what the file system does without."""
+    if what not in _said:
+        _said.add(what)
+        sys.stderr.write(printable(f"{folder}: the file system has no {what}; {instead}\n"))
 
 
 def write_text(file: Path, text: str) -> None:
@@ -51,6 +164,11 @@ def write_bytes(file: Path, content: bytes) -> None:
 def write_json(file: Path, content: Mapping[str, Any]) -> None:
     """Write JSON whole or not at all; a number that is not finite is written as null."""
     write_text(file, json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
+
+
+def write_sealed(file: Path, content: Mapping[str, Any]) -> None:
+    """Write JSON with a digest of itself, whole or not at all; see `untrusted.sealed`."""
+    write_json(file, sealed(_finite(content)))
 
 
 def _finite(content: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import io
 import os
@@ -9,6 +10,7 @@ import pickle
 import random
 import re
 import resource
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -116,7 +118,7 @@ def test_code_in_a_checkpoint_is_not_run(tmp_path: Path) -> None:
     torch.save({"format": checkpoint.FORMAT, "evil": Doctored(marker)}, zipped)
     for payload in (zipped.getvalue(), pickle.dumps(Doctored(marker)), b"", b"\x80\x02."):
         file.write_bytes(sealed(payload))
-        with pytest.raises(UserError, match="cannot be read"):
+        with pytest.raises(UserError, match="not a checkpoint that can be read"):
             checkpoint.load(file)
         assert not marker.exists()
     pickle.loads(pickle.dumps(Doctored(marker)))  # noqa: S301  it does run when it is unpickled
@@ -198,3 +200,67 @@ def test_what_a_killed_save_left_is_cleared_away(tmp_path: Path) -> None:
     (tmp_path / "iteration-00000009.part").write_bytes(b"half")
     checkpoint.save(tmp_path, 10, state(), keep=2)
     assert names(tmp_path) == ["iteration-00000010.pt", "last.pt"]
+
+
+def archived(content: bytes, method: int) -> bytes:
+    """The members of a checkpoint's archive, packed anew, and a gigabyte of zeros where they are compressed."""
+    packed = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(content)) as old, zipfile.ZipFile(packed, "w", method) as new:
+        for member in old.infolist():
+            new.writestr(member, old.read(member), method)
+        if method == zipfile.ZIP_DEFLATED:
+            with new.open("archive/data/bomb", "w", force_zip64=True) as stream:
+                for _ in range(64):
+                    stream.write(bytes(2**20))
+    return packed.getvalue()
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
+def test_an_archive_that_unfolds_is_refused(tmp_path: Path, method: int) -> None:
+    file = checkpoint.save(tmp_path, 1, state(), keep=1)
+    file.write_bytes(sealed(archived(file.read_bytes()[:-128], method)))
+    if method == zipfile.ZIP_STORED:
+        assert checkpoint.load(file)["counter"] == 0
+        return
+    with pytest.raises(UserError, match="a compressed archive"):
+        checkpoint.load(file)
+
+
+def test_what_is_no_ordinary_file_is_neither_read_nor_removed(tmp_path: Path) -> None:
+    mine = checkpoint.save(tmp_path, 1, state(1), keep=1)
+    (tmp_path / "iteration-00000007.pt").mkdir()
+    os.mkfifo(tmp_path / "iteration-00000008.pt")
+    (tmp_path / "iteration-00000009.pt").symlink_to(mine)
+    assert checkpoint.available(tmp_path) == [mine]
+    newer = checkpoint.save(tmp_path, 2, state(2), keep=1)
+    assert checkpoint.available(tmp_path) == [newer]
+    for number, kind in ((7, "a folder"), (8, "a pipe"), (9, "a symbolic link")):
+        with pytest.raises(UserError, match=f"iteration-0000000{number}.pt: {kind}"):
+            checkpoint.load(tmp_path / f"iteration-0000000{number}.pt")
+
+
+def test_a_folder_of_checkpoints_that_is_a_link_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "theirs").mkdir()
+    (tmp_path / "theirs/notes.part").write_text("mine")
+    (tmp_path / "checkpoints").symlink_to(tmp_path / "theirs")
+    with pytest.raises(UserError, match="a link or a file, expected a folder of the run's own"):
+        checkpoint.save(tmp_path / "checkpoints", 1, state(), keep=1)
+    assert names(tmp_path / "theirs") == ["notes.part"]
+
+
+def test_without_hard_links_the_names_are_copies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*args: Any) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", refused)
+    for iteration in (1, 2, 3):
+        checkpoint.save(tmp_path, iteration, state(iteration), keep=1, best=iteration == 2)
+    assert names(tmp_path) == ["best.pt", "iteration-00000003.pt", "last.pt"]
+    assert [checkpoint.load(tmp_path / name)["counter"] for name in (checkpoint.BEST, checkpoint.LAST)] == [2, 3]
+
+
+def test_a_run_killed_between_two_names_gets_them_when_it_resumes(tmp_path: Path) -> None:
+    checkpoint.save(tmp_path, 1, state(1), keep=2, best=True)
+    file = checkpoint.save(tmp_path, 2, state(2), keep=2)
+    checkpoint.point(file, best=True)
+    assert [checkpoint.load(tmp_path / name)["counter"] for name in (checkpoint.BEST, checkpoint.LAST)] == [2, 2]

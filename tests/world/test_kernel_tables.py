@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import pickle
 import zipfile
 from collections.abc import Callable
@@ -66,7 +67,12 @@ def _broken_member(file: Path) -> None:
 
 UNREADABLE: dict[str, tuple[str, Callable[[Path], Any], str]] = {
     "missing": ("k.npy", lambda file: None, "no such file"),
-    "folder": ("k.npy", lambda file: file.mkdir(), "no such file"),
+    "folder": ("k.npy", lambda file: file.mkdir(), "a folder, expected an ordinary file"),
+    "pipe": ("k.npy", os.mkfifo, "a pipe, expected an ordinary file"),
+    "claims": ("k.npy", lambda file: _claim(file, "(1000000000000,)"), "claims 8,000,000,000,000 bytes of numbers"),
+    "claims, packed": ("k.npz", lambda file: _bomb(file), "that unfold to"),
+    "sparse": ("k.csv", lambda file: _sparse(file, 2**29), "not text"),
+    "too long": ("k.csv", lambda file: _sparse(file, 2**31), "expected at most"),
     "suffix": ("k.txt", lambda file: file.write_text("1"), "expected a .npy, .npz or .csv file"),
     "garbage": ("k.npy", lambda file: file.write_bytes(b"garbage"), "not a table of numbers"),
     "empty": ("k.npy", lambda file: file.touch(), "not a table of numbers"),
@@ -85,6 +91,22 @@ UNREADABLE: dict[str, tuple[str, Callable[[Path], Any], str]] = {
     "no rows": ("k.csv", lambda file: file.touch(), "not a table of numbers"),
     "bytes": ("k.csv", lambda file: file.write_bytes(b"\xff\xfe\x00"), "not a table of numbers"),
 }
+
+
+def _claim(file: Path, shape: str) -> None:
+    head = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}".encode().ljust(117) + b"\n"
+    file.write_bytes(b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head + bytes(64))
+
+
+def _bomb(file: Path) -> None:
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("kernel.npy", "w") as stream:
+        for _ in range(96):
+            stream.write(bytes(2**20))
+
+
+def _sparse(file: Path, size: int) -> None:
+    with file.open("wb") as stream:
+        stream.truncate(size)
 
 
 def _as_npy(file: Path) -> None:

@@ -9,22 +9,25 @@ import hashlib
 import os
 import pickle
 import re
+import stat
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any, BinaryIO, cast
 
 import torch
 
-from trackmdp.durable import sync_folder, whole_file
+from trackmdp.durable import own_folder, second_name, sync_folder, whole_file
 from trackmdp.errors import UserError
+from trackmdp.untrusted import decoded, opened
 
-__all__ = ["BEST", "FORMAT", "LAST", "available", "load", "newest", "save"]
+__all__ = ["BEST", "FORMAT", "LAST", "available", "load", "newest", "point", "save"]
 
 FORMAT = 3
 BEST, LAST = "best.pt", "last.pt"
 _SEAL = 128
-_SMALL = 2**20
-_NAME = re.compile(r"iteration-(\d+)\.pt")
+_SMALL, _LARGEST = 2**20, 2**38
+_NAME = re.compile(r"iteration-\d{8}\.pt")
 
 
 def save(folder: Path, iteration: int, state: dict[str, Any], *, keep: int, best: bool = False) -> Path:
@@ -32,7 +35,7 @@ def save(folder: Path, iteration: int, state: dict[str, Any], *, keep: int, best
 
     The file appears under its name only once its bytes are on the disk; a failure leaves the older ones as they were.
     """
-    folder.mkdir(exist_ok=True)
+    own_folder(folder)
     for left in folder.glob("*.part"):  # of a process that was killed while it saved
         left.unlink()
     file = folder / f"iteration-{iteration:08d}.pt"
@@ -40,12 +43,20 @@ def save(folder: Path, iteration: int, state: dict[str, Any], *, keep: int, best
         hashed = _Hashed(stream)
         hashed.save({"format": FORMAT, "iteration": iteration, **state})
         stream.write(_seal(hashed.digest.hexdigest()))
-    for name in (LAST, BEST) if best else (LAST,):
-        _link(file, folder / name)
-    sync_folder(folder)
+    point(file, best=best)
     for old in _numbered(folder)[:-keep]:
         old.unlink()
     return file
+
+
+def point(file: Path, *, best: bool) -> None:
+    """Let last.pt, and best.pt too if `best`, be this checkpoint.
+
+    A run that resumes from `file` calls it as well: the process that wrote it may have been killed just before.
+    """
+    for name in (LAST, BEST) if best else (LAST,):
+        second_name(file, file.with_name(name))
+    sync_folder(file.parent)
 
 
 def available(folder: Path) -> list[Path]:
@@ -73,19 +84,15 @@ def load(file: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
     Raises:
         UserError: the file is missing, damaged, foreign, or of another format.
     """
-    try:
-        with file.open("rb") as stream:
-            _check(file, stream)
-        state = torch.load(str(file), map_location=device, mmap=True, weights_only=True)
-    except FileNotFoundError:
-        raise UserError(f"{file}: no such file") from None
-    except (RuntimeError, EOFError, OSError, ValueError, KeyError, pickle.UnpicklingError) as error:
-        if isinstance(error, UserError):
-            raise
-        raise UserError(f"{file}: a checkpoint that cannot be read ({type(error).__name__})") from error
-    if not isinstance(state, dict) or state.get("format") != FORMAT:
-        raise UserError(f"{file}: not the state of a run")
-    _take_out(state)
+    with opened(file, most=_LARGEST) as stream, decoded(str(file), "a checkpoint that can be read"):
+        _check_archive(stream, _check(file, stream))
+        try:
+            state = torch.load(str(file), map_location=device, mmap=True, weights_only=True)
+        except pickle.UnpicklingError as error:  # torch advises to switch weights_only off
+            raise ValueError("it holds more than tensors and plain values") from error
+        if not isinstance(state, dict) or type(state.get("format")) is not int or state["format"] != FORMAT:
+            raise UserError(f"{file}: not the state of a run")
+        _take_out(state)
     return state
 
 
@@ -128,8 +135,9 @@ def _seal(digest: str) -> bytes:
     return f"\ntrackmdp checkpoint {FORMAT} sha256 {digest}".encode().ljust(_SEAL - 1) + b"\n"
 
 
-def _check(file: Path, stream: BinaryIO) -> None:
-    size = max(stream.seek(0, os.SEEK_END) - _SEAL, 0)
+def _check(file: Path, stream: BinaryIO) -> int:
+    """The bytes before the seal, once their hash is the one that it names."""
+    size = left = max(stream.seek(0, os.SEEK_END) - _SEAL, 0)
     stream.seek(size)
     found = re.fullmatch(rb"\ntrackmdp checkpoint (\d+) sha256 ([0-9a-f]{64}) *\n", stream.read())
     if found is None:
@@ -138,20 +146,26 @@ def _check(file: Path, stream: BinaryIO) -> None:
         raise UserError(f"{file}: checkpoint format {int(found[1])}, expected {FORMAT}")
     stream.seek(0)
     digest = hashlib.sha256()
-    while size:
-        piece = stream.read(min(size, 2**20))
+    while left:
+        piece = stream.read(min(left, 2**20))
         digest.update(piece)
-        size -= len(piece)
+        left -= len(piece)
     if digest.hexdigest() != found[2].decode():
         raise UserError(f"{file}: damaged, its content does not match its hash")
+    return size
+
+
+def _check_archive(stream: BinaryIO, size: int) -> None:
+    """See that the archive holds no more than its own bytes: `torch.load` would unfold a deflated one of any size."""
+    with zipfile.ZipFile(stream) as archive:
+        members = archive.infolist()
+    if any(member.compress_type != zipfile.ZIP_STORED for member in members):
+        raise ValueError("a compressed archive")
+    if sum(member.file_size for member in members) > size:
+        raise ValueError("an archive that claims more bytes than it has")
 
 
 def _numbered(folder: Path) -> list[Path]:
-    return sorted(file for file in folder.glob("iteration-*.pt") if _NAME.fullmatch(file.name))
-
-
-def _link(file: Path, name: Path) -> None:
-    """Give `file` a second name, replacing what had it."""
-    part = name.with_suffix(".part")
-    os.link(file, part)
-    part.replace(name)
+    """The checkpoints, the oldest first; what is no ordinary file is somebody else's, not to be read or removed."""
+    found = [file for file in folder.glob("iteration-*.pt") if _NAME.fullmatch(file.name)]
+    return sorted(file for file in found if stat.S_ISREG(file.lstat().st_mode))

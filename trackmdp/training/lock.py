@@ -2,47 +2,161 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
+import json
 import os
+import secrets
+import socket
+import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO
+from typing import Any
 
+from trackmdp.durable import UNSUPPORTED, create, reopen, say_lacking
 from trackmdp.errors import UserError
+from trackmdp.untrusted import opened, read_object
 
-__all__ = ["locked"]
+__all__ = ["is_locked", "locked"]
 
 _TRIES, _BETWEEN = 5, 0.05
+_LOCK, _OWNER = ".lock", ".lock.owner"
+_BEAT, _SILENT = 5.0, 60.0
+"""Seconds between two signs of life of an owner, and without one after which it counts as gone."""
+
+_SETTLE = 0.2
 
 
 @contextmanager
 def locked(folder: Path, key: str = "hydra.run.dir") -> Iterator[None]:
     """Hold the folder that was chosen by `key`; the system lets go of it when the process ends, however it ends.
 
-    Where nothing else was written, the lock's file is gone afterwards as well.
+    Where the file system has no locks, a file names the owner and is touched every few seconds. Where nothing else was
+    written, the lock's files are gone afterwards as well.
 
     Raises:
-        UserError: another process holds it.
+        UserError: another process holds it, or the lock is no ordinary file.
     """
-    file = folder / ".lock"
-    with file.open("w") as stream:
-        if not _take(stream, file):
+    file = folder / _LOCK
+    descriptor = reopen(file, "r+")
+    try:
+        taken = _take(descriptor, file)
+        if taken is False:
             raise UserError(f"{key}={folder}: another process is running in this folder")
         try:
-            yield
+            if taken:
+                yield
+            else:
+                with _owned(folder, key):
+                    yield
         finally:
             if folder.is_dir() and [each.name for each in folder.iterdir()] == [file.name]:
                 file.unlink()
+    finally:
+        os.close(descriptor)
 
 
-def _take(stream: IO[str], file: Path) -> bool:
-    """Whether the lock could be had; who only looks whether it is held does so for an instant."""
+def is_locked(folder: Path) -> bool:
+    """Whether a process is running in the folder, as far as its lock tells."""
+    try:
+        with opened(folder / _LOCK, most=2**20) as stream:
+            fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError as error:
+        return error.errno in UNSUPPORTED and _is_alive(folder / _OWNER)
+    except UserError:
+        return False
+    return False
+
+
+def _take(descriptor: int, file: Path) -> bool | None:
+    """Whether the lock could be had, None where there are no locks; who only looks at it holds it for an instant."""
     for _ in range(_TRIES):
         try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return os.fstat(stream.fileno()).st_ino == file.stat().st_ino  # not one that was just removed
-        except OSError:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return os.fstat(descriptor).st_ino == file.stat().st_ino  # not one that was just removed
+        except OSError as error:
+            if error.errno in UNSUPPORTED:
+                return None
+            if error.errno not in (errno.EAGAIN, errno.EACCES, errno.EINTR, errno.ENOENT):
+                raise
             time.sleep(_BETWEEN)
     return False
+
+
+@contextmanager
+def _owned(folder: Path, key: str) -> Iterator[None]:
+    """Hold the folder by a file that says who does, touched every `_BEAT` seconds."""
+    say_lacking(folder, "locks", f"{_OWNER} names the process that runs in it")
+    file, token = folder / _OWNER, secrets.token_hex(8)
+    if _is_alive(file):
+        raise UserError(f"{key}={folder}: another process is running in this folder{_who(file)}")
+    # Of two that both find a dead owner's file, each may remove the other's new one. So the one whose file is still
+    # there a moment later has the folder.
+    with suppress(FileExistsError), create(file) as stream:
+        stream.write(json.dumps({"token": token, "host": socket.gethostname(), "pid": os.getpid()}).encode())
+    time.sleep(_SETTLE)
+    if _said(file).get("token") != token:
+        raise UserError(f"{key}={folder}: another process is running in this folder{_who(file)}")
+    over = threading.Event()
+    beat = threading.Thread(target=_beat, args=(file, over), daemon=True)
+    beat.start()
+    try:
+        yield
+    finally:
+        over.set()
+        beat.join()
+        if _said(file).get("token") == token:
+            file.unlink(missing_ok=True)
+
+
+def _beat(file: Path, over: threading.Event) -> None:
+    while not over.wait(_BEAT):
+        with suppress(OSError):  # the folder may have been removed; the run finds that out by itself
+            os.utime(file)
+
+
+def _is_alive(file: Path) -> bool:
+    """Whether the owner that the file names has given a sign of life.
+
+    On this host the process is asked for. Elsewhere the file's age counts, by the clock of its own file system: that of
+    this host may be off.
+    """
+    said = _said(file)
+    if not said:
+        return False
+    if said.get("host") == socket.gethostname() and isinstance(said.get("pid"), int):
+        return _runs(said["pid"])
+    now = file.with_name(f"{_OWNER}.{secrets.token_hex(4)}")
+    try:
+        with create(now):
+            return now.stat().st_mtime - file.stat().st_mtime < _SILENT
+    except OSError:
+        return True  # a folder that cannot be written to: better refused than shared
+    finally:
+        now.unlink(missing_ok=True)
+
+
+def _runs(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except PermissionError:
+        return True
+    except (OSError, OverflowError):
+        return False
+    return True
+
+
+def _said(file: Path) -> dict[str, Any]:
+    try:
+        return read_object(file, most=2**12)
+    except UserError:
+        return {}
+
+
+def _who(file: Path) -> str:
+    said = _said(file)
+    return f" (process {said.get('pid')} on {said.get('host')})" if said else ""

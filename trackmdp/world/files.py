@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import os
 import warnings
-import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,10 +12,15 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from trackmdp.arrays import LARGE, load_npy, load_npz, size_of
 from trackmdp.errors import UserError
+from trackmdp.untrusted import decoded, opened
 from trackmdp.world.model import Array
 
 __all__ = ["read_columns", "read_numbers"]
+
+_LONGEST_TEXT, _LONGEST_HEAD = 2**30, 2**16
+"""Bytes of the longest .csv file, a recording of some eighty million steps, and of its first line."""
 
 
 def read_numbers(key: str, path: str | Path, *, name: str) -> Array:
@@ -41,7 +46,7 @@ def read_columns(key: str, path: str | Path) -> dict[str, Array]:
     if suffix not in (".csv", ".npz"):
         raise UserError(f"{source}: expected a .csv or .npz file")
     with _opened(source, Path(path)) as stream:
-        columns = _csv_columns(stream) if suffix == ".csv" else _npz_columns(stream)
+        columns = _csv_columns(stream) if suffix == ".csv" else load_npz(stream)
     for name, column in columns.items():
         if column.dtype.kind not in "iuf" or column.ndim != 1:
             raise UserError(f"{source}: {name} is not a column of numbers (but {column.dtype}, shape {column.shape})")
@@ -54,45 +59,56 @@ def read_columns(key: str, path: str | Path) -> dict[str, Array]:
 @contextmanager
 def _opened(source: str, file: Path) -> Iterator[BinaryIO]:
     """The file, open; what goes wrong with it ends in one line that begins with `source`."""
-    if not file.is_file():
-        raise UserError(f"{source}: no such file")
-    try:
-        with warnings.catch_warnings(action="error"), file.open("rb") as stream:  # numpy only warns of an empty .csv
-            yield stream
-    except UserError:
-        raise
-    except (OSError, ValueError, TypeError, EOFError, KeyError, UserWarning, zipfile.BadZipFile) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise UserError(f"{source}: not a table of numbers ({reason})") from error
+    most = _LONGEST_TEXT if file.suffix == ".csv" else LARGE
+    with (
+        # The user named this very file, so it may be a link: data sets on a cluster often are.
+        opened(file, most=most, source=source, links=True) as stream,
+        decoded(source, "a table of numbers"),
+        warnings.catch_warnings(action="error"),  # numpy only warns of an empty .csv
+    ):
+        yield stream
 
 
 def _csv_columns(stream: BinaryIO) -> dict[str, np.ndarray]:
-    names = [name.strip() for name in stream.readline().decode("utf-8-sig").split(",")]
+    names = [name.strip() for name in _first_line(stream).decode("utf-8-sig").split(",")]
     if len(set(names)) < len(names):
-        raise ValueError(f"two columns of one name in {','.join(names)}")
+        raise ValueError(f"two columns of one name in {','.join(names)[:80]}")
     if not stream.read(1):
         return {name: np.zeros(0) for name in names}
     stream.seek(-1, os.SEEK_CUR)
-    table = np.loadtxt(stream, delimiter=",", ndmin=2, comments=None)
+    table = _csv(stream, comments=None)
     if table.shape[1] != len(names):
         raise ValueError(f"{len(names)} names in the first line, but {table.shape[1]} columns")
     return dict(zip(names, table.T, strict=True))
 
 
-def _npz_columns(stream: BinaryIO) -> dict[str, np.ndarray]:
-    with np.load(stream, allow_pickle=False) as archive:
-        return {name: archive[name] for name in archive.files}
+def _first_line(stream: BinaryIO) -> bytes:
+    line = stream.readline(_LONGEST_HEAD)
+    if len(line) == _LONGEST_HEAD:
+        raise ValueError(f"a first line of more than {_LONGEST_HEAD:,} bytes")
+    return line
+
+
+def _csv(stream: BinaryIO, comments: str | None = "#") -> Array:
+    """The numbers of the lines that are left."""
+    here = stream.tell()
+    if b"\0" in stream.read(_LONGEST_HEAD):  # a sparse file, UTF-16, a binary one: not worth gigabytes of parsing
+        raise ValueError("not text")
+    stream.seek(here)
+    text = io.TextIOWrapper(stream, encoding="utf-8-sig")
+    table: Array = np.loadtxt(text, delimiter=",", ndmin=2, comments=comments)
+    text.detach()  # else it closes the stream, which is its opener's
+    return table
 
 
 def _read(source: str, suffix: str, stream: BinaryIO, name: str) -> Any:
     if suffix == ".npy":
-        return np.load(stream, allow_pickle=False)
+        return load_npy(stream, size_of(stream))
     if suffix == ".npz":
-        with np.load(stream, allow_pickle=False) as archive:
-            names = archive.files
-            if name not in names and len(names) != 1:
-                raise UserError(f"{source}: expected one array or one called '{name}', found {names}")
-            return archive[name if name in names else names[0]]
+        arrays = load_npz(stream)
+        if name not in arrays and len(arrays) != 1:
+            raise UserError(f"{source}: expected one array or one called '{name}', found {list(arrays)[:9]}")
+        return arrays[name if name in arrays else next(iter(arrays))]
     if suffix == ".csv":
-        return np.loadtxt(stream, delimiter=",", ndmin=2)
+        return _csv(stream)
     raise UserError(f"{source}: expected a .npy, .npz or .csv file")

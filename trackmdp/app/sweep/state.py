@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +9,8 @@ from typing import Any
 
 from trackmdp.durable import write_json
 from trackmdp.errors import UserError
+from trackmdp.training.lock import is_locked
+from trackmdp.untrusted import read_object
 
 __all__ = ["DONE", "FAILED", "PLAN", "SUMMARY", "Run", "read_json", "read_plan", "run_of", "runs_of", "write_plan"]
 
@@ -66,7 +66,7 @@ def runs_of(sweep: Path) -> list[Run]:
 
 def run_of(folder: Path, overrides: tuple[str, ...] = ()) -> Run:
     """One run, as its folder shows it."""
-    if _is_locked(folder):
+    if is_locked(folder):
         return Run(folder, overrides, "running")
     for name in (SUMMARY, DONE):
         if result := read_json(folder / name):
@@ -79,19 +79,6 @@ def run_of(folder: Path, overrides: tuple[str, ...] = ()) -> Run:
 def read_json(file: Path) -> dict[str, Any]:
     """The content of a file that is whole or absent; empty where it is absent or no object."""
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return read_object(file)
+    except UserError:
         return {}
-    return content if isinstance(content, dict) else {}
-
-
-def _is_locked(folder: Path) -> bool:
-    """Whether a process is running in the folder."""
-    try:
-        with (folder / ".lock").open() as stream:
-            fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:
-        return False
-    return False

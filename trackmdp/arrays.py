@@ -1,0 +1,96 @@
+"""Arrays in `.npy` and `.npz` files that somebody else may have written: never unpickled, never larger than they claim.
+
+`numpy.load` believes a header: an `.npy` of 200 bytes that claims 10^12 numbers makes it ask for 8 TB, and an `.npz` of
+2 MB may unfold to gigabytes. Here what is claimed is held against what is there before anything is allocated.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import zipfile
+from collections.abc import Iterable
+from typing import Any, BinaryIO
+
+import numpy as np
+import numpy.typing as npt
+
+__all__ = ["LARGE", "load_npy", "load_npz", "size_of"]
+
+LARGE = 2**32
+"""Bytes of the largest table that is read: 4 GiB, once unfolded."""
+
+_MEMBERS = 256
+_HEADER = 10_000
+_FREE, _RATIO = 2**26, 300
+"""An archive may unfold to 64 MiB however small it is, and beyond that to 300 times its size. Deflate reaches 1,030 on
+zeros alone; the kernel of a 40 x 40 grid, nine entries to a row of 1,600, reaches 150."""
+
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+
+
+def size_of(stream: BinaryIO) -> int:
+    """Bytes from where the stream stands to its end; it stays where it is."""
+    here = stream.tell()
+    end = stream.seek(0, os.SEEK_END)
+    stream.seek(here)
+    return end - here
+
+
+def load_npy(stream: Any, size: int) -> npt.NDArray[Any]:
+    """The array of the next `size` bytes of `stream`, which are an `.npy` file.
+
+    Raises:
+        ValueError: they are something else, hold Python objects, or are more or fewer than their header claims.
+        Exception: whatever NumPy raises over a header; call it inside `untrusted.decoded`.
+    """
+    if np.lib.format.read_magic(stream) != (
+        1,
+        0,
+    ):  # the others have headers of up to 4 GiB, and what we read needs none
+        raise ValueError("an .npy file of another version than 1.0")
+    shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream, max_header_size=_HEADER)
+    if dtype.hasobject or dtype.kind == "V":
+        raise ValueError(f"an array of {dtype}")
+    if any(length < 0 for length in shape):
+        raise ValueError(f"a shape of {shape}")
+    claimed, left = math.prod(shape) * dtype.itemsize, size - stream.tell()
+    if claimed != left:
+        raise ValueError(f"its header claims {claimed:,} bytes of numbers, there are {left:,}")
+    content = bytearray()
+    while piece := stream.read(2**20):  # to the very end, where zipfile compares the checksum
+        content += piece
+        if len(content) > claimed:
+            raise ValueError("more bytes than its header claims")
+    if len(content) != claimed:
+        raise ValueError("fewer bytes than its header claims")
+    flat = np.frombuffer(content, dtype) if content else np.zeros(0, dtype)
+    return flat.reshape(shape, order="F" if fortran else "C")
+
+
+def load_npz(stream: BinaryIO, names: Iterable[str] | None = None) -> dict[str, npt.NDArray[Any]]:
+    """The arrays of an `.npz` file by their names, all or those of `names`.
+
+    Raises:
+        ValueError: it is damaged, oversized, encrypted or packed in an unusual way.
+        KeyError: one of `names` is missing.
+        Exception: whatever zipfile and NumPy raise over damage; call it inside `untrusted.decoded`.
+    """
+    packed = size_of(stream)
+    with zipfile.ZipFile(stream) as archive:
+        members = archive.infolist()
+        if len(members) > _MEMBERS:
+            raise ValueError(f"{len(members):,} arrays")
+        unfolded = sum(member.file_size for member in members)
+        if unfolded > min(LARGE, max(_FREE, _RATIO * packed)):
+            raise ValueError(f"{packed:,} bytes that unfold to {unfolded:,}")
+        for member in members:
+            if member.compress_type not in _METHODS or member.flag_bits & 1:
+                raise ValueError(f"{member.filename!r} is encrypted, or neither stored nor deflated")
+        known = {member.filename.removesuffix(".npy"): member for member in members}
+        return {name: _member(archive, known[name]) for name in (known if names is None else names)}
+
+
+def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> npt.NDArray[Any]:
+    with archive.open(member) as stream:
+        return load_npy(stream, member.file_size)
