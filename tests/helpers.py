@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -69,14 +70,21 @@ def hop_world(t_max: int = 1, *, safe_cost: float = 0.9) -> World:
     """A 2x2 grid: the target hops 0 -> 1 -> 2 -> 3 -> 0, staying in the grid with probability 3/4; r = 2."""
     kernel = np.zeros((4, 4))
     kernel[[0, 1, 2, 3], [1, 2, 3, 0]] = 0.75
-    return World(2, 2.0, np.array([0.1, 0.2, 0.3, 0.4]), safe_cost, t_max, kernel)
+    return World(kernel, 2, cost=np.array([0.1, 0.2, 0.3, 0.4]), safe_cost=safe_cost, t_max=t_max, reward=2.0)
 
 
-def small_world(size: int = 3, t_max: int = 1, *, exit_probability: float = 0.1, seed: int = 0) -> World:
+def small_world(
+    size: int = 3, t_max: int = 1, *, exit_probability: float = 0.1, seed: int = 0, max_steps: int | None = None
+) -> World:
     """A dense random kernel that leaves soon; the safe action costs what all sensors do."""
     m = size**2
     kernel = random_kernel(np.random.default_rng(seed), m, exit_probability)
-    return World(size, 1.0, np.full(m, 0.2), m * 0.2, t_max, kernel)
+    return World(kernel, size, cost=0.2, safe_cost=m * 0.2, t_max=t_max, max_steps=max_steps)
+
+
+def limited(problem: Any, max_steps: int | None) -> Any:
+    """The same problem, its episodes cut after so many steps."""
+    return replace(problem, max_steps=max_steps)
 
 
 def random_kernel(rng: np.random.Generator, m: int, exit_probability: float, density: float = 0.7) -> Array:
@@ -94,7 +102,9 @@ def worlds(draw: st.DrawFn) -> World:
     m = size**2
     cost = rng.random(m) if draw(st.booleans()) else np.full(m, rng.random())
     kernel = random_kernel(rng, m, draw(st.sampled_from([1e-6, 0.1, 0.5])))
-    return World(size, float(1 + rng.random()), cost, float(3 * rng.random()), t_max, kernel)
+    return World(
+        kernel, size, cost=cost, reward=float(1 + rng.random()), safe_cost=float(3 * rng.random()), t_max=t_max
+    )
 
 
 def random_state(world: World, rows: int, seed: int) -> TensorDict:
@@ -117,7 +127,7 @@ def random_state(world: World, rows: int, seed: int) -> TensorDict:
 @torch.no_grad()
 def collect(world: World, policy: Any, envs: int, time: int, *, seed: int = 0, max_steps: int | None = None) -> Any:
     """Frames `[envs, time]` of `policy`, as a collector would hand them over."""
-    env = TrackEnv(world, envs, seed=seed, max_steps=max_steps)
+    env = TrackEnv(limited(world, max_steps), envs, seed=seed)
     rows, frames = env.reset(), []
     with set_exploration_type(ExplorationType.RANDOM):
         for _ in range(time):

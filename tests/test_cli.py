@@ -95,7 +95,7 @@ def test_kernel_files_are_checked_before_a_folder_is_made(
     (tmp_path / "broken.npy").write_bytes(b"nothing")
     np.save(tmp_path / "objects.npy", np.array([{}], dtype=object), allow_pickle=True)
     for name, message in (
-        ("wrong.npy", "9 rows, but grid.size=10 has 100 cells"),
+        ("wrong.npy", "9 rows, but a 10x10 grid has 100 cells"),
         ("broken.npy", "not a table of numbers"),
         ("objects.npy", "not a table of numbers"),
     ):

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy import sparse
 
-from trackmdp.world.model import Array
 from trackmdp.world.tracks import Recorded, Tracks
 
 
@@ -19,10 +19,10 @@ def by_hand(*tracks: Sequence[int], exits: bool | Sequence[bool] = True) -> Trac
     return Tracks(cells, first, np.broadcast_to(exits, len(tracks)).copy(), np.arange(len(tracks)))
 
 
-def drawn(kernel: Array, count: int, seed: int = 0) -> Tracks:
+def drawn(kernel: sparse.csr_array, count: int, seed: int = 0) -> Tracks:
     """`count` tracks of a target that starts uniformly and moves as `kernel` says, to its exit."""
-    rng, m = np.random.default_rng(seed), len(kernel)
-    edges = np.cumsum(kernel, axis=1)
+    rng, m = np.random.default_rng(seed), kernel.shape[0]
+    edges = np.cumsum(kernel.toarray(), axis=1)
     at = [rng.integers(m, size=count)]
     while (at[-1] < m).any():
         here = at[-1].clip(max=m - 1)
@@ -36,7 +36,7 @@ def drawn(kernel: Array, count: int, seed: int = 0) -> Tracks:
 def recorded(tracks: Tracks, held_out: Tracks | None = None, *, size: int = 3, t_max: int = 1, **more: Any) -> Recorded:
     """A task on tracks; r = 1, c = 0.2, D = 0.2 M; what is held out are the same tracks unless given."""
     m = size**2
-    return Recorded(size, 1.0, np.full(m, 0.2), 0.2 * m, t_max, tracks, held_out or tracks, **more)
+    return Recorded(tracks, size, held_out=held_out or tracks, cost=0.2, safe_cost=0.2 * m, t_max=t_max, **more)
 
 
 def write(file: Path, tracks: Tracks, *, size: int | None = None, step: bool = True) -> Path:

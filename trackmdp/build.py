@@ -20,9 +20,10 @@ from trackmdp.config import (
 )
 from trackmdp.errors import UserError
 from trackmdp.world import kernels
+from trackmdp.world.checks import canonical_kernel, check_kernel
 from trackmdp.world.files import read_numbers
 from trackmdp.world.model import Array, World
-from trackmdp.world.tracks import Recorded, Setting, check_tracks, load_tracks, split
+from trackmdp.world.tracks import Problem, Recorded, check_tracks, load_tracks, split
 
 if TYPE_CHECKING:  # the world is built, and a config checked, before anything heavy is imported
     import torch
@@ -31,7 +32,7 @@ if TYPE_CHECKING:  # the world is built, and a config checked, before anything h
     from trackmdp.algos.common import Algorithm
     from trackmdp.config import BaselineConfig, TrainConfig
 
-__all__ = ["make_algorithm", "make_baseline", "make_collector", "make_setting", "make_world"]
+__all__ = ["make_algorithm", "make_baseline", "make_collector", "make_problem", "make_world"]
 
 KERNELS: dict[type[KernelConfig], Callable[..., Array]] = {
     RandomSupportConfig: kernels.random_support,
@@ -41,16 +42,16 @@ KERNELS: dict[type[KernelConfig], Callable[..., Array]] = {
 }
 
 
-def make_setting(cfg: WorldConfig) -> Setting:
+def make_problem(cfg: WorldConfig) -> Problem:
     """The world a config describes, or its recorded tracks.
 
     Raises:
         UserError: a file is missing or malformed, or the kernel or a track breaks a rule.
     """
-    return make_recorded(cfg) if isinstance(cfg.kernel, TracksConfig) else make_world(cfg)
+    return _make_recorded(cfg) if isinstance(cfg.kernel, TracksConfig) else make_world(cfg)
 
 
-def make_recorded(cfg: WorldConfig) -> Recorded:
+def _make_recorded(cfg: WorldConfig) -> Recorded:
     """The recorded tracks a config names, those held out set apart.
 
     Raises:
@@ -62,28 +63,33 @@ def make_recorded(cfg: WorldConfig) -> Recorded:
     shortest = max(kernel.min_length or t_max + 3, 1 if kernel.ends == "exit" else 2)  # a cut track of one has no step
     check_tracks(tracks, shortest, f"kernel.path={kernel.path}")
     mine, held_out = split(tracks, kernel.held_out, kernel.seed)
-    reward, price, safe = _costs(cfg.cost, size**2)
-    assumed = {"markov": kernel.markov, "homogeneous": kernel.homogeneous}
-    anywhere = kernel.starts == "anywhere"
-    return Recorded(size, reward, price, safe, t_max, mine, held_out, anywhere=anywhere, **assumed)
+    of_task = _of_task(cfg) | {"markov": kernel.markov, "homogeneous": kernel.homogeneous}
+    return Recorded(mine, size, held_out=held_out, anywhere=kernel.starts == "anywhere", **of_task)
 
 
 def make_world(cfg: WorldConfig) -> World:
     """The world a config describes.
 
     Raises:
-        UserError: a file is missing or malformed, or the kernel breaks a rule (`kernels.check_table`).
+        UserError: a file is missing or malformed, or the kernel breaks a rule (`checks.check_kernel`).
     """
     size = cfg.grid.size
     motion = _values(cfg.kernel)
     homogeneous = motion.pop("homogeneous")
     table = KERNELS[type(cfg.kernel)](size, **motion)
     source = f"kernel.path={cfg.kernel.path}" if isinstance(cfg.kernel, TableConfig) else f"kernel={cfg.kernel.name}"
-    kernel = kernels.check_table(table, size, truncates=cfg.grid.max_steps is not None, source=source)
+    kernel = canonical_kernel(table, source)
+    check_kernel(kernel, (size, size), truncates=cfg.grid.max_steps is not None, source=source)
     if homogeneous:
         kernels.check_homogeneous(kernel, size, source)
-    reward, price, safe = _costs(cfg.cost, size**2)
-    return World(size, reward, price, safe, cfg.grid.t_max, kernel, homogeneous=homogeneous)
+    return World(kernel, size, homogeneous=homogeneous, **_of_task(cfg))
+
+
+def _of_task(cfg: WorldConfig) -> dict[str, Any]:
+    """Costs and limits of a world config, as arguments of `Task`."""
+    reward, price, safe = _costs(cfg.cost, cfg.grid.size**2)
+    limits = {"t_max": cfg.grid.t_max, "max_steps": cfg.grid.max_steps}
+    return {"reward": reward, "cost": price, "safe_cost": safe} | limits
 
 
 def _values(node: Any) -> dict[str, Any]:
@@ -110,7 +116,7 @@ def _price_per_cell(sensor: float | list[float] | str, cells: int) -> Array:
     return price
 
 
-def make_algorithm(cfg: TrainConfig, world: Setting, device: torch.device) -> Algorithm:
+def make_algorithm(cfg: TrainConfig, world: Problem, device: torch.device) -> Algorithm:
     """The learner; it is given the task, never the motion."""
     from trackmdp import config
     from trackmdp.algos import a2c, dqn, hindsight, learned_kernel, per_sensor, ppo
@@ -130,7 +136,7 @@ def make_algorithm(cfg: TrainConfig, world: Setting, device: torch.device) -> Al
 
 
 def make_collector(
-    cfg: TrainConfig, world: Setting, algorithm: Algorithm, device: torch.device, done: int = 0
+    cfg: TrainConfig, world: Problem, algorithm: Algorithm, device: torch.device, done: int = 0
 ) -> BaseCollector:
     """The source of the frames that are left after the first `done`."""
     from trackmdp.training.collect import make_collector as make
@@ -141,14 +147,13 @@ def make_collector(
         algorithm.policy,
         cfg.collector,
         seed=cfg.seed,
-        max_steps=cfg.grid.max_steps,
         env_device=make_device(cfg.collector.device, "collector.device"),
         device=device,
         done=done,
     )
 
 
-def make_baseline(cfg: BaselineConfig, setting: Setting) -> np.ndarray:
+def make_baseline(cfg: BaselineConfig, setting: Problem) -> np.ndarray:
     """`[M, t_max+1, M]` chains of a policy that is not learned; probabilities for `random_k`, else bool."""
     from trackmdp import config
 

@@ -66,7 +66,7 @@ def test_frames_without_a_move_are_refused_in_one_line() -> None:
 def test_where_the_target_moves_alike_few_frames_are_enough() -> None:
     """144 cells and 12,000 frames: too few for each cell alone, plenty for all of them together."""
     kernel = random_walk(12, stay=0.2, diagonal=False, exit_probability=0.02, border="renormalize")
-    alone = World(12, 1.0, np.full(144, 0.16), 144 * 0.16, 1, kernel)
+    alone = World(kernel, 12, cost=np.full(144, 0.16), safe_cost=144 * 0.16, t_max=1)
     together = replace(alone, homogeneous=True)
     data = batches(alone, 47)
     upper = float(bounds.clocked(alone).mean())

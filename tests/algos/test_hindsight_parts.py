@@ -25,7 +25,7 @@ def far_world() -> World:
 
 def alike_world() -> World:
     kernel = random_walk(9, stay=0.2, diagonal=False, exit_probability=0.02, border="renormalize")
-    return World(9, 1.0, np.full(81, 0.16), 81 * 0.16, 0, kernel, homogeneous=True)
+    return World(kernel, 9, cost=np.full(81, 0.16), safe_cost=81 * 0.16, t_max=0, homogeneous=True)
 
 
 def gradients(world: World, form: str, reach: int, max_entries: int) -> tuple[dict[str, Tensor], list[Tensor], Tensor]:

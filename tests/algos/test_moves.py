@@ -107,7 +107,7 @@ def test_the_oldest_moves_go_first() -> None:
 def deviations(start: torch.Tensor, end: torch.Tensor, world: World) -> torch.Tensor:
     """`[M, M + 1]` by how many standard errors the moves seen out of each cell miss the motion; 0 where it has none."""
     m = world.num_cells
-    kernel = torch.as_tensor(np.column_stack([world.kernel, 1.0 - world.kernel.sum(1)]))
+    kernel = torch.as_tensor(np.column_stack([world.kernel.toarray(), 1.0 - world.stay_probability]))
     counts = torch.bincount(start * (m + 1) + end, minlength=m * (m + 1)).view(m, m + 1)
     seen = counts.sum(1, keepdim=True)
     error = (kernel * (1 - kernel) / seen).sqrt()
@@ -122,7 +122,7 @@ def test_a_mixture_shows_the_motion_as_it_is() -> None:
     """
     world = small_world()
     chains = np.zeros((9, 2, 9), dtype=bool)
-    chains[np.arange(9), 0, world.kernel.argmax(1)] = True
+    chains[np.arange(9), 0, world.kernel.toarray().argmax(1)] = True
     policy = AllOnOrChain(chains)
     policy.explore.fill_(0.3)
     torch.manual_seed(0)

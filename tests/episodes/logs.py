@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.helpers import small_world
+from tests.helpers import limited, small_world
 from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.episodes.record import Acting, Chains, record
@@ -28,7 +28,7 @@ def recorded(
     count: int, *, acting: Acting | None = None, seed: int = 0, max_steps: int | None = None, world: World = WORLD
 ) -> list[Episode]:
     seeds = [derive(seed, "episode", number) for number in range(count)]
-    return list(record(world, acting or policy(world), seeds, max_steps=max_steps))
+    return list(record(limited(world, max_steps), acting or policy(world), seeds))
 
 
 def write(
@@ -40,7 +40,7 @@ def write(
     world: World = WORLD,
 ) -> Path:
     acting = acting or policy(world)
-    writer = EpisodeWriter(file, world, facts={"seed": "0"}, config=CONFIG, max_steps=max_steps)
+    writer = EpisodeWriter(file, limited(world, max_steps), facts={"seed": "0"}, config=CONFIG)
     writer.add_policy(acting.facts, getattr(acting, "chains", None))
     for episode in episodes:
         writer.add(episode)

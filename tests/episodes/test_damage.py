@@ -34,7 +34,7 @@ def everything(file: Path) -> tuple[str, list[Episode]]:
         world = reader.world()
         said = [reader.run, reader.end, reader.rows, reader.policies, reader.attachment("config.yaml").decode()]
         said += [chain.tobytes().hex() for chain in chains if chain is not None]
-        said += [world.kernel.tobytes().hex(), world.cost.tobytes().hex()]
+        said += [world.kernel.toarray().tobytes().hex(), world.cost.tobytes().hex()]
         return json.dumps(said), list(reader.episodes())
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 
 from tests.episodes.logs import WORLD, policy, recorded
-from tests.helpers import hop_world, small_world
+from tests.helpers import hop_world, limited, small_world
 from trackmdp.episodes.episode import Episode, first_difference
 from trackmdp.episodes.record import Acting, Chains, Issued, RandomSets, record
 from trackmdp.policies.fixed import ChainPolicy
@@ -29,7 +29,7 @@ def stepped_alone(seed: int, max_steps: int | None) -> TensorDict:
     """The episode as the environment itself makes it, one row, from the same draws."""
     rng = torch.Generator().manual_seed(seed)
     start, motion = torch.randint(16, (1,), generator=rng), Motion(WORLD.kernel)
-    env = TrackEnv(WORLD, 1, max_steps=max_steps)
+    env = TrackEnv(limited(WORLD, max_steps), 1)
     state = env.reset().set("target", start).set("last_cell", start.clone())
     acting, steps = ChainPolicy(policy().chains), []
     while True:
@@ -57,7 +57,7 @@ def test_an_episode_is_what_the_environment_makes_of_its_draws(max_steps: int | 
 
 @pytest.mark.parametrize("max_steps", [None, 9])
 def test_its_keys_are_those_of_a_rollout(max_steps: int | None) -> None:
-    env = TrackEnv(WORLD, 1, max_steps=max_steps)
+    env = TrackEnv(limited(WORLD, max_steps), 1)
     rollout = env.rollout(3, ChainPolicy(policy().chains))
     mine = recorded(1, max_steps=max_steps)[0].to_tensordict(WORLD.t_max, max_steps)
     assert set(mine.keys(True, True)) == set(rollout.keys(True, True))

@@ -53,7 +53,7 @@ def test_a_policy_without_the_track_property_is_found_out() -> None:
     world = paper_world(5, 0.16, 1)
     chains = optimal.solve(world).chains.copy()
     cell = 44
-    off = int(np.argmax(world.kernel[cell]))
+    off = int(np.argmax(world.kernel.toarray()[cell]))
     chains[cell, 0, off] = False
     rows = checks(world, _solution(world, chains))
     (sharp,) = named(rows, "Theorem 1, sharp")
@@ -64,7 +64,7 @@ def test_a_policy_without_the_track_property_is_found_out() -> None:
 def test_with_a_cheap_safe_action_being_overdue_is_worth_more_than_being_located() -> None:
     """Lemma 1 needs D >= the price of all sensors: at D = 0 and c > r, only the safe action earns anything."""
     kernel = np.full((4, 4), 0.2)
-    world = World(2, 1.0, np.full(4, 1.5), 0.0, 1, kernel)
+    world = World(kernel, 2, cost=np.full(4, 1.5), safe_cost=0.0, t_max=1)
     (row,) = named(checks(world), "Lemma 1, first")
     assert not row.holds
     assert not row.expected
@@ -75,7 +75,7 @@ def test_the_remark_on_worlds_where_qmdp_is_optimal() -> None:
     rows = {row.name: row for row in remarks.check(1e-9)}
     assert rows["remark, c = 0.14, Z = 4"].holds
     world = paper_world(4, 0.14, 1)
-    np.testing.assert_array_equal(qmdp.solve(world)[:, 0], world.kernel > 0)
+    np.testing.assert_array_equal(qmdp.solve(world)[:, 0], world.kernel.toarray() > 0)
     assert evaluate(world, optimal.solve(world).chains).accuracy == pytest.approx(1.0)
 
 
@@ -92,5 +92,5 @@ def test_the_printed_bound_is_exceeded() -> None:
 def test_ties_do_not_look_like_failures() -> None:
     """A walk on nine cells, each as likely: from an inner cell p r = c p_in exactly, to sense or not is the same."""
     kernel = random_walk(4, stay=1 / 9, diagonal=True, exit_probability=0.1, border="renormalize")
-    world = World(4, 1.0, np.full(16, 1 / 9), 16 / 9, 1, kernel)
+    world = World(kernel, 4, cost=np.full(16, 1 / 9), safe_cost=16 / 9, t_max=1)
     assert all(row.passed for row in checks(world).values())

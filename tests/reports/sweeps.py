@@ -64,7 +64,7 @@ def write_run(
     }
     (folder / "config.yaml").write_text(config_text(cfg), encoding="utf-8")
     (folder / "summary.json").write_text(json.dumps(summary), encoding="utf-8")
-    np.save(folder / "kernel.npy", world.kernel)
+    np.save(folder / "kernel.npy", world.kernel.toarray())
     policy.write(folder / policy.FILE, policy.Policy(chains, score.evaluation.value))
     write_curve(folder, np.linspace(-100.0, score.evaluation.aihtr, 40))
     return summary

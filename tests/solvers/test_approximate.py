@@ -18,7 +18,7 @@ def line_world(price: float, t_max: int) -> World:
     kernel = np.zeros((4, 4))
     kernel[0, 1], kernel[0, 2] = 0.6, 0.3
     kernel[1, 3] = kernel[2, 3] = kernel[3, 0] = 0.9
-    return World(2, 1.0, np.full(4, price), 4 * price, t_max, kernel)
+    return World(kernel, 2, cost=np.full(4, price), safe_cost=4 * price, t_max=t_max)
 
 
 def test_fcr_by_hand() -> None:
@@ -34,9 +34,9 @@ def test_fcr_by_hand() -> None:
 def test_fcr_takes_no_notice_of_misses_and_qmdp_does() -> None:
     """From 0 with cell 1 sensed at 0.5, a miss leaves cell 2 only, which cannot be at 1 next."""
     world = line_world(0.5, 1)
-    kernel = world.kernel.copy()
+    kernel = world.kernel.toarray()
     kernel[1] = [0.0, 0.9, 0.0, 0.0]
-    world = World(2, 1.0, world.cost, world.safe_cost, 1, kernel)
+    world = World(kernel, 2, cost=world.cost, safe_cost=world.safe_cost, t_max=1)
     assert np.flatnonzero(fcr.solve(world)[0, 1]).tolist() == [1]
     assert np.flatnonzero(qmdp.solve(world)[0, 1]).tolist() == [3]
 

@@ -50,9 +50,10 @@ def test_no_chain_beats_the_clocked_bound_and_it_beats_no_valid_one(world: World
 @given(tiny_worlds(most_t_max=3))
 def test_the_clocked_table_solves_its_equation(world: World) -> None:
     table = bounds.clocked_table(world).table
-    sense = world.kernel * (world.reward + table[:, 0]) - world.cost * world.stay_probability[:, None]
+    kernel = world.kernel.toarray()
+    sense = kernel * (world.reward + table[:, 0]) - world.cost * world.stay_probability[:, None]
     for n in range(world.num_choices):
-        expected = np.maximum(sense, world.kernel * table[:, n + 1]).sum(axis=1)
+        expected = np.maximum(sense, kernel * table[:, n + 1]).sum(axis=1)
         np.testing.assert_allclose(table[:, n], expected, rtol=1e-9, atol=1e-9)
     forced = world.kernel @ (world.reward - world.safe_cost + table[:, 0])
     np.testing.assert_allclose(table[:, -1], forced, rtol=1e-9, atol=1e-9)
@@ -62,7 +63,7 @@ def test_a_probability_equal_to_the_threshold_is_sensed_whatever_its_rounding() 
     kernel = np.zeros((4, 4))
     kernel[:, 1], kernel[:, 2] = 0.15, 0.6
     kernel[1, 1] = np.nextafter(0.15, 0)
-    world = World(2, 1.0, np.full(4, 0.15), 0.6, 0, kernel)
+    world = World(kernel, 2, cost=np.full(4, 0.15), safe_cost=0.6, t_max=0)
     assert qmdp.solve(world)[:, 0].tolist() == [[False, True, True, False]] * 4
     assert myopic.solve(world, threshold=0.15)[:, 0].tolist() == [[False, True, True, False]] * 4
     assert myopic.solve(world, threshold=0.2)[:, 0].tolist() == [[False, False, True, False]] * 4
@@ -72,12 +73,12 @@ def test_the_in_grid_threshold_senses_what_the_printed_one_leaves() -> None:
     """From each cell p = 0.4 and 0.1 with exit 0.5: given that it stays, a sensor at 0.5 costs half as often."""
     kernel = np.zeros((4, 4))
     kernel[:, 0], kernel[:, 1] = 0.4, 0.1
-    world = World(2, 1.0, np.full(4, 0.5), 2.0, 0, kernel)
+    world = World(kernel, 2, cost=np.full(4, 0.5), safe_cost=2.0, t_max=0)
     assert qmdp.solve(world).sum() == 0
     assert qmdp.solve(world, in_grid=True)[:, 0].tolist() == [[True, False, False, False]] * 4
 
 
 def test_costs_per_cell_set_the_threshold_per_cell() -> None:
     kernel = np.full((4, 4), 0.2)
-    world = World(2, 1.0, np.array([0.1, 0.3, 0.19, 0.21]), 1.0, 0, kernel)
+    world = World(kernel, 2, cost=np.array([0.1, 0.3, 0.19, 0.21]), safe_cost=1.0, t_max=0)
     assert qmdp.solve(world)[:, 0].tolist() == [[True, False, True, False]] * 4

@@ -54,7 +54,7 @@ def test_a_world_by_hand() -> None:
     """
     kernel = np.zeros((4, 4))
     kernel[0, 1] = kernel[1, 0] = 0.5
-    world = World(2, 3.0, np.array([0.1, 0.2, 0.3, 0.4]), 1.0, 0, kernel)
+    world = World(kernel, 2, cost=np.array([0.1, 0.2, 0.3, 0.4]), safe_cost=1.0, t_max=0, reward=3.0)
     result = evaluate(world, np.zeros((4, 1, 4), dtype=bool))
     renewals = 4 / 3
     np.testing.assert_allclose(result.value, [renewals * 0.25 * 2.0] * 2 + [0.0] * 2)
@@ -72,13 +72,13 @@ def test_a_world_by_hand() -> None:
 
 
 def test_a_kernel_that_never_exits_has_no_value() -> None:
-    world = World(2, 1.0, np.full(4, 0.1), 0.4, 1, np.full((4, 4), 0.25))
+    world = World(np.full((4, 4), 0.25), 2, cost=0.1, t_max=1, max_steps=9)
     with pytest.raises(UserError, match="never exits"):
         evaluate(world, np.zeros((4, 2, 4), dtype=bool))
 
 
 def test_chains_of_another_world_are_refused() -> None:
-    world = World(2, 1.0, np.full(4, 0.1), 0.4, 1, np.full((4, 4), 0.2))
+    world = World(np.full((4, 4), 0.2), 2, cost=np.full(4, 0.1), safe_cost=0.4, t_max=1)
     with pytest.raises(UserError, match=r"expected shape \(4, 2, 4\)"):
         evaluate(world, np.zeros((4, 1, 4), dtype=bool))
     with pytest.raises(UserError, match="between 0 and 1"):

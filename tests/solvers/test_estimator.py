@@ -53,7 +53,7 @@ def test_both_forms_by_hand() -> None:
     """
     kernel = np.zeros((4, 4))
     kernel[0, 1], kernel[0, 2] = 0.5, 0.3
-    world = World(2, 1.0, np.full(4, 0.9), 2.0, 0, kernel)
+    world = World(kernel, 2, cost=np.full(4, 0.9), safe_cost=2.0, t_max=0)
     chains = np.zeros((4, 1, 4), dtype=bool)
     (estimate,) = estimator.positions(world, chains, evaluate(world, chains).value)
     assert estimate.rows.tolist() == [0, 0]

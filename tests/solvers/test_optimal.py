@@ -162,7 +162,7 @@ def test_numeric_edges(name: str, shape: str) -> None:
     cost = np.broadcast_to(price, (9,)).astype(float)
     walk = random_walk(3, stay=0.2, diagonal=False, exit_probability=0.01, border="clip")
     kernel = _kernel_with_edges() if shape == "edges" else walk
-    world = World(3, 1.0, cost, float(cost.sum()) if safe is None else safe, t_max, kernel)
+    world = World(kernel, 3, cost=cost, safe_cost=float(cost.sum()) if safe is None else safe, t_max=t_max)
     solution = optimal.solve(world, time_limit=20)
     scale = 1.0 + np.abs(solution.bound).max()
     assert np.isfinite(solution.value).all()

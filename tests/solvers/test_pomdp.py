@@ -30,11 +30,11 @@ def test_belief_states_are_counted_once() -> None:
     """Two cells that swap and exit with 1/2: after a miss the position is known, so per n there are two beliefs."""
     kernel = np.zeros((4, 4))
     kernel[0, 1] = kernel[1, 0] = kernel[2, 3] = kernel[3, 2] = 0.5
-    world = World(2, 1.0, np.full(4, 0.1), 0.4, 1, kernel)
+    world = World(kernel, 2, cost=np.full(4, 0.1), safe_cost=0.4, t_max=1)
     assert pomdp.solve(world).beliefs == 4 * 3
 
 
 def test_too_many_beliefs_are_refused() -> None:
-    world = World(2, 1.0, np.full(4, 0.1), 0.4, 2, np.random.default_rng(0).random((4, 4)) / 5)
+    world = World(np.random.default_rng(0).random((4, 4)) / 5, 2, cost=np.full(4, 0.1), safe_cost=0.4, t_max=2)
     with pytest.raises(UserError, match="more than 100 belief states"):
         pomdp.solve(world, most_beliefs=100)

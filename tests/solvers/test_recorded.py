@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.helpers import small_world
+from tests.helpers import limited, small_world
 from tests.tracks import by_hand, drawn, recorded
 from trackmdp.policies.fixed import ChainPolicy
 from trackmdp.solvers.chains import evaluate
@@ -63,7 +63,7 @@ def test_a_recording_that_stops_has_no_exit_step() -> None:
 def in_the_environment(setting: Recorded, chains: BoolArray, max_steps: int | None) -> np.ndarray:
     """`[K, 6]` reward, steps in the grid, detections, sensors, safe actions, length, stepping `TrackEnv`."""
     count = len(setting.tracks)
-    env, policy = TrackEnv(setting, count, max_steps=max_steps), ChainPolicy(chains)
+    env, policy = TrackEnv(limited(setting, max_steps), count), ChainPolicy(chains)
     state = env.reset()
     totals, running = torch.zeros(6, count), torch.ones(count, dtype=torch.bool)
     begun = state["point"]

@@ -26,7 +26,14 @@ PAPER_REFERENCES: list[dict[str, Any]] = json.loads(
 def reference_world(reference: dict[str, Any]) -> World:
     kernel = np.array(reference["kernel"])
     m = len(kernel)
-    return World(round(m**0.5), reference["r"], np.full(m, reference["c"]), reference["D"], reference["t_max"], kernel)
+    return World(
+        kernel,
+        round(m**0.5),
+        cost=np.full(m, reference["c"]),
+        safe_cost=reference["D"],
+        t_max=reference["t_max"],
+        reward=reference["r"],
+    )
 
 
 @cache
@@ -40,7 +47,7 @@ def paper_world(support_size: int, cost: float, t_max: int, size: int = 10) -> W
         border="renormalize",
         seed=support_size,
     )
-    return World(size, 1.0, np.full(size**2, cost), size**2 * cost, t_max, kernel)
+    return World(kernel, size, cost=np.full(size**2, cost), safe_cost=size**2 * cost, t_max=t_max)
 
 
 @st.composite
@@ -56,7 +63,14 @@ def tiny_worlds(draw: st.DrawFn, *, size: int = 2, most_t_max: int = 1, support:
     spread = draw(st.sampled_from([0.0, 1.0]))
     cost = draw(st.sampled_from([0.0, 0.1, 0.25, 0.5, 1.2])) * (1.0 + spread * rng.random(m))
     safe_cost = float(cost.sum()) * draw(st.sampled_from([0.1, 1.0, 3.0]))
-    return World(size, draw(st.sampled_from([1.0, 2.0])), cost, safe_cost, draw(st.integers(0, most_t_max)), kernel)
+    return World(
+        kernel,
+        size,
+        cost=cost,
+        safe_cost=safe_cost,
+        t_max=draw(st.integers(0, most_t_max)),
+        reward=draw(st.sampled_from([1.0, 2.0])),
+    )
 
 
 def value_of(world: World, chains: BoolArray) -> Array:

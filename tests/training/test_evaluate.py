@@ -14,7 +14,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from tests.helpers import ALGORITHMS, BASELINES, algorithm, collect, evaluate_config, hop_world, small_world
+from tests.helpers import ALGORITHMS, BASELINES, algorithm, collect, evaluate_config, hop_world, limited, small_world
 from trackmdp.build import make_baseline, make_world
 from trackmdp.policies.fixed import AllOn, ChainPolicy, RandomK
 from trackmdp.training.evaluate import Simulation, chains_of, simulate
@@ -79,9 +79,9 @@ def _evaluated(actor: Any) -> Callable[[TensorDict], TensorDict]:
     return act
 
 
-def assert_close(world: World, chains: np.ndarray, simulation: Simulation, max_steps: int | None = None) -> None:
+def assert_close(world: World, chains: np.ndarray, simulation: Simulation) -> None:
     """Every figure within four standard errors of the exact one."""
-    exact = ExactEvaluator(world, max_steps).evaluate(chains)
+    exact = ExactEvaluator(world).evaluate(chains)
     for key in FIGURES:
         estimate, value = getattr(simulation, key), getattr(exact, key)
         assert abs(estimate.mean - value) <= 4 * estimate.standard_error + 1e-5 * (1 + abs(value)), key
@@ -93,12 +93,12 @@ def assert_close(world: World, chains: np.ndarray, simulation: Simulation, max_s
 def test_exact_and_simulated_figures_agree_for_every_baseline(name: str, max_steps: int | None) -> None:
     words = ("grid.size=3", "grid.t_max=2", "kernel.exit_probability=0.2", "cost.sensor=0.25", f"baseline={name}")
     cfg = evaluate_config(*words)
-    world = make_world(cfg)
+    world = limited(make_world(cfg), max_steps)
     chains = make_baseline(cfg.baseline, world)
     policy: Any = ChainPolicy(chains)
     if chains.dtype != np.bool_:
         policy = RandomK(9, cfg.baseline.k, torch.Generator().manual_seed(1))
-    assert_close(world, chains, simulate(world, policy, episodes=20_000, seed=3, max_steps=max_steps), max_steps)
+    assert_close(world, chains, simulate(world, policy, episodes=20_000, seed=3))
 
 
 def test_exact_and_simulated_figures_agree_for_a_learned_actor() -> None:
@@ -152,7 +152,7 @@ def test_a_single_episode_has_no_standard_error() -> None:
 
 
 def test_a_target_that_leaves_at_once_has_no_accuracy() -> None:
-    world = World(2, 1.0, np.full(4, 0.1), 0.4, 1, np.zeros((4, 4)))
+    world = World(np.zeros((4, 4)), 2, cost=np.full(4, 0.1), safe_cost=0.4, t_max=1)
     simulation = simulate(world, AllOn(4), episodes=10, seed=0)
     assert simulation.expected_length.mean == 1.0
     assert simulation.aihtr.mean == 0.0

@@ -8,12 +8,13 @@ import numpy as np
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy import sparse
 
 from tests.helpers import random_kernel, small_world
 from trackmdp.world.belief import BeliefFilter
 from trackmdp.world.env import TrackEnv
 
-KERNEL = np.array([[0.2, 0.3, 0.4, 0.0], [0.5, 0.0, 0.0, 0.25], [0.0, 0.0, 0.5, 0.5], [0.1, 0.1, 0.1, 0.1]])
+KERNEL = sparse.csr_array([[0.2, 0.3, 0.4, 0.0], [0.5, 0.0, 0.0, 0.25], [0.0, 0.0, 0.5, 0.5], [0.1, 0.1, 0.1, 0.1]])
 
 
 def test_two_steps_by_hand() -> None:
@@ -57,7 +58,7 @@ def test_it_is_the_posterior_over_all_paths(seed: int, exit_probability: float, 
         moves = list(itertools.pairwise((start, *path)))
         dodged = all(not action[cell] for action, cell in zip(actions, path, strict=True))
         weight[path[-1]] += dodged * np.prod([kernel[move] for move in moves])
-    belief = BeliefFilter(kernel)
+    belief = BeliefFilter(sparse.csr_array(kernel))
     rows = belief.detect(torch.tensor([start]))
     for action in actions:
         rows = belief.miss(belief.predict(rows), torch.as_tensor(action)[None])

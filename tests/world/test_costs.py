@@ -13,7 +13,7 @@ ACTION = torch.tensor([[True, False, True, False]])
 
 
 def costs(cost: list[float]) -> Costs:
-    return Costs(Task(2, 2.0, np.array(cost), 0.9, 1))
+    return Costs(Task(2, cost=np.array(cost), safe_cost=0.9, t_max=1, reward=2.0))
 
 
 @pytest.mark.parametrize(
@@ -44,5 +44,5 @@ def test_sensing_cost_per_cell_and_for_all_cells() -> None:
 
 
 def test_more_than_255_sensors_are_counted() -> None:
-    task = Task(40, 1.0, np.full(1600, 0.5), 0.9, 1)
+    task = Task(40, cost=np.full(1600, 0.5), safe_cost=0.9, t_max=1)
     assert Costs(task).sensing_cost(torch.ones(1, 1600, dtype=torch.bool)).item() == 800.0

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs.utils import check_env_specs
 
-from tests.helpers import hop_world, small_world
+from tests.helpers import hop_world, limited, small_world
 from trackmdp.policies.fixed import RandomSubset
 from trackmdp.seeding import generator
 from trackmdp.world.env import TrackEnv
@@ -93,7 +93,7 @@ def test_t_max_zero_forces_after_one_miss() -> None:
 
 
 def test_the_time_limit_truncates_and_the_exit_terminates() -> None:
-    env = TrackEnv(hop_world(), 1, max_steps=3)
+    env = TrackEnv(limited(hop_world(), 3), 1)
     for count, draw, flags in [
         (1, STAY, (False, False, False)),
         (2, STAY, (False, True, True)),
@@ -114,7 +114,7 @@ def test_the_target_is_located_after_it_has_moved() -> None:
 @pytest.mark.parametrize("max_steps", [None, 1, 7])
 @pytest.mark.parametrize("num_envs", [1, 3, 64])
 def test_specs_are_those_of_torchrl(num_envs: int, max_steps: int | None) -> None:
-    check_env_specs(TrackEnv(small_world(), num_envs, max_steps=max_steps))
+    check_env_specs(TrackEnv(limited(small_world(), max_steps), num_envs))
 
 
 def rollout(env: TrackEnv, steps: int, seed: int = 0) -> list[TensorDictBase]:
@@ -130,7 +130,7 @@ def rollout(env: TrackEnv, steps: int, seed: int = 0) -> list[TensorDictBase]:
 @pytest.mark.parametrize(("t_max", "max_steps"), [(0, None), (1, 5), (3, None), (2, 1)])
 def test_every_frame_of_a_long_run_lies_in_the_specs(t_max: int, max_steps: int | None) -> None:
     world = small_world(t_max=t_max)
-    env = TrackEnv(world, 7, seed=3, max_steps=max_steps)
+    env = TrackEnv(limited(world, max_steps), 7, seed=3)
     reset = env.reset()
     assert env.observation_spec.is_in(reset.select(*env.observation_spec.keys()))
     seen, lengths = set(), torch.zeros(7, dtype=torch.int64)
@@ -161,7 +161,7 @@ def test_every_frame_of_a_long_run_lies_in_the_specs(t_max: int, max_steps: int 
 
 @pytest.mark.parametrize("max_steps", [None, 4])
 def test_one_pass_equals_torchrls_step_and_reset_bit_for_bit(max_steps: int | None) -> None:
-    ours, stock = (TrackEnv(small_world(t_max=2), 50, seed=5, max_steps=max_steps) for _ in range(2))
+    ours, stock = (TrackEnv(limited(small_world(t_max=2), max_steps), 50, seed=5) for _ in range(2))
     a, b = ours.reset(), stock.reset()
     policies = [RandomSubset(9, generator(0, "policy")) for _ in range(2)]
     ended = {"terminated": 0, "truncated": 0}

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import TensorDict, TensorDictBase
 
-from tests.helpers import random_state, small_world, worlds
+from tests.helpers import limited, random_state, small_world, worlds
 from trackmdp.policies.fixed import RandomSubset
 from trackmdp.seeding import generator
 from trackmdp.world.env import TrackEnv
@@ -34,8 +34,8 @@ def equal(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor]) -> bo
 @given(worlds(), st.integers(1, 20), SEEDS, LIMITS)
 def test_rows_together_equal_rows_alone(world: World, rows: int, seed: int, max_steps: int | None) -> None:
     before, draws = states(world, rows, seed, max_steps)
-    together = TrackEnv(world, rows, max_steps=max_steps).advance(before, draws)
-    one = TrackEnv(world, 1, max_steps=max_steps)
+    together = TrackEnv(limited(world, max_steps), rows).advance(before, draws)
+    one = TrackEnv(limited(world, max_steps), 1)
     alone = [one.advance(before[i : i + 1], draws[i : i + 1]) for i in range(rows)]
     assert equal(together, {key: torch.cat([row[key] for row in alone]) for key in together})
 
@@ -43,7 +43,7 @@ def test_rows_together_equal_rows_alone(world: World, rows: int, seed: int, max_
 @given(worlds(), st.integers(2, 20), SEEDS, LIMITS)
 def test_permuted_rows_give_permuted_results(world: World, rows: int, seed: int, max_steps: int | None) -> None:
     before, draws = states(world, rows, seed, max_steps)
-    env = TrackEnv(world, rows, max_steps=max_steps)
+    env = TrackEnv(limited(world, max_steps), rows)
     order = torch.randperm(rows, generator=torch.Generator().manual_seed(seed))
     straight, permuted = env.advance(before, draws), env.advance(before[order], draws[order])
     assert equal({key: value[order] for key, value in straight.items()}, permuted)
@@ -53,14 +53,14 @@ def test_permuted_rows_give_permuted_results(world: World, rows: int, seed: int,
 def test_a_step_leaves_its_input_as_it_was(world: World, rows: int, seed: int) -> None:
     before, draws = states(world, rows, seed, 3)
     kept = before.clone()
-    TrackEnv(world, rows, max_steps=3).advance(before, draws)
+    TrackEnv(limited(world, 3), rows).advance(before, draws)
     assert (before == kept).all()
 
 
 @given(SEEDS, st.lists(st.booleans(), min_size=6, max_size=6), LIMITS)
 def test_a_partial_reset_leaves_the_other_rows(seed: int, mask: list[bool], max_steps: int | None) -> None:
     world = small_world(t_max=2)
-    env, rows = TrackEnv(world, 6, seed=seed, max_steps=max_steps), torch.tensor(mask)
+    env, rows = TrackEnv(limited(world, max_steps), 6, seed=seed), torch.tensor(mask)
     before = _midway(env)
     after = env.reset(before.clone().set("_reset", rows.unsqueeze(-1)))
     for key in env.state_keys_of_step:
@@ -82,7 +82,7 @@ def _midway(env: TrackEnv) -> TensorDictBase:
 
 def test_rows_that_end_are_the_only_ones_reset() -> None:
     """The rows carried on are those of the step, bit for bit, wherever no episode ended."""
-    env = TrackEnv(small_world(t_max=2), 200, seed=1, max_steps=6)
+    env = TrackEnv(limited(small_world(t_max=2), 6), 200, seed=1)
     policy, rows, fresh = RandomSubset(9, generator(0, "policy")), env.reset(), 0
     for _ in range(100):
         frame, rows = env.step_and_maybe_reset(policy(rows))

@@ -12,12 +12,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy import sparse
 
 from tests.helpers import configured
 from tests.world.kernels import paper
 from trackmdp.build import make_world
 from trackmdp.errors import UserError
-from trackmdp.world.kernels import check_homogeneous, check_table, load_table, random_walk
+from trackmdp.world.kernels import check_homogeneous, load_table, random_walk
+from trackmdp.world.model import World
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".npz", ".csv"])
@@ -31,7 +33,7 @@ def test_a_table_comes_back_from_a_file(tmp_path: Path, suffix: str) -> None:
         np.savetxt(file, table, delimiter=",", fmt="%.18e")
     assert np.array_equal(load_table(file), table)
     cfg = configured("train", "grid.size=3", "kernel=table", f"kernel.path={file}")
-    assert np.array_equal(make_world(cfg).kernel, table)
+    assert np.array_equal(make_world(cfg).kernel.toarray(), table)
 
 
 def test_of_many_arrays_the_one_called_kernel_is_read(tmp_path: Path) -> None:
@@ -137,7 +139,7 @@ def _changed(row: int, column: int, value: float) -> np.ndarray:
 BROKEN: dict[str, tuple[np.ndarray, str]] = {
     "a vector": (np.ones(9), r"expected a square table, got shape \(9,\)"),
     "not square": (np.ones((9, 8)), r"expected a square table, got shape \(9, 8\)"),
-    "another grid": (np.eye(4) / 2, "4 rows, but grid.size=3 has 9 cells"),
+    "another grid": (np.eye(4) / 2, "4 rows, but a 3x3 grid has 9 cells"),
     "nan": (_changed(7, 2, np.nan), "row 7 holds a value that is not finite"),
     "inf": (_changed(6, 2, np.inf), "row 6 holds a value that is not finite"),
     "negative": (_changed(5, 8, -1e-9), "row 5 holds a negative probability"),
@@ -150,8 +152,8 @@ BROKEN: dict[str, tuple[np.ndarray, str]] = {
 def test_a_table_that_is_no_kernel_is_refused_with_row_and_rule(case: str) -> None:
     table, rule = BROKEN[case]
     with pytest.raises(UserError, match=rule) as refused:
-        check_table(table, 3, truncates=False, source="kernel.path=mine.npy")
-    assert str(refused.value).startswith("kernel.path=mine.npy: ")
+        World(table, 3, cost=0.1, t_max=1)
+    assert str(refused.value).startswith("kernel: ")
     assert "\n" not in str(refused.value)
 
 
@@ -164,15 +166,15 @@ def test_a_table_that_traps_the_target_needs_a_time_limit() -> None:
     for cell in (4, 5, 6):
         table[cell, 0] = 1.0
     with pytest.raises(UserError, match=r"from cell 7 .* set grid.max_steps"):
-        check_table(table, 3, truncates=False, source="kernel")
-    assert check_table(table, 3, truncates=True, source="kernel") is table
+        World(table, 3, cost=0.1, t_max=1)
+    assert np.array_equal(World(table, 3, cost=0.1, t_max=1, max_steps=9).kernel.toarray(), table)
 
 
 def test_rounding_of_a_row_sum_is_forgiven() -> None:
     table = np.full((9, 9), 1 / 9)
     table[0] *= 0.5
     table[4] += 1e-11
-    assert check_table(table, 3, truncates=False, source="kernel") is table
+    assert np.array_equal(World(table, 3, cost=0.1, t_max=1).kernel.toarray(), table)
 
 
 def test_a_kernel_that_only_claims_to_be_homogeneous_is_refused() -> None:
@@ -184,10 +186,10 @@ def test_a_kernel_that_only_claims_to_be_homogeneous_is_refused() -> None:
 
 def test_one_changed_row_is_found() -> None:
     table = random_walk(6, stay=0.4, diagonal=False, exit_probability=0.01, border="clip")
-    check_homogeneous(table, 6, "kernel")
+    check_homogeneous(sparse.csr_array(table), 6, "kernel")
     at_the_border = table.copy()
     at_the_border[3] = 0.0
-    check_homogeneous(at_the_border, 6, "kernel")
+    check_homogeneous(sparse.csr_array(at_the_border), 6, "kernel")
     table[14, 14], table[14, 15] = table[14, 15], table[14, 14]
     with pytest.raises(UserError, match=r"from cell 14 the target moves otherwise than from cell 7"):
-        check_homogeneous(table, 6, "kernel")
+        check_homogeneous(sparse.csr_array(table), 6, "kernel")

@@ -7,7 +7,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy import stats
+from scipy import sparse, stats
 
 from tests.helpers import random_kernel
 from trackmdp.world.motion import Motion
@@ -34,7 +34,7 @@ def kernels(draw: st.DrawFn) -> np.ndarray:
 @given(kernels(), st.integers(0, 2**32 - 1))
 def test_a_cell_of_probability_zero_is_never_reached(kernel: np.ndarray, seed: int) -> None:
     m = len(kernel)
-    motion, possible = Motion(kernel), np.append(kernel > 0, closed(kernel)[:, -1:] > 1e-15, axis=1)
+    motion, possible = Motion(sparse.csr_array(kernel)), np.append(kernel > 0, closed(kernel)[:, -1:] > 1e-15, axis=1)
     edges = np.floor(np.cumsum(closed(kernel), axis=1) * 2**40)
     near = [edges + step for step in (-2, -1, 0, 1, 2)]
     draws = np.concatenate([*near, np.zeros((m, 1)), np.floor(np.random.default_rng(seed).random((m, 20)) * 2**40)], 1)
@@ -48,7 +48,7 @@ def test_each_successor_has_its_own_stretch_of_draws(exit_probability: float) ->
     """Just below and just above every edge of every row: nowhere is the sampler off the table by more than 2^-37."""
     kernel = random_kernel(np.random.default_rng(0), 40, exit_probability)
     kernel = np.where(kernel > 1e-6, kernel, 0.0)
-    motion, table, step = Motion(kernel), closed(kernel), 2.0**-37
+    motion, table, step = Motion(sparse.csr_array(kernel)), closed(kernel), 2.0**-37
     for cell, row in enumerate(table):
         successors = np.flatnonzero(row > 1e-9)
         ends = np.cumsum(row)[successors]
@@ -63,7 +63,7 @@ def test_the_last_cells_of_a_large_grid_are_sampled_as_finely() -> None:
     m = 4096
     kernel = np.zeros((m, m))
     kernel[np.arange(m), np.arange(m)[::-1]] = 1 - 1e-6
-    motion, cells = Motion(kernel), torch.arange(m)
+    motion, cells = Motion(sparse.csr_array(kernel)), torch.arange(m)
     stays = motion.move(cells, torch.full((m,), 1 - 1e-6 - 2.0**-38, dtype=torch.float64))
     leaves = motion.move(cells, torch.full((m,), 1 - 1e-6 + 2.0**-38, dtype=torch.float64))
     assert torch.equal(stays, cells.flip(0))
@@ -76,7 +76,7 @@ def test_a_row_that_sums_to_a_little_more_than_one_stays_in_its_row() -> None:
     """Row sums up to 1 + 1e-9 are accepted; a last cell smaller than that excess must not shift the next row."""
     kernel = np.eye(9) * (1 + 9e-10)
     kernel[:8, 8] = 1e-12
-    motion, cells = Motion(kernel), torch.arange(9)
+    motion, cells = Motion(sparse.csr_array(kernel)), torch.arange(9)
     for draw in (0.0, 2.0**-40, 2.0**-31, 0.4):
         assert torch.equal(motion.move(cells, torch.full((9,), draw, dtype=torch.float64)), cells)
     last = motion.move(cells, torch.full((9,), LARGEST, dtype=torch.float64))
@@ -84,13 +84,13 @@ def test_a_row_that_sums_to_a_little_more_than_one_stays_in_its_row() -> None:
 
 
 def test_an_exited_target_stays_away() -> None:
-    motion = Motion(random_kernel(np.random.default_rng(1), 9, 0.1))
+    motion = Motion(sparse.csr_array(random_kernel(np.random.default_rng(1), 9, 0.1)))
     draws = torch.tensor([0.0, 0.5, LARGEST], dtype=torch.float64)
     assert motion.move(torch.full((3,), 9), draws).tolist() == [9, 9, 9]
 
 
 def test_draws_are_uniform_on_their_grid_and_the_generators_alone() -> None:
-    motion = Motion(random_kernel(np.random.default_rng(1), 4, 0.1))
+    motion = Motion(sparse.csr_array(random_kernel(np.random.default_rng(1), 4, 0.1)))
     draws = motion.draw(100_000, torch.Generator().manual_seed(5))
     torch.rand(3)
     assert torch.equal(draws, motion.draw(100_000, torch.Generator().manual_seed(5)))
@@ -103,7 +103,7 @@ def test_draws_are_uniform_on_their_grid_and_the_generators_alone() -> None:
 
 def test_frequencies_are_those_of_the_table() -> None:
     kernel = random_kernel(np.random.default_rng(2), 9, 0.05)
-    motion, rng, count = Motion(kernel), torch.Generator().manual_seed(0), 100_000
+    motion, rng, count = Motion(sparse.csr_array(kernel)), torch.Generator().manual_seed(0), 100_000
     for cell in range(9):
         moved = motion.move(torch.full((count,), cell), motion.draw(count, rng))
         observed = np.bincount(moved.numpy(), minlength=10)

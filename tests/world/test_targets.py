@@ -8,7 +8,7 @@ import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
 
-from tests.helpers import small_world
+from tests.helpers import limited, small_world
 from tests.tracks import by_hand, drawn, recorded
 from trackmdp.policies.fixed import AllOn, RandomSubset
 from trackmdp.seeding import generator
@@ -66,7 +66,7 @@ def test_starts_anywhere_are_all_points_that_have_a_next() -> None:
 @pytest.mark.parametrize("anywhere", [False, True])
 @pytest.mark.parametrize("num_envs", [1, 5])
 def test_specs_are_those_of_torchrl(num_envs: int, anywhere: bool, max_steps: int | None) -> None:
-    check_env_specs(TrackEnv(recorded(TRACKS, anywhere=anywhere), num_envs, max_steps=max_steps))
+    check_env_specs(TrackEnv(limited(recorded(TRACKS, anywhere=anywhere), max_steps), num_envs))
 
 
 @pytest.mark.parametrize("max_steps", [None, 4])
@@ -74,7 +74,7 @@ def test_one_pass_equals_torchrls_step_and_reset_bit_for_bit(max_steps: int | No
     tracks = drawn(small_world().kernel, 40)
     cut = recorded(type(tracks)(tracks.cells, tracks.first, tracks.names % 2 == 0, tracks.names), t_max=2)
     cut = recorded(cut.tracks.select(cut.tracks.lengths > 1), t_max=2)
-    ours, stock = (TrackEnv(cut, 50, seed=5, max_steps=max_steps) for _ in range(2))
+    ours, stock = (TrackEnv(limited(cut, max_steps), 50, seed=5) for _ in range(2))
     a, b = ours.reset(), stock.reset()
     policies = [RandomSubset(9, generator(0, "policy")) for _ in range(2)]
     ended = {"terminated": 0, "truncated": 0}

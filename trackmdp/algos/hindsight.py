@@ -78,7 +78,7 @@ class Hindsight:
                 progress = self._update / self.updates
                 learner.loss.actor_loss.prepare(self._update, progress)
                 cells = self._buffer.paths(cfg.batch_size, self.task.t_max + 2)
-                cells = _within(cells, learner.loss.near.radius, self.task.size) if farther else cells
+                cells = _within(cells, learner.loss.near.radius, self.task.rows) if farther else cells
                 averages.add(**learner.update(cells, cfg.learning_rate.at(progress), cfg.blend.at(progress)))
                 self._update += 1
             self.actor.chains.copy_(learner.chains())
@@ -141,7 +141,7 @@ class Hindsight:
         if not len(self._buffer):
             raise UserError("algo.total_frames: in none of them was a target located and sensed again; expected more")
         if self._seen is None:
-            self._seen = int(_distance(*self._buffer.moves(), self.task.size).max())
+            self._seen = int(_distance(*self._buffer.moves(), self.task.rows).max())
         return self._seen
 
 

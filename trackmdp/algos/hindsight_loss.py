@@ -82,8 +82,8 @@ class HindsightLoss(nn.Module):
     ) -> None:
         super().__init__()
         m, choices, device = task.num_cells, task.num_choices, generator.device
-        self.near = Neighbourhood(task.size, reach, device)
-        self.view = Neighbourhood(task.size, choices * reach, device)
+        self.near = Neighbourhood(task.rows, reach, device)
+        self.view = Neighbourhood(task.rows, choices * reach, device)
 
         # Where the target moves alike and sensors cost alike, what to sense is learned once for all such cells; values
         # stay each cell's own.

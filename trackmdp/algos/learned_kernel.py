@@ -39,7 +39,7 @@ class LearnedKernel:
         self, task: Task, cfg: LearnedKernelConfig, *, iterations: int, seed: int, device: torch.device
     ) -> None:
         self.task, self.cfg, self.iterations, self.device = task, cfg, iterations, device
-        self._estimate = KernelEstimate(task.size, weight=cfg.prior, exit_weight=cfg.exit_prior)
+        self._estimate = KernelEstimate(task.rows, weight=cfg.prior, exit_weight=cfg.exit_prior)
         self._rng = np.random.default_rng(derive(seed, "learned_kernel"))
         self._chooses, self._warm_up = cfg.sensing == "chosen", cfg.warm_up
         self._iteration, self._spent = 0, np.zeros(2)
@@ -64,7 +64,9 @@ class LearnedKernel:
     def _world(self, kernel: Array) -> World:
         """The task with the `[M, M + 1]` kernel believed."""
         task = self.task
-        return World(task.size, task.reward, task.cost, task.safe_cost, task.t_max, kernel[:, :-1])
+        return World(
+            kernel[:, :-1], task.size, cost=task.cost, safe_cost=task.safe_cost, t_max=task.t_max, reward=task.reward
+        )
 
     def _diagnostics(self, chains: BoolArray) -> dict[str, float]:
         """What the plan is believed to be worth, how sure that is, and what learning has cost so far."""

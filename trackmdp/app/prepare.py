@@ -59,9 +59,9 @@ def check_files(cfg: CommandConfig, task: Sequence[str]) -> None:
     elif isinstance(cfg, ReportConfig) and not Path(cfg.sweep).is_dir():
         raise UserError(f"sweep={cfg.sweep}: no such folder")
     elif isinstance(cfg, WorldConfig) and _reads_files(cfg):
-        from trackmdp.build import make_setting
+        from trackmdp.build import make_problem
 
-        make_setting(cfg)
+        make_problem(cfg)
 
 
 def announce(command: str, cfg: CommandConfig, folder: Path, label: str = "") -> None:

@@ -33,9 +33,9 @@ def sentence(episode: Episode, t: int, task: Task) -> str:
     state = outcome(episode, t, task)
     words = {
         "exited": "the target has left the grid",
-        "forced": f"safe action forced, target located in {where(int(episode.target[t]), task.size)}",
-        "detected": f"target detected in {where(int(episode.target[t]), task.size)}",
-        "missed": f"target missed in {where(int(episode.target[t]), task.size)}",
+        "forced": f"safe action forced, target located in {where(int(episode.target[t]), task.columns)}",
+        "detected": f"target detected in {where(int(episode.target[t]), task.columns)}",
+        "missed": f"target missed in {where(int(episode.target[t]), task.columns)}",
     }
     on = "" if state == "forced" else f"{int(episode.action[t].sum())} sensors on, "
     return (
@@ -53,6 +53,6 @@ def frame(episode: Episode, t: int, task: Task) -> str:
         marks = np.where(episode.action[t], ON, marks)
     if episode.target[t] < task.num_cells:
         marks[episode.target[t]] = FOUND if episode.located[t] else MISSED
-    rows = [" ".join(row) for row in marks.reshape(task.size, task.size)]
-    edge = "─" * (2 * task.size + 1)
+    rows = [" ".join(row) for row in marks.reshape(task.size)]
+    edge = "─" * (2 * task.columns + 1)
     return "\n".join([f"┌{edge}┐", *(f"│ {row} │" for row in rows), f"└{edge}┘"])

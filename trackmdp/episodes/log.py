@@ -27,7 +27,6 @@ class EpisodeLog:
         world: the world.
         seed: seed of the run, from which each episode's own derives.
         config: text of the run's `config.yaml`.
-        max_steps: where episodes are cut; None for never.
         layout: write a viewer's layout next to the log.
         policies: go on after so many policies of the log of an earlier process, what it wrote later being cut off; None
             for a log of its own.
@@ -41,12 +40,11 @@ class EpisodeLog:
         *,
         seed: int,
         config: str,
-        max_steps: int | None,
         layout: bool,
         command: str,
         policies: int | None = None,
     ) -> None:
-        self._world, self._seed, self._max_steps, self._command = world, seed, max_steps, command
+        self._world, self._seed, self._command = world, seed, command
         self._writer: EpisodeWriter | None = None
         try:
             self.file, self.episodes = folder / "episodes.mcap", 0
@@ -55,7 +53,7 @@ class EpisodeLog:
             if self._writer is None:
                 self.file = free_name(self.file)
                 facts = {"seed": str(seed)}
-                self._writer = EpisodeWriter(self.file, world, facts=facts, config=config, max_steps=max_steps)
+                self._writer = EpisodeWriter(self.file, world, facts=facts, config=config)
             if layout:
                 write_layout(folder / "episodes.layout.json")
         except OSError as error:
@@ -89,7 +87,7 @@ class EpisodeLog:
         seeds = [derive(self._seed, "episode", *names, number) for number in range(episodes)]
         try:
             policy = self._writer.add_policy({**facts, **acting.facts}, getattr(acting, "chains", None))
-            recorded = record(self._world, acting, seeds, first=self.episodes, policy=policy, max_steps=self._max_steps)
+            recorded = record(self._world, acting, seeds, first=self.episodes, policy=policy)
             for episode in recorded:
                 self._writer.add(episode)
                 self.episodes += 1

@@ -47,14 +47,13 @@ def page(reader: EpisodeReader, episode: Episode) -> str:
 
 def _content(reader: EpisodeReader, episode: Episode) -> dict[str, Any]:
     world, shown = reader.world(), slice(0, MOST_STEPS)
-    limit = reader.max_steps
-    bound = bounds.clocked(world) if limit is None else horizon.clocked(world, limit)
+    bound = bounds.clocked(world) if world.max_steps is None else horizon.clocked(world)
     target = np.where(episode.target == world.num_cells, -1, episode.target)
-    about = f"{world.size} x {world.size} grid, {len(episode)} steps, seed {reader.run.get('seed', '')}"
+    about = f"{world.rows} x {world.columns} grid, {len(episode)} steps, seed {reader.run.get('seed', '')}"
     if len(episode) > MOST_STEPS:
         about += f"; the first {MOST_STEPS:,} steps are shown"
     return {
-        "size": world.size,
+        "size": world.rows,
         "about": about,
         "bound": float(bound[episode.start]),
         "target": target[shown].tolist(),

@@ -161,7 +161,15 @@ class EpisodeReader:
         """The world in which the episodes were recorded."""
         run = self.run
         kernel, cost = (_load(self.attachment(name)) for name in ("kernel.npy", "cost.npy"))
-        return World(int(run["size"]), float(run["reward"]), cost, float(run["safe_cost"]), self.t_max, kernel)
+        return World(
+            kernel,
+            int(run["size"]),
+            cost=cost,
+            safe_cost=float(run["safe_cost"]),
+            t_max=self.t_max,
+            reward=float(run["reward"]),
+            max_steps=self.max_steps,
+        )
 
     def check_all(self) -> None:
         """Check every byte of the file, those without meaning to this reader included."""

@@ -117,7 +117,6 @@ def record(
     *,
     first: int = 0,
     policy: int = 0,
-    max_steps: int | None = None,
 ) -> Iterator[Episode]:
     """One episode for each of `seeds`, in their order; the same whatever the others are.
 
@@ -127,11 +126,10 @@ def record(
         seeds: seed of each episode.
         first: number of the first.
         policy: number of the policy in the log.
-        max_steps: episodes are cut after this many steps; None for never.
     """
     rows = max(1, min(256, _CELLS_AT_ONCE // world.num_cells))
     for begin in range(0, len(seeds), rows):
-        batch = _Batch(world, acting, seeds[begin : begin + rows], max_steps)
+        batch = _Batch(world, acting, seeds[begin : begin + rows])
         yield from batch.run(first + begin, policy)
 
 
@@ -163,11 +161,11 @@ class _Draws:
 class _Batch:
     """Episodes stepped together, each to its own end."""
 
-    def __init__(self, world: World, acting: Acting, seeds: Sequence[int], max_steps: int | None) -> None:
+    def __init__(self, world: World, acting: Acting, seeds: Sequence[int]) -> None:
         self._acting, self._seeds = acting, seeds
-        self._env = TrackEnv(world, len(seeds), max_steps=max_steps)
+        self._env = TrackEnv(world, len(seeds))
         self._filter = BeliefFilter(world.kernel)
-        self._into = world.transition.T.tocsr()
+        self._into = world.kernel.T.tocsr()
         self._draws = _Draws(Motion(world.kernel), seeds, acting.draws)
 
     @torch.no_grad()

@@ -59,7 +59,7 @@ def verify(
 def _again(reader: EpisodeReader, world: World, acting: Acting, numbers: list[int]) -> Iterator[tuple[int, Episode]]:
     seeds = [int(reader.row(number)["seed"]) for number in numbers]
     policy = reader.row(numbers[0])["policy"]
-    again = record(world, acting, seeds, policy=policy, max_steps=reader.max_steps)
+    again = record(world, acting, seeds, policy=policy)
     return zip(numbers, again, strict=True)
 
 

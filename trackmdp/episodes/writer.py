@@ -36,30 +36,27 @@ class EpisodeWriter:
         world: the world of all its episodes; its tables go into the log, so that it can be re-simulated.
         facts: what else the log says of the run, such as `seed`.
         config: text of the run's `config.yaml`.
-        max_steps: where episodes are cut; None for never.
     """
 
-    def __init__(
-        self, file: Path, world: World, *, facts: Mapping[str, str], config: str, max_steps: int | None = None
-    ) -> None:
+    def __init__(self, file: Path, world: World, *, facts: Mapping[str, str], config: str) -> None:
         tables = {
             "config.yaml": config.encode(),
-            "kernel.npy": _npy(world.kernel),
+            "kernel.npy": _npy(world.kernel.toarray()),
             "cost.npy": _npy(world.cost),
         }
         run = {
             **schema.versions(),
             **facts,
             "format_version": schema.FORMAT,
-            "size": str(world.size),
+            "size": str(world.rows),
             "t_max": str(world.t_max),
-            "max_steps": "" if max_steps is None else str(max_steps),
+            "max_steps": "" if world.max_steps is None else str(world.max_steps),
             "reward": repr(float(world.reward)),
             "safe_cost": repr(float(world.safe_cost)),
             "tick_ns": str(schema.TICK_NS),
             **{f"{name}.sha256": schema.digest(content) for name, content in tables.items()},
         }
-        self._size, self._t_max = world.size, world.t_max
+        self._size, self._t_max = world.rows, world.t_max
         self._open(file, run, tables)
 
     @classmethod

@@ -20,7 +20,7 @@ def check(tolerance: float) -> Iterator[Check]:
 
 def _support(tolerance: float) -> Check:
     world = paper_world(paper_kernel(4, seed=4, border="renormalize"), 0.14, 1)
-    support = world.kernel > 0
+    support = world.kernel.toarray() > 0
     best, simple = optimal.solve(world), qmdp.solve(world)
     wrong = sum(int((chains[:, 0] != support).sum()) for chains in (best.chains, simple))
     missed = 1.0 - evaluate(world, best.chains).accuracy

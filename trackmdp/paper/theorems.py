@@ -142,12 +142,19 @@ def _as_pomdp(world: World) -> Check:
 
 def _corner(world: World) -> World:
     """The top left cells alone; leaving them is exiting."""
-    side = min(CORNER, world.size)
-    cells = (np.arange(side)[:, None] * world.size + np.arange(side)).ravel()
-    kernel = world.kernel[np.ix_(cells, cells)]
+    side = min(CORNER, *world.size)
+    cells = (np.arange(side)[:, None] * world.columns + np.arange(side)).ravel()
+    kernel = world.kernel[cells][:, cells].toarray()
     kernel *= 0.99 / np.maximum(kernel.sum(axis=1, keepdims=True), 0.99)
     share = len(cells) / world.num_cells
-    return World(side, world.reward, world.cost[cells], world.safe_cost * share, min(world.t_max, 2), kernel)
+    return World(
+        kernel,
+        side,
+        cost=world.cost[cells],
+        safe_cost=world.safe_cost * share,
+        t_max=min(world.t_max, 2),
+        reward=world.reward,
+    )
 
 
 def _estimator(world: World, solution: Solution) -> Iterator[Check]:
@@ -175,7 +182,7 @@ def _qmdp_derivation(world: World) -> Iterator[Check]:
 
         unroll(world, follow)
         yield _row("Q_MDP", f"threshold {threshold}: largest gain of switching one sensor over", worst)
-    value, move = bounds.paper(world), world.transition
+    value, move = bounds.paper(world), world.kernel
     gain = np.maximum(move.data * world.reward - world.cost[move.indices], 0.0)
     residual = per_row(row_index(move), gain, world.num_cells) + move @ value - value
     yield _row("Q_MDP", "V*_QMDP as printed solves its equation: largest residual", np.abs(residual).max())

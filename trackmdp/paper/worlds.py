@@ -45,4 +45,4 @@ def paper_kernel(support_size: int, seed: int, border: Border) -> Array:
 def paper_world(kernel: Array, cost: float, t_max: int) -> World:
     """The paper's world with this kernel `[100, 100]`: the safe action costs as much as all sensors, D = N² c."""
     m = SIZE**2
-    return World(SIZE, REWARD, np.full(m, cost), m * cost, t_max, kernel)
+    return World(kernel, SIZE, cost=np.full(m, cost), safe_cost=m * cost, t_max=t_max, reward=REWARD)

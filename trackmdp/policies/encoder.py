@@ -63,10 +63,10 @@ class RelativeBias(nn.Module):
 
     def __init__(self, task: Task) -> None:
         super().__init__()
-        side, m = 2 * task.size - 1, task.num_cells
+        side, m = 2 * task.columns - 1, task.num_cells
         self.table = nn.Parameter(torch.zeros(task.t_max + 2, side**2))
         cell = torch.arange(m)
-        code = cell // task.size * side + cell % task.size
+        code = cell // task.columns * side + cell % task.columns
         self.register_buffer("_index", code - code.unsqueeze(-1) + side**2 // 2, persistent=False)
 
     def forward(self, last_cell: Tensor, steps_since_detection: Tensor) -> Tensor:

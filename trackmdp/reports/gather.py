@@ -230,10 +230,10 @@ def _motions(
         except UserError as error:
             problems.append(Problem(run.name, f"its world cannot be built ({error})"))
             continue
-        limit, simple = run.settings.get("grid.max_steps"), qmdp.solve(world)
-        value = evaluate(world, simple) if limit is None else horizon.evaluate(world, simple, limit)
-        bound = bounds.clocked(world) if limit is None else horizon.clocked(world, limit)
-        found[run.name] = Motion(world.transition, value.value, bound)
+        whole, simple = world.max_steps is None, qmdp.solve(world)
+        value = evaluate(world, simple) if whole else horizon.evaluate(world, simple)
+        bound = bounds.clocked(world) if whole else horizon.clocked(world)
+        found[run.name] = Motion(world.kernel, value.value, bound)
     return found, problems
 
 

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from trackmdp.seeding import derive
 from trackmdp.world.model import BoolArray, World
-from trackmdp.world.tracks import Setting
+from trackmdp.world.tracks import Problem
 
 __all__ = ["LEGEND", "draw"]
 
@@ -16,7 +16,7 @@ LEGEND = f"{FOUND} target, detected   {MISSED} target, missed   {ON} sensor on  
 MARGIN = "   "
 
 
-def draw(world: Setting, chains: npt.NDArray[np.generic], *, seed: int, steps: int = 6) -> str:
+def draw(world: Problem, chains: npt.NDArray[np.generic], *, seed: int, steps: int = 6) -> str:
     """The first `steps` steps of an episode from the middle of the grid, side by side, under the legend.
 
     Args:
@@ -33,7 +33,7 @@ def draw(world: Setting, chains: npt.NDArray[np.generic], *, seed: int, steps: i
     return "\n".join([*(line.rstrip() for line in lines), "", LEGEND, ""])
 
 
-def _episode(world: Setting, sensed: BoolArray, seed: int, steps: int) -> list[tuple[int, BoolArray]]:
+def _episode(world: Problem, sensed: BoolArray, seed: int, steps: int) -> list[tuple[int, BoolArray]]:
     """The target's cell and the sensors `[M]` of each step, the exit step left out."""
     last, *path = _path(world, seed, steps)
     misses, frames = 0, []
@@ -44,7 +44,7 @@ def _episode(world: Setting, sensed: BoolArray, seed: int, steps: int) -> list[t
     return frames
 
 
-def _path(world: Setting, seed: int, steps: int) -> list[int]:
+def _path(world: Problem, seed: int, steps: int) -> list[int]:
     """The cell in which the target starts, and those of at most `steps` steps."""
     rng = np.random.default_rng(derive(seed, "picture"))
     if not isinstance(world, World):
@@ -52,9 +52,9 @@ def _path(world: Setting, seed: int, steps: int) -> list[int]:
         chosen = int(rng.integers(len(tracks)))
         begin, end = tracks.first[chosen : chosen + 2]
         return [int(cell) for cell in tracks.cells[begin : min(end, begin + steps + 1)]]
-    path = [world.size // 2 * (world.size + 1)]
+    path = [world.rows // 2 * world.columns + world.columns // 2]
     while len(path) <= steps:
-        row = world.kernel[path[-1]]
+        row = world.kernel[[path[-1]]].toarray()[0]
         cell = int(rng.choice(world.num_cells + 1, p=[*row, max(0.0, 1.0 - row.sum())]))
         if cell == world.num_cells:
             break
@@ -62,7 +62,7 @@ def _path(world: Setting, seed: int, steps: int) -> list[int]:
     return path
 
 
-def _frame(world: Setting, cell: int, on: BoolArray) -> list[str]:
+def _frame(world: Problem, cell: int, on: BoolArray) -> list[str]:
     marks = np.where(on, ON, OFF)
     marks[cell] = FOUND if on[cell] else MISSED
-    return [" ".join(row) for row in marks.reshape(world.size, world.size)]
+    return [" ".join(row) for row in marks.reshape(world.size)]

@@ -34,9 +34,9 @@ def paper(world: World) -> Array:
 
     The reward is not, so this can lie below what a policy attains; see `valid`.
     """
-    rows, p = row_index(world.transition), world.transition.data
-    gain = np.maximum(p * world.reward - world.cost[world.transition.indices], 0.0)
-    return accumulate(world.transition, per_row(rows, gain, world.num_cells))
+    rows, p = row_index(world.kernel), world.kernel.data
+    gain = np.maximum(p * world.reward - world.cost[world.kernel.indices], 0.0)
+    return accumulate(world.kernel, per_row(rows, gain, world.num_cells))
 
 
 def valid(world: World) -> Array:
@@ -44,11 +44,11 @@ def valid(world: World) -> Array:
 
     Each step is worth the best free choice or, where D is less than that choice, the safe action.
     """
-    rows, p = row_index(world.transition), world.transition.data
-    cost = world.cost[world.transition.indices] * world.stay_probability[rows]
+    rows, p = row_index(world.kernel), world.kernel.data
+    cost = world.cost[world.kernel.indices] * world.stay_probability[rows]
     free = per_row(rows, np.maximum(p * world.reward - cost, 0.0), world.num_cells)
     forced = (world.reward - world.safe_cost) * world.stay_probability
-    return accumulate(world.transition, np.maximum(free, forced))
+    return accumulate(world.kernel, np.maximum(free, forced))
 
 
 def clocked(world: World) -> Array:
@@ -62,7 +62,7 @@ def clocked_table(world: World) -> Clocked:
     U(x, t_max + 1) = sum_j P_xj (r - D + U(j, 0)), and
     U(x, n) = sum_j max{P_xj (r + U(j, 0)) - c_j P_in(x), P_xj U(j, n + 1)}.
     """
-    sensed = np.ones((world.num_choices, world.transition.nnz), dtype=bool)
+    sensed = np.ones((world.num_choices, world.kernel.nnz), dtype=bool)
     table = _value(world, sensed)
     while True:
         improved = _improve(world, table, sensed)
@@ -76,7 +76,7 @@ def clocked_table(world: World) -> Clocked:
 
 def _improve(world: World, table: Array, sensed: BoolArray) -> BoolArray:
     """`[t_max + 1, E]` the choice for each possible move; a tie leaves the present choice."""
-    rows, cells, p = row_index(world.transition), world.transition.indices, world.transition.data
+    rows, cells, p = row_index(world.kernel), world.kernel.indices, world.kernel.data
     cost = world.cost[cells] * world.stay_probability[rows]
     gain = p * (world.reward + table[cells, 0] - table[cells, 1:].T) - cost
     tie = 1e-12 * (1.0 + np.abs(table).max())
@@ -85,7 +85,7 @@ def _improve(world: World, table: Array, sensed: BoolArray) -> BoolArray:
 
 def _value(world: World, sensed: BoolArray) -> Array:
     """`[M, t_max + 2]` U of the given choices: U(., n) = earned[n] + reach[n] U(., 0), from the last n backwards."""
-    moves = world.transition
+    moves = world.kernel
     rows, cells = row_index(moves), moves.indices
     earned = [(world.reward - world.safe_cost) * world.stay_probability]
     reach = [moves]

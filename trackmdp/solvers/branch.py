@@ -209,7 +209,7 @@ class Tree:
 
     def _one_more_set(self, mass: sparse.csr_array, sets_left: int) -> tuple[Array, sparse.csr_array, Array, Array]:
         """Bound of F on each row, one more set chosen jointly; also the prediction, worth of sensing and of leaving."""
-        moved = mass @ self._world.transition
+        moved = mass @ self._world.kernel
         rows, cells = row_index(moved), moved.indices
         sense = moved.data * self._detected[cells] - self._world.cost[cells] * row_sums(moved)[rows]
         leave = moved.data * self._revealed[sets_left - 1][cells]

@@ -87,7 +87,7 @@ def renewal(world: World, chains: npt.NDArray[np.generic]) -> Iterator[tuple[spa
     mass = sparse.eye_array(world.num_cells, format="csr")
     nothing = np.zeros(world.num_cells)
     for n in range(world.num_choices):
-        predicted = mass @ world.transition
+        predicted = mass @ world.kernel
         inside = row_sums(predicted)
         on = chains[:, n]
         sensed = on[row_index(predicted), predicted.indices]
@@ -96,7 +96,7 @@ def renewal(world: World, chains: npt.NDArray[np.generic]) -> Iterator[tuple[spa
         reward = world.reward * detected - (on @ world.cost) * inside
         yield hit, np.stack([reward, inside, detected, on.sum(axis=1) * inside, nothing], axis=1)
         mass = _with_data(predicted, predicted.data * (1.0 - sensed))
-    forced = mass @ world.transition
+    forced = mass @ world.kernel
     inside = row_sums(forced)
     yield forced, np.stack([(world.reward - world.safe_cost) * inside, inside, inside, nothing, inside], axis=1)
 
@@ -114,7 +114,7 @@ def unroll(world: World, rule: Callable[[Prediction], BoolArray]) -> BoolArray:
     chains = np.zeros((world.num_cells, world.num_choices, world.num_cells), dtype=bool)
     mass = sparse.eye_array(world.num_cells, format="csr")
     for n in range(world.num_choices):
-        predicted = mass @ world.transition
+        predicted = mass @ world.kernel
         rows = row_index(predicted)
         sensed = rule(Prediction(n, rows, predicted.indices, predicted.data, row_sums(mass), row_sums(predicted)))
         chains[rows, n, predicted.indices] = sensed

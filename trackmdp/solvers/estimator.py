@@ -67,7 +67,7 @@ class EstimatorAccuracy:
 def known_positions(world: World, value: Array) -> list[Array]:
     """W after n + 1 misses, for n = 0 ... t_max, each `[M]`: best play from a known position, V = `value`."""
     detected = world.reward + value
-    forced = world.transition @ (detected - world.safe_cost)
+    forced = world.kernel @ (detected - world.safe_cost)
     known = tables(world, detected, forced, world.t_max, slack=1e-9, go_on=_go_on)
     return known[::-1]
 

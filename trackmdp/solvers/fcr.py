@@ -25,7 +25,7 @@ def solve(world: World, *, in_grid: bool = False) -> BoolArray:
     chains = np.zeros((world.num_cells, world.num_choices, world.num_cells), dtype=bool)
     predicted = sparse.eye_array(world.num_cells, format="csr")
     for n in range(world.num_choices):
-        predicted = predicted @ world.transition
+        predicted = predicted @ world.kernel
         rows = row_index(predicted)
         charged = row_sums(predicted)[rows] if in_grid else 1.0
         worth_it = predicted.data * world.reward >= world.cost[predicted.indices] * charged * (1.0 - TIE)

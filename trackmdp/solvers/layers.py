@@ -38,7 +38,7 @@ def build(world: World, length: int) -> list[Layer]:
     rows = cells = np.arange(m)
     layers = [Layer(rows, cells, sparse.eye_array(m, format="csr"))]
     for _ in range(length):
-        step = world.transition[cells]
+        step = world.kernel[cells]
         origin = row_index(step)
         keys, target = np.unique(rows[origin] * m + step.indices, return_inverse=True)
         moves = sparse.csr_array((step.data, target, step.indptr), shape=(len(rows), len(keys)))

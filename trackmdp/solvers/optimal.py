@@ -205,7 +205,7 @@ class _Run:
             if tree.nodes >= next_look:
                 next_look += patience
                 self.tighten(tree)
-                gained = accumulate(self.world.transition, tree.best - self.value).mean()
+                gained = accumulate(self.world.kernel, tree.best - self.value).mean()
                 if gained > WORTH_A_RESTART * float((self.bound - self.value).mean()):
                     return False
             return now < self.ends
@@ -217,7 +217,7 @@ class _Run:
     def tighten(self, tree: Tree) -> None:
         """Use what the tree has proved so far."""
         residual = np.maximum(tree.upper() - self.value, 0.0)
-        self.bound = np.minimum(self.bound, self.value + accumulate(self.world.transition, residual))
+        self.bound = np.minimum(self.bound, self.value + accumulate(self.world.kernel, residual))
 
     def revealed(self, problem: InnerProblem, known: list[Array], length: int, patience: int) -> Array:
         """`[M]` upper bound of what `length` more sets can earn with the target known to be in each cell."""
@@ -238,7 +238,7 @@ def _sets_without(world: World, x: int, steps: list[set[int]]) -> BoolArray:
     chain = np.zeros((world.num_choices, world.num_cells), dtype=bool)
     mass = np.eye(world.num_cells)[x]
     for n, left in enumerate(steps):
-        mass = mass @ world.transition
+        mass = mass @ world.kernel
         chain[n] = mass > 0
         chain[n, sorted(left)] = False
         mass = np.where(chain[n], 0.0, mass)

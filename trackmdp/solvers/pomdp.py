@@ -102,7 +102,7 @@ def _enumerate(world: World, most_beliefs: int) -> tuple[_BeliefMdp, int]:
             price = float(world.cost[action].sum() * predicted.sum())
             problem.add(i, world.reward * float(predicted[action].sum()) - price, targets, probability)
         if len(beliefs) > most_beliefs:
-            raise UserError(f"grid.size={world.size}: more than {most_beliefs} belief states, expected a smaller world")
+            raise UserError(f"grid.size={world.rows}: more than {most_beliefs} belief states, expected a smaller world")
     return problem, len(beliefs)
 
 

@@ -48,7 +48,7 @@ def accumulate(transition: sparse.csr_array, gathered: Array) -> Array:
 
 def expected_steps(world: World) -> Array:
     """`[M]` expected steps until the exit, the exit step included; sensing never changes it."""
-    steps = accumulate(world.transition, np.ones(world.num_cells))
+    steps = accumulate(world.kernel, np.ones(world.num_cells))
     if (steps < 0).any() or (steps > LONGEST_EPISODE).any():
         raise UserError(_ENDLESS)
     return steps

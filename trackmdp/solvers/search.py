@@ -43,7 +43,7 @@ class InnerProblem:
     def of(cls, world: World, layers: list[Layer], value: Array) -> InnerProblem:
         """The problem of one renewal: after the last set comes the safe action. `value`: `[M]`, V."""
         detected = world.reward + value
-        return cls(world, layers, detected, world.transition @ (detected - world.safe_cost))
+        return cls(world, layers, detected, world.kernel @ (detected - world.safe_cost))
 
     @property
     def length(self) -> int:

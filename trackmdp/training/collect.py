@@ -14,18 +14,17 @@ from torchrl.collectors import BaseCollector, Collector, MultiAsyncCollector, Mu
 from trackmdp.config.learning import CollectorConfig, MultiAsyncConfig, MultiSyncConfig, RayWorkersConfig
 from trackmdp.seeding import derive
 from trackmdp.world.env import TrackEnv
-from trackmdp.world.tracks import Setting
+from trackmdp.world.tracks import Problem
 
 __all__ = ["collector_state", "load_collector_state", "make_collector"]
 
 
 def make_collector(
-    world: Setting,
+    world: Problem,
     policy: TensorDictModuleBase,
     cfg: CollectorConfig,
     *,
     seed: int,
-    max_steps: int | None,
     env_device: torch.device,
     device: torch.device,
     done: int = 0,
@@ -35,7 +34,7 @@ def make_collector(
     The environment's own `_step_and_maybe_reset` and the flags below make the collector as fast as a loop by hand.
     Of `cfg.total_frames`, made up to whole batches, the `done` frames of an earlier process are not collected again.
     """
-    env: dict[str, Any] = {"num_envs": cfg.envs, "seed": seed, "max_steps": max_steps, "device": env_device}
+    env: dict[str, Any] = {"num_envs": cfg.envs, "seed": seed, "device": env_device}
     common: dict[str, Any] = {
         "frames_per_batch": cfg.frames_per_batch,
         "total_frames": -(-(cfg.total_frames - done) // cfg.frames_per_batch) * cfg.frames_per_batch,
@@ -59,14 +58,14 @@ def make_collector(
     return Collector(TrackEnv(world, **env), policy, track_traj_ids=False, **common)
 
 
-def _worker_env(world: Setting, worker: str, env: dict[str, Any]) -> TrackEnv:
+def _worker_env(world: Problem, worker: str, env: dict[str, Any]) -> TrackEnv:
     """Built in a worker process: its own stream for the targets, and for the actions sampled there."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the workers as well; the learner tells them to end
     torch.manual_seed(derive(env["seed"], "torch", worker))
     return TrackEnv(world, stream=f"world-{worker}", **env)
 
 
-def _remote_env(world: Setting, worker: str, env: dict[str, Any], threads: int) -> TrackEnv:
+def _remote_env(world: Problem, worker: str, env: dict[str, Any], threads: int) -> TrackEnv:
     torch.set_num_threads(threads)
     torch.manual_seed(derive(env["seed"], "torch", worker))
     return TrackEnv(world, stream=f"world-{worker}", **env)

@@ -70,7 +70,6 @@ def simulate(
     *,
     episodes: int,
     seed: int,
-    max_steps: int | None = None,
     device: torch.device | str = "cpu",
 ) -> Simulation:
     """Run `episodes` independent episodes, one per row, each until its own end.
@@ -83,10 +82,9 @@ def simulate(
         policy: reads the state keys and writes `action`; run deterministically.
         episodes: how many, all stepped together.
         seed: seed of the run; the stream is "evaluation".
-        max_steps: episodes are cut after this many steps; None for never.
         device: where to run.
     """
-    env = TrackEnv(world, episodes, seed=seed, stream="evaluation", max_steps=max_steps, device=device)
+    env = TrackEnv(world, episodes, seed=seed, stream="evaluation", device=device)
     totals = torch.zeros(6, episodes, dtype=torch.float64, device=device)
     running = torch.ones(episodes, dtype=torch.bool, device=device)
     with preserved_global_rng(), set_exploration_type(ExplorationType.DETERMINISTIC):

@@ -64,30 +64,28 @@ class ExactEvaluator(Evaluator):
     """Evaluates with the motion model.
 
     Args:
-        world: the task and the motion.
-        max_steps: episodes are truncated after this many steps, and so are all figures; None for never. The paper's
-            bound knows no such limit and is None then.
+        world: the task and the motion. The paper's bound knows no `max_steps` and is None where the world has one.
     """
 
     world: World
     qmdp: Evaluation
 
-    def __init__(self, world: World, max_steps: int | None = None) -> None:
-        self.world, self.max_steps = world, max_steps
-        if max_steps is None:
+    def __init__(self, world: World) -> None:
+        self.world = world
+        if world.max_steps is None:
             paper, valid, clocked = (bound(world).mean() for bound in (bounds.paper, bounds.valid, bounds.clocked))
             self.bounds = {"paper": float(paper), "valid": float(valid), "clocked": float(clocked)}
         else:
-            valid, clocked = (bound(world, max_steps).mean() for bound in (horizon.valid, horizon.clocked))
+            valid, clocked = (bound(world).mean() for bound in (horizon.valid, horizon.clocked))
             self.bounds = {"paper": None, "valid": float(valid), "clocked": float(clocked)}
         self.upper = float(clocked)
         self.qmdp = self.evaluate(qmdp.solve(world))
 
     def evaluate(self, chains: npt.NDArray[np.generic]) -> Evaluation:
         """Exact figures of the policy with these `chains` `[M, t_max+1, M]`."""
-        if self.max_steps is None:
+        if self.world.max_steps is None:
             return evaluate(self.world, chains)
-        return horizon.evaluate(self.world, chains, self.max_steps)
+        return horizon.evaluate(self.world, chains)
 
 
 def while_collecting(upper: float, evaluation: Evaluation, reward: float, frames: int) -> dict[str, float]:

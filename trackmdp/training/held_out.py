@@ -15,7 +15,7 @@ from trackmdp.solvers.kernel_estimate import KernelEstimate
 from trackmdp.solvers.recorded import Interval, replay
 from trackmdp.training.evaluator import Evaluator, ExactEvaluator
 from trackmdp.world.model import BoolArray, World
-from trackmdp.world.tracks import Recorded, Setting, Tracks
+from trackmdp.world.tracks import Problem, Recorded, Tracks
 
 __all__ = ["ESTIMATED", "HeldOutEvaluator", "estimated_kernel", "make_evaluator"]
 
@@ -23,9 +23,9 @@ ESTIMATED = "Q_MDP of the estimated kernel"
 """Q_MDP for the motion as the tracks to learn from show it."""
 
 
-def make_evaluator(setting: Setting, max_steps: int | None = None) -> Evaluator:
+def make_evaluator(problem: Problem) -> Evaluator:
     """Exact where there is a motion model, else on the held-out tracks."""
-    return ExactEvaluator(setting, max_steps) if isinstance(setting, World) else HeldOutEvaluator(setting, max_steps)
+    return ExactEvaluator(problem) if isinstance(problem, World) else HeldOutEvaluator(problem)
 
 
 class HeldOutEvaluator(Evaluator):
@@ -34,15 +34,14 @@ class HeldOutEvaluator(Evaluator):
     Without a motion model there are no bounds, no Q_MDP and no regret: `upper` and the scores' regrets are nan.
 
     Args:
-        world: the task and its recorded tracks.
-        max_steps: tracks are truncated after this many steps; None for never.
+        world: the task and its recorded tracks, each truncated after `max_steps` steps.
     """
 
     world: Recorded
 
-    def __init__(self, world: Recorded, max_steps: int | None = None) -> None:
-        self.world, self.max_steps = world, max_steps
-        self.tracks = world.held_out.limited(max_steps)
+    def __init__(self, world: Recorded) -> None:
+        self.world = world
+        self.tracks = world.held_out.limited(world.max_steps)
         self.upper, self.qmdp = math.nan, None
         self.bounds = dict.fromkeys(("paper", "valid", "clocked"))
         self._starts = self.tracks.cells[self.tracks.first[:-1]]
@@ -59,8 +58,8 @@ class HeldOutEvaluator(Evaluator):
         """Chains of the policies to hold a learned one against, by their names in tables."""
         task = self.world
         shape = (task.num_cells, task.num_choices, task.num_cells)
-        kernel = estimated_kernel(task.tracks, task.size)
-        world = World(task.size, task.reward, task.cost, task.safe_cost, task.t_max, kernel)
+        kernel = estimated_kernel(task.tracks, task.rows)
+        world = World(kernel, task.size, cost=task.cost, safe_cost=task.safe_cost, t_max=task.t_max, reward=task.reward)
         return {
             "all on": np.ones(shape, dtype=bool),
             "no sensors": np.zeros(shape, dtype=bool),

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import torch
+from scipy import sparse
 from torch import Tensor
-
-from trackmdp.world.model import Array
 
 __all__ = ["BeliefFilter"]
 
@@ -16,8 +15,8 @@ class BeliefFilter:
     One step is `predict`, then `detect` or `miss`. All methods are pure.
     """
 
-    def __init__(self, kernel: Array, device: torch.device | str = "cpu") -> None:
-        self.kernel = torch.as_tensor(kernel, dtype=torch.float64, device=device)
+    def __init__(self, kernel: sparse.csr_array, device: torch.device | str = "cpu") -> None:
+        self.kernel = torch.as_tensor(kernel.toarray(), dtype=torch.float64, device=device)
 
     def detect(self, cell: Tensor) -> Tensor:
         """Certainty after a detection in `cell` `[B]`."""

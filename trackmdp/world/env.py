@@ -10,7 +10,7 @@ from torchrl.envs import EnvBase
 
 from trackmdp.world.costs import Costs
 from trackmdp.world.targets import make_targets
-from trackmdp.world.tracks import Setting
+from trackmdp.world.tracks import Problem
 
 __all__ = ["TrackEnv"]
 
@@ -32,29 +32,27 @@ class TrackEnv(EnvBase):
     - `action_history` `[B, t_max+1, M]` bool, the actions since then; slots n and later are empty;
     - `target` `[B]` int64, the true cell, M once exited: for the step, the log and tests; no policy reads it;
     - `point` `[B]` int64, only with recorded tracks: where in the recording it is; no policy reads it;
-    - `step_count` `[B]` int64, only with `max_steps`.
+    - `step_count` `[B]` int64, only with `max_steps` in the world.
 
     Args:
         world: the task and the target's motion, or recorded tracks.
         num_envs: B.
         seed: seed of the run; the generators' names begin with `stream`.
         stream: name that keeps this environment's draws apart from all others.
-        max_steps: truncate episodes after this many steps; None for never.
         device: where the tensors live.
     """
 
     def __init__(
         self,
-        world: Setting,
+        world: Problem,
         num_envs: int,
         *,
         seed: int = 0,
         stream: str = "world",
-        max_steps: int | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
-        self.num_envs, self.max_steps = num_envs, max_steps
+        self.num_envs, self.max_steps = num_envs, world.max_steps
         self.num_cells, self.t_max = world.num_cells, world.t_max
         self._stream = stream
         self._targets = make_targets(world, self.device)

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Literal, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
+from scipy import sparse
 
 from trackmdp.errors import UserError
 from trackmdp.world.files import read_numbers
 from trackmdp.world.model import Array
 
-__all__ = ["Border", "random_support", "random_walk", "drift", "load_table", "check_homogeneous", "check_table"]
+__all__ = ["Border", "random_support", "random_walk", "drift", "load_table", "check_homogeneous"]
 
 Border: TypeAlias = Literal["renormalize", "inside", "clip", "exit"]
 
@@ -79,36 +79,7 @@ def load_table(path: str | Path) -> Array:
     return read_numbers("kernel.path", path, name="kernel")
 
 
-def check_table(table: Array, size: int, *, truncates: bool, source: str) -> Array:
-    """Return `table` if it is a kernel for a size x size grid; else say which rule it breaks, and where.
-
-    Args:
-        table: candidate `[M, M]` kernel.
-        size: N; M = N² rows and columns are expected.
-        truncates: whether `grid.max_steps` ends the episodes; if not, the target must be able to exit from anywhere.
-        source: named at the start of the message.
-    """
-    m = size**2
-    if table.ndim != 2 or table.shape[0] != table.shape[1]:
-        raise UserError(f"{source}: expected a square table, got shape {table.shape}")
-    if len(table) != m:
-        raise UserError(f"{source}: {len(table)} rows, but grid.size={size} has {m} cells")
-    if not np.isfinite(table).all():
-        raise UserError(f"{source}: row {_first(~np.isfinite(table).all(axis=1))} holds a value that is not finite")
-    if (table < 0).any():
-        raise UserError(f"{source}: row {_first((table < 0).any(axis=1))} holds a negative probability")
-    sums = table.sum(axis=1)
-    if (sums > 1 + 1e-9).any():
-        row = _first(sums > 1 + 1e-9)
-        raise UserError(f"{source}: row {row} sums to {sums[row]:.6g}, expected at most 1 (the rest is the exit)")
-    if not truncates and (trapped := ~_can_exit(table)).any():
-        raise UserError(
-            f"{source}: from cell {_first(trapped)} the target never exits, so no episode ends; set grid.max_steps"
-        )
-    return table
-
-
-def check_homogeneous(kernel: Array, size: int, source: str) -> None:
+def check_homogeneous(kernel: sparse.csr_array, size: int, source: str) -> None:
     """See that the target moves alike from all cells whose moves stay clear of the border.
 
     Raises:
@@ -121,10 +92,10 @@ def check_homogeneous(kernel: Array, size: int, source: str) -> None:
     if not len(inner):
         return
     around = (np.arange(-reach, reach + 1)[:, None] * size + np.arange(-reach, reach + 1)).ravel()
-    moves = kernel[inner[:, None], inner[:, None] + around]
+    moves = np.asarray(kernel[inner[:, None], inner[:, None] + around].toarray())
     differs = np.abs(moves - moves[0]).max(axis=1) > 1e-9
     if differs.any():
-        other = inner[_first(differs)]
+        other = inner[np.flatnonzero(differs)[0]]
         raise UserError(
             f"{source}: kernel.homogeneous=true, but from cell {other} the target moves otherwise than from cell "
             f"{inner[0]}; expected alike away from the border"
@@ -172,18 +143,3 @@ def _place(size: int, cell: int, offsets: np.ndarray, weights: Array, border: Bo
 def _homogeneous(size: int, window: np.ndarray, weights: Array, exit_probability: float, border: Border) -> Array:
     scaled = weights * (1.0 - exit_probability)
     return np.stack([_place(size, cell, window, scaled, border) for cell in range(size**2)])
-
-
-def _can_exit(table: Array) -> np.ndarray:
-    """`[M]` whether the exit can be reached from each cell."""
-    leaves = table.sum(axis=1) < 1 - 1e-12
-    moves = table > 0
-    while True:
-        grown = leaves | (moves & leaves).any(axis=1)
-        if (grown == leaves).all():
-            return leaves
-        leaves = grown
-
-
-def _first(flags: npt.ArrayLike) -> int:
-    return int(np.flatnonzero(flags)[0])

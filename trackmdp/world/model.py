@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
 from trackmdp.errors import UserError
+from trackmdp.world.checks import canonical_kernel, check_kernel
+from trackmdp.world.rows import pairwise_row_sums
 
 __all__ = ["Array", "BoolArray", "Task", "World"]
 
@@ -18,41 +21,83 @@ Array: TypeAlias = npt.NDArray[np.float64]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class Task:
-    """What the tracker knows: the grid, the rewards, the costs and the safe-sensing limit, but not the motion.
+    """What the tracker knows: the grid, the rewards, the costs and the limits, but not the motion.
 
-    A learner is given a `Task`, never a `World`, so that it cannot read the kernel.
+    A learner is given a `Task`, never a `World`, so that it cannot read the kernel. Cells are numbered row by row: the
+    cell in row i and column j is i · columns + j.
 
     Attributes:
-        size: N, cells along one side of the grid.
-        reward: r, earned when the target is sensed.
-        cost: `[M]`, c per cell: the price of one sensor switched on for one step; M = N².
-        safe_cost: D, the price of the safe action, forced after t_max + 1 misses in a row.
+        size: (rows, columns) of the grid; the constructor takes one number for a square grid.
+        cost: `[M]`, c per cell: the price of one sensor switched on for one step; the constructor takes one number for
+            all cells.
         t_max: T_max; the controller chooses freely at n = 0 ... t_max.
+        safe_cost: D, the price of the safe action, forced after t_max + 1 misses in a row; default: the sum of `cost`.
+        reward: r, earned when the target is sensed.
+        max_steps: episodes are truncated after this many steps; None for never.
+        window: W; only the sensors up to W rows and columns from the last located cell can be chosen. None: all can.
         markov: whether the next move depends on the target's cell alone, so that a learner may put paths together from
             moves seen on different ones.
         homogeneous: whether the target moves alike from all cells away from the border.
+
+    Raises:
+        UserError: a number is out of its range, or `cost` does not have one price per cell.
     """
 
-    size: int
-    reward: float
+    size: tuple[int, int]
     cost: Array
-    safe_cost: float
     t_max: int
-    markov: bool = field(default=True, kw_only=True)
-    homogeneous: bool = field(default=False, kw_only=True)
+    safe_cost: float
+    reward: float
+    max_steps: int | None
+    window: int | None
+    markov: bool
+    homogeneous: bool
 
-    def __post_init__(self) -> None:
-        if self.cost.shape != (self.num_cells,):
-            raise UserError(
-                f"cost.sensor: expected one number or {self.num_cells} (one per cell), got shape {self.cost.shape}"
-            )
+    def __init__(
+        self,
+        size: int | tuple[int, int],
+        *,
+        cost: npt.ArrayLike,
+        t_max: int,
+        safe_cost: float | None = None,
+        reward: float = 1.0,
+        max_steps: int | None = None,
+        window: int | None = None,
+        markov: bool = True,
+        homogeneous: bool = False,
+    ) -> None:
+        rows, columns = _size(size)
+        prices = _prices(cost, rows * columns)
+        values = {
+            "size": (rows, columns),
+            "cost": prices,
+            "t_max": _at_least(0, "t_max", t_max),
+            "safe_cost": float(prices.sum()) if safe_cost is None else _price("safe_cost", safe_cost),
+            "reward": _price("reward", reward),
+            "max_steps": None if max_steps is None else _at_least(1, "max_steps", max_steps),
+            "window": None if window is None else _at_least(0, "window", window),
+            "markov": markov,
+            "homogeneous": homogeneous,
+        }
+        for name, value in values.items():
+            object.__setattr__(self, name, value)  # the dataclass is frozen
+
+    @property
+    def rows(self) -> int:
+        """Rows of the grid."""
+        return self.size[0]
+
+    @property
+    def columns(self) -> int:
+        """Columns of the grid."""
+        return self.size[1]
 
     @property
     def num_cells(self) -> int:
-        """M = N², the number of cells and of sensors."""
-        return self.size**2
+        """M = rows · columns, the number of cells and of sensors."""
+        return self.rows * self.columns
 
     @property
     def num_choices(self) -> int:
@@ -60,36 +105,98 @@ class Task:
         return self.t_max + 1
 
     @property
+    def num_sensors(self) -> int:
+        """K, the sensors that can be chosen from one located cell: M, or (2W+1)² with a window."""
+        return self.num_cells if self.window is None else (2 * self.window + 1) ** 2
+
+    @property
     def task(self) -> Task:
         """The same task without the motion."""
-        known = {"markov": self.markov, "homogeneous": self.homogeneous}
-        return Task(self.size, self.reward, self.cost, self.safe_cost, self.t_max, **known)
+        return Task(**self._known())
+
+    def _known(self) -> dict[str, Any]:
+        """All that a `Task` holds, as arguments of its constructor."""
+        return {name: getattr(self, name) for name in Task.__dataclass_fields__}
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class World(Task):
     """A task together with the target's motion (paper, Section II), which solvers may read and learners may not.
 
+    Args:
+        kernel: `[M, M]` table of P, sparse or dense.
+        size: see `Task`, as are all further arguments.
+
     Attributes:
-        kernel: `[M, M]` sub-stochastic table P; row i sums to 1 - p_exit(i).
+        kernel: `[M, M]` canonical CSR matrix P of float64, without explicit zeros; row i sums to 1 - p_exit(i).
+
+    Raises:
+        UserError: `kernel` is no sub-stochastic table for this grid, or without `max_steps` some cell has no way out.
     """
 
-    kernel: Array
+    kernel: sparse.csr_array
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        m = self.num_cells
-        if self.kernel.shape != (m, m):
-            raise UserError(
-                f"kernel: expected a {m}x{m} table for a {self.size}x{self.size} grid, got {self.kernel.shape}"
-            )
-
-    @cached_property
-    def transition(self) -> sparse.csr_array:
-        """The kernel as a sparse `[M, M]` matrix."""
-        return sparse.csr_array(self.kernel)
+    def __init__(
+        self,
+        kernel: sparse.sparray | sparse.spmatrix | npt.NDArray[np.generic],
+        size: int | tuple[int, int],
+        *,
+        cost: npt.ArrayLike,
+        t_max: int,
+        safe_cost: float | None = None,
+        reward: float = 1.0,
+        max_steps: int | None = None,
+        window: int | None = None,
+        markov: bool = True,
+        homogeneous: bool = False,
+    ) -> None:
+        super().__init__(
+            size,
+            cost=cost,
+            t_max=t_max,
+            safe_cost=safe_cost,
+            reward=reward,
+            max_steps=max_steps,
+            window=window,
+            markov=markov,
+            homogeneous=homogeneous,
+        )
+        canonical = canonical_kernel(kernel)
+        check_kernel(canonical, self.size, truncates=max_steps is not None)
+        object.__setattr__(self, "kernel", canonical)
 
     @cached_property
     def stay_probability(self) -> Array:
         """`[M]` probability of still being in the grid after one step, 1 - p_exit."""
-        return self.kernel.sum(axis=1)
+        return pairwise_row_sums(self.kernel)
+
+
+def _size(size: int | tuple[int, int]) -> tuple[int, int]:
+    """(rows, columns) of one number, or of two."""
+    pair = (size, size) if isinstance(size, (int, np.integer)) else tuple(size)
+    if len(pair) != 2 or not all(isinstance(side, (int, np.integer)) and side >= 1 for side in pair):
+        raise UserError(f"size={size}: expected an integer >= 1, or two of them, rows and columns")
+    return int(pair[0]), int(pair[1])
+
+
+def _prices(cost: npt.ArrayLike, cells: int) -> Array:
+    """`[M]` price of each sensor, from one number for all or from one for each."""
+    prices = np.asarray(cost, dtype=np.float64)
+    if prices.shape not in ((), (cells,)):
+        raise UserError(f"cost: expected one number or {cells} (one per cell), got shape {prices.shape}")
+    if not (fine := np.isfinite(prices) & (prices >= 0)).all():
+        bad = int(np.flatnonzero(~fine)[0])
+        raise UserError(f"cost: cell {bad} costs {prices.flat[bad]}, expected a finite number >= 0")
+    return np.broadcast_to(prices, (cells,)).copy()
+
+
+def _price(name: str, value: float) -> float:
+    if not (math.isfinite(value) and value >= 0):
+        raise UserError(f"{name}={value}: expected a finite number >= 0")
+    return float(value)
+
+
+def _at_least(lowest: int, name: str, value: int) -> int:
+    if not isinstance(value, (int, np.integer)) or value < lowest:
+        raise UserError(f"{name}={value}: expected an integer >= {lowest}")
+    return int(value)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from scipy import sparse
 from torch import Tensor
-
-from trackmdp.world.model import Array
 
 __all__ = ["Motion"]
 
@@ -20,10 +19,10 @@ class Motion:
     of x + u therefore finds the successor, whatever the support of the row. The exit is cell number M, and stays there.
     """
 
-    def __init__(self, kernel: Array, device: torch.device | str = "cpu") -> None:
-        m = len(kernel)
+    def __init__(self, kernel: sparse.csr_array, device: torch.device | str = "cpu") -> None:
+        m = kernel.shape[0]
         closed = np.zeros((m + 1, m + 1))
-        closed[:m, :m] = kernel
+        closed[:m, :m] = kernel.toarray()
         closed[:, m] = np.clip(1.0 - closed.sum(axis=1), 0.0, 1.0)
         rows, successors = np.nonzero(closed)
         edges = np.minimum(np.cumsum(closed, axis=1)[rows, successors], 1.0)  # a sum may round to more

@@ -12,7 +12,7 @@ from torch import Tensor
 from trackmdp.seeding import generator
 from trackmdp.world.model import World
 from trackmdp.world.motion import Motion
-from trackmdp.world.tracks import Recorded, Setting, Tracks
+from trackmdp.world.tracks import Problem, Recorded, Tracks
 
 __all__ = ["RecordedTargets", "SampledTargets", "Targets", "make_targets"]
 
@@ -52,7 +52,7 @@ class Targets(Protocol):
         ...
 
 
-def make_targets(setting: Setting, device: torch.device) -> Targets:
+def make_targets(setting: Problem, device: torch.device) -> Targets:
     """The targets of a world or of recorded tracks."""
     if isinstance(setting, World):
         return SampledTargets(setting, device)

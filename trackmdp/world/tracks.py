@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TypeAlias
@@ -16,7 +16,7 @@ from trackmdp.seeding import derive
 from trackmdp.world.files import read_columns
 from trackmdp.world.model import Array, BoolArray, Task, World
 
-__all__ = ["Indices", "Recorded", "Setting", "Tracks", "check_tracks", "load_tracks", "split"]
+__all__ = ["Indices", "Problem", "Recorded", "Tracks", "check_tracks", "load_tracks", "split"]
 
 Indices: TypeAlias = npt.NDArray[np.int64]
 
@@ -81,19 +81,49 @@ class Tracks:
         return digest.hexdigest()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class Recorded(Task):
     """A task whose target is known from recorded tracks alone.
 
     Attributes:
         tracks: those to learn from.
-        held_out: those to judge on; no learner sees them.
+        held_out: those to evaluate on; no learner sees them.
         anywhere: episodes begin at any recorded point, not only with a track.
     """
 
     tracks: Tracks
     held_out: Tracks
-    anywhere: bool = field(default=False, kw_only=True)
+    anywhere: bool
+
+    def __init__(
+        self,
+        tracks: Tracks,
+        size: int | tuple[int, int],
+        *,
+        held_out: Tracks,
+        cost: npt.ArrayLike,
+        t_max: int,
+        safe_cost: float | None = None,
+        reward: float = 1.0,
+        max_steps: int | None = None,
+        window: int | None = None,
+        markov: bool = True,
+        homogeneous: bool = False,
+        anywhere: bool = False,
+    ) -> None:
+        super().__init__(
+            size,
+            cost=cost,
+            t_max=t_max,
+            safe_cost=safe_cost,
+            reward=reward,
+            max_steps=max_steps,
+            window=window,
+            markov=markov,
+            homogeneous=homogeneous,
+        )
+        for name, value in (("tracks", tracks), ("held_out", held_out), ("anywhere", anywhere)):
+            object.__setattr__(self, name, value)  # the dataclass is frozen
 
     @property
     def judged(self) -> Recorded:
@@ -101,8 +131,8 @@ class Recorded(Task):
         return replace(self, tracks=self.held_out, anywhere=False)
 
 
-Setting: TypeAlias = World | Recorded
-"""What learning and judging take place in: a world with its motion model, or recorded tracks."""
+Problem: TypeAlias = World | Recorded
+"""What learning and evaluation take place in: a world with its motion model, or recorded tracks."""
 
 
 def load_tracks(path: str | Path, size: int, *, exits: bool) -> Tracks:

@@ -288,7 +288,7 @@ def test_a_file_that_may_not_grow_leaves_what_was_flushed(
     with EpisodeReader(log) as reader:
         world, acting = reader.world(), acting_of(reader, 0)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    mine = EpisodeLog(tmp_path, world, seed=0, config="", max_steps=None, layout=False, command="train")
+    mine = EpisodeLog(tmp_path, world, seed=0, config="", layout=False, command="train")
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
         for _ in range(3):

@@ -33,9 +33,9 @@ def log_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[
         for name, acting in policies.items():
 
             def simulate(acting: Acting = acting) -> int:
-                return sum(map(len, record(world, acting, seeds, max_steps=cfg.grid.max_steps)))
+                return sum(map(len, record(world, acting, seeds)))
 
-            episodes = list(record(world, acting, seeds, max_steps=cfg.grid.max_steps))
+            episodes = list(record(world, acting, seeds))
 
             def write(acting: Acting = acting, episodes: list[Episode] = episodes) -> int:
                 return _write(file, cfg, world, acting, episodes)

@@ -29,7 +29,7 @@ def env_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[
     """Steps with random subsets drawn inside the loop, resets included, nothing stored."""
     rows = []
     for envs in (1, 64, 1024, 8192):
-        env = TrackEnv(world, envs, seed=cfg.seed, max_steps=cfg.grid.max_steps, device=device)
+        env = TrackEnv(world, envs, seed=cfg.seed, device=device)
         policy = RandomSubset(world.num_cells, generator(cfg.seed, "benchmark", device=device))
         state = env.reset()
 
@@ -53,7 +53,7 @@ def collector_speed(cfg: BenchmarkConfig, world: World, device: torch.device) ->
     rows = []
     for name, policy in policies.items():
         for envs in (64, 1024):
-            env = TrackEnv(world, envs, seed=cfg.seed, max_steps=cfg.grid.max_steps, device=device)
+            env = TrackEnv(world, envs, seed=cfg.seed, device=device)
             collector = Collector(
                 env,
                 policy,

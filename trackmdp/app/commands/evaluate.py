@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from trackmdp.app.commands import held_out, playback
 from trackmdp.app.commands.trained import trained
-from trackmdp.build import make_baseline, make_setting
+from trackmdp.build import make_baseline, make_problem
 from trackmdp.config import EvaluateConfig, McapConfig, PlaybackConfig, RandomKConfig, load_run, to_yaml
 from trackmdp.durable import write_json, write_text
 from trackmdp.episodes.log import EpisodeLog
@@ -29,7 +29,7 @@ from trackmdp.training.display import make_console, table
 from trackmdp.training.evaluate import Simulation, simulate
 from trackmdp.training.evaluator import ExactEvaluator, Score, figures
 from trackmdp.world.model import World
-from trackmdp.world.tracks import Recorded, Setting
+from trackmdp.world.tracks import Problem, Recorded
 
 __all__ = ["run"]
 
@@ -41,10 +41,10 @@ def run(cfg: EvaluateConfig, folder: Path) -> float:
     device = make_device(cfg.device)
     if cfg.run is None and isinstance(cfg.baseline, PlaybackConfig):
         return playback.run(cfg, folder, console, device)
-    world, max_steps, chains, subject = _trained(cfg, device) if cfg.run else _baseline(cfg)
+    world, chains, subject = _trained(cfg, device) if cfg.run else _baseline(cfg)
     if isinstance(world, Recorded):
-        return held_out.run(world, max_steps, chains, subject, folder, console, cfg.seed)
-    evaluator = ExactEvaluator(world, max_steps)
+        return held_out.run(world, chains, subject, folder, console, cfg.seed)
+    evaluator = ExactEvaluator(world)
     score = evaluator.score(chains)
     simulation = None
     if cfg.episodes:
@@ -52,8 +52,8 @@ def run(cfg: EvaluateConfig, folder: Path) -> float:
         if isinstance(cfg.baseline, RandomKConfig):
             draws = generator(cfg.seed, "evaluation", "policy", device=device)
             policy = fixed.RandomK(world.num_cells, cfg.baseline.k, draws)
-        simulation = simulate(world, policy, episodes=cfg.episodes, seed=cfg.seed, max_steps=max_steps, device=device)
-    estimate = estimator.accuracy(world, chains) if chains.dtype == np.bool_ and max_steps is None else None
+        simulation = simulate(world, policy, episodes=cfg.episodes, seed=cfg.seed, device=device)
+    estimate = estimator.accuracy(world, chains) if chains.dtype == np.bool_ and world.max_steps is None else None
     report = _report(subject, evaluator, score, simulation) | {"estimator": asdict(estimate) if estimate else None}
     write_json(folder / "evaluation.json", report)
     if chains.dtype == np.bool_:
@@ -61,7 +61,7 @@ def run(cfg: EvaluateConfig, folder: Path) -> float:
         write_text(folder / "picture.txt", draw(world, chains, seed=cfg.seed))
     _show(console, subject, evaluator, score, simulation, folder)
     if cfg.log is not None:
-        _log_episodes(cfg, world, max_steps, chains, subject, folder, console)
+        _log_episodes(cfg, world, chains, subject, folder, console)
     if estimate is not None:
         shares = (
             f"from Q {estimate.exact:.2%} (printed form {estimate.paper:.2%}), from the belief {estimate.bayes:.2%}"
@@ -73,7 +73,6 @@ def run(cfg: EvaluateConfig, folder: Path) -> float:
 def _log_episodes(
     cfg: EvaluateConfig,
     world: World,
-    max_steps: int | None,
     chains: np.ndarray,
     subject: str,
     folder: Path,
@@ -82,9 +81,7 @@ def _log_episodes(
     """Write `episodes.mcap`: as many episodes as are simulated, each from a generator of its own."""
     assert isinstance(cfg.log, McapConfig)
     described = to_yaml(load_run(cfg.run) if cfg.run else cfg)
-    log = EpisodeLog(
-        folder, world, seed=cfg.seed, config=described, max_steps=max_steps, layout=cfg.log.layout, command="evaluate"
-    )
+    log = EpisodeLog(folder, world, seed=cfg.seed, config=described, layout=cfg.log.layout, command="evaluate")
     if isinstance(cfg.baseline, RandomKConfig):
         log.record(RandomSets(world.num_cells, cfg.baseline.k), {"label": subject}, cfg.episodes)
     else:
@@ -93,16 +90,16 @@ def _log_episodes(
         console.print(f"{log.episodes} episodes in {log.file}", markup=False)
 
 
-def _trained(cfg: EvaluateConfig, device: torch.device) -> tuple[Setting, int | None, np.ndarray, str]:
+def _trained(cfg: EvaluateConfig, device: torch.device) -> tuple[Problem, np.ndarray, str]:
     assert cfg.run is not None
     policy = trained(cfg.run, device)
-    return policy.world, policy.max_steps, policy.chains, policy.subject
+    return policy.world, policy.chains, policy.subject
 
 
-def _baseline(cfg: EvaluateConfig) -> tuple[Setting, int | None, np.ndarray, str]:
+def _baseline(cfg: EvaluateConfig) -> tuple[Problem, np.ndarray, str]:
     assert cfg.baseline is not None
-    world = make_setting(cfg)
-    return world, cfg.grid.max_steps, make_baseline(cfg.baseline, world), cfg.baseline.name
+    world = make_problem(cfg)
+    return world, make_baseline(cfg.baseline, world), cfg.baseline.name
 
 
 def _report(subject: str, evaluator: ExactEvaluator, score: Score, simulation: Simulation | None) -> dict[str, Any]:

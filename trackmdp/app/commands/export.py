@@ -43,7 +43,7 @@ def run(cfg: ExportConfig, folder: Path) -> None:
     about = {
         "trackmdp": __version__,
         "policy": policy.subject,
-        "grid_size": str(task.size),
+        "grid_size": str(task.rows),
         "t_max": str(task.t_max),
     }
     if cfg.format == "sets":

@@ -20,7 +20,6 @@ __all__ = ["run", "show_held_out"]
 
 def run(
     world: Recorded,
-    max_steps: int | None,
     chains: np.ndarray,
     subject: str,
     folder: Path,
@@ -28,7 +27,7 @@ def run(
     seed: int,
 ) -> float:
     """Write `evaluation.json`, `sets.json` and `picture.txt` to `folder`; returns the mean reward of a track."""
-    evaluator = HeldOutEvaluator(world, max_steps)
+    evaluator = HeldOutEvaluator(world)
     report = evaluator.report(chains)
     value = evaluator.evaluate(chains).value
     content = {"policy": subject, "value": value.tolist(), "held_out": report, "regret_per_step": None}

@@ -31,17 +31,15 @@ def run(cfg: EvaluateConfig, folder: Path, console: Console, device: torch.devic
     assert isinstance(cfg.baseline, PlaybackConfig)
     world = make_world(cfg)
     with EpisodeReader(cfg.baseline.file) as reader:
-        if int(reader.run["size"]) != world.size:
+        if int(reader.run["size"]) != world.rows:
             raise UserError(
                 f"baseline.file={cfg.baseline.file}: recorded on a grid of size {reader.run['size']}, "
-                f"expected grid.size={world.size}"
+                f"expected grid.size={world.rows}"
             )
         logged = reader.read(cfg.baseline.episode)
-    again = reissued(world, logged, cfg.grid.max_steps)
+    again = reissued(world, logged)
     policy = playback.Playback(logged.action, device)
-    simulation = simulate(
-        world, policy, episodes=cfg.episodes, seed=cfg.seed, max_steps=cfg.grid.max_steps, device=device
-    )
+    simulation = simulate(world, policy, episodes=cfg.episodes, seed=cfg.seed, device=device)
     report = {
         "policy": cfg.baseline.name,
         "file": Path(cfg.baseline.file).name,
@@ -61,7 +59,7 @@ def run(cfg: EvaluateConfig, folder: Path, console: Console, device: torch.devic
     return simulation.aihtr.mean
 
 
-def reissued(world: World, logged: Episode, max_steps: int | None) -> Episode:
+def reissued(world: World, logged: Episode) -> Episode:
     """The episode with its own seed and its own actions, in `world`."""
-    (again,) = record(world, Issued(logged.action), [logged.seed], first=logged.number, max_steps=max_steps)
+    (again,) = record(world, Issued(logged.action), [logged.seed], first=logged.number)
     return again

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 from rich.console import Console
 
 from trackmdp.build import make_world
@@ -98,10 +97,10 @@ def _kernel_difference(reader: EpisodeReader) -> str | None:
     described, logged = make_world(cfg).kernel, reader.world().kernel
     if described.shape != logged.shape:
         return f"kernel: logged {logged.shape}, the config gives {described.shape}"
-    places = np.argwhere(described != logged)
-    if not len(places):
+    places = (described != logged).tocoo()
+    if not places.nnz:
         return None
-    x, y = (int(each) for each in places[0])
+    x, y = min(zip(places.row.tolist(), places.col.tolist(), strict=True))
     return f"kernel from cell {x} to {y}: logged {logged[x, y]}, the config gives {described[x, y]}"
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from rich.console import Console
 
-from trackmdp.build import make_algorithm, make_collector, make_setting
+from trackmdp.build import make_algorithm, make_collector, make_problem
 from trackmdp.config import McapConfig, TrainConfig
 from trackmdp.config.resume import config_text
 from trackmdp.durable import write_bytes, write_json, write_text
@@ -32,7 +32,7 @@ from trackmdp.training.loop import Intervals, Position, train
 from trackmdp.training.metrics import MetricsLog
 from trackmdp.training.state import capture, find, restore, take_weights
 from trackmdp.world.model import Array, BoolArray, World
-from trackmdp.world.tracks import Recorded, Setting
+from trackmdp.world.tracks import Problem, Recorded
 
 __all__ = ["Session"]
 
@@ -49,7 +49,7 @@ class Session:
         self._opened = ExitStack()
         torch.set_num_threads(cfg.threads)
         self.device = make_device(cfg.device)
-        self.world = make_setting(cfg)
+        self.world = make_problem(cfg)
         console.print(memory.check(cfg, self.world.task, self.device))
         state, passed_over = find(cfg, folder, self.device)
         for line in passed_over:
@@ -65,7 +65,7 @@ class Session:
         done = state["position"]["frames"] if state else 0
         self.collector = make_collector(cfg, self.world, self.algorithm, self.device, done=done)
         opened.callback(self.collector.shutdown)
-        self.evaluator = make_evaluator(self.world, cfg.grid.max_steps)
+        self.evaluator = make_evaluator(self.world)
         self.start = self._start(state)
         self._best = state["best"] if state else -math.inf
         _write_inputs(cfg, self.world, folder, resumed=state is not None)
@@ -141,7 +141,7 @@ class Session:
             self.log.record(Chains(chains), {"label": f"iteration {iteration}"}, log.episodes, iteration)
 
 
-def _episode_log(cfg: TrainConfig, world: Setting, folder: Path, policies: int | None) -> EpisodeLog | None:
+def _episode_log(cfg: TrainConfig, world: Problem, folder: Path, policies: int | None) -> EpisodeLog | None:
     """The log of simulated episodes, where it is asked for."""
     if not isinstance(cfg.log, McapConfig):
         return None
@@ -151,14 +151,13 @@ def _episode_log(cfg: TrainConfig, world: Setting, folder: Path, policies: int |
         world,
         seed=cfg.seed,
         config=config_text(cfg),
-        max_steps=cfg.grid.max_steps,
         layout=cfg.log.layout,
         policies=policies,
         command="train",
     )
 
 
-def _write_inputs(cfg: TrainConfig, world: Setting, folder: Path, *, resumed: bool) -> None:
+def _write_inputs(cfg: TrainConfig, world: Problem, folder: Path, *, resumed: bool) -> None:
     """`config.yaml`, and `kernel.npy` or `tracks.json`: what the run takes in.
 
     Raises:
@@ -171,12 +170,12 @@ def _write_inputs(cfg: TrainConfig, world: Setting, folder: Path, *, resumed: bo
             f"{file}: the run's {what} is not the one that its config describes now; it cannot change on resume"
         )
     write_text(folder / "config.yaml", config_text(cfg))
-    write_bytes(file, _npy(world.kernel) if isinstance(world, World) else _described(world))
+    write_bytes(file, _npy(world.kernel.toarray()) if isinstance(world, World) else _described(world))
 
 
-def _same(file: Path, world: Setting) -> bool:
+def _same(file: Path, world: Problem) -> bool:
     if isinstance(world, World):
-        return np.array_equal(np.load(file, allow_pickle=False), world.kernel)
+        return np.array_equal(np.load(file, allow_pickle=False), world.kernel.toarray())
     return file.read_bytes() == _described(world)
 
 

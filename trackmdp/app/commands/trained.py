@@ -7,12 +7,12 @@ from pathlib import Path
 
 import torch
 
-from trackmdp.build import make_algorithm, make_setting
+from trackmdp.build import make_algorithm, make_problem
 from trackmdp.config import load_run
 from trackmdp.training import checkpoint
 from trackmdp.training.evaluate import chains_of
 from trackmdp.world.model import BoolArray
-from trackmdp.world.tracks import Setting
+from trackmdp.world.tracks import Problem
 
 __all__ = ["Trained", "trained"]
 
@@ -21,8 +21,7 @@ __all__ = ["Trained", "trained"]
 class Trained:
     """The policy of a run as `chains` `[M, t_max+1, M]`, where it was learned, and the checkpoint it is from."""
 
-    world: Setting
-    max_steps: int | None
+    world: Problem
     chains: BoolArray
     subject: str
 
@@ -34,9 +33,9 @@ def trained(run: str, device: torch.device, *, best: bool = False) -> Trained:
         UserError: that is no run, or the checkpoint is missing or damaged.
     """
     cfg, folder = load_run(run), Path(run)
-    world = make_setting(cfg)
+    world = make_problem(cfg)
     algorithm = make_algorithm(cfg, world, device)
     file = folder / "checkpoints" / checkpoint.BEST if best else checkpoint.newest(folder)
     algorithm.load_state_dict(checkpoint.load(file, device)["algorithm"])
     chains = chains_of(algorithm.actor, world.task, device)
-    return Trained(world, cfg.grid.max_steps, chains, f"{cfg.algo.name}, {file.name}")
+    return Trained(world, chains, f"{cfg.algo.name}, {file.name}")
