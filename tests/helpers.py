@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from trackmdp.app.compose import register
 from trackmdp.build import make_algorithm
-from trackmdp.config import GROUPS, ROOTS, EvaluateConfig, TrainConfig, conf_dir, from_hydra, options, register
+from trackmdp.config import GROUPS, ROOTS, EvaluateConfig, TrainConfig, conf_dir, from_hydra, options
 from trackmdp.config.world import BORDERS
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.model import Array, World

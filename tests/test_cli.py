@@ -280,7 +280,7 @@ def test_ctrl_c_ends_in_one_line_and_130(empty_folder: Path) -> None:
     code = """
 import sys, types, threading
 module = types.ModuleType("trackmdp.app.commands.train")
-module.run = lambda cfg, folder: threading.Event().wait(60)
+module.run = lambda *_: threading.Event().wait(60)
 sys.modules[module.__name__] = module
 from trackmdp.app.cli import main
 sys.exit(main(["train"]))

@@ -16,7 +16,7 @@ from trackmdp.app.cli import main
 def stub(monkeypatch: pytest.MonkeyPatch, command: str, run: Callable[[Any, Path], Any]) -> None:
     """Let `run` do the work of a command."""
     module = types.ModuleType(f"trackmdp.app.commands.{command}")
-    module.run = run  # type: ignore[attr-defined]
+    module.run = lambda cfg, folder, problem=None: run(cfg, folder)  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, module.__name__, module)
 
 

@@ -9,22 +9,13 @@ from typing import Any
 
 from hydra import compose, initialize_config_dir
 
-from trackmdp.config import GROUPS, ROOTS, Option, conf_dir, from_hydra, options, register
+from trackmdp.app.compose import register
+from trackmdp.config import GROUPS, ROOTS, Option, conf_dir, from_hydra, options
 
 REFUSED = {("evaluate", "log=csv"), ("evaluate", "log=tensorboard")} | {
     (command, "kernel=tracks") for command in ("evaluate", "solve", "verify", "benchmark")
 }
 """Choices that a command's group offers and its rules refuse."""
-
-COMBINATIONS = [
-    (command, f"{group}={name}")
-    for command, root in ROOTS.items()
-    for group, item in options(root).items()
-    if group in GROUPS and not isinstance(item, Option)
-    for name in GROUPS[group]
-    if (command, f"{group}={name}") not in REFUSED
-]
-"""(command, choice) of every choice that a command takes."""
 
 
 def files_of(command: str, choice: str) -> list[str]:

@@ -9,16 +9,14 @@ from typing import Any
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
-from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from trackmdp.config import GROUPS, ROOTS, SELECTORS, Option, options
-from trackmdp.config.refusals import refuse_renamed, unknown_choice, unknown_option
+from trackmdp.config import GROUPS, ROOTS, SELECTORS, Option, options, suggestion
 from trackmdp.errors import UserError
 
 __all__ = ["diagnose"]
 
-Compose = Callable[[Sequence[str], RunMode], DictConfig]
+Compose = Callable[[Sequence[str]], DictConfig]
 
 
 def diagnose(error: Exception, command: str, words: Sequence[str], compose: Compose) -> UserError:
@@ -30,6 +28,8 @@ def diagnose(error: Exception, command: str, words: Sequence[str], compose: Comp
         words: its overrides, as typed.
         compose: composes a config from overrides.
     """
+    if isinstance(error, UserError):  # a file of the user's was refused
+        return error
     parser = OverridesParser.create()
     parsed = []
     for word in words:
@@ -38,7 +38,7 @@ def diagnose(error: Exception, command: str, words: Sequence[str], compose: Comp
         except HydraException:
             return UserError(f"{word}: expected option=value (a value with blanks or commas needs quotes)")
     sweeps = [override.input_line for override in parsed if override.is_sweep_override()]
-    if "multirun" in str(error).lower() and sweeps:
+    if sweeps and ("multirun" in str(error).lower()):
         return UserError(f"{sweeps[0]}: expected one value; add -m to run once for each")
     groups = [override for override in parsed if _group(override, command)]
     files = [override for override in parsed if _is_choice(override, command)]
@@ -71,7 +71,7 @@ def _bad_choice(override: Override, group: str, error: Exception) -> UserError |
     for value in _values(override):
         absent = value not in known and f"Could not find '{group}/{value}" in str(error)
         if absent or not isinstance(value, str):
-            return unknown_choice(group, value)
+            return UserError(f"{group}={_shown(value)}: expected one of {', '.join(known)}")
     return None
 
 
@@ -104,7 +104,7 @@ def _jobs(groups: Sequence[Override]) -> Iterator[list[str]]:
 def _known(command: str, overrides: Sequence[str], compose: Compose) -> dict[str, Option] | None:
     """Dotted key -> option of the config with these choices; None where it cannot be composed."""
     try:
-        return dict(_options_of(compose(overrides, RunMode.RUN), ROOTS[command], ""))
+        return dict(_options_of(compose(overrides), ROOTS[command], ""))
     except Exception:  # the choices themselves are at fault; the caller reports Hydra's own message
         return None
 
@@ -139,8 +139,10 @@ def _unknown(override: Override, known: dict[str, Option]) -> UserError:
     key = override.key_or_group
     if inner := [name for name in known if name.startswith(f"{key}.")]:
         return UserError(f"{override.input_line}: expected {inner[0]}=value (known: {', '.join(inner)})")
-    refuse_renamed(key)
-    return unknown_option(key, known)
+    parent = key.rpartition(".")[0]
+    beside = [name for name in known if name.startswith(f"{parent}.")] if parent else []
+    names = beside or list(dict.fromkeys(name.split(".")[0] for name in known))
+    return UserError(f"{key}: unknown option{suggestion(key, known, names)}")
 
 
 def _values(override: Override) -> list[Any]:

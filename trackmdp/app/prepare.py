@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig
 
@@ -13,14 +16,20 @@ from trackmdp.config import (
     CommandConfig,
     EvaluateConfig,
     ExportConfig,
+    ReplayConfig,
     ReportConfig,
+    TrainConfig,
     WorldConfig,
     from_hydra,
     load_run,
 )
+from trackmdp.config.resume import continued
 from trackmdp.errors import UserError
 
-__all__ = ["announce", "check_files", "say", "shown", "typed_config"]
+if TYPE_CHECKING:
+    from trackmdp.world.tracks import Problem
+
+__all__ = ["Prepared", "announce", "prepare", "say", "shown", "typed_config"]
 
 WORLD_KEYS = ("grid", "kernel", "cost")
 
@@ -38,30 +47,51 @@ def typed_config(command: str, cfg: DictConfig, folder: Path) -> CommandConfig:
     return from_hydra(cfg, ROOTS[command], folder)
 
 
-def check_files(cfg: CommandConfig, task: Sequence[str]) -> None:
-    """Check what the config names: runs, sweeps, tables of motion and prices.
+@dataclass(frozen=True)
+class Prepared:
+    """A command that can be run: all that can be checked has been.
+
+    Attributes:
+        command: what is run.
+        cfg: its config.
+        folder: where it writes.
+        problem: the world or the tracks of `cfg`, where checking has built them; else the command builds them, after
+            its first line is on the terminal.
+    """
+
+    command: str
+    cfg: CommandConfig
+    folder: Path
+    problem: Problem | None = None
+
+    def run(self) -> Any:
+        """Run the command; returns what it returns."""
+        run: Callable[..., Any] = importlib.import_module(f"trackmdp.app.commands.{self.command}").run
+        if isinstance(self.cfg, WorldConfig):
+            return run(self.cfg, self.folder, self.problem)
+        return run(self.cfg, self.folder)
+
+
+def prepare(command: str, cfg: CommandConfig, folder: Path, words: Sequence[str]) -> Prepared:
+    """Check what the config names: runs, sweeps, files to write, tables of motion and prices.
 
     Args:
-        cfg: the typed config.
-        task: the overrides that were typed.
+        command: what is to be run.
+        cfg: its typed config.
+        folder: where it is to write; a run that is there already is resumed where `cfg.resume` says so.
+        words: the overrides that were typed.
 
     Raises:
         UserError: what is named is not there, or not what is expected.
     """
-    if isinstance(cfg, EvaluateConfig) and cfg.run is not None:
-        for word in task:
-            key = word.lstrip("+~").split("=")[0]
-            if key.split(".")[0].split("@")[0] in WORLD_KEYS:
-                raise UserError(f"{word}: not together with run={cfg.run}, whose own world is used")
-        load_run(cfg.run)
-    elif isinstance(cfg, ExportConfig):
-        load_run(cfg.run)
-    elif isinstance(cfg, ReportConfig) and not Path(cfg.sweep).is_dir():
-        raise UserError(f"sweep={cfg.sweep}: no such folder")
-    elif isinstance(cfg, WorldConfig) and _reads_files(cfg):
-        from trackmdp.build import make_problem
-
-        make_problem(cfg)
+    try:
+        if isinstance(cfg, TrainConfig):
+            cfg = continued(cfg, folder, words)
+        _check_files(cfg, words)
+        problem = _problem(cfg) if isinstance(cfg, WorldConfig) and _reads_files(cfg) else None
+    except OSError as error:
+        raise UserError(f"{error.filename}: cannot be used ({error.strerror})") from error
+    return Prepared(command, cfg, folder, problem)
 
 
 def announce(command: str, cfg: CommandConfig, folder: Path, label: str = "") -> None:
@@ -90,7 +120,39 @@ def say(line: str) -> None:
     sys.stdout.flush()
 
 
+def _problem(cfg: WorldConfig) -> Problem:
+    """The world or the tracks of `cfg`."""
+    from trackmdp.build import make_problem  # imports scipy, which takes longer than all other checks
+
+    return make_problem(cfg)
+
+
 def _reads_files(cfg: WorldConfig) -> bool:
     """Whether building the world can still fail: it is read from files, or its target may never exit."""
     exits = getattr(cfg.kernel, "exit_probability", 0.0) > 1e-9
     return not exits or isinstance(getattr(cfg.cost, "sensor", None), str)
+
+
+def _check_files(cfg: CommandConfig, words: Sequence[str]) -> None:
+    if isinstance(cfg, EvaluateConfig) and cfg.run is not None:
+        for word in words:
+            key = word.lstrip("+~").split("=")[0]
+            if key.split(".")[0].split("@")[0] in WORLD_KEYS:
+                raise UserError(f"{word}: not together with run={cfg.run}, whose own world is used")
+        load_run(cfg.run)
+    elif isinstance(cfg, ExportConfig):
+        load_run(cfg.run)
+    elif isinstance(cfg, ReportConfig) and not Path(cfg.sweep).is_dir():
+        raise UserError(f"sweep={cfg.sweep}: no such folder")
+    elif isinstance(cfg, ReplayConfig):
+        _check_outputs(cfg)
+
+
+def _check_outputs(cfg: ReplayConfig) -> None:
+    """Refuse an output that is a folder where a file is to be written, or the other way round."""
+    for key in ("html", "layout"):
+        named = getattr(cfg, key)
+        if named is not None and (Path(named).is_dir() or not Path(named).name):
+            raise UserError(f"{key}={named}: expected a file to write, not a folder")
+    if cfg.csv is not None and Path(cfg.csv).exists() and not Path(cfg.csv).is_dir():
+        raise UserError(f"csv={cfg.csv}: expected a folder")

@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from omegaconf import DictConfig
 
-from trackmdp.app.sweep.plan import combinations, of_task, plan, sweep_name
-from trackmdp.config import conf_dir, register
+from trackmdp.app.compose import of_task, register
+from trackmdp.app.sweep.plan import combinations, plan, sweep_name
+from trackmdp.config import conf_dir
 from trackmdp.errors import UserError
 
 

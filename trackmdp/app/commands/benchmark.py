@@ -16,6 +16,7 @@ from trackmdp.durable import write_json
 from trackmdp.training.devices import make_device
 from trackmdp.training.display import make_console, table
 from trackmdp.world.model import World
+from trackmdp.world.tracks import Problem
 
 __all__ = ["PARTS", "run"]
 
@@ -34,15 +35,20 @@ PARTS: dict[str, Callable[[BenchmarkConfig, World, torch.device], Iterable[dict[
 }
 
 
-def run(cfg: BenchmarkConfig, folder: Path) -> None:
-    """Measure `cfg.part` and write `benchmark.json` to `folder`, row by row as they come."""
+def run(cfg: BenchmarkConfig, folder: Path, problem: Problem | None = None) -> None:
+    """Measure `cfg.part` and write `benchmark.json` to `folder`, row by row as they come.
+
+    `problem` is the world of `cfg`, where it is built already.
+    """
     console = make_console(cfg.quiet)
     torch.set_num_threads(cfg.threads)
     device = make_device(cfg.device)
     where = machine()
     rows: list[dict[str, Any]] = []
+    world = make_world(cfg) if problem is None else problem
+    assert isinstance(world, World)  # recorded tracks are refused
     with console.status(f"measuring {cfg.part}") as status:
-        for row in PARTS[cfg.part](cfg, make_world(cfg), device):
+        for row in PARTS[cfg.part](cfg, world, device):
             rows.append(row)
             write_json(folder / "benchmark.json", {"machine": where, "rows": rows})
             status.update(f"measuring {cfg.part}: {len(rows)} rows so far, in {folder}")

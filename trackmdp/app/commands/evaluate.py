@@ -34,14 +34,17 @@ from trackmdp.world.tracks import Problem, Recorded
 __all__ = ["run"]
 
 
-def run(cfg: EvaluateConfig, folder: Path) -> float:
-    """Write `evaluation.json`, `sets.json` and `picture.txt` to `folder`; returns the exact AIHTR."""
+def run(cfg: EvaluateConfig, folder: Path, problem: Problem | None = None) -> float:
+    """Write `evaluation.json`, `sets.json` and `picture.txt` to `folder`; returns the exact AIHTR.
+
+    `problem` is the world of `cfg`, where it is built already.
+    """
     console = make_console(cfg.quiet)
     torch.set_num_threads(cfg.threads)
     device = make_device(cfg.device)
     if cfg.run is None and isinstance(cfg.baseline, PlaybackConfig):
-        return playback.run(cfg, folder, console, device)
-    world, chains, subject = _trained(cfg, device) if cfg.run else _baseline(cfg)
+        return playback.run(cfg, folder, console, device, problem)
+    world, chains, subject = _trained(cfg, device) if cfg.run else _baseline(cfg, problem)
     if isinstance(world, Recorded):
         return held_out.run(world, chains, subject, folder, console, cfg.seed)
     evaluator = ExactEvaluator(world)
@@ -96,9 +99,9 @@ def _trained(cfg: EvaluateConfig, device: torch.device) -> tuple[Problem, np.nda
     return policy.world, policy.chains, policy.subject
 
 
-def _baseline(cfg: EvaluateConfig) -> tuple[Problem, np.ndarray, str]:
+def _baseline(cfg: EvaluateConfig, problem: Problem | None) -> tuple[Problem, np.ndarray, str]:
     assert cfg.baseline is not None
-    world = make_problem(cfg)
+    world = make_problem(cfg) if problem is None else problem
     return world, make_baseline(cfg.baseline, world), cfg.baseline.name
 
 

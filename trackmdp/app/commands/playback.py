@@ -19,17 +19,21 @@ from trackmdp.policies import playback
 from trackmdp.training.display import table
 from trackmdp.training.evaluate import simulate
 from trackmdp.world.model import World
+from trackmdp.world.tracks import Problem
 
 __all__ = ["run"]
 
 
-def run(cfg: EvaluateConfig, folder: Path, console: Console, device: torch.device) -> float:
+def run(
+    cfg: EvaluateConfig, folder: Path, console: Console, device: torch.device, problem: Problem | None = None
+) -> float:
     """Write `evaluation.json` to `folder`; returns the simulated AIHTR.
 
     Such a policy ignores what it observes, so that it has no chains and no exact value.
     """
     assert isinstance(cfg.baseline, PlaybackConfig)
-    world = make_world(cfg)
+    world = make_world(cfg) if problem is None else problem
+    assert isinstance(world, World)  # recorded tracks are refused
     with EpisodeReader(cfg.baseline.file) as reader:
         if int(reader.run["size"]) != world.rows:
             raise UserError(

@@ -44,12 +44,12 @@ class Session:
         UserError: the config asks for what is not there, for more memory than there is, or for a run that is not this.
     """
 
-    def __init__(self, cfg: TrainConfig, folder: Path, console: Console) -> None:
+    def __init__(self, cfg: TrainConfig, folder: Path, console: Console, problem: Problem | None = None) -> None:
         self.cfg, self.folder, self.console = cfg, folder, console
         self._opened = ExitStack()
         torch.set_num_threads(cfg.threads)
         self.device = make_device(cfg.device)
-        self.world = make_problem(cfg)
+        self.world = make_problem(cfg) if problem is None else problem
         console.print(memory.check(cfg, self.world.task, self.device))
         state, passed_over = find(cfg, folder, self.device)
         for line in passed_over:

@@ -20,21 +20,24 @@ from trackmdp.solvers.optimal import Progress, Solution
 from trackmdp.training.display import make_console, table
 from trackmdp.training.evaluator import figures
 from trackmdp.world.model import World
+from trackmdp.world.tracks import Problem
 
 __all__ = ["run", "solve_world"]
 
 _SECONDS_BETWEEN_LINES = 2.0
 
 
-def run(cfg: SolveConfig, folder: Path) -> float:
+def run(cfg: SolveConfig, folder: Path, problem: Problem | None = None) -> float:
     """Write `solution.json` (and `verification.json`) to `folder`; returns the AIHTR.
 
     Ctrl-C ends a search early: the bracket reached so far is printed and saved.
+    `problem` is the world of `cfg`, where it is built already.
     """
     console = make_console(cfg.quiet)
     if cfg.grid.max_steps is not None:
         raise UserError(f"grid.max_steps={cfg.grid.max_steps}: only whole episodes are solved, expected null")
-    world = make_world(cfg)
+    world = make_world(cfg) if problem is None else problem
+    assert isinstance(world, World)  # recorded tracks are refused: there is no kernel to solve with
     with _SearchDisplay(console, f"solve {cfg.solver.name}") as display:
         solution = solve_world(cfg, world, display.update)
     evaluation = evaluate(world, solution.chains)

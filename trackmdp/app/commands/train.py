@@ -21,12 +21,18 @@ from trackmdp.training.display import make_console
 from trackmdp.training.evaluator import ExactEvaluator
 from trackmdp.training.lock import locked
 from trackmdp.world.model import World
+from trackmdp.world.tracks import Problem
 
 __all__ = ["run"]
 
 
-def run(cfg: TrainConfig, folder: Path) -> float:
+def run(cfg: TrainConfig, folder: Path, problem: Problem | None = None) -> float:
     """Train as `cfg` says and write inputs, metrics, checkpoints, policy and summary to `folder`; returns the AIHTR.
+
+    Args:
+        cfg: the checked config.
+        folder: of the run.
+        problem: the world or the tracks of `cfg`, where they are built already.
 
     Raises:
         UserError: the config asks for what is not there, or for more memory than there is.
@@ -35,7 +41,7 @@ def run(cfg: TrainConfig, folder: Path) -> float:
     """
     try:
         with locked(folder):
-            return _run(cfg, folder)
+            return _run(cfg, folder, problem)
     except OSError as error:
         if not folder.is_dir():
             raise RunError(f"hydra.run.dir={folder}: the folder was removed while the run wrote to it") from error
@@ -44,14 +50,14 @@ def run(cfg: TrainConfig, folder: Path) -> float:
         ) from error
 
 
-def _run(cfg: TrainConfig, folder: Path) -> float:
+def _run(cfg: TrainConfig, folder: Path, problem: Problem | None) -> float:
     started, used = time.monotonic(), time.process_time()
     console = make_console(cfg.quiet)
     reached = _finished(cfg, folder)
     if reached is not None:
         console.print(f"finished before; results in {folder}")
         return reached
-    with Session(cfg, folder, console) as session:
+    with Session(cfg, folder, console, problem) as session:
         score, end = session.train()
     evaluator, chains, solution, held_out = session.evaluator, session.chains(), None, None
     if isinstance(evaluator, ExactEvaluator):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import multiprocessing
 import os
 import signal
@@ -16,10 +15,8 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
-from trackmdp.app.prepare import announce, check_files
+from trackmdp.app.prepare import announce, prepare
 from trackmdp.app.sweep.plan import Job
-from trackmdp.config import CommandConfig, TrainConfig
-from trackmdp.config.resume import continued
 from trackmdp.errors import FAILED, USER_MISTAKE, Preempted, RunError, UserError
 
 __all__ = ["METHOD", "OUTPUT", "Outcome", "context_for", "end_all", "run_apart"]
@@ -155,13 +152,9 @@ def _run(job: Job) -> Outcome:
     """Run the command; nothing that it raises gets out."""
     assert job.cfg is not None
     try:
-        check_files(job.cfg, job.words)
-        cfg: CommandConfig = job.cfg
-        if isinstance(cfg, TrainConfig):
-            cfg = continued(cfg, job.folder, job.words)
-        announce(job.command, cfg, job.folder, job.label)
-        run: Callable[[Any, Path], Any] = importlib.import_module(f"trackmdp.app.commands.{job.command}").run
-        value = run(cfg, job.folder)
+        ready = prepare(job.command, job.cfg, job.folder, job.words)
+        announce(job.command, ready.cfg, job.folder, job.label)
+        value = ready.run()
         return Outcome(0, float(value) if isinstance(value, (int, float)) else None)
     except Preempted as error:
         return Outcome(128 + error.signal)

@@ -14,7 +14,7 @@ from typing import Any
 from trackmdp.app.sweep import apart
 from trackmdp.app.sweep.job import Launch, fail, run_job, stop_signal
 from trackmdp.app.sweep.plan import Job
-from trackmdp.config.sweeps import SubmititConfig, SubmititLocalConfig, SubmititSlurmConfig
+from trackmdp.app.sweep.schema import SubmititConfig, SubmititLocalConfig, SubmititSlurmConfig
 from trackmdp.errors import FAILED, UserError
 
 __all__ = ["launcher"]

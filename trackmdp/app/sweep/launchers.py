@@ -14,8 +14,8 @@ from functools import partial
 from trackmdp.app.sweep.apart import context_for
 from trackmdp.app.sweep.job import Launch, run_job
 from trackmdp.app.sweep.plan import Job
+from trackmdp.app.sweep.schema import BasicConfig, JoblibConfig, LauncherConfig, RayConfig, SubmititConfig
 from trackmdp.config import TrainConfig
-from trackmdp.config.sweeps import BasicConfig, JoblibConfig, LauncherConfig, RayConfig, SubmititConfig
 from trackmdp.errors import require
 
 __all__ = ["make_launcher", "threads_of"]

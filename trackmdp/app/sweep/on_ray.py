@@ -7,7 +7,7 @@ from typing import Any
 
 from trackmdp.app.sweep.job import run_job
 from trackmdp.app.sweep.plan import Job
-from trackmdp.config.sweeps import RayConfig
+from trackmdp.app.sweep.schema import RayConfig
 from trackmdp.errors import UserError
 from trackmdp.training.signals import kept_sigterm
 

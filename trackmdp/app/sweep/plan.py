@@ -22,7 +22,7 @@ from trackmdp.config import CommandConfig, TrainConfig, to_dict
 from trackmdp.config.resume import CHANGEABLE
 from trackmdp.errors import UserError
 
-__all__ = ["Job", "combinations", "of_task", "plan", "sweep_name"]
+__all__ = ["Job", "combinations", "plan", "sweep_name"]
 
 _UNNAMED = ("experiment", "quiet", "resume")
 """Words that are no part of a folder's readable name: they say how a run is done, or stand for other words."""
@@ -56,11 +56,6 @@ class Job:
     def folder(self) -> Path:
         """Of the run."""
         return self.sweep / self.name
-
-
-def of_task(words: Iterable[str]) -> list[str]:
-    """The words that say something of the runs, not of Hydra."""
-    return [word for word in words if not word.lstrip("+~").startswith(("hydra.", "hydra/"))]
 
 
 def combinations(blocks: Sequence[str], typed: Sequence[str]) -> list[list[str]]:

@@ -12,9 +12,9 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import IntervalSweep, Override, RangeSweep
 
 from trackmdp.app.sweep.plan import Job
+from trackmdp.app.sweep.schema import OptunaConfig
 from trackmdp.app.sweep.state import run_of
 from trackmdp.app.sweep.table import figures
-from trackmdp.config.sweeps import OptunaConfig
 from trackmdp.errors import UserError, require
 from trackmdp.seeding import derive
 

@@ -1,0 +1,228 @@
+"""From typed words to a composed config, by Hydra's public calls: what is composed is data, and names no code."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.plugins import Plugins
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from trackmdp.app.diagnose import diagnose
+from trackmdp.app.sources import searched
+from trackmdp.app.sweep.schema import PLUGINS
+from trackmdp.config import GROUPS, ROOTS, conf_dir, register_resolvers
+from trackmdp.config.untrusted import names_code
+from trackmdp.errors import UserError
+
+__all__ = ["Composer", "folder_of", "of_task", "register"]
+
+_LOGGING = {"class": {"logging.StreamHandler", "logging.FileHandler", "logging.NullHandler"}}
+_LOG_FILE = "${hydra.runtime.output_dir}/${hydra.job.name}.log"
+"""The one log file that Hydra's own logging configs write."""
+
+
+_HYDRAS_OWN = {
+    "_target_": "hydra._internal.core_plugins.basic_sweeper.BasicSweeper",
+    "max_batch_size": None,
+    "params": None,
+}
+"""What stands under `hydra.sweeper` where a primary config chooses none; it is never called."""
+
+
+def register() -> None:
+    """Make every schema known to Hydra as `base_<name>`, for the `defaults` lists in `conf/`."""
+    register_resolvers()
+    store = ConfigStore.instance()
+    for command, root in ROOTS.items():
+        store.store(name=f"base_{command}", node=root)
+    for group, members in GROUPS.items():
+        for name, schema in members.items():
+            store.store(group=group, name=f"base_{name}", node=schema)
+    Plugins.instance()  # Hydra's plugins store launchers and sweepers of the same names, which ours replace
+    for group, members in PLUGINS.items():
+        for name, schema in members.items():
+            store.repo["hydra"][group].pop(f"{name}.yaml", None)
+            store.store(group=f"hydra/{group}", name=f"base_{name}", node=schema)
+
+
+class Composer:
+    """Composes configs of one command; Hydra is initialised while the context is open.
+
+    Args:
+        command: whose `conf/<command>.yaml` is composed, unless `name` is another file.
+        words: what was typed, for the folders that `hydra.searchpath=` names.
+        name: of the primary config.
+        folder: a main folder in place of `conf/`.
+        extra: a further folder (`--config-dir`).
+
+    Raises:
+        UserError: a folder is not there.
+    """
+
+    def __init__(
+        self,
+        command: str,
+        words: Sequence[str] = (),
+        name: str | None = None,
+        folder: str | None = None,
+        extra: str | None = None,
+    ) -> None:
+        self.command, self.name = command, name or command
+        self.words = [word for word in words if not _is_search_path(word)]
+        """What was typed, but for search paths."""
+        named = [path for word in words if _is_search_path(word) for path in _search_path(word)]
+        self._users = [_existing("--config-dir", extra)] if extra is not None else []
+        self._users += [_existing("hydra.searchpath", path) for path in named]
+        self._main = None if folder is None else _existing("--config-path", folder)
+        self._opened = ExitStack()
+
+    def __enter__(self) -> Self:
+        register()
+        main = str(self._main) if self._main else conf_dir()
+        self._opened.enter_context(searched(self._users, (), main_is_users=self._main is not None))
+        self._opened.enter_context(initialize_config_dir(main, job_name="trackmdp", version_base="1.3"))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._opened.close()
+        GlobalHydra.instance().clear()
+
+    def __call__(self, words: Sequence[str]) -> DictConfig:
+        """The config of `words`, with Hydra's own under `hydra`; `${hydra:...}` then refers to it.
+
+        Raises:
+            UserError: the words do not make a config, or the config names code to call.
+        """
+        try:
+            cfg = self._compose(words)
+        except Exception as error:  # Hydra raises many kinds, ValueError among them; all are about what was typed
+            raise diagnose(error, self.command, words, self._compose) from error
+        _refuse_code(cfg, words)
+        HydraConfig.instance().set_config(cfg)
+        return cfg
+
+    def _compose(self, words: Sequence[str]) -> DictConfig:
+        return compose(self.name, overrides=list(words), return_hydra_config=True)
+
+
+def of_task(words: Iterable[str]) -> list[str]:
+    """The words that say something of the runs, not of Hydra."""
+    return [word for word in words if not word.lstrip("+~").startswith(("hydra.", "hydra/"))]
+
+
+def folder_of(cfg: DictConfig, key: str) -> Path:
+    """The folder at a dotted key, such as ``hydra.run.dir``, its interpolations resolved.
+
+    Raises:
+        UserError: it is missing or no folder's name, or an interpolation in it leads nowhere.
+    """
+    try:
+        value = OmegaConf.select(cfg, key, throw_on_missing=True)
+    except Exception as error:  # a resolver of `${name:...}` raises what it likes
+        said = str(error).strip().splitlines() or [type(error).__name__]
+        raise UserError(f"{key}: {said[0]}") from error
+    if not isinstance(value, str):
+        raise UserError(f"{key}: expected a folder")
+    folder = Path(value)
+    try:
+        folder.exists()
+    except OSError as error:
+        raise UserError(f"{key}={value}: expected a folder that can be written to ({error.strerror})") from error
+    return folder
+
+
+def _refuse_code(cfg: DictConfig, words: Sequence[str]) -> None:
+    """Refuse a config by which anything but our own code would be called.
+
+    Raises:
+        UserError: it names a callable, a callback, a launcher or a sweeper that is none of ours, or logging of its own.
+    """
+    plain = OmegaConf.to_container(cfg, resolve=False)
+    assert isinstance(plain, dict)
+    for group, members in PLUGINS.items():
+        if plain["hydra"][group] == _HYDRAS_OWN:
+            del plain["hydra"][group]
+        elif OmegaConf.get_type(cfg.hydra, group) not in members.values():
+            raise UserError(f"hydra/{group}: expected one of {', '.join(members)}")
+    if cfg.hydra.callbacks:
+        raise UserError(f"hydra.callbacks.{next(iter(cfg.hydra.callbacks))}: a config names no code to call")
+    if cfg.hydra.job.env_set and not any("hydra.job.env_" in word for word in words):
+        raise UserError("hydra.job.env_set: not taken from a file; set the environment in the shell")
+    if Path(cfg.hydra.output_subdir or "x").name != (cfg.hydra.output_subdir or "x"):
+        raise UserError(f"hydra.output_subdir={cfg.hydra.output_subdir}: expected a name, or null")
+    for name in ("job_logging", "hydra_logging"):
+        _check_logging(cfg.hydra, name)
+    del plain["hydra"]["job_logging"], plain["hydra"]["hydra_logging"]  # colorlog's formatter is named by "()"
+    if key := names_code(plain):
+        raise UserError(f"{key}: a config is data, and names no code to call")
+
+
+def _check_logging(hydra: DictConfig, name: str) -> None:
+    """Logging may only be one of Hydra's own choices: its configs name classes, factories and files."""
+    node = hydra[name]
+    plain = OmegaConf.to_container(node, resolve=False) if node is not None else {}
+    known = {"none", "default", "stdout", "disabled", "colorlog", None}
+    if hydra.runtime.choices.get(f"hydra/{name}") not in known:
+        raise UserError(f"hydra/{name}: expected one of none, default, stdout, disabled, colorlog")
+    for path, value in _entries(plain, f"hydra.{name}."):
+        key = path.rpartition(".")[2]
+        allowed = {
+            "class": value in _LOGGING["class"],
+            "()": value == "colorlog.ColoredFormatter",
+            "filename": value == _LOG_FILE and "/" not in str(hydra.job.name),
+        }.get(key, not str(value).startswith(("ext://", "cfg://")) or value in ("ext://sys.stdout", "ext://sys.stderr"))
+        if not allowed:
+            raise UserError(f"{path}: a config names no code to call and no file to log to")
+
+
+def _entries(plain: Any, prefix: str) -> Iterable[tuple[str, Any]]:
+    """Dotted key and value of every leaf."""
+    items = plain.items() if isinstance(plain, dict) else enumerate(plain)
+    for key, value in items:
+        if isinstance(value, (dict, list)):
+            yield from _entries(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def _is_search_path(word: str) -> bool:
+    return word.lstrip("+").startswith("hydra.searchpath=")
+
+
+def _search_path(word: str) -> list[str]:
+    """The folders that `hydra.searchpath=[...]` names."""
+    try:
+        value = OverridesParser.create().parse_override(word).value()
+    except (HydraException, OmegaConfBaseException) as error:
+        raise UserError(f"{word}: expected hydra.searchpath=[FOLDER, ...]") from error
+    paths = [] if value is None else value
+    if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
+        raise UserError(f"{word}: expected hydra.searchpath=[FOLDER, ...]")
+    paths = [path.removeprefix("file://") for path in paths]
+    if scheme := next((path for path in paths if "://" in path), None):
+        raise UserError(f"hydra.searchpath={scheme}: expected a folder; configs are not taken from a package")
+    return paths
+
+
+def _existing(option: str, folder: str) -> Path:
+    path = Path(folder).absolute()
+    try:
+        found = path.is_dir()
+    except OSError:  # a name that is too long
+        found = False
+    if not found:
+        raise UserError(f"{option} {folder}: no such folder")
+    return path

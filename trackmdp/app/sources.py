@@ -1,0 +1,126 @@
+"""Where Hydra finds configs: `conf/`, installed plugins, and the user's folders, which are read as data and no more."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.object_type import ObjectType
+from hydra.core.plugins import Plugins
+from hydra.plugins.config_source import ConfigLoadError, ConfigResult, ConfigSource
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+from omegaconf import DictConfig, OmegaConf
+
+from trackmdp.config.untrusted import parse_yaml, read_text
+from trackmdp.errors import UserError
+
+__all__ = ["searched"]
+
+_FORBIDDEN = {
+    "hydra.callbacks": "a config does not name code to call",
+    "hydra.searchpath": "further folders are named on the command line",
+    "hydra.job.env_set": "the environment is set in the shell",
+}
+"""Keys that a file of the user's may not set, and why: each reaches code outside the config."""
+
+_folders: list[tuple[str, str]] = []
+"""(provider, path) of the folders that `_Folders` adds, while `searched` is open."""
+
+_main_is_users = False
+"""Whether the main folder was named by `--config-path`."""
+
+
+@contextmanager
+def searched(users: Sequence[Path], plugins: Sequence[Path], *, main_is_users: bool = False) -> Iterator[None]:
+    """Hydra, initialised inside, also searches these folders, after the main one and in this order.
+
+    Args:
+        users: named on the command line; their files are read by `UserFolder`.
+        plugins: of installed packages.
+        main_is_users: the main folder is one of the user's as well.
+    """
+    global _main_is_users
+    for kind in (UserFolder, _Folders):
+        Plugins.instance().register(kind)  # what is registered already stays
+    _folders[:] = [("command-line", f"{UserFolder.scheme()}://{folder.absolute()}") for folder in users]
+    _folders.extend(("plugin", f"file://{folder.absolute()}") for folder in plugins)
+    _main_is_users = main_is_users
+    try:
+        yield
+    finally:
+        _folders.clear()
+        _main_is_users = False
+
+
+class _Folders(SearchPathPlugin):
+    """Hydra asks every such plugin for changes to its search path."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        for element in search_path.get_path():
+            if element.provider == "main" and _main_is_users:
+                element.path = f"{UserFolder.scheme()}://{element.path}"
+        for provider, path in _folders:
+            search_path.append(provider, path)
+
+
+class UserFolder(ConfigSource):
+    """A folder of the user's: only plain YAML files in it are read, of bounded size, and none names code."""
+
+    @staticmethod
+    def scheme() -> str:
+        return "data"
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        """The config at `config_path`, such as ``experiment/mine``.
+
+        Raises:
+            ConfigLoadError: there is no such file; Hydra then looks elsewhere.
+            UserError: it is not plain data.
+        """
+        file = self._file(config_path)
+        if not file.is_file():
+            raise ConfigLoadError(f"Config not found : {file}")
+        text = read_text(file)
+        config = parse_yaml(text, str(file))
+        if not isinstance(config, DictConfig):
+            raise UserError(f"{file}: not a config (expected a mapping)")
+        try:
+            header = self._get_header_dict(text[:512])
+        except ValueError as error:
+            raise UserError(f"{file}: not a config ({error})") from error
+        _refuse_settings(config, header.get("package") or "", file)
+        return ConfigResult(config=config, path=self.full_path(), provider=self.provider, header=header)
+
+    def available(self) -> bool:
+        return self.is_group("")
+
+    def is_group(self, config_path: str) -> bool:
+        return (Path(self.path) / config_path).is_dir()
+
+    def is_config(self, config_path: str) -> bool:
+        return self._file(config_path).is_file()
+
+    def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
+        names: list[str] = []
+        for entry in (Path(self.path) / config_path).iterdir():
+            self._list_add_result(names, str(Path(config_path) / entry.name), entry.name, results_filter)
+        return sorted(set(names))
+
+    def _file(self, config_path: str) -> Path:
+        return Path(self.path) / self._normalize_file_name(config_path)
+
+
+def _refuse_settings(config: DictConfig, package: str, file: Path) -> None:
+    """Refuse what `_FORBIDDEN` names, wherever the file's package puts its keys."""
+    prefix = [] if package in ("", "_global_") else package.split(".")
+    plain = OmegaConf.to_container(config, resolve=False)
+    for name in reversed(prefix):
+        plain = {name: plain}
+    for key, why in _FORBIDDEN.items():
+        found: object = plain
+        for name in key.split("."):
+            found = found.get(name) if isinstance(found, dict) else None
+        if found:
+            raise UserError(f"{file}: sets {key}, which is not taken from a file ({why})")

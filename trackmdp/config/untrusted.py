@@ -1,0 +1,104 @@
+"""Reading YAML that somebody else wrote: bounded in size, depth and what its aliases unfold to, and plain data only."""
+
+from __future__ import annotations
+
+import stat
+from pathlib import Path
+from typing import Any
+
+import yaml  # type: ignore[import-untyped]  # a dependency of OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from trackmdp.errors import UserError
+
+__all__ = ["names_code", "parse_yaml", "read_text"]
+
+_MAX_BYTES, _MAX_NODES, _MAX_DEPTH = 2**20, 100_000, 50
+_CODE = ("_target_", "()")
+"""Keys by which Hydra and Python's logging name what is called."""
+
+
+def read_text(file: Path) -> str:
+    """The text of a file.
+
+    Raises:
+        UserError: it is no ordinary file, too long, or not UTF-8.
+    """
+    try:
+        if not stat.S_ISREG(file.stat().st_mode):  # a pipe or a device may never end
+            raise UserError(f"{file}: expected an ordinary file")
+        with file.open("rb") as stream:
+            content = stream.read(_MAX_BYTES + 1)
+        if len(content) > _MAX_BYTES:
+            raise UserError(f"{file}: longer than {_MAX_BYTES:,} bytes, expected a config")
+        return content.decode("utf-8")
+    except OSError as error:
+        raise UserError(f"{file}: cannot be read ({error.strerror})") from error
+    except UnicodeDecodeError as error:
+        raise UserError(f"{file}: not a config (not UTF-8 at byte {error.start})") from error
+
+
+def parse_yaml(text: str, source: str) -> DictConfig | ListConfig:
+    """The content of YAML text; `source` is what messages call it.
+
+    Raises:
+        UserError: it is not YAML, unfolds to too much, or names code to call.
+    """
+    try:
+        _check_size(text)
+        config: Any = OmegaConf.create(text)
+        plain = OmegaConf.to_container(config, resolve=False)
+    except (yaml.YAMLError, OmegaConfBaseException, ValueError, RecursionError, AttributeError, TypeError) as error:
+        said = " ".join(str(error).split()) or type(error).__name__
+        raise UserError(f"{source}: not a config ({said[:200]})") from error
+    if key := names_code(plain):
+        raise UserError(f"{source}: {key}: a config is data, and names no code to call")
+    assert isinstance(config, (DictConfig, ListConfig))
+    return config
+
+
+def names_code(plain: Any, prefix: str = "") -> str:
+    """The dotted key of the first entry that names what is called; `""` where none does."""
+    if isinstance(plain, list):
+        plain = {str(place): item for place, item in enumerate(plain)}
+    if not isinstance(plain, dict):
+        return ""
+    for key, value in plain.items():
+        if key in _CODE:
+            return f"{prefix}{key}"
+        if found := names_code(value, f"{prefix}{key}."):
+            return found
+    return ""
+
+
+def _check_size(text: str) -> None:
+    """Count what the text unfolds to, from its events alone, before anything is built.
+
+    An alias counts as all that its anchor holds: nine lists of nine aliases each, ten times over, are 9^10 nodes in 700
+    bytes.
+
+    Raises:
+        ValueError: too many nodes, too deep, or an alias within its own anchor.
+    """
+    sizes: dict[str, int] = {}  # of the anchors that are complete
+    opened: list[tuple[str | None, int]] = []  # anchor of each open collection, and the count when it began
+    count = 0
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        if isinstance(event, yaml.AliasEvent):
+            if event.anchor not in sizes:
+                raise ValueError(f"alias *{event.anchor} stands inside its own anchor, or before it")
+            count += sizes[event.anchor]
+        elif isinstance(event, yaml.CollectionStartEvent):
+            opened.append((event.anchor, count))
+            count += 1
+        elif isinstance(event, yaml.CollectionEndEvent):
+            anchor, began = opened.pop()
+            if anchor is not None:
+                sizes[anchor] = count - began
+        elif isinstance(event, yaml.ScalarEvent):
+            count += 1
+            if event.anchor is not None:
+                sizes[event.anchor] = 1
+        if count > _MAX_NODES or len(opened) > _MAX_DEPTH:
+            raise ValueError(f"more than {_MAX_NODES:,} values, or deeper than {_MAX_DEPTH} levels")
