@@ -17,6 +17,16 @@ REFUSED = {("evaluate", "log=csv"), ("evaluate", "log=tensorboard")} | {
 }
 """Choices that a command's group offers and its rules refuse."""
 
+COMBINATIONS = [
+    (command, f"{group}={name}")
+    for command, root in ROOTS.items()
+    for group, item in options(root).items()
+    if group in GROUPS and not isinstance(item, Option)
+    for name in GROUPS[group]
+    if (command, f"{group}={name}") not in REFUSED
+]
+"""(command, choice) of every choice that a command takes."""
+
 
 def files_of(command: str, choice: str) -> list[str]:
     """A value for each option that has none in conf/: the files a user must name."""

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from omegaconf import OmegaConf
 
-from tests.config.cases import REFUSED, composed, files_of
+from tests.config.cases import COMBINATIONS, composed, files_of
 from tests.helpers import configured
 from tests.reads import record_reads, unread
 from trackmdp.app.sweep.schema import PLUGINS
@@ -116,16 +116,6 @@ def test_every_option_says_what_it_is_and_what_it_may_be(where: str, item: Optio
         assert not item.allows(math.inf)
     if item.kind is str:
         assert item.choices or item.expects, where
-
-
-COMBINATIONS = [
-    (command, f"{group}={name}")
-    for command, root in ROOTS.items()
-    for group, item in options(root).items()
-    if group in GROUPS and not isinstance(item, Option)
-    for name in GROUPS[group]
-    if (command, f"{group}={name}") not in REFUSED
-]
 
 
 @pytest.mark.parametrize(("command", "choice"), COMBINATIONS)

@@ -21,7 +21,9 @@ from omegaconf.errors import OmegaConfBaseException
 from trackmdp.app.diagnose import diagnose
 from trackmdp.app.sources import searched
 from trackmdp.app.sweep.schema import PLUGINS
-from trackmdp.config import GROUPS, ROOTS, conf_dir, register_resolvers
+from trackmdp.config import GROUPS, ROOTS, conf_dir
+from trackmdp.config.registry import plugin_folders
+from trackmdp.config.resolvers import register_resolvers
 from trackmdp.config.untrusted import names_code
 from trackmdp.errors import UserError
 
@@ -43,6 +45,7 @@ _HYDRAS_OWN = {
 def register() -> None:
     """Make every schema known to Hydra as `base_<name>`, for the `defaults` lists in `conf/`."""
     register_resolvers()
+    plugin_folders()  # installed packages add their choices to `GROUPS`
     store = ConfigStore.instance()
     for command, root in ROOTS.items():
         store.store(name=f"base_{command}", node=root)
@@ -90,7 +93,7 @@ class Composer:
     def __enter__(self) -> Self:
         register()
         main = str(self._main) if self._main else conf_dir()
-        self._opened.enter_context(searched(self._users, (), main_is_users=self._main is not None))
+        self._opened.enter_context(searched(self._users, plugin_folders(), main_is_users=self._main is not None))
         self._opened.enter_context(initialize_config_dir(main, job_name="trackmdp", version_base="1.3"))
         return self
 

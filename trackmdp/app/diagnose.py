@@ -11,7 +11,8 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
-from trackmdp.config import GROUPS, ROOTS, SELECTORS, Option, options, suggestion
+from trackmdp.config import GROUPS, ROOTS, SELECTORS, Option, options
+from trackmdp.config.refusals import refuse_renamed, unknown_choice, unknown_option
 from trackmdp.errors import UserError
 
 __all__ = ["diagnose"]
@@ -71,7 +72,7 @@ def _bad_choice(override: Override, group: str, error: Exception) -> UserError |
     for value in _values(override):
         absent = value not in known and f"Could not find '{group}/{value}" in str(error)
         if absent or not isinstance(value, str):
-            return UserError(f"{group}={_shown(value)}: expected one of {', '.join(known)}")
+            return unknown_choice(group, value)
     return None
 
 
@@ -139,10 +140,8 @@ def _unknown(override: Override, known: dict[str, Option]) -> UserError:
     key = override.key_or_group
     if inner := [name for name in known if name.startswith(f"{key}.")]:
         return UserError(f"{override.input_line}: expected {inner[0]}=value (known: {', '.join(inner)})")
-    parent = key.rpartition(".")[0]
-    beside = [name for name in known if name.startswith(f"{parent}.")] if parent else []
-    names = beside or list(dict.fromkeys(name.split(".")[0] for name in known))
-    return UserError(f"{key}: unknown option{suggestion(key, known, names)}")
+    refuse_renamed(key)
+    return unknown_option(key, known)
 
 
 def _values(override: Override) -> list[Any]:

@@ -40,6 +40,8 @@ from trackmdp.config.per_sensor import (
     PerSensorConfig,
     PpoPerSensorConfig,
 )
+from trackmdp.config.refusals import suggestion
+from trackmdp.config.registry import conf_dir, load_plugins
 from trackmdp.config.roots import (
     ROOTS,
     BenchmarkConfig,
@@ -56,17 +58,7 @@ from trackmdp.config.roots import (
     VerifyConfig,
     WorldConfig,
 )
-from trackmdp.config.tree import (
-    conf_dir,
-    from_hydra,
-    load,
-    load_run,
-    register_resolvers,
-    suggestion,
-    to_dict,
-    to_yaml,
-    world_of,
-)
+from trackmdp.config.tree import from_hydra, load, load_run, to_dict, to_yaml, world_of
 from trackmdp.config.world import (
     CostConfig,
     DriftConfig,
@@ -143,10 +135,11 @@ __all__ = [
     "load",
     "load_run",
     "options",
-    "register_resolvers",
     "suggestion",
     "to_dict",
     "to_yaml",
     "validate",
     "world_of",
 ]
+
+load_plugins()  # at the end: they import the names above

@@ -16,7 +16,19 @@ from typing import Any, TypeVar
 
 from trackmdp.errors import UserError
 
-__all__ = ["GROUPS", "SELECTORS", "Option", "Selector", "choice", "leaves", "nodes", "option", "options", "refuse"]
+__all__ = [
+    "GROUPS",
+    "SELECTORS",
+    "Option",
+    "Selector",
+    "choice",
+    "leaves",
+    "nodes",
+    "option",
+    "optional",
+    "options",
+    "refuse",
+]
 
 T = TypeVar("T")
 
@@ -154,6 +166,11 @@ def options(schema: type[Any]) -> dict[str, Option | type[Any]]:
         else:
             raise TypeError(f"{schema.__name__}.{field.name} is neither an option nor a nested config")
     return found
+
+
+def optional(schema: type[Any], name: str) -> bool:
+    """Whether the field `name`, a choice or a nested config, may be null."""
+    return _strip_none(typing.get_type_hints(schema).get(name))[1]
 
 
 def choice(group: str, name: str, *, makes: str) -> typing.Callable[[type[T]], type[T]]:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
-import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -14,45 +12,23 @@ from omegaconf.errors import OmegaConfBaseException
 
 from trackmdp.config.checks import absolute_paths, validate
 from trackmdp.config.options import GROUPS, Option, options
+from trackmdp.config.refusals import suggestion
 from trackmdp.config.roots import CommandConfig, TrainConfig, WorldConfig
 from trackmdp.config.schema import ChoiceConfig
 from trackmdp.errors import UserError
 
 __all__ = [
-    "conf_dir",
+    "build",
     "from_hydra",
     "load",
     "load_run",
     "refuse_unknown",
-    "register_resolvers",
-    "suggestion",
     "to_dict",
     "to_yaml",
     "world_of",
 ]
 
 C = TypeVar("C", bound=CommandConfig)
-
-
-def conf_dir() -> str:
-    """The folder of the YAML files: `$TRACKMDP_CONF`, a clone's `conf/`, or the copy inside the wheel.
-
-    Raises:
-        UserError: none of them holds a `train.yaml`.
-    """
-    package, chosen = Path(__file__).resolve().parents[1], os.environ.get("TRACKMDP_CONF")
-    clone = package.parent / "conf" if (package.parent / "pyproject.toml").is_file() else None
-    for folder in [Path(chosen)] if chosen else [clone, package / "conf"]:
-        if folder is not None and (folder / "train.yaml").is_file():
-            return str(folder.resolve())
-    where = f"TRACKMDP_CONF={chosen}: expected a folder with" if chosen else "TRACKMDP_CONF is not set, and there is no"
-    raise UserError(f"{where} train.yaml")
-
-
-def register_resolvers() -> None:
-    """Make known what `conf/` calls by `${first:a,b}` and `${per_cell:count,size}`."""
-    OmegaConf.register_new_resolver("first", _first_given, replace=True)
-    OmegaConf.register_new_resolver("per_cell", lambda count, size: count * size**2, replace=True)
 
 
 def from_hydra(cfg: DictConfig, root: type[C], folder: Path) -> C:
@@ -84,14 +60,6 @@ def refuse_unknown(cfg: Any, schema: type[Any], prefix: str = "") -> None:
             refuse_unknown(value, type(value), f"{prefix}{name}.")
 
 
-def suggestion(name: str, known: Iterable[str], listed: Iterable[str] | None = None) -> str:
-    """`, did you mean ...? (known: ...)` for a name that is none of the known ones; `listed`: name only these."""
-    names = list(known)
-    close = difflib.get_close_matches(name, names, n=1)
-    meant = f", did you mean {close[0]}?" if close else ""
-    return f"{meant} (known: {', '.join(names if listed is None else listed) or 'none'})"
-
-
 def to_dict(cfg: Any) -> dict[str, Any]:
     """A plain copy of the config; the option chosen from a group stands under `name`."""
     plain: dict[str, Any] = {"name": cfg.name} if hasattr(type(cfg), "name") else {}
@@ -121,7 +89,7 @@ def load(file: Path, root: type[C]) -> C:
     if not isinstance(plain, Mapping):
         raise UserError(f"{file}: not a config (expected a mapping)")
     try:
-        typed: C = _build(plain, root, "")
+        typed: C = build(plain, root)
         validate(typed)
     except UserError as error:
         raise UserError(f"{file}: {error}") from error
@@ -140,7 +108,7 @@ def world_of(text: str) -> WorldConfig:
         raise UserError(f"not a config ({_first_line(error)})") from error
     assert isinstance(plain, Mapping)
     known = options(WorldConfig)
-    typed: WorldConfig = _build({key: value for key, value in plain.items() if key in known}, WorldConfig, "")
+    typed: WorldConfig = build({key: value for key, value in plain.items() if key in known}, WorldConfig)
     validate(typed)
     return typed
 
@@ -162,12 +130,12 @@ def load_run(folder: str | Path) -> TrainConfig:
         raise UserError(f"run={folder}: not the folder of a run ({error})") from error
 
 
-def _first_given(*values: Any) -> Any:
-    """The first value that is not null, for `${first:a,b}` in `conf/`."""
-    return next((value for value in values if value is not None), None)
+def build(plain: Mapping[Any, Any], schema: type[Any], prefix: str = "", group: str = "") -> Any:
+    """The dataclasses of a plain config, each choice's schema by its `name`; values are not checked.
 
-
-def _build(plain: Mapping[Any, Any], schema: type[Any], prefix: str, group: str = "") -> Any:
+    Raises:
+        UserError: a key is missing or unknown, or a choice is.
+    """
     values = dict(plain)
     if group in GROUPS and issubclass(schema, ChoiceConfig):
         name = values.pop("name", None)
@@ -185,7 +153,7 @@ def _build(plain: Mapping[Any, Any], schema: type[Any], prefix: str, group: str 
         if not isinstance(described, Option) and value is not None:
             if not isinstance(value, Mapping):
                 raise UserError(f"{prefix}{key}={value}: expected a mapping")
-            values[key] = _build(value, described, f"{prefix}{key}.", key)
+            values[key] = build(value, described, f"{prefix}{key}.", key)
         elif isinstance(described, Option) and described.kind is float and type(value) is int:
             values[key] = float(value)
     return schema(**values)

@@ -1,0 +1,59 @@
+"""Composing without Hydra gives what the command line composes, and refuses in the same words."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.config.cases import COMBINATIONS, composed, files_of
+from trackmdp.config.compose import compose
+from trackmdp.errors import UserError
+
+SELECTED = [
+    ("train", f"algo={algo} credit={credit}") for algo in ("a2c", "ppo", "dqn") for credit in ("joint", "per_sensor")
+]
+
+
+def words_of(command: str, choice: str) -> list[str]:
+    """What a command needs beside a choice."""
+    words = [*choice.split(), *files_of(command, choice)]
+    return words if command != "evaluate" or "baseline=" in choice else ["baseline=qmdp", *words]
+
+
+@pytest.mark.parametrize(("command", "choice"), COMBINATIONS + SELECTED)
+def test_a_config_is_that_of_the_command_line(command: str, choice: str) -> None:
+    words = words_of(command, choice)
+    overrides = dict(word.split("=", 1) for word in words)
+    assert compose(command, overrides, folder=Path("/typed/here")) == composed(command, *words)
+
+
+def test_values_may_be_of_numpy_and_paths() -> None:
+    given = {"grid.size": np.int64(3), "cost.sensor": np.full(9, 0.5), "kernel": "table", "kernel.path": Path("k.npy")}
+    cfg = compose("train", given, folder=Path("/typed"))
+    assert (cfg.grid.size, cfg.cost.sensor, cfg.kernel.path) == (3, [0.5] * 9, "/typed/k.npy")
+    assert (type(cfg.grid.size), cfg.algo.total_frames) == (int, 27_000)
+
+
+REFUSED: list[tuple[dict[str, Any], str]] = [
+    ({"algo": "ppoo"}, "algo=ppoo: expected one of a2c, ppo, dqn"),
+    ({"log": None}, "log=null: expected one of csv"),
+    ({"credit": "all"}, "credit=all: expected one of joint, per_sensor"),
+    ({"algo.learning_rat": 1}, "algo.learning_rat: unknown option, did you mean algo.learning_rate"),
+    ({"sead": 1}, "sead: unknown option, did you mean seed? (known: quiet, grid"),
+    ({"seed": "abc"}, "seed=abc: expected an integer >= 0"),
+    ({"grid.size": 2}, "grid.size=2: expected an integer from 3"),
+    ({"algo": "ppo", "algo.minibatches": 3}, "algo.minibatches=3: expected a divisor"),
+    ({"kernel": "table"}, "kernel.path: missing, expected a path"),
+    ({"algo.lam": 0.5}, "algo.lam: renamed, expected algo.gae_lambda"),
+]
+
+
+@pytest.mark.parametrize(("overrides", "message"), REFUSED)
+def test_what_is_not_allowed_is_one_line(overrides: dict[str, Any], message: str) -> None:
+    with pytest.raises(UserError) as caught:
+        compose("train", overrides)
+    assert str(caught.value).startswith(message)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,150 @@
+"""A typed config from the files of `conf/`, without Hydra: where the Python functions take their defaults from.
+
+Of Hydra's defaults lists it reads what the files of this package and of its plugins use: a schema (``base_ppo``), a
+choice (``kernel: drift``), and another group's file in the same place (``/baseline@_here_: qmdp``), whose name may
+contain a selector (``${credit}/ppo``). Packages, `override` and `experiment` are for the command line alone.
+"""
+
+from __future__ import annotations
+
+import copy
+import os
+from collections.abc import Iterator, Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from trackmdp.config.checks import absolute_paths, validate
+from trackmdp.config.options import GROUPS, SELECTORS, Option, optional, options, refuse
+from trackmdp.config.refusals import refuse_renamed, unknown_choice, unknown_option
+from trackmdp.config.registry import conf_file
+from trackmdp.config.resolvers import register_resolvers
+from trackmdp.config.roots import ROOTS
+from trackmdp.config.tree import build
+from trackmdp.errors import UserError
+
+__all__ = ["compose"]
+
+
+def compose(command: str, overrides: Mapping[str, Any] | None = None, *, folder: Path | None = None) -> Any:
+    """The checked config of a command with some choices and options replaced.
+
+    Args:
+        command: whose `conf/<command>.yaml` is read.
+        overrides: choices (``{"algo": "ppo"}``) and options by their dotted names (``{"algo.epochs": 3}``).
+        folder: what relative paths are relative to; by default the current folder.
+
+    Raises:
+        UserError: a name, a type or a range is wrong, or a rule between options is broken.
+    """
+    typed = {key: _plain(value) for key, value in (overrides or {}).items()}
+    root = _read(command)
+    schema = ROOTS[command]
+    chosen = _chosen(root, schema, typed)
+    values: dict[str, Any] = {key: value for key, value in root.items() if key in options(schema)}
+    for group, name in chosen.items():
+        if group in options(schema):
+            values[group] = None if name is None else _choice(group, name, chosen)
+    known = dict(_known(schema, values))
+    for key, value in typed.items():
+        if key not in chosen:
+            _put(values, key, value, known)
+    cfg = build(_resolved(values, known), schema)
+    validate(cfg)
+    absolute_paths(cfg, folder or Path.cwd())
+    return cfg
+
+
+def _chosen(root: Mapping[str, Any], schema: type[Any], typed: Mapping[str, Any]) -> dict[str, str | None]:
+    """Group or selector -> its choice: that of the defaults list, unless another is given."""
+    chosen: dict[str, str | None] = {}
+    for entry in root["defaults"]:
+        pairs = entry.items() if isinstance(entry, dict) else ()
+        chosen |= {key: name for key, name in pairs if key in SELECTORS or key in options(schema)}
+    for group in chosen:
+        if group not in typed:
+            continue
+        name = typed[group]
+        refuse_renamed(group, str(name))
+        known = SELECTORS[group].choices if group in SELECTORS else GROUPS[group]
+        if name not in known and not (name is None and optional(schema, group)):
+            raise unknown_choice(group, name)
+        chosen[group] = name
+    return chosen
+
+
+def _choice(group: str, name: str, chosen: Mapping[str, str | None]) -> dict[str, Any]:
+    """The values of one choice with its `name`, its defaults list followed."""
+    values = _read(f"{group}/{name}")
+    merged: dict[str, Any] = {}
+    for entry in values.pop("defaults", []):
+        if isinstance(entry, str):  # base_ppo, or /algo/base_ppo@_here_: the schema
+            merged["name"] = entry.split("/")[-1].split("@")[0].removeprefix("base_")
+            continue
+        for target, other in entry.items():  # {/credit@_here_: '${credit}/ppo'}
+            for selector, selected in chosen.items():
+                other = other.replace(f"${{{selector}}}", str(selected))
+            merged |= _choice(target.strip("/").split("@")[0], other, chosen)
+    return merged | values
+
+
+def _known(schema: type[Any], values: Any, prefix: str = "") -> Iterator[tuple[str, Option]]:
+    """Dotted key -> option of all that the config with these choices has."""
+    for name, item in options(schema).items():
+        if isinstance(item, Option):
+            yield f"{prefix}{name}", item
+            continue
+        inner = values.get(name) if values else None
+        if inner is not None:
+            yield from _known(GROUPS[name][inner["name"]] if name in GROUPS else item, inner, f"{prefix}{name}.")
+
+
+def _put(values: dict[str, Any], key: str, value: Any, known: Mapping[str, Option]) -> None:
+    """Set the option `key`, checked."""
+    if key not in known:
+        refuse_renamed(key)
+        raise unknown_option(key, known)
+    if not known[key].allows(value):
+        raise refuse(key, value, known[key].expected)
+    *parents, last = key.split(".")
+    for parent in parents:
+        values = values[parent]
+    values[last] = value
+
+
+def _resolved(values: dict[str, Any], known: Mapping[str, Option]) -> dict[str, Any]:
+    """The values with every ``${...}`` replaced by what it stands for."""
+    register_resolvers()
+    config = OmegaConf.create(values)
+    for key in sorted(OmegaConf.missing_keys(config)):
+        raise UserError(f"{key}: missing, expected {known[key].expected}")
+    try:
+        plain: Any = OmegaConf.to_container(config, resolve=True)
+    except OmegaConfBaseException as error:
+        raise UserError(str(error).splitlines()[0]) from error
+    return dict(plain)
+
+
+def _read(name: str) -> dict[str, Any]:
+    """A file of `conf/`, uninterpreted."""
+    file = conf_file(name)
+    return copy.deepcopy(_load(file, file.stat().st_mtime_ns))
+
+
+@lru_cache(maxsize=128)  # parsing is nine tenths of composing
+def _load(file: Path, stamp: int) -> dict[str, Any]:  # noqa: ARG001  (the stamp tells a file from what it was before)
+    plain = OmegaConf.to_container(OmegaConf.load(file))
+    assert isinstance(plain, dict), file
+    return {str(key): value for key, value in plain.items()}
+
+
+def _plain(value: Any) -> Any:
+    """A value as it would be read from a file: numpy's numbers and arrays, tuples and paths become plain ones."""
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    return [_plain(item) for item in value] if isinstance(value, (list, tuple)) else value

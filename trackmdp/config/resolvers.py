@@ -1,0 +1,26 @@
+"""What `conf/` calls by ``${name:...}``."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from omegaconf import OmegaConf
+
+__all__ = ["register_resolvers"]
+
+
+def register_resolvers() -> None:
+    """Make known what `conf/` calls by `${first:a,b}` and `${per_cell:count,size}`."""
+    OmegaConf.register_new_resolver("first", _first_given, replace=True)
+    OmegaConf.register_new_resolver("per_cell", _per_cell, replace=True)
+
+
+def _first_given(*values: Any) -> Any:
+    """The first value that is not null."""
+    return next((value for value in values if value is not None), None)
+
+
+def _per_cell(count: int, size: Any) -> int:
+    """`count` for each cell of a grid of N x N cells, or of [rows, columns]."""
+    return count * (size**2 if isinstance(size, int) else math.prod(size))
