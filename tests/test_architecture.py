@@ -13,7 +13,7 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 
 # config, world, policy, collector, loss, trainer, checkpoint and log, replay and report; build and the commands on top
 ARROW = [
-    ["trackmdp", "trackmdp.errors", "trackmdp.seeding", "trackmdp.durable", "trackmdp.untrusted", "trackmdp.arrays"],
+    ["trackmdp", *(f"trackmdp.{name}" for name in ("errors", "seeding", "durable", "untrusted", "arrays", "statistics"))],
     ["trackmdp.config"],
     ["trackmdp.world"],
     ["trackmdp.policies", "trackmdp.solvers"],
@@ -21,8 +21,9 @@ ARROW = [
     ["trackmdp.training.collect", "trackmdp.training.on_ray"],
     ["trackmdp.algos"],
     ["trackmdp.training"],
-    ["trackmdp.app.sweep.state"],
-    ["trackmdp.episodes", "trackmdp.reports", "trackmdp.paper"],
+    ["trackmdp.episodes"],
+    ["trackmdp.reports"],
+    ["trackmdp.paper"],
     ["trackmdp.build"],
     ["trackmdp.app.bench"],
     ["trackmdp.app.commands"],

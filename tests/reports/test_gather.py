@@ -32,7 +32,7 @@ def sweep(whole: Path, tmp_path: Path) -> Path:
 
 
 def problems(found: Results) -> dict[str, str]:
-    return {problem.run: problem.text for problem in found.problems}
+    return {anomaly.run: anomaly.text for anomaly in found.anomalies}
 
 
 def plan(folder: Path, *names: str) -> None:
@@ -45,7 +45,7 @@ def plan(folder: Path, *names: str) -> None:
 def test_every_figure_of_a_run_is_read(whole: Path) -> None:
     found = gather(whole, make_world)
     assert len(found.runs) == 12
-    assert not found.problems
+    assert not found.anomalies
     run = next(run for run in found.runs if run.name == "a2c-0.22-1")
     summary = json.loads((whole / run.name / "summary.json").read_text())
     assert (run.algo, run.seed, run.settings["cost.sensor"]) == ("a2c", 1, 0.22)
@@ -83,10 +83,10 @@ def test_stored_results_read_back_the_same_and_are_small(whole: Path, tmp_path: 
     found = gather(whole, make_world)
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
-    results.save(found, tmp_path / "a")
+    results.save_results(found, tmp_path / "a")
     assert results.is_stored(tmp_path / "a")
     assert not results.is_stored(whole)
-    read = results.load(tmp_path / "a")
+    read = results.load_results(tmp_path / "a")
     assert [(r.name, dict(r.settings), dict(r.figures)) for r in read.runs] == [
         (r.name, dict(r.settings), dict(r.figures)) for r in found.runs
     ]
@@ -98,7 +98,7 @@ def test_stored_results_read_back_the_same_and_are_small(whole: Path, tmp_path: 
         assert np.array_equal(read.motions[name].kernel.toarray(), motion.kernel.toarray())
         assert np.array_equal(read.motions[name].qmdp, motion.qmdp)
         assert np.array_equal(read.motions[name].clocked, motion.clocked)
-    results.save(read, tmp_path / "b")
+    results.save_results(read, tmp_path / "b")
     for file in sorted((tmp_path / "a").iterdir()):
         assert file.read_bytes() == (tmp_path / "b" / file.name).read_bytes(), file.name
     assert sum(file.stat().st_size for file in (tmp_path / "a").iterdir()) < 20_000
@@ -107,10 +107,10 @@ def test_stored_results_read_back_the_same_and_are_small(whole: Path, tmp_path: 
 def test_no_path_of_the_machine_is_kept(sweep: Path, tmp_path: Path) -> None:
     plan(sweep, "a2c-0.16-0")
     (tmp_path / "out").mkdir()
-    results.save(gather(sweep, make_world), tmp_path / "out")
+    results.save_results(gather(sweep, make_world), tmp_path / "out")
     for file in ("manifest.json", "runs.csv"):
         assert str(tmp_path) not in (tmp_path / "out" / file).read_text()
-    assert results.load(tmp_path / "out").manifest["line"] == "trackmdp train -m"
+    assert results.load_results(tmp_path / "out").manifest["line"] == "trackmdp train -m"
 
 
 def test_a_curve_keeps_its_ends_and_few_points(sweep: Path) -> None:
@@ -213,8 +213,8 @@ def test_a_folder_without_runs_is_refused(content: str | None, tmp_path: Path) -
     [("runs.csv", "run\nx\n"), ("policies.npz", "PK"), ("worlds.npz", ""), ("curves.csv", "run,iteration\n99,1\n")],
 )
 def test_damaged_stored_results_are_refused_in_one_line(file: str, content: str, whole: Path, tmp_path: Path) -> None:
-    results.save(gather(whole, make_world), tmp_path)
+    results.save_results(gather(whole, make_world), tmp_path)
     (tmp_path / file).write_text(content)
     with pytest.raises(UserError, match="stored results that cannot be read") as caught:
-        results.load(tmp_path)
+        results.load_results(tmp_path)
     assert "\n" not in str(caught.value)

@@ -11,7 +11,7 @@ from tests.helpers import train_config
 from trackmdp.config import to_dict
 from trackmdp.reports.gather import flatten
 from trackmdp.reports.grouping import study, world_key
-from trackmdp.reports.results import FIGURES, Run
+from trackmdp.reports.results import FIGURES, FinishedRun
 
 
 @functools.cache
@@ -19,10 +19,10 @@ def composed(*overrides: str) -> dict[str, Any]:
     return flatten(to_dict(train_config(*overrides)))
 
 
-def run(name: str, *overrides: str, options: dict[str, Any] | None = None, **figures: float) -> Run:
+def run(name: str, *overrides: str, options: dict[str, Any] | None = None, **figures: float) -> FinishedRun:
     """A run with its figures; `options` are put into its config as they are."""
     settings = composed(*overrides) | (options or {})
-    return Run(name, settings, dict.fromkeys(FIGURES, None) | figures, name)
+    return FinishedRun(name, settings, dict.fromkeys(FIGURES, None) | figures, name)
 
 
 def paper_world(support_size: int, cost: float) -> dict[str, Any]:

@@ -7,7 +7,6 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from tests.episodes.browser import CHROMIUM, Browser
@@ -17,11 +16,12 @@ from trackmdp.paper.calibration import candidates, sensitivity
 from trackmdp.paper.critique import checks
 from trackmdp.paper.openings import Openings
 from trackmdp.paper.printed import pairs
-from trackmdp.paper.verdicts import Goal, acceptance_table, accuracy_table, goals
+from trackmdp.paper.sections import accuracy_table, sections
 from trackmdp.reports.gather import gather
 from trackmdp.reports.grouping import study
 from trackmdp.reports.page import Report, build
-from trackmdp.reports.results import Problem, Results
+from trackmdp.reports.results import Anomaly, Results
+from trackmdp.reports.summaries import groups_table, methods_table
 
 PAIRS = ((3, 0.22), (5, 0.16), (5, 0.22))
 WRONG = {"a2c": 40, "hindsight": 1}
@@ -37,7 +37,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
                 words = (f"kernel.support_size={z}", f"algo={algo}")
                 write_run(folder / f"{algo}-{z}-{cost}-{seed}", *words, cost=cost, seed=seed, wrong=wrong)
     found = gather(folder, make_world)
-    found.problems.append(Problem("</script><b>", "cut & gone"))  # type: ignore[attr-defined]
+    found.anomalies.append(Anomaly("</script><b>", "cut & gone"))  # type: ignore[attr-defined]
     return found
 
 
@@ -49,42 +49,33 @@ def openings() -> Openings:
 
 @pytest.fixture(scope="module")
 def report(results: Results, openings: Openings) -> Report:
-    return build(results, openings, resamples=100)
+    return build(results, 0.02, sections(study(results.runs), openings))
 
 
 def test_the_paper_s_worlds_are_found_by_z_and_price(results: Results) -> None:
     assert list(pairs(study(results.runs))) == list(PAIRS)
 
 
-def test_goals_are_counted_over_pairs(results: Results) -> None:
+def test_runs_are_counted_up_to_the_threshold_where_one_is_given(results: Results) -> None:
     grouped = study(results.runs)
-    found = goals(grouped, pairs(grouped), resamples=100)
-    far = {pair: max(grouped.regrets(world, "a2c")) for pair, world in pairs(grouped).items()}
-    assert min(far.values()) > 0.02  # or the rest of this test says nothing
-    assert found[1] == Goal(
-        "A2C within 0.02 per step of the optimum", 3, 0, 0, [f"Z = {z}, c = {c:g}" for z, c in PAIRS]
-    )
-    near = [float(np.mean(grouped.regrets(world, "hindsight"))) <= 0.01 for world in pairs(grouped).values()]
-    assert near == [True, True, False]
-    assert (found[2].pairs, found[2].met, found[2].missed) == (3, 2, ["Z = 5, c = 0.22"])
-    above = [
-        grouped.of(world, "a2c")[0].figure("qmdp_aihtr") < min(run.figure("aihtr") for run in grouped.of(world, "a2c"))
-        for world in pairs(grouped).values()
-    ]
-    assert found[0].by_all == sum(above)
-    assert 0 < sum(above) < 3
-
-
-def test_a_pair_without_runs_is_not_counted_as_met(results: Results) -> None:
-    grouped = study([run for run in results.runs if run.algo == "hindsight"])
-    assert [goal.pairs for goal in goals(grouped, pairs(grouped), resamples=100)] == [0, 0, 3]
-    row = acceptance_table(grouped, pairs(grouped), resamples=100).rows[0]
-    assert row[3:5] == [None, None]
+    regrets = {m: [r for world in grouped.worlds for r in grouped.regrets(world, m)] for m in WRONG}
+    threshold = sorted(regrets["hindsight"])[2]
+    for table, expected in (
+        (methods_table(grouped, threshold), {"a2c": 0, "hindsight": 3}),
+        (groups_table(grouped, threshold), None),
+    ):
+        place = [column.label for column in table.columns].index(f"runs ≤ {threshold:g}")
+        counted = [row[place] for row in table.rows]
+        if expected:
+            assert dict(zip(grouped.methods, counted, strict=True)) == expected
+        assert sum(map(int, counted)) == 3  # type: ignore[arg-type]
+    assert not [column for column in methods_table(grouped, None).columns if "≤" in column.label]
+    assert "≤ 0.02" not in build(results).tables[0].html()
 
 
 def test_accuracies_stand_beside_the_printed_ones(results: Results) -> None:
     grouped = study(results.runs)
-    rows = {tuple(row[:2]): row for row in accuracy_table(grouped, pairs(grouped), resamples=100).rows}
+    rows = {tuple(row[:2]): row for row in accuracy_table(grouped, pairs(grouped)).rows}
     row = rows[5, 0.22]
     assert (row[2], row[4]) == (54.3, 90.21)
     runs = grouped.of("Z=5, c=0.22", "hindsight")
@@ -93,7 +84,7 @@ def test_accuracies_stand_beside_the_printed_ones(results: Results) -> None:
 
 
 def test_the_same_results_give_the_same_page(results: Results, openings: Openings, report: Report) -> None:
-    again = build(results, openings, resamples=100)
+    again = build(results, 0.02, sections(study(results.runs), openings))
     assert again.html() == report.html()
     assert [figure.png for figure in again.figures] == [figure.png for figure in report.figures]
 
@@ -103,7 +94,7 @@ def test_the_page_is_one_file_that_asks_for_nothing(report: Report) -> None:
     assert not re.findall(r'(?:src=|href="[^#])|url\((?!#)|@import|fetch\(', text)
     assert "default-src 'none'" in text
     anchors = re.findall(r'<li><a href="#([\w-]+)">', text)
-    assert anchors == [anchor for anchor, _, _ in report.sections]
+    assert anchors == [section.anchor for section in report.sections]
     ids = re.findall(r'\bid="([^"]+)"', text)
     assert len(ids) == len(set(ids))
 
@@ -138,7 +129,7 @@ def test_the_printed_bound_is_shown_to_be_none(report: Report, results: Results)
 
 
 def test_a_sweep_without_finished_runs_still_says_what_is_missing() -> None:
-    page = build(Results([], problems=[Problem("a", "cut: it has no summary.json")]), None, resamples=100).html()
+    page = build(Results([], anomalies=[Anomaly("a", "cut: it has no summary.json")])).html()
     assert "cut: it has no summary.json" in page
 
 
@@ -152,9 +143,9 @@ def test_runs_on_recorded_tracks_have_neither_bound_nor_regret(tmp_path: Path) -
         config = (place / "config.yaml").read_text()
         (place / "config.yaml").write_text(config.replace("name: random_support", "name: tracks"))
     found = gather(tmp_path, make_world)
-    assert not found.problems
+    assert not found.anomalies
     assert not found.motions
-    made = build(found, None, resamples=100)
+    made = build(found)
     assert [figure.name for figure in made.figures] == ["aihtr-tracks-z-5"]
     table = next(table for table in made.tables if table.name == "methods")
     assert "nan" not in table.html()
@@ -166,8 +157,8 @@ def browser(tmp_path: Path) -> Iterator[Browser]:
         yield opened
 
 
-ROWS = "[...document.querySelectorAll('#outcome table')[1].tBodies[0].rows].map((row) => row.cells[0].textContent)"
-HEADS = "document.querySelectorAll('#outcome table')[1].tHead.rows[0].cells"
+ROWS = "[...document.querySelectorAll('#outcome table')[0].tBodies[0].rows].map((row) => row.cells[0].textContent)"
+HEADS = "document.querySelectorAll('#outcome table')[0].tHead.rows[0].cells"
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")

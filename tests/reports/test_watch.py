@@ -13,7 +13,7 @@ from rich.console import Console
 from trackmdp.durable import write_json
 from trackmdp.errors import UserError
 from trackmdp.reports import watch
-from trackmdp.reports.watch import Status, look
+from trackmdp.reports.watch import Status, statuses
 from trackmdp.training.lock import locked
 
 HEAD = "iteration,frames,aihtr,seconds\n"
@@ -47,7 +47,7 @@ def test_every_state_is_read_from_the_folder(tmp_path: Path) -> None:
     (sweep / "d").mkdir()
     write_json(sweep / "d/failed.json", {"reason": "out of luck"})
     with locked(sweep / "b"):
-        found = look(sweep)
+        found = statuses(sweep)
     assert found == [
         Status("a", "done", 1.0, 0.5, 0.0),
         Status("b", "running", 0.25, 20.0, 15.0),
@@ -61,7 +61,7 @@ def test_only_the_end_of_a_long_table_is_read(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(watch, "TAIL", 40)
     sweep = sweep_of(tmp_path / "s", "a")
     begin(sweep / "a", "".join(f"{i},{100 * i},{i / 2},{i / 10}\n" for i in range(1, 81)))
-    (found,) = look(sweep)
+    (found,) = statuses(sweep)
     assert (found.share, found.gap) == (0.8, 10.0)
     assert found.left == pytest.approx(2.0)
 
@@ -70,7 +70,7 @@ def test_only_the_end_of_a_long_table_is_read(tmp_path: Path, monkeypatch: pytes
 def test_a_table_without_a_whole_row_is_no_progress_yet(text: str, tmp_path: Path) -> None:
     sweep = sweep_of(tmp_path / "s", "a")
     (begin(sweep / "a") / "metrics.csv").write_text(text)
-    assert look(sweep) == [Status("a", "cut")]
+    assert statuses(sweep) == [Status("a", "cut")]
 
 
 def said(sweep: Path, monkeypatch: pytest.MonkeyPatch, *steps: Callable[[], object], terminal: bool = False) -> str:

@@ -202,7 +202,9 @@ class ReportConfig(CommandConfig):
     )
     watch: bool = option("show all runs live until they are done, instead of a report")
     paper: bool | None = option("add what concerns the paper's settings; null = where the runs are in its worlds")
-    resamples: int = option("bootstrap resamples behind each interval", unit="resamples", ge=100, le=100_000)
+    threshold: float | None = option(
+        "count the runs that end at most this far from the bound", unit="reward/step", gt=0
+    )
     every: float = option("seconds from one look at the runs to the next, with watch=true", unit="s", gt=0, le=3600)
 
 

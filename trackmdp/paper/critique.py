@@ -47,7 +47,7 @@ def bounds_table(study: Study, pairs: Mapping[tuple[int, float], str]) -> Table:
     columns = [Column("Z"), Column("c", 2), Column("Q_MDP", 3), Column("optimum, attained", 4)]
     columns += [
         Column("optimum, at most", 4),
-        Column("proved", judged=True),
+        Column("proved"),
         Column("clocked bound", 3),
         Column("valid bound", 3),
     ]

@@ -24,7 +24,7 @@ from trackmdp.paper.calibration import (
 from trackmdp.paper.theorems import Check
 from trackmdp.paper.worlds import SUPPORTS
 
-__all__ = ["FILE", "Openings", "compute", "load", "save"]
+__all__ = ["FILE", "Openings", "compute", "load_openings", "save_openings"]
 
 FILE = "paper.json"
 _DIGITS = 6
@@ -50,12 +50,12 @@ def compute(say: Callable[[str], None]) -> Openings:
     return _unpacked(_packed(Openings(every, settings, found)))
 
 
-def save(openings: Openings, folder: Path) -> None:
+def save_openings(openings: Openings, folder: Path) -> None:
     """Write `paper.json`."""
     write_text(folder / FILE, json.dumps(_packed(openings), separators=(",", ":"), ensure_ascii=False) + "\n")
 
 
-def load(folder: Path) -> Openings | None:
+def load_openings(folder: Path) -> Openings | None:
     """Read it back; None where there is none.
 
     Raises:

@@ -7,7 +7,7 @@ from typing import Any
 
 from trackmdp.paper.worlds import COSTS, EXIT_PROBABILITY, LOW_PROBABILITY, RADIUS, REWARD, SIZE
 from trackmdp.reports.grouping import Study
-from trackmdp.reports.results import Run
+from trackmdp.reports.results import FinishedRun
 
 __all__ = ["PRINTED_QMDP", "PRINTED_TMDP", "pair_of", "pairs"]
 
@@ -54,7 +54,7 @@ def pairs(study: Study) -> dict[tuple[int, float], str]:
     """
     found: dict[tuple[int, float], str] = {}
     for world in study.worlds:
-        runs: list[Run] = study.in_world(world)
+        runs: list[FinishedRun] = study.in_world(world)
         pair = pair_of(runs[0].settings)
         if pair is not None and (pair not in found or len(study.in_world(found[pair])) < len(runs)):
             found[pair] = world

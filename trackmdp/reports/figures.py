@@ -10,26 +10,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from trackmdp.reports.grouping import Study
-from trackmdp.reports.statistics import Estimate, estimate
-from trackmdp.reports.style import INK, LOOKS, Figure, draw, legend, look, tidy
-from trackmdp.reports.tables import Column, Table
+from trackmdp.reports.style import INK, LOOKS, Figure, draw, legend, look_of, tidy
+from trackmdp.reports.summaries import estimate_cells, estimate_columns
+from trackmdp.reports.tables import Cell, Column, Table
+from trackmdp.statistics import Estimate, mean_over_groups
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Canvas
 
-__all__ = [
-    "ALLOWED",
-    "FLOOR",
-    "Panel",
-    "against_cost",
-    "axis_break",
-    "estimate_columns",
-    "panels",
-    "parts",
-    "regret_against_cost",
-    "slug",
-]
+__all__ = ["FLOOR", "Panel", "against_cost", "axis_break", "panels", "regret_against_cost", "slug"]
 
 FLOOR = 1e-5
 """Smallest regret drawn on a logarithmic axis."""
@@ -39,7 +29,6 @@ BOUNDS = {
     "clocked bound": "bound_clocked",
     "optimum": "optimal_lower",
 }
-ALLOWED = (0.01, 0.02)
 
 
 @dataclass(frozen=True)
@@ -52,18 +41,14 @@ class Panel:
     worlds: Sequence[str]
 
 
-def panels(study: Study, chosen: Mapping[tuple[int, float], str] | None = None) -> list[Panel]:
-    """Worlds that differ in `cost.sensor` only, at least two of them to a panel; or the paper's, by Z."""
+def panels(study: Study) -> list[Panel]:
+    """Worlds that differ in `cost.sensor` only, at least two of them to a panel."""
     groups: dict[str, list[tuple[float, str]]] = {}
-    if chosen:
-        for (support_size, cost), world in chosen.items():
-            groups.setdefault(f"Z = {support_size}", []).append((cost, world))
-    else:
-        for world in study.worlds:
-            price = study.in_world(world)[0].settings.get("cost.sensor")
-            if isinstance(price, (int, float)):
-                rest = ", ".join(part for part in world.split(", ") if not part.startswith("c="))
-                groups.setdefault(rest, []).append((float(price), world))
+    for world in study.worlds:
+        price = study.in_world(world)[0].settings.get("cost.sensor")
+        if isinstance(price, (int, float)):
+            rest = ", ".join(part for part in world.split(", ") if not part.startswith("c="))
+            groups.setdefault(rest, []).append((float(price), world))
     found = [(title, sorted(entries)) for title, entries in groups.items() if len(entries) > 1]
     return [
         Panel(slug(title), title, [cost for cost, _ in entries], [world for _, world in entries])
@@ -71,9 +56,9 @@ def panels(study: Study, chosen: Mapping[tuple[int, float], str] | None = None) 
     ]
 
 
-def against_cost(study: Study, panel: Panel, resamples: int) -> Figure:
+def against_cost(study: Study, panel: Panel) -> Figure:
     """AIHTR against c: the learned policies with their intervals, Q_MDP, the bounds, the optimum."""
-    learned = _estimates(study, panel, resamples, regret=False)
+    learned = _estimates(study, panel, regret=False)
     exact = {"Q_MDP": _exact(study, panel, "qmdp_aihtr")}
     exact |= {label: _exact(study, panel, key) for label, key in BOUNDS.items()}
     exact = {label: values for label, values in exact.items() if not all(map(math.isnan, values))}
@@ -102,9 +87,9 @@ def against_cost(study: Study, panel: Panel, resamples: int) -> Figure:
     return draw(f"aihtr-{panel.name}", title, text, table, 3.9, paint)
 
 
-def regret_against_cost(study: Study, panel: Panel, resamples: int) -> Figure:
-    """Regret per step against c, logarithmic, so that the best are told apart."""
-    learned = _estimates(study, panel, resamples, regret=True)
+def regret_against_cost(study: Study, panel: Panel, threshold: float | None) -> Figure:
+    """Regret per step against c, logarithmic, so that the best are told apart; a line at the `threshold`."""
+    learned = _estimates(study, panel, regret=True)
     exact = {"Q_MDP": [_qmdp_regret(study, world) for world in panel.worlds]}
 
     def paint(figure: Canvas) -> None:
@@ -114,11 +99,10 @@ def regret_against_cost(study: Study, panel: Panel, resamples: int) -> Figure:
         axes.plot(
             panel.costs, np.maximum(exact["Q_MDP"], FLOOR), style.line, marker="x", color=style.colour, label="Q_MDP"
         )
-        for level in ALLOWED:
-            axes.axhline(level, color=INK, linewidth=0.6, linestyle=(0, (1, 2)))
-            axes.annotate(
-                f"{level:g}", (1.01, level), xycoords=("axes fraction", "data"), va="center", fontsize=7, clip_on=False
-            )
+        if threshold is not None:
+            axes.axhline(threshold, color=INK, linewidth=0.6, linestyle=(0, (1, 2)))
+            at, where = (1.01, threshold), ("axes fraction", "data")
+            axes.annotate(f"{threshold:g}", at, xycoords=where, va="center", fontsize=7, clip_on=False)
         axes.set_yscale("log")
         axes.set_ylabel("regret per step")
         axes.set_xlabel("c, price of a sensor for one step")
@@ -131,7 +115,7 @@ def regret_against_cost(study: Study, panel: Panel, resamples: int) -> Figure:
     return draw(f"regret-{panel.name}", title, _spoken(panel, learned, exact, digits=4), table, 3.4, paint)
 
 
-def _estimates(study: Study, panel: Panel, resamples: int, *, regret: bool) -> dict[str, list[Estimate]]:
+def _estimates(study: Study, panel: Panel, *, regret: bool) -> dict[str, list[Estimate]]:
     found = {}
     for method in study.methods:
         groups = [
@@ -139,11 +123,7 @@ def _estimates(study: Study, panel: Panel, resamples: int, *, regret: bool) -> d
             for world in panel.worlds
         ]
         if any(groups):
-            kind = "regret" if regret else "aihtr"
-            found[method] = [
-                estimate([group], kind, method, world, resamples=resamples)
-                for group, world in zip(groups, panel.worlds, strict=True)
-            ]
+            found[method] = [mean_over_groups([group]) for group in groups]
     return found
 
 
@@ -166,7 +146,7 @@ def _learned_lines(
     """Lines with error bars, a little apart so that the bars can be told from each other."""
     step = min(np.diff(panel.costs), default=0.02) * 0.04
     for place, (method, row) in enumerate(learned.items()):
-        style = look(method, place)
+        style = look_of(method, place)
         x = np.asarray(panel.costs) + step * (place - (len(learned) - 1) / 2)
         mean = np.maximum([e.mean for e in row], floor)
         low = np.maximum([e.mean if e.low is None else e.low for e in row], floor)
@@ -213,16 +193,6 @@ def _break(upper: Axes, lower: Axes, bottom: float, lower_end: float, upper_star
     lower.plot([0], [1], transform=lower.transAxes, **marks)  # type: ignore[arg-type]
 
 
-def estimate_columns(label: str, digits: int) -> list[Column]:
-    """Columns for what `parts` gives."""
-    return [Column(label, digits), Column("95 % from", digits), Column("to", digits), Column("n")]
-
-
-def parts(e: Estimate) -> list[float | int | None]:
-    """Mean, interval and n as cells."""
-    return [e.mean, e.low, e.high, e.n]
-
-
 def _cost_table(
     panel: Panel,
     learned: Mapping[str, Sequence[Estimate]],
@@ -231,14 +201,14 @@ def _cost_table(
     label: str,
     digits: int,
 ) -> Table:
-    rows: list[list[float | int | str | None]] = []
+    rows: list[list[Cell]] = []
     for place, cost in enumerate(panel.costs):
-        rows += [[cost, method, *parts(row[place])] for method, row in learned.items() if row[place].n]
+        rows += [
+            [cost, method, *estimate_cells(row[place]), row[place].n] for method, row in learned.items() if row[place].n
+        ]
         rows += [[cost, name, values[place], None, None, None] for name, values in exact.items()]
-    columns = [Column("c", 2), Column("policy or bound"), *estimate_columns(label, digits)]
-    return Table(
-        f"{kind}-{panel.name}", f"{label} by price, {panel.title}: interquartile mean over seeds", columns, rows
-    )
+    columns = [Column("c", 2), Column("policy or bound"), *estimate_columns(label, digits), Column("n")]
+    return Table(f"{kind}-{panel.name}", f"{label} by price, {panel.title}: mean over seeds", columns, rows)
 
 
 def _spoken(

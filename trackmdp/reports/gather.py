@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 from omegaconf import OmegaConf
 
-from trackmdp.app.sweep.state import FAILED, PLAN, SUMMARY, read_json, run_of
 from trackmdp.config import TableConfig, WorldConfig, world_of
 from trackmdp.errors import UserError
 from trackmdp.reports import policy
 from trackmdp.reports.grouping import Study, study, world_key
-from trackmdp.reports.results import FIGURES, Motion, Point, Problem, Results, Run
+from trackmdp.reports.results import FIGURES, Anomaly, CurvePoint, FinishedRun, Motion, Results
 from trackmdp.solvers import bounds, horizon, qmdp
 from trackmdp.solvers.chains import evaluate
+from trackmdp.training.folders import FAILED, PLAN, SUMMARY, read_json, run_of
 from trackmdp.world.model import World
 
 __all__ = ["flatten", "gather", "planned", "run_folders"]
@@ -43,27 +43,27 @@ def gather(folder: Path, make_world: Callable[[WorldConfig], World]) -> Results:
     names = run_folders(folder, plan)
     if not names:
         raise UserError(f"sweep={folder}: no runs in there, expected the folder of a sweep or of stored results")
-    problems: list[Problem] = []
+    anomalies: list[Anomaly] = []
     runs, summaries = [], []
     for name in names:
         read = _read_run(folder, name)
-        if isinstance(read, Problem):
-            problems.append(read)
+        if isinstance(read, Anomaly):
+            anomalies.append(read)
         else:
             runs.append(read[0])
             summaries.append(read[1])
-    problems += [*_repeated(runs), *_mixed(runs, summaries)]
-    repeated = {problem.run for problem in _repeated(runs)}
+    anomalies += [*_repeated(runs), *_mixed(runs, summaries)]
+    repeated = {anomaly.run for anomaly in _repeated(runs)}
     runs = [run for run in runs if run.name not in repeated]
     curves = {run.name: _curve(folder / run.name / "metrics.csv") for run in runs}
     grouped = study(runs)
-    problems += [Problem(name, "no learning curve") for name, curve in curves.items() if not curve]
-    problems += _missing_seeds(grouped) if plan is None else []  # a plan says what else there should be
+    anomalies += [Anomaly(name, "no learning curve") for name, curve in curves.items() if not curve]
+    anomalies += _missing_seeds(grouped) if plan is None else []  # a plan says what else there should be
     policies, unread = _policies(folder, grouped)
     motions, unbuilt = _motions(folder, runs, make_world)
     manifest = _manifest(plan, summaries)
     return Results(
-        runs, {n: c for n, c in curves.items() if c}, policies, motions, problems + unread + unbuilt, manifest
+        runs, {n: c for n, c in curves.items() if c}, policies, motions, anomalies + unread + unbuilt, manifest
     )
 
 
@@ -94,24 +94,24 @@ def _natural(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdigit() else (-1, part) for part in name.split("/")]
 
 
-def _read_run(folder: Path, name: str) -> tuple[Run, Mapping[str, Any]] | Problem:
+def _read_run(folder: Path, name: str) -> tuple[FinishedRun, Mapping[str, Any]] | Anomaly:
     """A run and its summary, or why there is none."""
     place = folder / name
     if (place / FAILED).is_file():
-        return Problem(name, f"failed: {read_json(place / FAILED).get('reason', 'no reason given')}")
+        return Anomaly(name, f"failed: {read_json(place / FAILED).get('reason', 'no reason given')}")
     if not place.is_dir() or not (place / "config.yaml").is_file():
-        return Problem(name, "not started")
+        return Anomaly(name, "not started")
     if not (place / SUMMARY).is_file():
         running = run_of(place).state == "running"
-        return Problem(name, "still running" if running else f"cut: it has no {SUMMARY}")
+        return Anomaly(name, "still running" if running else f"cut: it has no {SUMMARY}")
     settings = flatten(_config(place))
     if not settings.keys() >= {"algo.name", "seed", "grid.size", "kernel.name"}:
-        return Problem(name, "its config.yaml cannot be read")
+        return Anomaly(name, "its config.yaml cannot be read")
     try:
         summary = json.loads((place / SUMMARY).read_text(encoding="utf-8"))
-        return Run(name, settings, _figures(summary), str(summary["config_sha256"])), summary
+        return FinishedRun(name, settings, _figures(summary), str(summary["config_sha256"])), summary
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        return Problem(name, f"its {SUMMARY} cannot be read ({' '.join(str(error).split())})")
+        return Anomaly(name, f"its {SUMMARY} cannot be read ({' '.join(str(error).split())})")
 
 
 def _config(place: Path) -> Mapping[str, Any]:
@@ -139,13 +139,14 @@ def _figures(summary: Mapping[str, Any]) -> dict[str, float | None]:
     return {key: None if raw.get(key) is None else float(raw[key]) for key in FIGURES}
 
 
-def _curve(file: Path) -> list[Point]:
+def _curve(file: Path) -> list[CurvePoint]:
     """The points of a run's `metrics.csv` at which the policy was judged, thinned; none where it cannot be read."""
     try:
         with file.open(newline="", encoding="utf-8") as stream:
             rows = [row for row in csv.DictReader(stream) if row.get("aihtr")]
         points = [
-            Point(int(row["iteration"]), int(row["frames"]), float(row["seconds"]), float(row["aihtr"])) for row in rows
+            CurvePoint(int(row["iteration"]), int(row["frames"]), float(row["seconds"]), float(row["aihtr"]))
+            for row in rows
         ]
     except (OSError, ValueError, KeyError, TypeError):
         return []
@@ -155,17 +156,17 @@ def _curve(file: Path) -> list[Point]:
     return [points[place] for place in sorted({*wanted.tolist(), len(points) - 1})]
 
 
-def _repeated(runs: Iterable[Run]) -> list[Problem]:
+def _repeated(runs: Iterable[FinishedRun]) -> list[Anomaly]:
     """Runs of one and the same config: the first counts."""
     first: dict[str, str] = {}
     return [
-        Problem(run.name, f"the same config as {first[run.config_sha256]}, which counts")
+        Anomaly(run.name, f"the same config as {first[run.config_sha256]}, which counts")
         for run in runs
         if first.setdefault(run.config_sha256, run.name) != run.name
     ]
 
 
-def _mixed(runs: Sequence[Run], summaries: Sequence[Mapping[str, Any]]) -> list[Problem]:
+def _mixed(runs: Sequence[FinishedRun], summaries: Sequence[Mapping[str, Any]]) -> list[Anomaly]:
     """Runs made with other versions than most."""
     texts = [json.dumps(summary.get("versions", {}), sort_keys=True) for summary in summaries]
     if len(set(texts)) < 2:
@@ -176,11 +177,11 @@ def _mixed(runs: Sequence[Run], summaries: Sequence[Mapping[str, Any]]) -> list[
         own = json.loads(text)
         other = [f"{k} {own.get(k, 'unknown')}, most have {usual.get(k)}" for k in usual if own.get(k) != usual.get(k)]
         if other:
-            found.append(Problem(run.name, f"other versions: {'; '.join(other)}"))
+            found.append(Anomaly(run.name, f"other versions: {'; '.join(other)}"))
     return found
 
 
-def _missing_seeds(grouped: Study) -> list[Problem]:
+def _missing_seeds(grouped: Study) -> list[Anomaly]:
     """Seeds, or all runs, that a method has in one world and not in another."""
     found = []
     for method in grouped.methods:
@@ -189,18 +190,18 @@ def _missing_seeds(grouped: Study) -> list[Problem]:
         for world, runs in groups.items():
             missing = sorted(seeds - {run.seed for run in runs})
             if runs and missing:
-                found.append(Problem(f"{method}, {world}", f"seed {', '.join(map(str, missing))} missing"))
+                found.append(Anomaly(f"{method}, {world}", f"seed {', '.join(map(str, missing))} missing"))
         without = [world for world, runs in groups.items() if not runs]
         if without:
             text = f"no run in {len(without)} of {len(groups)} worlds: {'; '.join(without)}"
-            found.append(Problem(method, text))
+            found.append(Anomaly(method, text))
     return found
 
 
-def _policies(folder: Path, grouped: Study) -> tuple[dict[str, policy.Policy], list[Problem]]:
+def _policies(folder: Path, grouped: Study) -> tuple[dict[str, policy.Policy], list[Anomaly]]:
     """Of each world and method the policy of the run in the middle, or of the one next to it that can be read."""
     found: dict[str, policy.Policy] = {}
-    problems = []
+    anomalies = []
     for runs in grouped.groups.values():
         ranked = sorted(runs, key=lambda run: (run.figure("aihtr"), run.seed))
         middle = (len(ranked) - 1) / 2
@@ -209,16 +210,16 @@ def _policies(folder: Path, grouped: Study) -> tuple[dict[str, policy.Policy], l
                 found[run.name] = policy.read(folder / run.name / policy.FILE)
                 break
             except UserError as error:
-                problems.append(Problem(run.name, str(error).removeprefix(f"{folder / run.name}/")))
-    return found, problems
+                anomalies.append(Anomaly(run.name, str(error).removeprefix(f"{folder / run.name}/")))
+    return found, anomalies
 
 
 def _motions(
-    folder: Path, runs: Iterable[Run], make_world: Callable[[WorldConfig], World]
-) -> tuple[dict[str, Motion], list[Problem]]:
+    folder: Path, runs: Iterable[FinishedRun], make_world: Callable[[WorldConfig], World]
+) -> tuple[dict[str, Motion], list[Anomaly]]:
     """Motion and references of each world, from the `kernel.npy` of its first run."""
     found: dict[str, Motion] = {}
-    seen, problems = set[str](), list[Problem]()
+    seen, anomalies = set[str](), list[Anomaly]()
     for run in runs:
         if world_key(run) in seen:
             continue
@@ -228,13 +229,13 @@ def _motions(
         try:
             world = make_world(_world_config(folder / run.name))
         except UserError as error:
-            problems.append(Problem(run.name, f"its world cannot be built ({error})"))
+            anomalies.append(Anomaly(run.name, f"its world cannot be built ({error})"))
             continue
         whole, simple = world.max_steps is None, qmdp.solve(world)
         value = evaluate(world, simple) if whole else horizon.evaluate(world, simple)
         bound = bounds.clocked(world) if whole else horizon.clocked(world)
         found[run.name] = Motion(world.kernel, value.value, bound)
-    return found, problems
+    return found, anomalies
 
 
 def _world_config(place: Path) -> WorldConfig:

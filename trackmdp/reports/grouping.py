@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from trackmdp.reports.results import Run
+from trackmdp.reports.results import FinishedRun
 
 __all__ = ["Study", "study", "world_key"]
 
@@ -32,16 +32,16 @@ class Study:
         groups: (world, method) -> its runs, by seed.
     """
 
-    runs: Sequence[Run]
+    runs: Sequence[FinishedRun]
     worlds: Sequence[str]
     methods: Sequence[str]
-    groups: Mapping[tuple[str, str], Sequence[Run]]
+    groups: Mapping[tuple[str, str], Sequence[FinishedRun]]
 
-    def of(self, world: str, method: str) -> Sequence[Run]:
+    def of(self, world: str, method: str) -> Sequence[FinishedRun]:
         """The runs of a method in a world, one per seed."""
         return self.groups.get((world, method), ())
 
-    def in_world(self, world: str) -> list[Run]:
+    def in_world(self, world: str) -> list[FinishedRun]:
         """All runs in a world."""
         return [run for method in self.methods for run in self.of(world, method)]
 
@@ -55,7 +55,7 @@ class Study:
         found = [run.figures["optimal_lower"] for run in self.in_world(world)]
         return max((value for value in found if value is not None), default=None)
 
-    def regret(self, run: Run, world: str, aihtr: float | None = None) -> float:
+    def regret(self, run: FinishedRun, world: str, aihtr: float | None = None) -> float:
         """Distance per step to the best proved upper bound, of the run's policy or of one that earns `aihtr`."""
         earned = run.figure("aihtr") if aihtr is None else aihtr
         return (self.upper(world) - earned) / run.figure("expected_length")
@@ -66,12 +66,12 @@ class Study:
         return [self.regret(run, world) for run in self.of(world, method)] if known else []
 
 
-def study(runs: Sequence[Run]) -> Study:
+def study(runs: Sequence[FinishedRun]) -> Study:
     """Group `runs`; labels name only what differs between them."""
     varied = _varied(runs)
     labels = {run.name: (_world_label(run, varied), _method_label(run, varied)) for run in runs}
     order = {labels[run.name]: _order(run, varied) for run in reversed(runs)}
-    groups: dict[tuple[str, str], list[Run]] = {}
+    groups: dict[tuple[str, str], list[FinishedRun]] = {}
     for run in sorted(runs, key=lambda run: (order[labels[run.name]], run.seed, run.name)):
         groups.setdefault(labels[run.name], []).append(run)
     worlds = dict.fromkeys(world for world, _ in sorted(groups, key=lambda label: order[label][0]))
@@ -79,7 +79,7 @@ def study(runs: Sequence[Run]) -> Study:
     return Study(runs, list(worlds), list(methods), groups)
 
 
-def world_key(run: Run) -> str:
+def world_key(run: FinishedRun) -> str:
     """The same for runs in the same world."""
     return json.dumps({key: value for key, value in run.settings.items() if _of_world(key)}, sort_keys=True)
 
@@ -88,7 +88,7 @@ def _of_world(key: str) -> bool:
     return key.startswith(WORLD) and key != TOLD
 
 
-def _varied(runs: Sequence[Run]) -> list[str]:
+def _varied(runs: Sequence[FinishedRun]) -> list[str]:
     """Options that tell groups apart: not all the same among the runs of one algorithm, nor the copy of another."""
     values: dict[str, dict[str, set[str]]] = {}
     for run in runs:
@@ -104,7 +104,7 @@ def _varied(runs: Sequence[Run]) -> list[str]:
     return kept
 
 
-def _follows(runs: Iterable[Run], key: str, other: str) -> bool:
+def _follows(runs: Iterable[FinishedRun], key: str, other: str) -> bool:
     """Whether the value of `other` says that of `key`, both of the world or both of the method."""
     if _of_world(key) != _of_world(other):
         return False
@@ -113,7 +113,7 @@ def _follows(runs: Iterable[Run], key: str, other: str) -> bool:
     return all(seen.setdefault(mine, its) == its for mine, its in pairs)
 
 
-def _world_label(run: Run, varied: Sequence[str]) -> str:
+def _world_label(run: FinishedRun, varied: Sequence[str]) -> str:
     always = ["kernel.support_size", "cost.sensor"]
     keys = [*always, *(key for key in varied if _of_world(key) and key not in always)]
     named = [f"{_short(key)}={_text(run.settings[key])}" for key in keys if run.settings.get(key) is not None]
@@ -121,12 +121,12 @@ def _world_label(run: Run, varied: Sequence[str]) -> str:
     return ", ".join(named if kernel == "random_support" else [str(kernel), *named])
 
 
-def _method_label(run: Run, varied: Sequence[str]) -> str:
+def _method_label(run: FinishedRun, varied: Sequence[str]) -> str:
     keys = [key for key in varied if not _of_world(key) and key in run.settings]
     return ", ".join([run.algo, *(f"{_short(key)}={_text(run.settings[key])}" for key in keys)])
 
 
-def _order(run: Run, varied: Sequence[str]) -> tuple[Any, Any]:
+def _order(run: FinishedRun, varied: Sequence[str]) -> tuple[Any, Any]:
     world = [_sortable(run.settings.get(key)) for key in [*SHORT, *varied] if key in SHORT or _of_world(key)]
     place = ORDER.index(run.algo) if run.algo in ORDER else len(ORDER)
     method = [_sortable(run.settings.get(key)) for key in varied if not _of_world(key)]

@@ -5,99 +5,128 @@ from __future__ import annotations
 import html
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.resources import files
-from typing import Any
+from typing import Any, TypeAlias, TypeGuard
 
-from trackmdp.paper import critique, settings, verdicts
-from trackmdp.paper.calibration import DRAWS
-from trackmdp.paper.openings import Openings
-from trackmdp.paper.printed import pairs
-from trackmdp.reports import figures, learning, maps
+from trackmdp.reports import figures, learning, maps, summaries
 from trackmdp.reports.grouping import Study, study
 from trackmdp.reports.results import Results
 from trackmdp.reports.style import Figure
 from trackmdp.reports.tables import Table
 
-__all__ = ["Report", "build"]
+__all__ = ["Folded", "Part", "Report", "Section", "build"]
 
-MAPPED = 4
-"""Policies that are drawn on the page."""
+MAPPED = 2
+"""Methods and worlds whose policies are drawn on the page."""
 
 
-@dataclass
+@dataclass(frozen=True)
+class Folded:
+    """A table that shows when its summary is pressed."""
+
+    summary: str
+    table: Table
+
+
+Part: TypeAlias = "str | Table | Folded | Sequence[Figure]"
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading with what stands under it.
+
+    Attributes:
+        anchor: its id on the page.
+        heading: its title.
+        parts: HTML, tables, and rows of figures.
+        files: tables that are written but not shown.
+    """
+
+    anchor: str
+    heading: str
+    parts: Sequence[Part]
+    files: Sequence[Table] = ()
+
+    def html(self) -> str:
+        """The section as part of the page."""
+        body = "\n".join(map(_part, self.parts))
+        return f'<section id="{self.anchor}"><h2>{html.escape(self.heading)}</h2>{body}</section>'
+
+
+@dataclass(frozen=True)
 class Report:
-    """All that is written; the page is put together from `sections`."""
+    """All that is written."""
 
-    title: str
     about: str
-    figures: list[Figure] = field(default_factory=list)
-    tables: list[Table] = field(default_factory=list)
-    sections: list[tuple[str, str, str]] = field(default_factory=list)
+    sections: Sequence[Section]
 
-    def section(self, anchor: str, heading: str, *parts: str | Figure | Table | Sequence[Figure]) -> None:
-        """Add a section of text, figures and tables."""
-        shown = []
-        for part in parts:
-            if isinstance(part, str):
-                shown.append(part)
-            elif isinstance(part, Table):
-                self.tables.append(part)
-                shown.append(part.html())
-            else:
-                each = [part] if isinstance(part, Figure) else list(part)
-                self.figures += each
-                kind = "figures" if len(each) % 3 == 0 else "figures two"
-                shown.append(f'<div class="{kind}">{"".join(figure.html() for figure in each)}</div>')
-        self.sections.append((anchor, heading, "\n".join(shown)))
+    @property
+    def figures(self) -> list[Figure]:
+        """Every figure, in the order of the page."""
+        parts = [part for section in self.sections for part in section.parts]
+        return [figure for part in parts if not isinstance(part, (str, Table, Folded)) for figure in part]
+
+    @property
+    def tables(self) -> list[Table]:
+        """Every table but those of the figures, in the order of the page."""
+        found: list[Table] = []
+        for section in self.sections:
+            found += [part.table if isinstance(part, Folded) else part for part in section.parts if _has_table(part)]
+            found += section.files
+        return found
 
     def html(self) -> str:
         """The page."""
-        template = files("trackmdp.reports").joinpath("report.html").read_text(encoding="utf-8")
-        nav = "".join(
-            f'<li><a href="#{anchor}">{html.escape(heading)}</a></li>' for anchor, heading, _ in self.sections
-        )
-        body = "\n".join(
-            f'<section id="{anchor}"><h2>{html.escape(heading)}</h2>{content}</section>'
-            for anchor, heading, content in self.sections
-        )
-        parts = {"@TITLE@": html.escape(self.title), "@ABOUT@": self.about, "@NAV@": nav, "@BODY@": body}
-        for mark, text in parts.items():
-            template = template.replace(mark, text)
-        return template
+        page = files("trackmdp.reports").joinpath("report.html").read_text(encoding="utf-8")
+        nav = "".join(f'<li><a href="#{s.anchor}">{html.escape(s.heading)}</a></li>' for s in self.sections)
+        body = "\n".join(section.html() for section in self.sections)
+        for mark, text in {"@ABOUT@": self.about, "@NAV@": nav, "@BODY@": body}.items():
+            page = page.replace(mark, text)
+        return page
 
 
 def build(
-    results: Results, openings: Openings | None, resamples: int, say: Callable[[str], None] = lambda line: None
+    results: Results,
+    threshold: float | None = None,
+    extra: Sequence[Section] = (),
+    say: Callable[[str], None] = lambda line: None,
 ) -> Report:
     """The report of stored results.
 
     Args:
         results: of the sweep.
-        openings: what the paper leaves open, for a sweep in the paper's worlds.
-        resamples: of every bootstrap.
+        threshold: regret per step up to which runs are counted; None for no count.
+        extra: further sections, shown before the list of all runs.
         say: told what is under way.
     """
-    grouped = study(results.runs)
-    report = Report("The paper's sweep" if openings else "A sweep of trackmdp", _about(results))
-    chosen = pairs(grouped) if openings else {}
+    missing = Section("missing", "What is missing", [summaries.missing_table(results.anomalies)])
     if not results.runs:
-        report.section("missing", "What is missing", verdicts.missing_table(results.problems))
-        return report
+        return Report(_about(results), [missing])
     say("figures")
-    _outcome(report, results, grouped, chosen, resamples)
-    _against_cost(report, grouped, chosen, resamples)
-    if chosen:
-        report.section("accuracy", "Table II: accuracy", verdicts.accuracy_table(grouped, chosen, resamples))
-    _learning(report, results, grouped, resamples)
-    _maps(report, results, grouped, chosen)
-    if openings:
-        _openings(report, grouped, chosen, openings)
-    groups, runs = verdicts.groups_table(grouped, resamples), verdicts.runs_table(grouped)
-    folded = [_folded("By world and method", groups, report), _folded("Every run", runs, report)]
-    report.section("runs", "All runs", *folded)
-    report.section("made", "How it was made", _made(results.manifest, resamples))
-    return report
+    grouped = study(results.runs)
+    sections = [Section("outcome", "Outcome", [summaries.methods_table(grouped, threshold)])]
+    sections += [missing] if results.anomalies else []
+    sections += [*_against_cost(grouped, threshold), *_learning(results, grouped, threshold), *_maps(results, grouped)]
+    by_group = Folded("By world and method", summaries.groups_table(grouped, threshold))
+    runs = Section("runs", "All runs", [by_group, Folded("Every run", summaries.runs_table(grouped))])
+    made = Section("made", "How it was made", [_made(results.manifest)])
+    return Report(_about(results), [*sections, *extra, runs, made])
+
+
+def _part(part: Part) -> str:
+    if isinstance(part, str):
+        return part
+    if isinstance(part, Table):
+        return part.html()
+    if isinstance(part, Folded):
+        return f"<details><summary>{html.escape(part.summary)}</summary>{part.table.html()}</details>"
+    kind = "figures" if len(part) % 3 == 0 else "figures two"
+    return f'<div class="{kind}">{"".join(figure.html() for figure in part)}</div>'
+
+
+def _has_table(part: Part) -> TypeGuard[Table | Folded]:
+    return isinstance(part, (Table, Folded))
 
 
 def _about(results: Results) -> str:
@@ -111,123 +140,61 @@ def _about(results: Results) -> str:
     return html.escape(f"{count}, {took} of run time in all{', on ' + where if where else ''}.")
 
 
-def _outcome(
-    report: Report, results: Results, grouped: Study, chosen: dict[tuple[int, float], str], resamples: int
-) -> None:
-    parts: list[Any] = []
-    if chosen:
-        parts.append(_goals(verdicts.goals(grouped, chosen, resamples)))
-        parts.append(verdicts.acceptance_table(grouped, chosen, resamples))
-    report.section("outcome", "Outcome", *parts, verdicts.methods_table(grouped, resamples))
-    if results.problems:
-        note = '<p class="warn">Not all is as planned; the rest is shown.</p>'
-        report.section("missing", "What is missing", note, verdicts.missing_table(results.problems))
-
-
-def _goals(goals: Sequence[verdicts.Goal]) -> str:
-    items = []
-    for goal in goals:
-        state = "met" if goal.pairs and goal.met == goal.pairs else "open"
-        rest = f"Every single seed: in {goal.by_all}." if goal.pairs else "There is no run to judge by."
-        listed = goal.missed if len(goal.missed) < goal.pairs else ()
-        missed = f" Not in {html.escape('; '.join(listed))}." if listed else ""
-        items.append(
-            f'<li class="{state}"><b>{goal.met} of {goal.pairs}</b><span>pairs: {html.escape(goal.text)}</span>'
-            f'<span class="faint">{rest}{missed}</span></li>'
-        )
-    return f'<ul class="goals">{"".join(items)}</ul>'
-
-
-def _against_cost(report: Report, grouped: Study, chosen: dict[tuple[int, float], str], resamples: int) -> None:
-    found = figures.panels(grouped, chosen)
+def _against_cost(grouped: Study, threshold: float | None) -> list[Section]:
+    found = figures.panels(grouped)
     if not found:
-        return
-    heading = "Figures 3 to 5: AIHTR" if chosen else "Against the price of a sensor"
+        return []
     note = (
-        "<p>Learned policies: interquartile mean over seeds, bars are 95 % bootstrap intervals over seeds. Q_MDP, the "
-        "bounds and the optimum are exact. Below, the distance to the proved upper bound tells the best apart.</p>"
+        "<p>Learned policies: mean over seeds, bars are 95 % intervals (Student's t; none below three seeds). Q_MDP, "
+        "the bounds and the solver's policy are valued exactly. Below, the distance to the proved upper bound tells "
+        "the best apart.</p>"
     )
-    above = [figures.against_cost(grouped, panel, resamples) for panel in found]
+    above = [figures.against_cost(grouped, panel) for panel in found]
     bounded = [panel for panel in found if not any(math.isnan(grouped.upper(world)) for world in panel.worlds)]
-    below = [figures.regret_against_cost(grouped, panel, resamples) for panel in bounded]
-    report.section("figures", heading, note, above, below)
+    below = [figures.regret_against_cost(grouped, panel, threshold) for panel in bounded]
+    return [Section("figures", "Against the price of a sensor", [note, above, below])]
 
 
-def _learning(report: Report, results: Results, grouped: Study, resamples: int) -> None:
-    drawn = [learning.curves(grouped, results.curves, by, resamples) for by in ("frames", "seconds")]
-    shown = [figure for figure in (*drawn, learning.profiles(grouped, resamples)) if figure]
-    if shown:
-        report.section("learning", "Learning curves and profiles", shown)
+def _learning(results: Results, grouped: Study, threshold: float | None) -> list[Section]:
+    drawn = [learning.curves(grouped, results.curves, by) for by in ("frames", "seconds")]
+    shown = [figure for figure in (*drawn, learning.profiles(grouped, threshold)) if figure]
+    return [Section("learning", "Learning curves and profiles", [shown])] if shown else []
 
 
-def _maps(report: Report, results: Results, grouped: Study, chosen: dict[tuple[int, float], str]) -> None:
-    """Policies and values in the first and the last world, of at most two methods."""
-    worlds = list(chosen.values()) or list(grouped.worlds)
-    methods = [method for method in (verdicts.DEFAULT, verdicts.PAPERS) if method in grouped.methods]
+def _maps(results: Results, grouped: Study) -> list[Section]:
+    """Policies and values in the first and the last world."""
     sets, values = list[Figure | None](), list[Figure | None]()
-    for world in dict.fromkeys((worlds[-1], worlds[0])):
+    for world in dict.fromkeys((grouped.worlds[-1], grouped.worlds[0])):
         motion = next((results.motions[r.name] for r in grouped.in_world(world) if r.name in results.motions), None)
-        for method in methods or grouped.methods[:2]:
+        for method in grouped.methods[:MAPPED]:
             run = next((run for run in grouped.of(world, method) if run.name in results.policies), None)
-            if run is None or motion is None or len(sets) >= MAPPED:
+            if run is None or motion is None:
                 continue
-            name = figures.slug(f"{method}-{world}")
+            name, policy = figures.slug(f"{method}-{world}"), results.policies[run.name]
             where = f"{method}, {world}, seed {run.seed} (n = 1)"
-            sets.append(maps.policy_map(name, where, results.policies[run.name], motion))
-            values.append(maps.value_map(name, where, results.policies[run.name], motion))
+            sets.append(maps.policy_map(name, where, policy, motion))
+            values.append(maps.value_map(name, where, policy, motion))
     shown = [[figure for figure in group if figure is not None] for group in (values, sets)]
-    if any(shown):
-        note = (
-            "<p>Dot: where the target was located. Filled: sensor on. Pale: possible cell left out. "
-            "Contrasting: sensor on where the target cannot be. The run is the one in the middle of its seeds.</p>"
-        )
-        report.section("maps", "Policies and values, cell by cell", shown[0], note, shown[1])
-
-
-def _openings(report: Report, grouped: Study, chosen: dict[tuple[int, float], str], openings: Openings) -> None:
-    best = settings.fit_table(openings.settings)
-    border, t_max, *_, worst = best.rows[0]
+    if not any(shown):
+        return []
     note = (
-        f"<p>Nothing in the paper tells the settings apart but the printed accuracy of Q_MDP. Of those tried, border "
-        f"{border} with T_max = {t_max} fits it best (within {worst:.2f} points for every Z, with {len(DRAWS)} draws "
-        "only); the sweep keeps T_max = 1 and renormalize, this project's defaults.</p>"
+        "<p>Dot: where the target was located. Filled: sensor on. Pale: possible cell left out. "
+        "Contrasting: sensor on where the target cannot be. The run is the one in the middle of its seeds.</p>"
     )
-    report.section(
-        "worlds",
-        "The worlds, calibrated",
-        f"<p>{html.escape(settings.RULE)}</p>",
-        settings.calibration_figure(openings.candidates),
-        note,
-        best,
-        settings.sensitivity_figures(openings.settings),
-    )
-    report.tables += [settings.candidates_table(openings.candidates), settings.sensitivity_table(openings.settings)]
-    said = critique.points(grouped, chosen, openings.checks)
-    text = "".join(f"<h3>{html.escape(head)}</h3><p>{html.escape(body)}</p>" for head, body in said)
-    report.section(
-        "critique",
-        "Where the paper is silent or wrong",
-        text,
-        critique.bounds_table(grouped, chosen),
-        critique.checks_table(openings.checks),
-    )
+    return [Section("maps", "Policies and values, cell by cell", [shown[0], note, shown[1]])]
 
 
-def _folded(summary: str, table: Table, report: Report) -> str:
-    report.tables.append(table)
-    return f"<details><summary>{html.escape(summary)}</summary>{table.html()}</details>"
-
-
-def _made(manifest: Any, resamples: int) -> str:
+def _made(manifest: Any) -> str:
     facts = {"Command": manifest.get("line") or "not recorded"}
-    for entry in manifest.get("versions", []):
-        text = ", ".join(f"{name} {version}" for name, version in entry.items() if name != "runs")
-        facts[f"Versions, {entry['runs']} runs"] = text
-    for entry in manifest.get("machines", []):
-        text = ", ".join(f"{name} {value}" for name, value in entry.items() if name != "runs" and value is not None)
-        facts[f"Machine, {entry['runs']} runs"] = text
+    for key, label in (("versions", "Versions"), ("machines", "Machine")):
+        for entry in manifest.get(key, []):
+            text = ", ".join(f"{name} {value}" for name, value in entry.items() if name != "runs" and value is not None)
+            facts[f"{label}, {entry['runs']} runs"] = text
     seconds = [f"{manifest.get(key, 0):,.0f} s {key.split('_')[0]}" for key in ("wall_seconds", "cpu_seconds")]
     facts["Run time"] = ", ".join(seconds)
-    facts["Intervals"] = f"95 %, bootstrap over seeds within each world, {resamples:,} resamples, seeded"
+    facts["Intervals"] = (
+        "95 %, Student's t over seeds within each world, worlds combined after Welch and Satterthwaite; shares of runs "
+        "after Clopper and Pearson; none below three seeds"
+    )
     items = "".join(f"<div><dt>{html.escape(k)}</dt><dd>{html.escape(v)}</dd></div>" for k, v in facts.items())
     return f'<dl class="facts">{items}</dl><p class="faint">Numbers in full: the CSV files beside this page.</p>'

@@ -22,7 +22,18 @@ from trackmdp.errors import UserError
 from trackmdp.reports.policy import Policy, arrays, pack_all, unpack_all
 from trackmdp.world.model import Array
 
-__all__ = ["FIGURES", "FORMAT", "Motion", "Point", "Problem", "Results", "Run", "is_stored", "load", "save"]
+__all__ = [
+    "FIGURES",
+    "FORMAT",
+    "Motion",
+    "CurvePoint",
+    "Anomaly",
+    "Results",
+    "FinishedRun",
+    "is_stored",
+    "load_results",
+    "save_results",
+]
 
 FORMAT = "trackmdp results 1"
 FIGURES = (
@@ -46,7 +57,7 @@ FIGURES = (
 
 
 @dataclass(frozen=True)
-class Run:
+class FinishedRun:
     """A finished run.
 
     Attributes:
@@ -78,7 +89,7 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Point:
+class CurvePoint:
     """One point of a learning curve."""
 
     iteration: int
@@ -88,7 +99,7 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Problem:
+class Anomaly:
     """Something that is not as planned: a run that is missing, or one that is not like the others."""
 
     run: str
@@ -119,15 +130,15 @@ class Results:
         curves: learning curve of each run, by its name.
         policies: of some runs, by their names.
         motions: of the worlds, by the name of the first run in each.
-        problems: what is missing or mixed.
+        anomalies: what is missing or mixed.
         manifest: versions, machines, times, the sweep's own line.
     """
 
-    runs: Sequence[Run]
-    curves: Mapping[str, Sequence[Point]] = field(default_factory=dict)
+    runs: Sequence[FinishedRun]
+    curves: Mapping[str, Sequence[CurvePoint]] = field(default_factory=dict)
     policies: Mapping[str, Policy] = field(default_factory=dict)
     motions: Mapping[str, Motion] = field(default_factory=dict)
-    problems: Sequence[Problem] = ()
+    anomalies: Sequence[Anomaly] = ()
     manifest: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -139,7 +150,7 @@ def is_stored(folder: Path) -> bool:
         return False
 
 
-def save(results: Results, folder: Path) -> None:
+def save_results(results: Results, folder: Path) -> None:
     """Write all of it to `folder`; the same results, the same bytes."""
     index = {run.name: number for number, run in enumerate(results.runs)}
     common = _common(results.runs)
@@ -164,15 +175,15 @@ def save(results: Results, folder: Path) -> None:
     manifest = {
         "format": FORMAT,
         **results.manifest,
-        "problems": [vars(problem) for problem in results.problems],
+        "problems": [vars(anomaly) for anomaly in results.anomalies],
         "settings": common,
         "config_sha256": {run.name: run.config_sha256 for run in results.runs},
     }
     write_text(folder / "manifest.json", json.dumps(manifest, indent=1, ensure_ascii=False) + "\n")
 
 
-def load(folder: Path) -> Results:
-    """Read back what `save` wrote.
+def load_results(folder: Path) -> Results:
+    """Read back what `save_results` wrote.
 
     Raises:
         UserError: a file is missing or damaged.
@@ -180,29 +191,29 @@ def load(folder: Path) -> Results:
     try:
         manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
         common, hashes = manifest.pop("settings"), manifest.pop("config_sha256")
-        problems = [Problem(**entry) for entry in manifest.pop("problems")]
+        anomalies = [Anomaly(**entry) for entry in manifest.pop("problems")]
         del manifest["format"]
         runs = [_run(row, common, hashes) for row in _rows(folder / "runs.csv")]
-        curves: dict[str, list[Point]] = {}
+        curves: dict[str, list[CurvePoint]] = {}
         for row in _rows(folder / "curves.csv"):
-            point = Point(int(row["iteration"]), int(row["frames"]), float(row["seconds"]), float(row["aihtr"]))
+            point = CurvePoint(int(row["iteration"]), int(row["frames"]), float(row["seconds"]), float(row["aihtr"]))
             curves.setdefault(runs[int(row["run"])].name, []).append(point)
         policies = unpack_all((folder / "policies.npz").read_bytes())
         motions = _unpack_motions((folder / "worlds.npz").read_bytes())
     except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise UserError(f"sweep={folder}: stored results that cannot be read ({reason})") from error
-    return Results(runs, curves, policies, motions, problems, manifest)
+    return Results(runs, curves, policies, motions, anomalies, manifest)
 
 
-def _run(row: Mapping[str, str], common: Mapping[str, Any], hashes: Mapping[str, str]) -> Run:
+def _run(row: Mapping[str, str], common: Mapping[str, Any], hashes: Mapping[str, str]) -> FinishedRun:
     own = {key: _value(text) for key, text in row.items() if key not in FIGURES and key != "run" and text != ""}
     figures = {key: float(row[key]) if row[key] else None for key in FIGURES}
     algo = own.get("algo.name") or next(iter(common))
-    return Run(row["run"], {**common[algo], **own, "algo.name": algo}, figures, hashes[row["run"]])
+    return FinishedRun(row["run"], {**common[algo], **own, "algo.name": algo}, figures, hashes[row["run"]])
 
 
-def _common(runs: Iterable[Run]) -> dict[str, dict[str, Any]]:
+def _common(runs: Iterable[FinishedRun]) -> dict[str, dict[str, Any]]:
     """Algorithm -> the options that have one value in all of its runs."""
     found: dict[str, dict[str, Any]] = {}
     for run in runs:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:  # an extra, and a second to import
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Canvas
 
-__all__ = ["INK", "LINE", "PALETTE", "Figure", "Look", "Say", "draw", "legend", "look", "require", "tidy"]
+__all__ = ["INK", "LINE", "PALETTE", "Figure", "Look", "Say", "draw", "legend", "look_of", "require", "tidy"]
 
 Say: TypeAlias = Callable[[str], None]
 """Told in a few words what is under way."""
@@ -105,7 +105,7 @@ def require() -> None:
         raise UserError("report: drawing takes matplotlib, expected the extra trackmdp[report] installed") from error
 
 
-def look(label: str, place: int) -> Look:
+def look_of(label: str, place: int) -> Look:
     """How a method is drawn: by its algorithm, or where its label says more, by its place."""
     return LOOKS.get(label) or _MORE[place % len(_MORE)]
 

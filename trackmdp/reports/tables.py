@@ -27,13 +27,11 @@ class Column:
         label: heading.
         digits: decimals of a number; None for as they are.
         unit: shown in the heading.
-        judged: whether yes is good and no is bad, and is shown so.
     """
 
     label: str
     digits: int | None = None
     unit: str = ""
-    judged: bool = False
 
     @property
     def heading(self) -> str:
@@ -110,8 +108,7 @@ class Table:
         cells = []
         for place, (column, value) in enumerate(zip(self.columns, row, strict=True)):
             text = html.escape(column.text(value))
-            mark = f' class="{text}"' if isinstance(value, bool) and column.judged else ""
-            mark = mark or (' class="wide"' if len(text) > LONG else "")
+            mark = ' class="wide"' if len(text) > LONG else ""
             number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
             sort = f' data-v="{value!r}"' if number else ""
             cells.append(f"<td{mark or self._side(place)}{sort}>{text}</td>")

@@ -13,11 +13,11 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from trackmdp.app.sweep.state import read_json, run_of
 from trackmdp.errors import UserError
 from trackmdp.reports.gather import planned, run_folders
+from trackmdp.training.folders import read_json, run_of
 
-__all__ = ["Status", "look", "watch"]
+__all__ = ["Status", "statuses", "watch"]
 
 WAITING, RUNNING, CUT, FAILED, DONE = "waiting", "running", "cut", "failed", "done"
 TAIL = 4096
@@ -53,7 +53,7 @@ def watch(sweep: Path, console: Console, every: float) -> int:
     Raises:
         UserError: there are no runs.
     """
-    found = look(sweep)
+    found = statuses(sweep)
     if not found:
         raise UserError(f"sweep={sweep}: no runs in there, expected the folder of a sweep")
     if console.is_terminal:
@@ -63,7 +63,7 @@ def watch(sweep: Path, console: Console, every: float) -> int:
     return sum(status.state == DONE for status in found)
 
 
-def look(sweep: Path) -> list[Status]:
+def statuses(sweep: Path) -> list[Status]:
     """The runs as they are now."""
     return [_status(sweep / name, name) for name in run_folders(sweep, planned(sweep))]
 
@@ -72,7 +72,7 @@ def _live(sweep: Path, console: Console, every: float, found: list[Status]) -> l
     with Live(_table(found, console.height), console=console, auto_refresh=False) as live:
         while _going(sweep, found):
             time.sleep(every)
-            found = look(sweep)
+            found = statuses(sweep)
             live.update(_table(found, console.height), refresh=True)
     return found
 
@@ -87,7 +87,7 @@ def _lines(sweep: Path, console: Console, every: float, found: list[Status]) -> 
         if not _going(sweep, found):
             break
         time.sleep(every)
-        found = look(sweep)
+        found = statuses(sweep)
     console.print(_counts(found), markup=False)
     return found
 

@@ -34,7 +34,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 def test_a_report_holds_page_figures_tables_and_what_it_was_made_from(
     sweep: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["report", f"sweep={sweep}", "resamples=100"]) == 0
+    assert main(["report", f"sweep={sweep}"]) == 0
     assert capsys.readouterr().out == f"12 runs; report in {sweep / 'report/report.html'}\n"
     made = contents(sweep / "report")
     kept = {"runs.csv", "curves.csv", "policies.npz", "worlds.npz", "manifest.json"}
@@ -47,7 +47,7 @@ def test_a_report_holds_page_figures_tables_and_what_it_was_made_from(
     assert b"the paper" not in made["report.html"].lower()
 
     # from what it keeps, and from nothing else, the same report is made again
-    assert main(["report", f"sweep={sweep / 'report'}", "resamples=100", "hydra.run.dir=two", "quiet=true"]) == 0
+    assert main(["report", f"sweep={sweep / 'report'}", "hydra.run.dir=two", "quiet=true"]) == 0
     assert capsys.readouterr().out == ""
     assert contents(Path("two")) == made
     assert len(run_folders(sweep, None)) == 12  # the report that lies there is no run
@@ -59,7 +59,7 @@ def test_what_is_missing_is_said_in_one_line_and_in_the_page(
     cut = write_sweep(tmp_path / "cut")
     (cut / "a2c-0.16-0/summary.json").unlink()
     (cut / "a2c-0.16-1/summary.json").write_text("{")
-    assert main(["report", f"sweep={cut}", "resamples=100"]) == 0
+    assert main(["report", f"sweep={cut}"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "missing or mixed: a2c-0.16-0: cut: it has no summary.json and 2 more"
     assert lines[1].startswith("10 runs; report in")
@@ -105,7 +105,7 @@ def test_a_sweep_as_typed_is_reported_with_what_failed(capsys: pytest.CaptureFix
     words = ["seed=0,1", "grid.size=3,2", "algo.updates=2", "algo.total_frames=2000", "algo.frames_per_batch=1000"]
     assert main(["train", "-m", *words, "quiet=true", "hydra.sweep.dir=all"]) == 2
     capsys.readouterr()
-    assert main(["report", "sweep=all", "resamples=100"]) == 0, capsys.readouterr().err
+    assert main(["report", "sweep=all"]) == 0, capsys.readouterr().err
     lines = capsys.readouterr().out.splitlines()
     assert "failed: grid.size=2: expected an integer from 3 to 64 (cells) and 1 more" in lines[0]
     assert lines[1].startswith("2 runs; report in")

@@ -15,7 +15,7 @@ import pytest
 from tests.app.sweep.runs import TINY, here, nothing_left, started, states, swept, table
 from tests.typed import stub
 from trackmdp.app.cli import main
-from trackmdp.app.sweep.state import run_of, runs_of
+from trackmdp.training.folders import run_of, runs_of
 
 __all__ = ["here", "nothing_left"]
 

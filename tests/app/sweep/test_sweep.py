@@ -19,9 +19,9 @@ from tests.typed import stub
 from trackmdp.app.cli import main
 from trackmdp.app.sweep.job import stop_signal
 from trackmdp.app.sweep.plan import Job
-from trackmdp.app.sweep.state import read_plan, run_of, runs_of
 from trackmdp.app.sweep.sweep import sweep
 from trackmdp.errors import Preempted, RunError
+from trackmdp.training.folders import read_plan, run_of, runs_of
 from trackmdp.training.lock import locked
 
 __all__ = ["here"]

@@ -9,14 +9,14 @@ from rich.console import Console
 from trackmdp.build import make_world
 from trackmdp.config import ReportConfig
 from trackmdp.durable import write_bytes, write_text
-from trackmdp.paper import openings
-from trackmdp.paper.openings import Openings
+from trackmdp.paper.openings import compute, load_openings, save_openings
 from trackmdp.paper.printed import pairs
-from trackmdp.reports import results, style, watch
+from trackmdp.paper.sections import sections
+from trackmdp.reports import style, watch
 from trackmdp.reports.gather import gather
 from trackmdp.reports.grouping import study
-from trackmdp.reports.page import Report, build
-from trackmdp.reports.results import Results
+from trackmdp.reports.page import Report, Section, build
+from trackmdp.reports.results import Results, is_stored, load_results, save_results
 from trackmdp.training.display import make_console
 
 __all__ = ["run"]
@@ -37,28 +37,22 @@ def run(cfg: ReportConfig, folder: Path) -> float:
         def say(line: str) -> None:
             status.update(line)
 
-        found = results.load(sweep) if results.is_stored(sweep) else gather(sweep, make_world)
-        known = _openings(cfg, sweep, found, say)
-        _store(found, known, folder)
-        report = build(results.load(folder), known, cfg.resamples, say)
-        _write(report, folder)
+        found = load_results(sweep) if is_stored(sweep) else gather(sweep, make_world)
+        save_results(found, folder)
+        found = load_results(folder)
+        _write(build(found, cfg.threshold, _about_the_paper(cfg, sweep, found, folder, say), say), folder)
     _tell(console, found, folder)
     return float(len(found.runs))
 
 
-def _openings(cfg: ReportConfig, sweep: Path, found: Results, say: style.Say) -> Openings | None:
-    """What the paper leaves open, where it is asked for: as stored, or computed."""
-    wanted = bool(pairs(study(found.runs))) if cfg.paper is None else cfg.paper
-    if not wanted:
-        return None
-    return (openings.load(sweep) if results.is_stored(sweep) else None) or openings.compute(say)
-
-
-def _store(found: Results, known: Openings | None, folder: Path) -> None:
-    """What the report can be made from again."""
-    results.save(found, folder)
-    if known is not None:
-        openings.save(known, folder)
+def _about_the_paper(cfg: ReportConfig, sweep: Path, found: Results, folder: Path, say: style.Say) -> list[Section]:
+    """Where it is asked for, what concerns the paper: made from stored figures, or from such that are computed now."""
+    grouped = study(found.runs)
+    if not (bool(pairs(grouped)) if cfg.paper is None else cfg.paper):
+        return []
+    known = (load_openings(sweep) if is_stored(sweep) else None) or compute(say)
+    save_openings(known, folder)
+    return sections(grouped, known)
 
 
 def _write(report: Report, folder: Path) -> None:
@@ -75,8 +69,8 @@ def _write(report: Report, folder: Path) -> None:
 
 
 def _tell(console: Console, found: Results, folder: Path) -> None:
-    if found.problems:
-        first = found.problems[0]
-        more = f" and {len(found.problems) - 1} more" if len(found.problems) > 1 else ""
+    if found.anomalies:
+        first = found.anomalies[0]
+        more = f" and {len(found.anomalies) - 1} more" if len(found.anomalies) > 1 else ""
         console.print(f"missing or mixed: {first.run}: {first.text}{more}", markup=False)
     console.print(f"{len(found.runs)} runs; report in {folder / 'report.html'}", markup=False)

@@ -12,10 +12,10 @@ from trackmdp.app.outputs import remove_if_empty
 from trackmdp.app.prepare import say
 from trackmdp.app.sweep.apart import Outcome, run_apart
 from trackmdp.app.sweep.plan import Job
-from trackmdp.app.sweep.state import DONE, FAILED, SUMMARY, run_of
 from trackmdp.config import TrainConfig
 from trackmdp.durable import write_json
 from trackmdp.errors import USER_MISTAKE
+from trackmdp.training.folders import DONE, FAILED, SUMMARY, run_of
 
 __all__ = ["STOP", "Launch", "fail", "run_job", "stop_signal"]
 

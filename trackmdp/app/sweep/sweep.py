@@ -15,12 +15,12 @@ from trackmdp.app.sweep.apart import Outcome
 from trackmdp.app.sweep.job import STOP, Launch, fail
 from trackmdp.app.sweep.launchers import threads_of
 from trackmdp.app.sweep.plan import Job
-from trackmdp.app.sweep.state import DONE, FAILED, SUMMARY, Run, run_of, runs_of, write_plan
 from trackmdp.app.sweep.table import show, status_of, write_table
 from trackmdp.config import TrainConfig
 from trackmdp.config.resume import continued, finished
 from trackmdp.errors import FAILED as FAILED_STATUS
 from trackmdp.errors import Preempted, UserError
+from trackmdp.training.folders import DONE, FAILED, SUMMARY, RunState, run_of, runs_of, write_plan
 from trackmdp.training.lock import locked
 from trackmdp.training.signals import Signals
 
@@ -33,7 +33,7 @@ _ROUNDS = 3
 def sweep(
     folder: Path, command: str, line: str, batches: Iterable[Sequence[Job]], launch: Launch, console: Console
 ) -> int:
-    """Run what is not finished, and show what came of all; returns the exit status.
+    """RunState what is not finished, and show what came of all; returns the exit status.
 
     Args:
         folder: of the sweep.
@@ -114,7 +114,7 @@ def _opening(jobs: Sequence[Job], skipped: Collection[Path], folder: Path) -> st
     return f"{len(jobs)} runs{done} -> {shown(folder)}"
 
 
-def _tell_failures(command: str, runs: Sequence[Run]) -> None:
+def _tell_failures(command: str, runs: Sequence[RunState]) -> None:
     failed = [run for run in runs if run.state == "failed"]
     if failed:
         sys.stderr.write(f"trackmdp {command}: {len(failed)} of {len(runs)} runs failed\n")

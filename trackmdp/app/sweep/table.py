@@ -12,11 +12,11 @@ from rich.console import Console
 from rich.markup import escape
 
 from trackmdp.app.prepare import shown
-from trackmdp.app.sweep.state import FAILED, Run, read_json
 from trackmdp.durable import write_text
 from trackmdp.errors import FAILED as FAILED_STATUS
 from trackmdp.errors import USER_MISTAKE
 from trackmdp.training.display import table
+from trackmdp.training.folders import FAILED, RunState, read_json
 
 __all__ = ["TABLE", "figures", "show", "status_of", "write_table"]
 
@@ -25,7 +25,7 @@ TABLE = "runs.csv"
 _FIGURES = ("aihtr", "regret_per_step", "accuracy", "sensors_per_step", "frames")
 
 
-def show(console: Console, runs: Sequence[Run], skipped: Collection[Path], sweep: Path) -> None:
+def show(console: Console, runs: Sequence[RunState], skipped: Collection[Path], sweep: Path) -> None:
     """Every run with its state, AIHTR and regret per step, or why it failed."""
     names = [run.folder.name.rpartition("-")[0] for run in runs]
     if len(set(names)) < len(names):
@@ -41,7 +41,7 @@ def show(console: Console, runs: Sequence[Run], skipped: Collection[Path], sweep
     console.print(f"{counts}; {shown(sweep) / TABLE}", markup=False)
 
 
-def write_table(sweep: Path, runs: Sequence[Run]) -> None:
+def write_table(sweep: Path, runs: Sequence[RunState]) -> None:
     """Write `runs.csv`: folder, state, figures, reason, and one column for every option that was overridden.
 
     Nothing in it depends on time, or on how often a run was cut.
@@ -58,7 +58,7 @@ def write_table(sweep: Path, runs: Sequence[Run]) -> None:
     write_text(sweep / TABLE, stream.getvalue())
 
 
-def status_of(runs: Sequence[Run]) -> int:
+def status_of(runs: Sequence[RunState]) -> int:
     """The exit status: 0 if all is done, 2 if only mistakes of the user failed, else 1."""
     if all(run.state == "done" for run in runs):
         return 0
@@ -67,18 +67,18 @@ def status_of(runs: Sequence[Run]) -> int:
     return FAILED_STATUS if unfinished or any(status != USER_MISTAKE for status in statuses) else USER_MISTAKE
 
 
-def _state(run: Run, skipped: Collection[Path]) -> str:
+def _state(run: RunState, skipped: Collection[Path]) -> str:
     return "skipped" if run.folder in skipped and run.state == "done" else run.state
 
 
-def figures(run: Run) -> dict[str, Any]:
+def figures(run: RunState) -> dict[str, Any]:
     """The figures of a training run; of another command's the one value that it returns."""
     if "policy" not in run.result:
         return {"aihtr": run.result.get("value")}
     return {**run.result["policy"], **{name: run.result.get(name) for name in ("regret_per_step", "frames")}}
 
 
-def _short(run: Run) -> list[str]:
+def _short(run: RunState) -> list[str]:
     found = figures(run)
     aihtr, regret = found.get("aihtr"), found.get("regret_per_step")
     return [f"{aihtr:,.3f}" if aihtr is not None else "", f"{round(regret, 4) + 0.0:.4f}" if regret is not None else ""]

@@ -13,10 +13,10 @@ from hydra.core.override_parser.types import IntervalSweep, Override, RangeSweep
 
 from trackmdp.app.sweep.plan import Job
 from trackmdp.app.sweep.schema import OptunaConfig
-from trackmdp.app.sweep.state import run_of
 from trackmdp.app.sweep.table import figures
 from trackmdp.errors import UserError, require
 from trackmdp.seeding import derive
+from trackmdp.training.folders import run_of
 
 __all__ = ["STUDY", "trials"]
 

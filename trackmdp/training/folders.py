@@ -12,14 +12,14 @@ from trackmdp.errors import UserError
 from trackmdp.training.lock import is_locked
 from trackmdp.untrusted import read_object
 
-__all__ = ["DONE", "FAILED", "PLAN", "SUMMARY", "Run", "read_json", "read_plan", "run_of", "runs_of", "write_plan"]
+__all__ = ["DONE", "FAILED", "PLAN", "SUMMARY", "RunState", "read_json", "read_plan", "run_of", "runs_of", "write_plan"]
 
 PLAN, FAILED, SUMMARY, DONE = "sweep.json", "failed.json", "summary.json", "done.json"
 """Files: of a sweep; of a run that failed, of a training run that ended, of a run of another command that did."""
 
 
 @dataclass(frozen=True)
-class Run:
+class RunState:
     """One run of a sweep, as its folder shows it.
 
     Attributes:
@@ -55,7 +55,7 @@ def read_plan(sweep: Path) -> dict[str, Any]:
     return content
 
 
-def runs_of(sweep: Path) -> list[Run]:
+def runs_of(sweep: Path) -> list[RunState]:
     """All runs of a sweep, in the order planned.
 
     Raises:
@@ -64,16 +64,16 @@ def runs_of(sweep: Path) -> list[Run]:
     return [run_of(sweep / job["folder"], tuple(job["overrides"])) for job in read_plan(sweep)["jobs"]]
 
 
-def run_of(folder: Path, overrides: tuple[str, ...] = ()) -> Run:
+def run_of(folder: Path, overrides: tuple[str, ...] = ()) -> RunState:
     """One run, as its folder shows it."""
     if is_locked(folder):
-        return Run(folder, overrides, "running")
+        return RunState(folder, overrides, "running")
     for name in (SUMMARY, DONE):
         if result := read_json(folder / name):
-            return Run(folder, overrides, "done", "", result)
+            return RunState(folder, overrides, "done", "", result)
     if failed := read_json(folder / FAILED):
-        return Run(folder, overrides, "failed", str(failed.get("reason", "")))
-    return Run(folder, overrides, "cut" if (folder / "config.yaml").is_file() else "waiting")
+        return RunState(folder, overrides, "failed", str(failed.get("reason", "")))
+    return RunState(folder, overrides, "cut" if (folder / "config.yaml").is_file() else "waiting")
 
 
 def read_json(file: Path) -> dict[str, Any]:

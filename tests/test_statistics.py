@@ -1,0 +1,90 @@
+"""Intervals: against numbers worked out by hand, and how often they cover."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from trackmdp.statistics import Estimate, iqm, mean_over_groups, share
+
+Draw = Callable[[np.random.Generator, int], np.ndarray]
+
+
+def test_one_group_has_the_interval_of_student() -> None:
+    found = mean_over_groups([[1.0, 2.0, 3.0]])
+    margin = 4.302652729911275 / math.sqrt(3)  # t with two degrees of freedom, s = 1
+    assert (found.mean, found.n) == (2.0, 3)
+    assert (found.low, found.high) == pytest.approx((2.0 - margin, 2.0 + margin))
+
+
+def test_every_group_has_the_same_weight_whatever_its_size() -> None:
+    found = mean_over_groups([[1.0, 2.0, 3.0], [10.0, 10.5, 9.5, 10.0, 10.0, 10.0], []])
+    assert (found.mean, found.n) == (6.0, 9)
+
+
+def test_groups_of_equal_spread_have_their_degrees_of_freedom_together() -> None:
+    found = mean_over_groups([[1.0, 2.0, 3.0], [11.0, 12.0, 13.0]])
+    margin = 2.7764451051977987 * math.sqrt(1 / 6)  # t with 2 + 2; variance (1/3 + 1/3) / 4
+    assert (found.low, found.high) == pytest.approx((7.0 - margin, 7.0 + margin))
+
+
+@pytest.mark.parametrize("groups", [[[1.0]], [[1.0, 5.0]], [[1.0, 2.0, 3.0], [1.0, 2.0]], [[0.1] * 5, [0.3] * 5]])
+def test_too_few_values_or_no_spread_give_no_interval(groups: Sequence[Sequence[float]]) -> None:
+    found = mean_over_groups(groups)
+    assert math.isfinite(found.mean)
+    assert (found.low, found.high) == (None, None)
+
+
+def test_nothing_is_no_estimate() -> None:
+    assert mean_over_groups([[], []]).n == 0
+    assert math.isnan(mean_over_groups([]).mean)
+    assert math.isnan(iqm([]))
+
+
+def test_the_interquartile_mean_does_not_trim_a_hard_world_away() -> None:
+    easy, hard = [0.0, 0.0, 0.0, 0.0], [8.0, 4.0, 5.0, 90.0]
+    assert iqm([easy, easy, easy, hard]) == 6.5 / 4
+    assert stats.trim_mean([*easy, *easy, *easy, *hard], 0.25) == 0.0  # what all runs in one pot would give
+
+
+def test_none_of_many_still_allows_for_some() -> None:
+    found = share(0, 100)
+    assert (found.mean, found.low) == (0.0, 0.0)
+    assert found.high == pytest.approx(1 - 0.025 ** (1 / 100))
+    assert share(2, 2) == Estimate(1.0, None, None, 2)
+    assert share(0, 0).n == 0
+
+
+POPULATIONS: dict[str, tuple[Draw, float]] = {
+    "normal": (lambda rng, n: rng.normal(size=n), 0.0),
+    "skewed": (lambda rng, n: rng.gamma(4.0, size=n), 4.0),  # skewness 1
+    "flat": (lambda rng, n: rng.uniform(size=n), 0.5),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [3, 5, 10])
+@pytest.mark.parametrize("name", POPULATIONS)
+@pytest.mark.parametrize("worlds", [1, 12])
+def test_intervals_over_seeds_cover(worlds: int, name: str, count: int) -> None:
+    """At least .93 of 4,000 samples, less twice the error of the simulation, .004."""
+    draw, mean = POPULATIONS[name]
+    scales, rng, hits = np.geomspace(1, 50, worlds), np.random.default_rng(0), 0
+    for _ in range(4000):
+        found = mean_over_groups([list(scale * draw(rng, count)) for scale in scales])
+        assert found.low is not None
+        assert found.high is not None
+        hits += found.low <= mean * scales.mean() <= found.high
+    assert hits / 4000 >= 0.93 - 0.008
+
+
+@pytest.mark.parametrize("count", [3, 5, 10, 60])
+@pytest.mark.parametrize("chance", [0.02, 0.1, 0.5, 0.9])
+def test_intervals_of_shares_cover_by_their_exact_law(chance: float, count: int) -> None:
+    found = [share(part, count) for part in range(count + 1)]
+    inside = [(e.low or 0.0) <= chance <= (e.high or 0.0) for e in found]
+    assert stats.binom.pmf(np.arange(count + 1), count, chance) @ inside >= 0.95

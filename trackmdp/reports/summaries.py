@@ -1,0 +1,93 @@
+"""Tables of what came out: each method over all worlds, each world and method, every run, and what is missing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from trackmdp.reports.grouping import Study
+from trackmdp.reports.results import Anomaly, FinishedRun
+from trackmdp.reports.tables import Cell, Column, Table
+from trackmdp.statistics import Estimate, iqm, mean_over_groups
+
+__all__ = ["estimate_cells", "estimate_columns", "groups_table", "methods_table", "missing_table", "runs_table"]
+
+TIMES = [Column("wall", 1, "s"), Column("CPU", 1, "s")]
+
+
+def estimate_columns(label: str, digits: int) -> list[Column]:
+    """Columns for what `estimate_cells` gives."""
+    return [Column(label, digits), Column("95 % from", digits), Column("to", digits)]
+
+
+def estimate_cells(found: Estimate) -> list[Cell]:
+    """Mean and interval as cells."""
+    return [found.mean, found.low, found.high]
+
+
+def methods_table(study: Study, threshold: float | None) -> Table:
+    """Each method over all its worlds; with a `threshold`, how many runs end at most that far from the bound."""
+    rows: list[list[Cell]] = []
+    for method in study.methods:
+        groups = [group for world in study.worlds if (group := study.regrets(world, method))]
+        regrets = [regret for group in groups for regret in group]
+        runs = [run for world in study.worlds for run in study.of(world, method)]
+        spread: list[Cell] = [float(np.median(regrets)), max(regrets)] if regrets else [None, None]
+        means = [float(np.mean([run.figure(key) for run in runs])) for key in ("frames", "wall_seconds", "cpu_seconds")]
+        regret = [*estimate_cells(mean_over_groups(groups)), iqm(groups), *spread]
+        rows.append([method, len(groups), len(regrets), *regret, *_within(regrets, threshold), *means])
+    columns = [Column("method"), Column("worlds"), Column("n"), *estimate_columns("regret per step, mean", 4)]
+    columns += [Column("interquartile mean", 4), Column("median", 4), Column("worst", 4), *_within_column(threshold)]
+    columns += [Column("env steps", 0), *TIMES]
+    caption = "All methods: regret per step, n runs, every world with the same weight; what a run takes on average"
+    return Table("methods", caption, columns, rows)
+
+
+def groups_table(study: Study, threshold: float | None) -> Table:
+    """Each method in each world, its seeds together."""
+    rows: list[list[Cell]] = []
+    for (world, method), runs in _groups(study):
+        regrets = study.regrets(world, method)
+        earned = mean_over_groups([[run.figure("aihtr") for run in runs]])
+        rest = [float(np.mean([run.figure(key) for run in runs])) for key in ("accuracy", "sensors_per_step")]
+        means = [*estimate_cells(earned), *estimate_cells(mean_over_groups([regrets])), *_within(regrets, threshold)]
+        rows.append([world, method, len(runs), *means, 100 * rest[0], rest[1]])
+    columns = [Column("world"), Column("method"), Column("n"), *estimate_columns("AIHTR, mean", 3)]
+    columns += [*estimate_columns("regret per step, mean", 4), *_within_column(threshold)]
+    columns += [Column("accuracy", 2, "%"), Column("sensors per step", 3)]
+    return Table("groups", "Every world and method: means over n seeds", columns, rows)
+
+
+def runs_table(study: Study) -> Table:
+    """Every finished run."""
+    rows: list[list[Cell]] = []
+    for (world, method), runs in _groups(study):
+        for run in runs:
+            aihtr, accuracy, sensors = (run.figure(key) for key in ("aihtr", "accuracy", "sensors_per_step"))
+            times = [run.figure(key) for key in ("wall_seconds", "cpu_seconds")]
+            row: list[Cell] = [world, method, run.seed, int(run.figure("frames")), aihtr, study.regret(run, world)]
+            rows.append([*row, 100 * accuracy, sensors, *times, run.name])
+    columns = [Column("world"), Column("method"), Column("seed"), Column("env steps"), Column("AIHTR", 3)]
+    columns += [Column("regret per step", 5), Column("accuracy", 2, "%"), Column("sensors per step", 3), *TIMES]
+    return Table("runs", f"All {len(rows)} finished runs", [*columns, Column("folder")], rows)
+
+
+def missing_table(anomalies: Sequence[Anomaly]) -> Table:
+    """What is missing, mixed or damaged."""
+    rows = [[anomaly.run, anomaly.text] for anomaly in anomalies]
+    return Table("missing", "What is missing or not like the rest", [Column("run"), Column("what")], rows)
+
+
+def _groups(study: Study) -> list[tuple[tuple[str, str], Sequence[FinishedRun]]]:
+    """(world, method) and its runs, worlds first."""
+    keys = [(world, method) for world in study.worlds for method in study.methods]
+    return [(key, study.groups[key]) for key in keys if key in study.groups]
+
+
+def _within_column(threshold: float | None) -> list[Column]:
+    return [] if threshold is None else [Column(f"runs ≤ {threshold:g}")]
+
+
+def _within(regrets: Sequence[float], threshold: float | None) -> list[Cell]:
+    return [] if threshold is None else [sum(regret <= threshold for regret in regrets)]
