@@ -11,9 +11,11 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "trackmdp"
 FILES = sorted(PACKAGE.rglob("*.py"))
 
+BEFORE_ALL = ("errors", "seeding", "durable", "untrusted", "arrays", "statistics")
+
 # config, world, policy, collector, loss, trainer, checkpoint and log, replay and report; build and the commands on top
 ARROW = [
-    ["trackmdp", *(f"trackmdp.{name}" for name in ("errors", "seeding", "durable", "untrusted", "arrays", "statistics"))],
+    ["trackmdp", *(f"trackmdp.{name}" for name in BEFORE_ALL)],
     ["trackmdp.config"],
     ["trackmdp.world"],
     ["trackmdp.policies", "trackmdp.solvers"],
