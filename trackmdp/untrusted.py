@@ -51,8 +51,7 @@ _KINDS = {
 }
 
 
-@contextmanager
-def opened(file: Path, *, most: int, source: str = "", links: bool = False) -> Iterator[BinaryIO]:
+def opened(file: Path, *, most: int, source: str = "", links: bool = False) -> BinaryIO:
     """An ordinary file of at most `most` bytes, open for reading.
 
     Args:
@@ -82,8 +81,7 @@ def opened(file: Path, *, most: int, source: str = "", links: bool = False) -> I
     except BaseException:
         os.close(descriptor)
         raise
-    with os.fdopen(descriptor, "rb") as stream:
-        yield stream
+    return os.fdopen(descriptor, "rb")
 
 
 @contextmanager

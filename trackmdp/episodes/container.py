@@ -16,7 +16,9 @@ from typing import BinaryIO
 
 import zstandard
 
+from trackmdp import untrusted
 from trackmdp.errors import UserError
+from trackmdp.untrusted import reason
 
 __all__ = ["MAGIC", "Body", "Chunk", "Container", "Damaged", "Message", "opened", "records", "unpacked"]
 
@@ -24,7 +26,13 @@ MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
 ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = range(9, 16)
 _FOOTER_LENGTH = 1 + 8 + 20
-_CHUNK_LIMIT = 2**28  # bytes; a damaged or hostile size must not fill the memory
+_CHUNK_LIMIT, _RECORD_LIMIT = 2**26, 2**30
+"""Bytes of the largest chunk, unpacked, and of the largest record: a damaged or hostile size must not fill the memory.
+
+A writer closes its chunk after one MiB or one episode's end; the longest record is an attached kernel.
+"""
+
+_LONGEST = 2**42
 
 
 class Damaged(Exception):
@@ -91,15 +99,14 @@ class Container:
         try:
             self.profile, self.made_by = self._header()
             self._summary()
-        except (Damaged, struct.error, UnicodeDecodeError) as error:
+        except BaseException as error:
             self.stream.close()
-            raise UserError(f"file={file}: damaged ({error}); recover=true saves what can be read") from error
-        except UserError:
-            self.stream.close()
-            raise
+            if isinstance(error, UserError) or not isinstance(error, Exception):
+                raise
+            raise UserError(f"file={file}: damaged ({reason(error)}); recover=true saves what can be read") from error
 
     def _header(self) -> tuple[str, str]:
-        opcode, body = next(records(self.stream, len(MAGIC)))
+        opcode, body = next(records(self.stream, len(MAGIC)), (0, b""))
         if opcode != HEADER:
             raise Damaged("its first record is not the header")
         header = Body(body)
@@ -118,6 +125,8 @@ class Container:
         summary_length = self.length - _FOOTER_LENGTH - len(MAGIC) - self.summary_start
         if (opcode, size) != (FOOTER, 20) or not len(MAGIC) < self.summary_start or summary_length <= 0:
             raise Damaged("the footer")
+        if summary_length > _RECORD_LIMIT:
+            raise Damaged(f"a summary of {summary_length:,} bytes")
         self.stream.seek(self.summary_start)
         summary = self.stream.read(summary_length)
         if zlib.crc32(footer[:-4], zlib.crc32(summary)) != checksum:
@@ -147,6 +156,9 @@ class Container:
 
     def _record(self, opcode: int, offset: int, length: int) -> bytes:
         """The content of the record that the summary says is there."""
+        # The summary's checksum says that it is what was written, not that a kind hand wrote it.
+        if not (9 <= length <= min(_RECORD_LIMIT, self.length) and 0 <= offset <= self.length - length):
+            raise Damaged(f"a record of {length:,} bytes at byte {offset:,}")
         self.stream.seek(offset)
         data = self.stream.read(length)
         if len(data) != length or struct.unpack_from("<BQ", data) != (opcode, length - 9):
@@ -213,13 +225,7 @@ def opened(file: Path) -> BinaryIO:
     Raises:
         UserError: it does not.
     """
-    if file.is_dir():
-        raise UserError(f"file={file}: a folder, expected an MCAP file")
-    try:
-        stream = file.open("rb")
-    except OSError as error:
-        reason = (error.strerror or "cannot be read").lower()
-        raise UserError(f"file={file}: {reason}, expected an MCAP file") from error
+    stream = untrusted.opened(file, most=_LONGEST, source=f"file={file}", links=True)  # the user named this very file
     start = stream.read(len(MAGIC))
     if start != MAGIC:
         stream.close()
@@ -247,6 +253,10 @@ def records(stream: BinaryIO, offset: int) -> Iterator[tuple[int, bytes]]:
         size = int.from_bytes(head[1:], "little")
         if len(head) < 9 or size > length - offset - 9:
             raise Damaged(f"the record at byte {offset} reaches beyond the end of the file")
+        if head[0] == 0:  # no record has this opcode, but a sparse file holds nothing else, two thousand million times
+            raise Damaged(f"no record at byte {offset}")
+        if size > _RECORD_LIMIT:
+            raise Damaged(f"a record of {size:,} bytes at byte {offset}")
         offset += 9 + size
         yield head[0], stream.read(size)
 
@@ -313,8 +323,18 @@ def unpacked(data: bytes) -> tuple[tuple[int, int, int, str, int], bytes]:
 
 _UNPACK = {
     "": lambda packed, size: packed,
-    "zstd": lambda packed, size: zstandard.ZstdDecompressor().decompress(packed, max_output_size=size),
+    "zstd": lambda packed, size: _unzstd(packed, size),
 }
+
+
+def _unzstd(packed: bytes, size: int) -> bytes:
+    """The content of a frame of `size` bytes.
+
+    A frame that names its own size is unpacked to that, whatever `max_output_size` says: 200 kB may name 2 GiB.
+    """
+    if zstandard.frame_content_size(packed) not in (-1, size):
+        raise Damaged("a chunk whose frame has another size")
+    return zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
 
 
 def messages_of(content: bytes, channels: dict[int, str]) -> Iterator[Message]:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from trackmdp.episodes.episode import Episode
+from trackmdp.episodes.limits import check_steps
 from trackmdp.episodes.schema import time_of
 from trackmdp.errors import UserError
 
@@ -92,8 +93,12 @@ def decode(row: dict[str, Any], steps: list[bytes], grids: list[bytes], size: in
     """
     number, count, m = row["episode"], row["length"], size**2
     said = [json.loads(step) for step in steps]
-    if [(each["episode"], each["t"]) for each in said] != [(number, t) for t in range(count)] or len(grids) != count:
+    # Lengths first: what a row claims is no length to count up to.
+    if (len(said), len(grids)) != (count, count) or any(
+        (each["episode"], each["t"]) != (number, t) for t, each in enumerate(said)
+    ):
         raise UserError(f"episode={number}: its steps do not fit together")
+    check_steps(said, m)
     packed = b"".join(base64.b64decode(json.loads(grid)["data"], validate=True) for grid in grids)
     cells = np.frombuffer(packed, _CELL).reshape(count, size, size)[:, ::-1].reshape(count, m)
     target = np.array([each["target"] for each in said], dtype=np.int64)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import io
 import json
-import struct
 from bisect import bisect_left
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
@@ -14,11 +14,14 @@ from typing import Any, TypeVar
 import numpy as np
 from tensordict import TensorDict
 
-from trackmdp.episodes import schema
+from trackmdp.arrays import load_npy
+from trackmdp.episodes import limits, schema
 from trackmdp.episodes.container import Container, Damaged, Message
 from trackmdp.episodes.episode import Episode
+from trackmdp.episodes.limits import check_policy, check_row
 from trackmdp.episodes.messages import decode
 from trackmdp.errors import UserError
+from trackmdp.untrusted import decoded, reason
 from trackmdp.world.model import Array, BoolArray, World
 
 __all__ = ["EpisodeReader", "check_run"]
@@ -59,14 +62,25 @@ class EpisodeReader:
         if schema.END not in container.metadata:
             raise self._damage(f"no metadata {schema.END}")
         self.end = self._checked(self._told, schema.END)
-        index = self.attachment("episodes.json", self.end["episodes.json.sha256"])
-        self.rows: list[dict[str, Any]] = json.loads(index)
-        self.policies = [self._checked(self._told, f"{schema.POLICY}.{k}") for k in range(int(self.end["policies"]))]
-        self._numbers = [row["episode"] for row in self.rows]
+        index = self.attachment("episodes.json", self.end.get("episodes.json.sha256", ""))
+        self._checked(self._index, index)
         self._held: tuple[int, list[Message]] = (-1, [])
+
+    def _index(self, index: bytes) -> None:
+        """Policies and episodes, held against each other."""
+        cells = int(self.run["size"]) ** 2
+        self.policies = [self._told(f"{schema.POLICY}.{k}") for k in range(int(self.end["policies"]))]
+        for facts in self.policies:
+            check_policy(facts, cells)
+        self.rows: list[dict[str, Any]] = [check_row(row, cells) for row in json.loads(index)]
+        self._numbers = [row["episode"] for row in self.rows]
         steps = sum(row["length"] for row in self.rows)
         if (str(len(self.rows)), str(steps)) != (self.end["episodes"], self.end["steps"]):
-            raise self._damage("the index of episodes")
+            raise Damaged("the index of episodes")
+        if any(b <= a for a, b in pairwise(self._numbers)) or any(
+            row["policy"] >= len(self.policies) for row in self.rows
+        ):
+            raise Damaged("the order of the episodes, or a policy that is not there")
 
     def __enter__(self) -> EpisodeReader:
         return self
@@ -123,7 +137,7 @@ class EpisodeReader:
         mine: dict[str, list[bytes]] = {"/step": [], "/grid": [], "/episode": []}
         for message in self._checked(self._between, begin, end):
             mine.setdefault(message.topic, []).append(message.data)
-        if [json.loads(text) for text in mine["/episode"]] != [row]:
+        if self._checked(lambda: [json.loads(text) for text in mine["/episode"]]) != [row]:
             raise self._damage(f"episode {number} is not what the index says")
         size = int(self.run["size"])
         return self._checked(decode, row, mine["/step"], mine["/grid"], size, schema.tick_of(begin))
@@ -154,11 +168,19 @@ class EpisodeReader:
         table = self.policy_table(number)
         if table is None:
             return None
-        cells = int(self.run["size"]) ** 2
-        return np.unpackbits(_load(table).astype(np.uint8), axis=-1, count=cells).astype(bool)
+        return self._checked(self._unpacked, table)
+
+    def _unpacked(self, table: bytes) -> BoolArray:
+        cells, bits = int(self.run["size"]) ** 2, _load(table)
+        if bits.dtype != np.uint8 or bits.shape != (cells, self.t_max + 1, -(-cells // 8)):
+            raise Damaged("the table of a policy")
+        return np.unpackbits(bits.astype(np.uint8), axis=-1, count=cells).astype(bool)
 
     def world(self) -> World:
         """The world in which the episodes were recorded."""
+        return self._checked(self._world)
+
+    def _world(self) -> World:
         run = self.run
         kernel, cost = (_load(self.attachment(name)) for name in ("kernel.npy", "cost.npy"))
         return World(
@@ -189,10 +211,10 @@ class EpisodeReader:
         """What `work` returns; whatever damage makes it raise ends in one line."""
         try:
             return work(*arguments)
-        except (Damaged, struct.error, ValueError, KeyError, TypeError, IndexError) as error:
-            if isinstance(error, UserError):
-                raise
-            raise self._damage(str(error)) from error
+        except UserError:
+            raise
+        except Exception as error:  # whatever JSON, NumPy and base64 raise over what a hostile log says
+            raise self._damage(reason(error)) from error
 
     def _damage(self, what: str) -> UserError:
         return UserError(f"file={self.file}: damaged ({what}); recover=true saves what can be read")
@@ -208,9 +230,10 @@ def check_run(file: Path, run: dict[str, str]) -> dict[str, str]:
     if found != schema.FORMAT:
         writer = run.get("trackmdp", "unknown")
         raise UserError(f"file={file}: format {found} (trackmdp {writer}), expected format {schema.FORMAT}")
+    with decoded(f"file={file}", "a log of trackmdp"):
+        limits.check_run(run)
     return run
 
 
 def _load(content: bytes) -> Array:
-    table: Array = np.load(io.BytesIO(content), allow_pickle=False)
-    return table
+    return load_npy(io.BytesIO(content), len(content))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -12,12 +13,17 @@ from typing import Any
 
 from trackmdp.episodes import container, schema
 from trackmdp.episodes.container import Damaged
+from trackmdp.episodes.limits import check_policy, check_row
 from trackmdp.episodes.messages import decode
 from trackmdp.episodes.reader import check_run
 from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.errors import UserError
+from trackmdp.untrusted import reason
 
 __all__ = ["Recovered", "recover", "recovered_name", "taken_over"]
+
+_MOST_HELD = 2**28
+"""Bytes of one episode's messages."""
 
 _TABLES = ("config.yaml", "kernel.npy", "cost.npy")
 
@@ -39,6 +45,22 @@ class _Found:
     attachments: dict[str, bytes] = field(default_factory=dict)
     steps: dict[int, bytes] = field(default_factory=dict)
     grids: dict[int, bytes] = field(default_factory=dict)
+    held: int = 0
+
+    def hold(self, topic: str, time: int, data: bytes) -> None:
+        """Keep a message of the episode that is not complete yet, as long as they are not more than any episode's."""
+        if topic not in ("/step", "/grid"):
+            return
+        self.held += len(data)
+        if self.held > _MOST_HELD:
+            self.release()
+        (self.steps if topic == "/step" else self.grids)[time] = data
+
+    def release(self) -> None:
+        """Forget the messages."""
+        self.steps.clear()
+        self.grids.clear()
+        self.held = 0
 
 
 def recovered_name(file: Path) -> Path:
@@ -84,28 +106,33 @@ def _rewrite(file: Path, target: Path, damaged: list[str], most: float = math.in
     policies: set[int] = set()
     with container.opened(file) as stream:
         for topic, time, data in _whole(stream, found, damaged):
-            {"/step": found.steps, "/grid": found.grids}.get(topic, {})[time] = data
+            found.hold(topic, time, data)
             if topic != "/episode":
                 continue
             writer = writer or _begin(file, target, found)
-            row: dict[str, Any] = json.loads(data)
             try:
                 if writer is None:
                     raise Damaged("what says how it was recorded")
+                row = check_row(json.loads(data), int(found.metadata[schema.RUN]["size"]) ** 2)
                 if row["policy"] >= most:
                     break
                 _policies_up_to(row["policy"], writer, found, policies)
                 episodes += _copy(row, found, writer)
-            except (Damaged, ValueError, KeyError, TypeError, IndexError, struct.error) as error:
-                damaged.append(f"episode {row.get('episode')}: {error}")
-            found.steps.clear()
-            found.grids.clear()
+            except OSError:
+                raise
+            except Exception as error:  # whatever the content of one episode raises, the next may be whole
+                damaged.append(f"an episode after {episodes} whole ones: {reason(error)}")
+            found.release()
         writer = writer or _begin(file, target, found)
     if found.steps or schema.END not in found.metadata:
         damaged.append("the end is missing")
     if writer is not None:
-        last = max((int(name.rpartition(".")[2]) for name in found.metadata if schema.POLICY in name), default=-1)
-        _policies_up_to(int(min(last, most - 1)), writer, found, policies)
+        named = (re.fullmatch(rf"{re.escape(schema.POLICY)}\.([0-9]{{1,6}})", name) for name in found.metadata)
+        last = max((int(name[1]) for name in named if name), default=-1)
+        try:
+            _policies_up_to(int(min(last, most - 1)), writer, found, policies)
+        except (Damaged, ValueError, KeyError) as error:
+            damaged.append(reason(error))
     return writer, episodes
 
 
@@ -132,8 +159,8 @@ def _whole(stream: Any, found: _Found, damaged: list[str]) -> Iterator[tuple[str
                     yield message.topic, message.log_time, message.data
         except StopIteration:
             return
-        except (Damaged, struct.error, UnicodeDecodeError) as error:
-            damaged.append(str(error))
+        except (Damaged, struct.error, ValueError, IndexError) as error:
+            damaged.append(reason(error))
 
 
 def _begin(file: Path, target: Path, found: _Found) -> EpisodeWriter | None:
@@ -154,6 +181,7 @@ def _policies_up_to(number: int, writer: EpisodeWriter, found: _Found, done: set
         if not facts:
             raise Damaged(f"policy {each} is lost")
         writer.flush()  # as when it was recorded, so that a copy has the same bytes
+        check_policy(facts, int(found.metadata[schema.RUN]["size"]) ** 2)
         sha256, table = facts.pop("table.sha256"), found.attachments.get(f"policy-{each}.npy")
         if sha256 and (table is None or schema.digest(table) != sha256):
             raise Damaged(f"policy {each} is lost")

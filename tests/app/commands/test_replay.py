@@ -205,7 +205,7 @@ def test_recover_as_typed(log: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("file=none.mcap", "file={here}/none.mcap: no such file or directory, expected an MCAP file"),
+        ("file=none.mcap", "file={here}/none.mcap: no such file"),
         ("file={log} episode=999", "episode=999: {log} holds 30 episodes (0 to 29)"),
         ("file={log} html=no/such/a.html", "html={here}/no/such/a.html: cannot be written (no such file or directory)"),
         ("", "file: missing, expected a file written with log=mcap"),

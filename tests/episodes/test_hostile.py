@@ -1,0 +1,240 @@
+"""Logs with right checksums and wrong content, and such as unfold to gigabytes: one line, in bounded memory."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zstandard
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from tests.episodes.logs import recorded, write
+from trackmdp.episodes import container, schema
+from trackmdp.episodes.container import Damaged
+from trackmdp.episodes.reader import EpisodeReader
+from trackmdp.episodes.recover import recover
+from trackmdp.episodes.verify import verify
+from trackmdp.errors import UserError
+
+RUN, END, POLICY, INDEX = schema.RUN, schema.END, f"{schema.POLICY}.0", "episodes.json"
+Parts = dict[str, dict[str, Any]]
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("log") / "a.mcap", recorded(3))
+
+
+def doctored(log: Path, file: Path, change: Callable[[Parts], Any]) -> Path:
+    """The log with changed parts, every digest and checksum right: metadata `m`, attachments `a`, messages `x`."""
+    read = make_reader(io.BytesIO(log.read_bytes()))
+    parts: Parts = {
+        "m": {each.name: schema.unsealed(each.name, dict(each.metadata)) for each in read.iter_metadata()},
+        "a": {each.name: each.data for each in read.iter_attachments()},
+        "x": {},
+    }
+    for _, channel, message in read.iter_messages(log_time_order=False):
+        parts["x"].setdefault(channel.topic, []).append((message.log_time, json.loads(message.data)))
+    rows = json.loads(parts["a"][INDEX])
+    parts["a"][INDEX] = rows
+    change(parts)
+    metadata, attached = parts["m"], parts["a"]
+    attached[INDEX] = json.dumps(attached[INDEX]).encode()
+    metadata[END][f"{INDEX}.sha256"] = schema.digest(attached[INDEX])
+    for name in ("config.yaml", "kernel.npy", "cost.npy"):
+        metadata[RUN][f"{name}.sha256"] = schema.digest(attached[name])
+    metadata[POLICY]["table.sha256"] = schema.digest(attached["policy-0.npy"])
+    with file.open("wb") as stream:
+        _written(stream, parts)
+    return file
+
+
+def _written(stream: Any, parts: Parts) -> None:
+    writer = Writer(stream, enable_data_crcs=True)
+    writer.start(library=f"trackmdp {parts['m'][RUN]['trackmdp']}")
+    channels = {
+        topic: writer.register_channel(topic, "json", writer.register_schema(name, "jsonschema", b"{}"))
+        for topic, (name, _) in schema.SCHEMAS.items()
+    }
+    for name in (RUN, POLICY):
+        writer.add_metadata(name, schema.seal(name, parts["m"][name]))
+    for name, content in parts["a"].items():
+        writer.add_attachment(0, 0, name, "x", content)
+    order = {"/step": 0, "/grid": 1, "/episode": 2}
+    every = [(time, order[topic], topic, data) for topic, each in parts["x"].items() for time, data in each]
+    for time, _, topic, data in sorted(every, key=lambda message: message[:2]):
+        writer.add_message(channels[topic], time, json.dumps(data).encode(), time)
+    writer.add_metadata(END, schema.seal(END, parts["m"][END]))
+    writer.finish()
+
+
+def says(**facts: Any) -> Callable[[Parts], Any]:
+    return lambda parts: parts["m"][RUN].update(facts)
+
+
+def episode(**facts: Any) -> Callable[[Parts], Any]:
+    """In the index and in the message alike, so that they do not tell each other."""
+
+    def change(parts: Parts) -> None:
+        for row in (parts["a"][INDEX][1], parts["x"]["/episode"][1][1]):
+            row.update(facts)
+
+    return change
+
+
+def step(**facts: Any) -> Callable[[Parts], Any]:
+    return lambda parts: parts["x"]["/step"][0][1].update(facts)
+
+
+def attached(name: str, table: Any) -> Callable[[Parts], Any]:
+    buffer = io.BytesIO()
+    np.save(buffer, table, allow_pickle=True)
+    return lambda parts: parts["a"].update({name: buffer.getvalue()})
+
+
+CASES: dict[str, Callable[[Parts], Any]] = {
+    "size x": says(size="x"),
+    "size 10^9": says(size="1000000000"),
+    "size 5": says(size="5"),
+    "size -4": says(size="-4"),
+    "t_max 10^12": says(t_max="1000000000000"),
+    "reward nan": says(reward="nan"),
+    "safe_cost inf": says(safe_cost="inf"),
+    "max_steps 0": says(max_steps="0"),
+    "no t_max": lambda parts: parts["m"][RUN].pop("t_max"),
+    "policies 10^9": lambda parts: parts["m"][END].update(policies="1000000000"),
+    "no policies": lambda parts: parts["m"][END].pop("policies"),
+    "kind": lambda parts: parts["m"][POLICY].pop("kind"),
+    "random_k": lambda parts: parts["m"][POLICY].update(kind="random_k", k="1000000000"),
+    "index of {}": lambda parts: parts["a"].update({INDEX: [{}]}),
+    "index is a number": lambda parts: parts["a"].update({INDEX: 3}),
+    "index repeats": lambda parts: parts["a"].update({INDEX: parts["a"][INDEX] * 2}),
+    "length 10^12": episode(length=10**12),
+    "length 1.5": episode(length=1.5),
+    "seed 10^40": episode(seed=str(10**40)),
+    "policy 99": episode(policy=99),
+    "start -1": episode(start=-1),
+    "start_time": episode(start_time="-5"),
+    "terminated": episode(terminated="no"),
+    "return": episode(**{"return": None}),
+    "n": step(n=10**30),
+    "target": step(target=-2),
+    "active": step(active=[-1]),
+    "reward": step(reward=1e308),
+    "obs": step(obs="x"),
+    "grid": lambda parts: parts["x"]["/grid"][0][1].update(data="!!"),
+    "kernel of objects": attached("kernel.npy", np.array([{}], object)),
+    "kernel of another size": attached("kernel.npy", np.zeros((3, 3))),
+    "cost": attached("cost.npy", np.full(16, -1.0)),
+    "policy": attached("policy-0.npy", np.zeros((3, 3), np.uint8)),
+}
+
+
+def read_all(file: Path) -> None:
+    with EpisodeReader(file) as reader:
+        found = verify(reader)
+        if found.difference is not None:
+            raise UserError(found.difference)
+
+
+def test_the_doctored_log_itself_is_whole(log: Path, tmp_path: Path) -> None:
+    read_all(doctored(log, tmp_path / "a.mcap", lambda parts: None))
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_log_that_makes_no_sense_is_refused_in_one_line(case: str, log: Path, tmp_path: Path) -> None:
+    file = doctored(log, tmp_path / "a.mcap", CASES[case])
+    with pytest.raises(UserError) as refused:
+        read_all(file)
+    assert "\n" not in str(refused.value)
+    try:
+        recover(file)
+    except UserError as error:
+        assert "\n" not in str(error)
+
+
+def test_what_is_whole_beside_it_is_recovered(log: Path, tmp_path: Path) -> None:
+    file = doctored(log, tmp_path / "a.mcap", step(target=-2))
+    saved = recover(file)
+    assert saved.episodes == 2
+    assert saved.damaged[0].startswith("an episode after 0 whole ones: target -2 of a step")
+    read_all(saved.file)
+
+
+def chunk(frame: bytes, size: int) -> bytes:
+    head = struct.pack("<QQQI", 0, 1, size, 1) + struct.pack("<I", 4) + b"zstd"
+    return head + struct.pack("<Q", len(frame)) + frame
+
+
+def zeros(size: int, said: bool) -> bytes:
+    stream = io.BytesIO()
+    packer = zstandard.ZstdCompressor(write_content_size=said)
+    with packer.stream_writer(stream, size=size if said else -1, closefd=False) as writer:
+        for _ in range(size // 2**20):
+            writer.write(bytes(2**20))
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("size", "said", "claims"), [(2**28, True, 1000), (2**28, False, 1000), (2**28, True, 2**28), (2**20, True, 2**62)]
+)
+def test_a_chunk_unfolds_to_no_more_than_it_may(size: int, said: bool, claims: int) -> None:
+    with pytest.raises(Damaged):
+        container.unpacked(chunk(zeros(size, said), claims))
+
+
+def test_a_frame_that_names_another_size_is_not_unpacked(monkeypatch: pytest.MonkeyPatch) -> None:
+    def unpacks(*args: Any, **options: Any) -> None:
+        pytest.fail("it would allocate what the frame names")
+
+    monkeypatch.setattr(container.zstandard, "ZstdDecompressor", unpacks)
+    for claims in (1000, 2**28):
+        with pytest.raises(Damaged):
+            container.unpacked(chunk(zeros(2**28, True), claims))
+
+
+def test_a_sparse_file_of_two_gigabytes_is_over_at_once(log: Path, tmp_path: Path) -> None:
+    file = tmp_path / "a.mcap"
+    with file.open("wb") as stream:
+        stream.write(container.MAGIC)
+        stream.truncate(2**31)
+    with pytest.raises(UserError, match="too damaged"):
+        recover(file)
+    with file.open("wb") as stream:
+        stream.write(log.read_bytes()[:-8])
+        stream.truncate(2**31)
+    assert recover(file).episodes == 3
+
+
+def index(offset: int, length: int) -> bytes:
+    """A file whose summary says that its description stands there."""
+    name = RUN.encode()
+    body = struct.pack("<QQ", offset, length) + struct.pack("<I", len(name)) + name
+    summary = struct.pack("<BQ", container.METADATA_INDEX, len(body)) + body
+    header = struct.pack("<BQ", container.HEADER, 8) + bytes(8)
+    footer = struct.pack("<BQQQ", container.FOOTER, 20, len(container.MAGIC) + len(header), 0)
+    checksum = zlib.crc32(footer, zlib.crc32(summary))
+    return container.MAGIC + header + summary + footer + struct.pack("<I", checksum) + container.MAGIC
+
+
+@pytest.mark.parametrize("offset", [0, 20, 2**40, 2**63, 2**64 - 1])
+@pytest.mark.parametrize("length", [0, 5, 2**40, 2**63, 2**64 - 1])
+def test_an_index_that_leads_out_of_the_file(offset: int, length: int, tmp_path: Path) -> None:
+    (tmp_path / "a.mcap").write_bytes(index(offset, length))
+    with pytest.raises(UserError, match="damaged"):
+        EpisodeReader(tmp_path / "a.mcap")
+
+
+def test_a_pipe_is_no_log(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "a.mcap")
+    with pytest.raises(UserError, match="a pipe, expected an ordinary file"):
+        EpisodeReader(tmp_path / "a.mcap")
