@@ -73,12 +73,12 @@ class Hindsight:
         if self._iteration > self._collect_first:
             reach = self._reach()
             learner = self._learner = self._learner or self._make_learner(reach)
-            farther = reach > learner.loss.near.radius
+            farther = reach > learner.loss.reach
             for _ in range(min(cfg.updates_per_iteration, self.updates - self._update)):
                 progress = self._update / self.updates
                 learner.loss.actor_loss.prepare(self._update, progress)
                 cells = self._buffer.paths(cfg.batch_size, self.task.t_max + 2)
-                cells = _within(cells, learner.loss.near.radius, self.task.rows) if farther else cells
+                cells = _within(cells, learner.loss.reach, self.task.rows) if farther else cells
                 averages.add(**learner.update(cells, cfg.learning_rate.at(progress), cfg.blend.at(progress)))
                 self._update += 1
             self.actor.chains.copy_(learner.chains())
@@ -200,7 +200,7 @@ class _Learner:
 
     def state_dict(self) -> dict[str, Any]:
         return {
-            "reach": self.loss.near.radius,
+            "reach": self.loss.reach,
             "loss": self.loss.state_dict(),
             "ema": self.ema.state_dict(),
             "optimizer": self.optimizer.state_dict(),

@@ -12,8 +12,9 @@ from torch.nn.functional import pad
 from trackmdp.algos.actor_loss import ActorLoss, SensorCredit, decision_loss
 from trackmdp.algos.gains import chain_returns, clocked_advantage, sensing_gain
 from trackmdp.algos.tables import gather, scatter_add
-from trackmdp.policies.chain_table import CellClockNet, Neighbourhood
+from trackmdp.policies.chain_table import CellClockNet
 from trackmdp.world.model import Task
+from trackmdp.world.windows import Window
 
 __all__ = ["HindsightLoss"]
 
@@ -82,8 +83,8 @@ class HindsightLoss(nn.Module):
     ) -> None:
         super().__init__()
         m, choices, device = task.num_cells, task.num_choices, generator.device
-        self.near = Neighbourhood(task.rows, reach, device)
-        self.view = Neighbourhood(task.rows, choices * reach, device)
+        self.reach, self.near = reach, Window.reaching(task, reach, device)
+        self.view = Window.reaching(task, choices * reach, device)
 
         # Where the target moves alike and sensors cost alike, what to sense is learned once for all such cells; values
         # stay each cell's own.
@@ -94,8 +95,8 @@ class HindsightLoss(nn.Module):
                 m, clocks, hidden=hidden, outputs=outputs, bias=bias, generator=generator, groups=groups
             )
 
-        def decisions(seen: Neighbourhood) -> CellClockNet:
-            return net(choices, seen.width, -1.0, self.view.groups() if alike and seen.moves_along else None)
+        def decisions(seen: Window) -> CellClockNet:
+            return net(choices, seen.width, -1.0, self.view.groups() if alike and seen.is_local else None)
 
         self.actor, self.critic = decisions(self.view), net(1, 1, 0.0)
         self.clocked_actor, self.clocked_critic = decisions(self.near), net(choices + 1, 1, 0.0)
@@ -149,7 +150,7 @@ class HindsightLoss(nn.Module):
 
     def slices(self) -> list[slice]:
         """The located cells, as many at once as `max_entries` allows."""
-        m, step = len(self.view.cells), self._cells_at_once
+        m, step = self.view.num_cells, self._cells_at_once
         return [slice(begin, begin + step) for begin in range(0, m, step)] if step < m else [slice(None)]
 
     def _paths_from(self, start: Tensor, rows: slice) -> slice | Tensor:
@@ -170,7 +171,7 @@ class HindsightLoss(nn.Module):
         Returns:
             The clocked actor's losses summed per clock, `[T+1]`, and the clocked critic's targets `[rows, T+2]`.
         """
-        near, m = self.near, len(self.near.cells)
+        near, m = self.near, self.near.num_cells
         nearby, logits = near.cells[rows], self.clocked_actor(rows)
         count, k = nearby.shape
         start, end = moves

@@ -6,12 +6,10 @@ the policy is a table of chains, one per located cell, and a net may be run on a
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor, nn
 
-__all__ = ["CellClockNet", "Neighbourhood"]
+__all__ = ["CellClockNet"]
 
 
 class CellClockNet(nn.Module):
@@ -62,70 +60,3 @@ class CellClockNet(nn.Module):
             embedding = embedding[cells]
         rows = embedding.relu() @ self.weight + self.bias
         return rows if self.groups is None else rows.index_select(0, self.groups[cells])
-
-
-class Neighbourhood(nn.Module):
-    """The cells a net's outputs stand for, as seen from a located cell: a square window around it.
-
-    Seen from anywhere, an output stands for the same displacement. Where such a window has no fewer cells than the
-    grid, output k stands for cell k.
-
-    Args:
-        size: N.
-        radius: the target is never farther away than this, in rows and in columns.
-        device: where the tables live.
-
-    Attributes:
-        width: K, the number of outputs.
-        cells: `[M, K]`, the cell each output stands for; M where it lies outside the grid.
-    """
-
-    cells: Tensor
-    _code: Tensor
-    _center: Tensor
-
-    def __init__(self, size: int, radius: int, device: torch.device) -> None:
-        super().__init__()
-        m, side = size**2, 2 * radius + 1
-        self.radius, self.width = radius, min(side**2, m)
-        cell = torch.arange(m, device=device)
-        if self.width == m:
-            cells, code, center = cell.expand(m, m), cell, torch.zeros_like(cell)
-        else:
-            row, column = cell // size, cell % size
-            code = row * side + column
-            center = code - radius * (side + 1)
-            step = torch.arange(side**2, device=device)
-            rows = row[:, None] + step // side - radius
-            columns = column[:, None] + step % side - radius
-            inside = (rows.clamp(0, size - 1) == rows) & (columns.clamp(0, size - 1) == columns)
-            cells = torch.where(inside, rows * size + columns, m)
-        self.register_buffer("cells", cells, persistent=False)
-        # The output for cell y seen from x is code[y] - center[x].
-        self.register_buffer("_code", torch.cat([code, code[:1]]), persistent=False)
-        self.register_buffer("_center", center, persistent=False)
-
-    @property
-    def moves_along(self) -> bool:
-        """Whether an output stands for a displacement, not for a cell."""
-        return self.width < len(self.cells)
-
-    def groups(self) -> Tensor:
-        """`[M]` int64, the same number for cells from which the border looks alike within the radius."""
-        size, cell = math.isqrt(len(self.cells)), torch.arange(len(self.cells), device=self.cells.device)
-        row, column = cell // size, cell % size
-        margins = torch.stack([row, size - 1 - row, column, size - 1 - column], dim=1).clamp(max=self.radius)
-        return torch.unique(margins, dim=0, return_inverse=True)[1]
-
-    def index(self, start: Tensor, cell: Tensor) -> Tensor:
-        """`[*L, B]`, the output for `cell` `[*L, B]` seen from `start` `[B]`, int64; any where `cell` is M."""
-        code = self._code.index_select(0, cell.reshape(-1)).view(cell.shape)
-        # M has the code of cell 0, the lowest.
-        return (code - self._center.index_select(0, start)).clamp_(min=0)
-
-    def spread(self, on: Tensor) -> Tensor:
-        """`[M, C, M]` bool over all cells, from `on` `[M, C, K]` over the outputs."""
-        m, choices, _ = on.shape
-        spread = on.new_zeros(m, choices, m + 1)
-        spread.scatter_(2, self.cells[:, None].expand(-1, choices, -1), on)
-        return spread[..., :m]

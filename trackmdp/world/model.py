@@ -68,7 +68,7 @@ class Task:
         markov: bool = True,
         homogeneous: bool = False,
     ) -> None:
-        rows, columns = _size(size)
+        rows, columns = grid_size(size)
         prices = _prices(cost, rows * columns)
         values = {
             "size": (rows, columns),
@@ -171,7 +171,7 @@ class World(Task):
         return pairwise_row_sums(self.kernel)
 
 
-def _size(size: int | tuple[int, int]) -> tuple[int, int]:
+def grid_size(size: int | tuple[int, int]) -> tuple[int, int]:
     """(rows, columns) of one number, or of two."""
     pair = (size, size) if isinstance(size, (int, np.integer)) else tuple(size)
     if len(pair) != 2 or not all(isinstance(side, (int, np.integer)) and side >= 1 for side in pair):

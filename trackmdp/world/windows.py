@@ -1,0 +1,139 @@
+"""The sensors that can be chosen from a located cell: a square window around it, or all of the grid.
+
+What is chosen, remembered or learned per located cell is kept in the window's own numbering, so that it costs K numbers
+and not M. With radius 1 on 6 columns, seen from cell 7 (row 1, column 1), the K = 9 sensors of the window are
+
+    local   0 1 2        cell   0  1  2
+            3 4 5               6  7  8
+            6 7 8              12 13 14
+
+and seen from cell 0 the local sensors 0, 1, 2, 3 and 6 lie outside the grid: nothing is there, and what is switched on
+there costs and senses nothing.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from trackmdp.world.model import Task, grid_size
+
+__all__ = ["Window"]
+
+
+class Window(nn.Module):
+    """Local and global numbers of the sensors around each located cell.
+
+    Args:
+        size: a task, or the grid's (rows, columns), one number for a square.
+        radius: W; the window holds the cells up to W rows and columns away. None: all M cells, local = global.
+        device: where the tables live.
+
+    Attributes:
+        radius: W, or None.
+        width: K = (2W + 1)², or M without a radius.
+    """
+
+    _row: Tensor
+    _column: Tensor
+    _code: Tensor
+    _corner: Tensor
+
+    def __init__(
+        self, size: Task | int | tuple[int, int], radius: int | None, device: torch.device | str = "cpu"
+    ) -> None:
+        super().__init__()
+        self.rows, self.columns = size.size if isinstance(size, Task) else grid_size(size)
+        self.num_cells, self.radius = self.rows * self.columns, radius
+        cell = torch.arange(self.num_cells, device=device)
+        row, column = cell // self.columns, cell % self.columns
+        side = self.columns if radius is None else 2 * radius + 1
+        self.width = self.num_cells if radius is None else side**2
+        # With code(x) = side · row + column, the window of x begins at the corner code(x) - W · (side + 1), and its
+        # local sensor for cell y is code(y) - corner(x). Radius 1, from 7 to 14 on 6 columns: 3·2+2 - (3·1+1-4) = 8.
+        # Without a radius code(x) is x itself, and every window begins at 0.
+        code = side * row + column
+        corner = torch.zeros_like(code) if radius is None else code - radius * (side + 1)
+        tables = {"_row": row, "_column": column, "_code": code, "_corner": corner}
+        for name, table in tables.items():
+            # The exited target, cell M, has the place of cell 0: inside the tables, and told apart by callers.
+            self.register_buffer(name, torch.cat([table, table[:1]]), persistent=False)
+        self.register_buffer("_cells", None, persistent=False)
+
+    @classmethod
+    def of(cls, task: Task, device: torch.device | str = "cpu") -> Window:
+        """The sensors that can be chosen in `task` (`grid.window`)."""
+        return cls(task, task.window, device)
+
+    @classmethod
+    def reaching(cls, size: Task | int | tuple[int, int], radius: int, device: torch.device | str = "cpu") -> Window:
+        """A window of that radius, or the whole grid where that has no more cells; holds all cells in reach."""
+        rows, columns = size.size if isinstance(size, Task) else grid_size(size)
+        return cls((rows, columns), radius if (2 * radius + 1) ** 2 < rows * columns else None, device)
+
+    @property
+    def is_local(self) -> bool:
+        """Whether a local number stands for a displacement, not for a cell."""
+        return self.radius is not None
+
+    @property
+    def cells(self) -> Tensor:
+        """`[M, K]` int64, the cell of each local sensor; M where it lies outside the grid."""
+        if self._cells is None:
+            self._cells = self.around(torch.arange(self.num_cells, device=self._code.device))
+        return self._cells
+
+    def around(self, start: Tensor) -> Tensor:
+        """`[*B, K]` int64, the cells of the window of `start` `[*B]`; M where it lies outside the grid."""
+        if self.radius is None:
+            return torch.arange(self.num_cells, device=start.device).expand(*start.shape, self.num_cells)
+        side = 2 * self.radius + 1
+        step = torch.arange(side**2, device=start.device)
+        row = (self._row[start] - self.radius).unsqueeze(-1) + step // side
+        column = (self._column[start] - self.radius).unsqueeze(-1) + step % side
+        inside = (row >= 0) & (row < self.rows) & (column >= 0) & (column < self.columns)
+        return torch.where(inside, row * self.columns + column, self.num_cells)
+
+    def contains(self, start: Tensor, cell: Tensor) -> Tensor:
+        """`[*B]` bool, whether `cell` `[*B]` is a cell of the window of `start` `[*B]`; never where it is M."""
+        inside = cell < self.num_cells
+        if self.radius is None:
+            return inside
+        rows, columns = self._row[cell] - self._row[start], self._column[cell] - self._column[start]
+        return inside & (torch.maximum(rows.abs(), columns.abs()) <= self.radius)
+
+    def index(self, start: Tensor, cell: Tensor) -> Tensor:
+        """`[*L, B]` int64, the local number of `cell` `[*L, B]` seen from `start` `[B]`.
+
+        Some number from 0 to K - 1 where the window does not hold it, as where it is M (exited).
+        """
+        code = self._code.index_select(0, cell.reshape(-1)).view(cell.shape)
+        place = code - self._corner.index_select(0, start.reshape(-1)).view(start.shape)
+        return place.clamp_(0, self.width - 1)
+
+    def to_global(self, start: Tensor, local: Tensor) -> Tensor:
+        """`[*B, M]` over all cells, from `[*B, K]` over the window of `start` `[*B]`; zero elsewhere."""
+        if self.radius is None:
+            return local
+        spread = local.new_zeros(*local.shape[:-1], self.num_cells + 1)
+        return spread.scatter_(-1, self.around(start), local)[..., : self.num_cells]
+
+    def to_local(self, start: Tensor, everywhere: Tensor) -> Tensor:
+        """`[*B, K]` over the window of `start` `[*B]`, from `[*B, M]` over all cells; zero outside the grid."""
+        if self.radius is None:
+            return everywhere
+        around = self.around(start)
+        inside = around < self.num_cells
+        return everywhere.gather(-1, around.clamp_max(self.num_cells - 1)) * inside
+
+    def spread(self, on: Tensor) -> Tensor:
+        """`[M, C, M]` bool over all cells, from `on` `[M, C, K]` over the window of each cell."""
+        m, choices, _ = on.shape
+        start = torch.arange(m, device=on.device)
+        return self.to_global(start[:, None].expand(m, choices), on)
+
+    def groups(self) -> Tensor:
+        """`[M]` int64, the same number for cells from which the border looks alike within the radius."""
+        row, column = self._row[:-1], self._column[:-1]
+        margins = torch.stack([row, self.rows - 1 - row, column, self.columns - 1 - column], dim=1)
+        return torch.unique(margins.clamp(max=self.radius), dim=0, return_inverse=True)[1]
