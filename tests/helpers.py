@@ -14,9 +14,9 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from trackmdp.app.compose import register
-from trackmdp.build import make_algorithm
 from trackmdp.config import GROUPS, ROOTS, EvaluateConfig, TrainConfig, conf_dir, from_hydra, options
 from trackmdp.config.world import BORDERS
+from trackmdp.training.make import make_algorithm
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.model import Array, World
 

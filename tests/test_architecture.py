@@ -20,7 +20,7 @@ ARROW = [
     ["trackmdp.world"],
     ["trackmdp.policies", "trackmdp.solvers"],
     ["trackmdp.training.signals"],
-    ["trackmdp.training.collect", "trackmdp.training.on_ray"],
+    ["trackmdp.training.collect", "trackmdp.training.devices", "trackmdp.training.on_ray"],
     ["trackmdp.algos"],
     ["trackmdp.training"],
     ["trackmdp.episodes"],

@@ -26,13 +26,9 @@ from trackmdp.world.model import Array, World
 from trackmdp.world.tracks import Problem, Recorded, check_tracks, load_tracks, split
 
 if TYPE_CHECKING:  # the world is built, and a config checked, before anything heavy is imported
-    import torch
-    from torchrl.collectors import BaseCollector
+    from trackmdp.config import BaselineConfig
 
-    from trackmdp.algos.common import Algorithm
-    from trackmdp.config import BaselineConfig, TrainConfig
-
-__all__ = ["make_algorithm", "make_baseline", "make_collector", "make_problem", "make_world"]
+__all__ = ["make_baseline", "make_problem", "make_world"]
 
 KERNELS: dict[type[KernelConfig], Callable[..., Array]] = {
     RandomSupportConfig: kernels.random_support,
@@ -114,43 +110,6 @@ def _price_per_cell(sensor: float | list[float] | str, cells: int) -> Array:
         bad = int(np.flatnonzero(~(np.isfinite(price) & (price >= 0)))[0])
         raise UserError(f"cost.sensor={sensor}: cell {bad} costs {price[bad]}, expected a finite number >= 0")
     return price
-
-
-def make_algorithm(cfg: TrainConfig, world: Problem, device: torch.device) -> Algorithm:
-    """The learner; it is given the task, never the motion."""
-    from trackmdp import config
-    from trackmdp.algos import a2c, dqn, hindsight, learned_kernel, per_sensor, ppo
-
-    makers: dict[type[Any], Callable[..., Algorithm]] = {
-        config.HindsightConfig: hindsight.Hindsight,
-        config.A2cPerSensorConfig: per_sensor.PerSensorA2C,
-        config.PpoPerSensorConfig: per_sensor.PerSensorPPO,
-        config.DqnPerSensorConfig: per_sensor.PerSensorDQN,
-        config.LearnedKernelConfig: learned_kernel.LearnedKernel,
-        config.A2cConfig: a2c.A2C,
-        config.PpoConfig: ppo.PPO,
-        config.DqnConfig: dqn.DQN,
-    }
-    batches = -(-cfg.collector.total_frames // cfg.collector.frames_per_batch)
-    return makers[type(cfg.algo)](world.task, cfg.algo, iterations=batches, seed=cfg.seed, device=device)
-
-
-def make_collector(
-    cfg: TrainConfig, world: Problem, algorithm: Algorithm, device: torch.device, done: int = 0
-) -> BaseCollector:
-    """The source of the frames that are left after the first `done`."""
-    from trackmdp.training.collect import make_collector as make
-    from trackmdp.training.devices import make_device
-
-    return make(
-        world,
-        algorithm.policy,
-        cfg.collector,
-        seed=cfg.seed,
-        env_device=make_device(cfg.collector.device, "collector.device"),
-        device=device,
-        done=done,
-    )
 
 
 def make_baseline(cfg: BaselineConfig, setting: Problem) -> np.ndarray:

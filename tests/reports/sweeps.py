@@ -15,6 +15,7 @@ from tests.helpers import train_config
 from trackmdp.build import make_world
 from trackmdp.config import PaperCostConfig, TrainConfig
 from trackmdp.config.resume import config_text, digest
+from trackmdp.policies.policy import Policy
 from trackmdp.reports import policy
 from trackmdp.solvers import clocked
 from trackmdp.training.evaluator import ExactEvaluator, figures
@@ -46,7 +47,7 @@ def write_run(
     chains = clocked.solve(world)
     rng = np.random.default_rng(cfg.seed)
     chains.flat[rng.choice(chains.size, wrong, replace=False)] ^= True
-    score = evaluator.score(chains)
+    score = evaluator.score(Policy.from_dense(world, chains))
     summary = {
         "algo": cfg.algo.name,
         "seed": cfg.seed,

@@ -15,6 +15,7 @@ from trackmdp.reports import policy
 from trackmdp.reports.policy import Policy
 from trackmdp.solvers import qmdp
 from trackmdp.solvers.chains import evaluate
+from trackmdp.world.model import World
 
 
 def stored(**changed: np.ndarray) -> bytes:
@@ -44,8 +45,7 @@ def test_a_run_leaves_the_policy_that_its_summary_judges(tmp_path: Path) -> None
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
         aihtr = train.run(cfg, tmp_path / name)
-    world = small_world(3)
-    world = type(world)(3, 1.0, np.full(9, 0.16), 9 * 0.16, 1, np.load(tmp_path / "a/kernel.npy", allow_pickle=False))
+    world = World(np.load(tmp_path / "a/kernel.npy", allow_pickle=False), 3, cost=0.16, t_max=1)
     found = policy.read(tmp_path / "a/policy.npz")
     assert evaluate(world, found.chains).aihtr == aihtr
     assert found.value.mean() == pytest.approx(aihtr, rel=1e-12)

@@ -13,7 +13,7 @@ import torch
 from tests.helpers import train_config
 from trackmdp.app.commands.train import run
 from trackmdp.training import checkpoint
-from trackmdp.training.metrics import MetricsLog
+from trackmdp.training.metrics import CsvLogger
 
 TIMED = ("seconds", "frames_per_second")
 QUICK = ("grid.size=3", "quiet=true", "optimal.enabled=false", "evaluation.every=4", "checkpoint.seconds=null")
@@ -41,14 +41,14 @@ def train(folder: Path, *overrides: str, algo: str = "ppo") -> float:
 
 def at_iteration(patch: pytest.MonkeyPatch, iteration: int, action: Callable[[], Any]) -> None:
     """Do something once the metrics of this iteration are written, before its checkpoint."""
-    write = MetricsLog.write
+    write = CsvLogger.write
 
-    def written(self: MetricsLog, row: Any) -> None:
+    def written(self: CsvLogger, row: Any) -> None:
         write(self, row)
         if row["iteration"] == iteration:
             action()
 
-    patch.setattr(MetricsLog, "write", written)
+    patch.setattr(CsvLogger, "write", written)
 
 
 def rows(folder: Path) -> list[dict[str, str]]:
@@ -65,7 +65,7 @@ def tensors(state: Any, prefix: str = "") -> dict[str, Any]:
     if isinstance(state, dict):
         found: dict[str, Any] = {}
         for key, value in state.items():
-            if key not in ("seconds", "metrics", "best", "recorded"):
+            if key not in ("seconds", "callbacks"):
                 found |= tensors(value, f"{prefix}.{key}")
         return found
     if isinstance(state, (list, tuple)):

@@ -17,6 +17,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tests.helpers import ALGORITHMS, BASELINES, algorithm, collect, evaluate_config, hop_world, limited, small_world
 from trackmdp.build import make_baseline, make_world
 from trackmdp.policies.fixed import AllOn, ChainPolicy, RandomK
+from trackmdp.policies.policy import Policy
 from trackmdp.training.evaluate import Simulation, chains_of, simulate
 from trackmdp.training.evaluator import ExactEvaluator
 from trackmdp.world.model import World
@@ -81,7 +82,7 @@ def _evaluated(actor: Any) -> Callable[[TensorDict], TensorDict]:
 
 def assert_close(world: World, chains: np.ndarray, simulation: Simulation) -> None:
     """Every figure within four standard errors of the exact one."""
-    exact = ExactEvaluator(world).evaluate(chains)
+    exact = ExactEvaluator(world).evaluate(Policy.from_dense(world, chains))
     for key in FIGURES:
         estimate, value = getattr(simulation, key), getattr(exact, key)
         assert abs(estimate.mean - value) <= 4 * estimate.standard_error + 1e-5 * (1 + abs(value)), key

@@ -16,10 +16,11 @@ import torch
 
 from tests.helpers import train_config
 from tests.training.runs import BUDGET, QUICK, SMALL, assert_same_run, at_iteration, rows, train
-from trackmdp.build import make_algorithm, make_world
+from trackmdp.build import make_world
 from trackmdp.errors import Preempted, RunError, UserError
 from trackmdp.training import checkpoint
 from trackmdp.training.lock import locked
+from trackmdp.training.make import make_algorithm
 from trackmdp.training.state import _weights
 from trackmdp.training.workers import Watch
 

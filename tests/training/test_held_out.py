@@ -18,9 +18,9 @@ from tests.tracks import by_hand, drawn, recorded, write
 from tests.training.runs import SMALL, tensors
 from tests.training.runs import rows as metrics
 from tests.training.runs import train as train_run
+from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.solvers import qmdp
 from trackmdp.training import checkpoint
-from trackmdp.training.evaluate import chains_of
 from trackmdp.training.evaluator import ExactEvaluator
 from trackmdp.training.held_out import ESTIMATED, HeldOutEvaluator, estimated_kernel, make_evaluator
 from trackmdp.world.model import World
@@ -36,7 +36,7 @@ def test_the_setting_decides_who_evaluates() -> None:
 def test_only_the_held_out_tracks_count() -> None:
     """All on: r - 9 c a step in the grid, nothing on the exit step."""
     evaluator = HeldOutEvaluator(recorded(by_hand([0, 1, 2], [3, 3]), by_hand([4, 5], [4, 5, 6, 7], [8, 8])))
-    score = evaluator.score(np.ones((9, 2, 9), dtype=bool))
+    score = evaluator.score(Policy.all_on(evaluator.world))
     assert score.evaluation.aihtr == pytest.approx((1 + 3 + 1) / 3 * (1 - 1.8))
     assert score.evaluation.expected_length == pytest.approx((2 + 4 + 2) / 3)
     assert (score.evaluation.accuracy, score.evaluation.sensors_per_step) == (1.0, 9.0)
@@ -49,7 +49,7 @@ def test_only_the_held_out_tracks_count() -> None:
 
 def test_episodes_are_cut_where_the_limit_is() -> None:
     setting = recorded(by_hand([0, 1], [0, 1]), by_hand([4, 5, 6, 7], [8, 8]))
-    evaluation = HeldOutEvaluator(limited(setting, 2)).evaluate(np.ones((9, 2, 9), dtype=bool))
+    evaluation = HeldOutEvaluator(limited(setting, 2)).evaluate(Policy.all_on(setting))
     assert evaluation.aihtr == pytest.approx((2 + 1) / 2 * -0.8)
     assert evaluation.expected_length == 2.0
 
@@ -58,12 +58,12 @@ def test_the_report_holds_the_policy_and_the_references() -> None:
     world = small_world()
     setting = recorded(drawn(world.kernel, 300), drawn(world.kernel, 80, seed=1))
     evaluator = HeldOutEvaluator(setting)
-    chains = np.random.default_rng(0).random((9, 2, 9)) < 0.3
-    report = evaluator.report(chains)
+    policy = Policy.from_dense(world, np.random.default_rng(0).random((9, 2, 9)) < 0.3)
+    report = evaluator.report(policy)
     assert (report["tracks"], report["learned_from"]) == (80, 300)
     assert set(report["figures"]) == {"policy", "all on", "no sensors", ESTIMATED}
     assert report["figures"]["all on"]["aihtr"]["mean"] < report["figures"]["policy"]["aihtr"]["mean"]
-    assert report["figures"]["policy"]["aihtr"]["mean"] == pytest.approx(evaluator.evaluate(chains).aihtr)
+    assert report["figures"]["policy"]["aihtr"]["mean"] == pytest.approx(evaluator.evaluate(policy).aihtr)
     for figures in report["figures"].values():
         assert all(each["low"] <= each["mean"] <= each["high"] for each in figures.values())
 
@@ -84,7 +84,7 @@ def test_q_mdp_of_the_estimated_kernel_is_that_of_the_kernel() -> None:
     kernel = 0.6 * np.roll(np.eye(9), 2, axis=1) + 0.3 * np.roll(np.eye(9), 1, axis=1)
     setting = recorded(drawn(sparse.csr_array(kernel), 5_000), by_hand([0, 1]))
     world = World(kernel, 3, cost=setting.cost, safe_cost=setting.safe_cost, t_max=setting.t_max, reward=setting.reward)
-    assert np.array_equal(HeldOutEvaluator(setting).references()[ESTIMATED], qmdp.solve(world))
+    assert np.array_equal(HeldOutEvaluator(setting).references()[ESTIMATED].dense(), qmdp.solve(world))
 
 
 FILE = drawn(small_world(exit_probability=0.05).kernel, 60)
@@ -160,5 +160,5 @@ def test_every_algorithm_learns_from_tracks(name: str) -> None:
         learner.step(batch)
     for _ in range(learner.iterations - 4 if name == "hindsight" else 0):
         learner.step(None)
-    chains = chains_of(learner.actor, setting.task)
-    assert np.isfinite(HeldOutEvaluator(setting).score(chains).evaluation.aihtr)
+    policy = as_policy(setting.task, learner.actor)
+    assert np.isfinite(HeldOutEvaluator(setting).score(policy).evaluation.aihtr)

@@ -6,14 +6,32 @@ import csv
 import json
 import math
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from trackmdp.config import CsvConfig, TensorboardConfig
 from trackmdp.durable import write_json, write_text
-from trackmdp.training.metrics import MetricsLog
+from trackmdp.training.metrics import CsvLogger, TensorboardLogger
+from trackmdp.training.state import Position
 
 ROW = {"iteration": 1, "frames": 256, "aihtr": 0.1 + 0.2, "loss": 1e-300, "gap": -1 / 3}
+
+
+def trainer(frames: int) -> Any:
+    """What a log asks of a trainer."""
+    return SimpleNamespace(position=Position(frames=frames), due=lambda every: every == 1)
+
+
+TRAINER = trainer(0)
+
+
+def opened(folder: Path) -> CsvLogger:
+    log = CsvLogger(CsvConfig(every=1), folder)
+    log.on_start(TRAINER)
+    return log
 
 
 def rows(folder: Path) -> list[dict[str, str]]:
@@ -22,36 +40,37 @@ def rows(folder: Path) -> list[dict[str, str]]:
 
 
 def test_numbers_read_back_exactly_and_are_on_the_disk_at_once(tmp_path: Path) -> None:
-    log = MetricsLog(tmp_path, tensorboard=False)
+    log = opened(tmp_path)
     log.write(ROW)
     assert {key: float(value) for key, value in rows(tmp_path)[0].items()} == ROW
     log.write(ROW | {"iteration": 2})
     assert len(rows(tmp_path)) == 2
-    log.close()
+    log.on_end(TRAINER)
 
 
 def test_what_is_missing_or_not_finite_is_an_empty_field(tmp_path: Path) -> None:
-    log = MetricsLog(tmp_path, tensorboard=False)
+    log = opened(tmp_path)
     log.write(ROW)
     log.write({"iteration": 2, "frames": 512, "aihtr": None, "loss": math.nan, "gap": math.inf})
-    log.close()
+    log.on_end(TRAINER)
     assert rows(tmp_path)[1] == {"iteration": "2", "frames": "512", "aihtr": "", "loss": "", "gap": ""}
 
 
 def test_the_columns_are_those_of_the_first_row(tmp_path: Path) -> None:
-    log = MetricsLog(tmp_path, tensorboard=False)
+    log = opened(tmp_path)
     log.write(ROW)
     with pytest.raises(ValueError, match="surprise"):
         log.write(ROW | {"surprise": 1.0})
-    log.close()
+    log.on_end(TRAINER)
 
 
 def test_tensorboard_gets_the_same_numbers(tmp_path: Path) -> None:
     events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
-    log = MetricsLog(tmp_path, tensorboard=True)
-    log.write(ROW)
-    log.write(ROW | {"frames": 512, "loss": None})
-    log.close()
+    log = TensorboardLogger(TensorboardConfig(every=1), tmp_path)
+    log.on_start(trainer(0))
+    log.on_update(trainer(256), ROW)
+    log.on_update(trainer(512), ROW | {"frames": 512, "loss": None})
+    log.on_end(TRAINER)
     read = events.EventAccumulator(str(tmp_path / "tensorboard"))
     read.Reload()
     assert [(event.step, event.value) for event in read.Scalars("aihtr")] == [

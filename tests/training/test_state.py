@@ -78,7 +78,7 @@ def test_auto_goes_on_from_the_one_before_and_says_so(
     assert typed(half, "resume=auto", "quiet=false") == 0
     out = capsys.readouterr().out
     assert f"passed over: {newest}: damaged" in out
-    assert "goes on after iteration 3, 768 frames" in out
+    assert "resumes after iteration 3, 768 frames" in out
     assert_same_run(half, whole)
 
 

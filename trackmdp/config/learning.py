@@ -239,19 +239,19 @@ class LogConfig(ChoiceConfig):
     every: int = option("iterations from one row to the next", unit="iterations", ge=1)
 
 
-@choice("log", "csv", makes="trackmdp.training.metrics:MetricsLog")
+@choice("log", "csv", makes="trackmdp.training.metrics:CsvLogger")
 @dataclass(kw_only=True)
 class CsvConfig(LogConfig):
     """`metrics.csv`."""
 
 
-@choice("log", "tensorboard", makes="trackmdp.training.metrics:MetricsLog")
+@choice("log", "tensorboard", makes="trackmdp.training.metrics:TensorboardLogger")
 @dataclass(kw_only=True)
 class TensorboardConfig(LogConfig):
     """`metrics.csv` and TensorBoard event files."""
 
 
-@choice("log", "mcap", makes="trackmdp.episodes.log:EpisodeLog")
+@choice("log", "mcap", makes="trackmdp.episodes.logger:EpisodeLogger")
 @dataclass(kw_only=True)
 class McapConfig(LogConfig):
     """`episodes.mcap`: simulated episodes, step by step, for `replay` and viewers; in training `metrics.csv` too."""

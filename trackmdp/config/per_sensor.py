@@ -94,13 +94,13 @@ class PolicyGradientConfig(PerSensorConfig):
     entropy: ScheduleConfig
 
 
-@choice("algo", "a2c_per_sensor", makes="trackmdp.algos.per_sensor:A2C")
+@choice("algo", "a2c_per_sensor", makes="trackmdp.algos.per_sensor:PerSensorA2C")
 @dataclass(kw_only=True)
 class A2cPerSensorConfig(PolicyGradientConfig):
     """Hindsight with the policy gradient of A2C, over both actions of every sensor (algo=a2c credit=per_sensor)."""
 
 
-@choice("algo", "ppo_per_sensor", makes="trackmdp.algos.per_sensor:PPO")
+@choice("algo", "ppo_per_sensor", makes="trackmdp.algos.per_sensor:PerSensorPPO")
 @dataclass(kw_only=True)
 class PpoPerSensorConfig(PolicyGradientConfig):
     """Hindsight with the clipped surrogate of PPO, per sensor (algo=ppo credit=per_sensor)."""
@@ -112,7 +112,7 @@ class PpoPerSensorConfig(PolicyGradientConfig):
     )
 
 
-@choice("algo", "dqn_per_sensor", makes="trackmdp.algos.per_sensor:DQN")
+@choice("algo", "dqn_per_sensor", makes="trackmdp.algos.per_sensor:PerSensorDQN")
 @dataclass(kw_only=True)
 class DqnPerSensorConfig(PerSensorConfig):
     """Hindsight with a Q that adds up over the sensors, for DQN (algo=dqn credit=per_sensor)."""

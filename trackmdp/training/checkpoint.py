@@ -23,7 +23,7 @@ from trackmdp.untrusted import decoded, opened
 
 __all__ = ["BEST", "FORMAT", "LAST", "available", "load", "newest", "point", "save"]
 
-FORMAT = 3
+FORMAT = 4
 BEST, LAST = "best.pt", "last.pt"
 _SEAL = 128
 _SMALL, _LARGEST = 2**20, 2**38

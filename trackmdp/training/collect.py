@@ -11,51 +11,115 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import BaseCollector, Collector, MultiAsyncCollector, MultiSyncCollector
 
-from trackmdp.config.learning import CollectorConfig, MultiAsyncConfig, MultiSyncConfig, RayWorkersConfig
+from trackmdp.config.learning import CollectorConfig, RayWorkersConfig, WorkersConfig
 from trackmdp.seeding import derive
+from trackmdp.training.devices import make_device
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.tracks import Problem
 
-__all__ = ["collector_state", "load_collector_state", "make_collector"]
+__all__ = ["collector_state", "load_collector_state", "multi_async", "multi_sync", "ray", "single"]
 
 
-def make_collector(
-    world: Problem,
+def single(
+    problem: Problem,
     policy: TensorDictModuleBase,
     cfg: CollectorConfig,
     *,
     seed: int,
-    env_device: torch.device,
     device: torch.device,
     done: int = 0,
 ) -> BaseCollector:
-    """A collector of batches `[B, time]` on `device` (the learner's); its frames are env steps.
+    """A collector of batches `[B, time]` in this process; its frames are env steps.
 
-    The environment's own `_step_and_maybe_reset` and the flags below make the collector as fast as a loop by hand.
-    Of `cfg.total_frames`, made up to whole batches, the `done` frames of an earlier process are not collected again.
+    Args:
+        problem: the world or the tracks.
+        policy: acts, on `device`.
+        cfg: frames, environments and their device.
+        seed: of the run.
+        device: the learner's, where the batches end up.
+        done: of `cfg.total_frames`, made up to whole batches, so many were collected by an earlier process.
     """
-    env: dict[str, Any] = {"num_envs": cfg.envs, "seed": seed, "device": env_device}
-    common: dict[str, Any] = {
+    env, common = _env_options(cfg, seed), _common(cfg, device, done)
+    return Collector(TrackEnv(problem, **env), policy, track_traj_ids=False, **common)
+
+
+def multi_sync(
+    problem: Problem,
+    policy: TensorDictModuleBase,
+    cfg: WorkersConfig,
+    *,
+    seed: int,
+    device: torch.device,
+    done: int = 0,
+) -> BaseCollector:
+    """A collector in worker processes, every batch from all of them; arguments as for `single`."""
+    workers = _workers(problem, cfg, _env_options(cfg, seed), done)
+    return MultiSyncCollector(workers, policy, **_threads(cfg), **_common(cfg, device, done))
+
+
+def multi_async(
+    problem: Problem,
+    policy: TensorDictModuleBase,
+    cfg: WorkersConfig,
+    *,
+    seed: int,
+    device: torch.device,
+    done: int = 0,
+) -> BaseCollector:
+    """A collector in worker processes, every batch from the one that has it ready; arguments as for `single`."""
+    workers = _workers(problem, cfg, _env_options(cfg, seed), done)
+    return MultiAsyncCollector(workers, policy, **_threads(cfg), **_common(cfg, device, done))
+
+
+def ray(
+    problem: Problem,
+    policy: TensorDictModuleBase,
+    cfg: RayWorkersConfig,
+    *,
+    seed: int,
+    device: torch.device,
+    done: int = 0,
+) -> BaseCollector:
+    """A collector in the workers of a Ray cluster; arguments as for `single`.
+
+    Raises:
+        UserError: Ray is not installed, or there is no such cluster.
+    """
+    from trackmdp.training import on_ray
+
+    env = _env_options(cfg, seed)
+    workers = [partial(_remote_env, problem, f"{worker}-{done}", env, cfg.threads) for worker in range(cfg.workers)]
+    return on_ray.make_collector(workers, policy, cfg, _common(cfg, device, done))
+
+
+def _env_options(cfg: CollectorConfig, seed: int) -> dict[str, Any]:
+    device = make_device(cfg.device, "collector.device")
+    return {"num_envs": cfg.envs, "seed": seed, "device": device}
+
+
+def _common(cfg: CollectorConfig, device: torch.device, done: int) -> dict[str, Any]:
+    """What TorchRL's collectors are given alike.
+
+    With these flags, and the environment's own `_step_and_maybe_reset`, they are as fast as a loop by hand.
+    """
+    return {
         "frames_per_batch": cfg.frames_per_batch,
         "total_frames": -(-(cfg.total_frames - done) // cfg.frames_per_batch) * cfg.frames_per_batch,
         "auto_register_policy_transforms": False,
-        "env_device": env_device,
+        "env_device": make_device(cfg.device, "collector.device"),
         "policy_device": device,
         "storing_device": device,
         "trust_policy": True,  # a policy without parameters (all sensors on) lives on any device
     }
-    if isinstance(cfg, (MultiSyncConfig, MultiAsyncConfig)):
-        workers = [partial(_worker_env, world, f"{worker}-{done}", env) for worker in range(cfg.workers)]
-        kind = MultiSyncCollector if isinstance(cfg, MultiSyncConfig) else MultiAsyncCollector
-        return kind(workers, policy, num_threads=torch.get_num_threads(), num_sub_threads=cfg.threads, **common)
-    if isinstance(cfg, RayWorkersConfig):
-        from trackmdp.training import on_ray
 
-        places = [f"{worker}-{done}" for worker in range(cfg.workers)]
-        return on_ray.make_collector(
-            [partial(_remote_env, world, at, env, cfg.threads) for at in places], policy, cfg, common
-        )
-    return Collector(TrackEnv(world, **env), policy, track_traj_ids=False, **common)
+
+def _threads(cfg: WorkersConfig) -> dict[str, int]:
+    return {"num_threads": torch.get_num_threads(), "num_sub_threads": cfg.threads}
+
+
+def _workers(problem: Problem, cfg: WorkersConfig, env: dict[str, Any], done: int) -> list[partial[TrackEnv]]:
+    """Makers of the workers' environments; a resumed run's have streams of their own, not the first ones again."""
+    return [partial(_worker_env, problem, f"{worker}-{done}", env) for worker in range(cfg.workers)]
 
 
 def _worker_env(world: Problem, worker: str, env: dict[str, Any]) -> TrackEnv:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import sys
 import time
-from types import TracebackType
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
+
+from trackmdp.training.callbacks import Callback, Row, Training
 
 __all__ = ["Display", "make_console", "table"]
 
@@ -28,50 +29,56 @@ class _Figures(ProgressColumn):
         return Text(str(task.fields["figures"]))
 
 
-class Display:
-    """Shows the progress of `iterations` iterations; a context manager.
+class Display(Callback):
+    """Shows how far the run is and the figures of its last evaluation.
 
-    `first` iterations and `frames` frames were an earlier process's; they do not count for the speed.
+    Args:
+        console: where; a bar at a terminal, else a line now and then.
+        title: what the run is called there.
     """
 
-    def __init__(self, console: Console, title: str, iterations: int, first: int = 0, frames: int = 0) -> None:
-        self._console, self._title, self._iterations = console, title, iterations
-        self._first, self._frames = first, frames
+    def __init__(self, console: Console, title: str) -> None:
+        self._console, self._title = console, title
         self._bar: Progress | None = None
-        self._started = self._last_line = time.monotonic()
 
-    def __enter__(self) -> Display:
+    def on_start(self, trainer: Training) -> None:
+        """Begin the bar where the run is; what an earlier process did does not count for the speed."""
+        self._first = trainer.position
+        self._started = self._last_line = time.monotonic()
         if self._console.is_terminal and not self._console.quiet:
             columns = (TextColumn("{task.description}"), BarColumn(), _Figures(), TimeElapsedColumn())
             self._bar = Progress(*columns, TextColumn("left"), TimeRemainingColumn(), console=self._console)
             self._bar.start()
-            self._task = self._bar.add_task(self._title, total=self._iterations, completed=self._first, figures="")
-        return self
+            done, total = self._first.iteration, trainer.iterations
+            self._task = self._bar.add_task(self._title, total=total, completed=done, figures="")
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def on_end(self, trainer: Training) -> None:  # noqa: ARG002
+        """Leave the terminal as it was."""
         if self._bar is not None:
             self._bar.stop()
 
-    def update(self, iteration: int, frames: int, aihtr: float, gap: float) -> None:
-        """After `iteration` iterations; `gap` is the AIHTR missing to the upper bound, nan if none is known."""
-        elapsed = time.monotonic() - self._started
-        speed = (frames - self._frames) / max(elapsed, 1e-9)
-        figures = f"{frames:,} frames  {speed:,.0f}/s  AIHTR {aihtr:,.2f}"
-        if not math.isnan(gap):
+    def on_update(self, trainer: Training, row: Row) -> None:  # noqa: ARG002
+        """Show the figures of the last evaluation."""
+        at, aihtr, elapsed = trainer.position, trainer.score.evaluation.aihtr, time.monotonic() - self._started
+        speed = (at.frames - self._first.frames) / max(elapsed, 1e-9)
+        figures = f"{at.frames:,} frames  {speed:,.0f}/s  AIHTR {aihtr:,.2f}"
+        gap = trainer.evaluator.upper - aihtr
+        if not math.isnan(gap):  # no upper bound is known on recorded tracks
             figures += f"  gap {gap:,.2f}"
         if self._bar is not None:
-            self._bar.update(self._task, completed=iteration, figures=figures)
-            return
-        now, last = time.monotonic(), iteration == self._iterations
-        if self._console.quiet or not (
-            last or iteration == self._first + 1 or now - self._last_line >= _SECONDS_BETWEEN_LINES
-        ):
+            self._bar.update(self._task, completed=at.iteration, figures=figures)
+        elif not self._console.quiet:
+            self._line(at.iteration, trainer.iterations, figures)
+
+    def _line(self, iteration: int, iterations: int, figures: str) -> None:
+        """A line after the first iteration, after the last, and every two seconds between."""
+        now, first = time.monotonic(), self._first.iteration
+        ends = iteration in (first + 1, iterations)
+        if not ends and now - self._last_line < _SECONDS_BETWEEN_LINES:
             return
         self._last_line = now
-        left = elapsed / (iteration - self._first) * (self._iterations - iteration)
-        self._console.print(f"{self._title}: {100 * iteration // self._iterations:3d} %  {figures}  {left:,.0f} s left")
+        left = (now - self._started) / (iteration - first) * (iterations - iteration)
+        self._console.print(f"{self._title}: {100 * iteration // iterations:3d} %  {figures}  {left:,.0f} s left")
 
 
 def table(title: str, columns: list[str], rows: list[list[str]]) -> Table:

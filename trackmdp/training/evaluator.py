@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from trackmdp.policies.policy import Policy
 from trackmdp.solvers import bounds, horizon, qmdp
 from trackmdp.solvers.chains import Evaluation, evaluate, regret_per_step
 from trackmdp.world.model import Task, World
 
-__all__ = ["Evaluator", "ExactEvaluator", "Score", "figures", "while_collecting"]
+__all__ = ["Evaluator", "ExactEvaluator", "Score", "as_table", "figures", "while_collecting"]
 
 _PER_CELL = ("value", "steps", "detections", "sensors", "safe_actions")
 
@@ -27,7 +28,7 @@ class Score:
 
 
 class Evaluator(ABC):
-    """Scores learned, fixed and solved policies alike, by their chains.
+    """Scores learned, fixed and solved policies alike.
 
     Attributes:
         world: where policies are evaluated.
@@ -42,15 +43,15 @@ class Evaluator(ABC):
     qmdp: Evaluation | None
 
     @abstractmethod
-    def evaluate(self, chains: npt.NDArray[np.generic]) -> Evaluation:
-        """Figures of the policy with these `chains` `[M, t_max+1, M]`."""
+    def evaluate(self, policy: Policy) -> Evaluation:
+        """Figures of a policy."""
 
-    def score(self, chains: npt.NDArray[np.generic]) -> Score:
-        """Figures and the regret per step of the policy with these `chains` `[M, t_max+1, M]`."""
-        evaluation = self.evaluate(chains)
+    def score(self, policy: Policy) -> Score:
+        """Figures and the regret per step of a policy."""
+        evaluation = self.evaluate(policy)
         return Score(evaluation, regret_per_step(self.upper, evaluation))
 
-    def report(self, chains: npt.NDArray[np.generic]) -> dict[str, Any] | None:  # noqa: ARG002
+    def report(self, policy: Policy) -> dict[str, Any] | None:  # noqa: ARG002
         """Figures with confidence intervals beside those of the references; None where all figures are exact."""
         return None
 
@@ -79,13 +80,22 @@ class ExactEvaluator(Evaluator):
             valid, clocked = (bound(world).mean() for bound in (horizon.valid, horizon.clocked))
             self.bounds = {"paper": None, "valid": float(valid), "clocked": float(clocked)}
         self.upper = float(clocked)
-        self.qmdp = self.evaluate(qmdp.solve(world))
+        self.qmdp = self.evaluate(Policy.from_dense(world, qmdp.solve(world)))
 
-    def evaluate(self, chains: npt.NDArray[np.generic]) -> Evaluation:
-        """Exact figures of the policy with these `chains` `[M, t_max+1, M]`."""
+    def evaluate(self, policy: Policy) -> Evaluation:
+        """Exact figures of a policy."""
         if self.world.max_steps is None:
-            return evaluate(self.world, chains)
-        return horizon.evaluate(self.world, chains)
+            return evaluate(self.world, as_table(policy))
+        return horizon.evaluate(self.world, as_table(policy))
+
+
+def as_table(policy: Policy) -> npt.NDArray[np.generic]:
+    """`[M, t_max+1, M]`, bool, or probabilities where the policy draws."""
+    task = policy.task
+    if policy.deterministic:
+        return policy.dense()
+    shape = (task.num_cells, task.num_choices, task.num_cells)
+    return np.full(shape, policy.probability) if policy.sets is None else policy.sets.toarray().reshape(shape)
 
 
 def while_collecting(upper: float, evaluation: Evaluation, reward: float, frames: int) -> dict[str, float]:

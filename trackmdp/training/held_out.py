@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from trackmdp.policies.policy import Policy
 from trackmdp.solvers import qmdp
 from trackmdp.solvers.chains import Evaluation
 from trackmdp.solvers.kernel_estimate import KernelEstimate
 from trackmdp.solvers.recorded import Interval, replay
-from trackmdp.training.evaluator import Evaluator, ExactEvaluator
-from trackmdp.world.model import BoolArray, World
+from trackmdp.training.evaluator import Evaluator, ExactEvaluator, as_table
+from trackmdp.world.model import World
 from trackmdp.world.tracks import Problem, Recorded, Tracks
 
 __all__ = ["ESTIMATED", "HeldOutEvaluator", "estimated_kernel", "make_evaluator"]
@@ -46,29 +47,28 @@ class HeldOutEvaluator(Evaluator):
         self.bounds = dict.fromkeys(("paper", "valid", "clocked"))
         self._starts = self.tracks.cells[self.tracks.first[:-1]]
 
-    def evaluate(self, chains: npt.NDArray[np.generic]) -> Evaluation:
-        """Figures on the held-out tracks of the policy with these `chains` `[M, t_max+1, M]`."""
-        return replay(self.world, self.tracks, chains).evaluation(self._starts, self.world.num_cells)
+    def evaluate(self, policy: Policy) -> Evaluation:
+        """Figures of a policy on the held-out tracks."""
+        return replay(self.world, self.tracks, as_table(policy)).evaluation(self._starts, self.world.num_cells)
 
-    def intervals(self, chains: npt.NDArray[np.generic]) -> dict[str, Interval]:
+    def intervals(self, policy: Policy) -> dict[str, Interval]:
         """Figure -> its mean over the held-out tracks with a 95 % confidence interval."""
-        return replay(self.world, self.tracks, chains).intervals()
+        return replay(self.world, self.tracks, as_table(policy)).intervals()
 
-    def references(self) -> dict[str, BoolArray]:
-        """Chains of the policies to hold a learned one against, by their names in tables."""
+    def references(self) -> dict[str, Policy]:
+        """The policies to hold a learned one against, by their names in tables."""
         task = self.world
-        shape = (task.num_cells, task.num_choices, task.num_cells)
         kernel = estimated_kernel(task.tracks, task.rows)
         world = World(kernel, task.size, cost=task.cost, safe_cost=task.safe_cost, t_max=task.t_max, reward=task.reward)
         return {
-            "all on": np.ones(shape, dtype=bool),
-            "no sensors": np.zeros(shape, dtype=bool),
-            ESTIMATED: qmdp.solve(world),
+            "all on": Policy.all_on(task),
+            "no sensors": Policy.none(task),
+            ESTIMATED: Policy.from_dense(task, qmdp.solve(world)),
         }
 
-    def report(self, chains: npt.NDArray[np.generic]) -> dict[str, Any]:
+    def report(self, policy: Policy) -> dict[str, Any]:
         """What is written of a policy: its figures on the held-out tracks beside those of the references."""
-        policies = {"policy": chains, **self.references()}
+        policies = {"policy": policy, **self.references()}
         figures = {
             name: {figure: asdict(interval) for figure, interval in self.intervals(each).items()}
             for name, each in policies.items()

@@ -1,4 +1,4 @@
-"""What a run writes of itself: `metrics.csv`, TensorBoard events, and JSON files that are whole or absent."""
+"""What a run writes of its iterations: `metrics.csv` and TensorBoard events."""
 
 from __future__ import annotations
 
@@ -7,66 +7,106 @@ import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+from trackmdp.config import LogConfig
 from trackmdp.durable import own_folder, reopen
+from trackmdp.training.callbacks import Callback, Row, Training
 from trackmdp.untrusted import decoded, opened
 
-__all__ = ["MetricsLog"]
+__all__ = ["CsvLogger", "TensorboardLogger"]
 
 
-class MetricsLog:
-    """One row per logged iteration; the columns are those of the first row.
+class CsvLogger(Callback):
+    """`metrics.csv`: one row per logged iteration; the columns are those of the first row.
 
     A value that is not there, or not finite, leaves its field empty. Numbers read back exactly.
 
     Args:
+        cfg: how often.
         folder: of the run.
-        tensorboard: write event files as well.
-        position: the `position` up to which the file of an earlier process holds; what follows is cut off.
-        frames: those of the earlier process; its events after them are hidden.
-
-    Raises:
-        UserError: the file is a link, or not the one that the earlier process left.
     """
 
-    def __init__(self, folder: Path, *, tensorboard: bool, position: int = 0, frames: int = 0) -> None:
-        file = folder / "metrics.csv"
-        names = _names(file, position) if position else None
-        self._file = os.fdopen(reopen(file, "r+" if position else "w"), "r+", newline="", encoding="utf-8")
+    name = "csv"
+
+    def __init__(self, cfg: LogConfig, folder: Path) -> None:
+        self._every, self._path, self._position = cfg.every, folder / "metrics.csv", 0
+
+    def on_start(self, trainer: Training) -> None:  # noqa: ARG002
+        """Open the file; what an earlier process wrote after its last checkpoint is cut off.
+
+        Raises:
+            UserError: the file is a link, or not the one that the earlier process left.
+        """
+        names = _names(self._path, self._position) if self._position else None
+        mode = "r+" if self._position else "w"
+        self._file = os.fdopen(reopen(self._path, mode), "r+", newline="", encoding="utf-8")
         self._writer: csv.DictWriter[str] | None = None
         if names is not None:
             self._writer = csv.DictWriter(self._file, fieldnames=names)
-            self._file.truncate(position)
+            self._file.truncate(self._position)
             self._file.seek(0, os.SEEK_END)
-        self._events = None
-        if tensorboard:
-            from torch.utils.tensorboard import SummaryWriter  # optional dependency, a second to import
 
-            own_folder(folder / "tensorboard")
-            self._events = SummaryWriter(folder / "tensorboard", purge_step=frames + 1 if position else None)
+    def on_update(self, trainer: Training, row: Row) -> None:
+        """Write the row where it is due."""
+        if trainer.due(self._every):
+            self.write(row)
 
-    def write(self, row: Mapping[str, float | int | None]) -> None:
-        """Append `row`; it must hold `frames`."""
+    def write(self, row: Row) -> None:
+        """Append `row`; it is on its way to the disk at once."""
         if self._writer is None:
             self._writer = csv.DictWriter(self._file, fieldnames=list(row))
             self._writer.writeheader()
-        known = {key: value for key, value in row.items() if value is not None and math.isfinite(value)}
-        self._writer.writerow(known)
+        self._writer.writerow(_known(row))
         self._file.flush()
-        if self._events is not None:
-            for key, value in known.items():
-                self._events.add_scalar(key, value, int(row["frames"] or 0))
 
-    @property
-    def position(self) -> int:
-        """Bytes of `metrics.csv` so far."""
-        return self._file.tell()
-
-    def close(self) -> None:
-        """End the files."""
+    def on_end(self, trainer: Training) -> None:  # noqa: ARG002
+        """Close the file."""
         self._file.close()
-        if self._events is not None:
-            self._events.close()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Bytes of the file so far."""
+        return {"position": self._file.tell()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Keep so many bytes of the file."""
+        self._position = state["position"]
+
+
+class TensorboardLogger(Callback):
+    """TensorBoard event files in `tensorboard/`, the same figures over frames.
+
+    Args:
+        cfg: how often.
+        folder: of the run.
+    """
+
+    name = "tensorboard"
+
+    def __init__(self, cfg: LogConfig, folder: Path) -> None:
+        self._every, self._folder = cfg.every, folder / "tensorboard"
+
+    def on_start(self, trainer: Training) -> None:
+        """Open a file; an earlier process's events after its last checkpoint are hidden."""
+        from torch.utils.tensorboard import SummaryWriter  # optional dependency, a second to import
+
+        own_folder(self._folder)
+        frames = trainer.position.frames
+        self._events = SummaryWriter(self._folder, purge_step=frames + 1 if frames else None)
+
+    def on_update(self, trainer: Training, row: Row) -> None:
+        """Write the row where it is due."""
+        if trainer.due(self._every):
+            for key, value in _known(row).items():
+                self._events.add_scalar(key, value, trainer.position.frames)
+
+    def on_end(self, trainer: Training) -> None:  # noqa: ARG002
+        """Close the file."""
+        self._events.close()
+
+
+def _known(row: Row) -> dict[str, float | int]:
+    return {key: value for key, value in row.items() if value is not None and math.isfinite(value)}
 
 
 def _names(file: Path, position: int) -> list[str]:

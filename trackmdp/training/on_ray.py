@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -22,7 +22,7 @@ _STORE = 2**30
 
 
 def make_collector(
-    envs: list[Callable[[], TrackEnv]], policy: TensorDictModuleBase, cfg: RayWorkersConfig, common: dict[str, Any]
+    envs: Sequence[Callable[[], TrackEnv]], policy: TensorDictModuleBase, cfg: RayWorkersConfig, common: dict[str, Any]
 ) -> BaseCollector:
     """A collector whose batches `[B, time]` hold the rows of all workers, one after the other.
 
@@ -40,7 +40,7 @@ def make_collector(
     try:
         with kept_sigterm():  # a scheduler's signal must reach the run
             made = _Collector(
-                envs,
+                list(envs),
                 policy,
                 sync=True,
                 ray_init_config=_cluster(cfg),

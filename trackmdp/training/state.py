@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -17,16 +18,25 @@ from trackmdp.config.resume import CHANGEABLE
 from trackmdp.errors import UserError
 from trackmdp.training import checkpoint
 from trackmdp.training.collect import collector_state, load_collector_state
-from trackmdp.training.loop import Position
 
-__all__ = ["capture", "find", "identity", "restore", "take_weights"]
+__all__ = ["Position", "capture", "find", "identity", "restore", "take_weights"]
 
 _EXACT = ("torch", "torchrl", "tensordict", "trackmdp")
 _NOT_WEIGHTS = ("optimizer", "buffer", "generator")
 
 
+@dataclass(frozen=True)
+class Position:
+    """How far a run is: iterations done, frames collected, seconds spent, and the sum of the frames' rewards."""
+
+    iteration: int = 0
+    frames: int = 0
+    seconds: float = 0.0
+    reward: float = 0.0
+
+
 def identity(cfg: TrainConfig) -> str:
-    """SHA-256 of all options that must not change when a run goes on."""
+    """SHA-256 of all options that must not change when a run is resumed."""
     plain = to_dict(cfg)
     for key in (*CHANGEABLE, "resume"):
         *parents, last = key.split(".")
@@ -42,10 +52,7 @@ def capture(
     algorithm: Algorithm,
     collector: BaseCollector,
     at: Position,
-    *,
-    metrics: int,
-    best: float,
-    recorded: int | None = None,
+    callbacks: Mapping[str, Mapping[str, Any]],
 ) -> dict[str, Any]:
     """Everything that the next iteration depends on, and what has been written so far.
 
@@ -54,9 +61,7 @@ def capture(
         algorithm: networks, optimizers, schedules, buffers.
         collector: rows in mid-episode and the environment's generators.
         at: how far the run is.
-        metrics: bytes of `metrics.csv`.
-        best: the highest AIHTR of any checkpoint.
-        recorded: policies in the log of episodes; None where there is none.
+        callbacks: states of the callbacks by their names, such as how many bytes of `metrics.csv` there are.
     """
     cuda = torch.cuda.get_rng_state_all() if torch.cuda.is_available() else []
     return {
@@ -66,9 +71,7 @@ def capture(
         "collector": collector_state(collector),
         "random": {"cpu": torch.get_rng_state(), "cuda": cuda},
         "position": vars(at),
-        "metrics": metrics,
-        "best": best,
-        "recorded": recorded,
+        "callbacks": dict(callbacks),
     }
 
 
@@ -84,7 +87,7 @@ def restore(state: Mapping[str, Any], algorithm: Algorithm, collector: BaseColle
 
 
 def find(cfg: TrainConfig, folder: Path, device: torch.device) -> tuple[dict[str, Any] | None, list[str]]:
-    """The state to go on from, None to start anew; and a line for each checkpoint that had to be passed over.
+    """The state to resume from, None to start anew; and a line for each checkpoint that had to be passed over.
 
     `resume=auto` and a run's folder fall back to the newest checkpoint that can be read and is this run's; a checkpoint
     named by itself is taken or refused.
@@ -107,7 +110,7 @@ def find(cfg: TrainConfig, folder: Path, device: torch.device) -> tuple[dict[str
             passed_over.append(str(error))
             continue
         return state, passed_over
-    raise UserError(f"resume={cfg.resume}: no checkpoint to go on from ({'; '.join(passed_over) or 'there is none'})")
+    raise UserError(f"resume={cfg.resume}: no checkpoint to resume from ({'; '.join(passed_over) or 'there is none'})")
 
 
 def take_weights(algorithm: Algorithm, run: Path, device: torch.device) -> list[str]:

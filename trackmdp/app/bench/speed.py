@@ -12,11 +12,11 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 
 from trackmdp.app.bench.machine import rate
-from trackmdp.build import make_algorithm, make_collector
 from trackmdp.config import GROUPS, BenchmarkConfig, TrainConfig, from_hydra
 from trackmdp.policies.actor_critic import make_actor
 from trackmdp.policies.fixed import AllOn, RandomSubset
 from trackmdp.seeding import generator
+from trackmdp.training.make import make_algorithm, make_collector
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.model import World
 
@@ -84,7 +84,7 @@ def train_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> lis
         train = train_config([f"algo={name}", f"seed={cfg.seed}", f"threads={cfg.threads}"])
         train.grid, train.kernel, train.cost = cfg.grid, cfg.kernel, cfg.cost
         algorithm = make_algorithm(train, world, device)
-        collector = make_collector(train, world, algorithm, device)
+        collector = make_collector(train, world, algorithm.policy, device)
         batches, frames, done = iter(collector), 0, 0
         wall, cpu = time.perf_counter(), time.process_time()
         while done < algorithm.iterations and time.perf_counter() - wall < 5 * cfg.seconds:

@@ -9,12 +9,12 @@ from typing import Any
 import torch
 
 from trackmdp.app.bench import learned, log, memory, peers, quality, solver, speed
-from trackmdp.app.bench.machine import machine
 from trackmdp.build import make_world
 from trackmdp.config import BenchmarkConfig
 from trackmdp.durable import write_json
 from trackmdp.training.devices import make_device
 from trackmdp.training.display import make_console, table
+from trackmdp.training.machine import machine
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Problem
 

@@ -20,6 +20,7 @@ from trackmdp.episodes.log import EpisodeLog
 from trackmdp.episodes.record import Chains, RandomSets
 from trackmdp.policies import fixed
 from trackmdp.policies.fixed import ChainPolicy
+from trackmdp.policies.policy import Policy
 from trackmdp.reports.picture import draw
 from trackmdp.seeding import generator
 from trackmdp.solvers import estimator
@@ -48,7 +49,7 @@ def run(cfg: EvaluateConfig, folder: Path, problem: Problem | None = None) -> fl
     if isinstance(world, Recorded):
         return held_out.run(world, chains, subject, folder, console, cfg.seed)
     evaluator = ExactEvaluator(world)
-    score = evaluator.score(chains)
+    score = evaluator.score(Policy.from_dense(world, chains))
     simulation = None
     if cfg.episodes:
         policy: TensorDictModuleBase = ChainPolicy(chains, device)

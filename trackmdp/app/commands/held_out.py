@@ -9,6 +9,7 @@ import numpy as np
 from rich.console import Console
 
 from trackmdp.durable import write_json, write_text
+from trackmdp.policies.policy import Policy
 from trackmdp.reports.picture import draw
 from trackmdp.solvers.chains import sets_of
 from trackmdp.training.display import table
@@ -28,8 +29,9 @@ def run(
 ) -> float:
     """Write `evaluation.json`, `sets.json` and `picture.txt` to `folder`; returns the mean reward of a track."""
     evaluator = HeldOutEvaluator(world)
-    report = evaluator.report(chains)
-    value = evaluator.evaluate(chains).value
+    policy = Policy.from_dense(world, chains)
+    report = evaluator.report(policy)
+    value = evaluator.evaluate(policy).value
     content = {"policy": subject, "value": value.tolist(), "held_out": report, "regret_per_step": None}
     write_json(folder / "evaluation.json", content)
     if chains.dtype == np.bool_:

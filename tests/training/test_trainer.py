@@ -1,4 +1,4 @@
-"""When the loop saves, and what collecting has cost."""
+"""When the trainer saves, what its callbacks are told, and what collecting has cost."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ import pytest
 from tests.helpers import train_config
 from tests.training.runs import QUICK, rows, train
 from trackmdp.build import make_world
+from trackmdp.config import CheckpointConfig
 from trackmdp.solvers.chains import evaluate
 from trackmdp.training.evaluator import ExactEvaluator
-from trackmdp.training.loop import Intervals, Position, _due
+from trackmdp.training.saving import Checkpoints
+from trackmdp.training.state import Position
 
 
 @pytest.mark.parametrize(
@@ -30,14 +32,15 @@ from trackmdp.training.loop import Intervals, Position, _due
 def test_saved_by_frames_or_by_time_but_not_most_of_the_time(
     frames: int, seconds: float, rest: float, due: bool
 ) -> None:
-    every = Intervals(evaluate=1, log=1, save_frames=1000, save_seconds=30.0)
-    start = Position(10, 5000, 500.0)
-    assert _due(start, Position(11, 5000 + frames, 500.0 + seconds), rest, every) is due
+    checkpoints = Checkpoints(CheckpointConfig(every=1000, seconds=30.0, keep=1), Path())
+    checkpoints._saved, checkpoints._rest = Position(10, 5000, 500.0), rest
+    assert checkpoints.due(Position(11, 5000 + frames, 500.0 + seconds)) is due
 
 
 def test_neither_by_frames_nor_by_time() -> None:
-    every = Intervals(evaluate=1, log=1, save_frames=0, save_seconds=None)
-    assert not _due(Position(), Position(10, 10**9, 10.0**9), 0.0, every)
+    checkpoints = Checkpoints(CheckpointConfig(every=0, seconds=None, keep=1), Path())
+    checkpoints._saved = Position()
+    assert not checkpoints.due(Position(10, 10**9, 10.0**9))
 
 
 def test_what_collecting_costs_is_in_the_log(tmp_path: Path) -> None:

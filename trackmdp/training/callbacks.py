@@ -1,0 +1,92 @@
+"""What can be hooked into a training run: its logs, checkpoints and display are callbacks, and so may be the user's."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from rich.console import Console
+from tensordict import TensorDictBase
+from torchrl.collectors import BaseCollector
+
+from trackmdp.algos.common import Algorithm
+from trackmdp.config import TrainConfig
+from trackmdp.policies.policy import Policy
+from trackmdp.training.evaluator import Evaluator, Score
+from trackmdp.training.state import Position
+from trackmdp.world.tracks import Problem
+
+__all__ = ["Callback", "Row", "Training"]
+
+Row = Mapping[str, float | int | None]
+"""Figures of one iteration by their names, as `metrics.csv` has them; None for what was not measured."""
+
+
+class Training(Protocol):
+    """What a callback may read of the run: the trainer, `trackmdp.training.trainer.Trainer`, which describes each."""
+
+    problem: Problem
+    config: TrainConfig
+    folder: Path | None
+    console: Console
+    device: torch.device
+    algorithm: Algorithm
+    collector: BaseCollector
+    evaluator: Evaluator
+    callbacks: list[Callback]
+    start: Position
+    position: Position
+    score: Score
+    error: BaseException | None
+
+    @property
+    def iterations(self) -> int:
+        """Iterations of the whole run."""
+
+    def due(self, every: int) -> bool:
+        """Whether something is to be done after this iteration that is done every so many, and at the end."""
+
+    def policy(self) -> Policy:
+        """The policy as it is now."""
+
+
+class Callback:
+    """Base of all callbacks: every hook does nothing.
+
+    In an iteration the hooks are called in the order `on_batch` (learning follows), `on_evaluation` where an
+    evaluation is due, `on_update`, `on_checkpoint` where one was saved. The callbacks are called in the order in which
+    the trainer has them. A hook may read everything of the trainer; to change the run is at its own risk.
+    """
+
+    name = ""
+    """Under this name the callback's state stands in a checkpoint; "" for a callback without state."""
+
+    def on_start(self, trainer: Training) -> None:
+        """Everything is built, and a resumed run put back where it was; the first batch comes next."""
+
+    def on_batch(self, trainer: Training, batch: TensorDictBase) -> None:
+        """A batch `[B, time]` was collected; it is learned from next."""
+
+    def on_evaluation(self, trainer: Training, policy: Policy, score: Score) -> None:
+        """The policy learned so far was evaluated."""
+
+    def on_update(self, trainer: Training, row: Row) -> None:
+        """An iteration is over: learned, evaluated where that was due, `trainer.position` moved on."""
+
+    def on_checkpoint(self, trainer: Training, file: Path) -> None:
+        """A checkpoint was saved."""
+
+    def on_end(self, trainer: Training) -> None:
+        """The run is over, however it ended: `trainer.error` is None where all iterations are done.
+
+        Called in reverse order, once for every callback whose `on_start` returned.
+        """
+
+    def state_dict(self) -> dict[str, Any]:
+        """Tensors and plain values that a resumed run hands to `load_state_dict`."""
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from a `state_dict`; called before `on_start`."""

@@ -1,0 +1,55 @@
+"""What a run takes in, as its folder keeps it: `config.yaml`, and `kernel.npy` or `tracks.json`."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+
+from trackmdp.config import TrainConfig
+from trackmdp.config.resume import config_text
+from trackmdp.durable import write_bytes, write_text
+from trackmdp.errors import UserError
+from trackmdp.world.model import Array, World
+from trackmdp.world.tracks import Problem, Recorded
+
+__all__ = ["write_inputs"]
+
+
+def write_inputs(config: TrainConfig, problem: Problem, folder: Path, *, resumed: bool) -> None:
+    """Write the config, and the kernel or which tracks these are.
+
+    Raises:
+        UserError: the run that is resumed was begun with another kernel, or with other tracks.
+    """
+    name, what = ("kernel.npy", "kernel") if isinstance(problem, World) else ("tracks.json", "recording")
+    file = folder / name
+    if resumed and not _same(file, problem):
+        raise UserError(
+            f"{file}: the run's {what} is not the one that its config describes now; it cannot change on resume"
+        )
+    write_text(folder / "config.yaml", config_text(config))
+    write_bytes(file, _npy(problem.kernel.toarray()) if isinstance(problem, World) else _described(problem))
+
+
+def _same(file: Path, problem: Problem) -> bool:
+    if isinstance(problem, World):
+        return np.array_equal(np.load(file, allow_pickle=False), problem.kernel.toarray())
+    return file.read_bytes() == _described(problem)
+
+
+def _npy(table: Array) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, table)
+    return buffer.getvalue()
+
+
+def _described(problem: Recorded) -> bytes:
+    """How many tracks and points of which content, as JSON."""
+    parts = {"learned_from": problem.tracks, "held_out": problem.held_out}
+    content = {
+        name: {"tracks": len(part), "cells": len(part.cells), "sha256": part.digest()} for name, part in parts.items()
+    }
+    return (json.dumps(content, indent=2) + "\n").encode()

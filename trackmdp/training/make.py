@@ -1,0 +1,41 @@
+"""From config to the parts of a run, each made by what its choice names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torchrl.collectors import BaseCollector
+
+from trackmdp.algos.common import Algorithm
+from trackmdp.config import TrainConfig
+from trackmdp.config.registry import maker
+from trackmdp.training.callbacks import Callback
+from trackmdp.training.metrics import CsvLogger
+from trackmdp.world.model import Task
+from trackmdp.world.tracks import Problem
+
+__all__ = ["make_algorithm", "make_collector", "make_loggers"]
+
+
+def make_algorithm(cfg: TrainConfig, task: Task, device: torch.device) -> Algorithm:
+    """The learner; it is given the task, never the motion."""
+    batches = -(-cfg.collector.total_frames // cfg.collector.frames_per_batch)
+    made: Algorithm = maker(cfg.algo)(task.task, cfg.algo, iterations=batches, seed=cfg.seed, device=device)
+    return made
+
+
+def make_collector(
+    cfg: TrainConfig, problem: Problem, policy: TensorDictModuleBase, device: torch.device, *, done: int = 0
+) -> BaseCollector:
+    """The source of the frames that are left after the first `done`."""
+    more = {"seed": cfg.seed, "device": device, "done": done}
+    made: BaseCollector = maker(cfg.collector)(problem, policy, cfg.collector, **more)
+    return made
+
+
+def make_loggers(cfg: TrainConfig, folder: Path) -> list[Callback]:
+    """What the run writes of itself while it learns."""
+    csv = CsvLogger(cfg.log, folder)
+    return [csv] if cfg.log.name == "csv" else [csv, maker(cfg.log)(cfg.log, folder)]

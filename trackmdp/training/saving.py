@@ -1,0 +1,78 @@
+"""When a run is saved."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from trackmdp.config import CheckpointConfig
+from trackmdp.errors import Preempted
+from trackmdp.training import checkpoint
+from trackmdp.training.callbacks import Callback, Row, Training
+from trackmdp.training.state import Position, capture
+
+__all__ = ["Checkpoints"]
+
+_SAVING = 50  # seconds of training to one of saving, at least
+
+
+class Checkpoints(Callback):
+    """Saves the run by frames and by time, at its end, and where a signal asks for its end.
+
+    Args:
+        cfg: how often, and how many checkpoints are kept.
+        folder: of the checkpoints.
+    """
+
+    name = "checkpoints"
+
+    def __init__(self, cfg: CheckpointConfig, folder: Path) -> None:
+        self._cfg, self._folder = cfg, folder
+        self._best, self._rest = -math.inf, 0.0
+
+    def on_start(self, trainer: Training) -> None:
+        """Intervals count from where the run is."""
+        self._saved = trainer.position
+
+    def on_update(self, trainer: Training, row: Row) -> None:  # noqa: ARG002
+        """Save after the last iteration, and where it is due."""
+        if trainer.position.iteration == trainer.iterations or self.due(trainer.position):
+            self.save(trainer)
+
+    def on_end(self, trainer: Training) -> None:
+        """Save where a signal ended the run: that is the one error that leaves a state between two iterations."""
+        if isinstance(trainer.error, Preempted) and trainer.position != self._saved:
+            self.save(trainer)
+
+    def due(self, at: Position) -> bool:
+        """Whether to save at `at`.
+
+        By time not before training took 50 times as long as the last saving, which would else take too much of it.
+        """
+        every, saved = self._cfg.every, self._saved
+        frames = every and at.frames // every > saved.frames // every
+        seconds = self._cfg.seconds is not None and at.seconds - saved.seconds >= max(self._cfg.seconds, self._rest)
+        return bool(frames or seconds)
+
+    def save(self, trainer: Training) -> None:
+        """Save the run as it is, and tell the callbacks."""
+        begin, aihtr = time.monotonic(), trainer.score.evaluation.aihtr
+        better, self._best = aihtr > self._best, max(self._best, aihtr)
+        # Its own state first: that of the others is as they wrote their rows and episodes before this.
+        named = {each.name: each.state_dict() for each in trainer.callbacks if each.name}
+        state = capture(trainer.config, trainer.algorithm, trainer.collector, trainer.position, named)
+        file = checkpoint.save(self._folder, trainer.position.iteration, state, keep=self._cfg.keep, best=better)
+        self._saved, self._rest = trainer.position, _SAVING * (time.monotonic() - begin)
+        for callback in trainer.callbacks:
+            callback.on_checkpoint(trainer, file)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The highest AIHTR of any checkpoint."""
+        return {"best": self._best}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from a `state_dict`."""
+        self._best = state["best"]

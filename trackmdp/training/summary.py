@@ -1,0 +1,50 @@
+"""What a training run says of itself at its end: the content of `summary.json`."""
+
+from __future__ import annotations
+
+import platform
+from importlib.metadata import version
+from typing import Any
+
+from trackmdp import __version__
+from trackmdp.config.resume import digest
+from trackmdp.solvers.optimal import Solution
+from trackmdp.training.callbacks import Training
+from trackmdp.training.evaluator import Score, figures, while_collecting
+from trackmdp.training.machine import machine
+
+__all__ = ["summarize"]
+
+_PACKAGES = ("torch", "torchrl", "tensordict", "hydra-core", "numpy", "scipy")
+
+
+def summarize(trainer: Training, score: Score, solution: Solution | None, times: dict[str, float]) -> dict[str, Any]:
+    """The figures of a run that has ended; on held-out tracks there are no bounds, no Q_MDP and no regret.
+
+    Args:
+        trainer: of the run.
+        score: of the last policy, its regret to the best bound known by now.
+        solution: the optimum or a bracket of it, where it was solved for.
+        times: seconds spent, by their names in the summary.
+    """
+    config, evaluator, end = trainer.config, trainer.evaluator, trainer.position
+    return {
+        "algo": config.algo.name,
+        "credit": config.algo.credit,
+        "seed": config.seed,
+        "frames": end.frames,
+        **times,
+        "policy": figures(score.evaluation),
+        "qmdp": figures(evaluator.qmdp) if evaluator.qmdp else None,
+        "bounds": evaluator.bounds,
+        "optimal": {"lower": solution.lower, "upper": solution.upper, "certified": solution.certified}
+        if solution
+        else None,
+        "regret_per_step": score.regret_per_step,
+        "while_collecting": while_collecting(evaluator.upper, score.evaluation, end.reward, end.frames),
+        "held_out": evaluator.report(trainer.policy()),
+        "versions": {"trackmdp": __version__, "python": platform.python_version()}
+        | {name: version(name) for name in _PACKAGES},
+        "machine": machine(),
+        "config_sha256": digest(config),
+    }

@@ -1,0 +1,240 @@
+"""The training run: collect, learn, evaluate, log, save; it names no algorithm and no log."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from tensordict import TensorDictBase
+
+from trackmdp.config import TrainConfig
+from trackmdp.durable import write_json
+from trackmdp.errors import Preempted, RunError
+from trackmdp.policies.policy import Policy, as_policy
+from trackmdp.seeding import seed_global
+from trackmdp.training import memory
+from trackmdp.training.callbacks import Callback, Row
+from trackmdp.training.devices import make_device
+from trackmdp.training.display import Display
+from trackmdp.training.evaluator import Score, while_collecting
+from trackmdp.training.held_out import make_evaluator
+from trackmdp.training.inputs import write_inputs
+from trackmdp.training.make import make_algorithm, make_collector, make_loggers
+from trackmdp.training.saving import Checkpoints
+from trackmdp.training.signals import Signals
+from trackmdp.training.state import Position, find, restore, take_weights
+from trackmdp.training.workers import Watch
+from trackmdp.world.tracks import Problem
+
+__all__ = ["Trainer"]
+
+
+class Trainer:
+    """One training run, begun anew or resumed from a checkpoint in its folder.
+
+    Args:
+        problem: the world, or recorded tracks. The learner is given its task alone.
+        config: the checked config of `trackmdp train`.
+        folder: where inputs, logs and checkpoints are written; None to write nothing.
+        callbacks: are called after the logs that the config names, before the checkpoints.
+        console: where progress is shown; None for nowhere.
+
+    Attributes:
+        algorithm: the learner; its `actor` is evaluated. From the start of `run` on, as the following ones.
+        collector: yields batches `[B, time]` until the frames are spent.
+        evaluator: gives figures of policies, and upper bounds.
+        start: where an earlier process left the run.
+        position: how far the run is.
+        score: of the last evaluation.
+        error: what ended the run before its time, None otherwise.
+
+    Raises:
+        UserError: the config asks for what is not there, or for more memory than there is.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        config: TrainConfig,
+        *,
+        folder: Path | None = None,
+        callbacks: Sequence[Callback] = (),
+        console: Console | None = None,
+    ) -> None:
+        self.problem, self.config, self.folder = problem, config, folder
+        self.console = console or Console(quiet=True)
+        self.device = make_device(config.device)
+        self.callbacks = [*callbacks, Display(self.console, f"{config.algo.name} seed {config.seed}")]
+        if folder is not None:
+            self.callbacks[-1:-1] = [Checkpoints(config.checkpoint, folder / "checkpoints")]
+            self.callbacks[:0] = make_loggers(config, folder)
+        self.start, self.position = Position(), Position()
+        self.error: BaseException | None = None
+        self.console.print(memory.check(config, problem.task, self.device))
+
+    @property
+    def iterations(self) -> int:
+        """Iterations of the whole run."""
+        return self.algorithm.iterations
+
+    def due(self, every: int) -> bool:
+        """Whether something is to be done after this iteration that is done every so many, and at the end."""
+        return self.position.iteration == self.iterations or self.position.iteration % every == 0
+
+    def policy(self) -> Policy:
+        """The policy as it is now; asking for it does not disturb the run."""
+        return as_policy(self.problem.task, self.algorithm.actor, device=self.device)
+
+    def run(self) -> Score:
+        """Train to the end; returns the score of the last policy.
+
+        Raises:
+            UserError: the run in the folder is not the one that the config describes.
+            Preempted: a signal asked for the end; a checkpoint has been saved.
+            RunError: the loss is not finite, or collecting broke down; the last checkpoint stands.
+        """
+        began = time.monotonic()
+        with ExitStack() as opened:
+            opened.callback(torch.set_num_threads, torch.get_num_threads())
+            torch.set_num_threads(self.config.threads)
+            self._build(opened)
+            # Left last, after the callbacks' ends: a second signal must not cut off the saving that the first began.
+            self._signals = opened.enter_context(Signals())
+            self._watch = opened.enter_context(Watch(self.collector))
+            for callback in self.callbacks:
+                callback.on_start(self)
+                opened.callback(callback.on_end, self)
+            self._began = time.monotonic() - self.start.seconds
+            try:
+                self._loop()
+            except BaseException as error:
+                self.error = error
+                raise
+        self.position = replace(self.position, seconds=time.monotonic() - began + self.start.seconds)
+        return self.score
+
+    def _build(self, opened: ExitStack) -> None:
+        """Learner, collector and evaluator; put back from the checkpoint where the run is resumed."""
+        config, problem, folder = self.config, self.problem, self.folder
+        state, skipped = (None, []) if folder is None else find(config, folder, self.device)
+        for line in skipped:
+            self.console.print(f"passed over: {line}")
+        # Networks are initialised from torch's global generator, so that it is seeded before anything is built.
+        seed_global(config.seed)
+        self.algorithm = make_algorithm(config, problem.task, self.device)
+        done = state["position"]["frames"] if state else 0
+        self.collector = make_collector(config, problem, self.algorithm.policy, self.device, done=done)
+        opened.callback(self.collector.shutdown)
+        self.evaluator = make_evaluator(problem)
+        self.start = self._restore(state)
+        self.position = self.start
+        if folder is not None:
+            write_inputs(config, problem, folder, resumed=state is not None)
+            plan = {"iterations": self.iterations, "upper_bound": self.evaluator.upper}
+            write_json(folder / "plan.json", plan)  # for those who watch the run
+
+    def _restore(self, state: dict[str, Any] | None) -> Position:
+        """The position after the last checkpoint, or at the start, perhaps with the weights of another run."""
+        if state is not None:
+            for callback in self.callbacks:
+                if callback.name in state["callbacks"]:
+                    callback.load_state_dict(state["callbacks"][callback.name])
+            start = restore(state, self.algorithm, self.collector)
+            self.console.print(f"resumes after iteration {start.iteration}, {start.frames:,} frames")
+            return start
+        if self.config.init_from is not None:
+            taken = take_weights(self.algorithm, Path(self.config.init_from), self.device)
+            self.console.print(f"weights from {self.config.init_from}: {', '.join(taken)}")
+        return Position()
+
+    def _loop(self) -> None:
+        self._batches = iter(self.collector)
+        self.score = self.evaluator.score(self.policy())
+        for iteration in range(self.position.iteration + 1, self.iterations + 1):
+            batch = self._collect(iteration)
+            # Summed before learning: an algorithm may scale the rewards of its batch in place.
+            frames, earned = (0, 0.0) if batch is None else (batch.numel(), batch["next", "reward"].sum().item())
+            diagnostics = self._learn(batch, iteration)
+            before, elapsed = self.position, time.monotonic() - self._began
+            self.position = Position(iteration, before.frames + frames, elapsed, before.reward + earned)
+            self._account(diagnostics, earned / frames if frames else None)
+            if self._signals.received and iteration < self.iterations:
+                raise Preempted(self._signals.received)
+
+    def _collect(self, iteration: int) -> TensorDictBase | None:
+        """The next batch, None once all frames are in."""
+        try:
+            with _named(iteration), self._watch.waiting():
+                batch = next(self._batches, None)
+        except RunError:
+            if not self._signals.received:
+                raise
+            # The signal went to the worker processes too. Nothing has been learned since the last iteration, so that
+            # this is a state to save.
+            raise Preempted(self._signals.received) from None
+        if batch is not None:
+            for callback in self.callbacks:
+                callback.on_batch(self, batch)
+        return batch
+
+    def _learn(self, batch: TensorDictBase | None, iteration: int) -> dict[str, float]:
+        """One iteration of learning, after which the collector has the new weights."""
+        try:
+            diagnostics = self.algorithm.step(batch)
+        except FloatingPointError as error:
+            raise RunError(f"iteration {iteration}: {error}; the last checkpoint holds a good state") from error
+        if batch is not None:
+            with _named(iteration), self._watch.waiting():
+                self.collector.update_policy_weights_()
+        return diagnostics
+
+    def _account(self, diagnostics: dict[str, float], earned: float | None) -> None:
+        """Evaluate where that is due, and tell the callbacks; `earned`: mean reward of the batch's frames, if any."""
+        evaluated = self.position.iteration == 1 or self.due(self.config.evaluation.every)
+        if evaluated:
+            policy = self.policy()
+            self.score = self.evaluator.score(policy)
+            for callback in self.callbacks:
+                callback.on_evaluation(self, policy, self.score)
+        row = self._row(evaluated, diagnostics, earned)
+        for callback in self.callbacks:
+            callback.on_update(self, row)
+
+    def _row(self, evaluated: bool, diagnostics: dict[str, float], earned: float | None) -> Row:
+        """Counters, exact figures (empty between evaluations), diagnostics, and last the columns that time decides."""
+        at, evaluation = self.position, self.score.evaluation
+        exact = {
+            "aihtr": evaluation.aihtr,
+            "regret_per_step": self.score.regret_per_step,
+            "accuracy": evaluation.accuracy,
+            "sensors_per_step": evaluation.sensors_per_step,
+        }
+        so_far = while_collecting(self.evaluator.upper, evaluation, at.reward, at.frames)
+        return {
+            "iteration": at.iteration,
+            "frames": at.frames,
+            **(exact if evaluated else dict.fromkeys(exact)),
+            "reward_per_frame": earned,
+            "regret_while_collecting": so_far["regret_per_frame"],
+            **diagnostics,
+            "seconds": at.seconds,
+            "frames_per_second": at.frames / at.seconds,
+        }
+
+
+@contextmanager
+def _named(iteration: int) -> Iterator[None]:
+    """Say where and why collecting broke down."""
+    try:
+        yield
+    except (RuntimeError, OSError) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise RunError(
+            f"iteration {iteration}: collecting broke down ({reason}); resume=auto resumes from the last checkpoint"
+        ) from error
