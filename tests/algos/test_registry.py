@@ -15,11 +15,11 @@ import torch
 
 from tests.helpers import ALGORITHMS, algorithm, collect, small_world, train_config
 from trackmdp.app.commands.train import run
-from trackmdp.build import make_world
 from trackmdp.config import GROUPS, PerSensorConfig
 from trackmdp.solvers import optimal
 from trackmdp.training import checkpoint
 from trackmdp.training.evaluate import chains_of
+from trackmdp.world.make import build_world
 
 ROOT = Path(__file__).parents[2]
 TIMED = ("seconds", "frames_per_second")
@@ -56,7 +56,7 @@ QUIET = ("quiet=true", "optimal.enabled=false", "evaluation.every=100000")
 def test_it_solves_a_tiny_world(name: str, tmp_path: Path) -> None:
     """Within 3 % of the certified optimum 5.83; FCR gets 4.87, no sensors -2.15, all sensors -7.2."""
     cfg = train_config(*QUIET, *WORLD, f"algo={name}", *BUDGETS.get(name, "").split(), "seed=0")
-    best = optimal.solve(make_world(cfg))
+    best = optimal.solve(build_world(cfg))
     assert best.certified
     reached = run(cfg, tmp_path)
     assert 0.97 * best.lower <= reached <= best.lower + 1e-9

@@ -12,11 +12,11 @@ import pytest
 from tests.episodes.browser import CHROMIUM, Browser
 from tests.episodes.logs import WORLD, recorded, write
 from tests.helpers import train_config
-from trackmdp.build import make_world
 from trackmdp.episodes.page import MOST_STEPS, page, write_page
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.episodes.record import Chains, record
 from trackmdp.solvers import bounds, qmdp
+from trackmdp.world.make import build_world
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def test_a_page_holds_the_episode_to_the_digit(reader: EpisodeReader) -> None:
 
 
 def test_a_page_is_one_small_file_that_asks_for_nothing(tmp_path: Path) -> None:
-    world = make_world(train_config())
+    world = build_world(train_config())
     acting = Chains(qmdp.solve(world))
     episode = next(each for each in record(world, acting, range(100)) if 100 <= len(each) < 150)
     with EpisodeReader(write(tmp_path / "a.mcap", [episode], acting=acting, world=world)) as reader:

@@ -9,8 +9,8 @@ import pytest
 
 from tests.helpers import BORDERS, configured
 from tests.solvers import worlds
-from trackmdp.build import make_world
 from trackmdp.paper.worlds import COSTS, SUPPORTS, paper_kernel, paper_world
+from trackmdp.world.make import build_world
 from trackmdp.world.model import World
 
 
@@ -24,7 +24,7 @@ def assert_equal(one: World, other: World) -> None:
 @pytest.mark.parametrize("border", BORDERS)
 def test_the_world_of_a_draw_is_the_one_that_its_options_describe(border: Any) -> None:
     words = ["kernel.support_size=4", "kernel.seed=7", f"kernel.border={border}", "cost.sensor=0.2", "grid.t_max=2"]
-    assert_equal(paper_world(paper_kernel(4, 7, border), 0.2, 2), make_world(configured("train", *words)))
+    assert_equal(paper_world(paper_kernel(4, 7, border), 0.2, 2), build_world(configured("train", *words)))
 
 
 def test_the_twelve_pairs_are_those_of_the_references() -> None:

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from tests.helpers import train_config
-from trackmdp.build import make_world
 from trackmdp.config import PaperCostConfig, TrainConfig
 from trackmdp.config.resume import config_text, digest
 from trackmdp.policies.policy import Policy
 from trackmdp.reports import policy
 from trackmdp.solvers import clocked
 from trackmdp.training.evaluator import ExactEvaluator, figures
+from trackmdp.world.make import build_world
 
 VERSIONS = {"trackmdp": "0.1.0", "torch": "2.13.0"}
 MACHINE = {"processor": "a processor", "cores": 2}
@@ -42,7 +42,7 @@ def write_run(
     cfg = copy.deepcopy(_composed(*overrides))
     assert isinstance(cfg.cost, PaperCostConfig)
     cfg.cost.sensor, cfg.seed = cost, seed
-    world = make_world(cfg)
+    world = build_world(cfg)
     evaluator = ExactEvaluator(world)
     chains = clocked.solve(world)
     rng = np.random.default_rng(cfg.seed)

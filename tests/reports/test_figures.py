@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 
 from tests.reports.sweeps import write_sweep
-from trackmdp.build import make_world
 from trackmdp.errors import UserError
 from trackmdp.reports import figures, learning, maps, style
 from trackmdp.reports.figures import Panel
 from trackmdp.reports.gather import gather
 from trackmdp.reports.grouping import Study, study
 from trackmdp.reports.results import Results
+from trackmdp.world.make import build_world
 
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
-    return gather(write_sweep(tmp_path_factory.mktemp("sweep")), make_world)
+    return gather(write_sweep(tmp_path_factory.mktemp("sweep")), build_world)
 
 
 @pytest.fixture(scope="module")

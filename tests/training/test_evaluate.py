@@ -15,11 +15,12 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from tests.helpers import ALGORITHMS, BASELINES, algorithm, collect, evaluate_config, hop_world, limited, small_world
-from trackmdp.build import make_baseline, make_world
+from trackmdp.build import make_baseline
 from trackmdp.policies.fixed import AllOn, ChainPolicy, RandomK
 from trackmdp.policies.policy import Policy
 from trackmdp.training.evaluate import Simulation, chains_of, simulate
 from trackmdp.training.evaluator import ExactEvaluator
+from trackmdp.world.make import build_world
 from trackmdp.world.model import World
 
 STATE = ["last_cell", "steps_since_detection", "action_history"]
@@ -94,7 +95,7 @@ def assert_close(world: World, chains: np.ndarray, simulation: Simulation) -> No
 def test_exact_and_simulated_figures_agree_for_every_baseline(name: str, max_steps: int | None) -> None:
     words = ("grid.size=3", "grid.t_max=2", "kernel.exit_probability=0.2", "cost.sensor=0.25", f"baseline={name}")
     cfg = evaluate_config(*words)
-    world = limited(make_world(cfg), max_steps)
+    world = limited(build_world(cfg), max_steps)
     chains = make_baseline(cfg.baseline, world)
     policy: Any = ChainPolicy(chains)
     if chains.dtype != np.bool_:

@@ -16,13 +16,13 @@ import torch
 
 from tests.helpers import train_config
 from tests.training.runs import BUDGET, QUICK, SMALL, assert_same_run, at_iteration, rows, train
-from trackmdp.build import make_world
 from trackmdp.errors import Preempted, RunError, UserError
 from trackmdp.training import checkpoint
 from trackmdp.training.lock import locked
 from trackmdp.training.make import make_algorithm
 from trackmdp.training.state import _weights
 from trackmdp.training.workers import Watch
+from trackmdp.world.make import build_world
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +82,7 @@ def test_a_loss_that_is_not_finite_names_the_iteration_and_leaves_the_last_good_
     algo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: dict[str, Path]
 ) -> None:
     cfg = train_config(*SMALL[algo], *QUICK, *BUDGET)
-    learner = type(make_algorithm(cfg, make_world(cfg), torch.device("cpu")))
+    learner = type(make_algorithm(cfg, build_world(cfg), torch.device("cpu")))
     step, bad = learner.step, 10 if algo == "hindsight" else 4
 
     def poisoned(self: Any, batch: Any) -> dict[str, float]:

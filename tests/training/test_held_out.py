@@ -24,7 +24,7 @@ from trackmdp.training import checkpoint
 from trackmdp.training.evaluator import ExactEvaluator
 from trackmdp.training.held_out import ESTIMATED, HeldOutEvaluator, estimated_kernel, make_evaluator
 from trackmdp.world.model import World
-from trackmdp.world.tracks import Tracks, load_tracks, split
+from trackmdp.world.tracks import Tracks, read_tracks, split
 
 
 def test_the_setting_decides_who_evaluates() -> None:
@@ -136,7 +136,7 @@ def test_held_out_tracks_are_never_learned_from(algo: str, file: Path, tmp_path:
 
 
 def held_out_names(file: Path) -> Any:
-    return split(load_tracks(file, 3, exits=True), 0.2, 0)[1].names
+    return split(read_tracks(file, 3, exits=True), 0.2, 0)[1].names
 
 
 def checkpoints(folder: Path) -> tuple[list[str], dict[str, Any]]:

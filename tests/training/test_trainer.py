@@ -10,12 +10,12 @@ import pytest
 
 from tests.helpers import train_config
 from tests.training.runs import QUICK, rows, train
-from trackmdp.build import make_world
 from trackmdp.config import CheckpointConfig
 from trackmdp.solvers.chains import evaluate
 from trackmdp.training.evaluator import ExactEvaluator
 from trackmdp.training.saving import Checkpoints
 from trackmdp.training.state import Position
+from trackmdp.world.make import build_world
 
 
 @pytest.mark.parametrize(
@@ -49,7 +49,7 @@ def test_what_collecting_costs_is_in_the_log(tmp_path: Path) -> None:
     table, summary = rows(tmp_path), json.loads((tmp_path / "summary.json").read_text())
     earned = [float(row["reward_per_frame"]) for row in table if row["reward_per_frame"]]
     assert len(earned) == 8
-    world = make_world(train_config(*QUICK))
+    world = build_world(train_config(*QUICK))
     everything = np.ones((9, 2, 9), dtype=bool)
     exact = evaluate(world, everything)
     assert np.mean(earned) == pytest.approx(exact.aihtr / exact.expected_length, rel=0.02)

@@ -16,9 +16,9 @@ from scipy import sparse
 
 from tests.helpers import configured
 from tests.world.kernels import paper
-from trackmdp.build import make_world
 from trackmdp.errors import UserError
 from trackmdp.world.kernels import check_homogeneous, load_table, random_walk
+from trackmdp.world.make import build_world
 from trackmdp.world.model import World
 
 
@@ -31,14 +31,14 @@ def test_a_table_comes_back_from_a_file(tmp_path: Path, suffix: str) -> None:
         np.savez(file, anything=table)
     else:
         np.savetxt(file, table, delimiter=",", fmt="%.18e")
-    assert np.array_equal(load_table(file), table)
+    assert np.array_equal(load_table(3, path=file), table)
     cfg = configured("train", "grid.size=3", "kernel=table", f"kernel.path={file}")
-    assert np.array_equal(make_world(cfg).kernel.toarray(), table)
+    assert np.array_equal(build_world(cfg).kernel.toarray(), table)
 
 
 def test_of_many_arrays_the_one_called_kernel_is_read(tmp_path: Path) -> None:
     np.savez(tmp_path / "many.npz", other=np.ones(3), kernel=paper(3))
-    assert np.array_equal(load_table(tmp_path / "many.npz"), paper(3))
+    assert np.array_equal(load_table(3, path=tmp_path / "many.npz"), paper(3))
 
 
 def _trap(file: Path) -> None:
@@ -122,7 +122,7 @@ def test_a_file_that_holds_no_table_is_refused_in_one_line(tmp_path: Path, case:
     name, write, rule = UNREADABLE[case]
     write(tmp_path / name)
     with pytest.raises(UserError) as refused:
-        load_table(tmp_path / name)
+        load_table(3, path=tmp_path / name)
     message = str(refused.value)
     assert "\n" not in message
     assert message.startswith(f"kernel.path={tmp_path / name}: ")
@@ -181,7 +181,7 @@ def test_a_kernel_that_only_claims_to_be_homogeneous_is_refused() -> None:
     with pytest.raises(
         UserError, match=r"kernel=random_support: kernel.homogeneous=true, but from cell \d+ the target"
     ):
-        make_world(configured("train", "kernel.homogeneous=true"))
+        build_world(configured("train", "kernel.homogeneous=true"))
 
 
 def test_one_changed_row_is_found() -> None:

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from tests.helpers import BORDERS, KERNELS, configured
 from tests.world.kernels import paper
-from trackmdp.build import make_world
 from trackmdp.world import kernels
 from trackmdp.world.kernels import drift, random_walk
+from trackmdp.world.make import build_world
 
 
 def window_of(size: int, cell: int, radius: int = 1) -> np.ndarray:
@@ -26,7 +26,7 @@ def window_of(size: int, cell: int, radius: int = 1) -> np.ndarray:
 @pytest.mark.parametrize("name", KERNELS)
 def test_every_kernel_is_a_table_of_probabilities_within_reach(name: str, border: str) -> None:
     words = ("grid.size=6", f"kernel={name}", f"kernel.border={border}", "kernel.exit_probability=0.02")
-    table = make_world(configured("train", *words)).kernel.toarray()
+    table = build_world(configured("train", *words)).kernel.toarray()
     assert table.shape == (36, 36)
     assert table.dtype == np.float64
     assert (table >= 0).all()
@@ -85,7 +85,7 @@ def test_the_kernel_seed_alone_decides_the_random_support() -> None:
     np.random.seed(2)  # noqa: NPY002
     assert np.array_equal(first, paper(seed=3))
     assert not np.array_equal(first, paper(seed=4))
-    world = make_world(configured("train", "grid.size=5", "kernel.seed=3", "seed=17"))
+    world = build_world(configured("train", "grid.size=5", "kernel.seed=3", "seed=17"))
     assert np.array_equal(world.kernel.toarray(), first)
 
 
@@ -196,4 +196,4 @@ def test_all_kernels_are_listed() -> None:
 def test_walks_and_drifts_are_homogeneous_with_every_border(kernel: str, border: str) -> None:
     cfg = configured("train", f"kernel={kernel}", f"kernel.border={border}", "grid.size=6")
     assert cfg.kernel.homogeneous
-    assert make_world(cfg).task.homogeneous
+    assert build_world(cfg).task.homogeneous

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from tests.helpers import small_world
 from tests.tracks import by_hand, drawn, write
 from trackmdp.errors import UserError
-from trackmdp.world.tracks import Tracks, check_tracks, load_tracks, split
+from trackmdp.world.tracks import Tracks, check_tracks, read_tracks, split
 
 
 def same(one: Tracks, other: Tracks) -> bool:
@@ -26,23 +26,23 @@ def same(one: Tracks, other: Tracks) -> bool:
 def test_files_hold_cells_or_rows_and_columns(size: int | None, step: bool, tmp_path: Path) -> None:
     tracks = drawn(small_world().kernel, 20)
     file = write(tmp_path / "t.csv", tracks, size=size, step=step)
-    assert same(load_tracks(file, 3, exits=True), tracks)
+    assert same(read_tracks(file, 3, exits=True), tracks)
     columns = np.genfromtxt(file, delimiter=",", names=True)
     arrays: Any = {name: columns[name].astype(int) for name in columns.dtype.names}
     np.savez(tmp_path / "t.npz", **arrays)
-    assert same(load_tracks(tmp_path / "t.npz", 3, exits=True), tracks)
+    assert same(read_tracks(tmp_path / "t.npz", 3, exits=True), tracks)
 
 
 def test_lines_of_several_tracks_may_be_mixed(tmp_path: Path) -> None:
     file = tmp_path / "t.csv"
     file.write_text("cell, step, track\n4,11,7\n1,-2,-3\n3,10,7\n0,-3,-3\n5,12,7\n")
-    tracks = load_tracks(file, 3, exits=False)
+    tracks = read_tracks(file, 3, exits=False)
     assert tracks.names.tolist() == [-3, 7]
     assert tracks.cells.tolist() == [0, 1, 3, 4, 5]
     assert tracks.first.tolist() == [0, 2, 5]
     assert not tracks.exits.any()
     file.write_text("track,cell\n7,3\n-3,0\n7,4\n-3,1\n7,5\n")
-    assert load_tracks(file, 3, exits=True).cells.tolist() == [0, 1, 3, 4, 5]
+    assert read_tracks(file, 3, exits=True).cells.tolist() == [0, 1, 3, 4, 5]
 
 
 def test_a_file_that_has_changed_is_read_again(tmp_path: Path) -> None:
@@ -51,9 +51,9 @@ def test_a_file_that_has_changed_is_read_again(tmp_path: Path) -> None:
         file.unlink(missing_ok=True)
         file.write_text(f"track,cell\n0,{cell}\n")
         os.utime(file, ns=(cell, cell))
-        assert load_tracks(file, 3, exits=True).cells.tolist() == [cell]
-        assert load_tracks(file, 3, exits=True) is load_tracks(file, 3, exits=True)
-        assert not load_tracks(file, 3, exits=False).exits.any()
+        assert read_tracks(file, 3, exits=True).cells.tolist() == [cell]
+        assert read_tracks(file, 3, exits=True) is read_tracks(file, 3, exits=True)
+        assert not read_tracks(file, 3, exits=False).exits.any()
 
 
 @pytest.mark.parametrize(
@@ -82,7 +82,7 @@ def test_what_is_wrong_is_said_in_one_line(text: str, message: str, tmp_path: Pa
     file = tmp_path / "t.csv"
     file.write_text(text)
     with pytest.raises(UserError) as caught:
-        load_tracks(file, 3, exits=True)
+        read_tracks(file, 3, exits=True)
     assert str(caught.value).startswith(f"kernel.path={file}: {message}")
     assert "\n" not in str(caught.value)
 
@@ -107,7 +107,7 @@ def test_files_that_are_no_columns_are_refused(tmp_path: Path) -> None:
         ("none.csv", "no such file"),
     ):
         with pytest.raises(UserError) as caught:
-            load_tracks(tmp_path / name, 3, exits=True)
+            read_tracks(tmp_path / name, 3, exits=True)
         assert str(caught.value).startswith(f"kernel.path={tmp_path / name}: {message}")
 
 

@@ -122,7 +122,7 @@ def say(line: str) -> None:
 
 def _problem(cfg: WorldConfig) -> Problem:
     """The world or the tracks of `cfg`."""
-    from trackmdp.build import make_problem  # imports scipy, which takes longer than all other checks
+    from trackmdp.world.make import make_problem  # imports scipy, which takes longer than all other checks
 
     return make_problem(cfg)
 

@@ -26,7 +26,7 @@ from trackmdp.config.roots import ROOTS
 from trackmdp.config.tree import build
 from trackmdp.errors import UserError
 
-__all__ = ["compose"]
+__all__ = ["Default", "compose", "default", "given"]
 
 
 def compose(command: str, overrides: Mapping[str, Any] | None = None, *, folder: Path | None = None) -> Any:
@@ -56,6 +56,34 @@ def compose(command: str, overrides: Mapping[str, Any] | None = None, *, folder:
     validate(cfg)
     absolute_paths(cfg, folder or Path.cwd())
     return cfg
+
+
+class Default:
+    """Stands in a signature for a value of `conf/`, which is not written down a second time, and is shown by `help`.
+
+    Args:
+        key: the option, by its dotted name.
+        command: whose config has it.
+    """
+
+    def __init__(self, key: str, command: str = "train") -> None:
+        self.key, self.command = key, command
+
+    def __repr__(self) -> str:
+        value = compose(self.command)
+        for name in self.key.split("."):
+            value = getattr(value, name)
+        return repr(getattr(value, "name", value))
+
+
+def default(key: str, command: str = "train") -> Any:
+    """A `Default`; to a type checker it is of the type of the parameter it stands for."""
+    return Default(key, command)
+
+
+def given(arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """The arguments that are no `Default`."""
+    return {name: value for name, value in arguments.items() if not isinstance(value, Default)}
 
 
 def _chosen(root: Mapping[str, Any], schema: type[Any], typed: Mapping[str, Any]) -> dict[str, str | None]:

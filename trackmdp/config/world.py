@@ -117,7 +117,7 @@ class TableConfig(KernelConfig):
         return f"kernel.path={self.path}"
 
 
-@choice("kernel", "tracks", makes="trackmdp.world.make:make_recorded")
+@choice("kernel", "tracks", makes="trackmdp.world.make:recorded")
 @dataclass(kw_only=True)
 class TracksConfig(KernelConfig):
     """No motion model but recorded tracks: learn from most of them, and judge on those held out."""

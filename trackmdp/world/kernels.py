@@ -74,7 +74,7 @@ def drift(size: int, *, direction: float, persistence: float, exit_probability: 
     return _homogeneous(size, window, weights, exit_probability, border)
 
 
-def load_table(path: str | Path) -> Array:
+def load_table(size: int, *, path: str | Path) -> Array:  # noqa: ARG001  (a table has its own size, checked later)
     """Read a kernel table from a .npy, .npz (its only array, or the one called `kernel`) or .csv file."""
     return read_numbers("kernel.path", path, name="kernel")
 

@@ -16,7 +16,7 @@ from trackmdp.seeding import derive
 from trackmdp.world.files import read_columns
 from trackmdp.world.model import Array, BoolArray, Task, World
 
-__all__ = ["Indices", "Problem", "Recorded", "Tracks", "check_tracks", "load_tracks", "split"]
+__all__ = ["Indices", "Problem", "Recorded", "Tracks", "check_tracks", "read_tracks", "split"]
 
 Indices: TypeAlias = npt.NDArray[np.int64]
 
@@ -135,7 +135,7 @@ Problem: TypeAlias = World | Recorded
 """What learning and evaluation take place in: a world with its motion model, or recorded tracks."""
 
 
-def load_tracks(path: str | Path, size: int, *, exits: bool) -> Tracks:
+def read_tracks(path: str | Path, size: int, *, exits: bool) -> Tracks:
     """Read tracks from a .csv file with a header line, or from arrays of the same names in an .npz file.
 
     The columns are `track` (an integer, the same for all steps of a track), `cell` (or `row` and `column`), and if
@@ -156,7 +156,7 @@ def load_tracks(path: str | Path, size: int, *, exits: bool) -> Tracks:
 
 @lru_cache(maxsize=1)  # a run is checked before its folder is made, and asks again after
 def _load(path: str | Path, size: int, exits: bool, stamp: tuple[int, ...] | None) -> Tracks:  # noqa: ARG001
-    """See `load_tracks`; `stamp` tells the file from what it was before."""
+    """See `read_tracks`; `stamp` tells the file from what it was before."""
     source, columns = f"kernel.path={path}", read_columns("kernel.path", path)
     if set(columns) not in _COLUMNS:
         raise UserError(f"{source}: columns {', '.join(columns)}, expected {_FORMAT}")

@@ -7,7 +7,7 @@ import torch
 
 from tests.helpers import configured
 from trackmdp.app.bench import learned, solver
-from trackmdp.build import make_world
+from trackmdp.world.make import build_world
 
 
 @pytest.mark.slow
@@ -16,7 +16,7 @@ def test_growth_gives_a_row_per_world(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(solver, "SIZES", (3, 4))
     monkeypatch.setattr(solver, "T_MAX", (1,))
     cfg = configured("benchmark", "part=solver")
-    rows = solver.solver(cfg, make_world(cfg), torch.device("cpu"))
+    rows = solver.solver(cfg, build_world(cfg), torch.device("cpu"))
     assert [(row["N"], row["T_max"], row["certified"]) for row in rows] == [(3, 1, True), (4, 1, True)]
     for row in rows:
         assert row["solve_seconds"] > 0
@@ -30,7 +30,7 @@ def test_the_learned_kernel_gives_a_row_per_pair(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(learned, "SUPPORTS", (3, 5))
     monkeypatch.setattr(learned, "COSTS", (0.16,))
     cfg = configured("benchmark", "part=learned_kernel", "seeds=[0,1]")
-    rows = list(learned.learned_kernel(cfg, make_world(cfg), torch.device("cpu")))
+    rows = list(learned.learned_kernel(cfg, build_world(cfg), torch.device("cpu")))
     assert [(row["Z"], row["c"], row["frames"]) for row in rows] == [(3, 0.16, 10_000), (5, 0.16, 10_000)]
     for row in rows:
         assert 0 < row["mean_regret"] <= row["worst_regret"] < 0.1

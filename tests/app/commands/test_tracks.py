@@ -19,7 +19,7 @@ from tests.typed import refused
 from trackmdp.app.cli import main
 from trackmdp.app.commands.train import run
 from trackmdp.config import GROUPS
-from trackmdp.world.tracks import load_tracks, split
+from trackmdp.world.tracks import read_tracks, split
 
 TRACKS = drawn(small_world(exit_probability=0.05).kernel, 60)
 WORDS = ["kernel=tracks", "kernel.path=../tracks.csv", "kernel.min_length=1", "grid.size=3", "quiet=true"]
@@ -72,7 +72,7 @@ def test_the_picture_follows_a_held_out_track(folder: Path) -> None:
         for row in range(3)
         if "●" in frame[row]
     ]
-    held_out = split(load_tracks(folder.parent / "tracks.csv", 3, exits=True), 0.2, 0)[1]
+    held_out = split(read_tracks(folder.parent / "tracks.csv", 3, exits=True), 0.2, 0)[1]
     paths = [held_out.cells[a:b].tolist() for a, b in zip(held_out.first[:-1], held_out.first[1:], strict=True)]
     assert any(path[1:7] == drawn_cells for path in paths)
 
@@ -188,7 +188,7 @@ def test_ends_and_starts_are_options(ends: str, starts: str, folder: Path) -> No
     assert train("a", f"kernel.ends={ends}", f"kernel.starts={starts}", "algo.updates=2") == 0
     summary = json.loads((folder / "a/summary.json").read_text())
     length = summary["policy"]["expected_length"]
-    held_out = split(load_tracks(folder.parent / "tracks.csv", 3, exits=True), 0.2, 0)[1]
+    held_out = split(read_tracks(folder.parent / "tracks.csv", 3, exits=True), 0.2, 0)[1]
     assert length == pytest.approx(held_out.lengths.mean() - (ends == "cut"))
 
 

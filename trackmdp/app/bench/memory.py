@@ -10,9 +10,9 @@ import torch
 
 from trackmdp.app.bench.process import trained
 from trackmdp.app.bench.speed import train_config
-from trackmdp.build import make_world
 from trackmdp.config import BenchmarkConfig
 from trackmdp.training.memory import needs
+from trackmdp.world.make import build_world
 from trackmdp.world.model import World
 
 __all__ = ["memory"]
@@ -25,6 +25,6 @@ def memory(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator
     for algo, size in itertools.product(cfg.algos, SIZES):
         words = [f"algo={algo}", f"grid.size={size}", f"collector.total_frames={FRAMES}", "optimal.enabled=false"]
         train = train_config(words)
-        expected = sum(needs(train, make_world(train).task).values())
+        expected = sum(needs(train, build_world(train).task).values())
         peak = trained(*words, f"threads={cfg.threads}", f"device={device}").usage.peak_mib
         yield {"part": "memory", "algo": algo, "N": size, "expected_mib": expected / 2**20, "peak_mib": peak}

@@ -9,12 +9,12 @@ from typing import Any
 import torch
 
 from trackmdp.app.bench import learned, log, memory, peers, quality, solver, speed
-from trackmdp.build import make_world
 from trackmdp.config import BenchmarkConfig
 from trackmdp.durable import write_json
 from trackmdp.training.devices import make_device
 from trackmdp.training.display import make_console, table
 from trackmdp.training.machine import machine
+from trackmdp.world.make import build_world
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Problem
 
@@ -45,7 +45,7 @@ def run(cfg: BenchmarkConfig, folder: Path, problem: Problem | None = None) -> N
     device = make_device(cfg.device)
     where = machine()
     rows: list[dict[str, Any]] = []
-    world = make_world(cfg) if problem is None else problem
+    world = build_world(cfg) if problem is None else problem
     assert isinstance(world, World)  # recorded tracks are refused
     with console.status(f"measuring {cfg.part}") as status:
         for row in PARTS[cfg.part](cfg, world, device):

@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from trackmdp.app.commands import held_out, playback
 from trackmdp.app.commands.trained import trained
-from trackmdp.build import make_baseline, make_problem
+from trackmdp.build import make_baseline
 from trackmdp.config import EvaluateConfig, McapConfig, PlaybackConfig, RandomKConfig, load_run, to_yaml
 from trackmdp.durable import write_json, write_text
 from trackmdp.episodes.log import EpisodeLog
@@ -29,6 +29,7 @@ from trackmdp.training.devices import make_device
 from trackmdp.training.display import make_console, table
 from trackmdp.training.evaluate import Simulation, simulate
 from trackmdp.training.evaluator import ExactEvaluator, Score, figures
+from trackmdp.world.make import make_problem
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Problem, Recorded
 

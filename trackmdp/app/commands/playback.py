@@ -8,7 +8,6 @@ from pathlib import Path
 import torch
 from rich.console import Console
 
-from trackmdp.build import make_world
 from trackmdp.config import EvaluateConfig, PlaybackConfig
 from trackmdp.durable import write_json
 from trackmdp.episodes.episode import Episode
@@ -18,6 +17,7 @@ from trackmdp.errors import UserError
 from trackmdp.policies import playback
 from trackmdp.training.display import table
 from trackmdp.training.evaluate import simulate
+from trackmdp.world.make import build_world
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Problem
 
@@ -32,7 +32,7 @@ def run(
     Such a policy ignores what it observes, so that it has no chains and no exact value.
     """
     assert isinstance(cfg.baseline, PlaybackConfig)
-    world = make_world(cfg) if problem is None else problem
+    world = build_world(cfg) if problem is None else problem
     assert isinstance(world, World)  # recorded tracks are refused
     with EpisodeReader(cfg.baseline.file) as reader:
         if int(reader.run["size"]) != world.rows:

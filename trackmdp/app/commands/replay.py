@@ -7,7 +7,6 @@ from pathlib import Path
 
 from rich.console import Console
 
-from trackmdp.build import make_world
 from trackmdp.config import ReplayConfig, TableConfig, world_of
 from trackmdp.episodes.layout import write_layout
 from trackmdp.episodes.page import write_page
@@ -19,6 +18,7 @@ from trackmdp.episodes.tables import write_tables
 from trackmdp.episodes.verify import verify
 from trackmdp.errors import RunError, UserError
 from trackmdp.training.display import make_console, table
+from trackmdp.world.make import build_world
 
 __all__ = ["run"]
 
@@ -94,7 +94,7 @@ def _kernel_difference(reader: EpisodeReader) -> str | None:
     cfg = world_of(reader.attachment("config.yaml").decode())
     if isinstance(cfg.kernel, TableConfig) or isinstance(getattr(cfg.cost, "sensor", None), str):
         return None
-    described, logged = make_world(cfg).kernel, reader.world().kernel
+    described, logged = build_world(cfg).kernel, reader.world().kernel
     if described.shape != logged.shape:
         return f"kernel: logged {logged.shape}, the config gives {described.shape}"
     places = (described != logged).tocoo()

@@ -6,7 +6,6 @@ from pathlib import Path
 
 from rich.console import Console
 
-from trackmdp.build import make_world
 from trackmdp.config import ReportConfig
 from trackmdp.durable import write_bytes, write_text
 from trackmdp.paper.openings import compute, load_openings, save_openings
@@ -18,6 +17,7 @@ from trackmdp.reports.grouping import study
 from trackmdp.reports.page import Report, Section, build
 from trackmdp.reports.results import Results, is_stored, load_results, save_results
 from trackmdp.training.display import make_console
+from trackmdp.world.make import build_world
 
 __all__ = ["run"]
 
@@ -37,7 +37,7 @@ def run(cfg: ReportConfig, folder: Path) -> float:
         def say(line: str) -> None:
             status.update(line)
 
-        found = load_results(sweep) if is_stored(sweep) else gather(sweep, make_world)
+        found = load_results(sweep) if is_stored(sweep) else gather(sweep, build_world)
         save_results(found, folder)
         found = load_results(folder)
         _write(build(found, cfg.threshold, _about_the_paper(cfg, sweep, found, folder, say), say), folder)

@@ -10,7 +10,7 @@ from typing import Any
 from rich.console import Console
 
 from trackmdp.app.commands.verify import show_checks, write_checks
-from trackmdp.build import make_baseline, make_world
+from trackmdp.build import make_baseline
 from trackmdp.config import OptimalConfig, SolveConfig
 from trackmdp.durable import write_json
 from trackmdp.errors import UserError
@@ -19,6 +19,7 @@ from trackmdp.solvers.chains import Evaluation, evaluate, regret_per_step, sets_
 from trackmdp.solvers.optimal import Progress, Solution
 from trackmdp.training.display import make_console, table
 from trackmdp.training.evaluator import figures
+from trackmdp.world.make import build_world
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Problem
 
@@ -36,7 +37,7 @@ def run(cfg: SolveConfig, folder: Path, problem: Problem | None = None) -> float
     console = make_console(cfg.quiet)
     if cfg.grid.max_steps is not None:
         raise UserError(f"grid.max_steps={cfg.grid.max_steps}: only whole episodes are solved, expected null")
-    world = make_world(cfg) if problem is None else problem
+    world = build_world(cfg) if problem is None else problem
     assert isinstance(world, World)  # recorded tracks are refused: there is no kernel to solve with
     with _SearchDisplay(console, f"solve {cfg.solver.name}") as display:
         solution = solve_world(cfg, world, display.update)

@@ -6,7 +6,6 @@ from pathlib import Path
 
 from trackmdp.app.commands.held_out import show_held_out
 from trackmdp.app.commands.summary import show
-from trackmdp.build import make_problem
 from trackmdp.config import TrainConfig
 from trackmdp.config.resume import finished
 from trackmdp.errors import RunError
@@ -14,6 +13,7 @@ from trackmdp.training.display import make_console
 from trackmdp.training.lock import locked
 from trackmdp.training.run import complete
 from trackmdp.training.trainer import Trainer
+from trackmdp.world.make import make_problem
 from trackmdp.world.tracks import Problem
 
 __all__ = ["run"]

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import torch
 
-from trackmdp.build import make_problem
 from trackmdp.config import load_run
 from trackmdp.training import checkpoint
 from trackmdp.training.evaluate import chains_of
 from trackmdp.training.make import make_algorithm
+from trackmdp.world.make import make_problem
 from trackmdp.world.model import BoolArray
 from trackmdp.world.tracks import Problem
 

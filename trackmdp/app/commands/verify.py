@@ -9,7 +9,6 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from trackmdp.build import make_world
 from trackmdp.config import VerifyConfig
 from trackmdp.durable import write_json
 from trackmdp.errors import UserError
@@ -17,6 +16,7 @@ from trackmdp.paper import remarks, theorems
 from trackmdp.paper.theorems import Check
 from trackmdp.solvers import optimal
 from trackmdp.training.display import make_console
+from trackmdp.world.make import build_world
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Problem
 
@@ -35,7 +35,7 @@ def run(cfg: VerifyConfig, folder: Path, problem: Problem | None = None) -> floa
     if cfg.grid.max_steps is not None:
         raise UserError(f"grid.max_steps={cfg.grid.max_steps}: theorems are on whole episodes, expected null")
     with console.status("checking the paper's theorems"):
-        world = make_world(cfg) if problem is None else problem
+        world = build_world(cfg) if problem is None else problem
         assert isinstance(world, World)  # recorded tracks are refused
         checks = write_checks(world, cfg.tolerance, folder)
     show_checks(console, checks, folder)

@@ -1,0 +1,179 @@
+"""From names and options, or from a config, to a world or to recorded tracks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from trackmdp.config import WorldConfig
+from trackmdp.config.compose import compose, default, given
+from trackmdp.config.registry import make, maker
+from trackmdp.errors import UserError
+from trackmdp.world import kernels
+from trackmdp.world.checks import canonical_kernel, check_kernel
+from trackmdp.world.files import read_numbers
+from trackmdp.world.model import Array, World
+from trackmdp.world.tracks import Problem, Recorded, check_tracks, read_tracks, split
+
+__all__ = ["build_world", "load_tracks", "make_problem", "make_world", "paper_cost", "recorded"]
+
+
+def make_world(
+    kernel: str = default("kernel"),
+    *,
+    size: int | tuple[int, int] = default("grid.size"),
+    t_max: int = default("grid.t_max"),
+    cost: npt.ArrayLike | str = default("cost.sensor"),
+    safe_cost: float | None = default("cost.safe"),
+    reward: float = default("cost.reward"),
+    max_steps: int | None = default("grid.max_steps"),
+    **kernel_options: Any,
+) -> World:
+    """A world with one of the motion kernels; for a table of your own take `World` itself.
+
+    The defaults are those of `conf/`, and the checks those of the command line.
+
+    Args:
+        kernel: name of the kernel, as in ``trackmdp solve kernel=...``: ``random_support``, ``random_walk``, ``drift``,
+            ``table``, or one of an installed plugin.
+        size: N of an N x N grid, or (rows, columns).
+        t_max: T_max; the controller chooses freely at n = 0 ... t_max.
+        cost: c, the price of one sensor for one step; one number, one per cell, or a file.
+        safe_cost: D; None: the sum of all sensors' prices.
+        reward: r, earned by a detection.
+        max_steps: episodes are truncated after so many steps; None: never.
+        **kernel_options: the kernel's own, such as ``support_size=5`` (``trackmdp solve --help`` lists them).
+
+    Raises:
+        UserError: a name, a type or a range is wrong, or the kernel breaks a rule.
+
+    Example:
+        >>> make_world("drift", size=5, direction=90).num_cells
+        25
+    """
+    of_task = _task_words(size, t_max, cost, safe_cost, reward, max_steps)
+    own = {f"kernel.{name}": value for name, value in kernel_options.items()}
+    return build_world(compose("solve", given({"kernel": kernel}) | of_task | own))
+
+
+def load_tracks(
+    path: str | Path,
+    size: int | tuple[int, int] = default("grid.size"),
+    *,
+    t_max: int = default("grid.t_max"),
+    cost: npt.ArrayLike | str = default("cost.sensor"),
+    safe_cost: float | None = default("cost.safe"),
+    reward: float = default("cost.reward"),
+    max_steps: int | None = default("grid.max_steps"),
+    **track_options: Any,
+) -> Recorded:
+    """Recorded tracks in place of a motion model: most of them to learn from, the others held out to evaluate on.
+
+    Args:
+        path: a .csv or .npz file with columns track, cell (or row, column) and, if wanted, step.
+        size: N of an N x N grid, or (rows, columns).
+        t_max: see `make_world`, as for the following.
+        cost: c.
+        safe_cost: D.
+        reward: r.
+        max_steps: tracks are cut after so many steps; None: never.
+        **track_options: those of ``kernel=tracks``: `ends`, `starts`, `held_out`, `seed`, `min_length`, `markov`.
+
+    Raises:
+        UserError: the file is not of that form, a track is too short, or an option is wrong.
+    """
+    of_task = _task_words(size, t_max, cost, safe_cost, reward, max_steps)
+    own = {f"kernel.{name}": value for name, value in track_options.items()}
+    made = make_problem(compose("train", {"kernel": "tracks", "kernel.path": path} | of_task | own))
+    assert isinstance(made, Recorded)
+    return made
+
+
+def make_problem(cfg: WorldConfig) -> Problem:
+    """The world a config describes, or its recorded tracks.
+
+    Raises:
+        UserError: a file is missing or malformed, or the kernel or a track breaks a rule.
+    """
+    if cfg.kernel.is_motion:
+        return build_world(cfg)
+    tracks: Recorded = make(cfg.kernel, cfg.grid.size, **_of_task(cfg))
+    return tracks
+
+
+def build_world(cfg: WorldConfig) -> World:
+    """The world a config describes.
+
+    Raises:
+        UserError: a file is missing or malformed, or the kernel breaks a rule (`checks.check_kernel`).
+    """
+    size, source = cfg.grid.size, cfg.kernel.source
+    options = dict(vars(cfg.kernel))
+    homogeneous = options.pop("homogeneous")
+    kernel = canonical_kernel(maker(cfg.kernel)(size, **options), source)
+    check_kernel(kernel, (size, size), truncates=cfg.grid.max_steps is not None, source=source)
+    if homogeneous:
+        kernels.check_homogeneous(kernel, size, source)
+    return World(kernel, size, homogeneous=homogeneous, **_of_task(cfg))
+
+
+def recorded(
+    size: int,
+    *,
+    path: str,
+    ends: str,
+    starts: str,
+    held_out: float,
+    seed: int,
+    min_length: int | None,
+    markov: bool,
+    homogeneous: bool,
+    **of_task: Any,
+) -> Recorded:
+    """The recorded tracks in a file, those held out set apart; see `TracksConfig` for the options.
+
+    Raises:
+        UserError: the file is missing or malformed, a track is too short, or one of the two parts would be empty.
+    """
+    tracks = read_tracks(path, size, exits=ends == "exit")
+    shortest = max(min_length or of_task["t_max"] + 3, 1 if ends == "exit" else 2)  # a cut track of one has no step
+    check_tracks(tracks, shortest, f"kernel.path={path}")
+    mine, apart = split(tracks, held_out, seed)
+    assumed = {"markov": markov, "homogeneous": homogeneous, "anywhere": starts == "anywhere"}
+    return Recorded(mine, size, held_out=apart, **assumed, **of_task)
+
+
+def paper_cost(size: int, *, reward: float, sensor: float | list[float] | str, safe: float | None) -> dict[str, Any]:
+    """r, c and D as arguments of `Task`.
+
+    Raises:
+        UserError: a file of prices is missing or malformed, or does not have one price per cell.
+    """
+    return {"reward": reward, "cost": _price_per_cell(sensor, size**2), "safe_cost": safe}
+
+
+def _task_words(size: Any, t_max: Any, cost: Any, safe_cost: Any, reward: Any, max_steps: Any) -> dict[str, Any]:
+    """What was given of a task, by the names of the command line."""
+    grid = {"grid.size": size, "grid.t_max": t_max, "grid.max_steps": max_steps}
+    return given(grid | {"cost.sensor": cost, "cost.safe": safe_cost, "cost.reward": reward})
+
+
+def _of_task(cfg: WorldConfig) -> dict[str, Any]:
+    """Costs and limits of a world config, as arguments of `Task`."""
+    costs: dict[str, Any] = make(cfg.cost, cfg.grid.size)
+    return costs | {"t_max": cfg.grid.t_max, "max_steps": cfg.grid.max_steps}
+
+
+def _price_per_cell(sensor: float | list[float] | str, cells: int) -> Array:
+    if not isinstance(sensor, str):
+        return np.broadcast_to(np.asarray(sensor, dtype=np.float64), (cells,)).copy()
+    price = read_numbers("cost.sensor", sensor, name="cost").ravel()
+    if price.size != cells:
+        raise UserError(f"cost.sensor={sensor}: {price.size} values, expected {cells} (one per cell)")
+    if not (np.isfinite(price) & (price >= 0)).all():
+        bad = int(np.flatnonzero(~(np.isfinite(price) & (price >= 0)))[0])
+        raise UserError(f"cost.sensor={sensor}: cell {bad} costs {price[bad]}, expected a finite number >= 0")
+    return price
