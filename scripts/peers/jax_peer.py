@@ -102,7 +102,11 @@ def collect(env: Env, parameters: Any, states: State, key: jax.Array) -> tuple[S
         action = jax.random.bernoulli(act, jax.nn.sigmoid(logits)).astype(jnp.float32)
         after, reward, exited = jax.vmap(env.step)(jax.random.split(move, ENVS), states, action)
         row = {"shown": shown, "action": action, "log_probability": log_probability(logits, action)}
-        return after, row | {"reward": reward, "goes_on": 1.0 - exited, "value": apply(parameters["critic"], shown)[..., 0]}
+        return after, row | {
+            "reward": reward,
+            "goes_on": 1.0 - exited,
+            "value": apply(parameters["critic"], shown)[..., 0],
+        }
 
     states, rows = jax.lax.scan(step, states, jax.random.split(key, STEPS))
     final = apply(parameters["critic"], jax.vmap(env.observe)(states))[..., 0]
@@ -155,7 +159,11 @@ def main() -> None:
     carry = parameters, optimizer.init(parameters), jax.vmap(env.begin)(jax.random.split(begin, ENVS))
     learn, steps = learner(env, optimizer), 0
     logits = jax.jit(lambda parameters, shown: apply(parameters["actor"], shown))
-    while record.keep(lambda shown: np.asarray(logits(carry[0], shown)) > 0, steps):
+
+    def greedy(shown: np.ndarray) -> np.ndarray:
+        return np.asarray(logits(carry[0], shown)) > 0
+
+    while record.keep(greedy, steps):
         key, now = jax.random.split(key)
         carry = jax.block_until_ready(learn(carry, now))
         steps += UPDATES_A_CALL * ENVS * STEPS

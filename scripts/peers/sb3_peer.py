@@ -1,4 +1,4 @@
-"""PPO of Stable-Baselines3 with an MlpPolicy over M on/off actions, on a VecEnv in numpy that steps all rows at once."""
+"""PPO of Stable-Baselines3: an MlpPolicy over M on/off actions, on a VecEnv in numpy that steps its rows at once."""
 
 from __future__ import annotations
 

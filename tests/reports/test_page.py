@@ -21,7 +21,6 @@ from trackmdp.reports.grouping import study
 from trackmdp.reports.page import Report, build
 from trackmdp.reports.results import Anomaly, Results
 from trackmdp.reports.summaries import groups_table, methods_table
-from trackmdp.world.make import build_world
 
 PAIRS = ((3, 0.22), (5, 0.16), (5, 0.22))
 WRONG = {"a2c": 40, "hindsight": 1}
@@ -36,7 +35,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
             for seed in range(2):
                 words = (f"kernel.support_size={z}", f"algo={algo}")
                 write_run(folder / f"{algo}-{z}-{cost}-{seed}", *words, cost=cost, seed=seed, wrong=wrong)
-    found = gather(folder, build_world)
+    found = gather(folder)
     found.anomalies.append(Anomaly("</script><b>", "cut & gone"))  # type: ignore[attr-defined]
     return found
 
@@ -142,7 +141,7 @@ def test_runs_on_recorded_tracks_have_neither_bound_nor_regret(tmp_path: Path) -
         (place / "summary.json").write_text(json.dumps(summary))
         config = (place / "config.yaml").read_text()
         (place / "config.yaml").write_text(config.replace("name: random_support", "name: tracks"))
-    found = gather(tmp_path, build_world)
+    found = gather(tmp_path)
     assert not found.anomalies
     assert not found.motions
     made = build(found)

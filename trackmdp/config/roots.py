@@ -142,39 +142,26 @@ class VerifyConfig(WorldConfig):
 
 @dataclass(kw_only=True)
 class BenchmarkConfig(WorldConfig):
-    """Measure speed and quality on this machine."""
+    """Measure time and memory on this machine; how good the policies are, sweeps and reports say."""
 
     part: str = option(
         "what is measured",
-        choices=(
-            "env",
-            "collector",
-            "train",
-            "quality",
-            "pairs",
-            "growth",
-            "memory",
-            "peers",
-            "solver",
-            "learned_kernel",
-            "log",
-        ),
+        choices=("env", "collector", "train", "size", "memory", "peers", "log"),
     )
     seed: int = option("every random draw derives from it", ge=0)
     device: str = option("device of environments and networks", expects="cpu, cuda, cuda:N or auto", pattern=DEVICE)
     threads: int = option("torch threads", unit="threads", ge=1, le=256)
     seconds: float = option("least time spent on each figure of speed", unit="s", gt=0)
-    algos: list[str] = option("algorithms that `quality`, `pairs`, `growth` train", choices=tuple(GROUPS["algo"]))
-    seeds: list[int] = option("seeds that they and `peers` train with; `growth`: the first", ge=0)
-    peers: str | None = option(
+    batch_sizes: list[int] = option("`env`: environments stepped together", unit="environments", ge=1)
+    sizes: list[int] = option("`size`: sides of the grid", unit="cells", ge=3)
+    algos: list[str] = option("`memory`: algorithms that train", choices=tuple(GROUPS["algo"]))
+    seeds: list[int] = option("`peers`: seeds that all train with", ge=0)
+    peers: str = option(
         "`peers`: folder with the scripts <name>_peer.py to run beside ours",
         expects="the folder of the scripts",
         path=True,
     )
-    peers_python: list[str] | None = option(
-        "`peers`: the interpreter of each script, in the order of their names; null: this one",
-        expects="a path to a Python interpreter",
-    )
+    peers_seconds: float = option("`peers`: how long a peer learns", unit="s", gt=0)
 
 
 @dataclass(kw_only=True)

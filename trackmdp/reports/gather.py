@@ -6,7 +6,7 @@ import csv
 import dataclasses
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from trackmdp.reports.results import FIGURES, Anomaly, CurvePoint, FinishedRun, 
 from trackmdp.solvers import bounds, horizon, qmdp
 from trackmdp.solvers.chains import evaluate
 from trackmdp.training.folders import FAILED, PLAN, SUMMARY, read_json, run_of
-from trackmdp.world.model import World
+from trackmdp.world.make import build_world
 
 __all__ = ["flatten", "gather", "planned", "run_folders"]
 
@@ -29,12 +29,11 @@ MOST_POINTS = 16
 """Points kept of a learning curve: evenly spaced in the logarithm of the iteration."""
 
 
-def gather(folder: Path, make_world: Callable[[WorldConfig], World]) -> Results:
+def gather(folder: Path) -> Results:
     """Read every run below `folder`.
 
     Args:
         folder: of a sweep, perhaps one that is not done.
-        make_world: builds the world of a config.
 
     Raises:
         UserError: there is no run at all.
@@ -60,7 +59,7 @@ def gather(folder: Path, make_world: Callable[[WorldConfig], World]) -> Results:
     anomalies += [Anomaly(name, "no learning curve") for name, curve in curves.items() if not curve]
     anomalies += _missing_seeds(grouped) if plan is None else []  # a plan says what else there should be
     policies, unread = _policies(folder, grouped)
-    motions, unbuilt = _motions(folder, runs, make_world)
+    motions, unbuilt = _motions(folder, runs)
     manifest = _manifest(plan, summaries)
     return Results(
         runs, {n: c for n, c in curves.items() if c}, policies, motions, anomalies + unread + unbuilt, manifest
@@ -214,9 +213,7 @@ def _policies(folder: Path, grouped: Study) -> tuple[dict[str, policy.Policy], l
     return found, anomalies
 
 
-def _motions(
-    folder: Path, runs: Iterable[FinishedRun], make_world: Callable[[WorldConfig], World]
-) -> tuple[dict[str, Motion], list[Anomaly]]:
+def _motions(folder: Path, runs: Iterable[FinishedRun]) -> tuple[dict[str, Motion], list[Anomaly]]:
     """Motion and references of each world, from the `kernel.npy` of its first run."""
     found: dict[str, Motion] = {}
     seen, anomalies = set[str](), list[Anomaly]()
@@ -227,7 +224,7 @@ def _motions(
         if run.settings["kernel.name"] == "tracks":
             continue  # no motion is known there
         try:
-            world = make_world(_world_config(folder / run.name))
+            world = build_world(_world_config(folder / run.name))
         except UserError as error:
             anomalies.append(Anomaly(run.name, f"its world cannot be built ({error})"))
             continue

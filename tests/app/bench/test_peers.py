@@ -2,74 +2,142 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
+import sys
 from pathlib import Path
+from types import ModuleType
 
+import numpy as np
 import pytest
 
-from trackmdp.app.bench.peers import chart
+from tests.solvers.worlds import paper_world
+from trackmdp.app.bench.peers import Learned, chart
+from trackmdp.app.bench.process import Usage
 from trackmdp.app.cli import main
 
+SCRIPTS = Path(__file__).parents[3] / "scripts/peers"
+
 PEER = """
-import json, sys
-words = dict(zip(sys.argv[1::2], sys.argv[2::2]))
-assert words["--stop-regret"] == "0.02" and words["--algo"] == "ppo" and words["--threads"] == "1"
-assert (words["--z"], words["--c"], words["--t-max"]) == ("4", "0.2", "0")
-rows = [{"seconds": 1.0, "steps": 10, "regret_per_step": 0.5}, {"seconds": 2.0, "steps": 20, "regret_per_step": LAST}]
-json.dump({"final_regret": LAST, "curve": rows}, open(words["--json"], "w"))
+import sys, numpy as np
+instance, record, *words = sys.argv[1:]
+assert dict(zip(words[::2], words[1::2])) == {"--seed": "3", "--seconds": "7.0"}
+at = np.load(instance)
+assert at["kernel"].shape == (25, 25) and (at["cost"] == 0.2).all() and at["t_max"] == 0
+every, none = np.ones((25, 1, 25), bool), np.zeros((25, 1, 25), bool)
+best = (at["kernel"] > 0)[:, None]
+np.savez(record, seconds=[1.0, 2.0, 3.0], steps=[10, 20, 30], sets=[np.packbits(s) for s in (none, every, LAST)])
 print("said to nobody")
 """
 
 
 def peers(folder: Path) -> Path:
     folder.mkdir()
-    (folder / "good_peer.py").write_text(PEER.replace("LAST", "0.01"))
-    (folder / "lost_peer.py").write_text(PEER.replace("LAST", "0.3"))
+    (folder / "good_peer.py").write_text(PEER.replace("LAST", "best"))
+    (folder / "lost_peer.py").write_text(PEER.replace("LAST", "none"))
     (folder / "common.py").write_text("raise SystemExit('not a peer')")
     return folder
 
 
+def learned(*regrets: float) -> Learned:
+    return Learned("a", 0, [(1.0 + at, 10 * at, regret) for at, regret in enumerate(regrets)], Usage(9.0, 9.0, 9.0))
+
+
+def test_settled_is_when_the_regret_stays_at_the_goal_and_first_when_it_was_there_once() -> None:
+    way = learned(0.5, 0.01, 0.3, 0.02, 0.01)
+    assert (way.reached(settled=False), way.reached(settled=True)) == ((2.0, 10), (4.0, 30))
+    assert learned(0.01, 0.03).reached(settled=True) is None
+    assert learned(0.01, 0.03).reached(settled=False) == (1.0, 0)
+    assert learned(0.4).reached(settled=False) is None
+
+
 @pytest.mark.slow
-def test_ours_and_the_peers_take_turns(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    world = ["kernel.support_size=4", "cost.sensor=0.2", "grid.t_max=0"]
-    words = ["part=peers", "seeds=[3]", f"peers={peers(tmp_path / 'peers')}", *world]
+def test_ours_and_the_peers_take_turns_and_are_timed_alike(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    world = ["kernel.support_size=4", "cost.sensor=0.2", "grid.t_max=0", "grid.size=5"]
+    words = ["part=peers", "seeds=[3]", "peers_seconds=7", f"peers={peers(tmp_path / 'peers')}", *world]
     assert main(["benchmark", *words, f"hydra.run.dir={tmp_path}/run"]) == 0
     rows = json.loads((tmp_path / "run" / "benchmark.json").read_text())["rows"]
     assert [(row["learner"].split()[0], row["seed"]) for row in rows] == [("trackmdp", 3), ("good", 3), ("lost", 3)]
     ours, good, lost = rows
-    assert ours["times_our_wall"] == ours["times_our_cpu"] == 1
+    assert ours["times_ours"] == 1
     assert ours["last_regret"] < 0.005 < ours["goal"] == 0.02
-    assert 0 < ours["frames"] <= 300_000
-    assert good["frames"] == 20
-    assert good["times_our_wall"] == pytest.approx(good["wall_seconds"] / ours["wall_seconds"])
-    # Start and end of the process count, which took less than the seconds that the script claims.
-    assert 0 < good["wall_seconds"] < 2 < ours["wall_seconds"]
-    assert good["curve"]["seconds"][-1] == pytest.approx(good["wall_seconds"])
-    assert lost["frames"] is lost["wall_seconds"] is lost["times_our_cpu"] is None
-    assert lost["last_regret"] == 0.3
+    assert ours["first_seconds"] <= ours["settled_seconds"] < ours["wall_seconds"]
+    # its record ends 3 s after learning began, whatever its process took besides
+    assert good["settled_seconds"] == good["first_seconds"] == good["curve"]["seconds"][2]
+    assert np.diff(good["curve"]["seconds"]).tolist() == pytest.approx([1.0, 1.0])
+    assert good["settled_steps"] == 30
+    assert good["curve"]["seconds"][2] == pytest.approx(good["wall_seconds"])
+    assert good["curve"]["regret"][0] > good["curve"]["regret"][1] > 0.5
+    assert lost["settled_seconds"] is lost["settled_steps"] is lost["times_ours"] is None
+    assert lost["last_regret"] == pytest.approx(good["curve"]["regret"][0])
     out = capfd.readouterr().out
     assert "said to nobody" not in out
     assert "t trackmdp hindsight, g good ppo, l lost ppo" in out
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ([], "peers=null: part=peers needs the folder with the peers' scripts"),
-        (["peers={tmp}/none"], "peers={tmp}/none: expected a folder with scripts called <name>_peer.py"),
-        (["peers={tmp}/peers", "peers_python=[python]"], "peers_python: 1 interpreters, expected 2"),
-        (["peers={tmp}/peers", "peers_python=[/no/python,/no/python]"], "peers_python=/no/python: no such file"),
-        (["peers={tmp}/peers", "kernel=random_walk"], "part=peers: the peers know the default kernel"),
-        (["peers={tmp}/peers", "kernel.seed=9"], "part=peers: the peers know the default kernel"),
-    ],
-)
-def test_what_is_missing_is_said(
-    words: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_a_folder_without_peers_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["part=peers", f"peers={tmp_path}", f"hydra.run.dir={tmp_path}/run"]
+    assert main(["benchmark", *words]) == 2
+    assert f"peers={tmp_path}: expected a folder with scripts called <name>_peer.py" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def track() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("track", SCRIPTS / "track.py")
+    assert spec
+    assert spec.loader
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["track"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_peers_instance_moves_the_target_as_the_kernel_does(track: ModuleType, tmp_path: Path) -> None:
+    world = paper_world(5, 0.22, 1)
+    kernel = world.kernel.toarray()
+    np.savez(tmp_path / "at.npz", kernel=kernel, cost=world.cost, safe_cost=world.safe_cost, reward=1.0, t_max=1)
+    at = track.Instance(str(tmp_path / "at.npz"))
+    grid = (np.arange(20_000) + 0.5) / 20_000  # in place of uniform draws
+    for cell in (0, 44, 99):
+        number = (grid[:, None] > at.cumulated[cell]).sum(axis=1)
+        inside = number < at.cumulated.shape[1]
+        found = np.bincount(at.cells[cell, number[inside]], minlength=100) / len(grid)
+        assert found == pytest.approx(kernel[cell], abs=1e-3)
+
+    def greedy(shown: np.ndarray) -> np.ndarray:
+        assert shown.shape == (100, 100 + 3 + 200)
+        rows, missed = shown[:, :100].argmax(axis=1), shown[:, 100:103].argmax(axis=1)
+        first = shown[:, 103:203].astype(bool)
+        near = kernel[rows] > 0
+        return np.where(missed[:, None] == 0, near, ~first)
+
+    sets = at.table(greedy)
+    assert (sets[:, 0] == (kernel > 0)).all()
+    assert (sets[:, 1] == ~sets[:, 0]).all()
+
+
+def test_the_record_leaves_out_what_recording_takes(
+    track: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    peers(tmp_path / "peers")
-    typed = [word.format(tmp=tmp_path) for word in words]
-    assert main(["benchmark", "part=peers", f"hydra.run.dir={tmp_path}/run", *typed]) == 2
-    assert message.format(tmp=tmp_path) in capsys.readouterr().err
+    world = paper_world(5, 0.22, 1)
+    kernel = world.kernel.toarray()
+    np.savez(tmp_path / "at.npz", kernel=kernel, cost=world.cost, safe_cost=22.0, reward=1.0, t_max=1)
+    now = [0.0]
+    monkeypatch.setattr(track.time, "perf_counter", lambda: now[0])
+
+    def slow(shown: np.ndarray) -> np.ndarray:
+        now[0] += 50.0
+        return np.zeros((len(shown), 100), bool)
+
+    record = track.Record(track.Instance(str(tmp_path / "at.npz")), str(tmp_path / "record.npz"), seconds=2.5)
+    steps = 0
+    while record.keep(slow, steps):
+        now[0] += 0.75
+        steps += 1
+    record.save()
+    with np.load(tmp_path / "record.npz", allow_pickle=False) as stored:
+        assert stored["seconds"].tolist() == [0.0, 1.5, 3.0]  # due every second, and at the end
+        assert stored["steps"].tolist() == [0, 2, 4]
 
 
 def test_the_chart_has_a_mark_for_every_point() -> None:

@@ -1,165 +1,140 @@
-"""Beside ours what a user would pick instead: training scripts of others, on the same instance and the same core."""
+"""Beside ours what a user would pick instead: training scripts of others, in the same world and on the same core."""
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
-from trackmdp.app.bench.process import measured, on_one_core, trained
-from trackmdp.config import BenchmarkConfig, PaperCostConfig, RandomSupportConfig
+from trackmdp.app.bench.process import Usage, measured, on_one_core, trained, typed
+from trackmdp.config import BenchmarkConfig
 from trackmdp.errors import UserError
+from trackmdp.training.evaluator import ExactEvaluator
 from trackmdp.world.model import World
 
-__all__ = ["chart", "peers"]
+__all__ = ["Learned", "chart", "peers"]
 
 GOAL = 0.02
-"""Regret per step at which a peer's run ends."""
-BUDGET = 300
-"""Seconds after which it ends anyway."""
+"""Regret per step that the learners are timed to."""
 
 
 @dataclass(frozen=True)
-class Instance:
-    """Of the paper's worlds the one that all learn in."""
-
-    support_size: int
-    cost: float
-    t_max: int
-
-
-@dataclass(frozen=True)
-class Run:
-    """One learner's way to the goal, by the time of its whole process: imports and compilation count."""
+class Learned:
+    """A learner's way: `curve` holds seconds since its process began, env steps, and regret per step."""
 
     learner: str
     seed: int
-    regret: float
-    wall_seconds: float | None
-    cpu_seconds: float | None
-    frames: int | None
-    peak_mib: float
-    curve: list[tuple[float, float]]
+    curve: Sequence[tuple[float, int, float]]
+    usage: Usage
+
+    def reached(self, *, settled: bool) -> tuple[float, int] | None:
+        """Seconds and env steps at which the regret was `GOAL` or less: at first, or `settled` to the end."""
+        within = [regret <= GOAL for _, _, regret in self.curve]
+        places = [place for place, found in enumerate(within) if (all(within[place:]) if settled else found)]
+        return self.curve[places[0]][:2] if places else None
 
 
-def peers(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[dict[str, Any]]:  # noqa: ARG001
+def peers(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[dict[str, Any]]:
     """One row per seed and learner; ours and the peers' take turns on one core.
 
-    The seconds run from the start of the process until the regret per step was `GOAL` or less: of ours until it
-    stayed there, of a peer's until it was there once. Everything else that the process did counts in full.
+    All are timed alike. The clock of a learner runs from the start of its process, imports and compilation included,
+    and every policy on its way is valued exactly, by the same code. Each learns to the end of its budget: ours as its
+    options stand, a peer for `peers_seconds`.
 
-    A peer is a script `<name>_peer.py` in the folder `peers`. It takes `--algo ppo`, the instance (`--z --c --t-max`),
-    `--seed`, `--stop-regret`, `--budget-seconds`, `--threads` and `--json FILE`, and writes `final_regret` and `curve`:
-    rows of `seconds`, `steps`, `regret_per_step`.
+    A peer is a script `<name>_peer.py` in the folder `peers`; `scripts/peers/track.py` says what it is given and what
+    it leaves. It runs under `.venv-<name>/bin/python` of that folder where there is one, else under this interpreter.
 
     Raises:
-        UserError: `peers` is no folder with such scripts, or the world is not one they know.
+        UserError: `peers` is no folder with such scripts.
     """
     scripts = _scripts(cfg)
-    instance = _instance(cfg)
+    evaluator = ExactEvaluator(world)
     runs = []
-    with on_one_core():
+    with on_one_core(), tempfile.TemporaryDirectory() as folder:
+        instance = Path(folder, "instance.npz")
+        np.savez_compressed(
+            instance,
+            kernel=world.kernel.toarray(),
+            cost=world.cost,
+            safe_cost=world.safe_cost,
+            reward=world.reward,
+            t_max=world.t_max,
+        )
         for seed in cfg.seeds:
-            runs.append(_ours(cfg, instance, seed, device))
-            runs += [_peer(script, python, instance, seed, cfg.threads) for script, python in scripts]
-    return [_row(run, _first(runs, run.seed)) for run in runs]
+            runs.append(_ours(cfg, seed, device))
+            runs += [_peer(script, python, instance, seed, cfg, evaluator) for script, python in scripts]
+    return [_row(run, next(each for each in runs if each.seed == run.seed)) for run in runs]
 
 
 def _scripts(cfg: BenchmarkConfig) -> list[tuple[Path, str]]:
-    if cfg.peers is None:
-        raise UserError("peers=null: part=peers needs the folder with the peers' scripts")
-    scripts = sorted(Path(cfg.peers).glob("*_peer.py"))
+    folder = Path(cfg.peers)
+    scripts = sorted(folder.glob("*_peer.py"))
     if not scripts:
         raise UserError(f"peers={cfg.peers}: expected a folder with scripts called <name>_peer.py")
-    pythons = cfg.peers_python or [sys.executable] * len(scripts)
-    if len(pythons) != len(scripts):
-        names = ", ".join(script.name for script in scripts)
-        raise UserError(f"peers_python: {len(pythons)} interpreters, expected {len(scripts)} (for {names})")
-    for python in pythons:
-        if not Path(python).is_file():
-            raise UserError(f"peers_python={python}: no such file, expected a Python interpreter")
-    return list(zip(scripts, pythons, strict=True))
+    own = [folder / f".venv-{script.stem.removesuffix('_peer')}/bin/python" for script in scripts]
+    return [
+        (s, str(python.absolute()) if python.exists() else sys.executable)
+        for s, python in zip(scripts, own, strict=True)
+    ]
 
 
-def _instance(cfg: BenchmarkConfig) -> Instance:
-    kernel, cost = cfg.kernel, cfg.cost
-    z = kernel.support_size if isinstance(kernel, RandomSupportConfig) and kernel.seed == kernel.support_size else None
-    if z is None or not isinstance(cost, PaperCostConfig) or cfg.grid.size != 10:
-        raise UserError("part=peers: the peers know the default kernel on a 10x10 grid with one price for all sensors")
-    return Instance(z, cost.sensor, cfg.grid.t_max)
+def _ours(cfg: BenchmarkConfig, seed: int, device: torch.device) -> Learned:
+    own = [f"seed={seed}", f"threads={cfg.threads}", f"device={device}", "evaluation.every=1", "optimal.enabled=false"]
+    run = trained(*typed("grid", "kernel", "cost"), *own)
+    points = [(float(row["seconds"]), int(row["frames"]), float(row["regret_per_step"])) for row in run.curve]
+    return Learned("trackmdp hindsight", seed, _from_start(points, run.usage), run.usage)
 
 
-def _ours(cfg: BenchmarkConfig, at: Instance, seed: int, device: torch.device) -> Run:
-    world = [f"kernel.support_size={at.support_size}", f"cost.sensor={at.cost}", f"grid.t_max={at.t_max}"]
-    run = trained(*world, f"seed={seed}", f"threads={cfg.threads}", f"device={device}", "evaluation.every=1")
-    reached, curve, usage = run.settled(GOAL), run.curve, run.usage
-    # What came after the goal is known; all else, before the loop and after it, counts.
-    end = float(curve[-1]["seconds"])
-    early = None if reached is None else end - reached
-    frames = next((int(row["frames"]) for row in curve if float(row["seconds"]) == reached), None)
-    start = usage.wall_seconds - end
-    return Run(
-        "trackmdp hindsight",
-        seed,
-        run.summary["regret_per_step"],
-        None if early is None else usage.wall_seconds - early,
-        None if early is None else usage.cpu_seconds * (1 - early / usage.wall_seconds),
-        frames,
-        usage.peak_mib,
-        [(start + float(row["seconds"]), float(row["regret_per_step"])) for row in curve],
-    )
+def _peer(
+    script: Path, python: str, instance: Path, seed: int, cfg: BenchmarkConfig, evaluator: ExactEvaluator
+) -> Learned:
+    record = instance.with_name("record.npz")
+    words = [str(instance), str(record), "--seed", str(seed), "--seconds", str(cfg.peers_seconds)]
+    usage = measured(*words, script=str(script), python=python, quiet=True)
+    task = evaluator.world
+    shape = (task.num_cells, task.num_choices, task.num_cells)
+    with np.load(record, allow_pickle=False) as stored:
+        tables = [np.unpackbits(bits, count=math.prod(shape)).astype(bool).reshape(shape) for bits in stored["sets"]]
+        times, steps = stored["seconds"].tolist(), stored["steps"].tolist()
+    regrets = [evaluator.score(table).regret_per_step for table in tables]
+    points = list(zip(times, steps, regrets, strict=True))
+    return Learned(f"{script.stem.removesuffix('_peer')} ppo", seed, _from_start(points, usage), usage)
 
 
-def _peer(script: Path, python: str, at: Instance, seed: int, threads: int) -> Run:
-    with tempfile.TemporaryDirectory() as folder:
-        file = f"{folder}/peer.json"
-        limits = ["--stop-regret", str(GOAL), "--budget-seconds", str(BUDGET), "--threads", str(threads)]
-        world = ["--z", str(at.support_size), "--c", str(at.cost), "--t-max", str(at.t_max)]
-        words = ["--algo", "ppo", *world, "--seed", str(seed), *limits, "--json", file]
-        usage = measured(*words, script=str(script), python=python, quiet=True)
-        result = json.loads(Path(file).read_text())
-    reached, curve = result["final_regret"] <= GOAL, result["curve"]
-    start = usage.wall_seconds - curve[-1]["seconds"]
-    return Run(
-        f"{script.stem.removesuffix('_peer')} ppo",
-        seed,
-        result["final_regret"],
-        usage.wall_seconds if reached else None,
-        usage.cpu_seconds if reached else None,
-        curve[-1]["steps"] if reached else None,
-        usage.peak_mib,
-        [(start + row["seconds"], row["regret_per_step"]) for row in curve],
-    )
+def _from_start(points: Sequence[tuple[float, int, float]], usage: Usage) -> list[tuple[float, int, float]]:
+    """Seconds of learning as seconds of the process: what it spent outside of learning counts as spent before."""
+    outside = usage.wall_seconds - points[-1][0]
+    return [(outside + seconds, steps, regret) for seconds, steps, regret in points]
 
 
-def _first(runs: list[Run], seed: int) -> Run:
-    """Ours of the same seed."""
-    return next(run for run in runs if run.seed == seed)
+def _row(run: Learned, ours: Learned) -> dict[str, Any]:
+    def seconds(of: Learned, settled: bool) -> float | None:
+        found = of.reached(settled=settled)
+        return None if found is None else found[0]
 
-
-def _row(run: Run, ours: Run) -> dict[str, Any]:
-    def times(mine: float | None, other: float | None) -> float | None:
-        return None if mine is None or other is None else other / mine
-
+    settled = run.reached(settled=True)
+    mine, theirs = seconds(ours, True), seconds(run, True)
     return {
         "part": "peers",
         "learner": run.learner,
         "seed": run.seed,
         "goal": GOAL,
-        "frames": run.frames,
-        "wall_seconds": run.wall_seconds,
-        "cpu_seconds": run.cpu_seconds,
-        "times_our_wall": times(ours.wall_seconds, run.wall_seconds),
-        "times_our_cpu": times(ours.cpu_seconds, run.cpu_seconds),
-        "last_regret": run.regret,
-        "peak_mib": run.peak_mib,
-        "curve": {"seconds": [at for at, _ in run.curve], "regret": [regret for _, regret in run.curve]},
+        "first_seconds": seconds(run, False),
+        "settled_seconds": theirs,
+        "settled_steps": None if settled is None else settled[1],
+        "times_ours": theirs / mine if mine and theirs else None,
+        "last_regret": run.curve[-1][2],
+        "wall_seconds": run.usage.wall_seconds,
+        "cpu_seconds": run.usage.cpu_seconds,
+        "peak_mib": run.usage.peak_mib,
+        "curve": {"seconds": [row[0] for row in run.curve], "regret": [row[2] for row in run.curve]},
     }
 
 

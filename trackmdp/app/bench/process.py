@@ -11,11 +11,13 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-__all__ = ["Trained", "Usage", "measured", "on_one_core", "trained"]
+from hydra.core.hydra_config import HydraConfig
+
+__all__ = ["Trained", "Usage", "measured", "on_one_core", "trained", "typed"]
 
 _WRAPPER = """
 import json, re, resource, runpy, sys
@@ -53,24 +55,6 @@ class Trained:
     curve: list[dict[str, str]]
     usage: Usage
 
-    def settled(self, threshold: float) -> float | None:
-        """Seconds of collecting and learning after which the regret stays below `threshold`; None if it never does."""
-        since = None
-        for row in self.curve:
-            if float(row["regret_per_step"]) > threshold:
-                since = None
-            elif since is None:
-                since = float(row["seconds"])
-        return since
-
-    def figures(self) -> dict[str, float]:
-        """Frames, final regret and usage, as the columns of a table."""
-        return {
-            "frames": self.summary["frames"],
-            "regret_per_step": self.summary["regret_per_step"],
-            **asdict(self.usage),
-        }
-
 
 def measured(*words: str, script: str | None = None, python: str = sys.executable, quiet: bool = False) -> Usage:
     """Run `trackmdp words...`, or `python script words...`, in a process of its own.
@@ -102,6 +86,11 @@ def trained(*words: str) -> Trained:
         with Path(folder, "run", "metrics.csv").open() as stream:
             curve = [row for row in csv.DictReader(stream) if row["regret_per_step"]]
     return Trained(summary, curve, usage)
+
+
+def typed(*keys: str) -> list[str]:
+    """The words typed for this benchmark that are about one of `keys`."""
+    return [word for word in HydraConfig.get().overrides.task if word.lstrip("+").startswith(keys)]
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""`benchmark`: measure speed and quality on this machine."""
+"""`benchmark`: measure what this machine takes: time and memory."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from trackmdp.app.bench import learned, log, memory, peers, quality, solver, speed
+from trackmdp.app.bench import log, memory, peers, size, speed
 from trackmdp.config import BenchmarkConfig
 from trackmdp.durable import write_json
 from trackmdp.training.devices import make_device
@@ -24,13 +24,9 @@ PARTS: dict[str, Callable[[BenchmarkConfig, World, torch.device], Iterable[dict[
     "env": speed.env_speed,
     "collector": speed.collector_speed,
     "train": speed.train_speed,
-    "quality": quality.quality,
-    "pairs": quality.pairs,
-    "growth": quality.growth,
+    "size": size.size,
     "memory": memory.memory,
     "peers": peers.peers,
-    "solver": solver.solver,
-    "learned_kernel": learned.learned_kernel,
     "log": log.log_speed,
 }
 
@@ -55,9 +51,6 @@ def run(cfg: BenchmarkConfig, folder: Path, problem: Problem | None = None) -> N
     shown = [key for key in rows[0] if not isinstance(rows[0][key], dict)]
     title = f"{where['processor']}, {where['cores']} cores, {cfg.threads} torch threads, {device}"
     console.print(table(title, shown, [[_text(row[key]) for key in shown] for row in rows]))
-    if cfg.part == "quality":
-        counted = [[algo, text, str(runs), "#" * runs] for algo, text, runs in quality.histogram(rows)]
-        console.print(table("runs by regret per step", ["algo", "regret", "runs", ""], counted))
     if cfg.part == "peers":
         console.print(peers.chart(rows, cfg.seeds[0]), markup=False, highlight=False)
     console.print(f"results in {folder}")
@@ -66,4 +59,4 @@ def run(cfg: BenchmarkConfig, folder: Path, problem: Problem | None = None) -> N
 def _text(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:,.3g}" if abs(value) < 1000 else f"{value:,.0f}"
-    return "never" if value is None else str(value)
+    return "–" if value is None else str(value)

@@ -17,7 +17,6 @@ from trackmdp.reports.grouping import study
 from trackmdp.reports.page import Report, Section, build
 from trackmdp.reports.results import Results, is_stored, load_results, save_results
 from trackmdp.training.display import make_console
-from trackmdp.world.make import build_world
 
 __all__ = ["run"]
 
@@ -37,7 +36,7 @@ def run(cfg: ReportConfig, folder: Path) -> float:
         def say(line: str) -> None:
             status.update(line)
 
-        found = load_results(sweep) if is_stored(sweep) else gather(sweep, build_world)
+        found = load_results(sweep) if is_stored(sweep) else gather(sweep)
         save_results(found, folder)
         found = load_results(folder)
         _write(build(found, cfg.threshold, _about_the_paper(cfg, sweep, found, folder, say), say), folder)

@@ -1,0 +1,75 @@
+"""Cost by size: whole commands as a user types them, and the table made of them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from trackmdp.app.bench import memory, size
+from trackmdp.app.bench.process import Usage, measured
+from trackmdp.app.cli import main
+
+
+def bench(folder: Path, *words: str) -> list[dict[str, Any]]:
+    assert main(["benchmark", *words, f"hydra.run.dir={folder}"]) == 0
+    rows: list[dict[str, Any]] = json.loads((folder / "benchmark.json").read_text())["rows"]
+    return rows
+
+
+def test_a_process_is_measured_from_start_to_end(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import sys\nblock = b'x' * 300_000_000\nassert sys.argv[1:] == ['a', 'b']\nsum(range(3_000_000))\n"
+    )
+    usage = measured("a", "b", script=str(script))
+    assert usage.peak_mib > 286
+    assert usage.cpu_seconds > 0
+    assert usage.wall_seconds > 0
+
+
+def test_what_was_measured_before_ctrl_c_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stand_in(*words: str) -> Usage:
+        if words[0] == "train":
+            raise KeyboardInterrupt
+        folder = Path(words[-1].partition("=")[2])
+        folder.mkdir()
+        (folder / "solution.json").write_text('{"regret_per_step": 0.25}')
+        assert {"grid.size=12", "grid.t_max=2", "kernel.support_size=4"} <= set(words)
+        return Usage(1.0, 1.0, 1.0)
+
+    monkeypatch.setattr(size, "measured", stand_in)
+    words = ["part=size", "sizes=[12]", "grid.t_max=2", "kernel.support_size=4", "quiet=true"]
+    assert main(["benchmark", *words, f"hydra.run.dir={tmp_path}/b"]) == 130
+    rows = json.loads((tmp_path / "b" / "benchmark.json").read_text())["rows"]
+    assert [(row["N"], row["what"], row["regret_per_step"]) for row in rows] == [
+        (12, "solve, c = 0.16", 0.25),
+        (12, "solve, c = 0.22", 0.25),
+    ]
+
+
+@pytest.mark.slow
+def test_one_table_of_cost_by_size(tmp_path: Path) -> None:
+    rows = bench(tmp_path / "size", "part=size", "sizes=[3]", "seconds=0.05")
+    assert [row["what"] for row in rows][:4] == [
+        "solve, c = 0.16",
+        "solve, c = 0.22",
+        "train hindsight",
+        "env, B = 1024",
+    ]
+    for row in rows[:3]:
+        assert 0 <= row["regret_per_step"] < 0.01
+        assert row["wall_seconds"] > 0.1 < row["cpu_seconds"]
+        assert 20 < row["peak_mib"] < 1500
+    assert rows[3]["per_second"] > 1000
+    assert rows[3]["wall_seconds"] is None
+
+
+@pytest.mark.slow
+def test_memory_beside_what_was_expected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "SIZES", (3,))
+    monkeypatch.setattr(memory, "FRAMES", 20_000)
+    (row,) = bench(tmp_path / "memory", "part=memory", "algos=[dqn]")
+    assert 0 < row["expected_mib"] < row["peak_mib"]
