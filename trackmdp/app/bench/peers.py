@@ -16,6 +16,7 @@ import torch
 from trackmdp.app.bench.process import Usage, measured, on_one_core, trained, typed
 from trackmdp.config import BenchmarkConfig
 from trackmdp.errors import UserError
+from trackmdp.policies.policy import Policy
 from trackmdp.training.evaluator import ExactEvaluator
 from trackmdp.world.model import World
 
@@ -103,7 +104,7 @@ def _peer(
     with np.load(record, allow_pickle=False) as stored:
         tables = [np.unpackbits(bits, count=math.prod(shape)).astype(bool).reshape(shape) for bits in stored["sets"]]
         times, steps = stored["seconds"].tolist(), stored["steps"].tolist()
-    regrets = [evaluator.score(table).regret_per_step for table in tables]
+    regrets = [evaluator.score(Policy.from_dense(task, table)).regret_per_step for table in tables]
     points = list(zip(times, steps, regrets, strict=True))
     return Learned(f"{script.stem.removesuffix('_peer')} ppo", seed, _from_start(points, usage), usage)
 
