@@ -1,3 +1,54 @@
-"""Target tracking with controlled sensing: learn it, solve it, study it (Track-MDP)."""
+"""Target tracking with controlled sensing: learn it, solve it, study it (Track-MDP).
+
+    import trackmdp as tm
+
+    world = tm.make_world("random_support", size=10, cost=0.16)
+    env = tm.TrackEnv(world, 64)
+
+Every name below is imported from its module when it is first used: ``import trackmdp`` loads neither torch nor scipy.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "Policy",
+    "Recorded",
+    "TrackEnv",
+    "World",
+    "load_tracks",
+    "make_world",
+]
+
+_HOMES = {
+    "Policy": "trackmdp.policies.policy",
+    "Recorded": "trackmdp.world.tracks",
+    "TrackEnv": "trackmdp.world.env",
+    "World": "trackmdp.world.model",
+    "load_tracks": "trackmdp.world.make",
+    "make_world": "trackmdp.world.make",
+}
+"""Name -> the module it is defined in."""
+
+if TYPE_CHECKING:  # the same once more, for type checkers and editors, which do not run `__getattr__`
+    from trackmdp.policies.policy import Policy
+    from trackmdp.world.env import TrackEnv
+    from trackmdp.world.make import load_tracks, make_world
+    from trackmdp.world.model import World
+    from trackmdp.world.tracks import Recorded
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name (PEP 562); Python calls this only for names that are not there yet."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found = globals()[name] = getattr(importlib.import_module(_HOMES[name]), name)
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -9,8 +9,10 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
-import torch
+if TYPE_CHECKING:  # a world, whose draws are numpy's, is made without loading torch
+    import torch
 
 __all__ = ["derive", "generator", "seed_global", "preserved_global_rng"]
 
@@ -23,17 +25,23 @@ def derive(seed: int, *names: str | int) -> int:
 
 def generator(seed: int, *names: str | int, device: torch.device | str = "cpu") -> torch.Generator:
     """A fresh `torch.Generator` for the stream called `names`."""
+    import torch
+
     return torch.Generator(device=device).manual_seed(derive(seed, *names))
 
 
 def seed_global(seed: int) -> None:
     """Seed torch's global generator: network initialisation and the sampling inside TorchRL's actors use it."""
+    import torch
+
     torch.manual_seed(derive(seed, "torch"))
 
 
 @contextmanager
 def preserved_global_rng() -> Iterator[None]:
     """Leave torch's global generators as they were, whatever is drawn inside."""
+    import torch
+
     devices = list(range(torch.cuda.device_count())) if torch.cuda.is_available() else []
     with torch.random.fork_rng(devices=devices):
         yield

@@ -38,6 +38,7 @@ class Window(nn.Module):
     _column: Tensor
     _code: Tensor
     _corner: Tensor
+    _cells: Tensor | None
 
     def __init__(
         self, size: Task | int | tuple[int, int], radius: int | None, device: torch.device | str = "cpu"

@@ -1,0 +1,103 @@
+"""`import trackmdp as tm`: light, complete, and the same to a type checker as when run."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import trackmdp as tm
+from trackmdp.errors import UserError
+
+HEAVY = ("torch", "torchrl", "tensordict", "hydra", "omegaconf", "scipy", "numpy")
+
+
+def after(code: str) -> Any:
+    """What a new process leaves in `found` after `code`."""
+    script = f"import json, sys\n{code}\nprint(json.dumps(found))"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def loaded(code: str, *packages: str) -> list[str]:
+    """Which of the packages are loaded after `code`."""
+    return list(after(f"{code}\nfound = [name for name in {packages!r} if name in sys.modules]"))
+
+
+def test_importing_takes_no_time() -> None:
+    # Processor time, which other processes on the machine do not lengthen as they do the time on the clock.
+    code = "import time\nstart = time.process_time()\nimport trackmdp\nfound = time.process_time() - start"
+    assert min(after(code) for _ in range(3)) <= 0.02
+
+
+def test_importing_loads_nothing_heavy() -> None:
+    assert not loaded("import trackmdp", *HEAVY)
+
+
+def test_a_world_needs_neither_torch_nor_hydra() -> None:
+    assert not loaded("import trackmdp as tm\ntm.make_world(size=4)", "torch", "hydra")
+
+
+@pytest.mark.parametrize("name", tm.__all__)
+def test_every_name_is_there_and_says_what_it_is(name: str) -> None:
+    found = getattr(tm, name)
+    assert name in dir(tm)
+    assert inspect.getdoc(found)
+    assert found.__module__ == tm._HOMES[name]
+
+
+def test_type_checkers_see_the_same_names() -> None:
+    tree = ast.parse(Path(tm.__file__).read_text(encoding="utf-8"))
+    (block,) = (node for node in tree.body if isinstance(node, ast.If))
+    seen = {alias.name: node.module for node in block.body if isinstance(node, ast.ImportFrom) for alias in node.names}
+    assert seen == tm._HOMES
+    assert sorted(seen) == sorted(tm.__all__)
+
+
+def test_a_name_that_is_not_there_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="has no attribute 'wrold'"):
+        _ = tm.wrold
+
+
+def test_signatures_show_the_values_of_conf() -> None:
+    shown = str(inspect.signature(tm.make_world))
+    for default in ("'random_support'", "= 10,", "= 1,", "= 0.16,"):
+        assert default in shown
+
+
+def test_a_world_is_that_of_the_command_line() -> None:
+    from tests.helpers import train_config
+    from trackmdp.world.make import make_problem
+
+    world = tm.make_world("drift", size=4, cost=np.linspace(0.1, 0.2, 16), direction=90, max_steps=30)
+    cost = ",".join(str(price) for price in np.linspace(0.1, 0.2, 16))
+    same = make_problem(
+        train_config("kernel=drift", "grid.size=4", f"cost.sensor=[{cost}]", "kernel.direction=90", "grid.max_steps=30")
+    )
+    assert isinstance(same, tm.World)
+    assert (world.kernel != same.kernel).nnz == 0
+    assert np.array_equal(world.cost, same.cost)
+    assert (world.max_steps, world.t_max, world.safe_cost) == (30, 1, same.safe_cost)
+
+
+REFUSED: list[tuple[dict[str, Any], str]] = [
+    ({"size": 2}, "grid.size=2: expected"),
+    ({"kernel": "lvey"}, "kernel=lvey: expected one of random_support"),
+    ({"support_sizee": 3}, "kernel.support_sizee: unknown option, did you mean kernel.support_size?"),
+    ({"cost": [1, 2]}, "cost.sensor: 2 values, expected one number or 100"),
+    ({"t_max": 1.5}, "grid.t_max=1.5: expected an integer"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), REFUSED)
+def test_a_mistake_is_told_as_at_the_terminal(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(UserError) as caught:
+        tm.make_world(**arguments)
+    assert str(caught.value).startswith(message)
