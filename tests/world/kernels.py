@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 
 from trackmdp.world.kernels import random_support
+from trackmdp.world.model import Size
 
 
-def paper(size: int = 5, **changes: Any) -> np.ndarray:
+def paper(size: Size = 5, **changes: Any) -> np.ndarray:
     options: dict[str, Any] = {
         "support_size": 5,
         "radius": 1,
@@ -18,4 +19,4 @@ def paper(size: int = 5, **changes: Any) -> np.ndarray:
         "border": "renormalize",
         "seed": 0,
     }
-    return random_support(size, **(options | changes))
+    return random_support(size, **(options | changes)).toarray()

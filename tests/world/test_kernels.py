@@ -144,7 +144,7 @@ def test_renormalize_stays_where_no_position_is_left() -> None:
 )
 def test_a_corner_row_of_the_random_walk(border: Any, row: dict[int, float]) -> None:
     """Stay 0.2, each of four neighbours 0.2, exit 0.1; from cell 0 two neighbours lie outside."""
-    table = random_walk(3, stay=0.2, diagonal=False, exit_probability=0.1, border=border)
+    table = random_walk(3, stay=0.2, diagonal=False, exit_probability=0.1, border=border).toarray()
     expected = np.zeros(9)
     expected[list(row)] = list(row.values())
     np.testing.assert_allclose(table[0], expected, atol=1e-15)
@@ -152,7 +152,7 @@ def test_a_corner_row_of_the_random_walk(border: Any, row: dict[int, float]) -> 
 
 
 def test_the_diagonal_random_walk_shares_among_eight() -> None:
-    table = random_walk(3, stay=0.2, diagonal=True, exit_probability=0.1, border="exit")
+    table = random_walk(3, stay=0.2, diagonal=True, exit_probability=0.1, border="exit").toarray()
     np.testing.assert_allclose(table[4], [0.09] * 4 + [0.18] + [0.09] * 4)
     np.testing.assert_allclose(table[8], [0, 0, 0, 0, 0.09, 0.09, 0, 0.09, 0.18], atol=1e-15)
 
@@ -168,7 +168,7 @@ def test_the_diagonal_random_walk_shares_among_eight() -> None:
 )
 def test_a_corner_row_of_the_drift(border: Any, row: dict[int, float]) -> None:
     """Heading right with 0.7 from the right end of row 0 (cell 2), each of nine cells 1/30, exit 0.1."""
-    table = drift(3, direction=0, persistence=0.7, exit_probability=0.1, border=border)
+    table = drift(3, direction=0, persistence=0.7, exit_probability=0.1, border=border).toarray()
     expected = np.zeros(9)
     expected[list(row)] = list(row.values())
     np.testing.assert_allclose(table[2], 0.9 * expected, atol=1e-15)
@@ -177,7 +177,7 @@ def test_a_corner_row_of_the_drift(border: Any, row: dict[int, float]) -> None:
 @given(st.floats(0, 359.99))
 def test_the_drift_heads_where_it_is_told(direction: float) -> None:
     """The heading is shared between the two nearest of the eight neighbours, in proportion to the angle."""
-    row = drift(5, direction=direction, persistence=1.0, exit_probability=0.0, border="clip")[12]
+    row = drift(5, direction=direction, persistence=1.0, exit_probability=0.0, border="clip").toarray()[12]
     cells = np.flatnonzero(row)
     assert len(cells) <= 2
     angles = np.degrees(np.arctan2(2 - cells // 5, cells % 5 - 2)) % 360

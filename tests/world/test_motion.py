@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from scipy import sparse, stats
 
 from tests.helpers import random_kernel
+from trackmdp.errors import UserError
 from trackmdp.world.motion import Motion
 
 LARGEST = 1.0 - 2.0**-40
@@ -70,6 +71,26 @@ def test_the_last_cells_of_a_large_grid_are_sampled_as_finely() -> None:
     assert (leaves == m).all()
     assert torch.equal(motion.move(cells, torch.zeros(m, dtype=torch.float64)), cells.flip(0))
     assert (motion.move(cells, torch.full((m,), LARGEST, dtype=torch.float64)) == m).all()
+
+
+def test_a_million_cells_are_sampled_as_finely() -> None:
+    """2^20 cells, each with two successors; the draws next to the edge between them fall on its two sides."""
+    m = 2**20
+    cells, edge = np.arange(m), 0.3
+    table = (np.tile([edge, 0.7 - 1e-6], m), (np.repeat(cells, 2), np.sort([cells, cells ^ 1], axis=0).T.ravel()))
+    motion, some = Motion(sparse.csr_array(table, shape=(m, m))), torch.tensor([0, 5, m // 2, m - 1])
+    first, second = some & ~1, some | 1
+    below, above = np.ceil(edge * 2**40) - 1, np.ceil(edge * 2**40)
+    for draw, expected in ((0, first), (below, first), (above, second)):
+        draws = torch.full((4,), draw / 2**40, dtype=torch.float64)
+        assert torch.equal(motion.move(some, draws), expected)
+    left = torch.full((4,), 1 - 1e-6 + 2.0**-39, dtype=torch.float64)
+    assert (motion.move(some, left) == m).all()
+
+
+def test_more_cells_than_the_line_holds_are_refused() -> None:
+    with pytest.raises(UserError, match="8,388,607 cells, expected at most 8,388,606"):
+        Motion(sparse.csr_array((2**23 - 1, 2**23 - 1)))
 
 
 def test_a_row_that_sums_to_a_little_more_than_one_stays_in_its_row() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from scipy import sparse
 from torch import Tensor
@@ -16,15 +17,21 @@ class BeliefFilter:
     """
 
     def __init__(self, kernel: sparse.csr_array, device: torch.device | str = "cpu") -> None:
-        self.kernel = torch.as_tensor(kernel.toarray(), dtype=torch.float64, device=device)
+        into = sparse.coo_array(kernel.T.tocsr())  # entry (y, x): from x into y; sorted, so that sums have one order
+        places = torch.as_tensor(np.stack([into.row, into.col]).astype(np.int64))
+        values = torch.as_tensor(into.data, dtype=torch.float64)
+        self.num_cells: int = kernel.shape[0]
+        self._into = torch.sparse_coo_tensor(
+            places, values, into.shape, device=device, check_invariants=True
+        ).coalesce()
 
     def detect(self, cell: Tensor) -> Tensor:
         """Certainty after a detection in `cell` `[B]`."""
-        return torch.nn.functional.one_hot(cell, len(self.kernel)).to(self.kernel.dtype)
+        return torch.nn.functional.one_hot(cell, self.num_cells).double()
 
     def predict(self, belief: Tensor) -> Tensor:
         """`[B, M]` predicted probability of each cell after one move; a row sums to the probability of no exit."""
-        return belief @ self.kernel
+        return torch.sparse.mm(self._into, belief.T).T.contiguous()
 
     def miss(self, predicted: Tensor, action: Tensor) -> Tensor:
         """Condition `predicted` `[B, M]` on no detection under `action` `[B, M]` and no exit.

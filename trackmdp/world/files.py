@@ -5,22 +5,26 @@ from __future__ import annotations
 import io
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from scipy import sparse
 
 from trackmdp.arrays import LARGE, load_npy, load_npz, size_of
 from trackmdp.errors import UserError
 from trackmdp.untrusted import decoded, opened
 from trackmdp.world.model import Array
 
-__all__ = ["read_columns", "read_numbers"]
+__all__ = ["csr_of", "read_columns", "read_matrix", "read_numbers"]
 
 _LONGEST_TEXT, _LONGEST_HEAD = 2**30, 2**16
 """Bytes of the longest .csv file, a recording of some eighty million steps, and of its first line."""
+
+
+_CSR = {"data", "indices", "indptr", "shape"}
 
 
 def read_numbers(key: str, path: str | Path, *, name: str) -> Array:
@@ -34,6 +38,42 @@ def read_numbers(key: str, path: str | Path, *, name: str) -> Array:
     if not isinstance(table, np.ndarray) or table.dtype.kind not in "biuf":
         raise UserError(f"{key}={path}: not a table of numbers (but of {getattr(table, 'dtype', type(table))})")
     return table.astype(np.float64)
+
+
+def read_matrix(key: str, path: str | Path, *, name: str) -> sparse.csr_array | Array:
+    """The table in a file of `read_numbers`, or the CSR matrix in an .npz as `scipy.sparse.save_npz` writes it.
+
+    Raises:
+        UserError: there is no such file, or it holds no real numbers, or no matrix.
+    """
+    source, file = f"{key}={path}", Path(path)
+    if file.suffix == ".npz":
+        with _opened(source, file) as stream:
+            arrays = load_npz(stream)
+            if set(arrays) >= _CSR:
+                return csr_of(arrays)
+    return read_numbers(key, path, name=name)
+
+
+def csr_of(arrays: Mapping[str, np.ndarray]) -> sparse.csr_array:
+    """The CSR matrix of float64 with the arrays `data`, `indices`, `indptr` and `shape`.
+
+    Raises:
+        ValueError: they do not fit together; SciPy would read outside its memory.
+    """
+    data, indices, indptr, shape = (np.asarray(arrays[name]) for name in ("data", "indices", "indptr", "shape"))
+    if str(np.asarray(arrays.get("format", "csr")).astype(str)) != "csr":
+        raise ValueError("a sparse matrix of another format than csr")
+    if data.dtype.kind not in "biuf" or any(each.dtype.kind not in "iu" for each in (indices, indptr, shape)):
+        raise ValueError("a sparse matrix of other things than numbers")
+    rows, columns = (int(side) for side in shape)  # ValueError where there are not two
+    if any(each.ndim != 1 for each in (data, indices, indptr)) or len(indptr) != rows + 1 or len(data) != len(indices):
+        raise ValueError("a sparse matrix whose arrays do not fit together")
+    if indptr[0] != 0 or indptr[-1] != len(data) or (np.diff(indptr.astype(np.int64)) < 0).any():
+        raise ValueError("a sparse matrix whose rows do not follow each other")
+    if len(indices) and not 0 <= indices.min() <= indices.max() < columns:
+        raise ValueError("a sparse matrix with an entry outside")
+    return sparse.csr_array((data.astype(np.float64), indices, indptr), shape=(rows, columns))
 
 
 def read_columns(key: str, path: str | Path) -> dict[str, Array]:

@@ -1,6 +1,7 @@
-"""Motion kernels: each function returns one sub-stochastic table, row i summing to 1 - p_exit(i).
+"""Motion kernels: each function returns one sub-stochastic sparse matrix, row i summing to 1 - p_exit(i).
 
-The sampler of the environment is derived from the table (`trackmdp.world.env`); no law is written twice.
+The sampler of the environment is derived from the matrix (`trackmdp.world.motion`); no law is written twice. Time and
+memory follow the number of possible moves: a grid of 256 x 256 with five moves from each cell takes a second and 8 MB.
 """
 
 from __future__ import annotations
@@ -10,19 +11,27 @@ from pathlib import Path
 from typing import Literal, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 from scipy import sparse
 
 from trackmdp.errors import UserError
-from trackmdp.world.files import read_numbers
-from trackmdp.world.model import Array
+from trackmdp.world.checks import canonical_kernel
+from trackmdp.world.files import read_matrix
+from trackmdp.world.model import Array, BoolArray, Size, grid_size
+from trackmdp.world.rows import pairwise_row_sums
 
 __all__ = ["Border", "random_support", "random_walk", "drift", "load_table", "check_homogeneous"]
 
 Border: TypeAlias = Literal["renormalize", "inside", "clip", "exit"]
 
+_Offsets: TypeAlias = npt.NDArray[np.int64]
+
+_CELLS_AT_ONCE = 2**15
+"""Rows made together: what is drawn and thrown away again stays small beside the kernel."""
+
 
 def random_support(
-    size: int,
+    size: Size,
     *,
     support_size: int,
     radius: int,
@@ -30,25 +39,35 @@ def random_support(
     exit_probability: float,
     border: Border,
     seed: int,
-) -> Array:
+) -> sparse.csr_array:
     """The paper's kernel (Section VII): from each cell, Z random positions of the (2·radius+1)² around it.
 
     One position has `low_probability`, the others share the rest equally; the target exits with `exit_probability`.
     With a single position left, that one has all of 1 - exit_probability.
     """
-    window = _window(radius)
-    rng = np.random.default_rng(seed)
-    table = np.zeros((size**2, size**2))
-    for cell in range(size**2):
-        order = rng.permutation(len(window))
+    grid, window, rng = grid_size(size), _window(radius), np.random.default_rng(seed)
+    lows = [_one_low(count, low_probability, exit_probability) for count in range(1, support_size + 1)]
+    weights = np.array([np.pad(low, (0, support_size - len(low))) for low in lows])
+    totals = np.array([low.sum() for low in lows])
+    blocks = []
+    for cells in _blocks(grid):
+        # Each row of `order` is one `rng.permutation` of the window, drawn in the order of the cells.
+        order = rng.permuted(np.tile(np.arange(len(window)), (len(cells), 1)), axis=1)
+        count = np.full(len(cells), support_size)
         if border == "inside":
-            order = order[_in_grid(size, cell, window[order])]
-        chosen = window[order[:support_size]]
-        table[cell] = _place(size, cell, chosen, _one_low(len(chosen), low_probability, exit_probability), border)
-    return table
+            # Only positions in the grid count: they go first, in the order drawn.
+            inside = _in_grid(grid, cells[:, None], window[order])
+            order = np.take_along_axis(order, np.argsort(~inside, axis=1, kind="stable"), axis=1)
+            count = np.minimum(inside.sum(axis=1), support_size)
+        blocks.append(
+            _place(grid, cells, window[order[:, :support_size]], weights[count - 1], totals[count - 1], border)
+        )
+    return canonical_kernel(sparse.vstack(blocks))
 
 
-def random_walk(size: int, *, stay: float, diagonal: bool, exit_probability: float, border: Border) -> Array:
+def random_walk(
+    size: Size, *, stay: float, diagonal: bool, exit_probability: float, border: Border
+) -> sparse.csr_array:
     """A lazy random walk: stay with probability `stay`, else one of the 4 (or, with `diagonal`, 8) neighbours."""
     window = _window(1)
     distance = np.abs(window).sum(axis=1)
@@ -57,7 +76,9 @@ def random_walk(size: int, *, stay: float, diagonal: bool, exit_probability: flo
     return _homogeneous(size, window, weights, exit_probability, border)
 
 
-def drift(size: int, *, direction: float, persistence: float, exit_probability: float, border: Border) -> Array:
+def drift(
+    size: Size, *, direction: float, persistence: float, exit_probability: float, border: Border
+) -> sparse.csr_array:
     """A target that heads one way: it keeps to `direction` (degrees, 0 = right, 90 = up) with `persistence`.
 
     With the rest of the probability it moves to any of the 9 cells around, uniformly. A direction between two of
@@ -74,38 +95,54 @@ def drift(size: int, *, direction: float, persistence: float, exit_probability: 
     return _homogeneous(size, window, weights, exit_probability, border)
 
 
-def load_table(size: int, *, path: str | Path) -> Array:  # noqa: ARG001  (a table has its own size, checked later)
-    """Read a kernel table from a .npy, .npz (its only array, or the one called `kernel`) or .csv file."""
-    return read_numbers("kernel.path", path, name="kernel")
+def load_table(size: Size, *, path: str | Path) -> sparse.csr_array:  # noqa: ARG001  (the file has its own size)
+    """Read a kernel from a .npy, .npz or .csv file.
+
+    An .npz holds one array, or one called `kernel`, or the arrays `data`, `indices`, `indptr` and `shape` of a CSR
+    matrix, as `scipy.sparse.save_npz` writes them.
+
+    Raises:
+        UserError: there is no such file, or it holds no square table of numbers.
+    """
+    return canonical_kernel(read_matrix("kernel.path", path, name="kernel"), f"kernel.path={path}")
 
 
-def check_homogeneous(kernel: sparse.csr_array, size: int, source: str) -> None:
+def check_homogeneous(kernel: sparse.csr_array, size: Size, source: str) -> None:
     """See that the target moves alike from all cells whose moves stay clear of the border.
 
     Raises:
         UserError: from two such cells it does not; `source` is named at the start of the message.
     """
-    cell, (start, end) = np.arange(size**2), kernel.nonzero()
-    row, column = cell // size, cell % size
+    rows, columns = grid_size(size)
+    cell, (start, end) = np.arange(rows * columns), kernel.nonzero()
+    row, column = np.divmod(cell, columns)
     reach = max(np.abs(row[start] - row[end]).max(initial=0), np.abs(column[start] - column[end]).max(initial=0))
-    inner = cell[(np.minimum(row, column) >= reach) & (np.maximum(row, column) < size - reach)]
+    clear = np.minimum(np.minimum(row, rows - 1 - row), np.minimum(column, columns - 1 - column))
+    inner = cell[clear >= reach]
     if not len(inner):
         return
-    around = (np.arange(-reach, reach + 1)[:, None] * size + np.arange(-reach, reach + 1)).ravel()
-    moves = np.asarray(kernel[inner[:, None], inner[:, None] + around].toarray())
-    differs = np.abs(moves - moves[0]).max(axis=1) > 1e-9
-    if differs.any():
-        other = inner[np.flatnonzero(differs)[0]]
+    # Column start - end + M: the same for the same displacement, for away from the border no move wraps around.
+    shift = (end - start) + rows * columns
+    moves = sparse.csr_array((kernel.data, (start, shift)), shape=(len(cell), 2 * rows * columns))[inner]
+    first = sparse.csr_array(np.ones((len(inner), 1))) @ moves[[0]]
+    differs = np.flatnonzero(abs(moves - first).max(axis=1).toarray().ravel() > 1e-9)
+    if len(differs):
         raise UserError(
-            f"{source}: kernel.homogeneous=true, but from cell {other} the target moves otherwise than from cell "
-            f"{inner[0]}; expected alike away from the border"
+            f"{source}: kernel.homogeneous=true, but from cell {inner[differs[0]]} the target moves otherwise than "
+            f"from cell {inner[0]}; expected alike away from the border"
         )
 
 
-def _window(radius: int) -> np.ndarray:
+def _window(radius: int) -> _Offsets:
     """`[(2·radius+1)², 2]` offsets (row, column), row by row."""
     steps = np.arange(-radius, radius + 1)
     return np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def _blocks(grid: tuple[int, int]) -> list[_Offsets]:
+    """All cells in order, some at a time."""
+    m = grid[0] * grid[1]
+    return [np.arange(begin, min(begin + _CELLS_AT_ONCE, m)) for begin in range(0, m, _CELLS_AT_ONCE)]
 
 
 def _one_low(count: int, low: float, exit_probability: float) -> Array:
@@ -116,30 +153,62 @@ def _one_low(count: int, low: float, exit_probability: float) -> Array:
     return np.array([low] + [rest] * (count - 1))
 
 
-def _in_grid(size: int, cell: int, offsets: np.ndarray) -> np.ndarray:
-    position = np.array(divmod(cell, size)) + offsets
-    return ((position >= 0) & (position < size)).all(axis=1)
+def _in_grid(grid: tuple[int, int], cells: npt.NDArray[np.int64], offsets: _Offsets) -> BoolArray:
+    position = np.stack(np.divmod(cells, grid[1]), axis=-1) + offsets
+    inside: BoolArray = np.all((position >= 0) & (position < grid), axis=-1)
+    return inside
 
 
-def _place(size: int, cell: int, offsets: np.ndarray, weights: Array, border: Border) -> Array:
-    """One kernel row: `weights` put at `offsets` around `cell`, what falls outside treated as `border` says.
+def _place(
+    grid: tuple[int, int],
+    cells: npt.NDArray[np.int64],
+    offsets: _Offsets,
+    weights: Array,
+    totals: Array,
+    border: Border,
+) -> sparse.csr_array:
+    """`[B, M]` the kernel rows of `cells` `[B]`: `weights` `[B, K]` put at `offsets` `[B, K, 2]`.
 
-    Where `renormalize` or `inside` leaves no position at all, the target stays.
+    What falls outside is treated as `border` says; with `renormalize` and `inside` a row still sums to its entry of
+    `totals` `[B]`, and where they leave no position at all the target stays.
     """
-    row = np.zeros(size**2)
-    position = np.array(divmod(cell, size)) + offsets
+    position = np.stack(np.divmod(cells, grid[1]), axis=-1)[:, None] + offsets
     if border == "clip":
-        position = position.clip(0, size - 1)
-    inside = ((position >= 0) & (position < size)).all(axis=1)
-    cells = position[inside] @ (size, 1)
-    np.add.at(row, cells, weights[inside])
+        position = position.clip(0, np.array(grid) - 1)
+    inside = ((position >= 0) & (position < grid)).all(axis=-1) & (weights != 0)
+    row = np.nonzero(inside)[0]
+    target = position[inside] @ (grid[1], 1)
+    rows = _summed(row, target, weights[inside], (len(cells), grid[0] * grid[1]))
     if border in ("renormalize", "inside"):
-        if not row.any():
-            row[cell] = 1.0
-        row *= weights.sum() / row.sum()
-    return row
+        empty = np.flatnonzero(np.diff(rows.indptr) == 0)
+        stays = sparse.csr_array((np.ones(len(empty)), (empty, cells[empty])), shape=rows.shape)
+        rows = sparse.csr_array(rows + stays)
+        rows.data *= np.repeat(totals / pairwise_row_sums(rows), np.diff(rows.indptr))
+    return rows
 
 
-def _homogeneous(size: int, window: np.ndarray, weights: Array, exit_probability: float, border: Border) -> Array:
-    scaled = weights * (1.0 - exit_probability)
-    return np.stack([_place(size, cell, window, scaled, border) for cell in range(size**2)])
+def _summed(
+    row: npt.NDArray[np.int64], column: npt.NDArray[np.int64], values: Array, shape: tuple[int, int]
+) -> sparse.csr_array:
+    """The matrix with these entries; entries of one place are added up in the order given."""
+    order = np.lexsort((column, row))  # stable, which `sum_duplicates` of SciPy is not
+    row, column, values = row[order], column[order], values[order]
+    new = np.ones(len(row), dtype=bool)
+    new[1:] = (row[1:] != row[:-1]) | (column[1:] != column[:-1])
+    total = np.zeros(int(new.sum()))
+    np.add.at(total, np.cumsum(new) - 1, values)
+    return sparse.csr_array((total, (row[new], column[new])), shape=shape)
+
+
+def _homogeneous(
+    size: Size, window: _Offsets, weights: Array, exit_probability: float, border: Border
+) -> sparse.csr_array:
+    """The kernel whose rows all have `weights` `[K]` at the offsets `window` `[K, 2]`."""
+    grid, scaled = grid_size(size), weights * (1.0 - exit_probability)
+
+    def rows(cells: npt.NDArray[np.int64]) -> sparse.csr_array:
+        offsets = np.broadcast_to(window, (len(cells), *window.shape))
+        same = np.broadcast_to(scaled, (len(cells), len(window)))
+        return _place(grid, cells, offsets, same, np.full(len(cells), scaled.sum()), border)
+
+    return canonical_kernel(sparse.vstack([rows(cells) for cells in _blocks(grid)]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeAlias
@@ -15,10 +16,13 @@ from trackmdp.errors import UserError
 from trackmdp.world.checks import canonical_kernel, check_kernel
 from trackmdp.world.rows import pairwise_row_sums
 
-__all__ = ["Array", "BoolArray", "Task", "World"]
+__all__ = ["Array", "BoolArray", "Size", "Task", "World", "grid_size"]
 
 Array: TypeAlias = npt.NDArray[np.float64]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
+
+Size: TypeAlias = int | Sequence[int]
+"""A grid as it is asked for: one number for a square, or rows and columns."""
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -57,7 +61,7 @@ class Task:
 
     def __init__(
         self,
-        size: int | tuple[int, int],
+        size: Size,
         *,
         cost: npt.ArrayLike,
         t_max: int,
@@ -139,7 +143,7 @@ class World(Task):
     def __init__(
         self,
         kernel: sparse.sparray | sparse.spmatrix | npt.NDArray[np.generic],
-        size: int | tuple[int, int],
+        size: Size,
         *,
         cost: npt.ArrayLike,
         t_max: int,
@@ -171,8 +175,12 @@ class World(Task):
         return pairwise_row_sums(self.kernel)
 
 
-def grid_size(size: int | tuple[int, int]) -> tuple[int, int]:
-    """(rows, columns) of one number, or of two."""
+def grid_size(size: Size) -> tuple[int, int]:
+    """(rows, columns) of one number, or of two.
+
+    Raises:
+        UserError: these are no whole numbers of at least 1.
+    """
     pair = (size, size) if isinstance(size, (int, np.integer)) else tuple(size)
     if len(pair) != 2 or not all(isinstance(side, (int, np.integer)) and side >= 1 for side in pair):
         raise UserError(f"size={size}: expected an integer >= 1, or two of them, rows and columns")

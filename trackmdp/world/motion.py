@@ -1,41 +1,64 @@
-"""The target's motion as a sampler derived from the kernel table."""
+"""The target's motion as a sampler derived from the kernel."""
 
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from scipy import sparse
 from torch import Tensor
 
+from trackmdp.errors import UserError
+
 __all__ = ["Motion"]
 
-_RESOLUTION = 2**40  # with cell numbers below 2^13, cell + draw is exact in float64
+_RESOLUTION = 2**40
+"""Draws are multiples of 2^-40; no successor is more or less likely than in the kernel by more than that."""
+
+_MOST_CELLS = 2**23 - 2
+"""(M + 1) · 2^40, the end of the line, must be an int64."""
 
 
 class Motion:
     """Samples x_{k+1} ~ P(x_k, ·) for a batch of targets.
 
-    The rows of the table, each closed by the exit, lie end to end on one line: cell x owns [x, x+1). One binary search
-    of x + u therefore finds the successor, whatever the support of the row. The exit is cell number M, and stays there.
+    The rows of the kernel, each closed by the exit, lie end to end on one line of whole numbers: cell x owns
+    [x · 2^40, (x + 1) · 2^40), and of it each successor the share that is its probability. One binary search of
+    x · 2^40 + u · 2^40 therefore finds the successor, whatever the support of the row; being a search among integers it
+    is exact for every cell of a large grid. The exit is cell number M, and stays there.
     """
 
     def __init__(self, kernel: sparse.csr_array, device: torch.device | str = "cpu") -> None:
         m = kernel.shape[0]
-        closed = np.zeros((m + 1, m + 1))
-        closed[:m, :m] = kernel.toarray()
-        closed[:, m] = np.clip(1.0 - closed.sum(axis=1), 0.0, 1.0)
-        rows, successors = np.nonzero(closed)
-        edges = np.minimum(np.cumsum(closed, axis=1)[rows, successors], 1.0)  # a sum may round to more
-        last = np.append(rows[1:] != rows[:-1], True)
-        edges[last] = 1.0
-        self._edges = torch.as_tensor(rows + edges, device=device)
+        if m > _MOST_CELLS:
+            raise UserError(f"kernel: {m:,} cells, expected at most {_MOST_CELLS:,}")
+        ends = _running_sums(kernel)
+        # A successor whose share ends at e is drawn for u < e. With u = k / 2^40 that is k < ceil(e · 2^40), exactly.
+        edges = np.ceil(np.minimum(ends, 1.0) * _RESOLUTION).astype(np.int64)
+        # What is left of 1 is the exit's. A row that reaches 1, up to rounding, leaves nothing.
+        after = np.arange(1, m + 1, dtype=np.int64) * _RESOLUTION
+        edges += np.repeat(after - _RESOLUTION, np.diff(kernel.indptr))
+        closed = np.append(np.insert(edges, kernel.indptr[1:], after), (m + 1) * _RESOLUTION)
+        successors = np.append(np.insert(kernel.indices.astype(np.int64), kernel.indptr[1:], m), m)
+        self._edges = torch.as_tensor(closed, device=device)
         self._successors = torch.as_tensor(successors, device=device)
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
-        """`[count]` uniform draws for `move`."""
+        """`[count]` float64 uniform draws for `move`."""
         draws = torch.randint(_RESOLUTION, (count,), generator=generator, device=self._edges.device)
         return draws.double() / _RESOLUTION
 
     def move(self, cells: Tensor, draws: Tensor) -> Tensor:
         """`[B]` next cells of the targets at `cells` `[B]` under uniform `draws` `[B]`; M means exited."""
-        return self._successors[torch.searchsorted(self._edges, cells + draws, right=True)]
+        place = (draws * _RESOLUTION).long().add_(cells, alpha=_RESOLUTION)
+        return self._successors[torch.searchsorted(self._edges, place, right=True)]
+
+
+def _running_sums(kernel: sparse.csr_array) -> npt.NDArray[np.float64]:
+    """`[nnz]` for each entry the sum of its row up to and with it, added from left to right."""
+    sums, lengths = kernel.data.astype(np.float64), np.diff(kernel.indptr)
+    # One pass for each place in a row: a running sum over all entries at once would round differently in each row.
+    for place in range(1, int(lengths.max(initial=0))):
+        entry = kernel.indptr[:-1][lengths > place] + place
+        sums[entry] += sums[entry - 1]
+    return sums

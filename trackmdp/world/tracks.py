@@ -14,7 +14,7 @@ import numpy.typing as npt
 from trackmdp.errors import UserError
 from trackmdp.seeding import derive
 from trackmdp.world.files import read_columns
-from trackmdp.world.model import Array, BoolArray, Task, World
+from trackmdp.world.model import Array, BoolArray, Size, Task, World, grid_size
 
 __all__ = ["Indices", "Problem", "Recorded", "Tracks", "check_tracks", "read_tracks", "split"]
 
@@ -98,7 +98,7 @@ class Recorded(Task):
     def __init__(
         self,
         tracks: Tracks,
-        size: int | tuple[int, int],
+        size: Size,
         *,
         held_out: Tracks,
         cost: npt.ArrayLike,
@@ -135,7 +135,7 @@ Problem: TypeAlias = World | Recorded
 """What learning and evaluation take place in: a world with its motion model, or recorded tracks."""
 
 
-def read_tracks(path: str | Path, size: int, *, exits: bool) -> Tracks:
+def read_tracks(path: str | Path, size: Size, *, exits: bool) -> Tracks:
     """Read tracks from a .csv file with a header line, or from arrays of the same names in an .npz file.
 
     The columns are `track` (an integer, the same for all steps of a track), `cell` (or `row` and `column`), and if
@@ -143,7 +143,7 @@ def read_tracks(path: str | Path, size: int, *, exits: bool) -> Tracks:
 
     Args:
         path: the file.
-        size: N.
+        size: of the grid, one number for a square.
         exits: whether the target left the grid at the end of each track.
 
     Raises:
@@ -151,11 +151,11 @@ def read_tracks(path: str | Path, size: int, *, exits: bool) -> Tracks:
     """
     file = Path(path)
     stamp = (file.stat().st_mtime_ns, file.stat().st_size, file.stat().st_ino) if file.is_file() else None
-    return _load(path, size, exits, stamp)
+    return _load(path, grid_size(size), exits, stamp)
 
 
 @lru_cache(maxsize=1)  # a run is checked before its folder is made, and asks again after
-def _load(path: str | Path, size: int, exits: bool, stamp: tuple[int, ...] | None) -> Tracks:  # noqa: ARG001
+def _load(path: str | Path, size: tuple[int, int], exits: bool, stamp: tuple[int, ...] | None) -> Tracks:  # noqa: ARG001
     """See `read_tracks`; `stamp` tells the file from what it was before."""
     source, columns = f"kernel.path={path}", read_columns("kernel.path", path)
     if set(columns) not in _COLUMNS:
@@ -216,17 +216,18 @@ def _integers(source: str, name: str, column: Array) -> Indices:
     return column.astype(np.int64)
 
 
-def _cells(source: str, numbers: dict[str, Indices], size: int) -> Indices:
-    limits = {"cell": size**2} if "cell" in numbers else {"row": size, "column": size}
+def _cells(source: str, numbers: dict[str, Indices], size: tuple[int, int]) -> Indices:
+    rows, columns = size
+    limits = {"cell": rows * columns} if "cell" in numbers else {"row": rows, "column": columns}
     for name, limit in limits.items():
         outside = (numbers[name] < 0) | (numbers[name] >= limit)
         if outside.any():
             entry = int(np.flatnonzero(outside)[0])
             raise UserError(
                 f"{source}: {name} of entry {entry + 1} is {numbers[name][entry]}, expected 0 to {limit - 1} on a "
-                f"grid of grid.size={size}"
+                f"grid of {rows}x{columns} cells"
             )
-    return numbers["cell"] if "cell" in numbers else numbers["row"] * size + numbers["column"]
+    return numbers["cell"] if "cell" in numbers else numbers["row"] * columns + numbers["column"]
 
 
 def _check_steps(source: str, track: Indices, step: Indices) -> None:

@@ -16,7 +16,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from trackmdp.world.model import Task, grid_size
+from trackmdp.world.model import Size, Task, grid_size
 
 __all__ = ["Window"]
 
@@ -40,9 +40,7 @@ class Window(nn.Module):
     _corner: Tensor
     _cells: Tensor | None
 
-    def __init__(
-        self, size: Task | int | tuple[int, int], radius: int | None, device: torch.device | str = "cpu"
-    ) -> None:
+    def __init__(self, size: Task | Size, radius: int | None, device: torch.device | str = "cpu") -> None:
         super().__init__()
         self.rows, self.columns = size.size if isinstance(size, Task) else grid_size(size)
         self.num_cells, self.radius = self.rows * self.columns, radius
@@ -67,7 +65,7 @@ class Window(nn.Module):
         return cls(task, task.window, device)
 
     @classmethod
-    def reaching(cls, size: Task | int | tuple[int, int], radius: int, device: torch.device | str = "cpu") -> Window:
+    def reaching(cls, size: Task | Size, radius: int, device: torch.device | str = "cpu") -> Window:
         """A window of that radius, or the whole grid where that has no more cells; holds all cells in reach."""
         rows, columns = size.size if isinstance(size, Task) else grid_size(size)
         return cls((rows, columns), radius if (2 * radius + 1) ** 2 < rows * columns else None, device)
