@@ -37,10 +37,12 @@ def _planners(world: World) -> dict[type[Any], Callable[[Any], np.ndarray]]:
     from trackmdp.solvers import clocked, fcr, lookahead, myopic, optimal, qmdp
 
     return {
-        config.QmdpConfig: lambda c: qmdp.solve(world, in_grid=c.in_grid),
-        config.MyopicConfig: lambda c: myopic.solve(world, threshold=c.threshold),
-        config.ClockedConfig: lambda c: clocked.solve(world),
-        config.FcrConfig: lambda c: fcr.solve(world, in_grid=c.in_grid),
-        config.LookaheadConfig: lambda c: lookahead.solve(world, depth=c.depth, tail=c.tail),
-        config.OptimalConfig: lambda c: optimal.solve(world, time_limit=c.time_limit, tolerance=c.tolerance).chains,
+        config.QmdpConfig: lambda c: qmdp.solve(world, in_grid=c.in_grid).dense(),
+        config.MyopicConfig: lambda c: myopic.solve(world, threshold=c.threshold).dense(),
+        config.ClockedConfig: lambda c: clocked.solve(world).dense(),
+        config.FcrConfig: lambda c: fcr.solve(world, in_grid=c.in_grid).dense(),
+        config.LookaheadConfig: lambda c: lookahead.solve(world, depth=c.depth, tail=c.tail).dense(),
+        config.OptimalConfig: lambda c: optimal.solve(
+            world, time_limit=c.time_limit, tolerance=c.tolerance
+        ).table.dense(),
     }

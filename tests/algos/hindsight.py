@@ -12,7 +12,8 @@ from tests.helpers import algorithm, collect, small_world
 from trackmdp.algos.actor_loss import ActorLoss, Decision, Poisson, PolicyGradient, Surrogate
 from trackmdp.config import ScheduleConfig
 from trackmdp.solvers import optimal
-from trackmdp.solvers.chains import evaluate, regret_per_step
+from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers.evaluation import regret_per_step
 from trackmdp.training.evaluate import chains_of
 from trackmdp.world.model import World
 

@@ -11,7 +11,8 @@ from tests.helpers import algorithm, small_world
 from trackmdp.algos.hindsight import _within
 from trackmdp.errors import UserError
 from trackmdp.solvers import bounds
-from trackmdp.solvers.chains import evaluate, regret_per_step
+from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers.evaluation import regret_per_step
 from trackmdp.world.kernels import random_walk
 from trackmdp.world.model import World
 

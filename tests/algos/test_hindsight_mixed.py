@@ -11,7 +11,8 @@ import torch
 from tests.algos.hindsight import SHORT, SOLVES, assert_same, batches, learn, policy
 from tests.helpers import algorithm, collect, small_world
 from trackmdp.solvers import optimal
-from trackmdp.solvers.chains import evaluate, regret_per_step
+from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers.evaluation import regret_per_step
 
 MIXED = ("algo.collect=mixed", "algo.explore.begin=0.25", "algo.explore.until=0.75", "algo.explore.end=0.1")
 

@@ -9,7 +9,7 @@ import torch
 from tests.helpers import algorithm, collect, hop_world, small_world
 from trackmdp.algos.learned_kernel import observed_paths
 from trackmdp.solvers import optimal
-from trackmdp.solvers.chains import evaluate
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.world.model import World
 
 

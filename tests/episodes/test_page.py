@@ -49,7 +49,7 @@ def test_a_page_holds_the_episode_to_the_digit(reader: EpisodeReader) -> None:
 
 def test_a_page_is_one_small_file_that_asks_for_nothing(tmp_path: Path) -> None:
     world = build_world(train_config())
-    acting = Chains(qmdp.solve(world))
+    acting = Chains(qmdp.solve(world).dense())
     episode = next(each for each in record(world, acting, range(100)) if 100 <= len(each) < 150)
     with EpisodeReader(write(tmp_path / "a.mcap", [episode], acting=acting, world=world)) as reader:
         write_page(reader, tmp_path / "a.html")

@@ -13,7 +13,7 @@ from trackmdp.paper.calibration import Candidate, candidates, chosen, sensitivit
 from trackmdp.paper.printed import PRINTED_QMDP, PRINTED_TMDP
 from trackmdp.paper.worlds import COSTS, SUPPORTS, paper_kernel, paper_world
 from trackmdp.solvers import bounds, qmdp
-from trackmdp.solvers.chains import evaluate
+from trackmdp.solvers.evaluate import evaluate
 
 PAPER = Path(conf_dir()) / "experiment/paper.yaml"
 

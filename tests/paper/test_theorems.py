@@ -11,9 +11,10 @@ from hypothesis import given, settings
 from tests.solvers.worlds import paper_world, tiny_worlds
 from trackmdp.paper import remarks, theorems, worlds
 from trackmdp.paper.theorems import Check
+from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import bounds, clocked, optimal, qmdp
-from trackmdp.solvers.chains import evaluate
-from trackmdp.solvers.optimal import Solution
+from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers.solution import Solution
 from trackmdp.world.kernels import random_walk
 from trackmdp.world.model import BoolArray, World
 
@@ -44,14 +45,14 @@ def test_every_claim_holds_where_beliefs_spread() -> None:
 
 
 def _solution(world: World, chains: BoolArray) -> Solution:
-    value = evaluate(world, chains).value
-    return replace(optimal.solve(world), chains=chains, value=value)
+    table = PolicyTable.from_dense(world, chains)
+    return replace(optimal.solve(world), table=table, evaluation=evaluate(world, table))
 
 
 def test_a_policy_without_the_track_property_is_found_out() -> None:
     """One sensor of the support switched off: p = 0.2113 there, so p r - c p_in = 0.2113 - 0.16 * 0.995."""
     world = paper_world(5, 0.16, 1)
-    chains = optimal.solve(world).chains.copy()
+    chains = optimal.solve(world).table.dense()
     cell = 44
     off = int(np.argmax(world.kernel.toarray()[cell]))
     chains[cell, 0, off] = False
@@ -75,8 +76,8 @@ def test_the_remark_on_worlds_where_qmdp_is_optimal() -> None:
     rows = {row.name: row for row in remarks.check(1e-9)}
     assert rows["remark, c = 0.14, Z = 4"].holds
     world = paper_world(4, 0.14, 1)
-    np.testing.assert_array_equal(qmdp.solve(world)[:, 0], world.kernel.toarray() > 0)
-    assert evaluate(world, optimal.solve(world).chains).accuracy == pytest.approx(1.0)
+    np.testing.assert_array_equal(qmdp.solve(world).dense()[:, 0], world.kernel.toarray() > 0)
+    assert optimal.solve(world).evaluation.accuracy == pytest.approx(1.0)
 
 
 def test_the_printed_bound_is_exceeded() -> None:

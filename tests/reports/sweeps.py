@@ -44,7 +44,7 @@ def write_run(
     cfg.cost.sensor, cfg.seed = cost, seed
     world = build_world(cfg)
     evaluator = ExactEvaluator(world)
-    chains = clocked.solve(world)
+    chains = clocked.solve(world).dense()
     rng = np.random.default_rng(cfg.seed)
     chains.flat[rng.choice(chains.size, wrong, replace=False)] ^= True
     score = evaluator.score(Policy.from_dense(world, chains))

@@ -16,7 +16,7 @@ from trackmdp.reports import policy, results
 from trackmdp.reports.gather import MOST_POINTS, gather
 from trackmdp.reports.results import Results
 from trackmdp.solvers import bounds, qmdp
-from trackmdp.solvers.chains import evaluate
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.training.lock import locked
 from trackmdp.world.make import build_world
 

@@ -14,7 +14,7 @@ from trackmdp.errors import UserError
 from trackmdp.reports import policy
 from trackmdp.reports.policy import Policy
 from trackmdp.solvers import qmdp
-from trackmdp.solvers.chains import evaluate
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.world.model import World
 
 
@@ -28,7 +28,7 @@ def stored(**changed: np.ndarray) -> bytes:
 
 def test_a_policy_is_read_back_as_it_was_written(tmp_path: Path) -> None:
     world = small_world(3, t_max=2)
-    chains = qmdp.solve(world)
+    chains = qmdp.solve(world).dense()
     policy.write(tmp_path / "policy.npz", Policy(chains, evaluate(world, chains).value))
     found = policy.read(tmp_path / "policy.npz")
     assert np.array_equal(found.chains, chains)

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from tests.solvers.worlds import all_chains, paper_world, renewal, tiny_worlds
 from trackmdp.solvers import clocked, fcr, lookahead, optimal, qmdp
 from trackmdp.solvers.bounds import clocked_table
-from trackmdp.solvers.chains import evaluate
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.world.model import World
 
 
@@ -24,11 +24,11 @@ def line_world(price: float, t_max: int) -> World:
 def test_fcr_by_hand() -> None:
     """From 0: step 1 has 0.6 at 1 and 0.3 at 2; step 2 has 0.81 at 3; step 3 has 0.729 at 0, misses or not."""
     chains = fcr.solve(line_world(0.5, 2))
-    assert [np.flatnonzero(on).tolist() for on in chains[0]] == [[1], [3], [0]]
+    assert [np.flatnonzero(on).tolist() for on in chains.dense()[0]] == [[1], [3], [0]]
     chains = fcr.solve(line_world(0.75, 2))
-    assert [np.flatnonzero(on).tolist() for on in chains[0]] == [[], [3], []]
+    assert [np.flatnonzero(on).tolist() for on in chains.dense()[0]] == [[], [3], []]
     in_grid = fcr.solve(line_world(0.75, 2), in_grid=True)
-    assert [np.flatnonzero(on).tolist() for on in in_grid[0]] == [[], [3], [0]]
+    assert [np.flatnonzero(on).tolist() for on in in_grid.dense()[0]] == [[], [3], [0]]
 
 
 def test_fcr_takes_no_notice_of_misses_and_qmdp_does() -> None:
@@ -37,8 +37,8 @@ def test_fcr_takes_no_notice_of_misses_and_qmdp_does() -> None:
     kernel = world.kernel.toarray()
     kernel[1] = [0.0, 0.9, 0.0, 0.0]
     world = World(kernel, 2, cost=world.cost, safe_cost=world.safe_cost, t_max=1)
-    assert np.flatnonzero(fcr.solve(world)[0, 1]).tolist() == [1]
-    assert np.flatnonzero(qmdp.solve(world)[0, 1]).tolist() == [3]
+    assert np.flatnonzero(fcr.solve(world).dense()[0, 1]).tolist() == [1]
+    assert np.flatnonzero(qmdp.solve(world).dense()[0, 1]).tolist() == [3]
 
 
 @settings(max_examples=40)
@@ -62,7 +62,7 @@ def test_sets_ahead_close_the_gap(depth: int, expected: float) -> None:
 
 def test_depth_beyond_the_safe_action_changes_nothing() -> None:
     world = paper_world(5, 0.22, 1)
-    np.testing.assert_array_equal(lookahead.solve(world, depth=2), lookahead.solve(world, depth=9))
+    np.testing.assert_array_equal(lookahead.solve(world, depth=2).dense(), lookahead.solve(world, depth=9).dense())
 
 
 @settings(max_examples=25)
@@ -70,7 +70,7 @@ def test_depth_beyond_the_safe_action_changes_nothing() -> None:
 def test_planning_to_the_safe_action_is_best_for_the_tail_it_counts_on(world: World) -> None:
     """Every pair of sets tried from every cell: none earns more, being located counted as U(j, 0)."""
     table = clocked_table(world).table[:, 0]
-    planned = lookahead.solve(world, depth=world.num_choices)
+    planned = lookahead.solve(world, depth=world.num_choices).dense()
     for x in range(world.num_cells):
         tried = [renewal(world, x, chain) for chain in all_chains(world, x)]
         best = max(earned + float(located @ table) for earned, located in tried)

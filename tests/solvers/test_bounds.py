@@ -15,7 +15,7 @@ from tests.solvers.worlds import (
     tiny_worlds,
 )
 from trackmdp.solvers import bounds, clocked, myopic, qmdp
-from trackmdp.solvers.chains import evaluate
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.world.model import World
 
 
@@ -64,9 +64,9 @@ def test_a_probability_equal_to_the_threshold_is_sensed_whatever_its_rounding() 
     kernel[:, 1], kernel[:, 2] = 0.15, 0.6
     kernel[1, 1] = np.nextafter(0.15, 0)
     world = World(kernel, 2, cost=np.full(4, 0.15), safe_cost=0.6, t_max=0)
-    assert qmdp.solve(world)[:, 0].tolist() == [[False, True, True, False]] * 4
-    assert myopic.solve(world, threshold=0.15)[:, 0].tolist() == [[False, True, True, False]] * 4
-    assert myopic.solve(world, threshold=0.2)[:, 0].tolist() == [[False, False, True, False]] * 4
+    assert qmdp.solve(world).dense()[:, 0].tolist() == [[False, True, True, False]] * 4
+    assert myopic.solve(world, threshold=0.15).dense()[:, 0].tolist() == [[False, True, True, False]] * 4
+    assert myopic.solve(world, threshold=0.2).dense()[:, 0].tolist() == [[False, False, True, False]] * 4
 
 
 def test_the_in_grid_threshold_senses_what_the_printed_one_leaves() -> None:
@@ -74,11 +74,11 @@ def test_the_in_grid_threshold_senses_what_the_printed_one_leaves() -> None:
     kernel = np.zeros((4, 4))
     kernel[:, 0], kernel[:, 1] = 0.4, 0.1
     world = World(kernel, 2, cost=np.full(4, 0.5), safe_cost=2.0, t_max=0)
-    assert qmdp.solve(world).sum() == 0
-    assert qmdp.solve(world, in_grid=True)[:, 0].tolist() == [[True, False, False, False]] * 4
+    assert qmdp.solve(world).dense().sum() == 0
+    assert qmdp.solve(world, in_grid=True).dense()[:, 0].tolist() == [[True, False, False, False]] * 4
 
 
 def test_costs_per_cell_set_the_threshold_per_cell() -> None:
     kernel = np.full((4, 4), 0.2)
     world = World(kernel, 2, cost=np.array([0.1, 0.3, 0.19, 0.21]), safe_cost=1.0, t_max=0)
-    assert qmdp.solve(world)[:, 0].tolist() == [[True, False, True, False]] * 4
+    assert qmdp.solve(world).dense()[:, 0].tolist() == [[True, False, True, False]] * 4

@@ -7,17 +7,18 @@ import numpy as np
 from tests.solvers.worlds import paper_world
 from trackmdp.solvers import optimal, search
 from trackmdp.solvers.branch import Tree
-from trackmdp.solvers.chains import evaluate
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.known import tables
-from trackmdp.solvers.layers import build
+from trackmdp.solvers.layers import reachable_layers
 from trackmdp.solvers.search import InnerProblem
+from trackmdp.solvers.solution import SearchProgress
 
 
 def _tree() -> tuple[Tree, np.ndarray, np.ndarray]:
     """The renewals of the policy that the homotopy finds at Z = 5, c = 0.22, t_max = 2: some can be improved."""
     world = paper_world(5, 0.22, 2)
     value = evaluate(world, search.solve(world)).value
-    problem = InnerProblem.of(world, build(world, 3), value)
+    problem = InnerProblem.of(world, reachable_layers(world, 3), value)
     known = tables(world, problem.detected, problem.missed, 2, slack=1e-9, go_on=lambda _: True)
     tree = Tree(world, problem.detected, known, value, 1e-9)
     closed = Tree(world, problem.detected, known, value, 1e-9)
@@ -46,12 +47,13 @@ def test_improvements_are_the_chains_that_earn_what_is_claimed() -> None:
     tree.run(lambda _: True)
     world = paper_world(5, 0.22, 2)
     detected = world.reward + value
-    assert tree.improvements()
-    for x, left_out in tree.improvements().items():
+    better, left_out = tree.improvements()
+    assert better.any()
+    for x in np.flatnonzero(better):
         mass, worth = np.eye(100)[x], 0.0
         for left in left_out:
             mass = mass @ world.kernel
-            sensed = (mass > 0) & ~np.isin(np.arange(100), list(left))
+            sensed = (mass > 0) & ~left.has(np.full(100, x), np.arange(100))
             worth += float(mass[sensed] @ detected[sensed] - 0.22 * sensed.sum() * mass.sum())
             mass = np.where(sensed, 0.0, mass)
         worth += float((mass @ world.kernel) @ (detected - world.safe_cost))
@@ -65,7 +67,7 @@ def test_a_search_cut_short_keeps_a_bracket_around_the_optimum() -> None:
     for reports in (1, 2, 3):
         left = iter(range(reports))
 
-        def stop(_: optimal.Progress, left: object = left) -> None:
+        def stop(_: SearchProgress, left: object = left) -> None:
             if next(left, None) is None:  # type: ignore[call-overload]
                 raise KeyboardInterrupt
 

@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given, settings
 
 from tests.solvers.worlds import paper_world, tiny_worlds
+from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import estimator, optimal, qmdp
-from trackmdp.solvers.chains import evaluate
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.world.model import BoolArray, World
 
 
@@ -18,15 +19,16 @@ from trackmdp.world.model import BoolArray, World
 @given(tiny_worlds(most_t_max=2))
 def test_the_exact_form_is_the_belief(world: World) -> None:
     solution = optimal.solve(world, tolerance=1e-9, time_limit=20)
-    for estimate in estimator.positions(world, solution.chains, solution.value):
+    for estimate in estimator.positions(world, solution.table, solution.value):
         np.testing.assert_allclose(estimate.exact, estimate.belief, rtol=0, atol=1e-8)
 
 
 @settings(max_examples=25)
 @given(tiny_worlds(most_t_max=1))
 def test_the_belief_is_that_of_all_paths(world: World) -> None:
-    chains = qmdp.solve(world)
-    for estimate in estimator.positions(world, chains, evaluate(world, chains).value):
+    table = qmdp.solve(world)
+    chains = table.dense()
+    for estimate in estimator.positions(world, table, evaluate(world, table).value):
         for x, cell, belief in zip(estimate.rows, estimate.cells, estimate.belief, strict=True):
             assert belief == pytest.approx(_by_paths(world, chains, int(x), estimate.n, int(cell)))
 
@@ -54,14 +56,14 @@ def test_both_forms_by_hand() -> None:
     kernel = np.zeros((4, 4))
     kernel[0, 1], kernel[0, 2] = 0.5, 0.3
     world = World(kernel, 2, cost=np.full(4, 0.9), safe_cost=2.0, t_max=0)
-    chains = np.zeros((4, 1, 4), dtype=bool)
-    (estimate,) = estimator.positions(world, chains, evaluate(world, chains).value)
+    table = PolicyTable.none(world)
+    (estimate,) = estimator.positions(world, table, evaluate(world, table).value)
     assert estimate.rows.tolist() == [0, 0]
     assert estimate.cells.tolist() == [1, 2]
     np.testing.assert_allclose(estimate.belief, [0.5, 0.3])
     np.testing.assert_allclose(estimate.exact, [0.5, 0.3])
     np.testing.assert_allclose(estimate.paper, [0.5 + 0.9 * 0.2, 0.3 + 0.9 * 0.2])
-    scored = estimator.accuracy(world, chains)
+    scored = estimator.accuracy(world, table)
     assert scored.missed_per_episode == pytest.approx(0.25 * 0.8)
     assert scored.bayes == pytest.approx(0.5 / 0.8)
 
@@ -79,5 +81,5 @@ def test_accuracy_on_missed_steps() -> None:
 
 def test_nothing_missed_is_all_right() -> None:
     world = paper_world(5, 0.16, 0)
-    scored = estimator.accuracy(world, np.ones((100, 1, 100), dtype=bool))
+    scored = estimator.accuracy(world, PolicyTable.all_on(world))
     assert (scored.paper, scored.exact, scored.bayes, scored.missed_per_episode) == (1.0, 1.0, 1.0, 0.0)

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from tests.helpers import hop_world, limited, small_world
 from tests.solvers.worlds import tiny_worlds
-from trackmdp.solvers import bounds, chains, horizon
+from trackmdp.solvers import bounds
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.world.model import BoolArray, World
 
 
@@ -42,14 +43,14 @@ def test_value_equals_a_walk_through_every_state(world: World, steps: int, seed:
     shape = (world.num_cells, world.num_choices, world.num_cells)
     sets = np.random.default_rng(seed).random(shape) < 0.5
     expected = [by_recursion(world, sets, start, steps) for start in range(world.num_cells)]
-    np.testing.assert_allclose(horizon.evaluate(limited(world, steps), sets).value, expected, atol=1e-12)
+    np.testing.assert_allclose(evaluate(limited(world, steps), sets).value, expected, atol=1e-12)
 
 
 def test_one_step_by_hand() -> None:
     world = hop_world()
     sets = np.zeros((4, 2, 4), dtype=bool)
     sets[0, 0, 1] = True  # from cell 0 the next cell is sensed, from the others nothing is
-    figures = horizon.evaluate(limited(world, 1), sets)
+    figures = evaluate(limited(world, 1), sets)
     np.testing.assert_allclose(figures.value, [0.75 * (2.0 - 0.2), 0.0, 0.0, 0.0])
     assert figures.expected_length == 1.0
     assert figures.accuracy == pytest.approx(0.25)
@@ -59,26 +60,26 @@ def test_one_step_by_hand() -> None:
 @given(tiny_worlds(), st.integers(0, 2**16))
 def test_long_episodes_have_the_untruncated_figures(world: World, seed: int) -> None:
     sets = np.random.default_rng(seed).random((world.num_cells, world.num_choices, world.num_cells)) < 0.5
-    cut, whole = horizon.evaluate(limited(world, 1500), sets), chains.evaluate(world, sets)
+    cut, whole = evaluate(limited(world, 1500), sets), evaluate(world, sets)
     np.testing.assert_allclose(cut.value, whole.value, rtol=1e-9, atol=1e-9)
     assert cut.expected_length == pytest.approx(whole.expected_length)
     assert cut.safe_per_episode == pytest.approx(whole.safe_per_episode)
-    np.testing.assert_allclose(horizon.clocked(limited(world, 1500)), bounds.clocked(world), rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(horizon.valid(limited(world, 1500)), bounds.valid(world), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(bounds.clocked(limited(world, 1500)), bounds.clocked(world), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(bounds.valid(limited(world, 1500)), bounds.valid(world), rtol=1e-9, atol=1e-9)
 
 
 @settings(max_examples=30, deadline=None)
 @given(tiny_worlds(), st.integers(1, 6), st.integers(0, 2**16))
 def test_no_policy_beats_the_bounds(world: World, steps: int, seed: int) -> None:
     sets = np.random.default_rng(seed).random((world.num_cells, world.num_choices, world.num_cells)) < 0.5
-    value, clocked = horizon.evaluate(limited(world, steps), sets).value, horizon.clocked(limited(world, steps))
+    value, clocked = evaluate(limited(world, steps), sets).value, bounds.clocked(limited(world, steps))
     assert (value <= clocked + 1e-9).all()
-    assert (clocked <= horizon.valid(limited(world, steps)) + 1e-9).all()
+    assert (clocked <= bounds.valid(limited(world, steps)) + 1e-9).all()
 
 
 def test_a_target_that_never_exits() -> None:
     world = small_world(exit_probability=0.0, max_steps=50)
     everything = np.ones((9, 2, 9), dtype=bool)
-    figures = horizon.evaluate(world, everything)
+    figures = evaluate(world, everything)
     assert figures.aihtr == pytest.approx(50 * (1.0 - 9 * 0.2))
     assert figures.expected_length == pytest.approx(50.0)

@@ -15,9 +15,10 @@ from tests.solvers.worlds import (
     tiny_worlds,
 )
 from trackmdp.solvers import bounds, optimal, search
-from trackmdp.solvers.chains import evaluate
-from trackmdp.solvers.layers import build, chains_to_sets, sets_to_chains
+from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers.layers import layer_sets, policy_table, reachable_layers
 from trackmdp.solvers.search import InnerProblem
+from trackmdp.solvers.solution import SearchProgress
 from trackmdp.world.kernels import drift, random_walk
 from trackmdp.world.model import World
 
@@ -27,7 +28,7 @@ def assert_optimal(world: World, best: np.ndarray, tolerance: float = 1e-9) -> N
     scale = 1.0 + np.abs(best).max()
     assert solution.certified
     np.testing.assert_allclose(solution.value, best, rtol=0, atol=2 * tolerance * scale)
-    np.testing.assert_allclose(solution.value, evaluate(world, solution.chains).value, rtol=0, atol=1e-12 * scale)
+    np.testing.assert_allclose(solution.value, evaluate(world, solution.table).value, rtol=0, atol=1e-12 * scale)
     assert (best <= solution.bound + 1e-9 * scale).all()
     assert solution.lower <= solution.upper
 
@@ -36,8 +37,9 @@ def assert_optimal(world: World, best: np.ndarray, tolerance: float = 1e-9) -> N
 def test_reference_values(reference: dict) -> None:
     world = reference_world(reference)
     assert_optimal(world, np.array(reference["optimal_value"]))
-    chains = optimal.solve(world).chains
-    assert evaluate(world, chains).accuracy == pytest.approx(reference["optimal_accuracy"], abs=1e-9)
+    assert evaluate(world, optimal.solve(world).table).accuracy == pytest.approx(
+        reference["optimal_accuracy"], abs=1e-9
+    )
 
 
 @pytest.mark.parametrize(
@@ -72,11 +74,11 @@ def test_every_chain_of_up_to_four_sets_tried(world: World) -> None:
 @settings(max_examples=30)
 @given(tiny_worlds(most_t_max=2))
 def test_the_search_ends_where_no_single_set_can_be_improved(world: World) -> None:
-    chains = search.solve(world)
-    value = evaluate(world, chains).value
-    layers = build(world, world.num_choices)
-    sets = chains_to_sets(layers, chains)
-    np.testing.assert_array_equal(sets_to_chains(world, layers, sets), chains)
+    table = search.solve(world)
+    value = evaluate(world, table).value
+    layers = reachable_layers(world, world.num_choices)
+    sets = layer_sets(layers, table)
+    np.testing.assert_array_equal(policy_table(world, layers, sets).dense(), table.dense())
     problem = InnerProblem.of(world, layers, value)
     located = np.ones(world.num_cells)
     worth = problem.worth(sets, located)
@@ -107,7 +109,7 @@ def test_an_open_bracket_holds_the_optimum() -> None:
 
 
 def test_the_bracket_only_closes_while_the_search_goes_on() -> None:
-    seen: list[optimal.Progress] = []
+    seen: list[SearchProgress] = []
     optimal.solve(paper_world(5, 0.22, 2), on_progress=seen.append)
     lowers, uppers = [step.lower for step in seen], [step.upper for step in seen]
     assert len(seen) >= 3
@@ -116,9 +118,9 @@ def test_the_bracket_only_closes_while_the_search_goes_on() -> None:
 
 
 def test_ctrl_c_keeps_the_bracket() -> None:
-    seen: list[optimal.Progress] = []
+    seen: list[SearchProgress] = []
 
-    def interrupt(step: optimal.Progress) -> None:
+    def interrupt(step: SearchProgress) -> None:
         seen.append(step)
         if len(seen) == 2:
             raise KeyboardInterrupt
@@ -132,7 +134,7 @@ def test_ctrl_c_keeps_the_bracket() -> None:
 
 def test_the_same_world_gives_the_same_policy() -> None:
     first, second = (optimal.solve(paper_world(5, 0.22, 2)) for _ in range(2))
-    np.testing.assert_array_equal(first.chains, second.chains)
+    np.testing.assert_array_equal(first.table.dense(), second.table.dense())
     assert first.nodes == second.nodes
 
 
@@ -170,7 +172,7 @@ def test_numeric_edges(name: str, shape: str) -> None:
     assert solution.certified
     assert (solution.value <= bounds.clocked(world) + 1e-8 * scale).all()
     assert (bounds.clocked(world) <= bounds.valid(world) + 1e-8 * scale).all()
-    np.testing.assert_array_equal(solution.chains, optimal.solve(world, time_limit=20).chains)
+    np.testing.assert_array_equal(solution.table.dense(), optimal.solve(world, time_limit=20).table.dense())
 
 
 def test_a_larger_grid_is_certified() -> None:

@@ -13,11 +13,17 @@ from hypothesis import strategies as st
 from tests.helpers import limited, small_world
 from tests.tracks import by_hand, drawn, recorded
 from trackmdp.policies.fixed import ChainPolicy
-from trackmdp.solvers.chains import evaluate
-from trackmdp.solvers.recorded import replay
+from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers.recorded import ReplayedTracks, replay
 from trackmdp.world.env import TrackEnv
-from trackmdp.world.model import BoolArray
-from trackmdp.world.tracks import Recorded
+from trackmdp.world.model import BoolArray, Task
+from trackmdp.world.tracks import Recorded, Tracks
+
+
+def replayed(task: Task, tracks: Tracks, chains: np.ndarray) -> ReplayedTracks:
+    return replay(task, tracks, PolicyTable.from_dense(task, chains))
+
 
 FIGURES = ("aihtr", "accuracy", "sensors_per_step", "safe_per_episode", "expected_length")
 
@@ -48,14 +54,14 @@ def test_figures_by_hand(
     track: list[int], reward: float, steps: int, detections: int, sensors: int, safe: int, length: int
 ) -> None:
     other = [1, 3]  # a track beside it, which must not count
-    both = replay(recorded(by_hand(track)), by_hand(track, other), CHAINS)
+    both = replayed(recorded(by_hand(track)), by_hand(track, other), CHAINS)
     assert both.totals[0] == pytest.approx([reward, steps, detections, sensors, safe])
     assert both.length.tolist() == [length, 2]
     assert both.totals[1] == pytest.approx([0.6, 1, 1, 2, 0])
 
 
 def test_a_recording_that_stops_has_no_exit_step() -> None:
-    stops = replay(recorded(by_hand([0, 1])), by_hand([0, 1], [0, 1, 4], exits=[False, False]), CHAINS)
+    stops = replayed(recorded(by_hand([0, 1])), by_hand([0, 1], [0, 1, 4], exits=[False, False]), CHAINS)
     assert stops.length.tolist() == [1, 2]
     assert stops.totals[:, 0] == pytest.approx([0.8, 0.4])
 
@@ -89,7 +95,7 @@ def test_figures_are_those_of_the_environment(seed: int, t_max: int, max_steps: 
     tracks = replace(tracks, exits=rng.random(30) < 0.7).select(tracks.lengths > 1)
     setting = replace(recorded(tracks, t_max=t_max), cost=rng.random(9), safe_cost=0.7)
     chains = rng.random((9, t_max + 1, 9)) < density
-    ours = replay(setting, tracks.limited(max_steps), chains)
+    ours = replayed(setting, tracks.limited(max_steps), chains)
     stepped = in_the_environment(setting, chains, max_steps)
     np.testing.assert_allclose(np.column_stack([ours.totals, ours.length]), stepped, rtol=1e-5, atol=1e-5)
 
@@ -100,7 +106,7 @@ def test_the_mean_over_many_tracks_is_the_exact_value() -> None:
     chains = rng.random((9, 3, 9)) < 0.3
     tracks = drawn(world.kernel, 20_000)
     exact = evaluate(world, chains)
-    many = replay(world, tracks, chains)
+    many = replayed(world, tracks, chains)
     ours = many.evaluation(tracks.cells[tracks.first[:-1]], 9)
     for name in FIGURES:
         assert getattr(ours, name) == pytest.approx(getattr(exact, name), rel=0.02)
@@ -115,14 +121,14 @@ def test_intervals_cover_the_exact_value_19_times_of_20() -> None:
     tracks = drawn(world.kernel, 60 * trials)
     for trial in range(trials):
         mine = np.arange(len(tracks)) // 60 == trial
-        for name, interval in replay(world, tracks.select(mine), chains).intervals().items():
+        for name, interval in replayed(world, tracks.select(mine), chains).intervals().items():
             truth = exact.aihtr / exact.expected_length if name == "reward_per_step" else getattr(exact, name)
             covered[name] += interval.low <= truth <= interval.high
     assert all(0.90 * trials < count < 0.985 * trials for count in covered.values()), covered
 
 
 def test_a_single_track_has_no_interval() -> None:
-    alone = replay(recorded(by_hand([0, 1])), by_hand([0, 1]), CHAINS).intervals()
+    alone = replayed(recorded(by_hand([0, 1])), by_hand([0, 1]), CHAINS).intervals()
     assert alone["aihtr"].mean == pytest.approx(0.8)
     assert np.isnan([alone["aihtr"].low, alone["aihtr"].high]).all()
 
@@ -130,6 +136,6 @@ def test_a_single_track_has_no_interval() -> None:
 def test_probabilities_give_the_mean_over_draws() -> None:
     """Half of the time the sensor on 1 is on and finds the target; else it is missed twice and then forced."""
     chains = sensing((0, 0, [1])) * 0.5
-    only = replay(recorded(by_hand([0])), by_hand([0, 1, 1, 1]), chains)
+    only = replayed(recorded(by_hand([0])), by_hand([0, 1, 1, 1]), chains)
     assert only.totals[0] == pytest.approx([0.5 - 0.5 * 0.2 + 0.5 * (1 - 1.8), 3, 0.5 + 0.5, 0.5, 0.5])
     assert only.length[0] == 4

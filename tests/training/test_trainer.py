@@ -11,7 +11,7 @@ import pytest
 from tests.helpers import train_config
 from tests.training.runs import QUICK, rows, train
 from trackmdp.config import CheckpointConfig
-from trackmdp.solvers.chains import evaluate
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.training.evaluator import ExactEvaluator
 from trackmdp.training.saving import Checkpoints
 from trackmdp.training.state import Position

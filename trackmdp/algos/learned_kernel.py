@@ -17,7 +17,7 @@ from trackmdp.config.learned_kernel import LearnedKernelConfig
 from trackmdp.policies.fixed import ChainPolicy
 from trackmdp.seeding import derive
 from trackmdp.solvers import search
-from trackmdp.solvers.chains import evaluate
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.kernel_estimate import KernelEstimate, Paths
 from trackmdp.world.model import Array, BoolArray, Task, World
 
@@ -54,10 +54,10 @@ class LearnedKernel:
             self._estimate.add(observed_paths(batch, self.task.num_cells))
             self._spent += [batch.numel(), _sensors_on(batch)]
         self._estimate.fit(self.cfg.rounds_at_end if self._iteration == self.iterations else self.cfg.rounds)
-        chains = search.solve(self._world(self._estimate.mean()))
+        chains = search.solve(self._world(self._estimate.mean())).dense()
         self.actor.chains.copy_(torch.as_tensor(chains))
         if self._chooses and self._spent[0] >= self._warm_up:
-            drawn = search.solve(self._world(self._estimate.sample(self._rng)))
+            drawn = search.solve(self._world(self._estimate.sample(self._rng))).dense()
             self.policy.chains.copy_(torch.as_tensor(drawn))
         return self._diagnostics(chains)
 

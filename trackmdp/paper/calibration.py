@@ -13,7 +13,7 @@ import numpy as np
 from trackmdp.paper.printed import PRINTED_QMDP
 from trackmdp.paper.worlds import COSTS, SUPPORTS, paper_kernel, paper_world
 from trackmdp.solvers import bounds, qmdp
-from trackmdp.solvers.chains import evaluate
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.world.kernels import Border
 
 __all__ = ["BORDER", "DRAWS", "SEEDS", "T_MAX", "Candidate", "Setting", "Spread", "candidates", "chosen", "sensitivity"]

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from trackmdp.paper.theorems import Check
 from trackmdp.paper.worlds import paper_kernel, paper_world
 from trackmdp.solvers import bounds, clocked, optimal, qmdp
-from trackmdp.solvers.chains import evaluate
+from trackmdp.solvers.evaluate import evaluate
 
 __all__ = ["check"]
 
@@ -22,8 +22,8 @@ def _support(tolerance: float) -> Check:
     world = paper_world(paper_kernel(4, seed=4, border="renormalize"), 0.14, 1)
     support = world.kernel.toarray() > 0
     best, simple = optimal.solve(world), qmdp.solve(world)
-    wrong = sum(int((chains[:, 0] != support).sum()) for chains in (best.chains, simple))
-    missed = 1.0 - evaluate(world, best.chains).accuracy
+    wrong = sum(int((table.dense()[:, 0] != support).sum()) for table in (best.table, simple))
+    missed = 1.0 - best.evaluation.accuracy
     deviation = max(float(wrong), missed)
     statement = "optimum and Q_MDP sense exactly the support, accuracy 100 %: sensors that differ"
     return Check("remark, c = 0.14, Z = 4", statement, deviation, deviation <= tolerance, note="N = 10, t_max 1")

@@ -8,15 +8,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import sparse
 
+from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import bounds, estimator, pomdp, qmdp
 from trackmdp.solvers import optimal as optimum
 from trackmdp.solvers.branch import Tree
-from trackmdp.solvers.chains import Prediction, evaluate, unroll
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.known import tables
-from trackmdp.solvers.layers import Layer, build, chains_to_sets
-from trackmdp.solvers.optimal import Solution
+from trackmdp.solvers.layers import Layer, layer_sets, reachable_layers
+from trackmdp.solvers.prediction import Prediction, unroll
 from trackmdp.solvers.renewal import per_row, row_index
 from trackmdp.solvers.search import InnerProblem
+from trackmdp.solvers.solution import Solution
 from trackmdp.world.model import Array, BoolArray, World
 
 __all__ = ["Check", "check"]
@@ -82,7 +84,7 @@ def _track_property(world: World, solution: Solution) -> Iterator[Check]:
     def follow(seen: Prediction) -> BoolArray:
         nonlocal states
         states += int((seen.before > 0).sum())
-        sensed = solution.chains[seen.rows, seen.n, seen.cells]
+        sensed = solution.table.on(seen.n, seen.rows, seen.cells) > 0
         earned = seen.mass * world.reward
         for which, mass in (("printed", seen.before), ("sharp", seen.inside)):
             gain = (earned - world.cost[seen.cells] * mass[seen.rows]) / seen.before[seen.rows]
@@ -96,8 +98,8 @@ def _track_property(world: World, solution: Solution) -> Iterator[Check]:
 
 
 def _tower_lemma(world: World, solution: Solution) -> Iterator[Check]:
-    layers = build(world, world.num_choices)
-    sets = chains_to_sets(layers, solution.chains)
+    layers = reachable_layers(world, world.num_choices)
+    sets = layer_sets(layers, solution.table)
     problem = InnerProblem.of(world, layers, solution.value)
     later, mass, first = problem.undetected(sets), np.ones(world.num_cells), -np.inf
     second = -np.inf
@@ -113,9 +115,9 @@ def _tower_lemma(world: World, solution: Solution) -> Iterator[Check]:
 
 
 def _one_cell_less(problem: InnerProblem, layer: Layer, later: Array, mass: Array, known: list[Array]) -> float:
-    """Largest loss of the best chain, one missed cell taken out, against the chain going on (by joint probability).
+    """Largest loss of the best plan, one missed cell taken out, against the plan being followed (by joint probability).
 
-    The best chain is searched for anew, from a little below what it has to reach.
+    The best plan is searched for anew, from a little below what it has to reach.
     """
     entries = np.flatnonzero(mass)
     others = [np.setdiff1d(entries[layer.rows[entries] == layer.rows[e]], [e]) for e in entries]
@@ -126,7 +128,7 @@ def _one_cell_less(problem: InnerProblem, layer: Layer, later: Array, mass: Arra
     entry = np.concatenate(others)
     left = sparse.csr_array((mass[entry], (row, layer.cells[entry])), shape=(len(others), problem.world.num_cells))
     going_on = per_row(row, mass[entry] * later[entry], len(others))
-    tree = Tree(problem.world, problem.detected, known, going_on - SEARCHED, SLACK, left)
+    tree = Tree(problem.world, problem.detected, known, going_on - SEARCHED, SLACK, left, windowed=False)
     tree.run(_go_on)
     return float((going_on - tree.best).max())
 
@@ -134,10 +136,10 @@ def _one_cell_less(problem: InnerProblem, layer: Layer, later: Array, mass: Arra
 def _as_pomdp(world: World) -> Check:
     small = _corner(world)
     beliefs = pomdp.solve(small)
-    chains = optimum.solve(small, tolerance=SLACK, time_limit=20.0)
-    statement = "V*_TMDP = V*_POMDP, by chains and over belief states"
+    best = optimum.solve(small, tolerance=SLACK, time_limit=20.0)
+    statement = "V*_TMDP = V*_POMDP, by plans of sets and over belief states"
     note = f"on the {CORNER}x{CORNER} corner, t_max {small.t_max}, {beliefs.beliefs} belief states"
-    return _row("Theorem 2", statement, float(np.abs(beliefs.value - chains.value).max()), note=note)
+    return _row("Theorem 2", statement, float(np.abs(beliefs.value - best.value).max()), note=note)
 
 
 def _corner(world: World) -> World:
@@ -158,10 +160,10 @@ def _corner(world: World) -> World:
 
 
 def _estimator(world: World, solution: Solution) -> Iterator[Check]:
-    estimates = estimator.positions(world, solution.chains, solution.value)
+    estimates = estimator.positions(world, solution.table, solution.value)
     exact = max(float(np.abs(e.exact - e.belief).max(initial=0.0)) for e in estimates)
     paper = max(float(np.abs(e.paper - e.belief).max(initial=0.0)) for e in estimates)
-    scored = estimator.accuracy(world, solution.chains, solution.value)
+    scored = estimator.accuracy(world, solution.table, solution.value)
     yield _row("Theorem 3, exact form", "the estimate from Q is the belief", exact)
     note = f"argmax right on {scored.paper:.2%} of missed steps, the belief's on {scored.bayes:.2%}"
     statement = "the printed form is the belief (it takes W = V and charges the exit step)"
@@ -172,9 +174,9 @@ def _qmdp_derivation(world: World) -> Iterator[Check]:
     for in_grid, threshold in ((False, "c/r"), (True, "c p_in / r")):
         policy, worst = qmdp.solve(world, in_grid=in_grid), -np.inf
 
-        def follow(seen: Prediction, policy: BoolArray = policy, in_grid: bool = in_grid) -> BoolArray:
+        def follow(seen: Prediction, policy: PolicyTable = policy, in_grid: bool = in_grid) -> BoolArray:
             nonlocal worst
-            sensed = policy[seen.rows, seen.n, seen.cells]
+            sensed = policy.on(seen.n, seen.rows, seen.cells) > 0
             charged = (seen.inside if in_grid else seen.before)[seen.rows]
             gain = (seen.mass * world.reward - world.cost[seen.cells] * charged) / seen.before[seen.rows]
             worst = max(worst, float(np.where(sensed, -gain, gain).max(initial=-np.inf)))

@@ -1,6 +1,6 @@
 """The one policy: which sensors are on n misses after the target was located in x, as a table or as one number.
 
-After a miss the next state is known in advance (theory: `solvers/chains.py`), so a deterministic policy of a Track-MDP
+After a miss the next state is known in advance (`solvers/evaluate.py`), so a deterministic policy of a Track-MDP
 is one open-loop plan per located cell: the sets sensed at n = 0 ... t_max misses, followed until the next detection.
 All plans together are a sparse matrix with a row per pair (x, n) and a column per sensor.
 """
@@ -171,9 +171,7 @@ def as_policy(task: Task, policy: PolicyLike, *, device: torch.device | str | No
         UserError: it draws at random, belongs to another grid, or is not of these forms.
     """
     if isinstance(policy, Policy):
-        if (policy.task.num_cells, policy.task.t_max) != (task.num_cells, task.t_max):
-            theirs, ours = (f"{each.num_cells} cells, t_max {each.t_max}" for each in (policy.task, task))
-            raise UserError(f"policy: made for {theirs}; expected {ours}")
+        policy.check_fits(task)
         return policy
     if isinstance(policy, PolicyTable):
         return as_policy(task, Policy(policy.task, policy.sets, probability=policy.probability))

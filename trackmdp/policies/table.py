@@ -93,6 +93,16 @@ class PolicyTable:
         row = np.repeat(np.arange(self.sets.shape[0], dtype=np.int64), np.diff(self.sets.indptr))
         return np.append(row * self.task.num_cells + self.sets.indices, np.iinfo(np.int64).max)
 
+    def check_fits(self, task: Task) -> None:
+        """Refuse a task of another grid or t_max.
+
+        Raises:
+            UserError: it is.
+        """
+        if (self.task.num_cells, self.task.t_max) != (task.num_cells, task.t_max):
+            theirs, ours = (f"{each.num_cells} cells, t_max {each.t_max}" for each in (self.task, task))
+            raise UserError(f"policy: made for {theirs}; expected {ours}")
+
     def dense(self) -> BoolArray:
         """`[M, t_max + 1, M]`, the sets of a deterministic policy; M² (t_max + 1) bytes, so for small worlds alone.
 

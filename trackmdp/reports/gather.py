@@ -18,8 +18,8 @@ from trackmdp.errors import UserError
 from trackmdp.reports import policy
 from trackmdp.reports.grouping import Study, study, world_key
 from trackmdp.reports.results import FIGURES, Anomaly, CurvePoint, FinishedRun, Motion, Results
-from trackmdp.solvers import bounds, horizon, qmdp
-from trackmdp.solvers.chains import evaluate
+from trackmdp.solvers import bounds, qmdp
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.training.folders import FAILED, PLAN, SUMMARY, read_json, run_of
 from trackmdp.world.make import build_world
 
@@ -228,10 +228,7 @@ def _motions(folder: Path, runs: Iterable[FinishedRun]) -> tuple[dict[str, Motio
         except UserError as error:
             anomalies.append(Anomaly(run.name, f"its world cannot be built ({error})"))
             continue
-        whole, simple = world.max_steps is None, qmdp.solve(world)
-        value = evaluate(world, simple) if whole else horizon.evaluate(world, simple)
-        bound = bounds.clocked(world) if whole else horizon.clocked(world)
-        found[run.name] = Motion(world.kernel, value.value, bound)
+        found[run.name] = Motion(world.kernel, evaluate(world, qmdp.solve(world)).value, bounds.clocked(world))
     return found, anomalies
 
 

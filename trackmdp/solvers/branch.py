@@ -25,12 +25,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import sparse
 
-from trackmdp.solvers.renewal import IndexArray, per_row, row_index, row_sums
+from trackmdp.solvers.layers import within_window
+from trackmdp.solvers.renewal import IndexArray, per_row, row_index
 from trackmdp.world.model import Array, BoolArray, World
 
-__all__ = ["Tree"]
+__all__ = ["LeftOut", "Tree"]
 
 LARGEST_BATCH = 4096
+FORBIDDEN = 1e30
 MOST_PAIRED = 10
 """Cells of one state up to which every pair is looked at for a better bound."""
 
@@ -84,6 +86,31 @@ class _Choices:
         return self.frontier.start[self.state]
 
 
+@dataclass(frozen=True)
+class LeftOut:
+    """Cells left unsensed at one step, of the problems that have a better plan.
+
+    Attributes:
+        keys: sorted x · M + j of each problem x and cell j.
+        num_cells: M.
+    """
+
+    keys: IndexArray
+    num_cells: int
+
+    @classmethod
+    def of(cls, cells: dict[int, IndexArray], world: World) -> LeftOut:
+        """From the cells of each problem."""
+        keys = [x * world.num_cells + left.astype(np.int64) for x, left in cells.items()]
+        return cls(np.sort(np.concatenate([np.zeros(0, dtype=np.int64), *keys])), world.num_cells)
+
+    def has(self, rows: IndexArray, cells: IndexArray) -> BoolArray:
+        """`[E]` whether problem `rows` leaves `cells` out."""
+        wanted = rows * self.num_cells + cells
+        place = np.minimum(np.searchsorted(self.keys, wanted), max(len(self.keys) - 1, 0))
+        return self.keys[place] == wanted if len(self.keys) else np.zeros(len(wanted), dtype=bool)
+
+
 class Tree:
     """The open choices for F_H from every located cell x, given R_0 ... R_{H-1} (upper bounds of F_h(e_j)).
 
@@ -100,6 +127,8 @@ class Tree:
         lower: Array,
         slack: float,
         mass: sparse.csr_array | None = None,
+        *,
+        windowed: bool = True,
     ) -> None:
         """Start with nothing chosen.
 
@@ -108,13 +137,15 @@ class Tree:
             detected: `[M]`, worth of sensing the target in each cell, r + V.
             revealed: R_0 ... R_{H-1}, each `[M]`; R_0 is exact (what follows the last set).
             lower: `[B]`, worth of a known chain for each problem.
-            slack: chains better than the best known by less than this are not looked for.
+            slack: plans better than the best known by less than this are not looked for.
             mass: `[B, M]`, where the undetected target may be, one problem per row; without it, B = M and row x is e_x.
+            windowed: whether the task's window around the located cell of each problem limits its sets.
         """
+        self._windowed = windowed
         self._world, self._detected, self._revealed, self._slack = world, detected, revealed, slack
         self.best = lower.copy()
         self.nodes = 0
-        self._leaves: dict[int, list[set[int]]] = {}
+        self._leaves: dict[int, list[IndexArray]] = {}
         self._heap: list[tuple[float, int, _Choices]] = []
         self._ticket = itertools.count()
         start = sparse.eye_array(world.num_cells, format="csr") if mass is None else mass
@@ -137,9 +168,12 @@ class Tree:
         while self._heap and go_on(self):
             self._decide(heapq.heappop(self._heap)[2])
 
-    def improvements(self) -> dict[int, list[set[int]]]:
-        """Per problem with a better chain than it started from: the cells to leave unsensed at each step."""
-        return self._leaves
+    def improvements(self) -> tuple[BoolArray, list[LeftOut]]:
+        """`[B]` which problems have a better plan than they started from, and what it leaves unsensed at each step."""
+        better = np.zeros(len(self.best), dtype=bool)
+        better[list(self._leaves)] = True
+        steps = range(len(self._revealed))
+        return better, [LeftOut.of({x: plan[t] for x, plan in self._leaves.items()}, self._world) for t in steps]
 
     def _decide(self, choices: _Choices) -> None:
         """Split every choice on its next cell; a choice without one goes on to the next step."""
@@ -211,7 +245,10 @@ class Tree:
         """Bound of F on each row, one more set chosen jointly; also the prediction, worth of sensing and of leaving."""
         moved = mass @ self._world.kernel
         rows, cells = row_index(moved), moved.indices
-        sense = moved.data * self._detected[cells] - self._world.cost[cells] * row_sums(moved)[rows]
+        sense = (
+            moved.data * self._detected[cells]
+            - self._world.cost[cells] * per_row(rows, moved.data, mass.shape[0])[rows]
+        )
         leave = moved.data * self._revealed[sets_left - 1][cells]
         return per_row(rows, np.maximum(sense, leave), mass.shape[0]), moved, sense, leave
 
@@ -226,8 +263,10 @@ class Tree:
         self, start: IndexArray, earned: Array, mass: sparse.csr_array, sets_left: int, origin: _Choices | None
     ) -> None:
         """Put the info states with undetected `mass` on the heap, or close them where one set is left."""
-        future, moved, sense, leave = self._one_more_set(mass, sets_left)
-        relaxed = earned + future
+        _, moved, sense, leave = self._one_more_set(mass, sets_left)
+        rows = row_index(moved)
+        sense = self._within(start[rows], moved.indices, sense)
+        relaxed = earned + per_row(rows, np.maximum(sense, leave), len(start))
         if sets_left == 1:  # the last set is separable: this is its exact value
             self._record(start, relaxed, moved, leave > sense, origin)
             return
@@ -239,6 +278,14 @@ class Tree:
         none = np.zeros(len(kept))
         self._push(_Choices(frontier, 0, np.arange(len(kept)), left, frontier.relaxed, none, bound))
 
+    def _within(self, start: IndexArray, cells: IndexArray, sense: Array) -> Array:
+        """`sense`, far down where a sensor cannot be chosen: finite, so that sums and differences stay numbers.
+
+        The bounds on later steps, which do not use this, only get larger by counting such a sensor in.
+        """
+        allowed = within_window(self._world, start, cells) if self._windowed else None
+        return sense if allowed is None else np.where(allowed, sense, -FORBIDDEN)
+
     def _record(
         self, start: IndexArray, worth: Array, moved: sparse.csr_array, left: BoolArray, origin: _Choices | None
     ) -> None:
@@ -249,7 +296,7 @@ class Tree:
                 continue
             self.best[x] = worth[place]
             last = slice(moved.indptr[place], moved.indptr[place + 1])
-            self._leaves[x] = [*_sets_left_out(origin, int(place)), set(moved.indices[last][left[last]].tolist())]
+            self._leaves[x] = [*_sets_left_out(origin, int(place)), moved.indices[last][left[last]]]
 
     def _hopeful(self, start: IndexArray, bound: Array) -> BoolArray:
         hopeful: BoolArray = bound > self.best[start] + self._slack
@@ -291,12 +338,12 @@ def _frontier(
     return _Frontier(start[kept], sets_left, relaxed[kept], cells, mass, loss, count, none, source)
 
 
-def _sets_left_out(choices: _Choices | None, place: int) -> list[set[int]]:
-    """The cells left unsensed at each step so far."""
-    steps: list[set[int]] = []
+def _sets_left_out(choices: _Choices | None, place: int) -> list[IndexArray]:
+    """The cells left unsensed at each step so far, found by going back from batch to batch."""
+    steps: list[IndexArray] = []
     while choices is not None:
         frontier, state = choices.frontier, choices.state[place]
-        steps.insert(0, set(frontier.cells[state][choices.left[place]].tolist()))
+        steps.insert(0, frontier.cells[state][choices.left[place]])
         if frontier.origin is None:
             break
         choices, place = frontier.origin[0], int(frontier.origin[1][state])

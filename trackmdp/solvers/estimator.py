@@ -12,10 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
+from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.branch import Tree
-from trackmdp.solvers.chains import evaluate, renewal
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.known import tables
-from trackmdp.solvers.layers import Layer, build, chains_to_sets
+from trackmdp.solvers.layers import Layer, layer_sets, reachable_layers
+from trackmdp.solvers.prediction import renewal
 from trackmdp.solvers.renewal import IndexArray, accumulate, per_row
 from trackmdp.world.model import Array, BoolArray, World
 
@@ -27,7 +29,7 @@ MOST_NODES = 100_000
 
 @dataclass(frozen=True)
 class PositionEstimate:
-    """What Q says about the next position, at every info state that `chains` can be in after n misses.
+    """What Q says about the next position, at every info state that a policy can be in after n misses.
 
     Attributes:
         n: misses so far.
@@ -72,16 +74,16 @@ def known_positions(world: World, value: Array) -> list[Array]:
     return known[::-1]
 
 
-def positions(world: World, chains: BoolArray, value: Array) -> list[PositionEstimate]:
-    """The estimates at every info state on the chains, n = 0 ... t_max.
+def positions(world: World, policy: PolicyTable, value: Array) -> list[PositionEstimate]:
+    """The estimates at every info state that `policy` brings about, n = 0 ... t_max.
 
     Q-values are those of playing best from a known position, V = `value` once located: the optimal policy's own
-    where `chains` and `value` are optimal.
+    where `policy` and `value` are optimal.
     """
-    layers = build(world, world.num_choices)
+    layers = reachable_layers(world, world.num_choices)
     later = known_positions(world, value)
     mass, estimates = np.ones(world.num_cells), []
-    for n, sensed in enumerate(chains_to_sets(layers, chains)):
+    for n, sensed in enumerate(layer_sets(layers, policy)):
         predicted = mass @ layers[n + 1].moves
         before = per_row(layers[n].rows, mass, world.num_cells)
         estimates.append(_estimate(world, n, layers[n + 1], predicted, before, value, later[n], ~sensed))
@@ -89,18 +91,18 @@ def positions(world: World, chains: BoolArray, value: Array) -> list[PositionEst
     return estimates
 
 
-def accuracy(world: World, chains: BoolArray, value: Array | None = None) -> EstimatorAccuracy:
+def accuracy(world: World, policy: PolicyTable, value: Array | None = None) -> EstimatorAccuracy:
     """How often the estimates are right on missed steps, pooled over a uniform start.
 
     Args:
         world: the problem.
-        chains: `[M, t_max + 1, M]`, the policy that senses.
+        policy: the one that senses.
         value: `[M]`, V of the Q-values; the policy's own where not given.
     """
-    policy = evaluate(world, chains)
-    visits = _visits(world, chains)
+    own = evaluate(world, policy).value if value is None else value
+    visits = _visits(world, policy)
     missed, right = 0.0, np.zeros(3)
-    for estimate in positions(world, chains, policy.value if value is None else value):
+    for estimate in positions(world, policy, own):
         weight = visits[estimate.rows] * estimate.missed
         missed += float(weight.sum())
         for which, score in enumerate((estimate.paper, estimate.exact, estimate.belief)):
@@ -133,11 +135,11 @@ def _best(rows: IndexArray, score: Array, allowed: BoolArray) -> IndexArray:
     return order[np.unique(rows[order], return_index=True)[1]]
 
 
-def _visits(world: World, chains: BoolArray) -> Array:
-    """`[M]` expected renewals that start in each cell, per episode from a uniform start."""
+def _visits(world: World, policy: PolicyTable) -> Array:
+    """`[M]` expected renewals that start in each cell, per episode from a uniform start: s (I - T)^-1."""
     start = np.full(world.num_cells, 1.0 / world.num_cells)
-    located = sum((hit for hit, _ in renewal(world, chains)), sparse.csr_array((world.num_cells, world.num_cells)))
-    return accumulate(located.T.tocsr(), start)
+    located = sum((hit for hit, _ in renewal(world, policy)), sparse.csr_array((world.num_cells, world.num_cells)))
+    return accumulate(sparse.csr_array(located.T), start, world.size)
 
 
 def _go_on(tree: Tree) -> bool:

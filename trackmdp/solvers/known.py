@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from trackmdp.solvers.branch import Tree
-from trackmdp.solvers.layers import Layer, build
+from trackmdp.solvers.layers import Layer, reachable_layers
 from trackmdp.solvers.search import InnerProblem
 from trackmdp.world.model import Array, BoolArray, World
 
@@ -24,10 +25,14 @@ def first_guess(problem: InnerProblem, known: list[Array], mass: Array) -> list[
 
 
 def next_table(problem: InnerProblem, known: list[Array], slack: float) -> Tree:
-    """The tree that gives R_H once run (`Tree.upper`), H the length of `problem`, from R_0 ... R_{H-1}."""
-    mass = np.ones(problem.world.num_cells)
+    """The tree that gives R_H once run (`Tree.upper`), H the length of `problem`, from R_0 ... R_{H-1}.
+
+    The position j is revealed in the middle of a plan made in any x, so that no window around j limits the sets: R is
+    then an upper bound for every x, and exact without a window.
+    """
+    problem, mass = replace(problem, windowed=False), np.ones(problem.world.num_cells)
     lower = problem.worth(first_guess(problem, known, mass), mass)
-    return Tree(problem.world, problem.detected, known, lower, slack)
+    return Tree(problem.world, problem.detected, known, lower, slack, windowed=False)
 
 
 def tables(
@@ -51,7 +56,7 @@ def tables(
         go_on: asked now and then whether to look further.
         layers: possible positions, where they are known already.
     """
-    layers = build(world, length) if layers is None else layers
+    layers = reachable_layers(world, length) if layers is None else layers
     known = [missed]
     for sets in range(1, length + 1):
         tree = next_table(InnerProblem(world, layers[: sets + 1], detected, missed), known, slack)

@@ -1,60 +1,106 @@
-"""The possible positions after each move from each located cell: the ground on which chains of sets are searched.
+"""The possible positions after each move from each located cell: the ground on which sets are planned.
 
 Layer t holds one entry per pair (located cell x, cell j reachable from x in t moves), so that work on all located
-cells at once is a few sparse products whose cost follows the support of the kernel, not M².
+cells at once is a few sparse products whose cost and memory follow the support of the kernel, not M².
+
+On a line of four cells whose target moves one cell to the right, or stays in cell 3:
+
+    layer 0: (0,0) (1,1) (2,2) (3,3)        layer 1: (0,1) (1,2) (2,3) (3,3)        layer 2: (0,2) (1,3) (2,3) (3,3)
+
+The sets of a plan are one bool per entry of the layers from the first on: `on[e]` says whether, after as many misses,
+the sensor at `cells[e]` is switched on by a plan made when the target was located in `rows[e]`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
 
+from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.renewal import IndexArray, row_index
-from trackmdp.world.model import BoolArray, World
+from trackmdp.world.model import BoolArray, Task, World
 
-__all__ = ["Layer", "build", "sets_to_chains", "chains_to_sets"]
+__all__ = ["Layer", "layer_sets", "policy_table", "reachable", "reachable_layers", "sensed_csr", "within_window"]
 
 
 @dataclass(frozen=True)
 class Layer:
-    """The entries after t moves.
+    """The entries after t moves, in order of (row, cell).
 
     Attributes:
         rows, cells: `[E]`, located cell and possible position of each entry.
         moves: `[E_before, E]`, probability of moving from an entry of the layer before to one of this layer; in
             layer 0, where nothing has moved yet, the identity.
+        allowed: `[E]`, whether the sensor at `cells` can be chosen from `rows`; None where all can.
     """
 
     rows: IndexArray
     cells: IndexArray
     moves: sparse.csr_array
+    allowed: BoolArray | None = None
 
 
-def build(world: World, length: int) -> list[Layer]:
+def reachable_layers(world: World, length: int) -> list[Layer]:
     """Layers 0 ... `length`, all located cells together."""
-    m = world.num_cells
-    rows = cells = np.arange(m)
-    layers = [Layer(rows, cells, sparse.eye_array(m, format="csr"))]
+    return reachable(world.kernel, np.arange(world.num_cells), length, world)
+
+
+def reachable(kernel: sparse.csr_array, start: IndexArray, length: int, task: Task | None = None) -> list[Layer]:
+    """Layers 0 ... `length` from any cells `start` `[K]`; the rows of the entries are 0 ... K - 1.
+
+    Args:
+        kernel: `[M, M]`.
+        start: `[K]`.
+        length: moves.
+        task: whose window limits the sensors, row k being located in cell k; None for no limit.
+    """
+    m = kernel.shape[0]
+    rows, cells = np.arange(len(start), dtype=np.int64), start.astype(np.int64)
+    layers = [Layer(rows, cells, sparse.eye_array(len(start), format="csr"))]
     for _ in range(length):
-        step = world.kernel[cells]
-        origin = row_index(step)
-        keys, target = np.unique(rows[origin] * m + step.indices, return_inverse=True)
+        step = kernel[cells]
+        # The pair (row 2, cell 5) of a grid of 16 cells has the key 2 * 16 + 5 = 37; sorted keys are the new entries.
+        keys, target = np.unique(rows[row_index(step)] * m + step.indices, return_inverse=True)
         moves = sparse.csr_array((step.data, target, step.indptr), shape=(len(rows), len(keys)))
         rows, cells = np.divmod(keys, m)
-        layers.append(Layer(rows, cells, moves))
+        layers.append(Layer(rows, cells, moves, None if task is None else within_window(task, rows, cells)))
     return layers
 
 
-def sets_to_chains(world: World, layers: list[Layer], sets: list[BoolArray]) -> BoolArray:
-    """`[M, t_max + 1, M]` chains from the sensed entries of layers 1 ... t_max + 1."""
-    chains = np.zeros((world.num_cells, len(sets), world.num_cells), dtype=bool)
-    for n, (layer, on) in enumerate(zip(layers[1:], sets, strict=True)):
-        chains[layer.rows, n, layer.cells] = on
-    return chains
+def within_window(task: Task, rows: IndexArray, cells: IndexArray) -> BoolArray | None:
+    """`[E]` whether sensor `cells` can be chosen after locating the target in `rows`; None where all can.
+
+    On a grid of 10 columns with W = 2, sensor 25 (row 2, column 5) can be chosen from cell 3 (row 0, column 3), and
+    sensor 26 cannot.
+    """
+    if task.window is None:
+        return None
+    row, column = np.divmod(rows, task.columns)
+    other_row, other_column = np.divmod(cells, task.columns)
+    near: BoolArray = np.maximum(np.abs(row - other_row), np.abs(column - other_column)) <= task.window
+    return near
 
 
-def chains_to_sets(layers: list[Layer], chains: BoolArray) -> list[BoolArray]:
-    """The sensed entries of layers 1 ... t_max + 1."""
-    return [chains[layer.rows, n, layer.cells] for n, layer in enumerate(layers[1:])]
+def sensed_csr(task: Task, parts: Sequence[tuple[IndexArray, IndexArray]]) -> sparse.csr_array:
+    """`[M * (t_max + 1), M]` bool, the sets of a `PolicyTable`, from what is sensed at each n: (rows, cells)."""
+    choices, m = task.num_choices, task.num_cells
+    # Located in x after n misses is row x (t_max + 1) + n: with t_max = 1, (x, n) = (3, 1) is row 7.
+    rows = np.concatenate([part[0] * choices + n for n, part in enumerate(parts)])
+    cells = np.concatenate([part[1] for part in parts])
+    table = sparse.csr_array((np.ones(len(rows), dtype=bool), (rows, cells)), shape=(m * choices, m))
+    table.sort_indices()
+    return table
+
+
+def policy_table(task: Task, layers: Sequence[Layer], sets: Sequence[BoolArray]) -> PolicyTable:
+    """The policy whose `sets` are given on layers 1 ... t_max + 1."""
+    sensed = [(layer.rows[on], layer.cells[on]) for layer, on in zip(layers[1:], sets, strict=True)]
+    return PolicyTable(task, sensed_csr(task, sensed))
+
+
+def layer_sets(layers: Sequence[Layer], policy: PolicyTable) -> list[BoolArray]:
+    """The sensed entries of layers 1 ... t_max + 1; what a policy senses where the target cannot be is left out."""
+    return [policy.on(n, layer.rows, layer.cells) > 0 for n, layer in enumerate(layers[1:])]

@@ -7,10 +7,11 @@ from typing import Literal, TypeAlias
 import numpy as np
 from scipy import sparse
 
+from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.bounds import clocked_table, valid
 from trackmdp.solvers.branch import Tree
 from trackmdp.solvers.known import first_guess, tables
-from trackmdp.solvers.layers import Layer, build
+from trackmdp.solvers.layers import Layer, policy_table, reachable_layers
 from trackmdp.solvers.search import InnerProblem
 from trackmdp.world.model import Array, BoolArray, World
 
@@ -23,8 +24,8 @@ MOST_NODES = 2_000_000
 """Choices looked at per plan; a count, not a time, so that the same world gives the same policy."""
 
 
-def solve(world: World, *, depth: int = 2, tail: Tail = "clocked") -> BoolArray:
-    """Chains of the policy that plans `depth` sets at every info state, fewer where the safe action comes before.
+def solve(world: World, *, depth: int = 2, tail: Tail = "clocked") -> PolicyTable:
+    """The policy that plans `depth` sets at every info state, fewer where the safe action comes before.
 
     Args:
         world: the problem.
@@ -32,16 +33,15 @@ def solve(world: World, *, depth: int = 2, tail: Tail = "clocked") -> BoolArray:
         tail: the value after them: `qmdp`, the position known after every action, or `clocked`, U(j, n).
     """
     table = _tail_table(world, tail)
-    layers = build(world, world.num_choices)
-    chains = np.zeros((world.num_cells, world.num_choices, world.num_cells), dtype=bool)
+    layers = reachable_layers(world, world.num_choices)
+    sets: list[BoolArray] = []
     mass = np.ones(world.num_cells)
     for n in range(world.num_choices):
-        sets = min(depth, world.num_choices - n)
-        problem = InnerProblem(world, layers[n : n + sets + 1], world.reward + table[:, 0], table[:, n + sets])
-        sensed = _first_set(problem, layers, mass)
-        chains[layers[n + 1].rows, n, layers[n + 1].cells] = sensed
-        mass = (mass @ layers[n + 1].moves) * ~sensed
-    return chains
+        ahead = min(depth, world.num_choices - n)
+        problem = InnerProblem(world, layers[n : n + ahead + 1], world.reward + table[:, 0], table[:, n + ahead])
+        sets.append(_first_set(problem, layers, mass))
+        mass = (mass @ layers[n + 1].moves) * ~sets[-1]
+    return policy_table(world, layers, sets)
 
 
 def _tail_table(world: World, tail: Tail) -> Array:
@@ -60,11 +60,10 @@ def _first_set(problem: InnerProblem, layers: list[Layer], mass: Array) -> BoolA
     here.eliminate_zeros()
     tree = Tree(world, problem.detected, known, problem.worth(sets, mass), SLACK, here)
     tree.run(_go_on)
-    sensed, possible = sets[0].copy(), mass @ after.moves > 0
-    for x, left_out in tree.improvements().items():
-        mine = after.rows == x
-        sensed[mine] = possible[mine] & ~np.isin(after.cells[mine], list(left_out[0]))
-    return sensed
+    better, left = tree.improvements()
+    if not better.any():
+        return sets[0]
+    return np.where(better[after.rows], (mass @ after.moves > 0) & ~left[0].has(after.rows, after.cells), sets[0])
 
 
 def _known(problem: InnerProblem, layers: list[Layer]) -> list[Array]:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import qmdp
-from trackmdp.solvers.chains import Prediction, unroll
+from trackmdp.solvers.prediction import Prediction, unroll
 from trackmdp.world.model import BoolArray, World
 
 __all__ = ["solve"]
 
 
-def solve(world: World, *, threshold: float | None = None) -> BoolArray:
-    """Chains that sense j iff the predicted probability of j, given the misses so far, is at least `threshold`.
+def solve(world: World, *, threshold: float | None = None) -> PolicyTable:
+    """Sense j iff its predicted probability, given the misses so far, is at least `threshold`.
 
     Without one, sense where the sensor earns its price in this very step: p_j r >= c_j p_in.
     """

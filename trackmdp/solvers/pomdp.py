@@ -1,4 +1,4 @@
-"""The POMDP of Section IV solved as one, over belief states (beta, n): a check on all that is built on chains.
+"""The POMDP of Section IV solved as one, over belief states (beta, n): a check on all that is built on plans of sets.
 
 Every belief that some sequence of actions can lead to is listed, and the finite MDP over them is solved by policy
 iteration. Beliefs multiply with the actions tried, so this is for worlds of a few cells.
@@ -81,12 +81,13 @@ def _first_best(worth: Array, best: Array, state: np.ndarray, first: np.ndarray)
 
 
 def _enumerate(world: World, most_beliefs: int) -> tuple[_BeliefMdp, int]:
+    kernel = world.kernel.toarray()  # a few cells: every set of sensors is tried in every belief
     beliefs = [(belief, 0) for belief in np.eye(world.num_cells)]
     index = {_key(belief, n): i for i, (belief, n) in enumerate(beliefs)}
     actions = np.array(list(itertools.product([True, False], repeat=world.num_cells)))
     problem = _BeliefMdp()
     for i, (belief, n) in enumerate(beliefs):  # grows while it is gone through
-        predicted = belief @ world.kernel
+        predicted = belief @ kernel
         if n == world.num_choices:
             problem.add(i, (world.reward - world.safe_cost) * float(predicted.sum()), *_sparse(predicted))
             continue

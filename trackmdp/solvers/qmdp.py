@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from trackmdp.solvers.chains import Prediction, unroll
+from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers.prediction import Prediction, unroll
 from trackmdp.world.model import BoolArray, World
 
 __all__ = ["solve", "TIE"]
@@ -11,8 +12,8 @@ TIE = 1e-12
 """Relative slack of a threshold: probabilities equal to c/r but for rounding are sensed, the same way each time."""
 
 
-def solve(world: World, *, in_grid: bool = False) -> BoolArray:
-    """Chains of Q_MDP, eq. qmdp_policy: sense j iff p_j >= c_j / r.
+def solve(world: World, *, in_grid: bool = False) -> PolicyTable:
+    """Q_MDP, eq. qmdp_policy: sense j iff p_j >= c_j / r.
 
     p_j is the predicted probability of cell j given the misses so far, the exit being one of the possibilities.
 
@@ -22,6 +23,7 @@ def solve(world: World, *, in_grid: bool = False) -> BoolArray:
     """
 
     def worth_it(seen: Prediction) -> BoolArray:
+        # multiplied by the probability of the misses, which need not be divided by then
         charged = seen.inside if in_grid else seen.before
         return seen.mass * world.reward >= world.cost[seen.cells] * charged[seen.rows] * (1.0 - TIE)
 

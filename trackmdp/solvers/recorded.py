@@ -5,17 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse.linalg import spsolve_triangular
-from scipy.special import stdtrit
 
-from trackmdp.solvers.chains import Evaluation, pool
+from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers.evaluation import Evaluation, pooled
 from trackmdp.solvers.renewal import IndexArray
 from trackmdp.world.model import Array, Task
-from trackmdp.world.tracks import Tracks
+from trackmdp.world.tracks import Recorded, Tracks
 
-__all__ = ["Interval", "Replay", "replay"]
+__all__ = ["Interval", "ReplayedTracks", "evaluate_recorded", "replay"]
 
 
 @dataclass(frozen=True)
@@ -28,7 +27,7 @@ class Interval:
 
 
 @dataclass(frozen=True)
-class Replay:
+class ReplayedTracks:
     """What a policy earned and did on K tracks, each from its first cell to its end.
 
     Attributes:
@@ -42,7 +41,7 @@ class Replay:
 
     def evaluation(self, starts: IndexArray, num_cells: int) -> Evaluation:
         """The figures of all tracks together, and by start cell, nan where no track starts; `starts` is `[K]`."""
-        together = pool(self.totals, self.length)
+        together = pooled(self.totals, self.length)
         count = np.bincount(starts, minlength=num_cells)
         with np.errstate(invalid="ignore"):
             by_cell = [np.bincount(starts, weights, num_cells) / count for weights in self.totals.T]
@@ -74,8 +73,15 @@ class Replay:
         }
 
 
-def replay(task: Task, tracks: Tracks, chains: npt.NDArray[np.generic]) -> Replay:
-    """Follow `chains` `[M, t_max+1, M]` (bool or probabilities) along every track, from its first cell.
+def evaluate_recorded(problem: Recorded, policy: PolicyTable) -> Evaluation:
+    """The figures of `policy` on the held-out tracks, each from its first cell to its end or `max_steps`."""
+    tracks = problem.held_out.limited(problem.max_steps)
+    starts = tracks.cells[tracks.first[:-1]]
+    return replay(problem, tracks, policy).evaluation(starts, problem.num_cells)
+
+
+def replay(task: Task, tracks: Tracks, policy: PolicyTable) -> ReplayedTracks:
+    """Follow `policy` along every track, from its first cell.
 
     Every point of the recording is taken as one where the target may be located; what follows up to the next detection
     is known from the recording, so that one triangular system tells which points are reached.
@@ -85,24 +91,24 @@ def replay(task: Task, tracks: Tracks, chains: npt.NDArray[np.generic]) -> Repla
     points = len(line.cells)
     track = np.repeat(np.arange(len(line)), np.diff(line.first))
     last = line.first[1:][track] - 1
-    figures, hits = _renewals(task, line.cells, last, chains)
+    figures, hits = _renewals(task, line.cells, last, policy)
     reached = np.zeros(points)
     reached[line.first[:-1]] = 1.0
     start, end, weight = hits
     onward = sparse.csr_array((weight, (end, start)), shape=(points, points))
     reached = spsolve_triangular(sparse.eye_array(points, format="csr") - onward, reached, unit_diagonal=True)
     sums = np.stack([np.bincount(track, reached * figure, len(line)) for figure in figures], axis=1)
-    return Replay(sums[:, :5].astype(np.float64), sums[:, 5].astype(np.float64))
+    return ReplayedTracks(sums[:, :5].astype(np.float64), sums[:, 5].astype(np.float64))
 
 
 def _renewals(
-    task: Task, cells: IndexArray, last: IndexArray, chains: npt.NDArray[np.generic]
+    task: Task, cells: IndexArray, last: IndexArray, policy: PolicyTable
 ) -> tuple[list[Array], tuple[IndexArray, IndexArray, Array]]:
     """From every point, located there, to the next detection or the end of the track.
 
     Returns:
-        Six `[P]`, the columns of `Replay.totals` and the steps; and the detections as a sparse matrix: from which
-        point, at which one, with what probability.
+        Six `[P]`, the columns of `ReplayedTracks.totals` and the steps; and the detections as a sparse matrix: from
+        which point, at which one, with what probability.
     """
     m, points = task.num_cells, np.arange(len(cells))
     figures, hits = np.zeros((6, len(cells))), []
@@ -115,9 +121,9 @@ def _renewals(
         figures[5, at] += undetected
         at, undetected, cell = at[inside], undetected[inside], cell[inside]
         if n < task.num_choices:
-            on = chains[:, n].astype(np.float64)
-            sensed = on[cells[at], cell]
-            sensors, price, safe = on.sum(axis=1)[cells[at]], (on @ task.cost)[cells[at]], 0.0
+            sensed = policy.on(n, cells[at], cell)
+            sensors, price = (policy.spent(n, each)[cells[at]] for each in (np.ones(task.num_cells), task.cost))
+            safe: float | Array = 0.0
         else:
             sensed, sensors, safe = np.ones(len(at)), np.zeros(len(at)), 1.0
             price = np.full(len(at), task.safe_cost)
@@ -138,6 +144,8 @@ def _interval(part: Array, whole: Array) -> Interval:
     ratio = float(part.sum() / total)
     if count < 2:
         return Interval(ratio, np.nan, np.nan)
+    from scipy.special import stdtrit  # a quarter of a second to load
+
     error = (part - ratio * whole).std(ddof=1) / (total / count * np.sqrt(count))
     margin = float(stdtrit(count - 1, 0.975) * error)
     return Interval(ratio, ratio - margin, ratio + margin)

@@ -1,4 +1,4 @@
-"""Forward-and-backward search (Brown 1980, Washburn 1983) for chains of sets, led by a homotopy from the clocked bound.
+"""Forward-and-backward search (Brown 1980, Washburn 1983) for plans of sets, led by a homotopy from the clocked bound.
 
 With the value V of being located fixed, the sets after each located cell are an optimal search for a moving target:
 given the sets before, the undetected mass m_t; given the sets after, the value W_t(j) of the target going on undetected
@@ -12,15 +12,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import sparse
 
+from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import clocked
 from trackmdp.solvers.bounds import clocked_table
-from trackmdp.solvers.chains import evaluate
-from trackmdp.solvers.layers import Layer, build, chains_to_sets, sets_to_chains
-from trackmdp.solvers.renewal import per_row
+from trackmdp.solvers.layers import Layer, layer_sets, policy_table, reachable_layers
+from trackmdp.solvers.renewal import RenewalSystem, per_row
 from trackmdp.world.model import Array, BoolArray, World
 
-__all__ = ["InnerProblem", "improve", "solve"]
+__all__ = ["InnerProblem", "improve", "located_value", "solve"]
+
+DIRECT_SEARCH = 1_500
+"""Cells up to which the systems of a search are factorised: above, the value before is so near that iterating is
+faster. What the search ends at is valued by `evaluate`, by its own rule."""
 
 
 @dataclass(frozen=True)
@@ -32,12 +37,14 @@ class InnerProblem:
         layers: possible positions before the first of the H sets to be chosen and after each move: H + 1 layers.
         detected: `[M]`, worth of sensing the target in each cell, r + V.
         missed: `[M]`, worth of the target being in each cell, undetected, after the last set.
+        windowed: whether the task's window limits the sets; not where a known position stands for any located cell.
     """
 
     world: World
     layers: list[Layer]
     detected: Array
     missed: Array
+    windowed: bool = True
 
     @classmethod
     def of(cls, world: World, layers: list[Layer], value: Array) -> InnerProblem:
@@ -89,7 +96,9 @@ class InnerProblem:
                 gain = self.detected[layer.cells] - later[t + 1]
                 if credit is not None:
                     gain = optimism * credit[t][layer.cells] + (1.0 - optimism) * gain
-                chosen.append(now * gain > self.world.cost[layer.cells] * inside[layer.rows])
+                # strict: an entry without mass is never sensed, not even by a sensor that costs nothing
+                on = now * gain > self.world.cost[layer.cells] * inside[layer.rows]
+                chosen.append(on & layer.allowed if self.windowed and layer.allowed is not None else on)
                 now = now * ~chosen[-1]
             if all((new == old).all() for new, old in zip(chosen, sets, strict=True)):
                 break
@@ -101,28 +110,63 @@ class InnerProblem:
         return [np.zeros(len(layer.rows), dtype=bool) for layer in self.layers[1:]]
 
 
-def solve(world: World, *, steps: int = 30, sweeps: int = 3) -> BoolArray:
-    """Chains found by the homotopy in `steps` steps of `sweeps` sweeps each, then by plain ascent."""
-    layers = build(world, world.num_choices)
+def solve(world: World, *, steps: int = 30, sweeps: int = 3) -> PolicyTable:
+    """The policy found by the homotopy in `steps` steps of `sweeps` sweeps each, then by plain ascent.
+
+    The better one of it and the clocked policy, so that it is never worse than that.
+    """
+    layers = reachable_layers(world, world.num_choices)
+    first = layer_sets(layers, clocked.solve(world))
+    sets = follow_credit(world, layers, first, steps, sweeps)
+    found, simple = (located_value(world, layers, each) for each in (sets, first))
+    return policy_table(world, layers, sets if found.sum() >= simple.sum() else first)
+
+
+def follow_credit(
+    world: World, layers: list[Layer], sets: list[BoolArray], steps: int = 30, sweeps: int = 3
+) -> list[BoolArray]:
+    """The homotopy from the clocked bound's credit to the exact one, from the clocked policy's `sets`."""
     table = clocked_table(world).table
     credit = list((world.reward + table[:, :1] - table[:, 1:]).T)
-    chains, value = clocked.solve(world, table=table), table[:, 0]
-    sets, located = chains_to_sets(layers, chains), np.ones(world.num_cells)
+    value, located = table[:, 0], np.ones(world.num_cells)
     for step in range(steps + 1):
         problem = InnerProblem.of(world, layers, value)
         sets = problem.ascend(sets, located, sweeps=sweeps, optimism=1.0 - step / steps, credit=credit)
-        value = evaluate(world, sets_to_chains(world, layers, sets)).value
-    ascended = improve(world, layers, sets)
-    both = [sets_to_chains(world, layers, ascended), chains]
-    return max(both, key=lambda candidate: evaluate(world, candidate).aihtr)
+        value = located_value(world, layers, sets, value)
+    return improve(world, layers, sets, value)
 
 
-def improve(world: World, layers: list[Layer], sets: list[BoolArray], *, sweeps: int = 10) -> list[BoolArray]:
-    """Policy iteration by ascent, until the mean value no longer grows."""
-    value, located = evaluate(world, sets_to_chains(world, layers, sets)).value, np.ones(world.num_cells)
+def improve(
+    world: World, layers: list[Layer], sets: list[BoolArray], value: Array | None = None, *, sweeps: int = 10
+) -> list[BoolArray]:
+    """Policy iteration by ascent, until the mean value no longer grows; `value` `[M]`: that of `sets`, where known."""
+    located = np.ones(world.num_cells)
+    value = located_value(world, layers, sets) if value is None else value
     while True:
         candidate = InnerProblem.of(world, layers, value).ascend(sets, located, sweeps=sweeps)
-        better = evaluate(world, sets_to_chains(world, layers, candidate)).value
+        if all((new == old).all() for new, old in zip(candidate, sets, strict=True)):
+            return sets
+        better = located_value(world, layers, candidate, value)
         if better.sum() <= value.sum() + 1e-12 * np.abs(value).sum():
             return sets
         sets, value = candidate, better
+
+
+def located_value(world: World, layers: list[Layer], sets: list[BoolArray], guess: Array | None = None) -> Array:
+    """`[M]` V of a policy given as sets on the layers, on large worlds by iteration from `guess` `[M]`."""
+    m, mass, earned = world.num_cells, np.ones(world.num_cells), np.zeros(world.num_cells)
+    hits = []
+    for layer, on in zip(layers[1:], sets, strict=True):
+        now = mass @ layer.moves
+        inside = per_row(layer.rows, now, m)
+        paid = per_row(layer.rows[on], world.cost[layer.cells[on]], m)
+        earned += world.reward * per_row(layer.rows[on], now[on], m) - paid * inside
+        hits.append((now[on], layer.rows[on], layer.cells[on]))
+        mass = now * ~on
+    left = mass > 0
+    missed = sparse.csr_array((mass[left], (layers[-1].rows[left], layers[-1].cells[left])), shape=(m, m))
+    forced = missed @ world.kernel
+    earned += (world.reward - world.safe_cost) * forced.sum(axis=1)
+    data, rows, cells = (np.concatenate(part) for part in zip(*hits, strict=True))
+    located = sparse.csr_array((data, (rows, cells)), shape=(m, m)) + forced
+    return RenewalSystem(located, world.size, direct=DIRECT_SEARCH).solve(earned, guess)

@@ -23,7 +23,7 @@ def chains_of(actor: TensorDictModuleBase, task: Task, device: torch.device | st
     """`[M, t_max+1, M]`, the sets a deterministic policy senses from each located cell, followed until detection.
 
     After a miss the next state is known in advance, so M · (t_max + 1) calls of the policy say all there is to say
-    about it; `trackmdp.solvers.chains.evaluate` turns them into exact values.
+    about it; `trackmdp.solvers.evaluate` turns them into exact values.
     """
     m, choices = task.num_cells, task.num_choices
     history = torch.zeros(m, choices, m, dtype=torch.bool, device=device)

@@ -6,15 +6,13 @@ from abc import ABC, abstractmethod
 from dataclasses import asdict, dataclass
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
-from trackmdp.policies.policy import Policy
-from trackmdp.solvers import bounds, horizon, qmdp
-from trackmdp.solvers.chains import Evaluation, evaluate, regret_per_step
+from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers import bounds, qmdp
+from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers.evaluation import Evaluation, regret_per_step
 from trackmdp.world.model import Task, World
 
-__all__ = ["Evaluator", "ExactEvaluator", "Score", "as_table", "figures", "while_collecting"]
+__all__ = ["Evaluator", "ExactEvaluator", "Score", "figures", "while_collecting"]
 
 _PER_CELL = ("value", "steps", "detections", "sensors", "safe_actions")
 
@@ -43,15 +41,15 @@ class Evaluator(ABC):
     qmdp: Evaluation | None
 
     @abstractmethod
-    def evaluate(self, policy: Policy) -> Evaluation:
+    def evaluate(self, policy: PolicyTable) -> Evaluation:
         """Figures of a policy."""
 
-    def score(self, policy: Policy) -> Score:
+    def score(self, policy: PolicyTable) -> Score:
         """Figures and the regret per step of a policy."""
         evaluation = self.evaluate(policy)
         return Score(evaluation, regret_per_step(self.upper, evaluation))
 
-    def report(self, policy: Policy) -> dict[str, Any] | None:  # noqa: ARG002
+    def report(self, policy: PolicyTable) -> dict[str, Any] | None:  # noqa: ARG002
         """Figures with confidence intervals beside those of the references; None where all figures are exact."""
         return None
 
@@ -73,29 +71,14 @@ class ExactEvaluator(Evaluator):
 
     def __init__(self, world: World) -> None:
         self.world = world
-        if world.max_steps is None:
-            paper, valid, clocked = (bound(world).mean() for bound in (bounds.paper, bounds.valid, bounds.clocked))
-            self.bounds = {"paper": float(paper), "valid": float(valid), "clocked": float(clocked)}
-        else:
-            valid, clocked = (bound(world).mean() for bound in (horizon.valid, horizon.clocked))
-            self.bounds = {"paper": None, "valid": float(valid), "clocked": float(clocked)}
-        self.upper = float(clocked)
-        self.qmdp = self.evaluate(Policy.from_dense(world, qmdp.solve(world)))
+        paper = None if world.max_steps is not None else float(bounds.paper(world).mean())
+        self.upper = float(bounds.clocked(world).mean())
+        self.bounds = {"paper": paper, "valid": float(bounds.valid(world).mean()), "clocked": self.upper}
+        self.qmdp = evaluate(world, qmdp.solve(world))
 
-    def evaluate(self, policy: Policy) -> Evaluation:
+    def evaluate(self, policy: PolicyTable) -> Evaluation:
         """Exact figures of a policy."""
-        if self.world.max_steps is None:
-            return evaluate(self.world, as_table(policy))
-        return horizon.evaluate(self.world, as_table(policy))
-
-
-def as_table(policy: Policy) -> npt.NDArray[np.generic]:
-    """`[M, t_max+1, M]`, bool, or probabilities where the policy draws."""
-    task = policy.task
-    if policy.deterministic:
-        return policy.dense()
-    shape = (task.num_cells, task.num_choices, task.num_cells)
-    return np.full(shape, policy.probability) if policy.sets is None else policy.sets.toarray().reshape(shape)
+        return evaluate(self.world, policy)
 
 
 def while_collecting(upper: float, evaluation: Evaluation, reward: float, frames: int) -> dict[str, float]:

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from trackmdp.policies.policy import Policy
+from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import qmdp
-from trackmdp.solvers.chains import Evaluation
+from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.kernel_estimate import KernelEstimate
 from trackmdp.solvers.recorded import Interval, replay
-from trackmdp.training.evaluator import Evaluator, ExactEvaluator, as_table
+from trackmdp.training.evaluator import Evaluator, ExactEvaluator
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Problem, Recorded, Tracks
 
@@ -45,28 +46,27 @@ class HeldOutEvaluator(Evaluator):
         self.tracks = world.held_out.limited(world.max_steps)
         self.upper, self.qmdp = math.nan, None
         self.bounds = dict.fromkeys(("paper", "valid", "clocked"))
-        self._starts = self.tracks.cells[self.tracks.first[:-1]]
 
-    def evaluate(self, policy: Policy) -> Evaluation:
+    def evaluate(self, policy: PolicyTable) -> Evaluation:
         """Figures of a policy on the held-out tracks."""
-        return replay(self.world, self.tracks, as_table(policy)).evaluation(self._starts, self.world.num_cells)
+        return evaluate(self.world, policy)
 
-    def intervals(self, policy: Policy) -> dict[str, Interval]:
+    def intervals(self, policy: PolicyTable) -> dict[str, Interval]:
         """Figure -> its mean over the held-out tracks with a 95 % confidence interval."""
-        return replay(self.world, self.tracks, as_table(policy)).intervals()
+        return replay(self.world, self.tracks, policy).intervals()
 
-    def references(self) -> dict[str, Policy]:
+    def references(self) -> dict[str, PolicyTable]:
         """The policies to hold a learned one against, by their names in tables."""
         task = self.world
         kernel = estimated_kernel(task.tracks, task.rows)
         world = World(kernel, task.size, cost=task.cost, safe_cost=task.safe_cost, t_max=task.t_max, reward=task.reward)
         return {
-            "all on": Policy.all_on(task),
-            "no sensors": Policy.none(task),
-            ESTIMATED: Policy.from_dense(task, qmdp.solve(world)),
+            "all on": PolicyTable.all_on(task),
+            "no sensors": PolicyTable.none(task),
+            ESTIMATED: qmdp.solve(world),
         }
 
-    def report(self, policy: Policy) -> dict[str, Any]:
+    def report(self, policy: PolicyTable) -> dict[str, Any]:
         """What is written of a policy: its figures on the held-out tracks beside those of the references."""
         policies = {"policy": policy, **self.references()}
         figures = {

@@ -13,8 +13,8 @@ import numpy as np
 from trackmdp.durable import write_bytes, write_json
 from trackmdp.policies.policy import Policy
 from trackmdp.solvers import optimal
-from trackmdp.solvers.chains import Evaluation
-from trackmdp.solvers.optimal import Solution
+from trackmdp.solvers.evaluation import Evaluation
+from trackmdp.solvers.solution import Solution
 from trackmdp.training.callbacks import Callback, Row, Training
 from trackmdp.training.summary import summarize
 from trackmdp.training.trainer import Trainer

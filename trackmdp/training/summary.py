@@ -8,7 +8,7 @@ from typing import Any
 
 from trackmdp import __version__
 from trackmdp.config.resume import digest
-from trackmdp.solvers.optimal import Solution
+from trackmdp.solvers.solution import Solution
 from trackmdp.training.callbacks import Training
 from trackmdp.training.evaluator import Score, figures, while_collecting
 from trackmdp.training.machine import machine

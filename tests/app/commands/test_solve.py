@@ -15,7 +15,7 @@ import pytest
 from tests.solvers.worlds import paper_world
 from trackmdp.app.cli import main
 from trackmdp.solvers import bounds
-from trackmdp.solvers.chains import evaluate
+from trackmdp.solvers.evaluate import evaluate
 
 
 def read(folder: Path, name: str) -> dict[str, Any]:

@@ -25,7 +25,10 @@ _EPISODES = 100
 
 def log_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[dict[str, Any]]:
     """Steps per second of recording, writing, reading and decoding; bytes of a step; belief and policy are in it."""
-    policies: dict[str, Acting] = {"qmdp": Chains(qmdp.solve(world)), "random_k": RandomSets(world.num_cells, 5)}
+    policies: dict[str, Acting] = {
+        "qmdp": Chains(qmdp.solve(world).dense()),
+        "random_k": RandomSets(world.num_cells, 5),
+    }
     seeds = [derive(cfg.seed, "benchmark", number) for number in range(_EPISODES)]
     rows = []
     with tempfile.TemporaryDirectory() as folder:

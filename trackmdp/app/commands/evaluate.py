@@ -20,11 +20,10 @@ from trackmdp.episodes.log import EpisodeLog
 from trackmdp.episodes.record import Chains, RandomSets
 from trackmdp.policies import fixed
 from trackmdp.policies.fixed import ChainPolicy
-from trackmdp.policies.policy import Policy
+from trackmdp.policies.table import PolicyTable
 from trackmdp.reports.picture import draw
 from trackmdp.seeding import generator
 from trackmdp.solvers import estimator
-from trackmdp.solvers.chains import sets_of
 from trackmdp.training.devices import make_device
 from trackmdp.training.display import make_console, table
 from trackmdp.training.evaluate import Simulation, simulate
@@ -50,7 +49,8 @@ def run(cfg: EvaluateConfig, folder: Path, problem: Problem | None = None) -> fl
     if isinstance(world, Recorded):
         return held_out.run(world, chains, subject, folder, console, cfg.seed)
     evaluator = ExactEvaluator(world)
-    score = evaluator.score(Policy.from_dense(world, chains))
+    sets = PolicyTable.from_dense(world, chains)
+    score = evaluator.score(sets)
     simulation = None
     if cfg.episodes:
         policy: TensorDictModuleBase = ChainPolicy(chains, device)
@@ -58,11 +58,11 @@ def run(cfg: EvaluateConfig, folder: Path, problem: Problem | None = None) -> fl
             draws = generator(cfg.seed, "evaluation", "policy", device=device)
             policy = fixed.RandomK(world.num_cells, cfg.baseline.k, draws)
         simulation = simulate(world, policy, episodes=cfg.episodes, seed=cfg.seed, device=device)
-    estimate = estimator.accuracy(world, chains) if chains.dtype == np.bool_ and world.max_steps is None else None
+    estimate = estimator.accuracy(world, sets) if sets.deterministic and world.max_steps is None else None
     report = _report(subject, evaluator, score, simulation) | {"estimator": asdict(estimate) if estimate else None}
     write_json(folder / "evaluation.json", report)
     if chains.dtype == np.bool_:
-        write_json(folder / "sets.json", sets_of(chains))
+        write_json(folder / "sets.json", sets.as_lists())
         write_text(folder / "picture.txt", draw(world, chains, seed=cfg.seed))
     _show(console, subject, evaluator, score, simulation, folder)
     if cfg.log is not None:

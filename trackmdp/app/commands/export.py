@@ -19,7 +19,7 @@ from trackmdp.app.commands.trained import trained
 from trackmdp.config import ExportConfig
 from trackmdp.durable import write_bytes, write_json
 from trackmdp.errors import UserError
-from trackmdp.solvers.chains import sets_of
+from trackmdp.policies.table import PolicyTable
 from trackmdp.training.display import make_console
 from trackmdp.world.model import BoolArray
 
@@ -47,7 +47,7 @@ def run(cfg: ExportConfig, folder: Path) -> None:
         "t_max": str(task.t_max),
     }
     if cfg.format == "sets":
-        write_json(file, sets_of(policy.chains))
+        write_json(file, PolicyTable.from_dense(task, policy.chains).as_lists())
     else:
         forms: dict[str, Callable[[BoolArray, dict[str, str]], bytes]] = {"torch_export": to_torch, "onnx": to_onnx}
         write_bytes(file, forms[cfg.format](policy.chains, about))

@@ -9,9 +9,8 @@ import numpy as np
 from rich.console import Console
 
 from trackmdp.durable import write_json, write_text
-from trackmdp.policies.policy import Policy
+from trackmdp.policies.table import PolicyTable
 from trackmdp.reports.picture import draw
-from trackmdp.solvers.chains import sets_of
 from trackmdp.training.display import table
 from trackmdp.training.held_out import HeldOutEvaluator
 from trackmdp.world.tracks import Recorded
@@ -29,13 +28,13 @@ def run(
 ) -> float:
     """Write `evaluation.json`, `sets.json` and `picture.txt` to `folder`; returns the mean reward of a track."""
     evaluator = HeldOutEvaluator(world)
-    policy = Policy.from_dense(world, chains)
+    policy = PolicyTable.from_dense(world, chains)
     report = evaluator.report(policy)
     value = evaluator.evaluate(policy).value
     content = {"policy": subject, "value": value.tolist(), "held_out": report, "regret_per_step": None}
     write_json(folder / "evaluation.json", content)
     if chains.dtype == np.bool_:
-        write_json(folder / "sets.json", sets_of(chains))
+        write_json(folder / "sets.json", policy.as_lists())
         write_text(folder / "picture.txt", draw(world, chains, seed=seed))
     show_held_out(console, subject, report)
     console.print(f"results in {folder}")

@@ -14,9 +14,11 @@ from trackmdp.build import make_baseline
 from trackmdp.config import OptimalConfig, SolveConfig
 from trackmdp.durable import write_json
 from trackmdp.errors import UserError
+from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import bounds, optimal, qmdp
-from trackmdp.solvers.chains import Evaluation, evaluate, regret_per_step, sets_of
-from trackmdp.solvers.optimal import Progress, Solution
+from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers.evaluation import regret_per_step
+from trackmdp.solvers.solution import SearchProgress, Solution, bracketed
 from trackmdp.training.display import make_console, table
 from trackmdp.training.evaluator import figures
 from trackmdp.world.make import build_world
@@ -41,9 +43,8 @@ def run(cfg: SolveConfig, folder: Path, problem: Problem | None = None) -> float
     assert isinstance(world, World)  # recorded tracks are refused: there is no kernel to solve with
     with _SearchDisplay(console, f"solve {cfg.solver.name}") as display:
         solution = solve_world(cfg, world, display.update)
-    evaluation = evaluate(world, solution.chains)
-    write_json(folder / "solution.json", _report(cfg, world, solution, evaluation))
-    _show(console, cfg, world, solution, evaluation, folder)
+    write_json(folder / "solution.json", _report(cfg, world, solution))
+    _show(console, cfg, world, solution, folder)
     if solution.interrupted:
         raise KeyboardInterrupt
     if cfg.verify:
@@ -52,17 +53,17 @@ def run(cfg: SolveConfig, folder: Path, problem: Problem | None = None) -> float
     return solution.lower
 
 
-def solve_world(cfg: SolveConfig, world: World, on_progress: Callable[[Progress], None]) -> Solution:
+def solve_world(cfg: SolveConfig, world: World, on_progress: Callable[[SearchProgress], None]) -> Solution:
     """The policy of `cfg.solver` with the bracket it proves: its own for `optimal`, else up to the clocked bound."""
     if isinstance(cfg.solver, OptimalConfig):
         limit, tolerance = cfg.solver.time_limit, cfg.solver.tolerance
         return optimal.solve(world, time_limit=limit, tolerance=tolerance, on_progress=on_progress)
     started = time.monotonic()
-    chains = make_baseline(cfg.solver, world)
-    return optimal.bracketed(world, chains, time.monotonic() - started)
+    table = PolicyTable.from_dense(world, make_baseline(cfg.solver, world))
+    return bracketed(world, table, time.monotonic() - started)
 
 
-def _report(cfg: SolveConfig, world: World, solution: Solution, evaluation: Evaluation) -> dict[str, Any]:
+def _report(cfg: SolveConfig, world: World, solution: Solution) -> dict[str, Any]:
     return {
         "solver": cfg.solver.name,
         "lower": solution.lower,
@@ -71,12 +72,12 @@ def _report(cfg: SolveConfig, world: World, solution: Solution, evaluation: Eval
         "interrupted": solution.interrupted,
         "seconds": solution.seconds,
         "nodes": solution.nodes,
-        "regret_per_step": regret_per_step(solution.upper, evaluation),
-        "figures": figures(evaluation),
+        "regret_per_step": regret_per_step(solution.upper, solution.evaluation),
+        "figures": figures(solution.evaluation),
         "bounds": _bounds(world),
         "value": solution.value.tolist(),
         "upper_value": solution.bound.tolist(),
-        "policy": sets_of(solution.chains),
+        "policy": solution.table.as_lists(),
     }
 
 
@@ -85,19 +86,17 @@ def _bounds(world: World) -> dict[str, float]:
     return {name: float(bound(world).mean()) for name, bound in every.items()}
 
 
-def _show(
-    console: Console, cfg: SolveConfig, world: World, solution: Solution, evaluation: Evaluation, folder: Path
-) -> None:
+def _show(console: Console, cfg: SolveConfig, world: World, solution: Solution, folder: Path) -> None:
     rows = [
         [name, f"{e.aihtr:,.6f}", f"{100 * e.accuracy:.2f} %", f"{e.sensors_per_step:.3f}", f"{e.safe_per_episode:.3f}"]
-        for name, e in ((cfg.solver.name, evaluation), ("Q_MDP", evaluate(world, qmdp.solve(world))))
+        for name, e in ((cfg.solver.name, solution.evaluation), ("Q_MDP", evaluate(world, qmdp.solve(world))))
     ]
     rows.append(["upper bound proved", f"{solution.upper:,.6f}", "", "", ""])
     rows += [[f"{name} bound", f"{value:,.6f}", "", "", ""] for name, value in _bounds(world).items()]
     columns = ["policy", "AIHTR", "accuracy", "sensors per step", "safe actions per episode"]
     console.print(table("exact values", columns, rows))
     state = "certified" if solution.certified else "interrupted" if solution.interrupted else "not closed"
-    regret = max(regret_per_step(solution.upper, evaluation), 0.0)
+    regret = max(regret_per_step(solution.upper, solution.evaluation), 0.0)
     console.print(
         f"{state}: bracket {solution.lower:,.6f} ... {solution.upper:,.6f}, {regret:.2g} per step, after "
         f"{solution.seconds:.1f} s and {solution.nodes:,} nodes; results in {folder}"
@@ -119,7 +118,7 @@ class _SearchDisplay:
     def __exit__(self, *_: object) -> None:
         self._status.stop()
 
-    def update(self, progress: Progress) -> None:
+    def update(self, progress: SearchProgress) -> None:
         """Show how far the search has come."""
         bracket = f"bracket {progress.lower:,.4f} ... {progress.upper:,.4f}"
         line = f"{self._title}: {progress.seconds:.0f} s  {bracket}  {progress.nodes:,} nodes"

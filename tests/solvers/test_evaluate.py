@@ -10,7 +10,9 @@ from hypothesis import strategies as st
 from tests.solvers.worlds import REFERENCES, reference_world, renewal, tiny_worlds, value_of
 from trackmdp.errors import UserError
 from trackmdp.solvers import qmdp
-from trackmdp.solvers.chains import evaluate, regret_per_step
+from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers.evaluation import regret_per_step
+from trackmdp.solvers.renewal import expected_steps
 from trackmdp.world.model import World
 
 
@@ -74,7 +76,7 @@ def test_a_world_by_hand() -> None:
 def test_a_kernel_that_never_exits_has_no_value() -> None:
     world = World(np.full((4, 4), 0.25), 2, cost=0.1, t_max=1, max_steps=9)
     with pytest.raises(UserError, match="never exits"):
-        evaluate(world, np.zeros((4, 2, 4), dtype=bool))
+        expected_steps(world)
 
 
 def test_chains_of_another_world_are_refused() -> None:

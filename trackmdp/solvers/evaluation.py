@@ -1,0 +1,64 @@
+"""What a policy earns and does: the figures of an evaluation, however they were found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from trackmdp.world.model import Array
+
+__all__ = ["Evaluation", "pooled", "regret_per_step"]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What a policy earns; single figures are pooled over a uniform start.
+
+    Attributes:
+        aihtr: mean of `value` (paper, Section VII-A).
+        value: `[M]`, V(x, 0, ∅), the expected reward of an episode that starts located in x.
+        accuracy: detections per step in the grid, forced ones included (y_0 and the exit step do not count).
+        sensors_per_step: sensors switched on by free choice per step in the grid; the safe action counts as none.
+        safe_per_episode: forced safe actions per episode.
+        expected_length: steps per episode, the exit step included.
+        steps, detections, sensors, safe_actions: `[M]`, per episode from each start cell; `steps` in the grid.
+        error: no entry of `value` is farther from the exact one; 0 where the system was factorised.
+    """
+
+    aihtr: float
+    value: Array
+    accuracy: float
+    sensors_per_step: float
+    safe_per_episode: float
+    expected_length: float
+    steps: Array
+    detections: Array
+    sensors: Array
+    safe_actions: Array
+    error: float = 0.0
+
+
+def regret_per_step(upper_aihtr: float, evaluation: Evaluation) -> float:
+    """How far a policy is from `upper_aihtr`, per step of its episodes."""
+    return (upper_aihtr - evaluation.aihtr) / evaluation.expected_length
+
+
+def pooled(totals: Array, length: Array, error: float = 0.0) -> Evaluation:
+    """An evaluation from `[M, 5]` reward, steps in the grid, detections, sensors, safe actions per episode.
+
+    `length` `[M]` is the expected number of steps of an episode, the exit step included.
+    """
+    value, steps, detections, sensors, safe = totals.T
+    in_grid = float(steps.mean())
+    return Evaluation(
+        aihtr=float(value.mean()),
+        value=value,
+        accuracy=float(detections.mean()) / in_grid if in_grid else 1.0,
+        sensors_per_step=float(sensors.mean()) / in_grid if in_grid else 0.0,
+        safe_per_episode=float(safe.mean()),
+        expected_length=float(length.mean()),
+        steps=steps,
+        detections=detections,
+        sensors=sensors,
+        safe_actions=safe,
+        error=error,
+    )
