@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import importlib
+import itertools
+import logging
 import os
 import re
 import signal
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +24,7 @@ from trackmdp.config import GROUPS, ROOTS, SELECTORS, options
 from trackmdp.errors import Preempted, RunError, UserError
 
 ROOT = Path(__file__).parents[1]
+LONG = "a" * 300  # longer than a name may be
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
 
 
@@ -76,6 +81,29 @@ def test_unknown_credit_is_refused(algo: str, bad: str, capsys: pytest.CaptureFi
         ("train kernel=table kernel.path=no.npy", "kernel.path="),
         ("train kernel.exit_probability=0", "kernel=random_support: from cell 0 the target never exits"),
         ("train cost.sensor=no.csv", "cost.sensor="),
+        ("train algo={name:ppo}", "algo={'name': 'ppo'}: expected one of "),
+        ("train algo.lam=0.9", "algo.lam: renamed, expected algo.gae_lambda"),
+        ("train algo=ppo algo.lr=1", "algo.lr: renamed, expected algo.learning_rate"),
+        ("train hydra.run.dir=???", "hydra.run.dir: missing, expected a folder"),
+        ("train hydra.run.dir=${nope}", "hydra.run.dir: Interpolation key 'nope' not found"),
+        ("train hydra.run.dir=${nope:1}", "hydra.run.dir: Unsupported interpolation type nope"),
+        ("train -m seed=0,1 hydra.sweep.dir=???", "hydra.sweep.dir: missing, expected a folder"),
+        (f"train hydra.run.dir={LONG}", f"hydra.run.dir={LONG}: expected a folder that can be written to"),
+        (f"train resume={LONG}", f"{Path('/')}"),
+        (f"train kernel=table kernel.path={LONG}", f"kernel.path={Path('/')}"),
+        ("replay file=log.mcap html=/", "html=/: expected a file to write, not a folder"),
+        ("train --shell-completion x", "Expecting one subcommand"),
+        ("train --cfg job --package nope", "--package nope: not in the config"),
+        ("train --package grid", "--resolve and --package: only together with --cfg"),
+        ("train --cfg job -m", "expected only one of"),
+        ("train hydra.verbose={a:1}", "hydra.verbose={'a': 1}: expected true, false, or a list of loggers"),
+        ("train +algo._target_=os.system", "algo._target_: a config is data, and names no code to call"),
+        ("train ++hydra.sweeper._target_=os.system", "hydra.sweeper._target_: a config is data"),
+        ("train +hydra.callbacks.x._target_=os.getcwd", "hydra.callbacks.x: a config names no code to call"),
+        ("train hydra.output_subdir=../x", "hydra.output_subdir=../x: expected a name, or null"),
+        ("train hydra.searchpath=[pkg://os]", "hydra.searchpath=pkg://os: expected a folder"),
+        ("train hydra.searchpath=[nowhere]", "hydra.searchpath nowhere: no such folder"),
+        ("train -m seed=0,1 hydra/launcher=basic,joblib", "hydra/launcher=basic,joblib: expected one launcher"),
         ("train hydra.sizzle=1", "Could not override 'hydra.sizzle': Key 'sizzle' not in 'HydraConf'"),
         ("evaluate", "expected exactly one of run=FOLDER and baseline=NAME, got neither"),
         ("evaluate run=nowhere", "run="),
@@ -236,6 +264,103 @@ def test_a_config_folder_of_ones_own_adds_choices(
     assert (calls[0].kernel.name, calls[0].kernel.stay) == ("random_walk", 0.9)
     capsys.readouterr()
     assert "stai" in refused(capsys, "train", "--config-dir", "../mine", "kernel=typo")
+
+
+EVIL = "{_target_: os.mkdir, path: mark}"
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "words", "message"),
+    [
+        (
+            "experiment/a",
+            f"hydra: {{callbacks: {{x: {EVIL}}}}}",
+            "experiment=a",
+            "hydra.callbacks.x._target_: a config",
+        ),
+        ("experiment/a", "hydra: {callbacks: {x: {path: mark}}}", "experiment=a", "sets hydra.callbacks"),
+        ("experiment/a", "hydra: {job: {env_set: {PYTHONPATH: x}}}", "experiment=a", "sets hydra.job.env_set"),
+        ("experiment/a", "seed: !!python/object/apply:os.mkdir [mark]", "experiment=a", "not a config"),
+        ("experiment/a", "seed: &a [*a]", "experiment=a", "not a config (alias *a"),
+        ("experiment/a", f"seed: {'[' * 3000}{']' * 3000}", "experiment=a", "deeper than 50 levels"),
+        ("experiment/a", "- 1", "experiment=a", "expected a mapping"),
+        ("experiment/a", "x: " + "y" * 2**20, "experiment=a", "longer than 1,048,576 bytes"),
+        ("algo/a", f"defaults: [hindsight]\nx: {EVIL}", "algo=a", "x._target_: a config is data"),
+        ("mine", "defaults: [base_train]\nhydra: {searchpath: ['pkg://os']}", "--config-name mine", "sets hydra.sea"),
+        ("hydra/job_logging/a", "root: {level: 1}\nfilters: {x: {(): os.mkdir}}", "hydra/job_logging=a", "x.(): a con"),
+        ("hydra/job_logging/a", "root: {level: INFO}", "hydra/job_logging=a", "expected one of none, default"),
+        ("hydra/launcher/a", f"x: {EVIL}", "hydra/launcher=a", "x._target_: a config is data"),
+        ("hydra/launcher/a", "x: 1", "hydra/launcher=a", "hydra/launcher: expected one of basic, joblib"),
+    ],
+)
+def test_a_config_of_the_users_is_data(
+    file: str, text: str, words: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "mine" / f"{file}.yaml"
+    path.parent.mkdir(parents=True)
+    path.write_text(f"# @package _global_\n{text}\n" if "experiment" in file else f"{text}\n")
+    for flag in ("--config-dir ../mine", "hydra.searchpath=[../mine]"):
+        assert message in refused(capsys, "train", *flag.split(), *words.split())
+
+
+def test_aliases_that_unfold_to_too_much_are_refused_at_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine/experiment").mkdir(parents=True)
+    names = "abcdefghij"
+    lines = ["a: &a [x,x,x,x,x,x,x,x,x]"]
+    lines += [f"{c}: &{c} [{','.join([f'*{p}'] * 9)}]" for p, c in itertools.pairwise(names)]
+    (tmp_path / "mine/experiment/a.yaml").write_text("\n".join(lines))
+    assert "more than 100,000 values" in refused(capsys, "train", "--config-dir", "../mine", "experiment=a")
+
+
+@pytest.mark.parametrize("words", [["seed=3"], ["kernel=table", "kernel.path=../k.npy"]])
+def test_a_command_composes_once_checks_once_and_builds_one_world(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    np.save(tmp_path / "k.npy", np.full((100, 100), 0.009))
+    counts = Counter[str]()
+
+    def spy(module: str, name: str) -> None:
+        owner = importlib.import_module(module)
+        inner = getattr(owner, name)
+
+        def counted(*args: Any, **kwargs: Any) -> Any:
+            counts[name] += 1
+            return inner(*args, **kwargs)
+
+        monkeypatch.setattr(owner, name, counted)
+
+    module = importlib.import_module("trackmdp.app.commands.train")
+    spy("trackmdp.app.compose", "compose")
+    spy("trackmdp.config.tree", "validate")
+    spy("trackmdp.world.make", "make_problem")
+    spy(module.__name__, "make_problem")
+    monkeypatch.setattr(module, "Trainer", lambda problem, cfg, **_: (_ for _ in ()).throw(RunError("far enough")))
+    assert main(["train", *words]) == 1
+    assert counts == {"compose": 1, "validate": 1, "make_problem": 1}
+
+
+def test_hydras_own_settings_still_hold(monkeypatch: pytest.MonkeyPatch, empty_folder: Path) -> None:
+    seen: list[Any] = []
+    stub(monkeypatch, "train", lambda cfg, folder: seen.append((Path.cwd(), folder, os.environ.get("X_Y"))))
+    words = ["hydra.job.chdir=true", "hydra.output_subdir=.hydra", "+hydra.job.env_set.X_Y=1", "hydra.run.dir=r"]
+    root = logging.getLogger()
+    before = (root.level, list(root.handlers))
+    try:
+        assert main(["train", "quiet=true", "seed=${grid.size}", "hydra/job_logging=default", *words]) == 0
+    finally:
+        for handler in set(root.handlers) - set(before[1]):
+            handler.close()
+        root.level, root.handlers[:] = before
+    assert seen == [(empty_folder / "r", empty_folder / "r", "1")]
+    assert "X_Y" not in os.environ
+    assert sorted(path.name for path in Path("r/.hydra").iterdir()) == ["config.yaml", "hydra.yaml", "overrides.yaml"]
+    assert (empty_folder / "r/trackmdp.log").is_file()
+
+
+def test_what_a_terminal_would_obey_is_spelled_out(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "\\x1b[31mred" in refused(capsys, "evaluate", "run='\x1b[31mred'")
 
 
 def test_mistakes_typed_in_a_shell(empty_folder: Path) -> None:

@@ -5,6 +5,7 @@ Nothing heavy is imported before the first line is on the terminal; a user's mis
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 import traceback
@@ -24,6 +25,13 @@ COMMANDS = {
     "replay": "list, play, verify and recover logged episodes, or show one as a web page",
     "report": "make figures, tables and a web page of a sweep, or watch it run",
 }
+
+
+_OF_FILES = {
+    getattr(errno, name)
+    for name in ("EACCES", "EDQUOT", "EISDIR", "ELOOP", "ENAMETOOLONG", "ENOSPC", "ENOTDIR", "EPERM", "EROFS")
+}
+"""What the file system refuses, whoever wrote the code: its own words are enough."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -61,10 +69,16 @@ def _dispatch(words: list[str]) -> int:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             traceback.print_exc()
         name = f"trackmdp {command}" if command in COMMANDS else "trackmdp"
-        sys.stderr.write(f"{name}: {' '.join(str(error).split())}\n")
+        sys.stderr.write(f"{name}: {_printable(str(error))}\n")
         return USER_MISTAKE if isinstance(error, UserError) else FAILED
     except BrokenPipeError:
         raise
+    except OSError as error:
+        if error.filename is None or error.errno not in _OF_FILES:
+            traceback.print_exc()
+        else:
+            sys.stderr.write(f"trackmdp {command}: {_printable(f'{error.filename}: {error.strerror}')}\n")
+        return FAILED
     except Exception:  # a bug: whoever reads it needs all of it
         traceback.print_exc()
         return FAILED
@@ -79,6 +93,11 @@ def _run(command: str, words: list[str]) -> int:
     from trackmdp.app.launch import launch
 
     return launch(command, words)
+
+
+def _printable(text: str) -> str:
+    """`text` in one line; what a terminal would obey, such as an escape sequence in a file's name, is spelled out."""
+    return "".join(each if each.isprintable() else ascii(each)[1:-1] for each in " ".join(text.split()))
 
 
 def _overview() -> str:

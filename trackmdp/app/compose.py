@@ -16,7 +16,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from trackmdp.app.diagnose import diagnose
 from trackmdp.app.sources import searched
@@ -134,11 +134,13 @@ def folder_of(cfg: DictConfig, key: str) -> Path:
     """
     try:
         value = OmegaConf.select(cfg, key, throw_on_missing=True)
+    except MissingMandatoryValue:
+        value = None
     except Exception as error:  # a resolver of `${name:...}` raises what it likes
         said = str(error).strip().splitlines() or [type(error).__name__]
         raise UserError(f"{key}: {said[0]}") from error
     if not isinstance(value, str):
-        raise UserError(f"{key}: expected a folder")
+        raise UserError(f"{key}: missing, expected a folder")
     folder = Path(value)
     try:
         folder.exists()
@@ -162,6 +164,12 @@ def _refuse_code(cfg: DictConfig, words: Sequence[str]) -> None:
             raise UserError(f"hydra/{group}: expected one of {', '.join(members)}")
     if cfg.hydra.callbacks:
         raise UserError(f"hydra.callbacks.{next(iter(cfg.hydra.callbacks))}: a config names no code to call")
+    verbose = plain["hydra"]["verbose"]
+    if not (
+        isinstance(verbose, (bool, str))
+        or (isinstance(verbose, list) and all(isinstance(name, str) for name in verbose))
+    ):
+        raise UserError(f"hydra.verbose={verbose}: expected true, false, or a list of loggers")
     if cfg.hydra.job.env_set and not any("hydra.job.env_" in word for word in words):
         raise UserError("hydra.job.env_set: not taken from a file; set the environment in the shell")
     if Path(cfg.hydra.output_subdir or "x").name != (cfg.hydra.output_subdir or "x"):

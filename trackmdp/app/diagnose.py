@@ -38,6 +38,9 @@ def diagnose(error: Exception, command: str, words: Sequence[str], compose: Comp
             parsed.append(parser.parse_override(word))
         except HydraException:
             return UserError(f"{word}: expected option=value (a value with blanks or commas needs quotes)")
+    for override in parsed:
+        if refusal := _renamed(override):
+            return refusal
     sweeps = [override.input_line for override in parsed if override.is_sweep_override()]
     if sweeps and ("multirun" in str(error).lower()):
         return UserError(f"{sweeps[0]}: expected one value; add -m to run once for each")
@@ -59,6 +62,17 @@ def diagnose(error: Exception, command: str, words: Sequence[str], compose: Comp
     return UserError(_plain(error))
 
 
+def _renamed(override: Override) -> UserError | None:
+    """The refusal of an option or a choice by its former name."""
+    try:
+        refuse_renamed(override.key_or_group)
+        for value in _values(override):
+            refuse_renamed(override.key_or_group, str(value))
+    except UserError as refusal:
+        return refusal
+    return None
+
+
 def _group(override: Override, command: str) -> str:
     """The group a word chooses from, `""` if it sets a value."""
     key = override.key_or_group
@@ -70,8 +84,7 @@ def _bad_choice(override: Override, group: str, error: Exception) -> UserError |
     """The refusal of a choice that Hydra did not find."""
     known = SELECTORS[group].choices if group in SELECTORS else GROUPS[group]
     for value in _values(override):
-        absent = value not in known and f"Could not find '{group}/{value}" in str(error)
-        if absent or not isinstance(value, str):
+        if not isinstance(value, str) or (value not in known and f"Could not find '{group}/{value}" in str(error)):
             return unknown_choice(group, value)
     return None
 

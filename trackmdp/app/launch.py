@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,8 +19,6 @@ from trackmdp.app.outputs import make_folder, remove_if_empty
 from trackmdp.app.prepare import Prepared, announce, prepare, typed_config
 from trackmdp.app.questions import answer, is_question, parse
 from trackmdp.app.sweep.schema import BlocksConfig, OptunaConfig, SweeperConfig, plugin
-from trackmdp.config import TrainConfig
-from trackmdp.config.resume import run_folder
 from trackmdp.errors import UserError
 
 if TYPE_CHECKING:
@@ -49,14 +47,12 @@ def _run_once(compose: Composer) -> int:
     cfg = compose(compose.words)
     typed = typed_config(compose.command, cfg, Path.cwd())
     folder = folder_of(cfg, "hydra.run.dir")
-    if isinstance(typed, TrainConfig):
-        folder = run_folder(typed, folder)
-    ready = prepare(compose.command, typed, folder.absolute(), of_task(compose.words))
-    made = make_folder("hydra.run.dir", folder)
+    ready = prepare(compose.command, typed, folder, of_task(compose.words))
+    made = make_folder("hydra.run.dir", ready.folder)
     with read_write(cfg.hydra):
-        cfg.hydra.run.dir = str(folder)  # a run that is resumed writes to its own
+        cfg.hydra.run.dir = str(ready.folder)  # a run that is resumed writes to its own
     try:
-        announce(compose.command, ready.cfg, folder)
+        announce(compose.command, ready.cfg, ready.folder)
         _run_in_hydra(cfg, ready)
     finally:
         remove_if_empty(made)
@@ -66,7 +62,7 @@ def _run_once(compose: Composer) -> int:
 def _run_in_hydra(cfg: DictConfig, ready: Prepared) -> None:
     """Run with what Hydra's own settings ask for: logging, environment, current folder, `.hydra`."""
     configure_log(cfg.hydra.hydra_logging, cfg.hydra.verbose)
-    task = _Task(ready)
+    task = _Task(replace(ready, folder=ready.folder.absolute()))  # hydra.job.chdir moves the current folder
     loader = GlobalHydra.instance().config_loader()
     run_job(
         task,

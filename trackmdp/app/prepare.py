@@ -23,7 +23,7 @@ from trackmdp.config import (
     from_hydra,
     load_run,
 )
-from trackmdp.config.resume import continued
+from trackmdp.config.resume import continued, run_folder
 from trackmdp.errors import UserError
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ def prepare(command: str, cfg: CommandConfig, folder: Path, words: Sequence[str]
     Args:
         command: what is to be run.
         cfg: its typed config.
-        folder: where it is to write; a run that is there already is resumed where `cfg.resume` says so.
+        folder: where it is to write, unless `cfg.resume` names a run, which then goes on in its own folder.
         words: the overrides that were typed.
 
     Raises:
@@ -86,11 +86,12 @@ def prepare(command: str, cfg: CommandConfig, folder: Path, words: Sequence[str]
     """
     try:
         if isinstance(cfg, TrainConfig):
+            folder = run_folder(cfg, folder)
             cfg = continued(cfg, folder, words)
         _check_files(cfg, words)
         problem = _problem(cfg) if isinstance(cfg, WorldConfig) and _reads_files(cfg) else None
     except OSError as error:
-        raise UserError(f"{error.filename}: cannot be used ({error.strerror})") from error
+        raise UserError(f"{error.filename}: cannot be read ({error.strerror})") from error
     return Prepared(command, cfg, folder, problem)
 
 

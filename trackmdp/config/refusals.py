@@ -15,7 +15,9 @@ RENAMED: dict[str, str] = {
     "algo.average": "algo.ema_decay",
     "algo.clip": "algo.clip_epsilon",
     "algo.lam": "algo.gae_lambda",
+    "algo.lr": "algo.learning_rate",
     "kernel.homogeneous": "algo.share_cells",
+    "lr": "algo.learning_rate",
 }
 """Former name of an option (``group.option``) or of a choice (``group=choice``) -> its name."""
 

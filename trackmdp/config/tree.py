@@ -15,6 +15,7 @@ from trackmdp.config.options import GROUPS, Option, options
 from trackmdp.config.refusals import suggestion
 from trackmdp.config.roots import CommandConfig, TrainConfig, WorldConfig
 from trackmdp.config.schema import ChoiceConfig
+from trackmdp.config.untrusted import parse_yaml, read_text
 from trackmdp.errors import UserError
 
 __all__ = [
@@ -80,12 +81,9 @@ def load(file: Path, root: type[C]) -> C:
     Raises:
         UserError: there is no such file, or it does not hold a config of this command.
     """
-    try:
-        plain = OmegaConf.to_container(OmegaConf.load(file))
-    except FileNotFoundError:
-        raise UserError(f"{file}: no such file") from None
-    except Exception as error:
-        raise UserError(f"{file}: not a config ({_first_line(error)})") from error
+    if not file.exists():
+        raise UserError(f"{file}: no such file")
+    plain = OmegaConf.to_container(parse_yaml(read_text(file), str(file)))
     if not isinstance(plain, Mapping):
         raise UserError(f"{file}: not a config (expected a mapping)")
     try:
@@ -102,11 +100,9 @@ def world_of(text: str) -> WorldConfig:
     Raises:
         UserError: it does not describe one.
     """
-    try:
-        plain = OmegaConf.to_container(OmegaConf.create(text))
-    except Exception as error:
-        raise UserError(f"not a config ({_first_line(error)})") from error
-    assert isinstance(plain, Mapping)
+    plain = OmegaConf.to_container(parse_yaml(text, "config.yaml"))
+    if not isinstance(plain, Mapping):
+        raise UserError("config.yaml: not a config (expected a mapping)")
     known = options(WorldConfig)
     typed: WorldConfig = build({key: value for key, value in plain.items() if key in known}, WorldConfig)
     validate(typed)
