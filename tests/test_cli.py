@@ -20,6 +20,7 @@ import pytest
 from tests.config.cases import composed, of_command
 from tests.typed import refused, stub
 from trackmdp.app.cli import COMMANDS, main
+from trackmdp.app.manual import EXAMPLES
 from trackmdp.config import GROUPS, ROOTS, SELECTORS, options
 from trackmdp.errors import Preempted, RunError, UserError
 
@@ -218,7 +219,38 @@ def test_help_names_every_option_with_range_unit_and_default(command: str, capsy
             assert f"  {group}={name}: " in text
     for name, selector in SELECTORS.items():
         offered = selector.group in options(ROOTS[command])
-        assert all((f"  {name}={choice}: {about}" in text) == offered for choice, about in selector.choices.items())
+        assert all((f" {name}={choice}: {about}" in flat) == offered for choice, about in selector.choices.items())
+    assert max(map(len, text.splitlines())) < 80
+    assert [text.count(f"  {line}\n") for line in EXAMPLES[command]] == [1] * len(EXAMPLES[command])
+    assert text.index("Examples") < text.index("Options")
+
+
+@pytest.mark.parametrize(
+    ("words", "shown", "hidden"),
+    [
+        (["algo=ppo"], "algo.clip_epsilon=0.2", ["algo.blend", "kernel.", "algo.buffer_size"]),
+        (["algo=ppo", "credit=per_sensor"], "algo.surrogate=all_action", ["algo.gae_lambda", "kernel."]),
+        (["kernel=drift", "seed=3"], "kernel.persistence=", ["kernel.stay", "algo."]),
+        (["hydra/launcher=submitit_slurm"], "hydra.launcher.partition=null", ["n_jobs", "algo."]),
+    ],
+)
+def test_help_of_a_choice_shows_what_it_reads(
+    words: list[str], shown: str, hidden: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["train", *words, "--help"]) == 0
+    text = capsys.readouterr().out
+    assert f"  {shown}" in text
+    assert not any(word in text for word in hidden)
+    assert max(map(len, text.splitlines())) < 80
+    assert text.index("Examples\n  trackmdp train ") < text.index(shown)
+    assert refused(capsys, "train", "algo=sac", "--help").startswith("algo=sac: expected one of ")
+
+
+def test_examples_of_the_help_can_be_typed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    for lines in EXAMPLES.values():
+        for line in lines:
+            main([word for word in line.split()[1:] if word != "-m" and "," not in word] + ["--cfg", "job"])
+            assert capsys.readouterr().err == "", line
 
 
 def test_help_shows_the_values_of_conf(capsys: pytest.CaptureFixture[str]) -> None:
@@ -233,7 +265,7 @@ def test_help_shows_the_values_of_conf(capsys: pytest.CaptureFixture[str]) -> No
     ):
         assert f" {expected}" in text
     assert "cost.sensor=0.16 " in text
-    assert "(default: random_support)" in text
+    assert "(default: random_support)" in " ".join(text.split())
 
 
 def test_overview_and_unknown_commands(capsys: pytest.CaptureFixture[str]) -> None:

@@ -88,7 +88,7 @@ def _run(command: str, words: list[str]) -> int:
     if "-h" in words or "--help" in words:
         from trackmdp.app.manual import manual
 
-        sys.stdout.write(manual(command))
+        sys.stdout.write(manual(command, [word for word in words if not word.startswith("-")]))
         return 0
     from trackmdp.app.launch import launch
 

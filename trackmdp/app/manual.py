@@ -1,67 +1,176 @@
-"""The text of `--help`: every group and option of a command with unit, range, default and choices."""
+"""The text of `--help`: examples, then every option of a command, or of what its words choose, in 80 columns."""
 
 from __future__ import annotations
 
 import inspect
 import json
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
 
-from trackmdp.config import GROUPS, ROOTS, SELECTORS, Option, conf_dir, options
+from trackmdp.app.sweep.schema import PLUGINS
+from trackmdp.config import GROUPS, ROOTS, SELECTORS, Option, options
+from trackmdp.config.refusals import refuse_renamed, unknown_choice
+from trackmdp.config.registry import conf_dir, conf_file, load_plugins
+from trackmdp.errors import UserError
 
-__all__ = ["manual"]
+__all__ = ["EXAMPLES", "manual"]
 
-USAGE = """\
-usage: trackmdp {command} [option=value ...] [group=choice ...]      (or: python scripts/{command}.py ...)
+EXAMPLES = {
+    "train": [
+        "trackmdp train",
+        "trackmdp train algo=ppo seed=3 hydra.run.dir=runs/mine",
+        "trackmdp train resume=auto hydra.run.dir=runs/mine",
+        "trackmdp train kernel=table kernel.path=table.npy grid.size=5",
+        "trackmdp train -m algo=hindsight,ppo cost.sensor=0.16,0.2 seed=0,1",
+        "trackmdp train algo=ppo --help",
+    ],
+    "evaluate": ["trackmdp evaluate run=runs/mine", "trackmdp evaluate baseline=qmdp grid.size=5"],
+    "solve": ["trackmdp solve", "trackmdp solve solver=lookahead cost.sensor=0.2"],
+    "verify": ["trackmdp verify", "trackmdp verify grid.size=5"],
+    "benchmark": ["trackmdp benchmark part=env", "trackmdp benchmark part=train threads=2"],
+    "replay": ["trackmdp replay file=episodes.mcap", "trackmdp replay file=episodes.mcap episode=0 html=page.html"],
+    "report": ["trackmdp report sweep=multirun/mine", "trackmdp report sweep=multirun/mine watch=true"],
+    "export": ["trackmdp export run=runs/mine", "trackmdp export run=runs/mine format=onnx"],
+}
+"""Command -> lines that can be typed as they stand, once there is what they name."""
 
-{about}
+_FLAGS = {
+    "-m, --multirun": "run once for every combination of option=a,b,c, each in a process of its own",
+    "-c job, --cfg job": "show the resolved options instead of running",
+    "--config-dir FOLDER": "a folder of your own with further choices, such as FOLDER/kernel/mine.yaml",
+    "--info, --hydra-help": "about Hydra, which reads the options",
+    "hydra.run.dir=FOLDER": "where the results go",
+}
 
-  -m, --multirun              run once for every combination of option=a,b,c, in one process after the other
-  -c job, --cfg job           show the resolved options instead of running
-  --config-dir FOLDER         a folder of your own with further choices, such as FOLDER/kernel/mine.yaml
-  --info, --hydra-help        about Hydra, which reads the options
-  hydra.run.dir=FOLDER        where the results go
-"""
+_WIDTH, _COLUMN = 80, 30
 
 
-def manual(command: str) -> str:
-    """The help of one command; the values shown are those of `conf/`."""
-    folder = Path(conf_dir())
-    values = _read(folder / f"{command}.yaml")
-    chosen = _chosen(values)
-    schema = ROOTS[command]
-    top = {key: item for key, item in options(schema).items() if isinstance(item, Option)}
-    lines = [USAGE.format(command=command, about=_about(schema)), "Options"]
-    for key, described in top.items():
-        lines += _entry(key, described, values.get(key))
-    for key, item in options(schema).items():
+def manual(command: str, words: Sequence[str] = ()) -> str:
+    """The help of one command; the values shown are those of `conf/`.
+
+    Args:
+        command: whose help.
+        words: what stands before `--help`; where a choice is among them, such as ``algo=ppo``, only what it reads is
+            shown.
+
+    Raises:
+        UserError: a choice is unknown.
+    """
+    load_plugins()
+    typed = _choices(command, words)
+    values = _read(Path(conf_dir()) / f"{command}.yaml")
+    blocks = [f"usage: trackmdp {command} [option=value ...] [group=choice ...]", *_wrapped(_about(ROOTS[command])), ""]
+    if typed:
+        chosen = " ".join(f"{group}={name}" for group, name in typed.items())
+        blocks += ["Examples", f"  trackmdp {command} {chosen}"]
+        for group, name in typed.items():
+            blocks += [
+                *_example(command, chosen, group, name),
+                *_choice(group, name, typed),
+                *_read_selectors(group, name, typed),
+            ]
+        return "\n".join([*blocks, "", f"trackmdp {command} --help lists every other option.", ""])
+    blocks += ["Examples", *(f"  {line}" for line in EXAMPLES[command]), ""]
+    for flag, text in _FLAGS.items():
+        blocks += _described(flag, text)
+    return "\n".join([*blocks, *_all(command, values), ""])
+
+
+def _all(command: str, values: dict[str, Any]) -> Iterator[str]:
+    """Every option of the command, those of every choice of its groups among them."""
+    yield from ("", "Options")
+    chosen = {key: name for each in values["defaults"] if isinstance(each, dict) for key, name in each.items()}
+    schema = options(ROOTS[command])
+    for key, item in schema.items():
+        if isinstance(item, Option):
+            yield from _entry(key, item, values.get(key))
+    for key, item in schema.items():
         if isinstance(item, Option):
             continue
-        if key in GROUPS:
-            lines += _group(folder, key, chosen.get(key))
-            lines += _selectors(key, chosen)
+        if key not in GROUPS:
+            yield from ("", *_wrapped(f"{key}: {_about(item)}"), *_entries(item, values.get(key), f"{key}."))
+            continue
+        yield from ("", *_wrapped(f"{key}={'|'.join(GROUPS[key])} (default: {chosen.get(key) or 'none chosen'})"))
+        yield from _selectors(key, chosen)
+        for name in GROUPS[key]:
+            yield from _choice(key, name, {})
+    if "override hydra/sweeper" in chosen:
+        for group, members in PLUGINS.items():
+            yield from ("", *_wrapped(f"With -m: hydra/{group}={'|'.join(members)} (default: {next(iter(members))})"))
+            for name in members:
+                yield from _choice(f"hydra/{group}", name, {})
+
+
+def _members(group: str) -> dict[str, type[Any]]:
+    return PLUGINS[group.partition("/")[2]] if group.startswith("hydra/") else GROUPS[group]
+
+
+def _choices(command: str, words: Sequence[str]) -> dict[str, str]:
+    """Group -> the choice that the words make, a selector's among them."""
+    groups = [*(key for key in options(ROOTS[command]) if key in GROUPS), *(f"hydra/{group}" for group in PLUGINS)]
+    made: dict[str, str] = {}
+    for word in words:
+        key, _, name = word.partition("=")
+        if key in SELECTORS and SELECTORS[key].group in groups:
+            known: Any = SELECTORS[key].choices
+        elif key in groups:
+            known = _members(key)
         else:
-            lines += ["", f"{key}: {_about(item)}", *_entries(item, values.get(key), f"{key}.")]
-    return "\n".join([*lines, ""])
+            continue
+        refuse_renamed(key, name)
+        if name not in known:
+            raise UserError(f"{word}: expected one of {', '.join(known)}") if "/" in key else unknown_choice(key, name)
+        made[key] = name
+    return made if made.keys() - SELECTORS.keys() else {}  # a selector alone chooses nothing
 
 
-def _group(folder: Path, group: str, default: str | None) -> Iterator[str]:
-    yield ""
-    yield f"{group}={'|'.join(GROUPS[group])}   (default: {default or 'none chosen'})"
-    for name, schema in GROUPS[group].items():
-        yield f"  {group}={name}: {_about(schema)}"
-        yield from (f"  {line}" for line in _entries(schema, _values(folder, group, name), f"{group}."))
+def _choice(group: str, name: str, typed: dict[str, str]) -> Iterator[str]:
+    """One choice of a group with its options; a selector that was typed says which of the group's it stands for."""
+    if group in SELECTORS:
+        return
+    yield from ("", *_wrapped(f"  {group}={name}: {_about(_schema(group, name, typed))}"))
+    values = _values(group, name, typed)
+    yield from _entries(_schema(group, name, typed), values, f"{group.replace('/', '.')}.")
 
 
-def _selectors(group: str, chosen: dict[str, str | None]) -> Iterator[str]:
+def _schema(group: str, name: str, typed: dict[str, str]) -> type[Any]:
+    members = _members(group)
+    picked = next((f"{name}_{value}" for key, value in typed.items() if key in SELECTORS), name)
+    return members.get(picked, members[name])
+
+
+def _example(command: str, chosen: str, group: str, name: str) -> Iterator[str]:
+    """A line that sets the first option of a choice."""
+    if group in SELECTORS:
+        return
+    for key, value in _values(group, name, {}).items():
+        if isinstance(options(_members(group)[name]).get(key), Option) and not isinstance(value, (dict, list)):
+            shown = "FILE" if value == "???" else json.dumps(value)
+            if "$" not in shown:
+                flag = "-m " if group.startswith("hydra/") else ""
+                yield f"  trackmdp {command} {flag}{chosen} {group.replace('/', '.')}.{key}={shown}"
+                return
+
+
+def _selectors(group: str, chosen: dict[str, Any]) -> Iterator[str]:
     for name, selector in SELECTORS.items():
         if selector.group == group and name in chosen:
-            yield from ("", f"{name}={'|'.join(selector.choices)}   (default: {chosen[name]}) {selector.about}")
-            yield from (f"  {name}={choice}: {text}" for choice, text in selector.choices.items())
+            yield from ("", *_wrapped(f"{name}={'|'.join(selector.choices)} ({chosen[name]}) {selector.about}"))
+            for choice, text in selector.choices.items():
+                yield from _wrapped(f"  {name}={choice}: {text}")
+
+
+def _read_selectors(group: str, name: str, typed: dict[str, str]) -> Iterator[str]:
+    """The selectors that a choice reads, as its file says: ``defaults: [{/credit@_here_: '${credit}/ppo'}]``."""
+    if group in SELECTORS:
+        return
+    source = str(_read(conf_file(f"{group}/{name}")).get("defaults"))
+    read = {key: typed.get(key, next(iter(item.choices))) for key, item in SELECTORS.items() if f"${{{key}}}" in source}
+    yield from _selectors(group, read)
 
 
 def _entries(schema: type[Any], values: Any, prefix: str) -> Iterator[str]:
@@ -75,30 +184,35 @@ def _entries(schema: type[Any], values: Any, prefix: str) -> Iterator[str]:
 
 def _entry(key: str, described: Option, value: Any) -> list[str]:
     shown = "" if value == "???" else json.dumps(value, ensure_ascii=False).strip('"')
-    text = f"{described.help}; {described.expected}"
-    indent = " " * 34
-    wrapped = textwrap.wrap(text, 118, initial_indent=indent, subsequent_indent=indent, break_long_words=False)
-    head = f"  {key}={shown}"
-    if len(head) < len(indent):
-        return [head + wrapped[0][len(head) :], *wrapped[1:]]
-    return [head, *wrapped]
+    return _described(f"{key}={shown}", f"{described.help}; {described.expected}")
 
 
-def _values(folder: Path, group: str, name: str) -> dict[str, Any]:
+def _described(head: str, text: str) -> list[str]:
+    """A term and what it is, in two columns; a long term has a line of its own."""
+    indent = " " * _COLUMN
+    lines = textwrap.wrap(text, _WIDTH - 1, initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False)
+    if len(head) + 2 < _COLUMN:
+        return [f"  {head}" + lines[0][len(head) + 2 :], *lines[1:]]
+    return [f"  {head}", *lines]
+
+
+def _wrapped(text: str) -> list[str]:
+    """A paragraph; its further lines are set in, and lists of choices break after `|`."""
+    deeper = " " * (len(text) - len(text.lstrip()) + 4)
+    wrapped = textwrap.wrap(text.replace("|", "| "), _WIDTH - 1, subsequent_indent=deeper, break_on_hyphens=False)
+    return [line.replace("| ", "|") for line in wrapped]
+
+
+def _values(group: str, name: str, typed: dict[str, str]) -> dict[str, Any]:
     """The values of one choice; a file that only points to another group's is followed."""
-    values = _read(folder / group / f"{name}.yaml")
+    values = _read(conf_file(f"{group}/{name}"))
     for entry in values.get("defaults", []):
         if isinstance(entry, dict):
             (target, choice), *_ = entry.items()
             for selector, item in SELECTORS.items():
-                choice = choice.replace(f"${{{selector}}}", next(iter(item.choices)))
-            values |= _values(folder, target.strip("/").split("@")[0], choice)
-    return values
-
-
-def _chosen(values: dict[str, Any]) -> dict[str, str | None]:
-    """Group -> the choice made in a `defaults` list."""
-    return {group: name for entry in values["defaults"] if isinstance(entry, dict) for group, name in entry.items()}
+                choice = choice.replace(f"${{{selector}}}", typed.get(selector, next(iter(item.choices))))
+            values |= _values(target.strip("/").split("@")[0], choice, typed)
+    return {key: value for key, value in values.items() if key != "defaults"}
 
 
 def _read(file: Path) -> dict[str, Any]:
