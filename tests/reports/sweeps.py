@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import csv
 import functools
-import json
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from trackmdp.policies.policy import Policy
 from trackmdp.reports import policy
 from trackmdp.solvers import clocked
 from trackmdp.training.evaluator import ExactEvaluator, figures
+from trackmdp.training.sealing import write_summary
 from trackmdp.world.make import build_world
 
 VERSIONS = {"trackmdp": "0.1.0", "torch": "2.13.0"}
@@ -64,9 +64,9 @@ def write_run(
         "config_sha256": digest(cfg),
     }
     (folder / "config.yaml").write_text(config_text(cfg), encoding="utf-8")
-    (folder / "summary.json").write_text(json.dumps(summary), encoding="utf-8")
     np.save(folder / "kernel.npy", world.kernel.toarray())
     policy.write(folder / policy.FILE, policy.Policy(chains, score.evaluation.value))
+    write_summary(folder, summary)
     write_curve(folder, np.linspace(-100.0, score.evaluation.aihtr, 40))
     return summary
 

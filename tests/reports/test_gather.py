@@ -13,11 +13,13 @@ from tests.reports.sweeps import VERSIONS, write_curve, write_run, write_sweep
 from trackmdp.durable import write_json
 from trackmdp.errors import UserError
 from trackmdp.reports import policy, results
-from trackmdp.reports.gather import MOST_POINTS, gather
+from trackmdp.reports.finished import MOST_POINTS
+from trackmdp.reports.gather import gather
 from trackmdp.reports.results import Results
 from trackmdp.solvers import bounds, qmdp
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.training.lock import locked
+from trackmdp.training.sealing import read_summary, write_summary
 from trackmdp.world.make import build_world
 
 
@@ -146,12 +148,12 @@ def test_what_is_wrong_with_a_run_is_named(sweep: Path) -> None:
     said = problems(found)
     assert len(found.runs) == 7
     assert said["a2c-0.16-0"] == "cut: it has no summary.json"
-    assert said["a2c-0.16-1"].startswith("its summary.json cannot be read")
-    assert said["a2c-0.16-2"].startswith("its summary.json cannot be read")
-    assert said["a2c-0.22-0"] == "its config.yaml cannot be read"
+    assert said["a2c-0.16-1"].startswith("summary.json: not JSON")
+    assert said["a2c-0.16-2"].startswith("summary.json: its content does not match its digest")
+    assert said["a2c-0.22-0"].startswith("config.yaml: not the file that this run left")
     assert said["a2c-0.22-1"] == "failed: out of luck"
     assert said["hindsight-0.16-1"] == "no learning curve"
-    assert said["hindsight-0.22-1"].startswith("policy.npz: not the policy of a run")
+    assert said["hindsight-0.22-1"].startswith("policy.npz: not the file that this run left")
     assert said["hindsight-0.16-0"].startswith("its world cannot be built")
     assert said["a2c"] == "no run in 1 of 2 worlds: Z=5, c=0.16"
     assert sorted(found.policies)[0] == "a2c-0.22-2"
@@ -163,6 +165,7 @@ def test_a_run_of_a_version_with_other_options_counts(sweep: Path) -> None:
     file.write_text(
         file.read_text().replace("  radius: 1\n", "  radius: 1\n  later: 3\n").replace("algo:", "algo:\n  x: 1")
     )
+    write_summary(file.parent, read_summary(file.parent))
     found = gather(sweep)
     assert len(found.runs) == 12
     assert "a2c-0.16-0" in found.motions
@@ -215,6 +218,6 @@ def test_a_folder_without_runs_is_refused(content: str | None, tmp_path: Path) -
 def test_damaged_stored_results_are_refused_in_one_line(file: str, content: str, whole: Path, tmp_path: Path) -> None:
     results.save_results(gather(whole), tmp_path)
     (tmp_path / file).write_text(content)
-    with pytest.raises(UserError, match="stored results that cannot be read") as caught:
+    with pytest.raises(UserError, match="not stored results that can be read") as caught:
         results.load_results(tmp_path)
     assert "\n" not in str(caught.value)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from trackmdp.durable import write_json
+from trackmdp.durable import write_json, write_sealed
 from trackmdp.errors import UserError
 from trackmdp.reports import watch
 from trackmdp.reports.watch import Status, statuses
@@ -36,7 +36,7 @@ def begin(place: Path, rows: str = "") -> Path:
 
 
 def finish(place: Path) -> None:
-    write_json(place / "summary.json", {"policy": {"aihtr": 49.0}, "optimal": {"upper": 49.5}})
+    write_sealed(place / "summary.json", {"policy": {"aihtr": 49.0}, "optimal": {"upper": 49.5}})
 
 
 def test_every_state_is_read_from_the_folder(tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from trackmdp.config.options import SELECTORS
 from trackmdp.config.roots import TrainConfig
 from trackmdp.config.tree import load_run, to_yaml
 from trackmdp.errors import UserError
+from trackmdp.untrusted import read_object, unsealed
 
 __all__ = ["CHANGEABLE", "config_text", "continued", "digest", "finished", "run_folder"]
 
@@ -42,13 +42,13 @@ def digest(cfg: TrainConfig) -> str:
 
 def finished(cfg: TrainConfig, folder: Path) -> dict[str, Any] | None:
     """The `summary.json` of a run that has nothing left to do; None where there is none, or one of another config."""
+    file = folder / "summary.json"
     try:
-        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-        known = summary["config_sha256"]
-    except (OSError, ValueError, LookupError, TypeError):
+        summary = unsealed(read_object(file), str(file))
+    except UserError:
         return None
-    mine = known in [digest(dataclasses.replace(cfg, quiet=quiet)) for quiet in (True, False)]
-    return dict(summary) if mine else None
+    mine = summary.get("config_sha256") in [digest(dataclasses.replace(cfg, quiet=quiet)) for quiet in (True, False)]
+    return summary if mine else None
 
 
 def run_folder(cfg: TrainConfig, chosen: Path) -> Path:

@@ -2,31 +2,33 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import json
+import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from omegaconf import OmegaConf
 
 from trackmdp.config import TableConfig, WorldConfig, world_of
 from trackmdp.errors import UserError
 from trackmdp.reports import policy
+from trackmdp.reports.finished import plain_config, read_curve, read_run
 from trackmdp.reports.grouping import Study, study, world_key
-from trackmdp.reports.results import FIGURES, Anomaly, CurvePoint, FinishedRun, Motion, Results
+from trackmdp.reports.results import Anomaly, FinishedRun, Motion, Results
 from trackmdp.solvers import bounds, qmdp
 from trackmdp.solvers.evaluate import evaluate
-from trackmdp.training.folders import FAILED, PLAN, SUMMARY, read_json, run_of
+from trackmdp.training.folders import FAILED, PLAN, SUMMARY, read_json
+from trackmdp.training.sealing import check_files, read_summary
+from trackmdp.untrusted import printable
 from trackmdp.world.make import build_world
 
-__all__ = ["flatten", "gather", "planned", "run_folders"]
+__all__ = ["gather", "planned", "run_folders"]
 
-MOST_POINTS = 16
-"""Points kept of a learning curve: evenly spaced in the logarithm of the iteration."""
+_LONGEST = 4096
+"""Letters of a path."""
 
 
 def gather(folder: Path) -> Results:
@@ -45,7 +47,7 @@ def gather(folder: Path) -> Results:
     anomalies: list[Anomaly] = []
     runs, summaries = [], []
     for name in names:
-        read = _read_run(folder, name)
+        read = read_run(folder, name)
         if isinstance(read, Anomaly):
             anomalies.append(read)
         else:
@@ -54,7 +56,7 @@ def gather(folder: Path) -> Results:
     anomalies += [*_repeated(runs), *_mixed(runs, summaries)]
     repeated = {anomaly.run for anomaly in _repeated(runs)}
     runs = [run for run in runs if run.name not in repeated]
-    curves = {run.name: _curve(folder / run.name / "metrics.csv") for run in runs}
+    curves = {run.name: read_curve(folder / run.name / "metrics.csv") for run in runs}
     grouped = study(runs)
     anomalies += [Anomaly(name, "no learning curve") for name, curve in curves.items() if not curve]
     anomalies += _missing_seeds(grouped) if plan is None else []  # a plan says what else there should be
@@ -73,12 +75,18 @@ def planned(folder: Path) -> Mapping[str, Any] | None:
 
 
 def run_folders(folder: Path, plan: Mapping[str, Any] | None) -> list[str]:
-    """The runs' folders, relative to the sweep's, in a fixed order: those that were planned, and those found."""
-    listed = [str(job["folder"]) for job in plan["jobs"] if isinstance(job, dict) and "folder" in job] if plan else []
-    named = {_relative(folder, name) for name in listed}
+    """The runs' folders, relative to the sweep's, in a fixed order: those that were planned, and those found.
+
+    A plan that names a folder outside of the sweep's, directly or through a link, is not followed there.
+    """
+    jobs = plan["jobs"] if plan else []
+    listed = [job["folder"] for job in jobs if isinstance(job, dict) and isinstance(job.get("folder"), str)]
+    named = {_relative(folder, name) for name in listed if 0 < len(name) < _LONGEST and "\0" not in name}
     marks = ("config.yaml", FAILED, SUMMARY)
     found = {file.parent.relative_to(folder).as_posix() for mark in marks for file in folder.rglob(mark)}
-    return sorted((named | found) - {"."}, key=_natural)
+    root = folder.resolve()
+    inside = {name for name in named | found if (folder / name).resolve().is_relative_to(root)}
+    return sorted(inside - {"."}, key=_natural)
 
 
 def _relative(folder: Path, name: str) -> str:
@@ -86,73 +94,12 @@ def _relative(folder: Path, name: str) -> str:
     for base in (folder.resolve(), folder):
         if path.is_absolute() and path.is_relative_to(base):
             return path.relative_to(base).as_posix()
-    return path.as_posix() if (folder / path).is_dir() or not path.is_absolute() else path.name
+    return path.as_posix() if not path.is_absolute() else path.name or "."
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in name.split("/")]
-
-
-def _read_run(folder: Path, name: str) -> tuple[FinishedRun, Mapping[str, Any]] | Anomaly:
-    """A run and its summary, or why there is none."""
-    place = folder / name
-    if (place / FAILED).is_file():
-        return Anomaly(name, f"failed: {read_json(place / FAILED).get('reason', 'no reason given')}")
-    if not place.is_dir() or not (place / "config.yaml").is_file():
-        return Anomaly(name, "not started")
-    if not (place / SUMMARY).is_file():
-        running = run_of(place).state == "running"
-        return Anomaly(name, "still running" if running else f"cut: it has no {SUMMARY}")
-    settings = flatten(_config(place))
-    if not settings.keys() >= {"algo.name", "seed", "grid.size", "kernel.name"}:
-        return Anomaly(name, "its config.yaml cannot be read")
-    try:
-        summary = json.loads((place / SUMMARY).read_text(encoding="utf-8"))
-        return FinishedRun(name, settings, _figures(summary), str(summary["config_sha256"])), summary
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        return Anomaly(name, f"its {SUMMARY} cannot be read ({' '.join(str(error).split())})")
-
-
-def _config(place: Path) -> Mapping[str, Any]:
-    """The plain config of a run, which another version may have written; empty where it cannot be read."""
-    try:
-        plain = OmegaConf.to_container(OmegaConf.load(place / "config.yaml"))
-    except Exception:  # yaml and OmegaConf raise many kinds
-        return {}
-    return {str(key): value for key, value in plain.items()} if isinstance(plain, Mapping) else {}
-
-
-def flatten(plain: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Every option by its dotted key."""
-    found: dict[str, Any] = {}
-    for key, value in plain.items():
-        found |= flatten(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
-    return found
-
-
-def _figures(summary: Mapping[str, Any]) -> dict[str, float | None]:
-    """`FIGURES` of a summary; on recorded tracks there is no Q_MDP, no bound and no optimum."""
-    groups = {"qmdp": summary["qmdp"], "bound": summary["bounds"], "optimal": summary["optimal"]}
-    raw = {key: summary[key] for key in ("frames", "wall_seconds", "cpu_seconds")} | summary["policy"]
-    raw |= {f"{group}_{key}": value for group, values in groups.items() for key, value in (values or {}).items()}
-    return {key: None if raw.get(key) is None else float(raw[key]) for key in FIGURES}
-
-
-def _curve(file: Path) -> list[CurvePoint]:
-    """The points of a run's `metrics.csv` at which the policy was judged, thinned; none where it cannot be read."""
-    try:
-        with file.open(newline="", encoding="utf-8") as stream:
-            rows = [row for row in csv.DictReader(stream) if row.get("aihtr")]
-        points = [
-            CurvePoint(int(row["iteration"]), int(row["frames"]), float(row["seconds"]), float(row["aihtr"]))
-            for row in rows
-        ]
-    except (OSError, ValueError, KeyError, TypeError):
-        return []
-    if len(points) <= MOST_POINTS:
-        return points
-    wanted = np.geomspace(1, len(points), MOST_POINTS).round().astype(int) - 1
-    return [points[place] for place in sorted({*wanted.tolist(), len(points) - 1})]
+    """Numbers in their order; int() would also take digits such as a raised two for some, and fail for others."""
+    return [(int(part), "") if re.fullmatch(r"[0-9]{1,18}", part) else (-1, part) for part in name.split("/")]
 
 
 def _repeated(runs: Iterable[FinishedRun]) -> list[Anomaly]:
@@ -206,6 +153,7 @@ def _policies(folder: Path, grouped: Study) -> tuple[dict[str, policy.Policy], l
         middle = (len(ranked) - 1) / 2
         for _, run in sorted(enumerate(ranked), key=lambda item: abs(item[0] - middle)):
             try:
+                check_files(folder / run.name, read_summary(folder / run.name), policy.FILE)
                 found[run.name] = policy.read(folder / run.name / policy.FILE)
                 break
             except UserError as error:
@@ -224,6 +172,7 @@ def _motions(folder: Path, runs: Iterable[FinishedRun]) -> tuple[dict[str, Motio
         if run.settings["kernel.name"] == "tracks":
             continue  # no motion is known there
         try:
+            check_files(folder / run.name, read_summary(folder / run.name), "kernel.npy")
             world = build_world(_world_config(folder / run.name))
         except UserError as error:
             anomalies.append(Anomaly(run.name, f"its world cannot be built ({error})"))
@@ -234,7 +183,7 @@ def _motions(folder: Path, runs: Iterable[FinishedRun]) -> tuple[dict[str, Motio
 
 def _world_config(place: Path) -> WorldConfig:
     """A run's world with the motion that it stored as its table, whatever made the motion."""
-    plain = _config(place)
+    plain = plain_config(place)
     kernel: dict[str, Any] = {field.name: False for field in dataclasses.fields(TableConfig)}
     kernel |= {"name": "table", "path": str(place / "kernel.npy")}
     parts = {key: plain.get(key) for key in ("grid", "cost")}
@@ -244,7 +193,7 @@ def _world_config(place: Path) -> WorldConfig:
 def _manifest(plan: Mapping[str, Any] | None, summaries: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Where the results come from; no path of the machine is kept."""
     line = plan.get("line", "") if plan else ""
-    words = line.split() if isinstance(line, str) else [str(word) for word in line]
+    words = printable(line).split() if isinstance(line, str) else []
     return {
         "line": " ".join(word for word in words if not word.startswith(("hydra.sweep.dir=", "hydra.run.dir="))),
         "planned": len(plan["jobs"]) if plan else None,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
@@ -81,9 +82,9 @@ class Report:
         page = files("trackmdp.reports").joinpath("report.html").read_text(encoding="utf-8")
         nav = "".join(f'<li><a href="#{s.anchor}">{html.escape(s.heading)}</a></li>' for s in self.sections)
         body = "\n".join(section.html() for section in self.sections)
-        for mark, text in {"@ABOUT@": self.about, "@NAV@": nav, "@BODY@": body}.items():
-            page = page.replace(mark, text)
-        return page
+        texts = {"@ABOUT@": self.about, "@NAV@": nav, "@BODY@": body}
+        # in one pass: what is put in may hold a mark itself, as a folder's name
+        return re.sub("|".join(texts), lambda mark: texts[mark[0]], page)
 
 
 def build(

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import io
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,13 +11,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from trackmdp.arrays import load_npz
 from trackmdp.durable import write_bytes
-from trackmdp.errors import UserError
+from trackmdp.untrusted import decoded, read_bytes
 from trackmdp.world.model import Array, BoolArray
 
 __all__ = ["FILE", "Policy", "arrays", "pack", "pack_all", "read", "unpack_all", "write"]
 
 FILE = "policy.npz"
+_LARGEST = 2**30
+"""Bytes of the longest; 64 x 64 cells need a few MB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,13 +48,10 @@ def arrays(content: bytes, *keys: str) -> list[npt.NDArray[Any]]:
     """The arrays of a `.npz`; code in it is not run.
 
     Raises:
-        ValueError, KeyError: the bytes are something else.
+        Exception: whatever zipfile and NumPy raise over damage; call it inside `untrusted.decoded`.
     """
-    try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as stored:
-            return [stored[key] for key in keys]
-    except (EOFError, TypeError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(str(error)) from error
+    found = load_npz(io.BytesIO(content), keys)
+    return [found[key] for key in keys]
 
 
 def pack_all(policies: Mapping[str, Policy]) -> bytes:
@@ -74,7 +72,7 @@ def unpack_all(content: bytes) -> dict[str, Policy]:
     """What `pack_all` packed.
 
     Raises:
-        ValueError, KeyError: the bytes are something else.
+        Exception: the bytes are something else; call it inside `untrusted.decoded`.
     """
     names, shapes, bits, values = arrays(content, "names", "shapes", "chains", "values")
     sizes = shapes.prod(axis=1)
@@ -95,12 +93,13 @@ def read(file: Path) -> Policy:
     Raises:
         UserError: the file is missing or damaged, or holds something else.
     """
-    try:
-        bits, shape, value = arrays(file.read_bytes(), "chains", "shape", "value")
-        m, choices, sensors = map(int, shape)
-        if sensors != m or value.shape != (m,) or bits.size != (m * choices * m + 7) // 8:
+    content = read_bytes(file, most=_LARGEST)
+    with decoded(str(file), "the policy of a run"):
+        bits, shape, value = arrays(content, "chains", "shape", "value")
+        m, choices, sensors = (int(length) for length in shape)
+        if min(m, choices) < 1 or sensors != m or value.shape != (m,) or bits.size != (m * choices * m + 7) // 8:
             raise ValueError("arrays that do not belong together")
+        if value.dtype != np.float64 or not np.isfinite(value).all():
+            raise ValueError("values that are not finite numbers")
         chains = np.unpackbits(bits, count=m * choices * m).astype(np.bool_).reshape(m, choices, m)
-        return Policy(chains, np.asarray(value, dtype=np.float64))
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{file}: not the policy of a run ({' '.join(str(error).split())})") from error
+        return Policy(chains, value)

@@ -7,6 +7,7 @@ per world and method, `worlds.npz` the motion and two reference values, `manifes
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -20,6 +21,7 @@ from scipy import sparse
 from trackmdp.durable import write_bytes, write_text
 from trackmdp.errors import UserError
 from trackmdp.reports.policy import Policy, arrays, pack_all, unpack_all
+from trackmdp.untrusted import decoded, read_bytes, read_object, read_text, sealed, unsealed
 from trackmdp.world.model import Array
 
 __all__ = [
@@ -35,7 +37,14 @@ __all__ = [
     "save_results",
 ]
 
-FORMAT = "trackmdp results 1"
+FORMAT = "trackmdp results 2"
+MANIFEST, FILES = "manifest.json", ("runs.csv", "curves.csv", "policies.npz", "worlds.npz")
+LARGEST = 2**28
+"""Bytes of the longest of these files."""
+
+_FORMULA = ('"', "=", "+", "-", "@", "\t", "\r")
+"""What a spreadsheet would compute stands in quotes, and so does what begins with one."""
+
 FIGURES = (
     "frames",
     "wall_seconds",
@@ -145,8 +154,8 @@ class Results:
 def is_stored(folder: Path) -> bool:
     """Whether `folder` holds stored results and not the runs themselves."""
     try:
-        return json.loads((folder / "manifest.json").read_text(encoding="utf-8"))["format"] == FORMAT
-    except (OSError, ValueError, KeyError, TypeError):
+        return bool(read_object(folder / MANIFEST).get("format") == FORMAT)
+    except UserError:
         return False
 
 
@@ -157,7 +166,7 @@ def save_results(results: Results, folder: Path) -> None:
     varied = sorted({key for run in results.runs for key in run.settings if key not in common[run.algo]})
     rows = [
         [
-            run.name,
+            json.dumps(run.name) if run.name.startswith(_FORMULA) else run.name,
             *(_cell(run.settings[key]) if key in run.settings else "" for key in varied),
             *("" if run.figures[key] is None else repr(run.figures[key]) for key in FIGURES),
         ]
@@ -179,7 +188,8 @@ def save_results(results: Results, folder: Path) -> None:
         "settings": common,
         "config_sha256": {run.name: run.config_sha256 for run in results.runs},
     }
-    write_text(folder / "manifest.json", json.dumps(manifest, indent=1, ensure_ascii=False) + "\n")
+    manifest["files"] = {name: _digest(folder / name) for name in FILES}
+    write_text(folder / MANIFEST, json.dumps(sealed(manifest), indent=1, ensure_ascii=False) + "\n")
 
 
 def load_results(folder: Path) -> Results:
@@ -188,8 +198,13 @@ def load_results(folder: Path) -> Results:
     Raises:
         UserError: a file is missing or damaged.
     """
-    try:
-        manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
+    source = f"sweep={folder}"
+    manifest = unsealed(read_object(folder / MANIFEST, source=source), f"{source}: {MANIFEST}")
+    with decoded(source, "stored results that can be read"):
+        files = manifest.pop("files")
+        for name in FILES:
+            if files[name] != _digest(folder / name):
+                raise ValueError(f"{name} is not the file that was stored with the others")
         common, hashes = manifest.pop("settings"), manifest.pop("config_sha256")
         anomalies = [Anomaly(**entry) for entry in manifest.pop("problems")]
         del manifest["format"]
@@ -198,19 +213,21 @@ def load_results(folder: Path) -> Results:
         for row in _rows(folder / "curves.csv"):
             point = CurvePoint(int(row["iteration"]), int(row["frames"]), float(row["seconds"]), float(row["aihtr"]))
             curves.setdefault(runs[int(row["run"])].name, []).append(point)
-        policies = unpack_all((folder / "policies.npz").read_bytes())
-        motions = _unpack_motions((folder / "worlds.npz").read_bytes())
-    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise UserError(f"sweep={folder}: stored results that cannot be read ({reason})") from error
+        policies = unpack_all(read_bytes(folder / "policies.npz", most=LARGEST))
+        motions = _unpack_motions(read_bytes(folder / "worlds.npz", most=LARGEST))
     return Results(runs, curves, policies, motions, anomalies, manifest)
+
+
+def _digest(file: Path) -> str:
+    return hashlib.sha256(read_bytes(file, most=LARGEST)).hexdigest()
 
 
 def _run(row: Mapping[str, str], common: Mapping[str, Any], hashes: Mapping[str, str]) -> FinishedRun:
     own = {key: _value(text) for key, text in row.items() if key not in FIGURES and key != "run" and text != ""}
     figures = {key: float(row[key]) if row[key] else None for key in FIGURES}
     algo = own.get("algo.name") or next(iter(common))
-    return FinishedRun(row["run"], {**common[algo], **own, "algo.name": algo}, figures, hashes[row["run"]])
+    name = str(_value(row["run"])) if row["run"].startswith('"') else row["run"]
+    return FinishedRun(name, {**common[algo], **own, "algo.name": algo}, figures, hashes[name])
 
 
 def _common(runs: Iterable[FinishedRun]) -> dict[str, dict[str, Any]]:
@@ -229,7 +246,7 @@ def _common(runs: Iterable[FinishedRun]) -> dict[str, dict[str, Any]]:
 def _cell(value: Any) -> str:
     """Text of a setting, from which `_value` tells a number from a word."""
     if isinstance(value, str):
-        return json.dumps(value) if _value(value) != value or value == "" else value
+        return json.dumps(value) if _value(value) != value or value == "" or value.startswith(_FORMULA) else value
     return json.dumps(value)
 
 
@@ -274,8 +291,8 @@ def _unpack_motions(content: bytes) -> dict[str, Motion]:
 
 
 def _rows(file: Path) -> list[dict[str, str]]:
-    with file.open(newline="", encoding="utf-8") as stream:
-        return list(csv.DictReader(stream, strict=True))
+    text = read_text(file, most=LARGEST)
+    return list(csv.DictReader(io.StringIO(text, newline=""), strict=True))
 
 
 def _csv(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> bytes:

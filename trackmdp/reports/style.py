@@ -181,6 +181,7 @@ def _settings(name: str) -> Any:
     return {
         "svg.hashsalt": name,
         "svg.fonttype": "none",
+        "text.parse_math": False,  # a label is a name, and $x^{$ one that somebody may give
         "font.family": "DejaVu Sans",
         "font.size": 8.5,
         "axes.labelsize": 8.5,

@@ -10,13 +10,23 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
+from trackmdp.untrusted import printable
+
 __all__ = ["Cell", "Column", "Table"]
 
 Cell: TypeAlias = "float | int | str | bool | None"
 
 LONG = 60
 """Letters of a cell that may be broken over lines."""
-_LATEX = {"&": r"\&", "%": r"\%", "#": r"\#", "_": r"\_", "≤": r"$\le$", "±": r"$\pm$", "–": "--", "²": "$^2$"}
+_LATEX = {
+    "\\": r"\textbackslash{}",
+    "{": r"\{",
+    "}": r"\}",
+    "$": r"\$",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+}
+_LATEX |= {"&": r"\&", "%": r"\%", "#": r"\#", "_": r"\_", "≤": r"$\le$", "±": r"$\pm$", "–": "--", "²": "$^2$"}
 
 
 @dataclass(frozen=True)
@@ -45,7 +55,7 @@ class Column:
         if isinstance(value, bool):
             return "yes" if value else "no"
         if isinstance(value, str):
-            return value
+            return printable(value)
         if self.digits is None:
             return f"{value:,}" if isinstance(value, int) else f"{value:g}"
         shown = f"{value:,.{self.digits}f}"
@@ -79,7 +89,7 @@ class Table:
         lines = [rf"{line} \\" for line in body]
         return "\n".join(
             [
-                f"% {self.caption}",
+                f"% {' '.join(self.caption.split())}",
                 rf"\begin{{tabular}}{{{align}}}",
                 r"\hline",
                 rf"{head} \\",
@@ -124,8 +134,16 @@ class Table:
 def _plain(value: Cell) -> Any:
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return ""
+    if isinstance(value, str):
+        return _no_formula(printable(value))
     return repr(value) if isinstance(value, float) else value
 
 
+def _no_formula(text: str) -> str:
+    """The text of a cell that a spreadsheet shows and does not compute, whatever somebody called a folder."""
+    return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text
+
+
 def _escape(text: str) -> str:
-    return "".join(_LATEX.get(character, character) for character in text.replace("\\", r"\textbackslash "))
+    # letter by letter: what stands for one is not looked at again
+    return "".join(_LATEX.get(letter, letter) for letter in " ".join(text.split()))

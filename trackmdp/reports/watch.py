@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import csv
+import os
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -16,12 +18,15 @@ from rich.text import Text
 from trackmdp.errors import UserError
 from trackmdp.reports.gather import planned, run_folders
 from trackmdp.training.folders import read_json, run_of
+from trackmdp.untrusted import decoded, opened, printable
 
 __all__ = ["Status", "statuses", "watch"]
 
 WAITING, RUNNING, CUT, FAILED, DONE = "waiting", "running", "cut", "failed", "done"
 TAIL = 4096
 """Bytes read from the end of `metrics.csv`."""
+LARGE = 1e15
+"""No figure of a run is as large; nan is not smaller either."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +88,7 @@ def _lines(sweep: Path, console: Console, every: float, found: list[Status]) -> 
         for status in found:
             if status.state != WAITING and said.get(status.name) != status.state:
                 said[status.name] = status.state
-                console.print(_line(status), markup=False)
+                console.print(printable(_line(status)), markup=False)
         if not _going(sweep, found):
             break
         time.sleep(every)
@@ -102,36 +107,48 @@ def _status(place: Path, name: str) -> Status:
     found, plan = run_of(place), read_json(place / "plan.json")
     if found.state == FAILED:
         return Status(name, FAILED, reason=found.reason)
-    upper, last = plan.get("upper_bound"), _last_rows(place / "metrics.csv")
+    upper, last = _number(plan, "upper_bound"), _last_rows(place / "metrics.csv")
     if found.state == DONE:
-        summary = read_json(place / "summary.json")
-        earned, best = summary.get("policy", {}).get("aihtr"), (summary.get("optimal") or {}).get("upper")
+        summary = found.result
+        earned, best = _number(summary.get("policy"), "aihtr"), _number(summary.get("optimal"), "upper")
         bounds = [bound for bound in (upper, best) if bound is not None]
         return Status(name, DONE, 1.0, min(bounds) - earned if bounds and earned is not None else None, 0.0)
     if not last:
         return Status(name, found.state)
-    share = min(1.0, float(last[-1]["iteration"]) / plan["iterations"]) if plan.get("iterations") else 0.0
-    judged = [float(row["aihtr"]) for row in last if row.get("aihtr")]
+    planned = _number(plan, "iterations") or 0.0
+    share = min(1.0, last[-1]["iteration"] / planned) if planned >= 1 else 0.0
+    judged = [row["aihtr"] for row in last if "aihtr" in row]
     gap = upper - judged[-1] if judged and upper is not None else None
-    left = float(last[-1]["seconds"]) * (1 - share) / share if share else None
+    left = last[-1]["seconds"] * (1 - share) / share if share else None
     return Status(name, found.state, share, gap, left)
 
 
-def _last_rows(file: Path) -> list[dict[str, str]]:
-    """The last whole rows of a table that is being written."""
+def _number(said: Any, key: str) -> float | None:
+    """The number under `key`; None where there is none: the file may be another program's."""
+    value = said.get(key) if isinstance(said, Mapping) else None
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return None
+    return float(value) if abs(value) < LARGE else None
+
+
+def _last_rows(file: Path) -> list[dict[str, float]]:
+    """The numbers of the last whole rows of a table that is being written; none where it is no such table."""
     try:
-        with file.open("rb") as stream:
-            head = stream.readline().decode()
-            begin = max(stream.tell(), file.stat().st_size - TAIL)
-            cut = begin > stream.tell()
+        with opened(file, most=2**40) as stream, decoded(str(file), "a table"):
+            head = stream.readline(TAIL).decode()
+            begin = max(stream.tell(), stream.seek(0, os.SEEK_END) - TAIL)
+            cut = begin > len(head.encode())
             stream.seek(begin)
-            lines = stream.read().decode(errors="replace").split("\n")
-    except OSError:
+            lines = stream.read(TAIL).decode(errors="replace").split("\n")
+            lines = lines[1 if cut else 0 : -1]  # the last one may be half written
+            names = next(csv.reader([head]), [])
+            rows = [dict(zip(names, row, strict=True)) for row in csv.reader(lines) if len(row) == len(names)]
+            wanted = ("iteration", "seconds", "aihtr")
+            found = [{key: float(row[key]) for key in wanted if row.get(key)} for row in rows]
+    except UserError:
         return []
-    lines = lines[1 if cut else 0 : -1]  # the last one may be half written
-    names = next(csv.reader([head]), [])
-    rows = [dict(zip(names, row, strict=False)) for row in csv.reader(lines)]
-    return [row for row in rows if len(row) == len(names) and row.get("iteration", "").isdigit() and row.get("seconds")]
+    whole = [row for row in found if row.keys() >= {"iteration", "seconds"}]
+    return [row for row in whole if all(abs(value) < LARGE for value in row.values()) and row["iteration"] >= 1]
 
 
 def _table(found: Sequence[Status], height: int) -> Group:
@@ -142,7 +159,7 @@ def _table(found: Sequence[Status], height: int) -> Group:
     room = max(3, height - 6)
     ordered = sorted(found, key=lambda status: order[status.state])
     for status in ordered[:room]:
-        shown.add_row(Text(status.name), Text(status.reason or status.state), *_figures(status))
+        shown.add_row(Text(printable(status.name)), Text(printable(status.reason or status.state)), *_figures(status))
     more = [Text(f"and {len(found) - room} more")] if len(found) > room else []
     return Group(shown, *more, Text(_counts(found)))
 

@@ -10,12 +10,13 @@ from typing import Any
 from trackmdp.durable import write_json
 from trackmdp.errors import UserError
 from trackmdp.training.lock import is_locked
+from trackmdp.training.sealing import SUMMARY, read_summary
 from trackmdp.untrusted import read_object
 
 __all__ = ["DONE", "FAILED", "PLAN", "SUMMARY", "RunState", "read_json", "read_plan", "run_of", "runs_of", "write_plan"]
 
-PLAN, FAILED, SUMMARY, DONE = "sweep.json", "failed.json", "summary.json", "done.json"
-"""Files: of a sweep; of a run that failed, of a training run that ended, of a run of another command that did."""
+PLAN, FAILED, DONE = "sweep.json", "failed.json", "done.json"
+"""Files: of a sweep; of a run that failed, of a run of another command than `train` that ended."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,12 @@ def read_plan(sweep: Path) -> dict[str, Any]:
         UserError: the folder is not that of a sweep.
     """
     content = read_json(sweep / PLAN)
-    if not content.keys() >= {"command", "line", "jobs"}:
+    jobs = content.get("jobs")
+    whole = isinstance(jobs, list) and all(
+        isinstance(job, dict) and isinstance(job.get("folder"), str) and isinstance(job.get("overrides"), list)
+        for job in jobs
+    )
+    if not whole or not content.keys() >= {"command", "line"}:
         raise UserError(f"sweep={sweep}: expected the folder of a sweep, with {PLAN}")
     return content
 
@@ -68,12 +74,19 @@ def run_of(folder: Path, overrides: tuple[str, ...] = ()) -> RunState:
     """One run, as its folder shows it."""
     if is_locked(folder):
         return RunState(folder, overrides, "running")
-    for name in (SUMMARY, DONE):
-        if result := read_json(folder / name):
-            return RunState(folder, overrides, "done", "", result)
+    if result := _result(folder):
+        return RunState(folder, overrides, "done", "", result)
     if failed := read_json(folder / FAILED):
         return RunState(folder, overrides, "failed", str(failed.get("reason", "")))
     return RunState(folder, overrides, "cut" if (folder / "config.yaml").is_file() else "waiting")
+
+
+def _result(folder: Path) -> dict[str, Any]:
+    """What a run that is done left; empty where it left nothing, or nothing that can be trusted."""
+    try:
+        return read_summary(folder)
+    except UserError:
+        return read_json(folder / DONE)
 
 
 def read_json(file: Path) -> dict[str, Any]:

@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from trackmdp.durable import write_bytes, write_json
+from trackmdp.durable import write_bytes
 from trackmdp.policies.policy import Policy
 from trackmdp.solvers import optimal
 from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.solution import Solution
 from trackmdp.training.callbacks import Callback, Row, Training
+from trackmdp.training.sealing import write_summary
 from trackmdp.training.summary import summarize
 from trackmdp.training.trainer import Trainer
 from trackmdp.world.model import World
@@ -80,7 +81,7 @@ def complete(trainer: Trainer) -> Run:
     if trainer.folder is not None:
         _write_policy(trainer.folder / "policy.npz", policy, score.evaluation)
         # Last, for a folder with a summary is a finished run.
-        write_json(trainer.folder / "summary.json", summary)
+        write_summary(trainer.folder, summary)
     return Run(policy, score.evaluation, table.columns, summary, trainer.folder, solution)
 
 

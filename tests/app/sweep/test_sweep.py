@@ -20,6 +20,7 @@ from trackmdp.app.cli import main
 from trackmdp.app.sweep.job import stop_signal
 from trackmdp.app.sweep.plan import Job
 from trackmdp.app.sweep.sweep import sweep
+from trackmdp.durable import write_sealed
 from trackmdp.errors import Preempted, RunError
 from trackmdp.training.folders import read_plan, run_of, runs_of
 from trackmdp.training.lock import locked
@@ -41,7 +42,7 @@ def test_the_same_line_again_skips_what_is_done(here: Path, capfd: pytest.Captur
     assert "2 skipped; " in said
     assert (sweep / "runs.csv").read_bytes() == first
     after = {file: file.stat().st_mtime_ns for file in sweep.rglob("*") if file.is_file()}
-    assert {file.name for file in after if after[file] != before.get(file)} == {"sweep.json", "runs.csv", ".lock"}
+    assert {file.name for file in after if after[file] != before.get(file)} == {"sweep.json", "runs.csv"}
 
 
 def test_the_table_holds_the_figures_of_each_run(here: Path) -> None:
@@ -207,7 +208,9 @@ def test_states_of_a_run(tmp_path: Path) -> None:
         assert run_of(folder).state == "running"
     (folder / "failed.json").write_text('{"reason": "no luck"}')
     assert (run_of(folder).state, run_of(folder).reason) == ("failed", "no luck")
-    (folder / "summary.json").write_text('{"policy": {}}')
+    (folder / "summary.json").write_text('{"policy": {}}')  # not as a run seals it
+    assert run_of(folder).state == "failed"
+    write_sealed(folder / "summary.json", {"policy": {}})
     assert run_of(folder).state == "done"
 
 

@@ -1,0 +1,139 @@
+"""One finished run as its folder holds it: its options, its figures and its learning curve, or why there is none."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import OmegaConf
+
+from trackmdp.config.untrusted import parse_yaml, read_text
+from trackmdp.errors import UserError
+from trackmdp.reports.results import FIGURES, Anomaly, CurvePoint, FinishedRun
+from trackmdp.training.folders import FAILED, read_json, run_of
+from trackmdp.training.sealing import SUMMARY, check_files, read_summary
+from trackmdp.untrusted import decoded, printable
+from trackmdp.untrusted import read_text as read_any_text
+
+__all__ = ["flatten", "plain_config", "read_curve", "read_run"]
+
+MOST_POINTS = 16
+"""Points kept of a learning curve: evenly spaced in the logarithm of the iteration."""
+
+_TABLE = 2**28
+"""Bytes of the longest `metrics.csv`: two million rows."""
+
+_LARGE = 1e15
+"""No figure of a run is as large, and sums and squares of smaller ones stay finite."""
+
+
+def read_run(folder: Path, name: str) -> tuple[FinishedRun, Mapping[str, Any]] | Anomaly:
+    """A run and its summary, or why there is none."""
+    place = folder / name
+    if (place / FAILED).is_file():
+        return Anomaly(name, f"failed: {printable(str(read_json(place / FAILED).get('reason', 'no reason given')))}")
+    if not place.is_dir() or not (place / "config.yaml").is_file():
+        return Anomaly(name, "not started")
+    if not (place / SUMMARY).is_file():
+        running = run_of(place).state == "running"
+        return Anomaly(name, "still running" if running else f"cut: it has no {SUMMARY}")
+    try:
+        summary = read_summary(place)
+        check_files(place, summary, "config.yaml")
+        settings = flatten(plain_config(place))
+        with decoded(str(place / "config.yaml"), "the config of a run"):
+            _check_settings(settings)
+        with decoded(str(place / SUMMARY), "the summary of a run"):
+            _check_origin(summary)
+            return FinishedRun(name, settings, _figures(summary), summary["config_sha256"]), summary
+    except UserError as error:
+        return Anomaly(name, str(error).replace(f"{place}/", ""))
+
+
+def plain_config(place: Path) -> Mapping[str, Any]:
+    """The plain config of a run, which another version may have written.
+
+    Raises:
+        UserError: it cannot be read.
+    """
+    file = place / "config.yaml"
+    plain = OmegaConf.to_container(parse_yaml(read_text(file), str(file)))
+    if not isinstance(plain, Mapping):
+        raise UserError(f"{file}: not a config (expected a mapping)")
+    return {str(key): value for key, value in plain.items()}
+
+
+def flatten(plain: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
+    """Every option by its dotted key."""
+    found: dict[str, Any] = {}
+    for key, value in plain.items():
+        found |= flatten(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return found
+
+
+def _check_settings(settings: Mapping[str, Any]) -> None:
+    """See that what runs are grouped by is there and of its kind; the rest is shown as it is."""
+    for key in ("algo.name", "kernel.name"):
+        if not isinstance(settings[key], str):
+            raise TypeError(f"{key}: expected a name")
+    if type(settings["seed"]) is not int or type(settings["grid.size"]) not in (int, list):
+        raise TypeError("seed, grid.size: expected whole numbers")
+
+
+def _check_origin(summary: Mapping[str, Any]) -> None:
+    """See that the versions and the machine are flat: they are counted, and shown."""
+    for key in ("versions", "machine"):
+        said = summary.get(key, {})
+        if not isinstance(said, Mapping) or any(isinstance(value, (Mapping, list)) for value in said.values()):
+            raise TypeError(f"{key}: expected names and values")
+    if not isinstance(summary["config_sha256"], str):
+        raise TypeError("config_sha256: expected a digest")
+
+
+def _figures(summary: Mapping[str, Any]) -> dict[str, float | None]:
+    """`FIGURES` of a summary; on recorded tracks there is no Q_MDP, no bound and no optimum."""
+    groups = {"qmdp": summary["qmdp"], "bound": summary["bounds"], "optimal": summary["optimal"]}
+    raw = {key: summary[key] for key in ("frames", "wall_seconds", "cpu_seconds")} | summary["policy"]
+    raw |= {f"{group}_{key}": value for group, values in groups.items() for key, value in (values or {}).items()}
+    return {key: None if raw.get(key) is None else _number(key, raw[key]) for key in FIGURES}
+
+
+def _number(key: str, value: Any) -> float:
+    if type(value) not in (int, float) or not abs(value) < _LARGE:
+        raise TypeError(f"{key}: {str(value)[:40]}, expected a number")
+    return float(value)
+
+
+def read_curve(file: Path) -> list[CurvePoint]:
+    """The points of a run's `metrics.csv` at which the policy was evaluated, thinned; none where it cannot be read."""
+    try:
+        text = read_any_text(file, most=_TABLE)
+        with decoded(str(file), "a learning curve"):
+            points = _points(text)
+    except UserError:
+        return []
+    if len(points) <= MOST_POINTS:
+        return points
+    wanted = np.geomspace(1, len(points), MOST_POINTS).round().astype(int) - 1
+    return [points[place] for place in sorted({*wanted.tolist(), len(points) - 1})]
+
+
+def _points(text: str) -> list[CurvePoint]:
+    """The points, in the order of iterations as they were written."""
+    points: list[CurvePoint] = []
+    for row in csv.DictReader(io.StringIO(text, newline="")):
+        if not row.get("aihtr"):
+            continue
+        last = points[-1] if points else CurvePoint(0, 0, 0.0, 0.0)
+        point = CurvePoint(int(row["iteration"]), int(row["frames"]), float(row["seconds"]), float(row["aihtr"]))
+        if not (last.iteration < point.iteration < _LARGE and max(last.frames, 1) <= point.frames < _LARGE):
+            raise ValueError("iterations or frames that do not grow")
+        if not (0 <= point.seconds < _LARGE and math.isfinite(point.aihtr) and abs(point.aihtr) < _LARGE):
+            raise ValueError("a number out of range")
+        points.append(point)
+    return points
