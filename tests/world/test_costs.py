@@ -29,20 +29,28 @@ def costs(cost: list[float]) -> Costs:
 )
 def test_one_step(sensed: bool, forced: bool, in_grid: bool, reward: float) -> None:
     flags = [torch.tensor([flag]) for flag in (sensed, forced, in_grid)]
-    earned = costs([0.1, 0.2, 0.3, 0.4]).pseudo_reward(ACTION, *flags)
+    earned = costs([0.1, 0.2, 0.3, 0.4]).pseudo_reward(ACTION, torch.tensor([0]), *flags)
     assert earned.shape == (1,)
     assert earned.item() == pytest.approx(reward)
 
 
 def test_sensing_cost_per_cell_and_for_all_cells() -> None:
     actions = torch.tensor([[0, 0, 0, 0], [1, 0, 1, 0], [0, 1, 0, 1], [1, 1, 1, 1]], dtype=torch.bool)
-    per_cell = costs([0.1, 0.2, 0.3, 0.4]).sensing_cost(actions)
+    per_cell = costs([0.1, 0.2, 0.3, 0.4]).sensing_cost(actions, torch.zeros(4, dtype=torch.int64))
     np.testing.assert_allclose(per_cell, [0, 0.4, 0.6, 1.0], rtol=1e-6)
-    same = costs([0.3] * 4).sensing_cost(actions)
+    same = costs([0.3] * 4).sensing_cost(actions, torch.zeros(4, dtype=torch.int64))
     np.testing.assert_allclose(same, [0, 0.6, 0.6, 1.2], rtol=1e-6)
     assert per_cell.dtype == same.dtype == torch.float32
 
 
 def test_more_than_255_sensors_are_counted() -> None:
     task = Task(40, cost=np.full(1600, 0.5), safe_cost=0.9, t_max=1)
-    assert Costs(task).sensing_cost(torch.ones(1, 1600, dtype=torch.bool)).item() == 800.0
+    assert Costs(task).sensing_cost(torch.ones(1, 1600, dtype=torch.bool), torch.tensor([0])).item() == 800.0
+
+
+@pytest.mark.parametrize("cost", [[0.1, 0.2, 0.3, 0.4, 0.5, 0.6], [0.2] * 6])
+def test_a_window_costs_what_its_sensors_in_the_grid_cost(cost: list[float]) -> None:
+    """2 x 3 cells, radius 1, all nine sensors on: from cell 0 cells 0, 1, 3, 4 are there, from cell 4 all six."""
+    task = Task((2, 3), cost=cost, t_max=0, window=1)
+    spent = Costs(task).sensing_cost(torch.ones(2, 9, dtype=torch.bool), torch.tensor([0, 4]))
+    np.testing.assert_allclose(spent, [sum(cost[cell] for cell in (0, 1, 3, 4)), sum(cost)], rtol=1e-6)

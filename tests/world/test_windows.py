@@ -43,6 +43,10 @@ def test_a_window_holds_the_cells_within_its_radius(size: tuple[int, int], radiu
         place = window.index(starts, cells)
         assert ((place >= 0) & (place < window.width)).all()
         assert window.cells[start, place[near]].tolist() == near
+        found = window.find(starts, cells)
+        assert torch.equal(found[near], place[near])
+        assert (found[[cell for cell in range(m + 1) if cell not in near]] >= window.width).all()
+        assert torch.equal(window.inside(starts[:1]), (window.around(starts[:1]) < m))
 
 
 def test_the_window_of_a_task_is_that_of_its_option() -> None:

@@ -94,7 +94,7 @@ def ray(
 
 def _env_options(cfg: CollectorConfig, seed: int) -> dict[str, Any]:
     device = make_device(cfg.device, "collector.device")
-    return {"num_envs": cfg.envs, "seed": seed, "device": device}
+    return {"batch_size": cfg.envs, "seed": seed, "device": device}
 
 
 def _common(cfg: CollectorConfig, device: torch.device, done: int) -> dict[str, Any]:

@@ -7,35 +7,51 @@ import torch
 from torch import Tensor
 
 from trackmdp.world.model import Array, Task
+from trackmdp.world.windows import Window
 
 __all__ = ["Costs"]
 
 
 class Costs:
-    """r, c and D as tensors of one device."""
+    """r, c and D as tensors of one device.
+
+    Args:
+        task: the prices, and which sensors can be chosen.
+        device: where the tensors live.
+    """
 
     def __init__(self, task: Task, device: torch.device | str = "cpu") -> None:
         self.reward, self.safe_cost = float(task.reward), float(task.safe_cost)
         self.sensor = torch.as_tensor(task.cost, dtype=torch.float32, device=device)
+        self._window = Window.of(task, device)
         self._uniform = bool((self.sensor == self.sensor[0]).all())
-        self._steps = torch.as_tensor(_whole_steps(task.cost), device=device)
+        # What lies outside the grid, cell M, costs nothing.
+        self._steps = torch.as_tensor(np.append(_whole_steps(task.cost), 0.0), device=device)
 
-    def sensing_cost(self, action: Tensor) -> Tensor:
-        """`[B]` price of the sensors switched on in `action` `[B, M]`: c·|a|, or the sum of the cells' own c."""
+    def sensing_cost(self, action: Tensor, last_cell: Tensor) -> Tensor:
+        """`[B]` price of the sensors in `action` `[B, K]`, seen from `last_cell` `[B]`: c·|a|, or the sum of c."""
         if self._uniform:
+            if self._window.is_local:
+                action = action & self._window.inside(last_cell)
             return action.view(torch.uint8).sum(-1, dtype=torch.int32) * self.sensor[0]  # a bool sum converts first
-        return (action.to(self._steps.dtype) @ self._steps).to(self.sensor.dtype)
+        if self._window.is_local:
+            price = self._steps[self._window.around(last_cell)]
+            return (action * price).sum(-1).to(self.sensor.dtype)
+        return (action.to(self._steps.dtype) @ self._steps[:-1]).to(self.sensor.dtype)
 
-    def pseudo_reward(self, action: Tensor, sensed: Tensor, forced: Tensor, in_grid: Tensor) -> Tensor:
+    def pseudo_reward(
+        self, action: Tensor, last_cell: Tensor, sensed: Tensor, forced: Tensor, in_grid: Tensor
+    ) -> Tensor:
         """`[B]` reward of one step: r·1[sensed] - c·|a|, or r - D when the safe action is forced; 0 on the exit step.
 
         Args:
-            action: `[B, M]` sensors on.
+            action: `[B, K]` sensors on.
+            last_cell: `[B]` where the target was located last; a window's sensors are around it.
             sensed: `[B]` the target stands on a cell whose sensor is on.
             forced: `[B]` the safe action replaces `action`.
             in_grid: `[B]` the target is still in the grid after its move.
         """
-        chosen = self.reward * sensed - self.sensing_cost(action)
+        chosen = self.reward * sensed - self.sensing_cost(action, last_cell)
         return torch.where(forced, self.reward - self.safe_cost, chosen) * in_grid
 
 

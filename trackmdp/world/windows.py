@@ -39,6 +39,11 @@ class Window(nn.Module):
     _code: Tensor
     _corner: Tensor
     _cells: Tensor | None
+    _slots: Tensor
+    _line_code: Tensor
+    _line_corner: Tensor
+    _groups: Tensor
+    _inside: Tensor
 
     def __init__(self, size: Task | Size, radius: int | None, device: torch.device | str = "cpu") -> None:
         super().__init__()
@@ -58,6 +63,33 @@ class Window(nn.Module):
             # The exited target, cell M, has the place of cell 0: inside the tables, and told apart by callers.
             self.register_buffer(name, torch.cat([table, table[:1]]), persistent=False)
         self.register_buffer("_cells", None, persistent=False)
+
+        self._find_tables(device)
+
+    def _find_tables(self, device: torch.device | str) -> None:
+        """What `find` and `inside` look up, for windows with a radius."""
+        if self.radius is None:
+            return
+        radius, side, k = self.radius, 2 * self.radius + 1, self.width
+        # Seen from x, cell y lies in line d = S·(row y - row x + W) + (column y - column x + W). With lines of length
+        # S = columns + side no two places share a d: a column too far to the left ends up behind the side of the line
+        # above, one too far to the right behind that of its own. Radius 1, 6 columns, S = 9: from 7 to 6 it is 9·1+0,
+        # local 3; from 7 to 11 (4 to the right) 9·1+5, behind the side of 3: not in the window.
+        line = self.columns + side
+        place = torch.arange(side * line, device=device)
+        local = torch.where(place % line < side, place // line * side + place % line, k)
+        outside = torch.full((1,), k, device=device)
+        self.register_buffer("_slots", torch.cat([outside, local, outside]), persistent=False)
+        code = line * self._row + self._column
+        code[-1] = 4 * line * (self.rows + side)  # an exited target lies behind every line
+        self.register_buffer("_line_code", code, persistent=False)
+        # + 1: place 0 of the table stands for all that lies before it
+        self.register_buffer("_line_corner", code[:-1] - radius * (line + 1) - 1, persistent=False)
+        groups = self.groups()
+        first = torch.full((int(groups.max()) + 1,), self.num_cells, device=device)
+        first.scatter_reduce_(0, groups, torch.arange(self.num_cells, device=device), "amin")
+        self.register_buffer("_groups", groups, persistent=False)
+        self.register_buffer("_inside", self.around(first) < self.num_cells, persistent=False)
 
     @classmethod
     def of(cls, task: Task, device: torch.device | str = "cpu") -> Window:
@@ -100,6 +132,19 @@ class Window(nn.Module):
             return inside
         rows, columns = self._row[cell] - self._row[start], self._column[cell] - self._column[start]
         return inside & (torch.maximum(rows.abs(), columns.abs()) <= self.radius)
+
+    def find(self, start: Tensor, cell: Tensor) -> Tensor:
+        """`[B]` int64, the local number of `cell` `[B]` seen from `start` `[B]`; at least K where there is none."""
+        if self.radius is None:
+            return cell
+        place = self._line_code.index_select(0, cell) - self._line_corner.index_select(0, start)
+        return self._slots.index_select(0, place.clamp_(0, len(self._slots) - 1))
+
+    def inside(self, start: Tensor) -> Tensor:
+        """`[B, K]` bool, whether each local sensor seen from `start` `[B]` is a cell of the grid."""
+        if self.radius is None:
+            return torch.ones(len(start), self.width, dtype=torch.bool, device=start.device)
+        return self._inside.index_select(0, self._groups.index_select(0, start))
 
     def index(self, start: Tensor, cell: Tensor) -> Tensor:
         """`[*L, B]` int64, the local number of `cell` `[*L, B]` seen from `start` `[B]`.
