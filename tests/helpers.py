@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from hydra import compose, initialize_config_dir
 from hypothesis import strategies as st
+from omegaconf import OmegaConf
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from trackmdp.app.compose import register
-from trackmdp.config import GROUPS, ROOTS, EvaluateConfig, TrainConfig, conf_dir, from_hydra, options
+from trackmdp.config import GROUPS, EvaluateConfig, TrainConfig, options
+from trackmdp.config.compose import compose
+from trackmdp.config.registry import conf_file
 from trackmdp.config.world import BORDERS
 from trackmdp.training.make import make_algorithm
 from trackmdp.world.env import TrackEnv
@@ -23,7 +23,7 @@ from trackmdp.world.model import Array, World
 
 def _without_files(group: str) -> list[str]:
     """Choices of a group that need no file of the user's."""
-    return [name for name in GROUPS[group] if "???" not in (Path(conf_dir()) / group / f"{name}.yaml").read_text()]
+    return [name for name in GROUPS[group] if "???" not in conf_file(f"{group}/{name}").read_text()]
 
 
 KERNELS = _without_files("kernel")
@@ -50,9 +50,12 @@ __all__ = [
 
 def configured(command: str, *overrides: str) -> Any:
     """The checked config of `trackmdp command overrides...`."""
-    register()
-    with initialize_config_dir(config_dir=conf_dir(), version_base="1.3"):
-        return from_hydra(compose(command, overrides=list(overrides)), ROOTS[command], Path.cwd())
+    typed = OmegaConf.from_dotlist([])  # reads values as the command line does: numbers, null, lists
+    given = {}
+    for key, _, value in (word.partition("=") for word in overrides):
+        typed.merge_with_dotlist([f"value={value}"])
+        given[key] = OmegaConf.to_container(typed)["value"]
+    return compose(command, given)
 
 
 def train_config(*overrides: str) -> TrainConfig:
