@@ -32,7 +32,7 @@ from trackmdp.config.learning import (
     SingleConfig,
     TensorboardConfig,
 )
-from trackmdp.config.options import GROUPS, SELECTORS, Option, options
+from trackmdp.config.options import GROUPS, SELECTORS, Option, choice, option, options, refuse
 from trackmdp.config.per_sensor import (
     A2cPerSensorConfig,
     DqnPerSensorConfig,
@@ -130,11 +130,14 @@ __all__ = [
     "TrainConfig",
     "VerifyConfig",
     "WorldConfig",
+    "choice",
     "conf_dir",
     "from_hydra",
     "load",
     "load_run",
+    "option",
     "options",
+    "refuse",
     "suggestion",
     "to_dict",
     "to_yaml",
