@@ -16,26 +16,38 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 __all__ = [
+    "Evaluation",
     "Policy",
     "Recorded",
+    "Solution",
     "TrackEnv",
     "World",
+    "evaluate",
     "load_tracks",
     "make_world",
+    "solve",
 ]
 
 _HOMES = {
+    "Evaluation": "trackmdp.solvers.evaluation",
     "Policy": "trackmdp.policies.policy",
     "Recorded": "trackmdp.world.tracks",
+    "Solution": "trackmdp.solvers.solution",
     "TrackEnv": "trackmdp.world.env",
     "World": "trackmdp.world.model",
+    "evaluate": "trackmdp.solvers.evaluate",
     "load_tracks": "trackmdp.world.make",
     "make_world": "trackmdp.world.make",
+    "solve": "trackmdp.solvers.solve",
 }
 """Name -> the module it is defined in."""
 
 if TYPE_CHECKING:  # the same once more, for type checkers and editors, which do not run `__getattr__`
     from trackmdp.policies.policy import Policy
+    from trackmdp.solvers.evaluate import evaluate
+    from trackmdp.solvers.evaluation import Evaluation
+    from trackmdp.solvers.solution import Solution
+    from trackmdp.solvers.solve import solve
     from trackmdp.world.env import TrackEnv
     from trackmdp.world.make import load_tracks, make_world
     from trackmdp.world.model import World

@@ -95,10 +95,13 @@ def renewal(world: World, x: int, chain: BoolArray) -> tuple[float, Array]:
     return earned + (world.reward - world.safe_cost) * mass.sum(), located + mass
 
 
-def best_by_enumeration(world: World) -> Array:
-    """`[M]` V*, every chain of sets tried from every cell until no cell has a better one."""
-    tried = [_all_renewals(world, x) for x in range(world.num_cells)]
-    value = value_of(world, np.ones((world.num_cells, world.num_choices, world.num_cells), dtype=bool))
+def best_by_enumeration(world: World, allowed: BoolArray | None = None) -> Array:
+    """`[M]` V*, every chain of sets tried from every cell until no cell has a better one.
+
+    `allowed` `[M, M]`: which sensors can be chosen from which located cell.
+    """
+    tried = [_all_renewals(world, x, None if allowed is None else allowed[x]) for x in range(world.num_cells)]
+    value = value_of(world, np.zeros((world.num_cells, world.num_choices, world.num_cells), dtype=bool))
     while True:
         picks = [int(np.argmax(earned + located @ value)) for earned, located in tried]
         located = np.stack([options[1][pick] for options, pick in zip(tried, picks, strict=True)])
@@ -109,17 +112,17 @@ def best_by_enumeration(world: World) -> Array:
         value = better
 
 
-def _all_renewals(world: World, x: int) -> tuple[Array, Array]:
-    outcomes = [renewal(world, x, chain) for chain in all_chains(world, x)]
+def _all_renewals(world: World, x: int, allowed: BoolArray | None) -> tuple[Array, Array]:
+    outcomes = [renewal(world, x, chain) for chain in all_chains(world, x, allowed)]
     return np.array([earned for earned, _ in outcomes]), np.stack([located for _, located in outcomes])
 
 
-def all_chains(world: World, x: int) -> Iterator[BoolArray]:
+def all_chains(world: World, x: int, allowed: BoolArray | None = None) -> Iterator[BoolArray]:
     """Every chain of sets of cells that can be reached in that many moves; a sensor anywhere else only costs."""
     reachable, options = np.eye(world.num_cells)[x], []
     for _ in range(world.num_choices):
         reachable = reachable @ world.kernel
-        cells = np.flatnonzero(reachable)
+        cells = np.flatnonzero(reachable if allowed is None else reachable * allowed)
         options.append([np.isin(np.arange(world.num_cells), chosen) for chosen in _subsets(cells)])
     return (np.stack(chain) for chain in itertools.product(*options))
 

@@ -1,3 +1,62 @@
-"""One verb for every solver: `solve(world)`."""
+"""One verb for every solver, by name: those of this package and those of installed plugins."""
 
 from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from inspect import signature
+from typing import Any
+
+from trackmdp.config.baselines import BaselineConfig
+from trackmdp.config.compose import compose, default, given
+from trackmdp.config.registry import make, maker
+from trackmdp.errors import UserError
+from trackmdp.solvers.solution import SearchProgress, Solution, bracketed
+from trackmdp.world.model import World
+
+__all__ = ["run_solver", "solve"]
+
+
+def solve(
+    world: World,
+    solver: str = default("solver", "solve"),
+    *,
+    time_limit: float = default("solver.time_limit", "solve"),
+    on_progress: Callable[[SearchProgress], None] | None = None,
+    **options: Any,
+) -> Solution:
+    """The policy that a solver finds for `world`, what it earns, and an upper bound on what any policy earns.
+
+    The defaults are those of `conf/`, the checks those of ``trackmdp solve``.
+
+    Args:
+        world: the problem with its motion model.
+        solver: ``optimal``, ``clocked``, ``qmdp``, ``fcr``, ``lookahead``, or one of an installed plugin.
+        time_limit: seconds after which `optimal` stops closing the bracket; not an option of the others.
+        on_progress: told how far a search has come, about once a second.
+        **options: the solver's own, such as ``depth=3`` (``trackmdp solve --help`` lists them).
+
+    Raises:
+        UserError: a name, a type or a range is wrong, or the target of the world never exits.
+
+    Example:
+        >>> from trackmdp.world.make import make_world
+        >>> solution = solve(make_world("drift", size=4))
+        >>> solution.certified and solution.upper - solution.lower < 1e-6 * abs(solution.upper)
+        True
+    """
+    own = {f"solver.{name}": value for name, value in options.items()}
+    named = given({"solver": solver, "solver.time_limit": time_limit})
+    return run_solver(world, compose("solve", named | own).solver, on_progress)
+
+
+def run_solver(
+    world: World, choice: BaselineConfig, on_progress: Callable[[SearchProgress], None] | None = None
+) -> Solution:
+    """What the solver of a config finds; a policy without a proof is bracketed by the clocked bound."""
+    if not isinstance(world, World):
+        raise UserError(f"solver={choice.name}: needs a motion model; recorded tracks have none")
+    watched = {"on_progress": on_progress} if "on_progress" in signature(maker(choice)).parameters else {}
+    started = time.monotonic()
+    made = make(choice, world, **watched)
+    return made if isinstance(made, Solution) else bracketed(world, made, time.monotonic() - started)

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-import torch
-from rich.console import Console
-from tensordict import TensorDictBase
-from torchrl.collectors import BaseCollector
+if TYPE_CHECKING:  # the display of a planner is no reason to load torch
+    import torch
+    from rich.console import Console
+    from tensordict import TensorDictBase
+    from torchrl.collectors import BaseCollector
 
-from trackmdp.algos.common import Algorithm
-from trackmdp.config import TrainConfig
-from trackmdp.policies.policy import Policy
-from trackmdp.training.evaluator import Evaluator, Score
-from trackmdp.training.state import Position
-from trackmdp.world.tracks import Problem
+    from trackmdp.algos.common import Algorithm
+    from trackmdp.config import TrainConfig
+    from trackmdp.policies.policy import Policy
+    from trackmdp.training.evaluator import Evaluator, Score
+    from trackmdp.training.state import Position
+    from trackmdp.world.tracks import Problem
 
 __all__ = ["Callback", "Row", "Training"]
 

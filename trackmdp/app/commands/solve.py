@@ -3,31 +3,29 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from trackmdp.app.commands.verify import show_checks, write_checks
-from trackmdp.build import make_baseline
-from trackmdp.config import OptimalConfig, SolveConfig
+from trackmdp.config import SolveConfig
 from trackmdp.durable import write_json
 from trackmdp.errors import UserError
-from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers import bounds, optimal, qmdp
+from trackmdp.solvers import bounds, qmdp
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import regret_per_step
-from trackmdp.solvers.solution import SearchProgress, Solution, bracketed
+from trackmdp.solvers.solution import SearchProgress, Solution
+from trackmdp.solvers.solve import run_solver
 from trackmdp.training.display import make_console, table
 from trackmdp.training.evaluator import figures
 from trackmdp.world.make import build_world
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Problem
 
-__all__ = ["run", "solve_world"]
+__all__ = ["run"]
 
 _SECONDS_BETWEEN_LINES = 2.0
+_BOUNDS = {"paper": bounds.paper, "valid": bounds.valid, "clocked": bounds.clocked}
 
 
 def run(cfg: SolveConfig, folder: Path, problem: Problem | None = None) -> float:
@@ -42,28 +40,21 @@ def run(cfg: SolveConfig, folder: Path, problem: Problem | None = None) -> float
     world = build_world(cfg) if problem is None else problem
     assert isinstance(world, World)  # recorded tracks are refused: there is no kernel to solve with
     with _SearchDisplay(console, f"solve {cfg.solver.name}") as display:
-        solution = solve_world(cfg, world, display.update)
-    write_json(folder / "solution.json", _report(cfg, world, solution))
-    _show(console, cfg, world, solution, folder)
+        solution = run_solver(world, cfg.solver, display.update)
+    bound = {name: float(each(world).mean()) for name, each in _BOUNDS.items()}
+    write_json(folder / "solution.json", _report(cfg, solution, bound))
+    _show(console, cfg, world, solution, bound, folder)
     if solution.interrupted:
         raise KeyboardInterrupt
     if cfg.verify:
+        from trackmdp.app.commands.verify import show_checks, write_checks  # loads what is about the paper
+
         checks = write_checks(world, 1e-9, folder)
         show_checks(console, checks, folder)
     return solution.lower
 
 
-def solve_world(cfg: SolveConfig, world: World, on_progress: Callable[[SearchProgress], None]) -> Solution:
-    """The policy of `cfg.solver` with the bracket it proves: its own for `optimal`, else up to the clocked bound."""
-    if isinstance(cfg.solver, OptimalConfig):
-        limit, tolerance = cfg.solver.time_limit, cfg.solver.tolerance
-        return optimal.solve(world, time_limit=limit, tolerance=tolerance, on_progress=on_progress)
-    started = time.monotonic()
-    table = PolicyTable.from_dense(world, make_baseline(cfg.solver, world))
-    return bracketed(world, table, time.monotonic() - started)
-
-
-def _report(cfg: SolveConfig, world: World, solution: Solution) -> dict[str, Any]:
+def _report(cfg: SolveConfig, solution: Solution, bound: dict[str, float]) -> dict[str, Any]:
     return {
         "solver": cfg.solver.name,
         "lower": solution.lower,
@@ -74,25 +65,22 @@ def _report(cfg: SolveConfig, world: World, solution: Solution) -> dict[str, Any
         "nodes": solution.nodes,
         "regret_per_step": regret_per_step(solution.upper, solution.evaluation),
         "figures": figures(solution.evaluation),
-        "bounds": _bounds(world),
+        "bounds": bound,
         "value": solution.value.tolist(),
         "upper_value": solution.bound.tolist(),
         "policy": solution.table.as_lists(),
     }
 
 
-def _bounds(world: World) -> dict[str, float]:
-    every = {"paper": bounds.paper, "valid": bounds.valid, "clocked": bounds.clocked}
-    return {name: float(bound(world).mean()) for name, bound in every.items()}
-
-
-def _show(console: Console, cfg: SolveConfig, world: World, solution: Solution, folder: Path) -> None:
+def _show(
+    console: Console, cfg: SolveConfig, world: World, solution: Solution, bound: dict[str, float], folder: Path
+) -> None:
     rows = [
         [name, f"{e.aihtr:,.6f}", f"{100 * e.accuracy:.2f} %", f"{e.sensors_per_step:.3f}", f"{e.safe_per_episode:.3f}"]
         for name, e in ((cfg.solver.name, solution.evaluation), ("Q_MDP", evaluate(world, qmdp.solve(world))))
     ]
     rows.append(["upper bound proved", f"{solution.upper:,.6f}", "", "", ""])
-    rows += [[f"{name} bound", f"{value:,.6f}", "", "", ""] for name, value in _bounds(world).items()]
+    rows += [[f"{name} bound", f"{value:,.6f}", "", "", ""] for name, value in bound.items()]
     columns = ["policy", "AIHTR", "accuracy", "sensors per step", "safe actions per episode"]
     console.print(table("exact values", columns, rows))
     state = "certified" if solution.certified else "interrupted" if solution.interrupted else "not closed"
