@@ -15,12 +15,11 @@ from trackmdp.reports.figures import Panel
 from trackmdp.reports.gather import gather
 from trackmdp.reports.grouping import Study, study
 from trackmdp.reports.results import Results
-from trackmdp.world.make import build_world
 
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
-    return gather(write_sweep(tmp_path_factory.mktemp("sweep")), build_world)
+    return gather(write_sweep(tmp_path_factory.mktemp("sweep")))
 
 
 @pytest.fixture(scope="module")
