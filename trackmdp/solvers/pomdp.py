@@ -16,7 +16,7 @@ from trackmdp.errors import UserError
 from trackmdp.solvers.renewal import accumulate
 from trackmdp.world.model import Array, BoolArray, World
 
-__all__ = ["BeliefSolution", "solve"]
+__all__ = ["BeliefSolution", "FiniteMdp", "solve"]
 
 DIGITS = 12
 """Beliefs that agree to this many digits are one."""
@@ -36,17 +36,36 @@ class BeliefSolution:
 
 
 @dataclass
-class _BeliefMdp:
-    """One row per belief state and admissible action; `state[i]` is the belief state row i belongs to."""
+class FiniteMdp:
+    """One row per state and admissible action, the rows of a state together; `state[i]` is the state of row i."""
 
     state: list[int] = field(default_factory=list)
     reward: list[float] = field(default_factory=list)
     successors: list[tuple[list[int], list[float]]] = field(default_factory=list)
 
     def add(self, state: int, reward: float, successors: list[int], probability: list[float]) -> None:
+        """Append an action of `state`, which has to be the last state or the one after it."""
         self.state.append(state)
         self.reward.append(reward)
         self.successors.append((successors, probability))
+
+    def solve(self, states: int) -> tuple[Array, Array]:
+        """Policy iteration: the optimal value `[states]`, and what each row is worth."""
+        columns = [column for successors, _ in self.successors for column in successors]
+        data = [p for _, probability in self.successors for p in probability]
+        pointer = np.concatenate([[0], np.cumsum([len(successors) for successors, _ in self.successors])])
+        moves = sparse.csr_array((data, columns, pointer), shape=(len(self.state), states))
+        reward, state = np.array(self.reward), np.array(self.state)
+        first = np.flatnonzero(np.diff(state, prepend=-1))
+        choice, value = first, accumulate(moves[first], reward[first])
+        while True:
+            worth = reward + moves @ value
+            best = np.maximum.reduceat(worth, first)
+            better = best > worth[choice] + 1e-12 * (1.0 + np.abs(value).max())
+            if not better.any():
+                return value, worth
+            choice = np.where(better, _first_best(worth, best, state, first), choice)
+            value = accumulate(moves[choice], reward[choice])
 
 
 def solve(world: World, *, most_beliefs: int = 50_000) -> BeliefSolution:
@@ -56,42 +75,26 @@ def solve(world: World, *, most_beliefs: int = 50_000) -> BeliefSolution:
         UserError: there are more than `most_beliefs` of them.
     """
     problem, count = _enumerate(world, most_beliefs)
-    rows = len(problem.state)
-    columns = [column for successors, _ in problem.successors for column in successors]
-    data = [p for _, probability in problem.successors for p in probability]
-    pointer = np.concatenate([[0], np.cumsum([len(successors) for successors, _ in problem.successors])])
-    moves = sparse.csr_array((data, columns, pointer), shape=(rows, count))
-    reward, state = np.array(problem.reward), np.array(problem.state)
-    first = np.flatnonzero(np.diff(state, prepend=-1))
-    choice, value = first, accumulate(moves[first], reward[first])
-    while True:
-        worth = reward + moves @ value
-        best = np.maximum.reduceat(worth, first)
-        better = best > worth[choice] + 1e-12 * (1.0 + np.abs(value).max())
-        if not better.any():
-            return BeliefSolution(value[: world.num_cells], count)
-        choice = np.where(better, _first_best(worth, best, state, first), choice)
-        value = accumulate(moves[choice], reward[choice])
+    return BeliefSolution(problem.solve(count)[0][: world.num_cells], count)
 
 
 def _first_best(worth: Array, best: Array, state: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """`[S]` the first row of each belief state that attains its best."""
+    """`[S]` the first row of each state that attains its best."""
     attained = np.flatnonzero(worth >= best[state])
     return attained[np.searchsorted(attained, first)]
 
 
-def _enumerate(world: World, most_beliefs: int) -> tuple[_BeliefMdp, int]:
+def _enumerate(world: World, most_beliefs: int) -> tuple[FiniteMdp, int]:
     kernel = world.kernel.toarray()  # a few cells: every set of sensors is tried in every belief
     beliefs = [(belief, 0) for belief in np.eye(world.num_cells)]
     index = {_key(belief, n): i for i, (belief, n) in enumerate(beliefs)}
-    actions = np.array(list(itertools.product([True, False], repeat=world.num_cells)))
-    problem = _BeliefMdp()
+    problem = FiniteMdp()
     for i, (belief, n) in enumerate(beliefs):  # grows while it is gone through
         predicted = belief @ kernel
         if n == world.num_choices:
             problem.add(i, (world.reward - world.safe_cost) * float(predicted.sum()), *_sparse(predicted))
             continue
-        for action in actions:
+        for action in _subsets(predicted > 0):
             after, missed = _miss(predicted, action)
             targets, probability = _sparse(np.where(action, predicted, 0.0))
             if missed > 0:
@@ -105,6 +108,14 @@ def _enumerate(world: World, most_beliefs: int) -> tuple[_BeliefMdp, int]:
         if len(beliefs) > most_beliefs:
             raise UserError(f"grid.size={world.rows}: more than {most_beliefs} belief states, expected a smaller world")
     return problem, len(beliefs)
+
+
+def _subsets(possible: BoolArray) -> BoolArray:
+    """Every set of possible cells, the fullest first; to sense an impossible one as well only costs."""
+    cells = np.flatnonzero(possible)
+    sets = np.zeros((2 ** len(cells), len(possible)), dtype=bool)
+    sets[:, cells] = list(itertools.product([True, False], repeat=len(cells)))
+    return sets
 
 
 def _miss(predicted: Array, action: BoolArray) -> tuple[Array, float]:

@@ -66,8 +66,14 @@ def test_verify_prints_and_writes_every_check(tmp_path: Path, capsys: pytest.Cap
     assert {"Theorem 1", "Theorem 2", "Lemma 1, first", "Theorem 3, exact form", "Q_MDP", "the printed bound"} <= names
     assert all(check["passed"] for check in checks)
     printed = capsys.readouterr().out
-    assert "13 of 13 claims hold" in printed
-    assert "does not hold" in printed
+    verdicts = [check["verdict"] for check in checks]
+    assert verdicts.count("not claimed; does not hold") == 3
+    assert "FAILS" not in verdicts
+    counts = verdicts.count("holds"), verdicts.count("no case")
+    assert sum(counts) == len(verdicts) - 3
+    last = " ".join(printed.split())
+    assert f"of {sum(counts)} claims {counts[0]} hold, " in last
+    assert "0 FAIL; of 3 looser forms, not claimed, 3 do not hold" in last
 
 
 def test_solve_verify(tmp_path: Path) -> None:

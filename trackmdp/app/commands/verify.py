@@ -51,7 +51,7 @@ def write_checks(world: World, tolerance: float, folder: Path) -> list[Check]:
     content = {
         "optimum": {"lower": solution.lower, "upper": solution.upper, "certified": solution.certified},
         "tolerance": tolerance,
-        "checks": [asdict(check) | {"passed": check.passed} for check in checks],
+        "checks": [asdict(check) | {"verdict": check.verdict, "passed": check.passed} for check in checks],
     }
     write_json(folder / "verification.json", content)
     return checks
@@ -63,17 +63,10 @@ def show_checks(console: Console, checks: list[Check], folder: Path) -> None:
     for column in ("theorem", "statement", "largest deviation", "verdict", "note"):
         shown.add_column(column)
     for check in checks:
-        shown.add_row(check.name, check.statement, _deviation(check), _verdict(check), check.note)
+        shown.add_row(check.name, check.statement, _deviation(check), check.verdict, check.note)
     console.print(shown)
-    claims = [check for check in checks if check.expected]
-    console.print(f"{sum(check.holds for check in claims)} of {len(claims)} claims hold; results in {folder}")
+    console.print(f"{theorems.summary(checks)}; results in {folder}", markup=False)
 
 
 def _deviation(check: Check) -> str:
-    return "no case" if np.isneginf(check.deviation) else f"{check.deviation:.2g}"
-
-
-def _verdict(check: Check) -> str:
-    if check.expected:
-        return "pass" if check.holds else "FAIL"
-    return "holds here" if check.holds else "does not hold"
+    return "–" if np.isneginf(check.deviation) else f"{check.deviation:.2g}"
