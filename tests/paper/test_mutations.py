@@ -12,10 +12,11 @@ import pytest
 from tests.solvers.worlds import paper_world
 from trackmdp.paper import histories, theorems
 from trackmdp.paper.theorems import Check, changed, corner, dearer
+from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import optimal
-from trackmdp.solvers.optimal import Solution
+from trackmdp.solvers.solution import Solution
 from trackmdp.world.belief import BeliefFilter
-from trackmdp.world.model import World
+from trackmdp.world.model import Task, World
 
 WORLDS = (corner(paper_world(5, 0.16, 1)), dearer(corner(paper_world(5, 0.22, 2))))
 """Four cells each. First sensors are worth their price at once; then misses happen and the clock runs out."""
@@ -70,12 +71,18 @@ def returns(module: str, name: str, spoil: Callable[[Any, World], Any]) -> Fault
     return apply
 
 
+def every(on: bool) -> Callable[[PolicyTable, Task], PolicyTable]:
+    """Another policy in place of a policy: all sensors on, or none."""
+    return lambda _, task: PolicyTable.from_dense(task, np.full((4, task.num_choices, 4), on))
+
+
 def none_on(solution: Solution) -> Solution:
-    return replace(solution, chains=np.zeros_like(solution.chains))
+    return replace(solution, table=every(False)(solution.table, solution.table.task))
 
 
 def located_too_low(solution: Solution) -> Solution:
-    return replace(solution, value=solution.value - np.array([5.0, 0.0, 0.0, 0.0]))
+    value = solution.value - np.array([5.0, 0.0, 0.0, 0.0])
+    return replace(solution, evaluation=replace(solution.evaluation, value=value))
 
 
 def known_too_low(patch: pytest.MonkeyPatch) -> None:
@@ -131,10 +138,10 @@ FAULTS: dict[str, tuple[Fault, Key]] = {
     "sensors are charged on exit": (in_the_histories(cost_on_exit), THEOREM_3),
     "the belief forgets misses": (forgetful, THEOREM_3),
     "Q_MDP senses everything": (
-        returns("qmdp", "solve", lambda sets, _: sets | True),
+        returns("qmdp", "solve", every(True)),
         ("Q_MDP", "threshold c/r: largest"),
     ),
-    "Q_MDP senses nothing": (returns("qmdp", "solve", lambda sets, _: sets & False), ("Q_MDP", "threshold c p_in")),
+    "Q_MDP senses nothing": (returns("qmdp", "solve", every(False)), ("Q_MDP", "threshold c p_in")),
     "the printed bound is the valid one": (
         returns("bounds", "paper", lambda bound, world: theorems.bounds.valid(world)),
         ("Q_MDP", "V*_QMDP as printed"),
