@@ -47,6 +47,10 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"grid.size": 2}, "grid.size=2: expected an integer from 3"),
     ({"algo": "ppo", "algo.minibatches": 3}, "algo.minibatches=3: expected a divisor"),
     ({"kernel": "table"}, "kernel.path: missing, expected a path"),
+    ({"credit": "per_sensor"}, "credit=per_sensor: not read by algo=hindsight, expected one of a2c, ppo, dqn"),
+    ({"algo.explore.until": 0.3}, "algo.explore.until=0.3: without effect with algo.collect=all_on"),
+    ({"algo": "dqn", "algo.prioritized.beta": 1}, "algo.prioritized.beta=1: without effect with algo.prioritized"),
+    ({"algo": "learned_kernel", "algo.warm_up": 1}, "algo.warm_up=1: without effect with algo.sensing=all"),
     ({"algo.lam": 0.5}, "algo.lam: renamed, expected algo.gae_lambda"),
 ]
 
@@ -57,3 +61,9 @@ def test_what_is_not_allowed_is_one_line(overrides: dict[str, Any], message: str
         compose("train", overrides)
     assert str(caught.value).startswith(message)
     assert "\n" not in str(caught.value)
+
+
+def test_what_only_training_reads_is_refused_elsewhere() -> None:
+    with pytest.raises(UserError, match=r"log\.every=2: without effect outside training"):
+        compose("evaluate", {"baseline": "qmdp", "log": "mcap", "log.every": 2})
+    assert compose("evaluate", {"baseline": "qmdp", "log": "mcap", "log.layout": True}).log.layout

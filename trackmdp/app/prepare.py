@@ -23,6 +23,7 @@ from trackmdp.config import (
     from_hydra,
     load_run,
 )
+from trackmdp.config.ignored import refuse_ignored
 from trackmdp.config.resume import continued, run_folder
 from trackmdp.errors import UserError
 
@@ -40,11 +41,17 @@ def typed_config(command: str, cfg: DictConfig, folder: Path) -> CommandConfig:
     Raises:
         UserError: an option is unknown or not allowed.
     """
+    given: dict[str, Any] = {}
+    choices: dict[str, Any] = {}
     if "hydra" in cfg:
+        words = (word.lstrip("+~").partition("=") for word in cfg.hydra.overrides.task)
+        given, choices = {key: value for key, _, value in words}, cfg.hydra.runtime.choices
         cfg = cfg.copy()
         cfg._set_flag("struct", False)
         del cfg["hydra"]
-    return from_hydra(cfg, ROOTS[command], folder)
+    typed = from_hydra(cfg, ROOTS[command], folder)
+    refuse_ignored(typed, given, choices)
+    return typed
 
 
 @dataclass(frozen=True)

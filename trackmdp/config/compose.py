@@ -18,6 +18,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from trackmdp.config.checks import absolute_paths, validate
+from trackmdp.config.ignored import refuse_ignored
 from trackmdp.config.options import GROUPS, SELECTORS, Option, optional, options, refuse
 from trackmdp.config.refusals import refuse_renamed, unknown_choice, unknown_option
 from trackmdp.config.registry import conf_file
@@ -54,6 +55,7 @@ def compose(command: str, overrides: Mapping[str, Any] | None = None, *, folder:
             _put(values, key, value, known)
     cfg = build(_resolved(values, known), schema)
     validate(cfg)
+    refuse_ignored(cfg, typed, chosen)
     absolute_paths(cfg, folder or Path.cwd())
     return cfg
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from trackmdp.config.learning import AlgoConfig
 from trackmdp.config.options import choice, option
@@ -24,3 +24,7 @@ class LearnedKernelConfig(AlgoConfig):
     rounds: int = option("EM rounds after each batch", ge=1)
     rounds_at_end: int = option("EM rounds after the last batch", ge=1)
     samples: int = option("kernels drawn for the uncertainty reported", ge=2)
+
+    def ignored(self, root: Any) -> dict[str, str]:
+        """With all sensors on throughout, nothing comes before chosen sets."""
+        return {} if self.sensing == "chosen" else {"warm_up": "with algo.sensing=all"}

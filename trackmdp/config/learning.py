@@ -121,6 +121,10 @@ class PrioritizedConfig(NodeConfig):
     alpha: float = option("how much priorities matter", ge=0, le=1)
     beta: float = option("how much the draw is corrected for", ge=0, le=1)
 
+    def ignored(self, root: Any) -> dict[str, str]:
+        """Uniform replay has no priorities."""
+        return {} if self.enabled else dict.fromkeys(("alpha", "beta"), "with algo.prioritized.enabled=false")
+
 
 @choice("algo", "dqn", makes="trackmdp.algos.dqn:DQN")
 @dataclass(kw_only=True)
@@ -238,6 +242,10 @@ class LogConfig(ChoiceConfig):
     episodes_only: ClassVar[bool] = False
     every: int = option("iterations from one row to the next", unit="iterations", ge=1)
 
+    def ignored(self, root: Any) -> dict[str, str]:
+        """An evaluation has no iterations."""
+        return {} if root.learns else {"every": "outside training"}
+
 
 @choice("log", "csv", makes="trackmdp.training.metrics:CsvLogger")
 @dataclass(kw_only=True)
@@ -262,6 +270,10 @@ class McapConfig(LogConfig):
     )
     episodes: int = option("training: episodes recorded of each such evaluation", unit="episodes", ge=1)
     layout: bool = option("write a viewer's layout next to the log")
+
+    def ignored(self, root: Any) -> dict[str, str]:
+        """An evaluation logs all the episodes that it simulates."""
+        return {} if root.learns else dict.fromkeys(("every", "evaluations", "episodes"), "outside training")
 
 
 def state_bytes(task: Sizes) -> int:

@@ -66,6 +66,10 @@ class PerSensorConfig(AlgoConfig):
             if (probability := getattr(self.explore, end)) > 1:
                 raise refuse(f"{key}.explore.{end}", probability, "a number from 0 to 1, a probability")
 
+    def ignored(self, root: Any) -> dict[str, str]:
+        """All sensors on leave nothing to explore."""
+        return {} if self.collect == "mixed" else {"explore": "with algo.collect=all_on"}
+
     def memory(self, task: Sizes, root: Any) -> dict[str, int]:
         """The moves kept, with what sorting them takes; the networks.
 

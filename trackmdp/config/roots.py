@@ -35,6 +35,7 @@ __all__ = [
 class CommandConfig(NodeConfig):
     """What every command has."""
 
+    learns: ClassVar[bool] = False
     quiet: bool = option("say nothing at the terminal but errors")
 
 
@@ -81,6 +82,7 @@ class TrainConfig(WorldConfig):
     """Learn a policy without the motion model, and evaluate it exactly."""
 
     needs_motion: ClassVar[bool] = False
+    learns: ClassVar[bool] = True
     seed: int = option("every random draw of the run derives from it", ge=0)
     device: str = option("device the networks live on", expects="cpu, cuda, cuda:N or auto", pattern=DEVICE)
     threads: int = option("torch threads of the learning process", unit="threads", ge=1, le=256)

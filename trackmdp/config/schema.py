@@ -46,6 +46,13 @@ class NodeConfig:
             UserError: a rule is broken.
         """
 
+    def ignored(self, root: Any) -> dict[str, str]:
+        """Options of this node without effect on this config, and why: ``{"alpha": "with algo.prioritized..."}``.
+
+        They are refused where they were typed (`trackmdp.config.ignored`).
+        """
+        return {}
+
     def memory(self, task: Sizes, root: Any) -> dict[str, int]:
         """Bytes that a run needs for what this node asks for, by the dotted option that they grow with."""
         return {}
