@@ -3,6 +3,7 @@
     import trackmdp as tm
 
     world = tm.make_world("random_support", size=10, cost=0.16)
+    run = tm.train(world, "hindsight", seed=0)
     env = tm.TrackEnv(world, 64)
 
 Every name below is imported from its module when it is first used: ``import trackmdp`` loads neither torch nor scipy.
@@ -19,26 +20,32 @@ __all__ = [
     "Evaluation",
     "Policy",
     "Recorded",
+    "Run",
     "Solution",
     "TrackEnv",
     "World",
     "evaluate",
+    "load_run",
     "load_tracks",
     "make_world",
     "solve",
+    "train",
 ]
 
 _HOMES = {
     "Evaluation": "trackmdp.solvers.evaluation",
     "Policy": "trackmdp.policies.policy",
     "Recorded": "trackmdp.world.tracks",
+    "Run": "trackmdp.training.run",
     "Solution": "trackmdp.solvers.solution",
     "TrackEnv": "trackmdp.world.env",
     "World": "trackmdp.world.model",
     "evaluate": "trackmdp.solvers.evaluate",
+    "load_run": "trackmdp.training.run",
     "load_tracks": "trackmdp.world.make",
     "make_world": "trackmdp.world.make",
     "solve": "trackmdp.solvers.solve",
+    "train": "trackmdp.training.train",
 }
 """Name -> the module it is defined in."""
 
@@ -48,6 +55,8 @@ if TYPE_CHECKING:  # the same once more, for type checkers and editors, which do
     from trackmdp.solvers.evaluation import Evaluation
     from trackmdp.solvers.solution import Solution
     from trackmdp.solvers.solve import solve
+    from trackmdp.training.run import Run, load_run
+    from trackmdp.training.train import train
     from trackmdp.world.env import TrackEnv
     from trackmdp.world.make import load_tracks, make_world
     from trackmdp.world.model import World

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy import sparse
 
 from tests.helpers import train_config
 from trackmdp.config import PaperCostConfig, TrainConfig
 from trackmdp.config.resume import config_text, digest
 from trackmdp.policies.policy import Policy
-from trackmdp.reports import policy
 from trackmdp.solvers import clocked
 from trackmdp.training.evaluator import ExactEvaluator, figures
 from trackmdp.training.sealing import write_summary
@@ -64,8 +64,8 @@ def write_run(
         "config_sha256": digest(cfg),
     }
     (folder / "config.yaml").write_text(config_text(cfg), encoding="utf-8")
-    np.save(folder / "kernel.npy", world.kernel.toarray())
-    policy.write(folder / policy.FILE, policy.Policy(chains, score.evaluation.value))
+    sparse.save_npz(folder / "kernel.npz", world.kernel)
+    Policy.from_dense(world, chains).save(folder / "policy.npz", score.evaluation.value)
     write_summary(folder, summary)
     write_curve(folder, np.linspace(-100.0, score.evaluation.aihtr, 40))
     return summary

@@ -143,7 +143,7 @@ def test_what_is_wrong_with_a_run_is_named(sweep: Path) -> None:
     (sweep / "hindsight-0.16-1/metrics.csv").write_text("iteration,frames\n1,x\n")
     for seed in range(3):
         (sweep / f"hindsight-0.22-{seed}/policy.npz").write_bytes(b"nothing")
-    (sweep / "hindsight-0.16-0/kernel.npy").unlink()
+    (sweep / "hindsight-0.16-0/kernel.npz").unlink()
     found = gather(sweep)
     said = problems(found)
     assert len(found.runs) == 7

@@ -113,7 +113,7 @@ def test_a_run_says_nothing_that_takes_a_kernel(file: Path, tmp_path: Path) -> N
     evaluated = [row for row in metrics(tmp_path / "run") if row["aihtr"]]
     assert {row["regret_per_step"] for row in metrics(tmp_path / "run")} == {""}
     assert float(evaluated[-1]["aihtr"]) == summary["policy"]["aihtr"]
-    assert not (tmp_path / "run" / "kernel.npy").exists()
+    assert not (tmp_path / "run" / "kernel.npz").exists()
     described = json.loads((tmp_path / "run" / "tracks.json").read_text())
     assert (described["learned_from"]["tracks"], described["held_out"]["tracks"]) == (48, 12)
 

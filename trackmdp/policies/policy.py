@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, ClassVar, TypeAlias
 
 import torch
@@ -19,9 +20,10 @@ from torch import Tensor
 
 from trackmdp.errors import UserError
 from trackmdp.policies.lookup import DenseTable, SparseTable
+from trackmdp.policies.saved import load_policy, save_policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.policies.unroll import STATE_KEYS, Rule, draws, function_rule, module_rule, unrolled
-from trackmdp.world.model import Task
+from trackmdp.world.model import Array, Task
 
 __all__ = ["Policy", "PolicyLike", "as_policy"]
 
@@ -157,6 +159,28 @@ class Policy(TensorDictModuleBase, PolicyTable):
         device = last_cell.device if self.generator is None else self.generator.device
         draws = torch.rand((*last_cell.shape, self.num_draws), generator=self.generator, device=device)
         return tensordict.set("action", self.act(last_cell, n, draws))
+
+    # Files.
+
+    def save(self, file: str | Path, value: Array | None = None) -> None:
+        """Write `policy.npz`; see `trackmdp.policies.saved`.
+
+        Raises:
+            UserError: the policy draws exactly k sensors, which no table says.
+        """
+        if self.k is not None:
+            raise UserError("policy: k sensors drawn at random are no table to save")
+        save_policy(Path(file), self, value)
+
+    @classmethod
+    def load(cls, file: str | Path) -> Policy:
+        """Read a `policy.npz`.
+
+        Raises:
+            UserError: the file is missing or damaged, or holds something else.
+        """
+        table, _ = load_policy(Path(file))
+        return cls(table.task, table.sets, probability=table.probability)
 
 
 def as_policy(task: Task, policy: PolicyLike, *, device: torch.device | str | None = None) -> Policy:

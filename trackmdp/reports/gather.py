@@ -162,7 +162,7 @@ def _policies(folder: Path, grouped: Study) -> tuple[dict[str, policy.Policy], l
 
 
 def _motions(folder: Path, runs: Iterable[FinishedRun]) -> tuple[dict[str, Motion], list[Anomaly]]:
-    """Motion and references of each world, from the `kernel.npy` of its first run."""
+    """Motion and references of each world, from the `kernel.npz` of its first run."""
     found: dict[str, Motion] = {}
     seen, anomalies = set[str](), list[Anomaly]()
     for run in runs:
@@ -185,7 +185,7 @@ def _world_config(place: Path) -> WorldConfig:
     """A run's world with the motion that it stored as its table, whatever made the motion."""
     plain = plain_config(place)
     kernel: dict[str, Any] = {field.name: False for field in dataclasses.fields(TableConfig)}
-    kernel |= {"name": "table", "path": str(place / "kernel.npy")}
+    kernel |= {"name": "table", "path": str(place / "kernel.npz")}
     parts = {key: plain.get(key) for key in ("grid", "cost")}
     return world_of(OmegaConf.to_yaml(OmegaConf.create({"quiet": True, "kernel": kernel, **parts})))
 

@@ -12,15 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 from trackmdp.arrays import load_npz
-from trackmdp.durable import write_bytes
-from trackmdp.untrusted import decoded, read_bytes
+from trackmdp.errors import UserError
+from trackmdp.policies.saved import load_policy
 from trackmdp.world.model import Array, BoolArray
 
-__all__ = ["FILE", "Policy", "arrays", "pack", "pack_all", "read", "unpack_all", "write"]
+__all__ = ["FILE", "Policy", "arrays", "pack_all", "read", "unpack_all"]
 
 FILE = "policy.npz"
-_LARGEST = 2**30
-"""Bytes of the longest; 64 x 64 cells need a few MB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,14 +32,6 @@ class Policy:
 
     chains: BoolArray
     value: Array
-
-
-def pack(policy: Policy) -> bytes:
-    """The bytes of a `policy.npz`: `chains` as bits, their `shape`, and `value`; the same policy, the same bytes."""
-    stream = io.BytesIO()
-    bits, shape = np.packbits(policy.chains), np.array(policy.chains.shape)
-    np.savez_compressed(stream, chains=bits, shape=shape, value=policy.value)
-    return stream.getvalue()
 
 
 def arrays(content: bytes, *keys: str) -> list[npt.NDArray[Any]]:
@@ -82,24 +72,13 @@ def unpack_all(content: bytes) -> dict[str, Policy]:
     return {str(name): Policy(c.reshape(s), v) for name, c, s, v in zip(names, chains, shapes, value, strict=True)}
 
 
-def write(file: Path, policy: Policy) -> None:
-    """Write the policy, whole or not at all."""
-    write_bytes(file, pack(policy))
-
-
 def read(file: Path) -> Policy:
     """Read a policy back.
 
     Raises:
         UserError: the file is missing or damaged, or holds something else.
     """
-    content = read_bytes(file, most=_LARGEST)
-    with decoded(str(file), "the policy of a run"):
-        bits, shape, value = arrays(content, "chains", "shape", "value")
-        m, choices, sensors = (int(length) for length in shape)
-        if min(m, choices) < 1 or sensors != m or value.shape != (m,) or bits.size != (m * choices * m + 7) // 8:
-            raise ValueError("arrays that do not belong together")
-        if value.dtype != np.float64 or not np.isfinite(value).all():
-            raise ValueError("values that are not finite numbers")
-        chains = np.unpackbits(bits, count=m * choices * m).astype(np.bool_).reshape(m, choices, m)
-        return Policy(chains, value)
+    table, value = load_policy(file)
+    if value is None:
+        raise UserError(f"{file}: not the policy of a run (it has no values)")
+    return Policy(table.dense(), value)

@@ -1,4 +1,4 @@
-"""What a run takes in, as its folder keeps it: `config.yaml`, and `kernel.npy` or `tracks.json`."""
+"""What a run takes in, as its folder keeps it: `config.yaml`, and `kernel.npz` or `tracks.json`."""
 
 from __future__ import annotations
 
@@ -6,13 +6,15 @@ import io
 import json
 from pathlib import Path
 
-import numpy as np
+from scipy import sparse
 
+from trackmdp.arrays import LARGE
 from trackmdp.config import TrainConfig
 from trackmdp.config.resume import config_text
 from trackmdp.durable import write_bytes, write_text
 from trackmdp.errors import UserError
-from trackmdp.world.model import Array, World
+from trackmdp.untrusted import read_bytes
+from trackmdp.world.model import World
 from trackmdp.world.tracks import Problem, Recorded
 
 __all__ = ["write_inputs"]
@@ -24,25 +26,23 @@ def write_inputs(config: TrainConfig, problem: Problem, folder: Path, *, resumed
     Raises:
         UserError: the run that is resumed was begun with another kernel, or with other tracks.
     """
-    name, what = ("kernel.npy", "kernel") if isinstance(problem, World) else ("tracks.json", "recording")
+    name, what = ("kernel.npz", "kernel") if isinstance(problem, World) else ("tracks.json", "recording")
     file = folder / name
-    if resumed and not _same(file, problem):
+    content = _content(problem)
+    if resumed and read_bytes(file, most=LARGE) != content:
         raise UserError(
             f"{file}: the run's {what} is not the one that its config describes now; it cannot change on resume"
         )
     write_text(folder / "config.yaml", config_text(config))
-    write_bytes(file, _npy(problem.kernel.toarray()) if isinstance(problem, World) else _described(problem))
+    write_bytes(file, content)
 
 
-def _same(file: Path, problem: Problem) -> bool:
-    if isinstance(problem, World):
-        return np.array_equal(np.load(file, allow_pickle=False), problem.kernel.toarray())
-    return file.read_bytes() == _described(problem)
-
-
-def _npy(table: Array) -> bytes:
+def _content(problem: Problem) -> bytes:
+    """Of `kernel.npz` or `tracks.json`; the same problem, the same bytes."""
+    if not isinstance(problem, World):
+        return _described(problem)
     buffer = io.BytesIO()
-    np.save(buffer, table)
+    sparse.save_npz(buffer, problem.kernel)
     return buffer.getvalue()
 
 

@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
-import io
+import csv
 import time
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from trackmdp.durable import write_bytes
+from trackmdp.arrays import LARGE
+from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
+from trackmdp.policies.saved import load_policy
 from trackmdp.solvers import optimal
 from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.solution import Solution
 from trackmdp.training.callbacks import Callback, Row, Training
-from trackmdp.training.sealing import write_summary
+from trackmdp.training.sealing import check_files, read_summary, write_summary
 from trackmdp.training.summary import summarize
 from trackmdp.training.trainer import Trainer
-from trackmdp.world.model import World
+from trackmdp.untrusted import decoded, read_text
+from trackmdp.world.model import Array, World
 
-__all__ = ["Metrics", "Run", "complete"]
+__all__ = ["Metrics", "Run", "complete", "load_run", "read_metrics"]
 
 Metrics = dict[str, list[float | int | None]]
 """Columns by their names, as in `metrics.csv`: one value for each logged iteration, None for what was not measured."""
@@ -79,10 +83,12 @@ def complete(trainer: Trainer) -> Run:
     }
     summary = summarize(trainer, score, solution, times)
     if trainer.folder is not None:
-        _write_policy(trainer.folder / "policy.npz", policy, score.evaluation)
+        policy.save(trainer.folder / "policy.npz", score.evaluation.value)
         # Last, for a folder with a summary is a finished run.
         write_summary(trainer.folder, summary)
-    return Run(policy, score.evaluation, table.columns, summary, trainer.folder, solution)
+    # A resumed run's earlier rows are in its file alone.
+    metrics = table.columns if trainer.folder is None else read_metrics(trainer.folder)
+    return Run(policy, score.evaluation, metrics or table.columns, summary, trainer.folder, solution)
 
 
 def _solve(trainer: Trainer) -> Solution | None:
@@ -94,7 +100,52 @@ def _solve(trainer: Trainer) -> Solution | None:
         return optimal.solve(problem, time_limit=cfg.optimal.time_limit)
 
 
-def _write_policy(file: Path, policy: Policy, evaluation: Evaluation) -> None:
-    stream, table = io.BytesIO(), policy.dense()
-    np.savez_compressed(stream, chains=np.packbits(table), shape=np.array(table.shape), value=evaluation.value)
-    write_bytes(file, stream.getvalue())
+def load_run(folder: str | Path) -> Run:
+    """A finished run from its folder.
+
+    Raises:
+        UserError: the folder is not that of a finished run, or a file in it is damaged.
+    """
+    place = Path(folder)
+    if not (place / "summary.json").is_file():
+        raise UserError(f"run={folder}: not the folder of a finished run (it has no summary.json)")
+    summary = read_summary(place)
+    check_files(place, summary)
+    table, value = load_policy(place / "policy.npz")
+    policy = Policy(table.task, table.sets, probability=table.probability)
+    return Run(policy, _evaluation(place, summary, value), read_metrics(place), summary, place)
+
+
+def _evaluation(folder: Path, summary: Mapping[str, Any], value: Array | None) -> Evaluation:
+    """The figures of the summary and the values of the policy; what else is known per cell is not kept in a folder."""
+    with decoded(str(folder / "summary.json"), "the summary of a run"):
+        known = {field.name for field in fields(Evaluation)}
+        figures: dict[str, Any] = {name: _number(it) for name, it in summary["policy"].items() if name in known}
+        cells = 0 if value is None else len(value)
+        unknown: dict[str, Any] = dict.fromkeys(known - {*figures, "value"}, np.full(cells, np.nan))
+        return Evaluation(value=np.full(cells, np.nan) if value is None else value, **unknown, **figures)
+
+
+def _number(value: Any) -> float:
+    return float("nan") if value is None else float(value)
+
+
+def read_metrics(folder: Path) -> Metrics:
+    """The columns of `metrics.csv`; none where the run wrote no such file."""
+    file = folder / "metrics.csv"
+    if not file.exists():
+        return {}
+    with decoded(str(file), "the metrics of a run"):
+        rows = csv.DictReader(read_text(file, most=LARGE).splitlines(), strict=True)
+        columns: Metrics = {name: [] for name in rows.fieldnames or ()}
+        for row in rows:
+            for name, column in columns.items():
+                column.append(_cell(row[name]))
+    return columns
+
+
+def _cell(text: str) -> float | int | None:
+    """A number as it was logged: whole where it was, None where there is none."""
+    if not text:
+        return None
+    return int(text) if text.lstrip("-").isdigit() else float(text)

@@ -1,0 +1,131 @@
+"""`policy.npz`: a policy as bytes that depend on nothing else, and what is no policy is refused."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import sparse
+
+from tests.helpers import small_world, train_config
+from trackmdp.app.commands import train
+from trackmdp.errors import UserError
+from trackmdp.policies.policy import Policy, as_policy
+from trackmdp.policies.saved import load_policy, save_policy
+from trackmdp.solvers import qmdp
+from trackmdp.solvers.evaluate import evaluate
+from trackmdp.world.model import Task, World
+
+
+def stored(**changed: Any) -> bytes:
+    """A `policy.npz` of a 2x2 grid, t_max 0, all sensors on, with other arrays."""
+    arrays: dict[str, Any] = {
+        "task_size": np.array([2, 2]),
+        "task_cost": np.full(4, 0.1),
+        "task_t_max": np.array(0),
+        "task_safe_cost": np.array(0.4),
+        "task_reward": np.array(1.0),
+        "task_max_steps": np.array(np.nan),
+        "task_window": np.array(np.nan),
+        "task_markov": np.array(True),
+        "indices": np.tile(np.arange(4, dtype=np.int32), 4),
+        "indptr": np.arange(0, 20, 4),
+        "value": np.zeros(4),
+    }
+    stream = io.BytesIO()
+    np.savez_compressed(stream, **(arrays | changed))
+    return stream.getvalue()
+
+
+def test_a_policy_is_read_back_as_it_was_written(tmp_path: Path) -> None:
+    world = small_world(3, t_max=2)
+    policy = as_policy(world, qmdp.solve(world))
+    value = evaluate(world, policy).value
+    policy.save(tmp_path / "policy.npz", value)
+    found, values = load_policy(tmp_path / "policy.npz")
+    assert values is not None
+    assert np.array_equal(values, value)
+    assert np.array_equal(found.dense(), policy.dense())
+    assert 0 < found.dense().mean() < 1
+    assert found.task.size == (3, 3)
+    assert (found.task.t_max, found.task.max_steps, found.task.safe_cost) == (2, None, world.safe_cost)
+    assert np.array_equal(found.task.cost, world.cost)
+
+
+def test_limits_and_probabilities_are_kept(tmp_path: Path) -> None:
+    task = Task((2, 3), cost=0.5, t_max=1, max_steps=7, window=1, markov=False)
+    half = Policy(task, sparse.csr_array(np.full((12, 6), 0.5)))
+    for policy in (half, Policy.none(task), Policy(task, probability=0.25)):
+        policy.save(tmp_path / "policy.npz")
+        found = Policy.load(tmp_path / "policy.npz")
+        assert (found.task.max_steps, found.task.window, found.task.markov) == (7, 1, False)
+        assert (found.deterministic, found.probability) == (policy.deterministic, policy.probability)
+        assert found.on(1, np.arange(6), np.arange(6)) == pytest.approx(policy.on(1, np.arange(6), np.arange(6)))
+
+
+def test_exactly_k_sensors_is_no_table(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="k sensors drawn at random"):
+        Policy.random_k(small_world(), 2).save(tmp_path / "policy.npz")
+
+
+def test_a_run_leaves_the_policy_of_its_summary(tmp_path: Path) -> None:
+    cfg = train_config(
+        "grid.size=3", "algo.total_frames=2048", "algo.frames_per_batch=1024", "algo.envs=64", "algo.updates=5"
+    )
+    cfg.quiet, cfg.optimal.enabled = True, False
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        aihtr = train.run(cfg, tmp_path / name)
+    world = World(sparse.load_npz(tmp_path / "a/kernel.npz"), 3, cost=0.16, t_max=1)
+    found, value = load_policy(tmp_path / "a/policy.npz")
+    assert value is not None
+    assert evaluate(world, found).aihtr == aihtr
+    assert value.mean() == pytest.approx(aihtr, rel=1e-12)
+    assert (tmp_path / "a/policy.npz").read_bytes() == (tmp_path / "b/policy.npz").read_bytes()
+
+
+def test_the_file_made_here_is_a_policy(tmp_path: Path) -> None:
+    (tmp_path / "policy.npz").write_bytes(stored())
+    found, _ = load_policy(tmp_path / "policy.npz")
+    assert found.dense().all()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"PK\x03\x04 and then nothing",
+        stored()[:100],
+        stored(task_size=np.array([4, 1, 5])),
+        stored(task_size=np.array([4, 4])),
+        stored(indices=np.tile(np.arange(1, 5, dtype=np.int32), 4)),
+        stored(indptr=np.array([0, 99, 8, 12, 16])),
+        stored(indptr=np.array([-4, 4, 8, 12, 16])),
+        stored(value=np.zeros(3)),
+        stored(value=np.array(["a", "b", "c", "d"])),
+        stored(data=np.full(16, np.nan)),
+        stored(probability=np.array(2.0)),
+        stored(task_cost=np.array([{}, {}, {}, {}], dtype=object)),
+    ],
+)
+def test_what_is_no_policy_is_refused_in_one_line(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "policy.npz").write_bytes(content)
+    with pytest.raises(UserError) as caught:
+        load_policy(tmp_path / "policy.npz")
+    assert "\n" not in str(caught.value)
+
+
+def test_saving_replaces_the_file_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    policy = Policy.all_on(small_world())
+    save_policy(tmp_path / "policy.npz", policy)
+
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        save_policy(tmp_path / "policy.npz", Policy.none(small_world()))
+    assert Policy.load(tmp_path / "policy.npz").probability == 1.0

@@ -1,0 +1,164 @@
+"""`train` from Python: the command's names and defaults, nothing written unless asked for, and no Hydra."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDictBase
+
+from tests.helpers import small_world, train_config
+from tests.tracks import drawn, recorded
+from tests.training.runs import rows
+from trackmdp.app.commands import train as command
+from trackmdp.errors import UserError
+from trackmdp.policies.policy import Policy
+from trackmdp.training.callbacks import Callback, Row, Training
+from trackmdp.training.evaluator import Score
+from trackmdp.training.run import load_run
+from trackmdp.training.train import train
+
+QUICK: dict[str, Any] = {
+    "total_frames": 2048,
+    "frames_per_batch": 256,
+    "envs": 32,
+    "hidden": 16,
+    "optimal": {"enabled": False},
+    "evaluation.every": 4,
+}
+
+
+class Heard(Callback):
+    """Writes down which hooks were called."""
+
+    def __init__(self) -> None:
+        self.calls: list[str] = []
+
+    def on_start(self, trainer: Training) -> None:
+        self.calls.append("start")
+
+    def on_batch(self, trainer: Training, batch: TensorDictBase) -> None:
+        self.calls.append(f"batch {tuple(batch.shape)}")
+
+    def on_evaluation(self, trainer: Training, policy: Policy, score: Score) -> None:
+        assert score.evaluation.aihtr == trainer.evaluator.evaluate(policy).aihtr
+        self.calls.append("evaluation")
+
+    def on_update(self, trainer: Training, row: Row) -> None:
+        self.calls.append(f"update {row['iteration']}")
+
+    def on_checkpoint(self, trainer: Training, file: Path) -> None:
+        assert file.is_file()
+        self.calls.append("checkpoint")
+
+    def on_end(self, trainer: Training) -> None:
+        self.calls.append(f"end {trainer.error}")
+
+
+def test_it_is_the_run_of_the_command(tmp_path: Path) -> None:
+    world = small_world()
+    run = train(world, "ppo", seed=3, folder=tmp_path / "python", **QUICK)
+    words = [f"algo.{key}={QUICK[key]}" for key in ("total_frames", "frames_per_batch", "envs", "hidden")]
+    words += ["optimal.enabled=false", "evaluation.every=4", "quiet=true", "grid.size=3", "cost.sensor=0.2"]
+    table = f"kernel.path={tmp_path / 'python' / 'kernel.npz'}"
+    (tmp_path / "typed").mkdir()
+    reached = command.run(train_config("algo=ppo", "seed=3", "kernel=table", table, *words), tmp_path / "typed")
+    assert reached == run.evaluation.aihtr
+    assert rows(tmp_path / "typed") == rows(tmp_path / "python")
+    assert (tmp_path / "typed/policy.npz").read_bytes() == (tmp_path / "python/policy.npz").read_bytes()
+
+
+def test_nothing_is_written_and_nothing_is_disturbed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    torch.manual_seed(5)
+    expected = torch.rand(3)
+    torch.manual_seed(5)
+    run = train(small_world(), "a2c", **QUICK)
+    assert torch.equal(torch.rand(3), expected)
+    assert not list(tmp_path.iterdir())
+    assert run.folder is None
+    assert run.metrics["iteration"] == list(range(1, 9))
+    assert run.metrics["aihtr"][-1] == run.summary["policy"]["aihtr"] == run.evaluation.aihtr
+    assert run.policy.dense().shape == (9, 2, 9)
+
+
+def test_a_run_is_loaded_as_it_ended(tmp_path: Path) -> None:
+    run = train(small_world(), "ppo", folder=tmp_path / "run", **QUICK)
+    found = load_run(tmp_path / "run")
+    assert np.array_equal(found.policy.dense(), run.policy.dense())
+    assert found.metrics == run.metrics
+    assert found.summary["policy"] == run.summary["policy"]
+    assert np.array_equal(found.evaluation.value, run.evaluation.value)
+    assert (found.evaluation.aihtr, found.evaluation.accuracy) == (run.evaluation.aihtr, run.evaluation.accuracy)
+    with pytest.raises(UserError, match="not the folder of a finished run"):
+        load_run(tmp_path)
+
+
+def test_a_run_in_a_folder_is_resumed_exactly(tmp_path: Path) -> None:
+    class Stop(Callback):
+        def on_update(self, trainer: Training, row: Row) -> None:
+            if row["iteration"] == 5:
+                raise RuntimeError("stopped")
+
+    whole = train(small_world(), "ppo", folder=tmp_path / "whole", **QUICK, **{"checkpoint.every": 256})
+    words: dict[str, Any] = {**QUICK, "checkpoint.every": 256, "folder": tmp_path / "cut"}
+    with pytest.raises(RuntimeError, match="stopped"):
+        train(small_world(), "ppo", callbacks=[Stop()], **words)
+    with pytest.raises(UserError, match="holds a run already"):
+        train(small_world(), "ppo", **words)
+    with pytest.raises(UserError, match="kernel is not the one"):
+        train(small_world(seed=1), "ppo", resume="auto", **words)
+    run = train(small_world(), "ppo", resume="auto", **words)
+    assert rows(tmp_path / "cut") == rows(tmp_path / "whole")
+    assert np.array_equal(run.policy.dense(), whole.policy.dense())
+
+
+def test_hooks_are_called_in_order(tmp_path: Path) -> None:
+    heard = Heard()
+    train(small_world(), "ppo", folder=tmp_path, callbacks=[heard], **QUICK | {"total_frames": 512})
+    batch = "batch (32, 8)"
+    first, last = [batch, "evaluation", "update 1"], [batch, "evaluation", "update 2", "checkpoint"]
+    assert heard.calls == ["start", *first, *last, "end None"]
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"hiden": 3}, "algo.hiden"),
+        ({"hidden": "many"}, "algo.hidden=many: expected"),
+        ({"collector": "singel"}, "collector=singel: expected one of"),
+        ({"gamma": 2}, "algo.gamma=2: expected a number from 0 to 1"),
+        ({"collector.workers": 2}, "collector.workers"),
+    ],
+)
+def test_a_wrong_option_is_refused_in_one_line(given: dict[str, Any], told: str) -> None:
+    with pytest.raises(UserError) as caught:
+        train(small_world(), "ppo", **given)
+    assert str(caught.value).startswith(told)
+    assert "\n" not in str(caught.value)
+
+
+def test_recorded_tracks_are_learned_from() -> None:
+    world = small_world(exit_probability=0.05)
+    setting = recorded(drawn(world.kernel, 200), drawn(world.kernel, 40, seed=1))
+    run = train(setting, "ppo", **QUICK)
+    assert run.summary["held_out"]["tracks"] == 40
+    assert np.isfinite(run.evaluation.aihtr)
+
+
+def test_no_hydra_is_loaded() -> None:
+    code = """
+import sys
+import numpy as np
+from trackmdp.training.train import train
+from trackmdp.world.model import World
+kernel = np.full((9, 9), 0.1)
+train(World(kernel, 3, cost=0.2, t_max=1), "ppo", total_frames=512, frames_per_batch=256, envs=32)
+assert not [name for name in sys.modules if name.split(".")[0] == "hydra"]
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)

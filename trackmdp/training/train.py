@@ -1,0 +1,102 @@
+"""`train`: learn a policy from Python; names and defaults are those of the command line."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from trackmdp.config import GROUPS, SELECTORS, TrainConfig, options
+from trackmdp.config.compose import compose
+from trackmdp.errors import UserError
+from trackmdp.seeding import preserved_global_rng
+from trackmdp.training.callbacks import Callback
+from trackmdp.training.display import make_console
+from trackmdp.training.lock import locked
+from trackmdp.training.run import Run, complete
+from trackmdp.training.trainer import Trainer
+from trackmdp.world.model import World
+from trackmdp.world.tracks import Problem
+
+__all__ = ["train"]
+
+
+def train(
+    problem: Problem,
+    algo: str = "hindsight",
+    *,
+    seed: int = 0,
+    folder: str | Path | None = None,
+    progress: bool = False,
+    callbacks: Sequence[Callback] = (),
+    **options: Any,
+) -> Run:
+    """Learn a sensing policy without the motion model, and evaluate it exactly.
+
+    ::
+
+        run = train(world, "ppo", total_frames=100_000, learning_rate={"end": 1e-4}, **{"collector.envs": 64})
+
+    Args:
+        problem: the world, or recorded tracks; the learner is given its task alone.
+        algo: name of the algorithm, as in `trackmdp train algo=...`.
+        seed: every random draw of the run derives from it; torch's global generators are left as they were.
+        folder: made if it is missing, and written to as the command does; None to write nothing. With
+            ``resume="auto"`` a run in it is resumed.
+        progress: show it at the terminal.
+        callbacks: see `trackmdp.training.callbacks`.
+        options: those of the command line. A name without a dot that the command does not have is the algorithm's;
+            a dict holds several options of one node.
+
+    Raises:
+        UserError: a name, type or range is wrong, there is not enough memory, or the folder holds another run.
+        RunError: learning or writing broke down.
+        Preempted: a signal ended the run; with a folder it can be resumed.
+    """
+    place = None if folder is None else Path(folder)
+    given = dict(_flat(options)) | {"algo": algo, "seed": seed, "quiet": not progress}
+    config: TrainConfig = compose("train", given | _described(problem, place))
+    if place is not None:
+        place.mkdir(parents=True, exist_ok=True)
+        if config.resume is None and (place / "config.yaml").is_file():
+            raise UserError(f"folder={folder}: holds a run already; resume it by resume='auto', or choose another one")
+    with locked(place, "folder") if place else nullcontext(), preserved_global_rng():
+        console = make_console(quiet=not progress)
+        return complete(Trainer(problem, config, folder=place, callbacks=callbacks, console=console))
+
+
+def _flat(given: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Options by the dotted names of the command line."""
+    for name, value in given.items():
+        known = prefix or "." in name or name in options(TrainConfig) or name in SELECTORS or name in GROUPS
+        key = f"{prefix}{name}" if known else f"algo.{name}"
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{key}.")
+        else:
+            yield key, value
+
+
+def _described(problem: Problem, folder: Path | None) -> dict[str, Any]:
+    """The options that a problem made in Python is described by: what is in memory counts, and is saved as a table."""
+    price = problem.cost
+    uniform = bool((price == price[0]).all())
+    given: dict[str, Any] = {
+        "grid.size": problem.rows if problem.rows == problem.columns else list(problem.size),
+        "grid.t_max": problem.t_max,
+        "grid.max_steps": problem.max_steps,
+        "cost.reward": problem.reward,
+        "cost.sensor": float(price[0]) if uniform else price.tolist(),
+        "cost.safe": None if np.isclose(problem.safe_cost, price.sum(), rtol=1e-15) else problem.safe_cost,
+    }
+    if isinstance(problem, World):
+        where = (folder or Path()).absolute() / "kernel.npz"
+        return given | {"kernel": "table", "kernel.path": str(where)}
+    if folder is not None:
+        raise UserError(
+            "folder: recorded tracks that were loaded in Python have no file to resume from; use trackmdp train "
+            "kernel=tracks kernel.path=..., or folder=None"
+        )
+    return given | {"kernel": "tracks", "kernel.path": "tracks.csv", "kernel.markov": problem.markov}
