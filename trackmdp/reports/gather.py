@@ -172,7 +172,7 @@ def _motions(folder: Path, runs: Iterable[FinishedRun]) -> tuple[dict[str, Motio
         if run.settings["kernel.name"] == "tracks":
             continue  # no motion is known there
         try:
-            check_files(folder / run.name, read_summary(folder / run.name), "kernel.npy")
+            check_files(folder / run.name, read_summary(folder / run.name), "kernel.npz")
             world = build_world(_world_config(folder / run.name))
         except UserError as error:
             anomalies.append(Anomaly(run.name, f"its world cannot be built ({error})"))

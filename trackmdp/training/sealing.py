@@ -18,7 +18,7 @@ from trackmdp.untrusted import opened, read_object, unsealed
 __all__ = ["SUMMARY", "check_files", "read_summary", "write_summary"]
 
 SUMMARY = "summary.json"
-_FILES = ("config.yaml", "kernel.npy", "kernel.npz", "tracks.json", "policy.npz")
+_FILES = ("config.yaml", "kernel.npz", "tracks.json", "policy.npz")
 _LARGEST = 2**36
 
 
