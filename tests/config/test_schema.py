@@ -14,7 +14,7 @@ from tests.config.cases import COMBINATIONS, composed, files_of
 from tests.helpers import configured
 from tests.reads import record_reads, unread
 from trackmdp.app.sweep.schema import PLUGINS
-from trackmdp.config import GROUPS, ROOTS, SELECTORS, Option, TrainConfig, conf_dir, load, options, to_yaml
+from trackmdp.config import GROUPS, ROOTS, SELECTORS, Option, TrainConfig, conf_dir, load_config, options, to_yaml
 from trackmdp.errors import UserError
 
 CONF = Path(conf_dir())
@@ -125,7 +125,7 @@ def test_every_choice_composes_and_survives_config_yaml(command: str, choice: st
     assert getattr(cfg, group).name == name
     file = tmp_path / "config.yaml"
     file.write_text(to_yaml(cfg), encoding="utf-8")
-    assert load(file, ROOTS[command]) == cfg
+    assert load_config(file, ROOTS[command]) == cfg
 
 
 def test_paths_are_resolved_where_the_command_was_typed() -> None:
@@ -179,7 +179,7 @@ def test_a_config_file_with_a_missing_key_is_refused(change: str, message: str, 
     file = tmp_path / "config.yaml"
     file.write_text(to_yaml(composed("train")).replace(f"  {change}\n", "", 1), encoding="utf-8")
     with pytest.raises(UserError, match="config\\.yaml: ") as caught:
-        load(file, TrainConfig)
+        load_config(file, TrainConfig)
     assert message in str(caught.value)
 
 
@@ -188,7 +188,7 @@ def test_a_file_that_is_no_config_is_refused(text: str, tmp_path: Path) -> None:
     file = tmp_path / "config.yaml"
     file.write_text(text, encoding="utf-8")
     with pytest.raises(UserError):
-        load(file, TrainConfig)
+        load_config(file, TrainConfig)
 
 
 def test_recorded_reads_are_those_that_happened() -> None:

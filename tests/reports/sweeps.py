@@ -13,7 +13,7 @@ from scipy import sparse
 
 from tests.helpers import train_config
 from trackmdp.config import PaperCostConfig, TrainConfig
-from trackmdp.config.resume import config_text, digest
+from trackmdp.config.resume import config_digest, config_text
 from trackmdp.policies.policy import Policy
 from trackmdp.solvers import clocked
 from trackmdp.training.evaluator import ExactEvaluator, figures
@@ -61,7 +61,7 @@ def write_run(
         "regret_per_step": score.regret_per_step,
         "versions": versions or VERSIONS,
         "machine": MACHINE,
-        "config_sha256": digest(cfg),
+        "config_sha256": config_digest(cfg),
     }
     (folder / "config.yaml").write_text(config_text(cfg), encoding="utf-8")
     sparse.save_npz(folder / "kernel.npz", world.kernel)

@@ -72,9 +72,9 @@ def test_one_policy_per_group_is_kept_that_of_the_run_in_the_middle(whole: Path)
 def test_motion_and_references_are_kept_per_world(whole: Path) -> None:
     found = gather(whole)
     assert sorted(found.motions) == ["a2c-0.16-0", "a2c-0.22-0"]
-    from trackmdp.config import load_run
+    from trackmdp.config import load_run_config
 
-    world = build_world(load_run(whole / "a2c-0.22-0"))
+    world = build_world(load_run_config(whole / "a2c-0.22-0"))
     motion = found.motions["a2c-0.22-0"]
     assert np.array_equal(motion.kernel.toarray(), world.kernel.toarray())
     assert np.array_equal(motion.clocked, bounds.clocked(world))

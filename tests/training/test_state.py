@@ -14,7 +14,7 @@ from tests.helpers import train_config
 from tests.training.runs import BUDGET, QUICK, SMALL, assert_same_run, at_iteration, rows, train
 from tests.training.test_checkpoint import corrupted
 from trackmdp.app.cli import main
-from trackmdp.config import load_run
+from trackmdp.config import load_run_config
 from trackmdp.errors import RunError, UserError
 from trackmdp.training import checkpoint
 from trackmdp.training.state import find
@@ -136,7 +136,7 @@ def test_budget_logging_and_saving_may_change(half: Path) -> None:
     words = ["collector.total_frames=2560", "checkpoint.every=512", "evaluation.every=2", "log.every=2"]
     assert typed(half, "resume=auto", *words) == 0
     assert [int(row["iteration"]) for row in rows(half)] == [1, 2, 3, 4, 6, 8, 10]
-    saved = load_run(half)
+    saved = load_run_config(half)
     assert (saved.collector.total_frames, saved.checkpoint.every, saved.log.every, saved.seed) == (2560, 512, 2, 0)
 
 

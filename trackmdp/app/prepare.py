@@ -21,7 +21,7 @@ from trackmdp.config import (
     TrainConfig,
     WorldConfig,
     from_hydra,
-    load_run,
+    load_run_config,
 )
 from trackmdp.config.ignored import refuse_ignored
 from trackmdp.config.resume import continued, run_folder
@@ -147,9 +147,9 @@ def _check_files(cfg: CommandConfig, words: Sequence[str]) -> None:
             key = word.lstrip("+~").split("=")[0]
             if key.split(".")[0].split("@")[0] in WORLD_KEYS:
                 raise UserError(f"{word}: not together with run={cfg.run}, whose own world is used")
-        load_run(cfg.run)
+        load_run_config(cfg.run)
     elif isinstance(cfg, ExportConfig):
-        load_run(cfg.run)
+        load_run_config(cfg.run)
     elif isinstance(cfg, ReportConfig) and not Path(cfg.sweep).is_dir():
         raise UserError(f"sweep={cfg.sweep}: no such folder")
     elif isinstance(cfg, ReplayConfig):

@@ -13,8 +13,9 @@ from hydra.plugins.config_source import ConfigLoadError, ConfigResult, ConfigSou
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 
-from trackmdp.config.untrusted import parse_yaml, read_text
+from trackmdp.config.untrusted import MAX_BYTES, parse_yaml
 from trackmdp.errors import UserError
+from trackmdp.untrusted import read_text
 
 __all__ = ["searched"]
 
@@ -82,7 +83,7 @@ class UserFolder(ConfigSource):
         file = self._file(config_path)
         if not file.is_file():
             raise ConfigLoadError(f"Config not found : {file}")
-        text = read_text(file)
+        text = read_text(file, most=MAX_BYTES, links=True)
         config = parse_yaml(text, str(file))
         if not isinstance(config, DictConfig):
             raise UserError(f"{file}: not a config (expected a mapping)")

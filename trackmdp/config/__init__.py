@@ -58,7 +58,7 @@ from trackmdp.config.roots import (
     VerifyConfig,
     WorldConfig,
 )
-from trackmdp.config.tree import from_hydra, load, load_run, to_dict, to_yaml, world_of
+from trackmdp.config.tree import from_hydra, load_config, load_run_config, to_dict, to_yaml, world_of
 from trackmdp.config.world import (
     CostConfig,
     DriftConfig,
@@ -133,8 +133,8 @@ __all__ = [
     "choice",
     "conf_dir",
     "from_hydra",
-    "load",
-    "load_run",
+    "load_config",
+    "load_run_config",
     "option",
     "options",
     "refuse",

@@ -24,7 +24,7 @@ from trackmdp.config.refusals import refuse_renamed, unknown_choice, unknown_opt
 from trackmdp.config.registry import conf_file
 from trackmdp.config.resolvers import register_resolvers
 from trackmdp.config.roots import ROOTS
-from trackmdp.config.tree import build
+from trackmdp.config.tree import build_config
 from trackmdp.errors import UserError
 
 __all__ = ["Default", "compose", "default", "given"]
@@ -53,7 +53,7 @@ def compose(command: str, overrides: Mapping[str, Any] | None = None, *, folder:
     for key, value in typed.items():
         if key not in chosen:
             _put(values, key, value, known)
-    cfg = build(_resolved(values, known), schema)
+    cfg = build_config(_resolved(values, known), schema)
     validate(cfg)
     refuse_ignored(cfg, typed, chosen)
     absolute_paths(cfg, folder or Path.cwd())

@@ -11,11 +11,11 @@ from typing import Any
 from trackmdp.config.checks import validate
 from trackmdp.config.options import SELECTORS
 from trackmdp.config.roots import TrainConfig
-from trackmdp.config.tree import load_run, to_yaml
+from trackmdp.config.tree import load_run_config, to_yaml
 from trackmdp.errors import UserError
 from trackmdp.untrusted import read_object, unsealed
 
-__all__ = ["CHANGEABLE", "config_text", "continued", "digest", "finished", "run_folder"]
+__all__ = ["CHANGEABLE", "config_text", "continued", "config_digest", "finished", "run_folder"]
 
 CHANGEABLE = (
     "collector.total_frames",
@@ -35,7 +35,7 @@ def config_text(cfg: TrainConfig) -> str:
     return to_yaml(dataclasses.replace(cfg, resume=None))
 
 
-def digest(cfg: TrainConfig) -> str:
+def config_digest(cfg: TrainConfig) -> str:
     """SHA-256 of `config.yaml`."""
     return hashlib.sha256(config_text(cfg).encode()).hexdigest()
 
@@ -47,7 +47,9 @@ def finished(cfg: TrainConfig, folder: Path) -> dict[str, Any] | None:
         summary = unsealed(read_object(file), str(file))
     except UserError:
         return None
-    mine = summary.get("config_sha256") in [digest(dataclasses.replace(cfg, quiet=quiet)) for quiet in (True, False)]
+    mine = summary.get("config_sha256") in [
+        config_digest(dataclasses.replace(cfg, quiet=quiet)) for quiet in (True, False)
+    ]
     return summary if mine else None
 
 
@@ -85,7 +87,7 @@ def continued(cfg: TrainConfig, folder: Path, words: Sequence[str]) -> TrainConf
     """
     if cfg.resume is None or not (folder / "config.yaml").is_file():
         return cfg
-    saved = load_run(folder)
+    saved = load_run_config(folder)
     for word in words:
         key = word.lstrip("+~").split("=", 1)[0].split("@")[0].replace("/", ".")
         if key.split(".")[0] in ("hydra", "resume"):

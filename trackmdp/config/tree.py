@@ -15,14 +15,15 @@ from trackmdp.config.options import GROUPS, Option, options
 from trackmdp.config.refusals import suggestion
 from trackmdp.config.roots import CommandConfig, TrainConfig, WorldConfig
 from trackmdp.config.schema import ChoiceConfig
-from trackmdp.config.untrusted import parse_yaml, read_text
+from trackmdp.config.untrusted import MAX_BYTES, parse_yaml
 from trackmdp.errors import UserError
+from trackmdp.untrusted import read_text
 
 __all__ = [
-    "build",
+    "build_config",
     "from_hydra",
-    "load",
-    "load_run",
+    "load_config",
+    "load_run_config",
     "refuse_unknown",
     "to_dict",
     "to_yaml",
@@ -75,7 +76,7 @@ def to_yaml(cfg: Any) -> str:
     return OmegaConf.to_yaml(OmegaConf.create(to_dict(cfg)))
 
 
-def load(file: Path, root: type[C]) -> C:
+def load_config(file: Path, root: type[C]) -> C:
     """Read back a `config.yaml` written by `to_yaml`, with all checks.
 
     Raises:
@@ -83,11 +84,11 @@ def load(file: Path, root: type[C]) -> C:
     """
     if not file.exists():
         raise UserError(f"{file}: no such file")
-    plain = OmegaConf.to_container(parse_yaml(read_text(file), str(file)))
+    plain = OmegaConf.to_container(parse_yaml(read_text(file, most=MAX_BYTES), str(file)))
     if not isinstance(plain, Mapping):
         raise UserError(f"{file}: not a config (expected a mapping)")
     try:
-        typed: C = build(plain, root)
+        typed: C = build_config(plain, root)
         validate(typed)
     except UserError as error:
         raise UserError(f"{file}: {error}") from error
@@ -104,12 +105,12 @@ def world_of(text: str) -> WorldConfig:
     if not isinstance(plain, Mapping):
         raise UserError("config.yaml: not a config (expected a mapping)")
     known = options(WorldConfig)
-    typed: WorldConfig = build({key: value for key, value in plain.items() if key in known}, WorldConfig)
+    typed: WorldConfig = build_config({key: value for key, value in plain.items() if key in known}, WorldConfig)
     validate(typed)
     return typed
 
 
-def load_run(folder: str | Path) -> TrainConfig:
+def load_run_config(folder: str | Path) -> TrainConfig:
     """The config of a training run.
 
     Raises:
@@ -121,12 +122,12 @@ def load_run(folder: str | Path) -> TrainConfig:
     if not file.is_file():
         raise UserError(f"run={folder}: not the folder of a run (it has no config.yaml)")
     try:
-        return load(file, TrainConfig)
+        return load_config(file, TrainConfig)
     except UserError as error:
         raise UserError(f"run={folder}: not the folder of a run ({error})") from error
 
 
-def build(plain: Mapping[Any, Any], schema: type[Any], prefix: str = "", group: str = "") -> Any:
+def build_config(plain: Mapping[Any, Any], schema: type[Any], prefix: str = "", group: str = "") -> Any:
     """The dataclasses of a plain config, each choice's schema by its `name`; values are not checked.
 
     Raises:
@@ -149,7 +150,7 @@ def build(plain: Mapping[Any, Any], schema: type[Any], prefix: str = "", group: 
         if not isinstance(described, Option) and value is not None:
             if not isinstance(value, Mapping):
                 raise UserError(f"{prefix}{key}={value}: expected a mapping")
-            values[key] = build(value, described, f"{prefix}{key}.", key)
+            values[key] = build_config(value, described, f"{prefix}{key}.", key)
         elif isinstance(described, Option) and described.kind is float and type(value) is int:
             values[key] = float(value)
     return schema(**values)

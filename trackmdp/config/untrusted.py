@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import stat
-from pathlib import Path
 from typing import Any
 
 import yaml  # type: ignore[import-untyped]  # a dependency of OmegaConf
@@ -12,31 +10,14 @@ from omegaconf.errors import OmegaConfBaseException
 
 from trackmdp.errors import UserError
 
-__all__ = ["names_code", "parse_yaml", "read_text"]
+__all__ = ["MAX_BYTES", "names_code", "parse_yaml"]
 
-_MAX_BYTES, _MAX_NODES, _MAX_DEPTH = 2**20, 100_000, 50
+MAX_BYTES = 2**20
+"""Bytes of the largest config file that is read."""
+
+_MAX_NODES, _MAX_DEPTH = 100_000, 50
 _CODE = ("_target_", "()")
 """Keys by which Hydra and Python's logging name what is called."""
-
-
-def read_text(file: Path) -> str:
-    """The text of a file.
-
-    Raises:
-        UserError: it is no ordinary file, too long, or not UTF-8.
-    """
-    try:
-        if not stat.S_ISREG(file.stat().st_mode):  # a pipe or a device may never end
-            raise UserError(f"{file}: expected an ordinary file")
-        with file.open("rb") as stream:
-            content = stream.read(_MAX_BYTES + 1)
-        if len(content) > _MAX_BYTES:
-            raise UserError(f"{file}: longer than {_MAX_BYTES:,} bytes, expected a config")
-        return content.decode("utf-8")
-    except OSError as error:
-        raise UserError(f"{file}: cannot be read ({error.strerror})") from error
-    except UnicodeDecodeError as error:
-        raise UserError(f"{file}: not a config (not UTF-8 at byte {error.start})") from error
 
 
 def parse_yaml(text: str, source: str) -> DictConfig | ListConfig:

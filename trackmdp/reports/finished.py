@@ -12,13 +12,12 @@ from typing import Any
 import numpy as np
 from omegaconf import OmegaConf
 
-from trackmdp.config.untrusted import parse_yaml, read_text
+from trackmdp.config.untrusted import MAX_BYTES, parse_yaml
 from trackmdp.errors import UserError
 from trackmdp.reports.results import FIGURES, Anomaly, CurvePoint, FinishedRun
 from trackmdp.training.folders import FAILED, read_json, run_of
 from trackmdp.training.sealing import SUMMARY, check_files, read_summary
-from trackmdp.untrusted import decoded, printable
-from trackmdp.untrusted import read_text as read_any_text
+from trackmdp.untrusted import decoded, printable, read_text
 
 __all__ = ["flatten", "plain_config", "read_curve", "read_run"]
 
@@ -62,7 +61,7 @@ def plain_config(place: Path) -> Mapping[str, Any]:
         UserError: it cannot be read.
     """
     file = place / "config.yaml"
-    plain = OmegaConf.to_container(parse_yaml(read_text(file), str(file)))
+    plain = OmegaConf.to_container(parse_yaml(read_text(file, most=MAX_BYTES), str(file)))
     if not isinstance(plain, Mapping):
         raise UserError(f"{file}: not a config (expected a mapping)")
     return {str(key): value for key, value in plain.items()}
@@ -112,7 +111,7 @@ def _number(key: str, value: Any) -> float:
 def read_curve(file: Path) -> list[CurvePoint]:
     """The points of a run's `metrics.csv` at which the policy was evaluated, thinned; none where it cannot be read."""
     try:
-        text = read_any_text(file, most=_TABLE)
+        text = read_text(file, most=_TABLE)
         with decoded(str(file), "a learning curve"):
             points = _points(text)
     except UserError:

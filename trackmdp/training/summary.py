@@ -7,7 +7,7 @@ from importlib.metadata import version
 from typing import Any
 
 from trackmdp import __version__
-from trackmdp.config.resume import digest
+from trackmdp.config.resume import config_digest
 from trackmdp.solvers.solution import Solution
 from trackmdp.training.callbacks import Training
 from trackmdp.training.evaluator import Score, figures, while_collecting
@@ -46,5 +46,5 @@ def summarize(trainer: Training, score: Score, solution: Solution | None, times:
         "versions": {"trackmdp": __version__, "python": platform.python_version()}
         | {name: version(name) for name in _PACKAGES},
         "machine": machine(),
-        "config_sha256": digest(config),
+        "config_sha256": config_digest(config),
     }

@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModuleBase
 from trackmdp.app.commands import held_out, playback
 from trackmdp.app.commands.trained import trained
 from trackmdp.build import make_baseline
-from trackmdp.config import EvaluateConfig, McapConfig, PlaybackConfig, RandomKConfig, load_run, to_yaml
+from trackmdp.config import EvaluateConfig, McapConfig, PlaybackConfig, RandomKConfig, load_run_config, to_yaml
 from trackmdp.durable import write_json, write_text
 from trackmdp.episodes.log import EpisodeLog
 from trackmdp.episodes.record import Chains, RandomSets
@@ -85,7 +85,7 @@ def _log_episodes(
 ) -> None:
     """Write `episodes.mcap`: as many episodes as are simulated, each from a generator of its own."""
     assert isinstance(cfg.log, McapConfig)
-    described = to_yaml(load_run(cfg.run) if cfg.run else cfg)
+    described = to_yaml(load_run_config(cfg.run) if cfg.run else cfg)
     log = EpisodeLog(folder, world, seed=cfg.seed, config=described, layout=cfg.log.layout, command="evaluate")
     if isinstance(cfg.baseline, RandomKConfig):
         log.record(RandomSets(world.num_cells, cfg.baseline.k), {"label": subject}, cfg.episodes)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from trackmdp.config import load_run
+from trackmdp.config import load_run_config
 from trackmdp.training import checkpoint
 from trackmdp.training.evaluate import chains_of
 from trackmdp.training.make import make_algorithm
@@ -33,7 +33,7 @@ def trained(run: str, device: torch.device, *, best: bool = False) -> Trained:
     Raises:
         UserError: that is no run, or the checkpoint is missing or damaged.
     """
-    cfg, folder = load_run(run), Path(run)
+    cfg, folder = load_run_config(run), Path(run)
     world = make_problem(cfg)
     algorithm = make_algorithm(cfg, world, device)
     file = folder / "checkpoints" / checkpoint.BEST if best else checkpoint.newest(folder)
