@@ -149,35 +149,33 @@ SAME_BY_DESIGN = {"run": "trackmdp.app.commands.", "solve": "trackmdp.solvers."}
 """Names that a whole row of modules has, since they are called alike."""
 
 
-STILL_TWICE = set(
-    [
-        "FAILED",
-        "FILE",
-        "FORMAT",
-        "LEGEND",
-        "MOST_CELLS",
-        "SUMMARY",
-        "STATE_KEYS",
-        "Estimate",
-        "Motion",
-        "Policy",
-        "Trained",
-        "available",
-        "check",
-        "check_run",
-        "draw",
-        "figures",
-        "gather",
-        "launch",
-        "make_collector",
-        "opened",
-        "read_json",
-        "require",
-        "show",
-        "trained",
-        "unsealed",
-    ]
-)
+STILL_TWICE = {
+    "FAILED",
+    "FILE",
+    "FORMAT",
+    "LEGEND",
+    "MOST_CELLS",
+    "SUMMARY",
+    "STATE_KEYS",
+    "Estimate",
+    "Motion",
+    "Policy",
+    "Trained",
+    "available",
+    "check",
+    "check_run",
+    "draw",
+    "figures",
+    "gather",
+    "launch",
+    "make_collector",
+    "opened",
+    "read_json",
+    "require",
+    "show",
+    "trained",
+    "unsealed",
+}
 """Names that are yet to be told apart."""
 
 
