@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 __all__ = [
+    "Episodes",
     "Evaluation",
     "Policy",
     "Recorded",
@@ -28,11 +29,13 @@ __all__ = [
     "load_run",
     "load_tracks",
     "make_world",
+    "simulate",
     "solve",
     "train",
 ]
 
 _HOMES = {
+    "Episodes": "trackmdp.episodes.batch",
     "Evaluation": "trackmdp.solvers.evaluation",
     "Policy": "trackmdp.policies.policy",
     "Recorded": "trackmdp.world.tracks",
@@ -44,12 +47,15 @@ _HOMES = {
     "load_run": "trackmdp.training.run",
     "load_tracks": "trackmdp.world.make",
     "make_world": "trackmdp.world.make",
+    "simulate": "trackmdp.episodes.simulate",
     "solve": "trackmdp.solvers.solve",
     "train": "trackmdp.training.train",
 }
 """Name -> the module it is defined in."""
 
 if TYPE_CHECKING:  # the same once more, for type checkers and editors, which do not run `__getattr__`
+    from trackmdp.episodes.batch import Episodes
+    from trackmdp.episodes.simulate import simulate
     from trackmdp.policies.policy import Policy
     from trackmdp.solvers.evaluate import evaluate
     from trackmdp.solvers.evaluation import Evaluation

@@ -11,10 +11,10 @@ from torch import Tensor
 from tests.helpers import algorithm, collect, small_world
 from trackmdp.algos.actor_loss import ActorLoss, Decision, Poisson, PolicyGradient, Surrogate
 from trackmdp.config import ScheduleConfig
+from trackmdp.policies.policy import as_policy
 from trackmdp.solvers import optimal
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import regret_per_step
-from trackmdp.training.evaluate import chains_of
 from trackmdp.world.model import World
 
 SHORT = ("algo.updates=30", "algo.updates_per_iteration=10", "algo.batch_size=512", "algo.hidden=16")
@@ -43,7 +43,7 @@ def learn(world: World, data: list[Any], *overrides: str, name: str = "hindsight
 
 
 def policy(learner: Any, world: World) -> Any:
-    return chains_of(learner.actor, world)
+    return as_policy(world, learner.actor).dense()
 
 
 def assert_it_learns(name: str, words: tuple[str, ...], t_max: int) -> None:

@@ -15,8 +15,8 @@ from tests.helpers import algorithm, collect, small_world
 from tests.tracks import by_hand, drawn, recorded
 from trackmdp.algos.segments import SegmentBuffer
 from trackmdp.policies.fixed import AllOn
+from trackmdp.policies.policy import as_policy
 from trackmdp.solvers.recorded import replay
-from trackmdp.training.evaluate import chains_of
 
 M = 9
 SETTING = recorded(drawn(small_world(exit_probability=0.2).kernel, 300))
@@ -191,7 +191,7 @@ def test_what_depends_on_more_than_the_cell_is_learned_from_whole_paths_only() -
             learner.step(part)
         while learner.step(None)["updates"] < 300:
             pass
-        chains = chains_of(learner.actor, setting.task)
+        chains = as_policy(setting, learner.actor).dense()
         earned[markov] = replay(setting, tracks, chains).intervals()["reward_per_step"].mean
         if not markov:
             assert chains[[3, 5]].nonzero()[1].tolist() == [1, 1]

@@ -10,38 +10,37 @@ import numpy as np
 from tests.helpers import limited, small_world
 from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.reader import EpisodeReader
-from trackmdp.episodes.record import Acting, Chains, record
+from trackmdp.episodes.simulate import simulate
 from trackmdp.episodes.writer import EpisodeWriter
-from trackmdp.seeding import derive
+from trackmdp.policies.policy import Policy
 from trackmdp.world.model import World
 
 CONFIG = "quiet: true\n"
 WORLD = small_world(4, t_max=2, exit_probability=0.04, seed=1)
 
 
-def policy(world: World = WORLD, seed: int = 5) -> Chains:
+def policy(world: World = WORLD, seed: int = 5) -> Policy:
     """A policy that misses now and then, and is forced at times."""
-    return Chains(np.random.default_rng(seed).random((world.num_cells, world.num_choices, world.num_cells)) < 0.5)
+    shape = (world.num_cells, world.num_choices, world.num_cells)
+    return Policy.from_dense(world, np.random.default_rng(seed).random(shape) < 0.5)
 
 
 def recorded(
-    count: int, *, acting: Acting | None = None, seed: int = 0, max_steps: int | None = None, world: World = WORLD
+    count: int, *, acting: Policy | None = None, seed: int = 0, max_steps: int | None = None, world: World = WORLD
 ) -> list[Episode]:
-    seeds = [derive(seed, "episode", number) for number in range(count)]
-    return list(record(limited(world, max_steps), acting or policy(world), seeds))
+    return list(simulate(limited(world, max_steps), acting or policy(world), count, seed=seed).complete())
 
 
 def write(
     file: Path,
     episodes: Sequence[Episode],
     *,
-    acting: Acting | None = None,
+    acting: Policy | None = None,
     max_steps: int | None = None,
     world: World = WORLD,
 ) -> Path:
-    acting = acting or policy(world)
     writer = EpisodeWriter(file, limited(world, max_steps), facts={"seed": "0"}, config=CONFIG)
-    writer.add_policy(acting.facts, getattr(acting, "chains", None))
+    writer.add_policy({}, acting or policy(world))
     for episode in episodes:
         writer.add(episode)
     return writer.finish()

@@ -30,10 +30,10 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def everything(file: Path) -> tuple[str, list[Episode]]:
     """All that a reader returns; the first as text."""
     with EpisodeReader(file) as reader:
-        chains = [reader.chains(number) for number in range(len(reader.policies))]
+        tables = [reader.policy_table(number) for number in range(len(reader.policies))]
         world = reader.world()
         said = [reader.run, reader.end, reader.rows, reader.policies, reader.attachment("config.yaml").decode()]
-        said += [chain.tobytes().hex() for chain in chains if chain is not None]
+        said += [table.hex() for table in tables if table is not None]
         said += [world.kernel.toarray().tobytes().hex(), world.cost.tobytes().hex()]
         return json.dumps(said), list(reader.episodes())
 
@@ -144,7 +144,7 @@ def test_a_damaged_chunk_costs_only_its_own_episodes(log: Path, tmp_path: Path) 
 def logging_child(file: Path, episodes: list[Episode], report: int) -> None:
     """Log without end; say after each flush how many episodes it holds."""
     writer = EpisodeWriter(file, WORLD, facts={}, config=CONFIG)
-    writer.add_policy({"kind": "chains"}, policy().chains)
+    writer.add_policy({}, policy())
     for count, episode in enumerate(episodes, start=1):
         writer.add(episode)
         if writer._unflushed == 0:

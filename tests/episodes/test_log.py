@@ -16,10 +16,10 @@ from tests.episodes.logs import CONFIG, WORLD, policy, recorded, rewritten, writ
 from trackmdp.episodes import schema
 from trackmdp.episodes.episode import first_difference
 from trackmdp.episodes.reader import EpisodeReader
-from trackmdp.episodes.record import RandomSets
 from trackmdp.episodes.verify import verify
 from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.errors import UserError
+from trackmdp.policies.policy import Policy
 
 
 @pytest.fixture(scope="module")
@@ -45,12 +45,12 @@ def test_write_read_write_gives_the_same_bytes(log: Path, tmp_path: Path) -> Non
 
 
 def test_a_random_policy_and_cut_episodes_come_back_too(tmp_path: Path) -> None:
-    acting = RandomSets(16, 3)
+    acting = Policy.random_k(WORLD, 3)
     episodes = recorded(10, acting=acting, max_steps=6)
     file = write(tmp_path / "a.mcap", episodes, acting=acting, max_steps=6)
     with EpisodeReader(file) as reader:
         assert all(first_difference(a, b) is None for a, b in zip(episodes, reader.episodes(), strict=True))
-        assert (reader.max_steps, reader.chains(0)) == (6, None)
+        assert (reader.max_steps, reader.policy_table(0), reader.policy(0).k) == (6, None, 3)
         assert verify(reader).difference is None
         assert any(row["truncated"] for row in reader.rows)
         assert reader[0]["step_count"].tolist() == list(range(len(reader.read(0))))
@@ -71,7 +71,7 @@ def test_what_the_log_carries_simulates_again(log: Path) -> None:
         assert (world.kernel != WORLD.kernel).nnz == 0
         assert (world.cost == WORLD.cost).all()
         assert (world.size, world.t_max, world.reward, world.safe_cost) == ((4, 4), 2, WORLD.reward, WORLD.safe_cost)
-        assert (reader.chains(0) == policy().chains).all()
+        assert (reader.policy(0).dense() == policy().dense()).all()
         assert reader.attachment("config.yaml").decode() == CONFIG
         assert schema.versions().items() <= reader.run.items()
         verified = verify(reader)
@@ -106,7 +106,7 @@ def test_a_bad_episode_does_not_spoil_the_file(tmp_path: Path) -> None:
     good, bad = recorded(2)
     bad.reward[0] = np.nan
     writer = EpisodeWriter(tmp_path / "a.mcap", WORLD, facts={}, config=CONFIG)
-    writer.add_policy({"kind": "chains"}, policy().chains)
+    writer.add_policy({}, policy())
     with pytest.raises(ValueError, match="not finite"):
         writer.add(bad)
     writer.add(good)

@@ -14,7 +14,8 @@ from tests.episodes.logs import WORLD, recorded, write
 from tests.helpers import train_config
 from trackmdp.episodes.page import MOST_STEPS, page, write_page
 from trackmdp.episodes.reader import EpisodeReader
-from trackmdp.episodes.record import Chains, record
+from trackmdp.episodes.simulate import resimulate
+from trackmdp.policies.policy import as_policy
 from trackmdp.solvers import bounds, qmdp
 from trackmdp.world.make import build_world
 
@@ -38,6 +39,7 @@ def data_of(text: str) -> dict[str, list[float]]:
 
 def test_a_page_holds_the_episode_to_the_digit(reader: EpisodeReader) -> None:
     episode = reader.read(longest(reader))
+    assert episode.belief is not None
     data = data_of(page(reader, episode))
     assert data["reward"] == episode.reward.tolist()
     assert data["total"] == episode.returns.tolist()
@@ -49,8 +51,9 @@ def test_a_page_holds_the_episode_to_the_digit(reader: EpisodeReader) -> None:
 
 def test_a_page_is_one_small_file_that_asks_for_nothing(tmp_path: Path) -> None:
     world = build_world(train_config())
-    acting = Chains(qmdp.solve(world).dense())
-    episode = next(each for each in record(world, acting, range(100)) if 100 <= len(each) < 150)
+    acting = as_policy(world, qmdp.solve(world))
+    episodes = resimulate(world, acting, range(100)).complete()
+    episode = next(each for each in episodes if 100 <= len(each) < 150)
     with EpisodeReader(write(tmp_path / "a.mcap", [episode], acting=acting, world=world)) as reader:
         write_page(reader, tmp_path / "a.html")
     text = (tmp_path / "a.html").read_text(encoding="utf-8")

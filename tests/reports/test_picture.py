@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from trackmdp.episodes.batch import Episodes
+from trackmdp.episodes.episode import Episode
+from trackmdp.episodes.simulate import simulate
+from trackmdp.policies.policy import Policy
 from trackmdp.reports.picture import LEGEND, draw
-from trackmdp.solvers import clocked
-from trackmdp.world.kernels import random_support
 from trackmdp.world.model import World
 
 
@@ -16,23 +18,27 @@ def right_mover() -> World:
     return World(kernel, 3, cost=np.full(9, 0.1), safe_cost=0.9, t_max=0)
 
 
+def from_the_middle(world: World, on: np.ndarray) -> Episode:
+    return next(episode for episode in simulate(world, Policy.from_dense(world, on), 50) if episode.start == 4)
+
+
 def test_a_detection_by_hand() -> None:
-    chains = np.zeros((9, 1, 9), dtype=bool)
-    chains[4, 0, [4, 5]] = True
+    on = np.zeros((9, 1, 9), dtype=bool)
+    on[4, 0, [4, 5]] = True
     expected = ["step 1", "· · ·", "· ▪ ●", "· · ·", "", LEGEND, ""]
-    assert draw(right_mover(), chains, seed=0).split("\n") == expected
+    assert draw([from_the_middle(right_mover(), on)], right_mover()).split("\n") == expected
 
 
 def test_a_miss_by_hand() -> None:
-    chains = np.zeros((9, 1, 9), dtype=bool)
-    chains[4, 0, 3] = True
+    on = np.zeros((9, 1, 9), dtype=bool)
+    on[4, 0, 3] = True
     expected = ["step 1", "· · ·", "▪ · ○", "· · ·", "", LEGEND, ""]
-    assert draw(right_mover(), chains, seed=0, steps=1).split("\n") == expected
+    assert draw([from_the_middle(right_mover(), on)], right_mover(), steps=1).split("\n") == expected
 
 
 def test_the_safe_action_follows_the_last_free_miss() -> None:
-    stay = World(np.eye(9), 3, cost=np.full(9, 0.1), safe_cost=0.9, t_max=0)
-    lines = draw(stay, np.zeros((9, 1, 9), dtype=bool), seed=0, steps=3).split("\n")
+    stay = World(np.eye(9), 3, cost=np.full(9, 0.1), safe_cost=0.9, t_max=0, max_steps=4)
+    lines = draw([from_the_middle(stay, np.zeros((9, 1, 9), dtype=bool))], stay, steps=3).split("\n")
     assert lines[:4] == [
         "step 1   step 2   step 3",
         "· · ·    ▪ ▪ ▪    · · ·",
@@ -41,11 +47,11 @@ def test_the_safe_action_follows_the_last_free_miss() -> None:
     ]
 
 
-def test_the_same_seed_draws_the_same_path_and_another_another() -> None:
-    kernel = random_support(
-        7, support_size=5, radius=1, low_probability=0.15, exit_probability=0.005, border="renormalize", seed=5
-    )
-    world = World(kernel, 7, cost=np.full(49, 0.16), safe_cost=7.84, t_max=1)
-    chains = clocked.solve(world).dense()
-    assert draw(world, chains, seed=1) == draw(world, chains, seed=1)
-    assert len({draw(world, chains, seed=seed) for seed in range(5)}) == 5
+def test_drawn_is_the_first_that_lasts_or_the_longest() -> None:
+    world = World(np.eye(9) * 0.8, 3, cost=0.1, t_max=0)
+    episodes: Episodes = simulate(world, Policy.all_on(world), 40)
+    lasting = next(episode for episode in episodes if len(episode) > 6)
+    assert draw(episodes, world) == draw([lasting], world)
+    short = [episode for episode in episodes if len(episode) <= 6]
+    assert draw(short, world) == draw([max(short, key=len)], world)
+    assert draw(short[:1], world) != draw([lasting], world)

@@ -13,7 +13,7 @@ from tensordict import TensorDict
 
 from trackmdp.world.model import BoolArray
 
-__all__ = ["Episode", "Floats", "Integers", "first_difference"]
+__all__ = ["Episode", "Floats", "Integers", "first_difference", "last_cells"]
 
 Floats: TypeAlias = npt.NDArray[np.float32]
 Integers: TypeAlias = npt.NDArray[np.int64]
@@ -30,14 +30,14 @@ class Episode:
         start: cell in which the target was located at the start.
         misses: `[T]` n before the step.
         action: `[T, M]` sensors on; where the safe action is forced (n > t_max) it counts for nothing.
-        belief: `[T, M]` probability of each cell after the move, given all that was observed before it; a row sums to
-            the probability of no exit.
-        probability: `[T, M]` with which the policy switched each sensor on.
         target: `[T]` the true cell after the move, M once exited.
         located: `[T]` whether the target was located in that cell.
         reward: `[T]` reward of the step.
         terminated: the target exited in the last step.
         truncated: the last step was the last one allowed.
+        belief: `[T, M]` probability of each cell after the move, given all that was observed before it; a row sums to
+            the probability of no exit. None unless it was asked for.
+        probability: `[T, M]` with which the policy switched each sensor on. None unless it was asked for.
     """
 
     number: int
@@ -46,13 +46,13 @@ class Episode:
     start: int
     misses: Integers
     action: BoolArray
-    belief: Floats
-    probability: Floats
     target: Integers
     located: BoolArray
     reward: Floats
     terminated: bool
     truncated: bool
+    belief: Floats | None = None
+    probability: Floats | None = None
     first_tick: int | None = field(default=None)
     """Place of its first step on the log's time line; None until it is logged."""
 
@@ -62,9 +62,7 @@ class Episode:
     @cached_property
     def last_cell(self) -> Integers:
         """`[T]` cell of the last detection before the step, x_{l(k)}."""
-        found = np.where(self.located, np.arange(len(self)), -1)
-        latest = np.concatenate([[-1], np.maximum.accumulate(found)[:-1]])
-        return np.where(latest < 0, self.start, self.target[latest])
+        return last_cells(self.start, self.target, self.located)
 
     @cached_property
     def observation(self) -> Integers:
@@ -128,6 +126,16 @@ class Episode:
         kept = history.copy()
         kept[min(int(self.misses[-1]), t_max)] = self.action[-1]
         return kept
+
+
+def last_cells(start: int, target: Integers, located: BoolArray) -> Integers:
+    """`[T]` cell of the last detection before each step of an episode; see `Episode`.
+
+    With detections at steps 1 and 3 of five, `latest` before each step is -1 -1 1 1 3.
+    """
+    found = np.where(located, np.arange(len(target)), -1)
+    latest = np.concatenate([[-1], np.maximum.accumulate(found)[:-1]])
+    return np.where(latest < 0, start, target[latest])
 
 
 def _ends(steps: int, terminated: bool, truncated: bool) -> dict[str, Any]:

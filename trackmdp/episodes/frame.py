@@ -46,7 +46,7 @@ def sentence(episode: Episode, t: int, task: Task) -> str:
 
 def frame(episode: Episode, t: int, task: Task) -> str:
     """The grid at a step: the target over the sensors that are on over the belief."""
-    belief = episode.belief[t]
+    belief = np.zeros(task.num_cells) if episode.belief is None else episode.belief[t]
     levels = np.digitize(belief, [1e-6, 0.05, 0.2, 0.5])
     marks = np.array(list(_SHADES))[levels]
     if outcome(episode, t, task) != "forced":

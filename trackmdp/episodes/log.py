@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
+from trackmdp.episodes.batch import Episodes
 from trackmdp.episodes.layout import write_layout
-from trackmdp.episodes.record import Acting, record
 from trackmdp.episodes.recover import taken_over
+from trackmdp.episodes.simulate import simulate
 from trackmdp.episodes.writer import EpisodeWriter
-from trackmdp.seeding import derive
+from trackmdp.policies.policy import PolicyLike
 from trackmdp.world.model import World
 
 __all__ = ["EpisodeLog", "free_name"]
@@ -80,16 +82,19 @@ class EpisodeLog:
         self._writer, self.episodes = taken
         earlier.unlink()
 
-    def record(self, acting: Acting, facts: Mapping[str, str], episodes: int, *names: str | int) -> None:
-        """Record `episodes` episodes of a policy; their seeds are those called (`"episode"`, `names`, 0, 1, ...)."""
+    def record(self, policy: PolicyLike, facts: Mapping[str, str], episodes: int, *names: str | int) -> None:
+        """Simulate and log `episodes` episodes; their seeds are those called (`"episode"`, `names`, 0, 1, ...)."""
+        if self._writer is not None:
+            self.add(simulate(self._world, policy, episodes, seed=self._seed, names=names), facts)
+
+    def add(self, episodes: Episodes, facts: Mapping[str, str]) -> None:
+        """Log simulated episodes; `facts` is what the log says of their policy, such as its `label`."""
         if self._writer is None:
             return
-        seeds = [derive(self._seed, "episode", *names, number) for number in range(episodes)]
         try:
-            policy = self._writer.add_policy({**facts, **acting.facts}, getattr(acting, "chains", None))
-            recorded = record(self._world, acting, seeds, first=self.episodes, policy=policy)
-            for episode in recorded:
-                self._writer.add(episode)
+            policy = self._writer.add_policy(facts, episodes.policy)
+            for episode in episodes.complete():
+                self._writer.add(replace(episode, number=self.episodes, policy=policy))
                 self.episodes += 1
             self._writer.flush()
         except OSError as error:

@@ -9,7 +9,6 @@ from typing import Any
 from trackmdp.config import McapConfig
 from trackmdp.config.resume import config_text
 from trackmdp.episodes.log import EpisodeLog
-from trackmdp.episodes.record import Chains
 from trackmdp.policies.policy import Policy
 from trackmdp.training.callbacks import Callback, Training
 from trackmdp.training.evaluator import Score
@@ -50,7 +49,7 @@ class EpisodeLogger(Callback):
         iteration, every = trainer.position.iteration, trainer.config.evaluation.every * self._cfg.evaluations
         if iteration == 1 or trainer.due(every):
             facts = {"label": f"iteration {iteration}"}
-            self._log.record(Chains(policy.dense()), facts, self._cfg.episodes, iteration)
+            self._log.record(policy, facts, self._cfg.episodes, iteration)
 
     def on_end(self, trainer: Training) -> None:  # noqa: ARG002
         """Finish the file."""

@@ -52,6 +52,7 @@ def _content(reader: EpisodeReader, episode: Episode) -> dict[str, Any]:
     about = f"{world.rows} x {world.columns} grid, {len(episode)} steps, seed {reader.run.get('seed', '')}"
     if len(episode) > MOST_STEPS:
         about += f"; the first {MOST_STEPS:,} steps are shown"
+    assert episode.belief is not None  # a logged episode has it
     return {
         "size": world.rows,
         "about": about,

@@ -21,6 +21,7 @@ from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.limits import check_policy, check_row
 from trackmdp.episodes.messages import decode
 from trackmdp.errors import UserError
+from trackmdp.policies.policy import Policy
 from trackmdp.untrusted import decoded, reason
 from trackmdp.world.model import Array, BoolArray, World
 
@@ -159,16 +160,22 @@ class EpisodeReader:
         return content
 
     def policy_table(self, number: int) -> bytes | None:
-        """The file of policy `number`; None if it has no chains."""
+        """The file of policy `number`; None if it has no table."""
         sha256 = self.policies[number]["table.sha256"]
         return self.attachment(f"policy-{number}.npy", sha256) if sha256 else None
 
-    def chains(self, number: int) -> BoolArray | None:
-        """`[M, t_max+1, M]` of policy `number`; None if it has none."""
-        table = self.policy_table(number)
-        if table is None:
-            return None
-        return self._checked(self._unpacked, table)
+    def policy(self, number: int) -> Policy:
+        """Policy `number`, as it acted.
+
+        Raises:
+            UserError: it is of a kind that cannot act again.
+        """
+        facts, task, table = self.policies[number], self.world().task, self.policy_table(number)
+        if facts["kind"] == "random_k":
+            return Policy.random_k(task, int(facts["k"]))
+        if facts["kind"] != "chains" or table is None:
+            raise UserError(f"file={self.file}: policy {number} is a {facts['kind']!r}, expected chains or random_k")
+        return Policy.from_dense(task, self._checked(self._unpacked, table))
 
     def _unpacked(self, table: bytes) -> BoolArray:
         cells, bits = int(self.run["size"]) ** 2, _load(table)

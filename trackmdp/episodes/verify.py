@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 
 from trackmdp.episodes.episode import Episode, first_difference
 from trackmdp.episodes.reader import EpisodeReader
-from trackmdp.episodes.record import Acting, Chains, RandomSets, record
 from trackmdp.episodes.schema import versions_apart
-from trackmdp.errors import UserError
+from trackmdp.episodes.simulate import resimulate
+from trackmdp.policies.policy import Policy
 from trackmdp.world.model import World
 
-__all__ = ["BELIEF_TOLERANCE", "Verified", "acting_of", "verify"]
+__all__ = ["BELIEF_TOLERANCE", "Verified", "verify"]
 
 BELIEF_TOLERANCE = 1e-6
 """How far the belief may be off where other versions wrote the log; all else must still be the same to the bit."""
@@ -43,10 +43,10 @@ def verify(
     wanted = [row["episode"] for row in reader.rows] if numbers is None else numbers
     tolerance = BELIEF_TOLERANCE if versions_apart(reader.run) else 0.0
     world, done, steps = reader.world(), 0, 0
-    for policy, group in groupby(wanted, lambda number: reader.row(number)["policy"]):
-        acting, mine = acting_of(reader, policy), list(group)
+    for number_of_policy, group in groupby(wanted, lambda number: reader.row(number)["policy"]):
+        policy, mine = reader.policy(number_of_policy), list(group)
         for begin in range(0, len(mine), _AT_ONCE):
-            for number, again in _again(reader, world, acting, mine[begin : begin + _AT_ONCE]):
+            for number, again in _again(reader, world, policy, mine[begin : begin + _AT_ONCE]):
                 logged = reader.read(number)
                 if difference := first_difference(logged, again, belief_tolerance=tolerance):
                     return Verified(done, steps, f"episode {number}, {difference}")
@@ -56,23 +56,8 @@ def verify(
     return Verified(done, steps, None)
 
 
-def _again(reader: EpisodeReader, world: World, acting: Acting, numbers: list[int]) -> Iterator[tuple[int, Episode]]:
-    seeds = [int(reader.row(number)["seed"]) for number in numbers]
-    policy = reader.row(numbers[0])["policy"]
-    again = record(world, acting, seeds, policy=policy)
-    return zip(numbers, again, strict=True)
-
-
-def acting_of(reader: EpisodeReader, number: int) -> Acting:
-    """Policy `number` of a log, as it acted.
-
-    Raises:
-        UserError: of a kind unknown here.
-    """
-    facts = reader.policies[number]
-    if facts["kind"] == "random_k":
-        return RandomSets(int(reader.run["size"]) ** 2, int(facts["k"]))
-    chains = reader.chains(number)
-    if facts["kind"] != "chains" or chains is None:
-        raise UserError(f"file={reader.file}: policy {number} is a {facts['kind']!r}, expected chains or random_k")
-    return Chains(chains)
+def _again(reader: EpisodeReader, world: World, policy: Policy, numbers: list[int]) -> Iterator[tuple[int, Episode]]:
+    rows = [reader.row(number) for number in numbers]
+    again = resimulate(world, policy, [int(row["seed"]) for row in rows]).complete()
+    # Simulated episodes do not know under which number and policy they were logged.
+    return ((row["episode"], replace(one, policy=row["policy"])) for row, one in zip(rows, again, strict=True))

@@ -18,9 +18,10 @@ from trackmdp.durable import sync_folder
 from trackmdp.episodes import messages, schema
 from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.schema import time_of
-from trackmdp.world.model import BoolArray, World
+from trackmdp.policies.policy import Policy
+from trackmdp.world.model import World
 
-__all__ = ["EpisodeWriter", "packed"]
+__all__ = ["EpisodeWriter"]
 
 FLUSH_STEPS = 100
 """An episode's end closes the chunk once so many steps are in it, and hands it to the operating system."""
@@ -92,15 +93,16 @@ class EpisodeWriter:
         """How many policies the log holds."""
         return self._policies
 
-    def add_policy(self, facts: Mapping[str, str], chains: BoolArray | None = None) -> int:
+    def add_policy(self, facts: Mapping[str, str], policy: Policy | None) -> int:
         """Add the policy of the episodes that follow; returns its number.
 
         Args:
-            facts: what the log says of it: `kind`, and for a reader `label`.
-            chains: `[M, t_max+1, M]` of a deterministic policy.
+            facts: what the log says of it, for a reader: its `label`.
+            policy: from which `replay verify=true` simulates them again; None where there is none.
         """
+        kind, table = _described(policy)
         with self._lock:
-            return self._add_policy(dict(facts), None if chains is None else packed(chains))
+            return self._add_policy({**facts, **kind}, table)
 
     def copy_policy(self, facts: Mapping[str, str], table: bytes | None) -> int:
         """Add a policy as it was read from another log."""
@@ -136,6 +138,8 @@ class EpisodeWriter:
                 self._flush()
 
     def _add_messages(self, episode: Episode, tick: int, row: dict[str, Any]) -> None:
+        if episode.belief is None or episode.probability is None:
+            raise ValueError(f"episode {episode.number}: without its belief; log those of `Episodes.complete`")
         if not (np.isfinite(episode.reward).all() and 0 <= tick < 2**50):
             raise ValueError(f"episode {episode.number}: a reward that is not finite, or a time out of range")
         add, step, grid = self._writer.add_message, self._channels["/step"], self._channels["/grid"]
@@ -190,9 +194,15 @@ class EpisodeWriter:
         self._writer.add_attachment(time, time, name, _MEDIA[Path(name).suffix], content)
 
 
-def packed(chains: BoolArray) -> bytes:
-    """The `.npy` of a policy: its chains `[M, t_max+1, M]`, eight sensors to a byte."""
-    return _npy(np.packbits(chains, axis=-1))
+def _described(policy: Policy | None) -> tuple[dict[str, str], bytes | None]:
+    """What a log says of how a policy acts, and its table `[M, t_max+1, ceil(M/8)]`, eight sensors to a byte."""
+    if policy is None:
+        return {"kind": "unknown"}, None
+    if policy.k is not None:
+        return {"kind": "random_k", "k": str(policy.k)}, None
+    if not policy.deterministic:
+        return {"kind": "probabilities"}, None
+    return {"kind": "chains"}, _npy(np.packbits(policy.dense(), axis=-1))
 
 
 def _npy(table: npt.NDArray[Any]) -> bytes:

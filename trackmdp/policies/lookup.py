@@ -26,6 +26,10 @@ class DenseTable:
         """`[*B, M]` of `row` `[*B]`: bool, or float32."""
         return self._rows[row]
 
+    def entry(self, row: Tensor, column: Tensor) -> Tensor:
+        """`[*B]`, the entries at (`row`, `column`), both `[*B]`."""
+        return self._rows[row, column]
+
 
 class SparseTable:
     """Rows put together from the entries stored, in memory that follows their number.
@@ -41,6 +45,9 @@ class SparseTable:
         self._index = torch.as_tensor(table.indices, dtype=torch.int64, device=device)
         data = torch.as_tensor(table.data, device=device)
         self._data = data if data.dtype == torch.bool else data.float()
+        # The place of each entry if the rows were written end to end; in order, as the entries are.
+        row = torch.repeat_interleave(self._begin.diff())
+        self._place = row * self._columns + self._index
 
     def __call__(self, row: Tensor) -> Tensor:
         """`[*B, M]` of `row` `[*B]`: bool, or float32."""
@@ -54,3 +61,11 @@ class SparseTable:
         rows = torch.zeros(len(flat), self._columns, dtype=self._data.dtype, device=self.device)
         rows[batch, self._index[entry]] = self._data[entry]
         return rows.reshape(*row.shape, self._columns)
+
+    def entry(self, row: Tensor, column: Tensor) -> Tensor:
+        """`[*B]`, the entries at (`row`, `column`), both `[*B]`."""
+        if not len(self._place):
+            return torch.zeros(row.shape, dtype=self._data.dtype, device=self.device)
+        wanted = row * self._columns + column
+        found = torch.searchsorted(self._place, wanted).clamp_max(len(self._place) - 1)
+        return self._data[found] * (self._place[found] == wanted)

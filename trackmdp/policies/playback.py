@@ -1,38 +1,35 @@
-"""A recorded history as a policy."""
+"""The actions of a recorded episode, issued again whatever is observed."""
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import torch
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from trackmdp.world.model import BoolArray
+from trackmdp.errors import UserError
+from trackmdp.world.model import BoolArray, Task
 
 __all__ = ["Playback"]
 
 
-class Playback(TensorDictModuleBase):
-    """Re-issues the actions `[T, M]` of an episode in their order, one a call, whatever is observed.
+class Playback:
+    """An open-loop policy: the action depends on the step of the episode alone.
 
-    After the last no sensor is on, so that the safe action locates the target.
+    It is therefore no table, and has no exact value; it can be simulated. After the last recorded action no sensor is
+    on, and the safe action locates the target.
+
+    Args:
+        task: grid, costs and limits.
+        actions: `[T, M]` bool, in their order.
+
+    Raises:
+        UserError: the actions are those of another grid.
     """
 
-    in_keys: ClassVar = ["last_cell"]
-    out_keys: ClassVar = ["action"]
-    actions: Tensor
+    def __init__(self, task: Task, actions: BoolArray) -> None:
+        if actions.shape[1:] != (task.num_cells,):
+            raise UserError(f"playback: actions for {actions.shape[1:]} cells, expected {task.num_cells}")
+        self.actions = torch.as_tensor(actions, dtype=torch.bool)
 
-    def __init__(self, actions: BoolArray, device: torch.device | str = "cpu") -> None:
-        super().__init__()
-        self.register_buffer("actions", torch.as_tensor(actions, dtype=torch.bool, device=device))
-        self.step = 0
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write `action` `[B, M]`: the same for all rows."""
-        shape = (*tensordict["last_cell"].shape, self.actions.shape[1])
-        over = self.step >= len(self.actions)
-        action = torch.zeros_like(self.actions[0]) if over else self.actions[self.step]
-        self.step += 1
-        return tensordict.set("action", action.expand(shape).clone())
+    def at(self, step: int) -> Tensor:
+        """`[M]` bool, the action of a step."""
+        return self.actions[step] if step < len(self.actions) else torch.zeros_like(self.actions[0])

@@ -25,12 +25,16 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.policies.unroll import STATE_KEYS, Rule, draws, function_rule, module_rule, unrolled
 from trackmdp.world.model import Array, Task
 
-__all__ = ["Policy", "PolicyLike", "as_policy"]
+__all__ = ["DrawsError", "Policy", "PolicyLike", "as_policy", "rule_of"]
 
 PolicyLike: TypeAlias = "PolicyTable | TensorDictModuleBase | Callable[..., Any]"
 """A policy or its table, a TensorDict module, or a function as `Policy.from_function` takes it."""
 
 _DENSE = 2**24  # entries; a table of no more is looked up dense, the faster of the two ways to act
+
+
+class DrawsError(UserError):
+    """An exact value was asked of something that draws at random."""
 
 
 class Policy(TensorDictModuleBase, PolicyTable):
@@ -111,7 +115,7 @@ class Policy(TensorDictModuleBase, PolicyTable):
     def _unrolled(cls, task: Task, rule: Rule, device: torch.device | str, *, check: bool) -> Policy:
         sets = unrolled(task, rule, torch.device(device))
         if check and draws(task, rule, torch.device(device), sets):
-            raise UserError("policy: draws at random, so that it has no exact value; simulate it, or take its mode")
+            raise DrawsError("policy: draws at random, so that it has no exact value; simulate it, or take its mode")
         return cls(task, sets)
 
     # Acting.
@@ -145,11 +149,19 @@ class Policy(TensorDictModuleBase, PolicyTable):
             assert self.probability is not None
             dtype = torch.bool if self.deterministic else torch.float32
             return torch.full(shape, self.probability, dtype=dtype, device=device)
+        return self.lookup(device)(self.row(last_cell, steps_since_detection))
+
+    def row(self, last_cell: Tensor, steps_since_detection: Tensor) -> Tensor:
+        """`[*B]`, the row of `sets` for a state; where the safe action is forced, that of the last free choice."""
+        return last_cell * self.task.num_choices + steps_since_detection.clamp_max(self.task.t_max)
+
+    def lookup(self, device: torch.device) -> DenseTable | SparseTable:
+        """The rows of `sets` on a device."""
+        assert self.sets is not None
         if self._lookup is None or self._lookup.device != device:
             form = DenseTable if self.sets.shape[0] * self.sets.shape[1] <= _DENSE else SparseTable
             self._lookup = form(self.sets, device)
-        n = steps_since_detection.clamp_max(self.task.t_max)
-        return self._lookup(last_cell * self.task.num_choices + n)
+        return self._lookup
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action` `[*B, M]`."""
@@ -192,18 +204,33 @@ def as_policy(task: Task, policy: PolicyLike, *, device: torch.device | str | No
         device: where to ask a module or function; None for where the module's first weight is, or the CPU.
 
     Raises:
-        UserError: it draws at random, belongs to another grid, or is not of these forms.
+        DrawsError: a module or function draws at random; `Policy.random_k` and tables of probabilities may.
+        UserError: it belongs to another grid, or is not of these forms.
     """
+    if not isinstance(policy, PolicyTable):
+        return Policy._unrolled(task, rule_of(task, policy), device or _device_of(policy), check=True)
+    policy.check_fits(task)
     if isinstance(policy, Policy):
-        policy.check_fits(task)
         return policy
-    if isinstance(policy, PolicyTable):
-        return as_policy(task, Policy(policy.task, policy.sets, probability=policy.probability))
+    return Policy(policy.task, policy.sets, probability=policy.probability)
+
+
+def rule_of(task: Task, policy: TensorDictModuleBase | Callable[..., Any]) -> Rule:
+    """A TensorDict module or a function as a rule.
+
+    Raises:
+        UserError: it is neither, or the module reads or writes other keys.
+    """
     if isinstance(policy, TensorDictModuleBase):
-        weights = itertools.chain(policy.parameters(), policy.buffers())
-        first = next(weights, None)
-        place = device or (torch.device("cpu") if first is None else first.device)
-        return Policy.from_module(task, policy, device=place)
+        return module_rule(task, policy)
     if callable(policy):
-        return Policy.from_function(task, policy, device=device or "cpu")
+        return function_rule(task, policy)
     raise UserError(f"policy: expected a Policy, a TensorDict module or a function, got {type(policy).__name__}")
+
+
+def _device_of(policy: TensorDictModuleBase | Callable[..., Any]) -> torch.device:
+    """Where a module's first weight is; the CPU for one without, and for a function."""
+    if not isinstance(policy, torch.nn.Module):
+        return torch.device("cpu")
+    first = next(itertools.chain(policy.parameters(), policy.buffers()), None)
+    return torch.device("cpu") if first is None else first.device

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from scipy import sparse
 from torch import Tensor
 
 from trackmdp.world.model import Array, Task
@@ -30,13 +31,17 @@ class Costs:
 
     def sensing_cost(self, action: Tensor, last_cell: Tensor) -> Tensor:
         """`[B]` price of the sensors in `action` `[B, K]`, seen from `last_cell` `[B]`: c·|a|, or the sum of c."""
-        if self._uniform:
-            if self._window.is_local:
-                action = action & self._window.inside(last_cell)
-            return action.view(torch.uint8).sum(-1, dtype=torch.int32) * self.sensor[0]  # a bool sum converts first
+        if self._window.is_local and self._uniform:
+            return self.price_of(action & self._window.inside(last_cell))
         if self._window.is_local:
             price = self._steps[self._window.around(last_cell)]
             return (action * price).sum(-1).to(self.sensor.dtype)
+        return self.price_of(action)
+
+    def price_of(self, action: Tensor) -> Tensor:
+        """`[B]` price of the sensors switched on in `action` `[B, M]`, whichever can be chosen."""
+        if self._uniform:
+            return action.view(torch.uint8).sum(-1, dtype=torch.int32) * self.sensor[0]  # a bool sum converts first
         return (action.to(self._steps.dtype) @ self._steps[:-1]).to(self.sensor.dtype)
 
     def pseudo_reward(
@@ -51,7 +56,19 @@ class Costs:
             forced: `[B]` the safe action replaces `action`.
             in_grid: `[B]` the target is still in the grid after its move.
         """
-        chosen = self.reward * sensed - self.sensing_cost(action, last_cell)
+        return self.reward_of(self.sensing_cost(action, last_cell), sensed, forced, in_grid)
+
+    def of_sets(self, sets: sparse.csr_array) -> Tensor:
+        """`[R]` price of each row of `sets` `[R, M]`, to the bit that of `price_of` for the row written out."""
+        count = torch.as_tensor(np.diff(sets.indptr), dtype=torch.int32, device=self.sensor.device)
+        if self._uniform:
+            return count * self.sensor[0]
+        exact = sets.astype(np.float64) @ self._steps[:-1].cpu().numpy()  # whatever the order of the sum
+        return torch.as_tensor(exact, device=self.sensor.device).to(self.sensor.dtype)
+
+    def reward_of(self, spent: Tensor, sensed: Tensor, forced: Tensor, in_grid: Tensor) -> Tensor:
+        """`pseudo_reward` where the price `spent` `[B]` of the sensors on is known."""
+        chosen = self.reward * sensed - spent
         return torch.where(forced, self.reward - self.safe_cost, chosen) * in_grid
 
 

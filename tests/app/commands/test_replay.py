@@ -231,7 +231,7 @@ def test_playback_issues_the_actions_again(log: Path, tmp_path: Path) -> None:
     said = json.loads((tmp_path / "evaluation.json").read_text())
     with EpisodeReader(log) as reader:
         episode = reader.read(6)
-        again = reissued(reader.world(), episode, None)
+        again = reissued(reader.world(), episode)
     assert first_difference(episode, again) is None
     assert said["return"] == said["logged_return"] == episode.returns[-1]
     assert said["simulated"]["episodes"] == 50
@@ -283,16 +283,15 @@ def test_a_file_that_may_not_grow_leaves_what_was_flushed(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from trackmdp.episodes.recover import recover
-    from trackmdp.episodes.verify import acting_of
 
     with EpisodeReader(log) as reader:
-        world, acting = reader.world(), acting_of(reader, 0)
+        world, policy = reader.world(), reader.policy(0)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     mine = EpisodeLog(tmp_path, world, seed=0, config="", layout=False, command="train")
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
         for _ in range(3):
-            mine.record(acting, {}, 300)
+            mine.record(policy, {}, 300)
         mine.close()
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)

@@ -12,9 +12,9 @@ from trackmdp.app.bench.machine import rate
 from trackmdp.config import BenchmarkConfig, to_yaml
 from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.reader import EpisodeReader
-from trackmdp.episodes.record import Acting, Chains, RandomSets, record
+from trackmdp.episodes.simulate import simulate
 from trackmdp.episodes.writer import EpisodeWriter
-from trackmdp.seeding import derive
+from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.solvers import qmdp
 from trackmdp.world.model import World
 
@@ -25,23 +25,19 @@ _EPISODES = 100
 
 def log_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[dict[str, Any]]:
     """Steps per second of recording, writing, reading and decoding; bytes of a step; belief and policy are in it."""
-    policies: dict[str, Acting] = {
-        "qmdp": Chains(qmdp.solve(world).dense()),
-        "random_k": RandomSets(world.num_cells, 5),
-    }
-    seeds = [derive(cfg.seed, "benchmark", number) for number in range(_EPISODES)]
+    policies = {"qmdp": as_policy(world, qmdp.solve(world)), "random_k": Policy.random_k(world, 5)}
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "episodes.mcap"
-        for name, acting in policies.items():
+        for name, policy in policies.items():
 
-            def simulate(acting: Acting = acting) -> int:
-                return sum(map(len, record(world, acting, seeds)))
+            def record(policy: Policy = policy) -> int:
+                return sum(map(len, simulate(world, policy, _EPISODES, seed=cfg.seed).complete()))
 
-            episodes = list(record(world, acting, seeds))
+            episodes = list(simulate(world, policy, _EPISODES, seed=cfg.seed).complete())
 
-            def write(acting: Acting = acting, episodes: list[Episode] = episodes) -> int:
-                return _write(file, cfg, world, acting, episodes)
+            def write(policy: Policy = policy, episodes: list[Episode] = episodes) -> int:
+                return _write(file, cfg, world, policy, episodes)
 
             def read() -> int:
                 with EpisodeReader(file) as reader:
@@ -49,15 +45,15 @@ def log_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[
 
             steps = write()
             size = file.stat().st_size / steps
-            for what, work in (("record", simulate), ("write", write), ("read", read)):
+            for what, work in (("record", record), ("write", write), ("read", read)):
                 figures = rate(work, cfg.seconds, device)
                 rows.append({"part": "log", "policy": name, "what": what, "bytes_per_step": size, **figures})
     return rows
 
 
-def _write(file: Path, cfg: BenchmarkConfig, world: World, acting: Acting, episodes: list[Episode]) -> int:
+def _write(file: Path, cfg: BenchmarkConfig, world: World, policy: Policy, episodes: list[Episode]) -> int:
     writer = EpisodeWriter(file, world, facts={"seed": str(cfg.seed)}, config=to_yaml(cfg))
-    writer.add_policy(acting.facts, getattr(acting, "chains", None))
+    writer.add_policy({"label": "benchmark"}, policy)
     for episode in episodes:
         writer.add(episode)
     writer.finish()

@@ -19,7 +19,7 @@ from trackmdp.app.commands.trained import trained
 from trackmdp.config import ExportConfig
 from trackmdp.durable import write_bytes, write_json
 from trackmdp.errors import UserError
-from trackmdp.policies.table import PolicyTable
+from trackmdp.policies.policy import Policy
 from trackmdp.training.display import make_console
 from trackmdp.world.model import BoolArray
 
@@ -38,33 +38,33 @@ def run(cfg: ExportConfig, folder: Path) -> None:
     Raises:
         UserError: there is no such run, or a package that `cfg.format` needs is missing.
     """
-    policy = trained(cfg.run, torch.device("cpu"), best=cfg.checkpoint == "best")
-    task, file = policy.world.task, folder / FILES[cfg.format]
+    found = trained(cfg.run, torch.device("cpu"), best=cfg.checkpoint == "best")
+    task, file = found.world.task, folder / FILES[cfg.format]
     about = {
         "trackmdp": __version__,
-        "policy": policy.subject,
+        "policy": found.subject,
         "grid_size": str(task.rows),
         "t_max": str(task.t_max),
     }
     if cfg.format == "sets":
-        write_json(file, PolicyTable.from_dense(task, policy.chains).as_lists())
+        write_json(file, found.policy.as_lists())
     else:
-        forms: dict[str, Callable[[BoolArray, dict[str, str]], bytes]] = {"torch_export": to_torch, "onnx": to_onnx}
-        write_bytes(file, forms[cfg.format](policy.chains, about))
-    make_console(cfg.quiet).print(f"{policy.subject} -> {file}")
+        forms: dict[str, Callable[[Policy, dict[str, str]], bytes]] = {"torch_export": to_torch, "onnx": to_onnx}
+        write_bytes(file, forms[cfg.format](found.policy, about))
+    make_console(cfg.quiet).print(f"{found.subject} -> {file}")
 
 
-def to_torch(chains: BoolArray, about: dict[str, str]) -> bytes:
+def to_torch(policy: Policy, about: dict[str, str]) -> bytes:
     """What `torch.export.load` reads; `about` stands beside it as text."""
     batch = torch.export.Dim("batch")
     states = tuple(torch.zeros(2, dtype=torch.int64) for _ in _INPUTS)
-    program = torch.export.export(_Table(chains), states, dynamic_shapes=({0: batch}, {0: batch}))
+    program = torch.export.export(_Table(policy), states, dynamic_shapes=({0: batch}, {0: batch}))
     buffer = io.BytesIO()
     torch.export.save(program, buffer, extra_files={"about.txt": "\n".join(f"{k}: {v}" for k, v in about.items())})
     return buffer.getvalue()
 
 
-def to_onnx(chains: BoolArray, about: dict[str, str]) -> bytes:
+def to_onnx(policy: Policy, about: dict[str, str]) -> bytes:
     """An ONNX model that looks the action up; `about` are its metadata.
 
     Raises:
@@ -76,7 +76,7 @@ def to_onnx(chains: BoolArray, about: dict[str, str]) -> bytes:
     except ImportError:
         raise UserError("format=onnx: needs the package onnx, as in pip install 'trackmdp[onnx]'") from None
 
-    table = _table(chains)
+    table = _table(policy)
     constants = {"table": table, "last_row": np.array(table.shape[1] - 1), "column": np.array([1])}
     nodes = [
         helper.make_node("Min", ["steps_since_detection", "last_row"], ["row"]),
@@ -105,14 +105,15 @@ class _Table(nn.Module):
 
     table: Tensor
 
-    def __init__(self, chains: BoolArray) -> None:
+    def __init__(self, policy: Policy) -> None:
         super().__init__()
-        self.register_buffer("table", torch.as_tensor(_table(chains)))
+        self.register_buffer("table", torch.as_tensor(_table(policy)))
 
     def forward(self, last_cell: Tensor, steps_since_detection: Tensor) -> Any:
         return self.table[last_cell, steps_since_detection.clamp(max=self.table.shape[1] - 1)]
 
 
-def _table(chains: BoolArray) -> BoolArray:
+def _table(policy: Policy) -> BoolArray:
     """`[M, t_max+2, M]`, the sets and after them the forced safe action."""
-    return np.concatenate([chains, np.ones_like(chains[:, :1])], axis=1)
+    sets = policy.dense()
+    return np.concatenate([sets, np.ones_like(sets[:, :1])], axis=1)

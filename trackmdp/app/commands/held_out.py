@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.console import Console
 
 from trackmdp.durable import write_json, write_text
-from trackmdp.policies.table import PolicyTable
+from trackmdp.episodes.simulate import simulate
+from trackmdp.policies.policy import Policy
 from trackmdp.reports.picture import draw
 from trackmdp.training.display import table
 from trackmdp.training.held_out import HeldOutEvaluator
@@ -20,7 +20,7 @@ __all__ = ["run", "show_held_out"]
 
 def run(
     world: Recorded,
-    chains: np.ndarray,
+    policy: Policy,
     subject: str,
     folder: Path,
     console: Console,
@@ -28,14 +28,13 @@ def run(
 ) -> float:
     """Write `evaluation.json`, `sets.json` and `picture.txt` to `folder`; returns the mean reward of a track."""
     evaluator = HeldOutEvaluator(world)
-    policy = PolicyTable.from_dense(world, chains)
     report = evaluator.report(policy)
     value = evaluator.evaluate(policy).value
     content = {"policy": subject, "value": value.tolist(), "held_out": report, "regret_per_step": None}
     write_json(folder / "evaluation.json", content)
-    if chains.dtype == np.bool_:
+    if policy.deterministic:
         write_json(folder / "sets.json", policy.as_lists())
-        write_text(folder / "picture.txt", draw(world, chains, seed=seed))
+    write_text(folder / "picture.txt", draw(simulate(world, policy, 16, seed=seed), world))
     show_held_out(console, subject, report)
     console.print(f"results in {folder}")
     return float(report["figures"]["policy"]["aihtr"]["mean"])

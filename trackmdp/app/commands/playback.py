@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
-import torch
 from rich.console import Console
 
 from trackmdp.config import EvaluateConfig, PlaybackConfig
 from trackmdp.durable import write_json
 from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.reader import EpisodeReader
-from trackmdp.episodes.record import Issued, record
+from trackmdp.episodes.simulate import resimulate, simulate
 from trackmdp.errors import UserError
-from trackmdp.policies import playback
+from trackmdp.policies.playback import Playback
 from trackmdp.training.display import table
-from trackmdp.training.evaluate import simulate
 from trackmdp.world.make import build_world
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Problem
@@ -24,12 +22,10 @@ from trackmdp.world.tracks import Problem
 __all__ = ["run"]
 
 
-def run(
-    cfg: EvaluateConfig, folder: Path, console: Console, device: torch.device, problem: Problem | None = None
-) -> float:
+def run(cfg: EvaluateConfig, folder: Path, console: Console, problem: Problem | None = None) -> float:
     """Write `evaluation.json` to `folder`; returns the simulated AIHTR.
 
-    Such a policy ignores what it observes, so that it has no chains and no exact value.
+    Such a policy ignores what it observes, so that it has no table and no exact value.
     """
     assert isinstance(cfg.baseline, PlaybackConfig)
     world = build_world(cfg) if problem is None else problem
@@ -42,8 +38,7 @@ def run(
             )
         logged = reader.read(cfg.baseline.episode)
     again = reissued(world, logged)
-    policy = playback.Playback(logged.action, device)
-    simulation = simulate(world, policy, episodes=cfg.episodes, seed=cfg.seed, device=device)
+    simulation = simulate(world, Playback(world, logged.action), cfg.episodes, seed=cfg.seed).figures()
     report = {
         "policy": cfg.baseline.name,
         "file": Path(cfg.baseline.file).name,
@@ -65,5 +60,5 @@ def run(
 
 def reissued(world: World, logged: Episode) -> Episode:
     """The episode with its own seed and its own actions, in `world`."""
-    (again,) = record(world, Issued(logged.action), [logged.seed], first=logged.number)
-    return again
+    (again,) = resimulate(world, Playback(world, logged.action), [logged.seed]).complete()
+    return replace(again, number=logged.number)

@@ -8,11 +8,10 @@ from pathlib import Path
 import torch
 
 from trackmdp.config import load_run_config
+from trackmdp.policies.policy import Policy
 from trackmdp.training import checkpoint
-from trackmdp.training.evaluate import chains_of
 from trackmdp.training.make import make_algorithm
 from trackmdp.world.make import make_problem
-from trackmdp.world.model import BoolArray
 from trackmdp.world.tracks import Problem
 
 __all__ = ["Trained", "trained"]
@@ -20,10 +19,10 @@ __all__ = ["Trained", "trained"]
 
 @dataclass(frozen=True)
 class Trained:
-    """The policy of a run as `chains` `[M, t_max+1, M]`, where it was learned, and the checkpoint it is from."""
+    """The policy of a run, where it was learned, and the checkpoint it is from."""
 
     world: Problem
-    chains: BoolArray
+    policy: Policy
     subject: str
 
 
@@ -38,5 +37,5 @@ def trained(run: str, device: torch.device, *, best: bool = False) -> Trained:
     algorithm = make_algorithm(cfg, world, device)
     file = folder / "checkpoints" / checkpoint.BEST if best else checkpoint.newest(folder)
     algorithm.load_state_dict(checkpoint.load(file, device)["algorithm"])
-    chains = chains_of(algorithm.actor, world.task, device)
-    return Trained(world, chains, f"{cfg.algo.name}, {file.name}")
+    policy = Policy.from_module(world.task, algorithm.actor, device=device)
+    return Trained(world, policy, f"{cfg.algo.name}, {file.name}")

@@ -1,4 +1,4 @@
-"""Recorded episodes: each on its own generator, stepped by the environment, believed by the filter."""
+"""Simulated episodes: each on its own generator, its steps those of the environment, its belief the filter's."""
 
 from __future__ import annotations
 
@@ -14,15 +14,28 @@ from tensordict import TensorDict
 
 from tests.episodes.logs import WORLD, policy, recorded
 from tests.helpers import hop_world, limited, small_world
+from tests.tracks import by_hand
+from tests.tracks import recorded as recorded_tracks
 from trackmdp.episodes.episode import Episode, first_difference
-from trackmdp.episodes.record import Acting, Chains, Issued, RandomSets, record
-from trackmdp.policies.fixed import ChainPolicy
+from trackmdp.episodes.simulate import episode_seeds, resimulate, simulate
+from trackmdp.errors import UserError
+from trackmdp.policies import policy as policies
+from trackmdp.policies.playback import Playback
+from trackmdp.policies.policy import Policy
 from trackmdp.seeding import derive
 from trackmdp.world.belief import BeliefFilter
+from trackmdp.world.costs import Costs
 from trackmdp.world.env import TrackEnv
+from trackmdp.world.model import World
 from trackmdp.world.motion import Motion
 
-ACTING: dict[str, Acting] = {"chains": policy(), "random_k": RandomSets(16, 3)}
+ACTING = {
+    "table": policy(),
+    "random_k": Policy.random_k(WORLD, 3),
+    "all_on": Policy.all_on(WORLD),
+    "none": Policy.none(WORLD),
+    "probabilities": Policy.from_dense(WORLD, np.random.default_rng(1).random((16, 3, 16)) * policy().dense()),
+}
 
 
 def stepped_alone(seed: int, max_steps: int | None) -> TensorDict:
@@ -31,7 +44,7 @@ def stepped_alone(seed: int, max_steps: int | None) -> TensorDict:
     start, motion = torch.randint(16, (1,), generator=rng), Motion(WORLD.kernel)
     env = TrackEnv(limited(WORLD, max_steps), 1)
     state = env.reset().set("target", start).set("last_cell", start.clone())
-    acting, steps = ChainPolicy(policy().chains), []
+    acting, steps = policy(), []
     while True:
         if len(steps) % 256 == 0:
             block = motion.draw(256, rng)
@@ -58,7 +71,7 @@ def test_an_episode_is_what_the_environment_makes_of_its_draws(max_steps: int | 
 @pytest.mark.parametrize("max_steps", [None, 9])
 def test_its_keys_are_those_of_a_rollout(max_steps: int | None) -> None:
     env = TrackEnv(limited(WORLD, max_steps), 1)
-    rollout = env.rollout(3, ChainPolicy(policy().chains))
+    rollout = env.rollout(3, policy())
     mine = recorded(1, max_steps=max_steps)[0].to_tensordict(WORLD.t_max, max_steps)
     assert set(mine.keys(True, True)) == set(rollout.keys(True, True))
     for key in mine.keys(True, True):
@@ -72,15 +85,16 @@ def test_its_keys_are_those_of_a_rollout(max_steps: int | None) -> None:
 def test_an_episode_is_the_same_alone_and_among_others(name: str, numbers: list[int]) -> None:
     everyone = together(name)
     seeds = [everyone[number].seed for number in numbers]
-    for number, alone in zip(numbers, record(WORLD, ACTING[name], seeds), strict=True):
+    for number, alone in zip(numbers, resimulate(WORLD, ACTING[name], seeds).complete(), strict=True):
         assert first_difference(everyone[number], alone) is None
 
 
 def test_the_belief_does_not_depend_on_how_many_are_recorded() -> None:
     """On a dense world of 100 cells, where a product of matrices would round otherwise for one row than for many."""
-    world, acting = small_world(10, t_max=3, exit_probability=0.05, seed=2), RandomSets(100, 20)
-    for number, episode in enumerate(record(world, acting, range(40))):
-        (alone,) = record(world, acting, [number], first=number)
+    world = small_world(10, t_max=3, exit_probability=0.05, seed=2)
+    acting = Policy.random_k(world, 20)
+    for number, episode in enumerate(resimulate(world, acting, range(40)).complete()):
+        (alone,) = resimulate(world, acting, [number]).complete()
         assert first_difference(episode, alone) is None
 
 
@@ -94,6 +108,7 @@ def together(name: str, made: dict[str, list[Episode]] = {}) -> list[Episode]:  
 def test_the_belief_is_the_filters(name: str) -> None:
     exact = BeliefFilter(WORLD.kernel)
     for episode in together(name)[:10]:
+        assert episode.belief is not None
         belief = exact.detect(torch.tensor([episode.start]))
         for t in range(len(episode)):
             predicted = exact.predict(belief)
@@ -108,8 +123,9 @@ def test_by_hand() -> None:
     world = hop_world()
     only = np.zeros((4, 2, 4), dtype=bool)
     only[..., 2] = True
-    long = [episode for episode in record(world, Chains(only), range(400)) if episode.start == 0 and len(episode) > 4]
-    episode = long[0]
+    episodes = resimulate(world, Policy.from_dense(world, only), range(400)).complete()
+    episode = next(episode for episode in episodes if episode.start == 0 and len(episode) > 4)
+    assert episode.belief is not None
     assert episode.target[:4].tolist() == [1, 2, 3, 0]
     assert episode.misses[:4].tolist() == [0, 1, 0, 1]
     assert episode.observation[:4].tolist() == [-1, 2, -1, -1]
@@ -125,11 +141,80 @@ def test_by_hand() -> None:
 
 def test_issued_actions_give_the_episode_again() -> None:
     for episode in together("random_k")[:20]:
-        (again,) = record(WORLD, Issued(episode.action), [episode.seed])
+        (again,) = resimulate(WORLD, Playback(WORLD, episode.action), [episode.seed]).complete()
         again = dataclasses.replace(again, probability=episode.probability)
         assert first_difference(episode, again) is None
-    (longer,) = record(WORLD, Issued(episode.action[:1]), [episode.seed])
+    (longer,) = resimulate(WORLD, Playback(WORLD, episode.action[:1]), [episode.seed])
     assert not longer.action[1:].any()
+
+
+def test_playback_of_another_grid_is_refused() -> None:
+    with pytest.raises(UserError, match=r"actions for \(9,\) cells, expected 16"):
+        Playback(WORLD, np.zeros((3, 9), dtype=bool))
+
+
+@pytest.mark.parametrize("name", ACTING)
+def test_batches_and_ways_of_looking_up_change_nothing(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("trackmdp.episodes.actors._MOST_ROWS", 7)
+    monkeypatch.setattr("trackmdp.episodes.actors._DRAWS", 100)
+    monkeypatch.setattr("trackmdp.episodes.actors.Following.most_rows", 7)
+    monkeypatch.setattr("trackmdp.episodes.batch._BELIEF", 50)
+    monkeypatch.setattr(policies, "_DENSE", 0)
+    acting = Policy(WORLD, ACTING[name].sets, probability=ACTING[name].probability, k=ACTING[name].k)
+    for mine, other in zip(simulate(WORLD, acting, 40).complete(), together(name), strict=False):
+        assert first_difference(mine, other) is None
+
+
+def test_one_price_per_cell_is_paid_to_the_bit_as_in_the_environment() -> None:
+    world = small_world(3, t_max=1, seed=3)
+    world = World(world.kernel, 3, cost=np.random.default_rng(0).random(9), t_max=1)
+    acting = Policy.from_dense(world, np.random.default_rng(4).random((9, 2, 9)) < 0.5)
+    costs, n = Costs(world), torch.zeros(9, dtype=torch.int64)
+    for k in range(2):
+        written = costs.price_of(acting.act(torch.arange(9), n + k))
+        assert acting.sets is not None
+        assert torch.equal(costs.of_sets(acting.sets)[k::2], written)
+
+
+def test_random_sets_come_from_the_second_generator_of_an_episode() -> None:
+    """As in logs written before: blocks of 256 rows of draws, of which the k largest are on."""
+    episode = max(together("random_k"), key=len)
+    rng = torch.Generator().manual_seed(derive(episode.seed, "policy"))
+    largest = torch.rand(256, 16, generator=rng).topk(3).indices[: len(episode)]
+    assert episode.action[:256].nonzero()[1].tolist() == largest.sort().values.flatten().tolist()
+
+
+def test_a_function_needs_no_table_of_its_own() -> None:
+    table = torch.as_tensor(policy().dense())
+    asked = simulate(WORLD, lambda x, n, h: table[x, n.clamp_max(2)], 20)
+    for mine, other in zip(asked.complete(), recorded(20), strict=True):
+        assert first_difference(mine, other) is None
+
+
+def test_episodes_are_a_sequence() -> None:
+    episodes = simulate(WORLD, policy(), 10)
+    assert len(episodes) == 10
+    assert [episode.number for episode in episodes] == list(range(10))
+    assert [episode.number for episode in episodes[2:8:3]] == [2, 5]
+    assert episodes[-1].seed == episode_seeds(0, 10)[9]
+    assert episodes[0].belief is None
+    with pytest.raises(IndexError):
+        episodes[10]
+
+
+def test_episodes_of_recorded_tracks_go_along_the_held_out_ones() -> None:
+    setting = recorded_tracks(by_hand([0, 1, 2, 5], [4, 3], [8, 7, 4, 1], exits=[True, False, True]))
+    closed = setting.held_out.closed(setting.num_cells)
+    paths = [closed.cells[a:b].tolist() for a, b in zip(closed.first[:-1], closed.first[1:], strict=True)]
+    episodes = simulate(setting, Policy.all_on(setting), 50)
+    for episode in episodes:
+        path = [episode.start, *episode.target.tolist()]
+        assert path in paths
+        assert episode.terminated == (path[-1] == setting.num_cells)
+        assert episode.truncated != episode.terminated
+    assert len({episode.start for episode in episodes}) > 1
+    with pytest.raises(UserError, match="no motion model"):
+        next(episodes.complete())
 
 
 CHANGES: list[tuple[str, Any, str]] = [
@@ -159,6 +244,7 @@ def test_the_first_difference_is_named(name: str, change: Any, message: str) -> 
 
 def test_a_belief_within_the_tolerance_passes() -> None:
     episode = recorded(1)[0]
+    assert episode.belief is not None
     changed = dataclasses.replace(episode, belief=episode.belief + np.float32(1e-7))
     assert first_difference(changed, episode)
     assert first_difference(changed, episode, belief_tolerance=1e-6) is None

@@ -1,0 +1,229 @@
+"""How whatever acts is stepped: what it decides in a batch of states, as a function of state and draws.
+
+A step asks three things of a decision: whether the sensor where the target turns up is on, how many sensors are on, and
+what they cost. A table answers them from one row per state, so that a step costs the same on any grid; whatever else
+acts writes its action out over all M sensors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from trackmdp.policies.playback import Playback
+from trackmdp.policies.policy import DrawsError, Policy, PolicyLike, as_policy, rule_of
+from trackmdp.policies.unroll import Rule
+from trackmdp.world.costs import Costs
+from trackmdp.world.model import Task
+
+__all__ = ["Actor", "Asking", "Choice", "Drawing", "Following", "Issuing", "States", "Uniform", "actor_of"]
+
+_MOST_ROWS = 4096  # episodes stepped together: their generators take 5 kB each
+_DRAWS = 25_600  # of one step: 256 steps of them are held at a time, 26 MB
+_HISTORY = 2**24  # entries of the action history of all rows
+
+
+@dataclass(frozen=True)
+class States:
+    """Where B episodes are before a step.
+
+    Attributes:
+        row: `[B]` which episodes of the batch these are.
+        last_cell: `[B]` cell of the last detection.
+        misses: `[B]` n since then.
+        step: steps done so far.
+    """
+
+    row: Tensor
+    last_cell: Tensor
+    misses: Tensor
+    step: int
+
+
+class Choice(Protocol):
+    """What was decided in B states."""
+
+    @property
+    def count(self) -> Tensor:
+        """`[B]` int64, sensors on."""
+        ...
+
+    @property
+    def spent(self) -> Tensor:
+        """`[B]` float32, their price."""
+        ...
+
+    @property
+    def action(self) -> Tensor | None:
+        """`[B, M]` bool; None where it follows from the state, and need not be kept."""
+        ...
+
+    def sensed(self, cell: Tensor) -> Tensor:
+        """`[B]` bool, whether the sensor at `cell` `[B]` is on."""
+        ...
+
+
+class Actor(Protocol):
+    """Anything that acts."""
+
+    @property
+    def policy(self) -> Policy | None:
+        """From which a step's action and its probabilities follow, where it is a `Policy`."""
+        ...
+
+    @property
+    def num_draws(self) -> int:
+        """Uniform draws that one decision takes from the episode's own generator."""
+        ...
+
+    @property
+    def most_rows(self) -> int:
+        """Episodes it can be asked for at a time."""
+        ...
+
+    def decide(self, states: States, draws: Tensor) -> Choice:
+        """The decisions in `states`; `draws` is `[B, num_draws]`, uniform in [0, 1)."""
+        ...
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Rows of a table."""
+
+    table: Callable[[Tensor, Tensor], Tensor]
+    row: Tensor
+    count: Tensor
+    spent: Tensor
+    action: ClassVar[Tensor | None] = None
+
+    def sensed(self, cell: Tensor) -> Tensor:
+        return self.table(self.row, cell)
+
+
+@dataclass(frozen=True)
+class _Same:
+    """All sensors, or none, in every state."""
+
+    on: bool
+    count: Tensor
+    spent: Tensor
+    action: ClassVar[Tensor | None] = None
+
+    def sensed(self, cell: Tensor) -> Tensor:
+        return torch.full_like(cell, self.on, dtype=torch.bool)
+
+
+class _Written:
+    """Actions written out over all sensors."""
+
+    def __init__(self, action: Tensor, costs: Costs) -> None:
+        self.action: Tensor | None = action
+        self._on = action
+        self.count, self.spent = action.sum(-1), costs.price_of(action)
+
+    def sensed(self, cell: Tensor) -> Tensor:
+        return self._on.gather(1, cell.unsqueeze(1)).squeeze(1)
+
+
+class Following:
+    """A deterministic policy with a table."""
+
+    num_draws, most_rows = 0, _MOST_ROWS
+
+    def __init__(self, policy: Policy, costs: Costs) -> None:
+        assert policy.sets is not None
+        self.policy, self._table = policy, policy.lookup(torch.device("cpu"))
+        self._count = torch.as_tensor(np.diff(policy.sets.indptr).astype(np.int64))
+        self._spent = costs.of_sets(policy.sets)
+
+    def decide(self, states: States, draws: Tensor) -> Choice:  # noqa: ARG002
+        """See `Actor`."""
+        row = self.policy.row(states.last_cell, states.misses)
+        return _Rows(self._table.entry, row, self._count[row], self._spent[row])
+
+
+class Uniform:
+    """All sensors on, or none."""
+
+    num_draws, most_rows = 0, _MOST_ROWS
+
+    def __init__(self, policy: Policy, costs: Costs) -> None:
+        self.policy = policy
+        action = torch.full((1, policy.task.num_cells), policy.probability == 1.0)
+        self._on, self._count, self._spent = bool(action[0, 0]), action.sum(-1), costs.price_of(action)
+
+    def decide(self, states: States, draws: Tensor) -> Choice:  # noqa: ARG002
+        """See `Actor`."""
+        b = len(states.row)
+        return _Same(self._on, self._count.expand(b), self._spent.expand(b))
+
+
+class Drawing:
+    """A policy that draws its sets."""
+
+    def __init__(self, policy: Policy, costs: Costs) -> None:
+        self.policy, self._costs, self.num_draws = policy, costs, policy.num_draws
+        self.most_rows = max(1, min(256, _DRAWS // policy.num_draws))
+
+    def decide(self, states: States, draws: Tensor) -> Choice:
+        """See `Actor`."""
+        return _Written(self.policy.act(states.last_cell, states.misses, draws), self._costs)
+
+
+class Issuing:
+    """Recorded actions, one a step."""
+
+    num_draws, most_rows, policy = 0, 256, None
+
+    def __init__(self, playback: Playback, costs: Costs) -> None:
+        self._playback, self._costs = playback, costs
+
+    def decide(self, states: States, draws: Tensor) -> Choice:  # noqa: ARG002
+        """See `Actor`."""
+        action = self._playback.at(states.step)
+        return _Written(action.expand(len(states.row), -1).contiguous(), self._costs)
+
+
+class Asking:
+    """A function or module that draws from a source of its own, asked at every step."""
+
+    num_draws, policy = 0, None
+
+    def __init__(self, task: Task, rule: Rule, costs: Costs) -> None:
+        self._rule, self._costs = rule, costs
+        self._slots = torch.arange(task.num_choices)
+        self.most_rows = max(1, _HISTORY // (task.num_choices * task.num_cells))
+        self._history = torch.zeros(self.most_rows, task.num_choices, task.num_cells, dtype=torch.bool)
+
+    def decide(self, states: States, draws: Tensor) -> Choice:  # noqa: ARG002
+        """See `Actor`."""
+        # Slot s holds the action at s misses; what stands in slot n and later is left from an earlier row of misses.
+        filled = self._slots < states.misses.unsqueeze(1)
+        history = self._history[states.row] & filled.unsqueeze(-1)
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            action = self._rule(states.last_cell, states.misses, history)
+        self._history[states.row, states.misses.clamp_max(len(self._slots) - 1)] = action
+        return _Written(action, self._costs)
+
+
+def actor_of(task: Task, policy: PolicyLike | Playback, costs: Costs) -> Actor:
+    """What steps a policy; a function or module that does not draw is turned into its table first.
+
+    Raises:
+        UserError: the policy is made for another grid, or is none.
+    """
+    if isinstance(policy, Playback):
+        return Issuing(policy, costs)
+    try:
+        made = as_policy(task, policy)
+    except DrawsError:
+        return Asking(task, rule_of(task, policy), costs)
+    if not made.deterministic:
+        return Drawing(made, costs)
+    return Uniform(made, costs) if made.sets is None else Following(made, costs)

@@ -1,0 +1,182 @@
+"""Simulated episodes held together: their steps as a few columns, from which an episode is made when asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, overload
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from trackmdp.episodes.actors import Choice
+from trackmdp.episodes.belief import beliefs
+from trackmdp.episodes.episode import Episode, Floats, Integers, last_cells
+from trackmdp.episodes.figures import Simulation, summary
+from trackmdp.errors import UserError
+from trackmdp.policies.policy import Policy
+from trackmdp.world.model import Array, BoolArray, World
+from trackmdp.world.tracks import Problem
+
+__all__ = ["Episodes", "Steps"]
+
+_BELIEF = 25_600  # cells of the beliefs that are updated together: memory stays bounded on large grids
+
+
+class Steps:
+    """The steps of a batch as they are taken, those of all running episodes at a time.
+
+    Args:
+        episodes: B.
+    """
+
+    def __init__(self, episodes: int) -> None:
+        self._episodes = episodes
+        self._taken: dict[str, list[npt.NDArray[Any]]] = {}
+
+    def begin(self, start: Tensor) -> None:
+        """Note the cells `[B]` in which the targets start."""
+        self.start = start.numpy().copy()
+
+    def add(self, row: Tensor, choice: Choice, **columns: Tensor) -> None:
+        """Note one step of the episodes `row`; the columns are `[R]`."""
+        step = {name: _narrow(column.numpy()) for name, column in columns.items()}
+        step |= {"row": _narrow(row.numpy()), "sensors": _narrow(choice.count.numpy())}
+        if choice.action is not None:
+            step["bits"] = np.packbits(choice.action.numpy(), axis=-1)
+        for name, column in step.items():
+            self._taken.setdefault(name, []).append(column)
+
+    def by_episode(self) -> dict[str, npt.NDArray[Any]]:
+        """The columns `[S, ...]` with the steps of one episode after those of another, and `length` `[B]`."""
+        columns = {name: np.concatenate(parts) for name, parts in self._taken.items()}
+        row = columns.pop("row")
+        # Steps were taken in order of time; a stable sort by episode leaves them so within each.
+        order = np.argsort(row, kind="stable")
+        return {name: column[order] for name, column in columns.items()} | {
+            "length": np.bincount(row, minlength=self._episodes)
+        }
+
+
+def _narrow(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """A copy, since an expanded tensor has no memory of its own; cells and counts fit into 32 bits."""
+    return column.astype(np.int32) if column.dtype == np.int64 else column.copy()
+
+
+@dataclass(frozen=True, eq=False)
+class Episodes(Sequence[Episode]):
+    """The episodes of one policy, all their steps end to end; a sequence of `Episode`.
+
+    Attributes:
+        problem: where they took place.
+        policy: that acted; None for one that is no table (a playback, a function that draws).
+        seeds: of each of the E episodes.
+        start: `[E]`, cells in which the targets were located at the start.
+        first: `[E + 1]`, where each episode's steps begin in the columns below, and S.
+        misses: `[S]`, n before each step.
+        target: `[S]`, cell after the step, M once exited.
+        located: `[S]`, whether the target was located there.
+        reward: `[S]`.
+        truncated: `[S]`, whether the step was the last one allowed.
+        sensors: `[S]`, how many were on.
+        bits: `[S, ceil(M/8)]`, the actions, eight sensors to a byte; None where they follow from the policy.
+    """
+
+    problem: Problem
+    policy: Policy | None
+    seeds: Sequence[int]
+    start: Integers
+    first: Integers
+    misses: npt.NDArray[np.int32]
+    target: npt.NDArray[np.int32]
+    located: BoolArray
+    reward: Floats
+    truncated: BoolArray
+    sensors: npt.NDArray[np.int32]
+    bits: npt.NDArray[np.uint8] | None
+
+    @classmethod
+    def of(cls, problem: Problem, policy: Policy | None, seeds: Sequence[int], batches: Sequence[Steps]) -> Episodes:
+        """The episodes of some batches, in their order."""
+        parts = [batch.by_episode() for batch in batches]
+        columns = {name: np.concatenate([part[name] for part in parts]) for name in (parts[0] if parts else ())}
+        if not parts:
+            none = np.zeros(0, dtype=np.int32)
+            columns = dict.fromkeys(("misses", "target", "sensors", "length"), none)
+            columns |= {"located": none > 0, "truncated": none > 0, "reward": none.astype(np.float32)}
+        start = np.concatenate([np.zeros(0, dtype=np.int64), *(batch.start for batch in batches)])
+        first = np.concatenate([[0], np.cumsum(columns.pop("length"))])
+        bits = columns.pop("bits", None)
+        return cls(problem, policy, list(seeds), start, first, bits=bits, **columns)
+
+    def __len__(self) -> int:
+        return len(self.seeds)
+
+    @overload
+    def __getitem__(self, which: int) -> Episode: ...
+    @overload
+    def __getitem__(self, which: slice) -> list[Episode]: ...
+    def __getitem__(self, which: int | slice) -> Episode | list[Episode]:
+        if isinstance(which, slice):
+            return [self._episode(number) for number in range(len(self))[which]]
+        return self._episode(range(len(self))[which])
+
+    def _episode(self, number: int) -> Episode:
+        steps = slice(int(self.first[number]), int(self.first[number + 1]))
+        target, located = self.target[steps].astype(np.int64), self.located[steps]
+        misses, start = self.misses[steps].astype(np.int64), int(self.start[number])
+        return Episode(
+            number=number,
+            seed=self.seeds[number],
+            policy=0,
+            start=start,
+            misses=misses,
+            action=self._action(steps, last_cells(start, target, located), misses),
+            target=target,
+            located=located,
+            reward=self.reward[steps],
+            terminated=bool(target[-1] == self.problem.num_cells),
+            truncated=bool(self.truncated[steps][-1]),
+        )
+
+    def _action(self, steps: slice, last_cell: Integers, misses: Integers) -> BoolArray:
+        """`[T, M]`."""
+        if self.bits is not None:
+            return np.unpackbits(self.bits[steps], axis=-1, count=self.problem.num_cells).astype(np.bool_)
+        assert self.policy is not None
+        return self.policy.act(torch.from_numpy(last_cell), torch.from_numpy(misses)).numpy()
+
+    def figures(self) -> Simulation:
+        """What the episodes say of the policy, with standard errors."""
+        if not len(self):
+            return summary(np.zeros((6, 0)))
+        in_grid = self.target < self.problem.num_cells
+        forced = (self.misses > self.problem.t_max) & in_grid
+        chosen = self.sensors * (in_grid & ~forced)
+        every = np.ones(len(self.target))
+        columns: list[npt.NDArray[Any]] = [self.reward, in_grid, self.located, chosen, forced, every]
+        # Every episode has a step, so that no two of `first` are the same and each sum is that of one episode.
+        totals: Array = np.stack([np.add.reduceat(column.astype(np.float64), self.first[:-1]) for column in columns])
+        return summary(totals)
+
+    def complete(self) -> Iterator[Episode]:
+        """The episodes with `belief` and `probability`, computed for a bounded number of them at a time.
+
+        Raises:
+            UserError: recorded tracks have no motion model, and so no belief.
+        """
+        if not isinstance(self.problem, World):
+            raise UserError("episodes: recorded tracks have no motion model, and so no belief")
+        at_once = max(1, min(256, _BELIEF // self.problem.num_cells))
+        for begin in range(0, len(self), at_once):
+            some = self[begin : begin + at_once]
+            for episode, belief in zip(some, beliefs(self.problem, some), strict=True):
+                yield replace(episode, belief=belief, probability=self._probability(episode))
+
+    def _probability(self, episode: Episode) -> Floats:
+        if self.policy is None:
+            return episode.action.astype(np.float32)
+        state = torch.from_numpy(episode.last_cell), torch.from_numpy(episode.misses)
+        return self.policy.probabilities(*state).float().numpy()

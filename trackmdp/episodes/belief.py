@@ -1,0 +1,51 @@
+"""The belief along recorded episodes, worked out afterwards, for whoever shows or logs it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from scipy import sparse
+from torch import Tensor
+
+from trackmdp.episodes.episode import Episode, Floats
+from trackmdp.world.belief import BeliefFilter
+from trackmdp.world.model import World
+
+__all__ = ["beliefs"]
+
+
+def beliefs(world: World, episodes: Sequence[Episode]) -> list[Floats]:
+    """For each episode `[T, M]`, the probability of each cell after a step's move, given what was observed before it.
+
+    A row sums to the probability of no exit. Each is the same to the bit whatever the other episodes are.
+    """
+    exact, into = BeliefFilter(world.kernel), world.kernel.T.tocsr()
+    lengths = torch.tensor([len(episode) for episode in episodes])
+    first = lengths.cumsum(0) - lengths
+    action = torch.as_tensor(np.concatenate([episode.action for episode in episodes]))
+    target = torch.as_tensor(np.concatenate([episode.target for episode in episodes]))
+    located = torch.as_tensor(np.concatenate([episode.located for episode in episodes]))
+    found = torch.zeros(len(target), world.num_cells)
+    belief = exact.detect(torch.tensor([episode.start for episode in episodes]))
+    rows = torch.arange(len(episodes))
+    for t in range(int(lengths.max())):
+        going_on = lengths[rows] > t
+        rows, belief = rows[going_on], belief[going_on]
+        step = first[rows] + t
+        predicted = _predict(into, belief)
+        found[step] = predicted.float()
+        # An exit ends the episode; its cell M has no belief, and cell 0 stands in, unused.
+        seen = exact.detect(target[step] * located[step])
+        belief = torch.where(located[step, None], seen, exact.miss(predicted, action[step]))
+    return [part.numpy() for part in found.split(lengths.tolist())]
+
+
+def _predict(into: sparse.csr_array, belief: Tensor) -> Tensor:
+    """`BeliefFilter.predict`, with sums whose order does not depend on how many rows there are.
+
+    A product of dense matrices may add up in another order for one row than for many, which would make an episode
+    differ in the last bit when it is simulated again alone; a sparse one adds up each result entry by entry.
+    """
+    return torch.from_numpy(np.ascontiguousarray((into @ np.ascontiguousarray(belief.numpy().T)).T))

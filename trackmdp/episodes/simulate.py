@@ -1,0 +1,151 @@
+"""Simulating episodes: many at once, each from its own generators, so that any of them can be simulated again alone.
+
+The log, the web page, the picture and the simulated figures of an evaluation are all made of what this module returns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from trackmdp.episodes.actors import Actor, States, actor_of
+from trackmdp.episodes.batch import Episodes, Steps
+from trackmdp.episodes.sources import Source, source_of
+from trackmdp.policies.playback import Playback
+from trackmdp.policies.policy import PolicyLike
+from trackmdp.seeding import derive, preserved_global_rng
+from trackmdp.world.costs import Costs
+from trackmdp.world.tracks import Problem
+
+__all__ = ["episode_seeds", "resimulate", "simulate"]
+
+_BLOCK = 256  # draws taken from an episode's generator at a time; part of what a seed means, so never to be changed
+
+
+def simulate(
+    problem: Problem, policy: PolicyLike | Playback, episodes: int, *, seed: int = 0, names: Sequence[str | int] = ()
+) -> Episodes:
+    """Independent episodes of a policy, each followed to its own end.
+
+    Keeping the first ones to finish would favour short episodes; here every episode that is begun is kept.
+
+    Args:
+        problem: a world, in which targets start uniformly; or recorded tracks, of which held-out ones are drawn.
+        policy: a `Policy`; or a function or module, which is asked at every step if it draws, and is then the only
+            thing not reproduced by an episode's seed alone.
+        episodes: how many.
+        seed: seed of the run; episode i has the seed called ("episode", *names, i) of it.
+        names: further names of the seeds, to tell several simulations of a run apart.
+
+    Raises:
+        UserError: the policy is made for another grid, or is none.
+    """
+    return resimulate(problem, policy, episode_seeds(seed, episodes, *names))
+
+
+def episode_seeds(seed: int, episodes: int, *names: str | int) -> list[int]:
+    """The seeds of a run's episodes."""
+    return [derive(seed, "episode", *names, number) for number in range(episodes)]
+
+
+@torch.no_grad()
+def resimulate(problem: Problem, policy: PolicyLike | Playback, seeds: Sequence[int]) -> Episodes:
+    """One episode for each of `seeds`, in their order; each the same whatever the others are. See `simulate`."""
+    costs, source = Costs(problem), source_of(problem)
+    actor = actor_of(problem.task, policy, costs)
+    at_once = [seeds[begin : begin + actor.most_rows] for begin in range(0, len(seeds), actor.most_rows)]
+    with preserved_global_rng():
+        # What a function or module draws from torch's global generator is then the same in every call.
+        torch.manual_seed(derive(seeds[0] if seeds else 0, "policy"))
+        parts = [_Batch(problem, source, actor, costs, some).run() for some in at_once]
+    return Episodes.of(problem, actor.policy, seeds, parts)
+
+
+class _Draws:
+    """Uniform draws of many episodes, each from two generators of its own: one for the moves, one for the choices."""
+
+    def __init__(self, source: Source, seeds: Sequence[int], per_choice: int) -> None:
+        self._source, self._per_choice = source, per_choice
+        self._of_moves = [torch.Generator().manual_seed(seed) for seed in seeds]
+        self._moves = torch.zeros(len(seeds), _BLOCK, dtype=torch.float64)
+        if per_choice:
+            self._of_choices = [torch.Generator().manual_seed(derive(seed, "policy")) for seed in seeds]
+        self._choices = torch.zeros(len(seeds), _BLOCK, per_choice)
+
+    def starts(self) -> Tensor:
+        """`[B]` places; taken before any move."""
+        return self._source.start(self._of_moves)
+
+    def at(self, step: int, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Draws of the moves `[R]` and of the choices `[R, per_choice]` of the episodes `rows` `[R]` at a step."""
+        place = step % _BLOCK
+        if place == 0:
+            for row in rows.tolist():
+                self._moves[row] = self._source.draw(_BLOCK, self._of_moves[row])
+                if self._per_choice:
+                    self._choices[row] = torch.rand(_BLOCK, self._per_choice, generator=self._of_choices[row])
+        return self._moves[rows, place], self._choices[rows, place]
+
+
+@dataclass(frozen=True)
+class _At:
+    """Where the episodes still running are, `[R]` each."""
+
+    row: Tensor
+    place: Tensor
+    last_cell: Tensor
+    misses: Tensor
+
+    def kept(self, rows: Tensor) -> _At:
+        """Those of the positions `rows`."""
+        return _At(self.row[rows], self.place[rows], self.last_cell[rows], self.misses[rows])
+
+
+class _Batch:
+    """Episodes stepped together; each leaves the batch with its end."""
+
+    def __init__(self, problem: Problem, source: Source, actor: Actor, costs: Costs, seeds: Sequence[int]) -> None:
+        self._task, self._source, self._actor, self._costs = problem, source, actor, costs
+        self._draws = _Draws(source, seeds, actor.num_draws)
+        self._steps = Steps(len(seeds))
+
+    def run(self) -> Steps:
+        """Step until the last episode has ended."""
+        place = self._draws.starts()
+        start = self._source.cell(place)
+        self._steps.begin(start)
+        at = _At(torch.arange(len(start)), place, start, torch.zeros_like(start))
+        step = 0
+        while len(at.row):
+            at = self._step(at, step)
+            step += 1
+        return self._steps
+
+    def _step(self, at: _At, step: int) -> _At:
+        """One step of `TrackEnv`, of the episodes still running; the same order of events, the same arithmetic."""
+        moves, choices = self._draws.at(step, at.row)
+        choice = self._actor.decide(States(at.row, at.last_cell, at.misses, step), choices)
+        place = self._source.move(at.place, moves)
+        target = self._source.cell(place)
+        in_grid = target < self._task.num_cells
+        sensed = choice.sensed(target.clamp_max(self._task.num_cells - 1)) & in_grid
+        forced = at.misses > self._task.t_max
+        located = (sensed | forced) & in_grid
+        reward = self._costs.reward_of(choice.spent, sensed, forced, in_grid)
+        truncated = self._truncated(place, step) & in_grid
+        self._steps.add(
+            at.row, choice, misses=at.misses, target=target, located=located, reward=reward, truncated=truncated
+        )
+        going_on = (in_grid & ~truncated).nonzero().squeeze(-1)
+        last_cell = torch.where(located, target, at.last_cell)
+        misses = torch.where(located, 0, at.misses + 1)
+        return _At(at.row, place, last_cell, misses).kept(going_on)
+
+    def _truncated(self, place: Tensor, step: int) -> Tensor:
+        """`[R]` whether this step is the last one allowed, or the last one recorded."""
+        limit = self._task.max_steps
+        stops = self._source.stops(place)
+        return stops if limit is None or step + 1 < limit else torch.ones_like(stops)

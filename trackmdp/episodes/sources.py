@@ -1,0 +1,96 @@
+"""Where the targets of episodes go: each by the draws of its own generator, or along a recorded track."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from trackmdp.world.model import World
+from trackmdp.world.motion import Motion
+from trackmdp.world.tracks import Problem, Recorded
+
+__all__ = ["Source", "source_of"]
+
+
+class Source(Protocol):
+    """The targets of a problem; a place `[B]` int64 says all there is to know of where they are."""
+
+    def start(self, generators: Sequence[torch.Generator]) -> Tensor:
+        """`[B]` places in which the targets start, one draw from each generator."""
+        ...
+
+    def draw(self, count: int, generator: torch.Generator) -> Tensor:
+        """`[count]` float64 draws, one for each of an episode's next moves."""
+        ...
+
+    def move(self, place: Tensor, draws: Tensor) -> Tensor:
+        """`[B]` places after one move."""
+        ...
+
+    def cell(self, place: Tensor) -> Tensor:
+        """`[B]` cells; M for a target that has exited."""
+        ...
+
+    def stops(self, place: Tensor) -> Tensor:
+        """`[B]` bool, whether nothing is known of the target from here on."""
+        ...
+
+
+class _Sampled:
+    """Targets that move as the kernel says, from a uniform start; a place is a cell."""
+
+    def __init__(self, world: World) -> None:
+        self._cells, self._motion = world.num_cells, Motion(world.kernel)
+
+    def start(self, generators: Sequence[torch.Generator]) -> Tensor:
+        return torch.cat([torch.randint(self._cells, (1,), generator=rng) for rng in generators])
+
+    def draw(self, count: int, generator: torch.Generator) -> Tensor:
+        return self._motion.draw(count, generator)
+
+    def move(self, place: Tensor, draws: Tensor) -> Tensor:
+        return self._motion.move(place, draws)
+
+    def cell(self, place: Tensor) -> Tensor:
+        return place
+
+    def stops(self, place: Tensor) -> Tensor:
+        return torch.zeros_like(place, dtype=torch.bool)
+
+
+class _Replayed:
+    """Targets that go along held-out tracks, drawn with replacement, from their first cell on.
+
+    A place is an index into the cells of all tracks end to end, each track that exits being closed by cell M.
+    """
+
+    def __init__(self, problem: Recorded) -> None:
+        line = problem.held_out.closed(problem.num_cells)
+        self._line, self._first = torch.as_tensor(line.cells), torch.as_tensor(line.first[:-1])
+        stops = np.zeros(len(line.cells), dtype=bool)
+        stops[line.first[1:] - 1] = ~line.exits
+        self._stops = torch.as_tensor(stops)
+
+    def start(self, generators: Sequence[torch.Generator]) -> Tensor:
+        return self._first[torch.cat([torch.randint(len(self._first), (1,), generator=rng) for rng in generators])]
+
+    def draw(self, count: int, generator: torch.Generator) -> Tensor:  # noqa: ARG002
+        return torch.zeros(count, dtype=torch.float64)  # a recorded path needs none
+
+    def move(self, place: Tensor, draws: Tensor) -> Tensor:  # noqa: ARG002
+        return place + 1  # an episode ends at the last place of its track
+
+    def cell(self, place: Tensor) -> Tensor:
+        return self._line[place]
+
+    def stops(self, place: Tensor) -> Tensor:
+        return self._stops[place]
+
+
+def source_of(problem: Problem) -> Source:
+    """The targets of a world or of recorded tracks."""
+    return _Sampled(problem) if isinstance(problem, World) else _Replayed(problem)
