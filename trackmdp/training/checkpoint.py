@@ -21,7 +21,7 @@ from trackmdp.durable import own_folder, second_name, sync_folder, whole_file
 from trackmdp.errors import UserError
 from trackmdp.untrusted import decoded, opened
 
-__all__ = ["BEST", "FORMAT", "LAST", "available", "load", "newest", "point", "save"]
+__all__ = ["BEST", "FORMAT", "LAST", "available", "load", "named", "newest", "point", "save"]
 
 FORMAT = 4
 BEST, LAST = "best.pt", "last.pt"
@@ -38,7 +38,7 @@ def save(folder: Path, iteration: int, state: dict[str, Any], *, keep: int, best
     own_folder(folder)
     for left in folder.glob("*.part"):  # of a process that was killed while it saved
         left.unlink()
-    file = folder / f"iteration-{iteration:08d}.pt"
+    file = named(folder, iteration)
     with whole_file(file) as stream:
         hashed = _Hashed(stream)
         hashed.save({"format": FORMAT, "iteration": iteration, **state})
@@ -47,6 +47,11 @@ def save(folder: Path, iteration: int, state: dict[str, Any], *, keep: int, best
     for old in _numbered(folder)[:-keep]:
         old.unlink()
     return file
+
+
+def named(folder: Path, iteration: int) -> Path:
+    """The file of a checkpoint."""
+    return folder / f"iteration-{iteration:08d}.pt"
 
 
 def point(file: Path, *, best: bool) -> None:

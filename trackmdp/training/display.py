@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 import sys
 import time
+from typing import Any
 
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.status import Status
 from rich.table import Table
 from rich.text import Text
 
 from trackmdp.training.callbacks import Callback, Row, Training
+from trackmdp.untrusted import printable
 
 __all__ = ["Display", "make_console", "table"]
 
@@ -21,7 +24,19 @@ _SECONDS_BETWEEN_LINES = 2.0
 def make_console(quiet: bool) -> Console:
     """Standard output; lines of any length stay whole when piped."""
     piped = not sys.stdout.isatty()
-    return Console(quiet=quiet, highlight=False, soft_wrap=piped, width=160 if piped else None)
+    return _Console(
+        quiet=quiet, markup=False, emoji=False, highlight=False, soft_wrap=piped, width=160 if piped else None
+    )
+
+
+class _Console(Console):
+    """Shows text as it is: what stands in a folder's name or a log's label is neither markup nor a control sequence."""
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        return super().render_str(printable(text), **options)
+
+    def status(self, status: RenderableType, **options: Any) -> Status:
+        return super().status(Text(printable(status)) if isinstance(status, str) else status, **options)
 
 
 class _Figures(ProgressColumn):

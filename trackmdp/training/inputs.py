@@ -17,7 +17,7 @@ from trackmdp.untrusted import read_bytes
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Problem, Recorded
 
-__all__ = ["write_inputs"]
+__all__ = ["check_inputs", "write_inputs"]
 
 
 def write_inputs(config: TrainConfig, problem: Problem, folder: Path, *, resumed: bool) -> None:
@@ -26,15 +26,27 @@ def write_inputs(config: TrainConfig, problem: Problem, folder: Path, *, resumed
     Raises:
         UserError: the run that is resumed was begun with another kernel, or with other tracks.
     """
-    name, what = ("kernel.npz", "kernel") if isinstance(problem, World) else ("tracks.json", "recording")
-    file = folder / name
-    content = _content(problem)
-    if resumed and read_bytes(file, most=LARGE) != content:
-        raise UserError(
-            f"{file}: the run's {what} is not the one that its config describes now; it cannot change on resume"
-        )
+    file, content = folder / _name(problem), _content(problem)
+    if resumed:
+        check_inputs(problem, folder)
     write_text(folder / "config.yaml", config_text(config))
     write_bytes(file, content)
+
+
+def check_inputs(problem: Problem, folder: Path) -> None:
+    """See that the folder's run learned in this world, or from these tracks.
+
+    Raises:
+        UserError: its kernel, or which tracks it names, is missing, damaged or another than that of `problem`.
+    """
+    file = folder / _name(problem)
+    if read_bytes(file, most=LARGE) != _content(problem):
+        what = "kernel" if isinstance(problem, World) else "recording"
+        raise UserError(f"{file}: the run's {what} is not the one that its config describes now; it cannot change")
+
+
+def _name(problem: Problem) -> str:
+    return "kernel.npz" if isinstance(problem, World) else "tracks.json"
 
 
 def _content(problem: Problem) -> bytes:

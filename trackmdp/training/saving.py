@@ -10,8 +10,10 @@ from typing import Any
 
 from trackmdp.config import CheckpointConfig
 from trackmdp.errors import Preempted
+from trackmdp.policies.policy import Policy
 from trackmdp.training import checkpoint
 from trackmdp.training.callbacks import Callback, Row, Training
+from trackmdp.training.evaluator import Score
 from trackmdp.training.state import Position, capture
 
 __all__ = ["Checkpoints"]
@@ -32,10 +34,22 @@ class Checkpoints(Callback):
     def __init__(self, cfg: CheckpointConfig, folder: Path) -> None:
         self._cfg, self._folder = cfg, folder
         self._best, self._rest = -math.inf, 0.0
+        self._is_best = False
+        self._evaluated: tuple[int, float] = (-1, -math.inf)
 
     def on_start(self, trainer: Training) -> None:
-        """Intervals count from where the run is."""
+        """Intervals count from where the run is.
+
+        The process that wrote the checkpoint may have been killed before last.pt and best.pt were the same file.
+        """
         self._saved = trainer.position
+        file = checkpoint.named(self._folder, trainer.position.iteration)
+        if trainer.position.iteration and file.is_file():
+            checkpoint.point(file, best=self._is_best)
+
+    def on_evaluation(self, trainer: Training, policy: Policy, score: Score) -> None:  # noqa: ARG002
+        """Remember what the policy of this iteration attains."""
+        self._evaluated = trainer.position.iteration, score.evaluation.aihtr
 
     def on_update(self, trainer: Training, row: Row) -> None:  # noqa: ARG002
         """Save after the last iteration, and where it is due."""
@@ -59,20 +73,31 @@ class Checkpoints(Callback):
 
     def save(self, trainer: Training) -> None:
         """Save the run as it is, and tell the callbacks."""
-        begin, aihtr = time.monotonic(), trainer.score.evaluation.aihtr
-        better, self._best = aihtr > self._best, max(self._best, aihtr)
+        begin, aihtr = time.monotonic(), self._attained(trainer)
+        self._is_best, self._best = aihtr > self._best, max(self._best, aihtr)
         # Its own state first: that of the others is as they wrote their rows and episodes before this.
         named = {each.name: each.state_dict() for each in trainer.callbacks if each.name}
         state = capture(trainer.config, trainer.algorithm, trainer.collector, trainer.position, named)
-        file = checkpoint.save(self._folder, trainer.position.iteration, state, keep=self._cfg.keep, best=better)
+        file = checkpoint.save(self._folder, trainer.position.iteration, state, keep=self._cfg.keep, best=self._is_best)
         self._saved, self._rest = trainer.position, _SAVING * (time.monotonic() - begin)
         for callback in trainer.callbacks:
             callback.on_checkpoint(trainer, file)
 
+    def _attained(self, trainer: Training) -> float:
+        """AIHTR of the very policy that is saved.
+
+        That of the last evaluation may be of an earlier policy, and of another one in a run that was resumed in
+        between: best.pt would depend on where a run was cut.
+        """
+        iteration, aihtr = self._evaluated
+        if iteration == trainer.position.iteration:
+            return aihtr
+        return trainer.evaluator.score(trainer.policy()).evaluation.aihtr
+
     def state_dict(self) -> dict[str, Any]:
-        """The highest AIHTR of any checkpoint."""
-        return {"best": self._best}
+        """The highest AIHTR of any checkpoint, and whether it is this one's."""
+        return {"best": self._best, "is_best": self._is_best}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a `state_dict`."""
-        self._best = state["best"]
+        self._best, self._is_best = float(state["best"]), state["is_best"] is True

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType, TracebackType
@@ -34,6 +35,17 @@ class Signals:
     ) -> None:
         for number, handler in self._before.items():
             signal.signal(number, handler)
+
+    def heard(self) -> bool:
+        """Whether a signal came, or comes within a moment.
+
+        A scheduler signals a whole group of processes; a worker may die of it before this one is told.
+        """
+        for _ in range(20):
+            if self.received:
+                return True
+            time.sleep(0.025)
+        return False
 
     def _note(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
         self.received = number

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -18,8 +19,9 @@ from trackmdp.config.resume import CHANGEABLE
 from trackmdp.errors import UserError
 from trackmdp.training import checkpoint
 from trackmdp.training.collect import collector_state, load_collector_state
+from trackmdp.untrusted import decoded
 
-__all__ = ["Position", "capture", "find", "identity", "restore", "take_weights"]
+__all__ = ["Position", "capture", "find", "identity", "load_learned", "restore", "take_weights"]
 
 _EXACT = ("torch", "torchrl", "tensordict", "trackmdp")
 _NOT_WEIGHTS = ("optimizer", "buffer", "generator")
@@ -109,7 +111,7 @@ def find(cfg: TrainConfig, folder: Path, device: torch.device) -> tuple[dict[str
         except UserError as error:
             passed_over.append(str(error))
             continue
-        return state, passed_over
+        return {**state, "file": str(file)}, passed_over
     raise UserError(f"resume={cfg.resume}: no checkpoint to resume from ({'; '.join(passed_over) or 'there is none'})")
 
 
@@ -119,10 +121,13 @@ def take_weights(algorithm: Algorithm, run: Path, device: torch.device) -> list[
     Raises:
         UserError: the run has no checkpoint, or nothing of it fits.
     """
-    given = dict(_weights(checkpoint.load(checkpoint.newest(run), device)["algorithm"]))
+    file = checkpoint.newest(run)
+    state = checkpoint.load(file, device)
+    with decoded(str(file), "the state of a run"):
+        given = dict(_weights(state["algorithm"]))
     own = algorithm.state_dict()
     taken = []
-    with torch.no_grad():
+    with torch.no_grad(), decoded(str(file), "the weights of a run"):
         for name, tensor in _weights(own):
             if name in given and given[name].shape == tensor.shape:
                 tensor.copy_(given[name])
@@ -133,12 +138,39 @@ def take_weights(algorithm: Algorithm, run: Path, device: torch.device) -> list[
     return taken
 
 
-def _check(state: Mapping[str, Any], cfg: TrainConfig, file: Path) -> None:
+def load_learned(algorithm: Algorithm, cfg: TrainConfig, file: Path, device: torch.device) -> None:
+    """Put the learner of a checkpoint of the run `cfg` back, to use what it has learned.
+
+    Raises:
+        UserError: the checkpoint is damaged, belongs to a run with another config, or does not fit.
+    """
+    state = checkpoint.load(file, device)
+    _check_identity(state, cfg, file)
+    with decoded(str(file), "a state that fits this run"):
+        algorithm.load_state_dict(state["algorithm"])
+
+
+def _check_identity(state: Mapping[str, Any], cfg: TrainConfig, file: Path) -> None:
     if state.get("identity") != identity(cfg):
         raise UserError(f"{file}: belongs to a run with another config")
-    for name, written in state["versions"].items():
-        if written != version(name):
-            raise UserError(f"{file}: written with {name} {written}, this is {version(name)}; expected the same")
+
+
+def _check(state: Mapping[str, Any], cfg: TrainConfig, file: Path) -> None:
+    """See that the state is one to resume from, before anything of it is used."""
+    _check_identity(state, cfg, file)
+    with decoded(str(file), "the state of a run"):
+        if state["versions"].keys() != set(_EXACT):
+            raise ValueError(f"versions of other packages than {', '.join(_EXACT)}")
+        for name, written in state["versions"].items():
+            if written != version(name):
+                raise UserError(f"{file}: written with {name} {written}, this is {version(name)}; expected the same")
+        at = Position(**state["position"])
+        if any(type(each) is not int or not 0 <= each < 2**53 for each in (at.iteration, at.frames)):
+            raise ValueError("a position that is none")
+        if not (0 <= at.seconds < math.inf and math.isfinite(at.reward)) or at.iteration != state["iteration"]:
+            raise ValueError("a position that is none")
+        if not {"algorithm", "collector", "random", "callbacks"} <= state.keys():
+            raise ValueError("a part is missing")
 
 
 def _weights(state: Mapping[str, Any], prefix: str = "") -> list[tuple[str, torch.Tensor]]:

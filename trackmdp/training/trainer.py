@@ -30,6 +30,7 @@ from trackmdp.training.saving import Checkpoints
 from trackmdp.training.signals import Signals
 from trackmdp.training.state import Position, find, restore, take_weights
 from trackmdp.training.workers import Watch
+from trackmdp.untrusted import decoded
 from trackmdp.world.tracks import Problem
 
 __all__ = ["Trainer"]
@@ -145,8 +146,10 @@ class Trainer:
         if state is not None:
             for callback in self.callbacks:
                 if callback.name in state["callbacks"]:
-                    callback.load_state_dict(state["callbacks"][callback.name])
-            start = restore(state, self.algorithm, self.collector)
+                    with decoded(state["file"], f"a state that fits {callback.name}"):
+                        callback.load_state_dict(state["callbacks"][callback.name])
+            with decoded(state["file"], "a state that fits this run"):
+                start = restore(state, self.algorithm, self.collector)
             self.console.print(f"resumes after iteration {start.iteration}, {start.frames:,} frames")
             return start
         if self.config.init_from is not None:
@@ -174,7 +177,7 @@ class Trainer:
             with _named(iteration), self._watch.waiting():
                 batch = next(self._batches, None)
         except RunError:
-            if not self._signals.received:
+            if not self._signals.heard():
                 raise
             # The signal went to the worker processes too. Nothing has been learned since the last iteration, so that
             # this is a state to save.
@@ -191,9 +194,18 @@ class Trainer:
         except FloatingPointError as error:
             raise RunError(f"iteration {iteration}: {error}; the last checkpoint holds a good state") from error
         if batch is not None:
+            self._send_weights(iteration)
+        return diagnostics
+
+    def _send_weights(self, iteration: int) -> None:
+        try:
             with _named(iteration), self._watch.waiting():
                 self.collector.update_policy_weights_()
-        return diagnostics
+        except RunError:
+            # The signal ended the workers too. What was learned is counted and saved, and then the run ends: nobody
+            # needs these weights, unless this was the last iteration, after which nobody does either.
+            if not self._signals.heard():
+                raise
 
     def _account(self, diagnostics: dict[str, float], earned: float | None) -> None:
         """Evaluate where that is due, and tell the callbacks; `earned`: mean reward of the batch's frames, if any."""
@@ -216,7 +228,9 @@ class Trainer:
             "accuracy": evaluation.accuracy,
             "sensors_per_step": evaluation.sensors_per_step,
         }
-        so_far = while_collecting(self.evaluator.upper, evaluation, at.reward, at.frames)
+        # No policy changes the expected length, but each rounds it otherwise; a fixed policy's is the same to the bit
+        # wherever a run was cut and resumed.
+        so_far = while_collecting(self.evaluator.upper, self.evaluator.qmdp or evaluation, at.reward, at.frames)
         return {
             "iteration": at.iteration,
             "frames": at.frames,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from rich.console import Console
+from rich.text import Text
 
 from trackmdp.config import ReportConfig
 from trackmdp.durable import write_bytes, write_text
@@ -17,6 +18,7 @@ from trackmdp.reports.grouping import study
 from trackmdp.reports.page import Report, Section, build
 from trackmdp.reports.results import Results, is_stored, load_results, save_results
 from trackmdp.training.display import make_console
+from trackmdp.untrusted import printable
 
 __all__ = ["run"]
 
@@ -34,7 +36,7 @@ def run(cfg: ReportConfig, folder: Path) -> float:
     with console.status("reading runs") as status:
 
         def say(line: str) -> None:
-            status.update(line)
+            status.update(Text(printable(line)))
 
         found = load_results(sweep) if is_stored(sweep) else gather(sweep)
         save_results(found, folder)

@@ -10,7 +10,9 @@ import torch
 from trackmdp.config import load_run_config
 from trackmdp.policies.policy import Policy
 from trackmdp.training import checkpoint
+from trackmdp.training.inputs import check_inputs
 from trackmdp.training.make import make_algorithm
+from trackmdp.training.state import load_learned
 from trackmdp.world.make import make_problem
 from trackmdp.world.tracks import Problem
 
@@ -30,12 +32,13 @@ def trained(run: str, device: torch.device, *, best: bool = False) -> Trained:
     """The policy of the newest checkpoint of the run in the folder `run`, or of the best one.
 
     Raises:
-        UserError: that is no run, or the checkpoint is missing or damaged.
+        UserError: that is no run, or the checkpoint is missing, damaged or another run's.
     """
     cfg, folder = load_run_config(run), Path(run)
     world = make_problem(cfg)
     algorithm = make_algorithm(cfg, world, device)
     file = folder / "checkpoints" / checkpoint.BEST if best else checkpoint.newest(folder)
-    algorithm.load_state_dict(checkpoint.load(file, device)["algorithm"])
+    load_learned(algorithm, cfg, file, device)
+    check_inputs(world, folder)
     policy = Policy.from_module(world.task, algorithm.actor, device=device)
     return Trained(world, policy, f"{cfg.algo.name}, {file.name}")

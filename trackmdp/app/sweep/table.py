@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.markup import escape
 
 from trackmdp.app.prepare import shown
 from trackmdp.durable import write_text
@@ -30,9 +29,7 @@ def show(console: Console, runs: Sequence[RunState], skipped: Collection[Path], 
     names = [run.folder.name.rpartition("-")[0] for run in runs]
     if len(set(names)) < len(names):
         names = [run.folder.name for run in runs]
-    rows = [
-        [name, _state(run, skipped), *_short(run), escape(run.reason)] for name, run in zip(names, runs, strict=True)
-    ]
+    rows = [[name, _state(run, skipped), *_short(run), run.reason] for name, run in zip(names, runs, strict=True)]
     made = table(f"{len(runs)} runs", ["run", "state", "AIHTR", "regret per step", "reason"], rows)
     made.columns[1].justify = made.columns[4].justify = "left"
     console.print(made)

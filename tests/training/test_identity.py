@@ -1,0 +1,189 @@
+"""Where a run is cut changes nothing, best.pt included; and what another run left is not taken for its own."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy import sparse
+from torchrl.collectors import Collector
+
+from tests.training.runs import assert_same_run, at_iteration, tensors, train
+from trackmdp.app.commands.trained import trained
+from trackmdp.errors import Preempted, RunError, UserError
+from trackmdp.training import checkpoint
+
+CPU = torch.device("cpu")
+
+
+def breaks() -> None:
+    raise OSError(5, "Input/output error")
+
+
+def assert_same_best(one: Path, other: Path) -> None:
+    """The same policy is called the best, for the same figure."""
+    for name in (checkpoint.BEST, checkpoint.LAST):
+        mine, theirs = (checkpoint.load(run / "checkpoints" / name) for run in (one, other))
+        assert mine["iteration"] == theirs["iteration"]
+        assert mine["callbacks"]["checkpoints"] == theirs["callbacks"]["checkpoints"]
+        kept, found = tensors(mine), tensors(theirs)
+        assert all(torch.equal(kept[k], found[k]) for k in kept if isinstance(kept[k], torch.Tensor))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that nothing happened to: saved after each iteration, evaluated after every fourth."""
+    folder = tmp_path_factory.mktemp("whole") / "run"
+    train(folder)
+    return folder
+
+
+@pytest.mark.parametrize("cuts", [(2,), (3, 5), (6, 7), (8,)])
+def test_the_best_does_not_depend_on_where_a_run_was_cut(
+    cuts: tuple[int, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: Path
+) -> None:
+    for cut in cuts:
+        with monkeypatch.context() as patch:
+            at_iteration(patch, cut, breaks)
+            with pytest.raises(RunError):
+                train(tmp_path, "resume=auto")
+    train(tmp_path, "resume=auto")
+    assert_same_run(tmp_path, whole)
+    assert_same_best(tmp_path, whole)
+
+
+def test_the_best_is_the_policy_that_it_was_called_the_best_for(whole: Path) -> None:
+    figures = [
+        checkpoint.load(file)["callbacks"]["checkpoints"]
+        for file in (whole / "checkpoints" / checkpoint.BEST, whole / "checkpoints" / checkpoint.LAST)
+    ]
+    assert figures[0]["is_best"]
+    assert figures[0]["best"] == figures[1]["best"]
+
+
+@pytest.mark.parametrize("name", [checkpoint.LAST, checkpoint.BEST])
+def test_a_run_cut_between_a_checkpoint_and_its_names_is_the_same(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: Path
+) -> None:
+    best = checkpoint.load(whole / "checkpoints" / checkpoint.BEST)["iteration"]
+    named = checkpoint.second_name
+
+    def broken(file: Path, other: Path) -> None:
+        if (file.name, other.name) == (f"iteration-{best:08d}.pt", name):
+            breaks()
+        named(file, other)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "second_name", broken)
+        with pytest.raises(RunError):
+            train(tmp_path)
+    train(tmp_path, "resume=auto")
+    assert_same_run(tmp_path, whole)
+    assert_same_best(tmp_path, whole)
+
+
+def test_a_signal_that_ends_the_workers_while_weights_are_sent_costs_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: Path
+) -> None:
+    send, calls = Collector.update_policy_weights_, iter(range(9))
+
+    def ended(self: Collector, *args: Any) -> None:
+        if next(calls) == 2:
+            signal.raise_signal(signal.SIGTERM)
+            raise RuntimeError("worker 0 was killed by SIGTERM")
+        send(self, *args)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Collector, "update_policy_weights_", ended)
+        with pytest.raises(Preempted) as told:
+            train(tmp_path, "checkpoint.every=0")
+    assert told.value.signal == signal.SIGTERM
+    assert [file.name for file in checkpoint.available(tmp_path / "checkpoints")] == ["iteration-00000003.pt"]
+    train(tmp_path, "resume=auto")
+    assert_same_run(tmp_path, whole)
+
+
+def one_file(name: str) -> Callable[[Path, Path], Any]:
+    return lambda mine, theirs: shutil.copy(theirs / name, mine / name)
+
+
+def newer(mine: Path, theirs: Path) -> None:
+    shutil.copy(checkpoint.newest(theirs), mine / "checkpoints/iteration-00000099.pt")
+
+
+SWAPS: dict[str, tuple[Callable[[Path, Path], Any], bool]] = {
+    "newest": (newer, False),
+    "best": (one_file("checkpoints/best.pt"), True),
+    "config": (one_file("config.yaml"), False),
+    "kernel": (lambda mine, theirs: sparse.save_npz(mine / "kernel.npz", sparse.csr_array(np.eye(9))), False),
+    "kernel, cut": (lambda mine, theirs: (mine / "kernel.npz").write_bytes(b"PK"), False),
+    "no kernel": (lambda mine, theirs: (mine / "kernel.npz").unlink(), True),
+}
+
+
+@pytest.mark.parametrize("case", SWAPS)
+def test_what_another_run_left_is_not_taken(
+    case: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, whole: Path
+) -> None:
+    swap, best = SWAPS[case]
+    mine = tmp_path / "mine"
+    shutil.copytree(whole, mine)
+    trained(str(mine), CPU, best=best)
+    other = tmp_path_factory.getbasetemp() / "other"
+    if not other.exists():
+        train(other, "cost.sensor=0.4")
+    swap(mine, other)
+    with pytest.raises(UserError) as refused:
+        trained(str(mine), CPU, best=best)
+    assert str(mine) in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"position": {"iteration": -1}},
+        {"position": {"iteration": 8, "frames": 10**30, "seconds": 0.0, "reward": 0.0}},
+        {"versions": [1]},
+        {"versions": {"nope": "1"}},
+        {"algorithm": [1]},
+        {"algorithm": {}},
+        {"collector": {"carrier": {}}},
+        {"random": {}},
+        {"callbacks": {"csv": {"position": 10**15}}},
+        {"callbacks": {"checkpoints": {"best": "x"}}},
+    ],
+)
+def test_a_sealed_state_that_makes_no_sense_is_refused_in_one_line(
+    damage: dict[str, Any], tmp_path: Path, whole: Path
+) -> None:
+    mine = tmp_path / "mine"
+    shutil.copytree(whole, mine)
+    state = checkpoint.load(checkpoint.newest(mine))
+    shutil.rmtree(mine / "checkpoints")
+    checkpoint.save(mine / "checkpoints", 8, {**state, **damage}, keep=1)
+    (mine / "summary.json").unlink()
+    before = (mine / "metrics.csv").read_bytes()
+    with pytest.raises(UserError) as refused:
+        train(mine, "resume=auto")
+    assert "\n" not in str(refused.value)
+    assert (mine / "metrics.csv").read_bytes() == before
+
+
+@pytest.mark.parametrize("content", [b"", b"x" * 9999, b"\0" * 9999, b"a\n" * 5000])
+def test_metrics_of_rubbish_stop_a_resume_before_anything_is_written(
+    content: bytes, tmp_path: Path, whole: Path
+) -> None:
+    mine = tmp_path / "mine"
+    shutil.copytree(whole, mine)
+    (mine / "summary.json").unlink()
+    (mine / "metrics.csv").write_bytes(content)
+    with pytest.raises(UserError, match=r"metrics\.csv: not the metrics of this run"):
+        train(mine, "resume=auto")
+    assert (mine / "metrics.csv").read_bytes() == content
