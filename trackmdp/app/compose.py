@@ -27,7 +27,7 @@ from trackmdp.config.resolvers import register_resolvers
 from trackmdp.config.untrusted import names_code
 from trackmdp.errors import UserError
 
-__all__ = ["Composer", "folder_of", "of_task", "register"]
+__all__ = ["Composer", "folder_of", "run_words", "register"]
 
 _LOGGING = {"class": {"logging.StreamHandler", "logging.FileHandler", "logging.NullHandler"}}
 _LOG_FILE = "${hydra.runtime.output_dir}/${hydra.job.name}.log"
@@ -121,7 +121,7 @@ class Composer:
         return compose(self.name, overrides=list(words), return_hydra_config=True)
 
 
-def of_task(words: Iterable[str]) -> list[str]:
+def run_words(words: Iterable[str]) -> list[str]:
     """The words that say something of the runs, not of Hydra."""
     return [word for word in words if not word.lstrip("+~").startswith(("hydra.", "hydra/"))]
 

@@ -14,7 +14,7 @@ from hydra.core.utils import configure_log, run_job
 from hydra.types import HydraContext
 from omegaconf import DictConfig, OmegaConf, read_write
 
-from trackmdp.app.compose import Composer, folder_of, of_task
+from trackmdp.app.compose import Composer, folder_of, run_words
 from trackmdp.app.outputs import make_folder, remove_if_empty
 from trackmdp.app.prepare import Prepared, announce, prepare, typed_config
 from trackmdp.app.questions import answer, is_question, parse
@@ -47,7 +47,7 @@ def _run_once(compose: Composer) -> int:
     cfg = compose(compose.words)
     typed = typed_config(compose.command, cfg, Path.cwd())
     folder = folder_of(cfg, "hydra.run.dir")
-    ready = prepare(compose.command, typed, folder, of_task(compose.words))
+    ready = prepare(compose.command, typed, folder, run_words(compose.words))
     made = make_folder("hydra.run.dir", ready.folder)
     with read_write(cfg.hydra):
         cfg.hydra.run.dir = str(ready.folder)  # a run that is resumed writes to its own
@@ -106,7 +106,7 @@ def _sweep(compose: Composer) -> int:
     from trackmdp.app.sweep.sweep import sweep
     from trackmdp.training.display import make_console
 
-    command, words = compose.command, of_task(compose.words)
+    command, words = compose.command, run_words(compose.words)
     cfg = compose([word for word in compose.words if not _has_values(word)])
     sweeper, launcher = plugin("sweeper", cfg.hydra.sweeper), plugin("launcher", cfg.hydra.launcher)
     launch_jobs = make_launcher(launcher)
@@ -132,7 +132,7 @@ def _has_values(word: str) -> bool:
         several = OverridesParser.create().parse_override(word).is_sweep_override()
     except Exception:  # composing says what is wrong with it
         return False
-    if several and not of_task([word]):
+    if several and not run_words([word]):
         raise UserError(f"{word}: expected one {word.partition('=')[0].split('/')[-1]}")
     return several
 
@@ -146,7 +146,7 @@ def _batches(compose: Composer, sweeper: SweeperConfig, words: Sequence[str], fo
     assert isinstance(sweeper, OptunaConfig)
     from trackmdp.app.sweep.trials import trials
 
-    def planned(words: Sequence[str], telling: set[str]) -> Job:
-        return plan(compose.command, [words], folder, compose, telling)[0]
+    def planned(words: Sequence[str], naming: set[str]) -> Job:
+        return plan(compose.command, [words], folder, compose, naming)[0]
 
     return trials(sweeper, words, folder, planned)

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from trackmdp.app.cli import main
-from trackmdp.app.sweep import apart
+from trackmdp.app.sweep import process
 
 ROOT = Path(__file__).parents[3]
 TINY = (
@@ -31,7 +31,7 @@ TINY = (
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty current folder, and runs that begin as a copy of this process, with all that is patched in it."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(apart, "METHOD", "fork")
+    monkeypatch.setattr(process, "METHOD", "fork")
     return tmp_path
 
 

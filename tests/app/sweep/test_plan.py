@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from omegaconf import DictConfig
 
-from trackmdp.app.compose import of_task, register
+from trackmdp.app.compose import register, run_words
 from trackmdp.app.sweep.plan import combinations, plan, sweep_name
 from trackmdp.config import conf_dir
 from trackmdp.errors import UserError
@@ -73,7 +73,7 @@ def test_words_that_make_no_grid(blocks: list[str], words: list[str], message: s
 
 
 def test_words_to_hydra_are_no_part_of_a_run() -> None:
-    assert of_task(["seed=1", "hydra.sweep.dir=x", "hydra/launcher=joblib", "+hydra.x=1"]) == ["seed=1"]
+    assert run_words(["seed=1", "hydra.sweep.dir=x", "hydra/launcher=joblib", "+hydra.x=1"]) == ["seed=1"]
 
 
 def test_folders_say_what_tells_the_runs_apart() -> None:

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from tests.app.sweep.runs import ROOT, TINY, here, states, swept, table
+from tests.app.sweep.runs import ROOT, TINY, here, started, states, swept, table
 from tests.typed import stub
 from trackmdp.app.cli import main
 from trackmdp.app.sweep.job import stop_signal
@@ -233,6 +234,7 @@ def test_skipping_imports_nothing_heavy(here: Path) -> None:
     assert swept("seed=0", "quiet=true") == 0
     code = f"""
 import sys
+import time
 from trackmdp.app.cli import main
 status = main({["train", "-m", *TINY, "seed=0", "hydra.sweep.dir=all"]})
 sys.exit(str((status, sorted({{"torch", "torchrl", "scipy"}} & set(sys.modules)))))
@@ -240,3 +242,27 @@ sys.exit(str((status, sorted({{"torch", "torchrl", "scipy"}} & set(sys.modules))
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)
     assert result.stderr == "(0, [])\n"
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
+def test_runs_outlive_their_fork_server(here: Path) -> None:
+    more = ["collector.total_frames=200_000", "seed=0,1", "hydra.sweep.dir=all"]
+    process = started(here, "train", "-m", *(word for word in TINY if "total_frames" not in word), *more)
+    for run in range(2):  # the server is killed while each of the two runs goes on
+        until = time.monotonic() + 120
+        while len(list((here / "all").glob("*/config.yaml"))) <= run and time.monotonic() < until:
+            time.sleep(0.02)
+        servers = [
+            int(path.parent.name)
+            for path in Path("/proc").glob("[0-9]*/cmdline")
+            if b"forkserver import main" in path.read_bytes() and _parent(path.parent) == process.pid
+        ]
+        assert len(servers) == 1
+        os.kill(servers[0], signal.SIGKILL)
+    _, said = process.communicate(timeout=240)
+    assert (process.returncode, said) == (0, "")
+    assert states(here / "all") == ["done", "done"]
+
+
+def _parent(process: Path) -> int:
+    return int((process / "stat").read_text().rpartition(")")[2].split()[1])

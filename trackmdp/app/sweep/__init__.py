@@ -1,1 +1,1 @@
-"""Many runs from one line: planned, launched, skipped where finished, gone on with where cut."""
+"""Many runs from one line: planned, launched, skipped where finished, resumed where interrupted."""

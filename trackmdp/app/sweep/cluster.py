@@ -1,4 +1,4 @@
-"""Sweeps by submissions, to SLURM or to processes of this machine."""
+"""Sweeps through submitit: as jobs of a SLURM cluster, or as processes of this machine."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from trackmdp.app.sweep import apart
+from trackmdp.app.sweep import process
 from trackmdp.app.sweep.job import Launch, fail, run_job, stop_signal
 from trackmdp.app.sweep.plan import Job
 from trackmdp.app.sweep.schema import SubmititConfig, SubmititLocalConfig, SubmititSlurmConfig
@@ -26,7 +26,7 @@ _POLL, _ASK = 0.5, 60.0
 
 
 class Submission:
-    """What is submitted; where it is preempted or out of time, it is submitted once more and the run goes on."""
+    """The submitted callable; where its job is preempted or out of time, it is submitted again and the run resumes."""
 
     def __call__(self, job: Job) -> None:
         """Run `job`."""
@@ -35,14 +35,14 @@ class Submission:
         try:
             run_job(job)
         except UncompletedJobError as error:  # raised by the scheduler's signal
-            apart.end_all()
-            fail(job, apart.Outcome(FAILED, reason=f"stopped by the scheduler: {error}"))
+            process.stop_all()
+            fail(job, process.Outcome(FAILED, reason=f"stopped by the scheduler: {error}"))
 
     def checkpoint(self, job: Job) -> Any:
         """Let the run save, and return what is to be submitted next."""
         from submitit.helpers import DelayedSubmission
 
-        apart.end_all()
+        process.stop_all()
         return DelayedSubmission(self, job)
 
 
@@ -74,7 +74,7 @@ def _local(cfg: SubmititLocalConfig, jobs: Sequence[Job]) -> None:
             time.sleep(_POLL)
         if stop_signal(job.sweep):
             break
-        with _deaf():
+        with _ignoring_ctrl_c():
             running.append(executor.submit(Submission(), job))
     _wait(running)
 
@@ -104,7 +104,7 @@ def _submissions(jobs: Sequence[Job]) -> Path:
 
 
 def _wait(submitted: Sequence[Any]) -> None:
-    """Come back once all are over; how they ended stands in the folders of the runs."""
+    """Return once all jobs have ended; how each ended stands in its run's folder."""
     asked = time.monotonic()
     while left := [each for each in submitted if not each.done()]:
         if time.monotonic() - asked > _ASK:  # one that was killed leaves no file by which it would be known
@@ -114,8 +114,8 @@ def _wait(submitted: Sequence[Any]) -> None:
 
 
 @contextmanager
-def _deaf() -> Iterator[None]:
-    """Processes started inside do not hear Ctrl-C, which the sweep hears."""
+def _ignoring_ctrl_c() -> Iterator[None]:
+    """Processes started inside ignore Ctrl-C: the sweep receives it and stops them in order."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         yield

@@ -1,4 +1,4 @@
-"""One job of a sweep, in whatever process a launcher calls it: it always comes back, and leaves its state on disk."""
+"""One job of a sweep, in whatever process a launcher calls it: it never raises, and leaves its state on disk."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pathlib import Path
 
 from trackmdp.app.outputs import remove_if_empty
 from trackmdp.app.prepare import say
-from trackmdp.app.sweep.apart import Outcome, run_apart
 from trackmdp.app.sweep.plan import Job
+from trackmdp.app.sweep.process import Outcome, run_in_process
 from trackmdp.config import TrainConfig
 from trackmdp.durable import write_json
 from trackmdp.errors import USER_MISTAKE
@@ -20,13 +20,13 @@ from trackmdp.training.folders import DONE, FAILED, SUMMARY, run_of
 __all__ = ["STOP", "Launch", "fail", "run_job", "stop_signal"]
 
 Launch = Callable[[Sequence[Job]], None]
-"""Runs jobs, and comes back once none is running any more."""
+"""Runs jobs, and returns once none of them is running."""
 
 STOP = ".stop"
 """File in a sweep's folder that holds the number of the signal by which all its runs are asked to stop."""
 
 _PATIENCE = 60.0
-"""Seconds for which a run's folder may still be held by a process that is about to save and end."""
+"""Seconds to wait for a run's folder that an earlier process, which lost its sweep, still holds while it saves."""
 
 
 def run_job(job: Job) -> None:
@@ -42,7 +42,7 @@ def run_job(job: Job) -> None:
     if job.cfg is None:
         fail(job, Outcome(USER_MISTAKE, reason=job.refusal))
         return
-    outcome = run_apart(job, lambda: stop_signal(job.sweep))
+    outcome = run_in_process(job, lambda: stop_signal(job.sweep))
     if outcome.status == 0:
         _done(job, outcome)
     elif outcome.reason:
@@ -70,7 +70,7 @@ def stop_signal(sweep: Path) -> int:
 def _done(job: Job, outcome: Outcome) -> None:
     if not (isinstance(job.cfg, TrainConfig) and (job.folder / SUMMARY).is_file()):
         write_json(job.folder / DONE, {"value": outcome.value})
-    if job.aside and job.cfg is not None and not job.cfg.quiet:
+    if job.concurrent and job.cfg is not None and not job.cfg.quiet:
         value = f": AIHTR {outcome.value:,.3f}" if outcome.value is not None else ""
         say(f"({job.label}) {job.name} done{value}")
 

@@ -1,4 +1,4 @@
-"""Where the jobs of a sweep are run: one after the other here, or several at once here or elsewhere.
+"""Where the jobs of a sweep run: one after the other on this machine, or several at once, here or on a cluster.
 
 A launcher reports nothing: what became of each run stands in its folder, in whatever process it ran.
 """
@@ -11,9 +11,9 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 
-from trackmdp.app.sweep.apart import context_for
 from trackmdp.app.sweep.job import Launch, run_job
 from trackmdp.app.sweep.plan import Job
+from trackmdp.app.sweep.process import context_for
 from trackmdp.app.sweep.schema import BasicConfig, JoblibConfig, LauncherConfig, RayConfig, SubmititConfig
 from trackmdp.config import TrainConfig
 from trackmdp.errors import require
@@ -32,7 +32,7 @@ def make_launcher(cfg: LauncherConfig) -> Launch:
     if isinstance(cfg, BasicConfig):
         return _basic
     launch = _parallel(cfg)
-    return lambda jobs: launch([replace(job, aside=True) for job in jobs])
+    return lambda jobs: launch([replace(job, concurrent=True) for job in jobs])
 
 
 def _parallel(cfg: LauncherConfig) -> Launch:
@@ -47,9 +47,9 @@ def _parallel(cfg: LauncherConfig) -> Launch:
         return cluster.launcher(cfg)
     assert isinstance(cfg, RayConfig)
     require("ray", "ray", option)
-    from trackmdp.app.sweep import on_ray
+    from trackmdp.app.sweep import ray_cluster
 
-    return partial(on_ray.launch, cfg)
+    return partial(ray_cluster.launch, cfg)
 
 
 @contextmanager
@@ -71,7 +71,7 @@ def _basic(jobs: Sequence[Job]) -> None:
 
 
 def _joblib(cfg: JoblibConfig, jobs: Sequence[Job]) -> None:
-    """Threads will do: each only waits for the process of its run."""
+    """In threads: each only waits for the process of its run."""
     from joblib import Parallel, delayed
 
     context_for(jobs[0].command)

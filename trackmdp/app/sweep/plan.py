@@ -1,4 +1,4 @@
-"""From the words of a sweep to its jobs: every combination, each checked and with a folder of its own."""
+"""From the words of a sweep to its jobs: every combination of values, each checked, each with its own folder."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from trackmdp.errors import UserError
 __all__ = ["Job", "combinations", "plan", "sweep_name"]
 
 _UNNAMED = ("experiment", "quiet", "resume")
-"""Words that are no part of a folder's readable name: they say how a run is done, or stand for other words."""
+"""Keys that are left out of a folder's readable name: they do not change a result, or stand for other words."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Job:
         cfg: its checked config; None where it was refused.
         refusal: why.
         label: place in the sweep, for the terminal: ``3/60``.
-        aside: it runs beside others, and says what it says in a file of its own.
+        concurrent: other runs go on at the same time, so its output goes to a file of its own.
     """
 
     command: str
@@ -50,7 +50,7 @@ class Job:
     cfg: CommandConfig | None
     refusal: str = ""
     label: str = ""
-    aside: bool = False
+    concurrent: bool = False
 
     @property
     def folder(self) -> Path:
@@ -72,7 +72,7 @@ def combinations(blocks: Sequence[str], typed: Sequence[str]) -> list[list[str]]
     for block in list(blocks) or [""]:
         axes: dict[str, list[str]] = {}
         for word in [*shlex.split(block, posix=False), *typed]:
-            override = _parsed(word)
+            override = _parse(word)
             if override.key_or_group == "experiment" and override.is_sweep_override():
                 raise UserError(f"{word}: expected one experiment; each is a sweep of its own")
             axes[override.key_or_group] = _values(override)
@@ -85,24 +85,24 @@ def plan(
     grid: Sequence[Sequence[str]],
     sweep: Path,
     compose: Callable[[Sequence[str]], DictConfig],
-    telling: Collection[str] = (),
+    naming: Collection[str] = (),
 ) -> list[Job]:
     """The jobs of a sweep, those that come out the same only once.
 
-    A run's folder is named by what tells it apart from the others, and by a digest of what was overridden and of the
-    config behind it. What may change when a run goes on (`CHANGEABLE`) counts only where it was overridden.
+    A run's folder is named by what differs from the others, and by a digest of what was overridden and of the
+    config behind it. What may change when a run is resumed (`CHANGEABLE`) counts only where it was overridden.
 
     Args:
         command: what is run.
         grid: the words of each run.
         sweep: the sweep's folder.
         compose: the config of some words.
-        telling: options that tell the runs apart; if none are named, those whose values differ in the grid.
+        naming: options whose values name the folders; if there are none, those whose values differ in the grid.
 
     Raises:
         UserError: words that do not make a config; a config that is refused is kept, as a job that fails.
     """
-    telling, known = telling or _varying(grid), _folders(sweep)
+    naming, known = naming or _varying(grid), _folders(sweep)
     jobs: dict[str, Job] = {}
     for words in grid:
         cfg: CommandConfig | None
@@ -111,8 +111,8 @@ def plan(
             cfg, refusal = _resumable(typed_config(command, composed, Path.cwd())), ""
         except UserError as error:
             cfg, refusal = None, str(error)
-        key = _digest(_told(words), _identity(cfg))
-        text = _slug([word for word in words if _key(word) in telling] or words)
+        key = _digest(_distinguishing(words), _identity(cfg))
+        text = _slug([word for word in words if _key(word) in naming] or words)
         name = known.get(key, f"{text}-{key}".lstrip("-"))
         jobs.setdefault(key, Job(command, sweep, name, tuple(words), cfg, refusal))
     return [replace(job, label=f"{place}/{len(jobs)}") for place, job in enumerate(jobs.values(), 1)]
@@ -120,14 +120,14 @@ def plan(
 
 def sweep_name(command: str, words: Sequence[str], blocks: Sequence[str]) -> str:
     """The name of a sweep's folder: the same for the same words, in whatever order; those with many values first."""
-    told = _told(words)
+    told = _distinguishing(words)
     experiments = [word.partition("=")[2] for word in told if _key(word) == "experiment"]
-    text = _slug(sorted(told, key=lambda word: not _parsed(word).is_sweep_override()), experiments or [command])
+    text = _slug(sorted(told, key=lambda word: not _parse(word).is_sweep_override()), experiments or [command])
     return f"{text}-{_digest(command, told, list(blocks))}"
 
 
 def _varying(grid: Sequence[Sequence[str]]) -> set[str]:
-    """The options that tell the runs of a grid apart."""
+    """The options that differ between the runs of a grid."""
     values: dict[str, set[str]] = {}
     for word in (word for words in grid for word in words):
         values.setdefault(_key(word), set()).add(word)
@@ -155,7 +155,7 @@ def _short(value: str) -> str:
     return f"{float(value):.4g}" if re.fullmatch(r"-?\d*\.\d{5,}(e-?\d+)?", value) else value
 
 
-def _told(words: Iterable[str]) -> list[str]:
+def _distinguishing(words: Iterable[str]) -> list[str]:
     return sorted(word for word in words if _key(word) not in ("quiet", "resume"))
 
 
@@ -178,7 +178,7 @@ def _identity(cfg: CommandConfig | None) -> dict[str, Any]:
 
 
 def _resumable(cfg: CommandConfig) -> CommandConfig:
-    """The runs of a sweep go on where they were cut, each in its own folder."""
+    """The runs of a sweep resume where they were interrupted, each in its own folder."""
     if not isinstance(cfg, TrainConfig):
         return cfg
     if cfg.resume not in (None, "auto"):
@@ -186,7 +186,7 @@ def _resumable(cfg: CommandConfig) -> CommandConfig:
     return replace(cfg, resume="auto")
 
 
-def _parsed(word: str) -> Override:
+def _parse(word: str) -> Override:
     try:
         return OverridesParser.create().parse_override(word)
     except HydraException as error:

@@ -119,7 +119,7 @@ class JoblibConfig(LauncherConfig):
 class SubmititConfig(LauncherConfig):
     """Base of the launchers that write a submission for each run."""
 
-    timeout_min: int = option("a run is stopped after this long, and goes on where requeued", unit="min", ge=1)
+    timeout_min: int = option("a run is stopped after this long, and resumes where requeued", unit="min", ge=1)
     cpus_per_task: int = option("cores of a run", unit="cores", ge=1)
 
 

@@ -11,10 +11,10 @@ from typing import Self
 from rich.console import Console
 
 from trackmdp.app.prepare import shown
-from trackmdp.app.sweep.apart import Outcome
 from trackmdp.app.sweep.job import STOP, Launch, fail
 from trackmdp.app.sweep.launchers import threads_of
 from trackmdp.app.sweep.plan import Job
+from trackmdp.app.sweep.process import Outcome
 from trackmdp.app.sweep.table import show, status_of, write_table
 from trackmdp.config import TrainConfig
 from trackmdp.config.resume import continued, finished
@@ -64,13 +64,13 @@ def sweep(
         show(console, runs, skipped, folder)
     if stop.received:
         raise Preempted(stop.received)
-    _tell_failures(command, runs)
+    _report_failures(command, runs)
     return status_of(runs)
 
 
 def _run(jobs: Sequence[Job], launch: Launch, stop: _Stop) -> None:
     for job in jobs:
-        _forget(job)
+        _remove_results(job)
     with threads_of(jobs):
         _launch(jobs, launch, stop)
 
@@ -85,7 +85,7 @@ def _is_finished(job: Job) -> bool:
         return False
 
 
-def _forget(job: Job) -> None:
+def _remove_results(job: Job) -> None:
     """Remove what an earlier call left of a run that is to be run now."""
     for name in (FAILED, DONE, SUMMARY):
         (job.folder / name).unlink(missing_ok=True)
@@ -114,7 +114,7 @@ def _opening(jobs: Sequence[Job], skipped: Collection[Path], folder: Path) -> st
     return f"{len(jobs)} runs{done} -> {shown(folder)}"
 
 
-def _tell_failures(command: str, runs: Sequence[RunState]) -> None:
+def _report_failures(command: str, runs: Sequence[RunState]) -> None:
     failed = [run for run in runs if run.state == "failed"]
     if failed:
         sys.stderr.write(f"trackmdp {command}: {len(failed)} of {len(runs)} runs failed\n")

@@ -41,7 +41,7 @@ def show(console: Console, runs: Sequence[RunState], skipped: Collection[Path], 
 def write_table(sweep: Path, runs: Sequence[RunState]) -> None:
     """Write `runs.csv`: folder, state, figures, reason, and one column for every option that was overridden.
 
-    Nothing in it depends on time, or on how often a run was cut.
+    Nothing in it depends on time, or on how often a run was interrupted.
     """
     words = [dict(_pair(word) for word in run.overrides) for run in runs]
     keys = [key for key in dict.fromkeys(key for pairs in words for key in pairs) if key != "quiet"]

@@ -1,4 +1,4 @@
-"""Sweeps whose runs are chosen by Optuna, one batch after the other; the study is kept and goes on where it stopped."""
+"""Sweeps whose runs are chosen by Optuna, one batch after the other; the study is kept and continued."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def trials(
 
 
 def _ask(cfg: OptunaConfig, study: Any, searched: dict[str, Override], place: int) -> tuple[Any, list[str]]:
-    """The next trial and its words. What is drawn depends on the seed and on what is known, not on who was cut when."""
+    """The next trial and its words. Draws depend on the seed and on the results known, not on interruptions."""
     study.sampler = _sampler(cfg, derive(cfg.seed, "optuna", _count(study, "COMPLETE"), place) % 2**32)
     trial = study.ask()
     try:
@@ -100,7 +100,7 @@ def _suggest(trial: Any, key: str, override: Override) -> Any:
 
 
 def _tell(cfg: OptunaConfig, study: Any, trial: Any, job: Job) -> int:
-    """Hand over what came of a job; 1 if it failed. One that was cut is taken up by the next call."""
+    """Hand over what came of a job; 1 if it failed. One that was interrupted is asked for again by the next call."""
     run = run_of(job.folder)
     value = figures(run).get(cfg.objective) if run.state == "done" else None
     if value is not None:
@@ -126,15 +126,15 @@ def _study(cfg: OptunaConfig, folder: Path) -> Iterator[Any]:
         study = optuna.create_study(
             study_name=cfg.study, storage=storage, direction=_DIRECTIONS[cfg.objective], load_if_exists=True
         )
-        _take_up(study)
+        _enqueue_interrupted(study)
         yield study
     finally:
         storage.remove_session()
         storage.engine.dispose()
 
 
-def _take_up(study: Any) -> None:
-    """Ask first for the trials of an earlier call that were cut, or failed."""
+def _enqueue_interrupted(study: Any) -> None:
+    """Ask first for the trials of an earlier call that were interrupted or failed."""
     done = [trial.params for trial in study.trials if trial.state == _states().COMPLETE]
     queued = [trial.system_attrs.get("fixed_params") for trial in study.trials if trial.state == _states().WAITING]
     for trial in study.trials:

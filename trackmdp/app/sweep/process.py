@@ -1,4 +1,4 @@
-"""A run in a process of its own, so that nothing that happens to it happens to the others."""
+"""One run of a sweep in a process of its own: a crash, a leak or a kill in one run does not reach the others."""
 
 from __future__ import annotations
 
@@ -19,18 +19,20 @@ from trackmdp.app.prepare import announce, prepare
 from trackmdp.app.sweep.plan import Job
 from trackmdp.errors import FAILED, USER_MISTAKE, Preempted, RunError, UserError
 
-__all__ = ["METHOD", "OUTPUT", "Outcome", "context_for", "end_all", "run_apart"]
+__all__ = ["METHOD", "OUTPUT", "Outcome", "context_for", "stop_all", "run_in_process"]
 
 OUTPUT = "output.txt"
 """File in a run's folder for what it says, where several runs would say it at once."""
 
 METHOD = "forkserver"
-"""The server imports the command once, on which seconds are spent, and every run begins as a copy of it."""
+"""The fork server imports the command once (seconds: torch, TorchRL); every run, of any launcher, is forked from it."""
 
 _running: list[Any] = []
-_one_at_a_time = threading.RLock()
-"""Held while a process is started or joined: either looks after all others that this process has started."""
+_start_or_join = threading.RLock()
+"""Held while a process is started or joined: `multiprocessing` polls all children in both, which is not thread-safe."""
 _POLL = 0.2
+_LOST = 255
+"""What `multiprocessing` gives as the exit status of a process whose fork server is gone."""
 _TERMINATING = (signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
 
 
@@ -49,45 +51,65 @@ class Outcome:
     reason: str = ""
 
 
-def run_apart(job: Job, stop: Callable[[], int]) -> Outcome:
-    """Run `job` in a child process and wait for it; `stop()` is the signal it is asked to stop by, 0 for none.
+def run_in_process(job: Job, stop: Callable[[], int]) -> Outcome:
+    """Run `job` in a child process and wait for it.
 
-    The child saves and ends as well when the calling process goes, however it goes.
+    The child also saves and stops when the calling process ends, even by SIGKILL.
+
+    Args:
+        job: what is run.
+        stop: asked every 0.2 s: the number of the signal by which the run is to stop, 0 for none.
     """
-    context = context_for(job.command)
-    ours, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_child, args=(job, Path.cwd(), theirs))
-    with _one_at_a_time:
-        process.start()
-        _running.append(process)
-    theirs.close()
+    for last in (False, True):
+        try:
+            process, ours = _start(job)
+            break
+        except (OSError, EOFError) as error:  # the fork server was killed; the next start makes another
+            if last:
+                return Outcome(FAILED, reason=f"its process could not be started ({_line(error)})")
     asked = 0
     try:
         while not wait([process.sentinel], _POLL):
             if not asked and (asked := stop()):
                 process.terminate()
+        # The run outlives a killed fork server, which then cannot report how it ends; its own pipe closes when it does.
+        while process.exitcode == _LOST and not ours.poll(_POLL):
+            if not asked and (asked := stop()):
+                os.kill(process.pid, signal.SIGTERM)
     finally:
-        _end(process)  # an exception takes this process out of the loop: let the run save first
+        _stop(process)  # after an exception in this process the run may still be going: let it save first
     return _outcome(ours, process.exitcode, asked)
 
 
-def end_all() -> None:
-    """Let the runs that this process waits for save and end, and wait for that."""
+def _start(job: Job) -> tuple[Any, Connection]:
+    """The process of a run, and the end of the pipe on which its `Outcome` arrives."""
+    context = context_for(job.command)
+    ours, theirs = context.Pipe(duplex=False)
+    process = context.Process(target=_run_in_child, args=(job, Path.cwd(), theirs))
+    with theirs, _start_or_join:
+        process.start()
+        _running.append(process)
+    return process, ours
+
+
+def stop_all() -> None:
+    """Ask every run that this process waits for to save and stop, and wait until they have."""
     for process in tuple(_running):
-        _end(process)
+        _stop(process)
 
 
 def context_for(command: str) -> Any:
-    """What starts processes for runs of `command`; called first in the main thread.
+    """The `multiprocessing` context that starts runs of `command`; call it first in the main thread.
 
-    Its server is deaf to signals that go to the whole group of processes, or it would leave the runs alone.
+    The fork server ignores the signals that a terminal or a scheduler sends to the whole process group: a run that it
+    has forked needs it to report how it ended.
     """
     context: Any = multiprocessing.get_context(METHOD)
     if METHOD != "forkserver":
         return context
     context.set_forkserver_preload([f"trackmdp.app.commands.{command}"])
-    deaf = _TERMINATING if threading.current_thread() is threading.main_thread() else ()
-    before = {number: signal.signal(number, signal.SIG_IGN) for number in deaf}
+    ignored = _TERMINATING if threading.current_thread() is threading.main_thread() else ()
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in ignored}
     try:
         forkserver.ensure_running()
     finally:
@@ -96,25 +118,25 @@ def context_for(command: str) -> Any:
     return context
 
 
-def _end(process: Any) -> None:
+def _stop(process: Any) -> None:
     if not wait([process.sentinel], 0):
         process.terminate()
         wait([process.sentinel])
-    with _one_at_a_time:
+    with _start_or_join:
         process.join()
         if process in _running:
             _running.remove(process)
 
 
 def _outcome(connection: Connection, code: int, asked: int) -> Outcome:
-    """What the child told, or what its end tells."""
+    """What the child sent; without that, what its exit status says."""
     with connection:
         try:
-            told = connection.recv() if connection.poll() else None
+            sent = connection.recv() if connection.poll() else None
         except EOFError:
-            told = None
-    if isinstance(told, Outcome):
-        return told
+            sent = None
+    if isinstance(sent, Outcome):
+        return sent
     if asked:
         return Outcome(128 + asked)
     if code < 0:
@@ -125,31 +147,31 @@ def _outcome(connection: Connection, code: int, asked: int) -> Outcome:
 _MEMORY = ", perhaps for lack of memory"
 
 
-def _child(job: Job, folder: Path, connection: Connection) -> None:
+def _run_in_child(job: Job, folder: Path, connection: Connection) -> None:
     for number in (signal.SIGTERM, signal.SIGUSR1):
         signal.signal(number, signal.SIG_DFL)
-    for number in (signal.SIGINT, signal.SIGUSR2):  # for the sweep, and for the job of a cluster; both pass it on
+    for number in (signal.SIGINT, signal.SIGUSR2):  # the sweep, or the cluster's job, receives these and passes them on
         signal.signal(number, signal.SIG_IGN)
     os.chdir(folder)
-    if job.aside:
+    if job.concurrent:
         with (job.folder / OUTPUT).open("a") as stream:
             sys.stdout.flush()
             os.dup2(stream.fileno(), 1)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    threading.Thread(target=_stop_with_parent, daemon=True).start()
     outcome = _run(job)
     with connection:
         connection.send(outcome)
 
 
-def _end_with_parent() -> None:
+def _stop_with_parent() -> None:
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
-        os.kill(os.getpid(), signal.SIGUSR1)  # SIGTERM may have come before, and a second one ends it at once
+        os.kill(os.getpid(), signal.SIGUSR1)  # not SIGTERM: where one came before, a second ends the run without saving
 
 
 def _run(job: Job) -> Outcome:
-    """Run the command; nothing that it raises gets out."""
+    """Run the command; whatever it raises becomes an `Outcome`."""
     assert job.cfg is not None
     try:
         ready = prepare(job.command, job.cfg, job.folder, job.words)
