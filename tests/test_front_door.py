@@ -45,6 +45,34 @@ def test_a_world_needs_neither_torch_nor_hydra() -> None:
     assert not loaded("import trackmdp as tm\ntm.make_world(size=4)", "torch", "hydra")
 
 
+TRAINED = """
+import trackmdp as tm
+world = tm.make_world(size=3)
+run = tm.train(world, "learned_kernel", total_frames=512, frames_per_batch=256, envs=32)
+assert tm.evaluate(world, run.policy).aihtr <= tm.solve(world).upper
+"""
+
+
+def test_training_and_solving_touch_no_hydra_and_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(Path(tm.__file__).parents[1]))
+    monkeypatch.chdir(tmp_path)
+    assert not after(f"{TRAINED}\nfound = [name for name in sys.modules if name.split('.')[0] == 'hydra']")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_mistyped_option_is_answered_before_torch_is_loaded() -> None:
+    code = """
+import time
+start = time.process_time()
+from trackmdp.app.cli import main
+assert main(["train", "sead=1"]) == 2
+found = ["torch" in sys.modules, time.process_time() - start]
+"""
+    heavy, seconds = after(code)
+    assert not heavy
+    assert seconds < 1.0
+
+
 @pytest.mark.parametrize("name", tm.__all__)
 def test_every_name_is_there_and_says_what_it_is(name: str) -> None:
     found = getattr(tm, name)
