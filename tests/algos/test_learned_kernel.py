@@ -25,12 +25,12 @@ def test_paths_are_read_from_what_the_tracker_saw() -> None:
     learner = algorithm("learned_kernel", world)
     learner.policy.chains.zero_()
     batch = collect(world, learner.policy, 64, 30)
-    paths = observed_paths(batch.exclude("target", ("next", "target")), 4)
+    paths = observed_paths(batch.exclude("target", ("next", "target")), world)
     located = paths.end < 4
     assert set(paths.misses[located].tolist()) == {2}
     np.testing.assert_array_equal(paths.end[located], (paths.start[located] + 3) % 4)
     assert set(paths.misses[~located].tolist()) == {0, 1, 2}
-    assert not paths.sensed.any()
+    assert not paths.sensed.nnz
     ended = batch["next", "terminated"].sum() + (batch["next", "steps_since_detection"] == 0).sum()
     assert len(paths.end) <= int(ended)
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy import sparse
 from tensordict import TensorDictBase
 
 from trackmdp.config.learned_kernel import LearnedKernelConfig
@@ -18,8 +19,9 @@ from trackmdp.policies.fixed import ChainPolicy
 from trackmdp.seeding import derive
 from trackmdp.solvers import search
 from trackmdp.solvers.evaluate import evaluate
-from trackmdp.solvers.kernel_estimate import KernelEstimate, Paths
-from trackmdp.world.model import Array, BoolArray, Task, World
+from trackmdp.solvers.kernel_estimate import KernelEstimate, ObservedPaths
+from trackmdp.world.model import BoolArray, Task, World
+from trackmdp.world.windows import Window
 
 __all__ = ["LearnedKernel", "observed_paths"]
 
@@ -39,7 +41,7 @@ class LearnedKernel:
         self, task: Task, cfg: LearnedKernelConfig, *, iterations: int, seed: int, device: torch.device
     ) -> None:
         self.task, self.cfg, self.iterations, self.device = task, cfg, iterations, device
-        self._estimate = KernelEstimate(task.rows, weight=cfg.prior, exit_weight=cfg.exit_prior)
+        self._estimate = KernelEstimate(task.size, weight=cfg.prior, exit_weight=cfg.exit_prior)
         self._rng = np.random.default_rng(derive(seed, "learned_kernel"))
         self._chooses, self._warm_up = cfg.sensing == "chosen", cfg.warm_up
         self._iteration, self._spent = 0, np.zeros(2)
@@ -51,7 +53,7 @@ class LearnedKernel:
         """Take in one batch `[B, time]`, plan, and choose the sets of the next one."""
         self._iteration += 1
         if batch is not None:
-            self._estimate.add(observed_paths(batch, self.task.num_cells))
+            self._estimate.add(observed_paths(batch, self.task))
             self._spent += [batch.numel(), _sensors_on(batch)]
         self._estimate.fit(self.cfg.rounds_at_end if self._iteration == self.iterations else self.cfg.rounds)
         chains = search.solve(self._world(self._estimate.mean())).dense()
@@ -61,7 +63,7 @@ class LearnedKernel:
             self.policy.chains.copy_(torch.as_tensor(drawn))
         return self._diagnostics(chains)
 
-    def _world(self, kernel: Array) -> World:
+    def _world(self, kernel: sparse.csr_array) -> World:
         """The task with the `[M, M + 1]` kernel believed."""
         task = self.task
         return World(
@@ -100,7 +102,7 @@ class LearnedKernel:
         self.actor.chains.copy_(state["actor"])
 
 
-def observed_paths(batch: TensorDictBase, num_cells: int) -> Paths:
+def observed_paths(batch: TensorDictBase, task: Task) -> ObservedPaths:
     """The paths that end in a collected batch `[B, time]`: from a detection to the next one or to the exit.
 
     Read is only what the tracker saw: where and when it located the target, its own sets, and that the target left.
@@ -108,9 +110,16 @@ def observed_paths(batch: TensorDictBase, num_cells: int) -> Paths:
     after = batch["next"]
     exited = after["terminated"].squeeze(-1)
     ended = exited | (after["steps_since_detection"] == 0)
-    end = torch.where(exited, num_cells, after["last_cell"])
-    parts = (batch["last_cell"], batch["steps_since_detection"], batch["action_history"], end)
-    return Paths(*(part[ended].cpu().numpy() for part in parts))
+    start, misses, history = (batch[key][ended] for key in ("last_cell", "steps_since_detection", "action_history"))
+    end = torch.where(exited, task.num_cells, after["last_cell"])[ended]
+    # Sensors are numbered within the window of the located cell; those outside the grid sense nothing.
+    path, miss, sensor = history.nonzero(as_tuple=True)
+    cell = sensor if task.window is None else Window.of(task, history.device).around(start)[path, sensor]
+    row, inside = path * history.shape[1] + miss, cell < task.num_cells
+    places = (row[inside].cpu().numpy(), cell[inside].cpu().numpy())
+    shape = (len(start) * history.shape[1], task.num_cells)
+    sensed = sparse.csr_array((np.ones(len(places[0]), dtype=bool), places), shape=shape)
+    return ObservedPaths(start.cpu().numpy(), misses.cpu().numpy(), sensed, end.cpu().numpy())
 
 
 def _sensors_on(batch: TensorDictBase) -> float:

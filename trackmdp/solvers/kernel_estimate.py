@@ -2,6 +2,9 @@
 
 A miss tells that the target is among the cells not sensed, and no more. Expectation-maximisation shares each such
 path among the moves it may have been (a forward and a backward pass), so that chosen sets give consistent estimates.
+
+Counts and kernels are sparse, `[M, M + 1]` with the exit in the last column: their memory follows the moves that were
+seen, and those that the prior adds, which puts the displacements seen anywhere down at every cell.
 """
 
 from __future__ import annotations
@@ -11,73 +14,102 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from trackmdp.solvers.renewal import IndexArray
-from trackmdp.world.model import Array, BoolArray
+from trackmdp.solvers.renewal import IndexArray, row_index
+from trackmdp.world.model import Array, grid_size
 
-__all__ = ["KernelEstimate", "Paths"]
-
+__all__ = ["KernelEstimate", "ObservedPaths"]
 
 OPEN = 0.01
 """Share of the first round's kernel that allows moves not seen yet."""
 NEGLIGIBLE = 1e-3
 """Expected number of moves that is none."""
-_PARTS = ("start", "misses", "sensed", "end")
 
 
 @dataclass(frozen=True)
-class Paths:
+class ObservedPaths:
     """K observed paths from one detection to the next.
 
     Attributes:
         start: `[K]`, located cell.
         misses: `[K]`, n, how often the target was missed on the way.
-        sensed: `[K, t_max + 1, M]`, the sets of those misses; slots n and later are not read.
+        sensed: `[K * (t_max + 1), M]` sparse bool; row `k * (t_max + 1) + t` is the set of the miss t of path k. Rows
+            of t >= n are not read.
         end: `[K]`, where it was located next; M once it had exited.
     """
 
     start: IndexArray
     misses: IndexArray
-    sensed: BoolArray
+    sensed: sparse.csr_array
     end: IndexArray
+
+    @property
+    def choices(self) -> int:
+        """t_max + 1."""
+        return int(self.sensed.shape[0] // max(len(self.start), 1))
+
+    def pick(self, paths: IndexArray) -> ObservedPaths:
+        """The `paths` of these numbers, in their order."""
+        rows = (paths[:, None] * self.choices + np.arange(self.choices)).ravel()
+        return ObservedPaths(self.start[paths], self.misses[paths], self.sensed[rows], self.end[paths])
 
 
 class KernelEstimate:
     """Posterior of the kernel, row by row: Dirichlet over the next cell, Beta for the exit.
 
     The prior of a row is the target's mean behaviour, all rows pooled: the displacements seen so far, as far as they
-    stay in the grid, and the pooled exit probability.
+    stay in the grid (where none does, all cells as near as the farthest move seen), and the pooled exit probability.
 
     Args:
-        size: N.
+        size: (rows, columns), or one number for a square.
         weight: the prior counts as much as this many moves.
         exit_weight: the pooled exit probability counts as much as this many moves.
+
+    Attributes:
+        direct: `[M, M + 1]`, moves seen at once.
+        counts: `[M, M + 1]`, moves seen, and those of censored paths at their expectation.
     """
 
-    def __init__(self, size: int, *, weight: float, exit_weight: float) -> None:
-        self.size, self.weight, self.exit_weight = size, weight, exit_weight
-        m = size**2
-        self.direct = np.zeros((m, m + 1))
+    def __init__(self, size: int | tuple[int, int], *, weight: float, exit_weight: float) -> None:
+        self.rows, self.columns = grid_size(size)
+        self.weight, self.exit_weight = weight, exit_weight
+        self.num_cells = self.rows * self.columns
+        self.direct = sparse.csr_array((self.num_cells, self.num_cells + 1))
         self.counts = self.direct
-        self._censored: list[Paths] = []
+        self._censored: list[ObservedPaths] = []
 
-    def add(self, paths: Paths) -> None:
+    def add(self, paths: ObservedPaths) -> None:
         """Take note of `paths`."""
         at_once = paths.misses == 0
-        np.add.at(self.direct, (paths.start[at_once], paths.end[at_once]), 1.0)
-        rest = ~at_once
-        if rest.any():
-            self._censored.append(Paths(paths.start[rest], paths.misses[rest], paths.sensed[rest], paths.end[rest]))
+        self.add_moves(paths.start[at_once], paths.end[at_once])
+        if not at_once.all():
+            self._censored.append(paths.pick(np.flatnonzero(~at_once)))
+
+    def add_moves(self, start: IndexArray, end: IndexArray) -> None:
+        """Take note of moves `[K]` that were seen; `end` is M at the exit."""
+        unfitted = self.counts is self.direct
+        self.direct = self.direct + _counted(start, end, np.ones(len(start)), self.direct.shape)
+        self.counts = self.direct if unfitted else self.counts
 
     def state(self) -> dict[str, np.ndarray]:
-        """All that was observed, and the counts so far."""
-        parts = self._censored or [_no_paths(self.size**2)]
-        merged = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _PARTS}
-        return {"direct": self.direct, "counts": self.counts, **merged}
+        """All that was observed, and the counts so far, as plain arrays."""
+        merged = _joined(self._censored) if self._censored else _no_paths(self.num_cells)
+        parts = {"start": merged.start, "misses": merged.misses, "end": merged.end}
+        matrices = {"direct": self.direct, "counts": self.counts, "sensed": merged.sensed}
+        for name, matrix in matrices.items():
+            parts |= {f"{name}_{part}": getattr(matrix, part) for part in ("data", "indices", "indptr")}
+        return parts
 
     def load_state(self, state: dict[str, np.ndarray]) -> None:
         """Continue from a `state`."""
-        self.direct, self.counts = state["direct"].copy(), state["counts"].copy()
-        self._censored = [Paths(*(state[name].copy() for name in _PARTS))] if len(state["start"]) else []
+
+        def matrix(name: str, columns: int) -> sparse.csr_array:
+            parts = tuple(state[f"{name}_{part}"].copy() for part in ("data", "indices", "indptr"))
+            return sparse.csr_array(parts, shape=(len(parts[2]) - 1, columns))
+
+        m = self.num_cells
+        self.direct, self.counts = matrix("direct", m + 1), matrix("counts", m + 1)
+        start, misses, end = (state[name].copy() for name in ("start", "misses", "end"))
+        self._censored = [ObservedPaths(start, misses, matrix("sensed", m), end)] if len(start) else []
 
     def fit(self, rounds: int) -> None:
         """Share the censored paths among the moves, `rounds` times, each time by the kernel found before.
@@ -86,28 +118,28 @@ class KernelEstimate:
         never leaves a probability of zero.
         """
         if not self._censored:
-            self.counts = self.direct.copy()
+            self.counts = self.direct.copy()  # a fit of its own, not what is added later
             return
-        paths, copies = _merge(self._censored)
+        paths, copies = _merged(_joined(self._censored))
         for first in [True, *[False] * (rounds - 1)]:
             kernel = (1.0 - OPEN) * self.mean() + OPEN * self._open_moves(paths) if first else self.mean()
             self.counts = self.direct + _expected_moves(kernel, paths, copies)
-        self.counts[self.counts < NEGLIGIBLE] = 0.0
+        counts = self.counts.copy()
+        counts.data[counts.data < NEGLIGIBLE] = 0.0
+        counts.eliminate_zeros()
+        self.counts = counts
 
-    def mean(self) -> Array:
+    def mean(self) -> sparse.csr_array:
         """`[M, M + 1]` posterior mean; the last column is the exit."""
         moves, exits = self._parameters()
-        stay = moves / moves.sum(axis=1, keepdims=True)
-        leave = exits[:, :1] / exits.sum(axis=1, keepdims=True)
-        return np.hstack([stay * (1.0 - leave), leave])
+        return self._kernel(moves, exits[:, 0] / exits.sum(axis=1))
 
-    def sample(self, rng: np.random.Generator) -> Array:
+    def sample(self, rng: np.random.Generator) -> sparse.csr_array:
         """`[M, M + 1]` one kernel drawn from the posterior, censored paths taken at their expected moves."""
         moves, exits = self._parameters()
-        weights = np.zeros_like(moves)
-        weights[moves > 0] = rng.standard_gamma(moves[moves > 0]) + 1e-300
-        leave = rng.beta(exits[:, :1], exits[:, 1:])
-        return np.hstack([weights / weights.sum(axis=1, keepdims=True) * (1.0 - leave), leave])
+        # A Dirichlet draw is a row of gamma draws, scaled to 1; 1e-300 keeps a row of tiny parameters from 0 / 0.
+        moves.data = rng.standard_gamma(moves.data) + 1e-300
+        return self._kernel(moves, rng.beta(exits[:, 0], exits[:, 1]))
 
     @property
     def visits(self) -> Array:
@@ -115,80 +147,140 @@ class KernelEstimate:
         visits: Array = self.counts.sum(axis=1)
         return visits
 
-    def _parameters(self) -> tuple[Array, Array]:
+    def _kernel(self, moves: sparse.csr_array, leave: Array) -> sparse.csr_array:
+        """`[M, M + 1]` from weights of the moves and `[M]` exit probabilities."""
+        scale = (1.0 - leave) / moves.sum(axis=1)
+        stay = sparse.csr_array((moves.data * scale[row_index(moves)], moves.indices, moves.indptr), shape=moves.shape)
+        return sparse.csr_array(sparse.hstack([stay, sparse.csr_array(leave[:, None])], format="csr"))
+
+    def _parameters(self) -> tuple[sparse.csr_array, Array]:
         """Dirichlet parameters `[M, M]` of the moves and Beta parameters `[M, 2]` of the exit."""
-        moved, left = self.counts[:, :-1], self.counts[:, -1]
+        moved, left = self.counts[:, :-1], self.counts[:, [-1]].toarray()[:, 0]
         pooled = (left.sum() + 0.5) / (self.counts.sum() + 1.0)
         exits = np.stack([left + self.exit_weight * pooled, moved.sum(axis=1) + self.exit_weight * (1 - pooled)], 1)
-        return moved + self.weight * self._typical_moves(moved), exits
+        moves = sparse.csr_array(moved + self.weight * self._typical_moves(sparse.csr_array(moved)))
+        moves.eliminate_zeros()
+        moves.sort_indices()  # draws are made entry by entry, row by row
+        return moves, exits
 
-    def _open_moves(self, paths: Paths) -> Array:
+    def _open_moves(self, paths: ObservedPaths) -> sparse.csr_array:
         """`[M, M + 1]` uniform over the cells that one move may reach, judging by the fastest path seen."""
-        n, cells = self.size, np.arange(self.size**2)
-        away = np.maximum(np.abs(cells[:, None] // n - cells // n), np.abs(cells[:, None] % n - cells % n))
-        inside = paths.end < len(cells)
-        gone = away[paths.start[inside], paths.end[inside]]
-        reach = max(
-            np.ceil(gone / (paths.misses[inside] + 1)).max(initial=1), away[self.direct[:, :-1] > 0].max(initial=1)
-        )
-        near = away <= reach + 1
-        return np.hstack([near / near.sum(axis=1, keepdims=True), np.zeros((len(cells), 1))])
+        inside = paths.end < self.num_cells
+        gone = self._distance(paths.start[inside], paths.end[inside])
+        fastest = np.ceil(gone / (paths.misses[inside] + 1)).max(initial=1)
+        near = self._near(int(max(fastest, self._farthest(self.direct[:, :-1]))) + 1)
+        return sparse.csr_array(sparse.hstack([near, sparse.csr_array((self.num_cells, 1))], format="csr"))
 
-    def _typical_moves(self, moved: Array) -> Array:
-        """`[M, M]` pooled displacements, put down at every cell, scaled to 1; uniform while nothing was seen."""
-        m, n = self.size**2, self.size
-        start, end = np.nonzero(moved > 1e-9)
-        if not len(start):
-            return np.full((m, m), 1.0 / m)
-        share = moved[start, end] / moved.sum(axis=1)[start]
-        shift = (end // n - start // n + n) * 2 * n + (end % n - start % n + n)
+    def _typical_moves(self, moved: sparse.csr_array) -> sparse.csr_array:
+        """`[M, M]` pooled displacements, put down at every cell, scaled to 1; see the class for where none fits."""
+        start, end, data = row_index(moved), moved.indices, moved.data
+        seen = data > 1e-9
+        start, end, share = start[seen], end[seen], (data / moved.sum(axis=1)[start])[seen]
+        # On 10 x 10 cells, 2 rows down and 1 column to the left is the shift (2 + 10) · 20 + (-1 + 10) = 249.
+        width = 2 * self.columns
+        shift = (end // self.columns - start // self.columns + self.rows) * width
+        shift = shift + end % self.columns - start % self.columns + self.columns
         shifts, place = np.unique(shift, return_inverse=True)
-        weight = np.bincount(place, weights=share)
-        rows, columns = shifts // (2 * n) - n, shifts % (2 * n) - n
-        cells = np.arange(m)
-        row, column = cells[:, None] // n + rows, cells[:, None] % n + columns
-        inside = (row >= 0) & (row < n) & (column >= 0) & (column < n)
-        typical = np.zeros((m, m))
-        origin, which = np.nonzero(inside)
-        typical[origin, (row * n + column)[inside]] = weight[which]
-        total = typical.sum(axis=1, keepdims=True)
-        return np.where(total > 0, typical / np.maximum(total, 1e-300), 1.0 / m)
+        weight = np.bincount(place, weights=share, minlength=len(shifts)).astype(np.float64)
+        typical = self._put_down(shifts // width - self.rows, shifts % width - self.columns, weight)
+        total = typical.sum(axis=1)
+        without = np.flatnonzero(total <= 0)
+        if len(without):
+            near = self._near(self._farthest(moved))
+            keep = sparse.csr_array((np.ones(len(without)), (without, without)), shape=near.shape)
+            typical, total = typical + keep @ near, np.where(total > 0, total, 1.0)
+        return sparse.csr_array(sparse.diags_array(1.0 / total) @ typical)
+
+    def _near(self, reach: int) -> sparse.csr_array:
+        """`[M, M]` uniform over the cells up to `reach` rows and columns away."""
+        row, column = (np.arange(-min(reach, side), min(reach, side) + 1) for side in (self.rows, self.columns))
+        rows, columns = (part.ravel() for part in np.meshgrid(row, column, indexing="ij"))
+        near = self._put_down(rows, columns, np.ones(len(rows)))
+        return sparse.csr_array(sparse.diags_array(1.0 / near.sum(axis=1)) @ near)
+
+    def _put_down(self, rows: IndexArray, columns: IndexArray, weight: Array) -> sparse.csr_array:
+        """`[M, M]` displacements `[S]` from every cell, those that leave the grid left out."""
+        cells = np.arange(self.num_cells)
+        row, column = cells[:, None] // self.columns + rows, cells[:, None] % self.columns + columns
+        inside = (row >= 0) & (row < self.rows) & (column >= 0) & (column < self.columns)
+        start, which = np.nonzero(inside)
+        end = (row * self.columns + column)[inside]
+        return _counted(start, end, weight[which], (self.num_cells, self.num_cells))
+
+    def _farthest(self, moved: sparse.csr_array) -> int:
+        """Rows or columns of the farthest move seen, at least 1."""
+        moved = sparse.csr_array(moved)
+        return int(self._distance(row_index(moved), moved.indices)[moved.data > 0].max(initial=1))
+
+    def _distance(self, start: IndexArray, end: IndexArray) -> IndexArray:
+        rows, columns = start // self.columns - end // self.columns, start % self.columns - end % self.columns
+        return np.maximum(np.abs(rows), np.abs(columns))
 
 
-def _no_paths(cells: int) -> Paths:
+def _counted(start: IndexArray, end: IndexArray, weight: Array, shape: tuple[int, int]) -> sparse.csr_array:
+    """Sums of `weight` over equal (start, end)."""
+    return sparse.csr_array((weight, (start, end)), shape=shape)
+
+
+def _no_paths(cells: int) -> ObservedPaths:
     none = np.zeros(0, dtype=np.int64)
-    return Paths(none, none, np.zeros((0, 1, cells), dtype=bool), none)
+    return ObservedPaths(none, none, sparse.csr_array((0, cells), dtype=bool), none)
 
 
-def _merge(parts: list[Paths]) -> tuple[Paths, Array]:
-    """All paths, equal ones once, and how often each occurs."""
-    start = np.concatenate([part.start for part in parts])
-    misses = np.concatenate([part.misses for part in parts])
-    end = np.concatenate([part.end for part in parts])
-    sensed = np.concatenate([part.sensed for part in parts])
-    sensed &= np.arange(sensed.shape[1])[:, None] < misses[:, None, None]
-    bits = np.packbits(sensed.reshape(len(start), -1), axis=1)
-    keys = np.hstack([np.stack([start, misses, end], axis=1).astype(np.int64).view(np.uint8), bits])
+def _joined(parts: list[ObservedPaths]) -> ObservedPaths:
+    """All paths of `parts`, one after the other."""
+    start, misses, end = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("start", "misses", "end")
+    )
+    return ObservedPaths(start, misses, sparse.csr_array(sparse.vstack([part.sensed for part in parts])), end)
+
+
+def _merged(paths: ObservedPaths) -> tuple[ObservedPaths, Array]:
+    """Equal paths once, and how often each occurs.
+
+    Sets are told apart by two sums of 64 random bits per (miss, cell): unequal ones agree with probability 2^-128.
+    """
+    choices, m = paths.choices, paths.sensed.shape[1]
+    path, miss = np.divmod(row_index(paths.sensed), choices)
+    read = miss < paths.misses[path]
+    marks = np.random.default_rng(0).integers(2**63, size=(2, choices * m), dtype=np.uint64)
+    sums = np.zeros((2, len(paths.start)), dtype=np.uint64)
+    for mark, total in zip(marks, sums, strict=True):  # unsigned sums wrap around, which is what is wanted
+        np.add.at(total, path[read], mark[(miss * m + paths.sensed.indices)[read]])
+    keys = np.stack([*(part.astype(np.uint64) for part in (paths.start, paths.misses, paths.end)), *sums], axis=1)
     _, first, copies = np.unique(keys, axis=0, return_index=True, return_counts=True)
-    return Paths(start[first], misses[first], sensed[first], end[first]), copies.astype(np.float64)
+    return paths.pick(first), copies.astype(np.float64)
 
 
-def _expected_moves(kernel: Array, paths: Paths, copies: Array) -> Array:
-    """`[M, M + 1]` expected moves on the censored paths, given the kernel."""
-    m = len(kernel)
-    moves, counts = sparse.csr_array(kernel[:, :-1]), np.zeros_like(kernel)
+def _expected_moves(kernel: sparse.csr_array, paths: ObservedPaths, copies: Array) -> sparse.csr_array:
+    """`[M, M + 1]` expected moves on the censored paths, given the kernel.
+
+    With f_t the mass that goes on undetected and l_t the likelihood of what is seen later, the move i -> j at step t of
+    a path is made with probability f_t(i) P_ij l_{t+1}(j) / (likelihood of the path); P_ij is multiplied in at the end.
+    """
+    m = kernel.shape[0]
+    moves, backward = sparse.csr_array(kernel[:, :-1]), sparse.csr_array(kernel.T)
+    expected = sparse.csr_array(kernel.shape)
     for n in np.unique(paths.misses):
-        rows = np.flatnonzero(paths.misses == n)
-        hidden = ~paths.sensed[rows, :n]
-        forward = [np.eye(m)[paths.start[rows]]]
+        part = np.flatnonzero(paths.misses == n)
+        some, each = paths.pick(part), np.arange(len(part))
+        sensed = [some.sensed[t :: some.choices].astype(np.float64) for t in range(n)]
+        forward = [_counted(each, some.start, np.ones(len(part)), (len(part), m))]
         for t in range(n):
-            forward.append((forward[t] @ moves) * hidden[:, t])
-        later = kernel[:, paths.end[rows]].T
-        weight = copies[rows] / np.maximum((forward[n] * later).sum(axis=1), 1e-300)
-        arrivals = sparse.csr_array((weight, (np.arange(len(rows)), paths.end[rows])), shape=(len(rows), m + 1))
-        counts += (arrivals.T @ forward[n]).T
+            forward.append(_hidden(forward[t] @ moves, sensed[t]))
+        later = backward[some.end]
+        weight = copies[part] / np.maximum(forward[n].multiply(later).sum(axis=1), 1e-300)
+        expected = expected + forward[n].T @ _counted(each, some.end, weight, (len(part), m + 1))
         for t in range(n - 1, -1, -1):
-            later = later * hidden[:, t]
-            counts[:, :-1] += (forward[t] * weight[:, None]).T @ later
+            later = _hidden(later, sensed[t])
+            moved = sparse.csr_array(forward[t].T @ (sparse.diags_array(weight) @ later))
+            expected = expected + sparse.hstack([moved, sparse.csr_array((m, 1))], format="csr")
             later = later @ moves.T
-    return counts * kernel
+    return sparse.csr_array(sparse.csr_array(expected).multiply(kernel))
+
+
+def _hidden(mass: sparse.csr_array, sensed: sparse.csr_array) -> sparse.csr_array:
+    """`mass` where nothing is sensed."""
+    left = sparse.csr_array(mass - mass.multiply(sensed))
+    left.eliminate_zeros()
+    return left

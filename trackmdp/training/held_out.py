@@ -7,7 +7,7 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
+from scipy import sparse
 
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import qmdp
@@ -58,7 +58,7 @@ class HeldOutEvaluator(Evaluator):
     def references(self) -> dict[str, PolicyTable]:
         """The policies to hold a learned one against, by their names in tables."""
         task = self.world
-        kernel = estimated_kernel(task.tracks, task.rows)
+        kernel = estimated_kernel(task.tracks, task.size)
         world = World(kernel, task.size, cost=task.cost, safe_cost=task.safe_cost, t_max=task.t_max, reward=task.reward)
         return {
             "all on": PolicyTable.all_on(task),
@@ -76,14 +76,13 @@ class HeldOutEvaluator(Evaluator):
         return {"tracks": len(self.tracks), "learned_from": len(self.world.tracks), "figures": figures}
 
 
-def estimated_kernel(tracks: Tracks, size: int) -> npt.NDArray[np.float64]:
+def estimated_kernel(tracks: Tracks, size: tuple[int, int]) -> sparse.csr_array:
     """`[M, M]` the motion as `tracks` show it: posterior mean, the prior of a row counting as one move."""
-    m = size**2
     estimate = KernelEstimate(size, weight=1.0, exit_weight=1.0)
-    line = tracks.closed(m)
+    line = tracks.closed(estimate.num_cells)
     moves = np.ones(len(line.cells), dtype=bool)
     moves[line.first[1:] - 1] = False
     at = np.flatnonzero(moves)
-    np.add.at(estimate.direct, (line.cells[at], line.cells[at + 1]), 1.0)
-    estimate.counts = estimate.direct
-    return estimate.mean()[:, :-1]
+    estimate.add_moves(line.cells[at], line.cells[at + 1])
+    estimate.fit(1)
+    return sparse.csr_array(estimate.mean()[:, :-1])
