@@ -58,6 +58,7 @@ from trackmdp.config.roots import (
     VerifyConfig,
     WorldConfig,
 )
+from trackmdp.config.schema import ChoiceConfig, NodeConfig, Sizes
 from trackmdp.config.tree import from_hydra, load_config, load_run_config, to_dict, to_yaml, world_of
 from trackmdp.config.world import (
     CostConfig,
@@ -82,6 +83,7 @@ __all__ = [
     "BaselineConfig",
     "BenchmarkConfig",
     "CheckpointConfig",
+    "ChoiceConfig",
     "ClockedConfig",
     "CollectorConfig",
     "CommandConfig",
@@ -105,6 +107,7 @@ __all__ = [
     "MultiSyncConfig",
     "MyopicConfig",
     "NoSensorsConfig",
+    "NodeConfig",
     "OptimalConfig",
     "OptimalBoundConfig",
     "Option",
@@ -123,6 +126,7 @@ __all__ = [
     "ReportConfig",
     "ScheduleConfig",
     "SingleConfig",
+    "Sizes",
     "SolveConfig",
     "TableConfig",
     "TensorboardConfig",

@@ -31,7 +31,7 @@ __all__ = ["conf_dir", "conf_file", "load_plugins", "make", "maker", "plugin_fol
 ENTRY_POINTS = "trackmdp.plugins"
 
 
-def maker(node: ChoiceConfig) -> Callable[..., Any]:
+def maker(node: ChoiceConfig | type[ChoiceConfig]) -> Callable[..., Any]:
     """What a choice makes, imported now: the kernel's function, the learner's class, ...
 
     Raises:

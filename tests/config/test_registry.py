@@ -1,0 +1,30 @@
+"""Every choice names what it makes, and a choice is the only place that says so."""
+
+from __future__ import annotations
+
+import pytest
+
+from trackmdp.config import GROUPS, ChoiceConfig
+from trackmdp.config.registry import conf_file, maker
+from trackmdp.errors import UserError
+
+CHOICES = [(group, name) for group, names in GROUPS.items() for name in names]
+
+
+@pytest.mark.parametrize(("group", "name"), CHOICES)
+def test_what_a_choice_makes_is_there(group: str, name: str) -> None:
+    schema = GROUPS[group][name]
+    assert schema.name == name
+    assert callable(maker(schema))
+    assert conf_file(f"{group}/{name}").is_file()
+
+
+def test_what_is_not_there_is_one_line() -> None:
+    class Absent(ChoiceConfig):
+        name = "absent"
+        makes = "trackmdp.world.kernels:no_such_kernel"
+
+    with pytest.raises(UserError, match=r"absent: cannot be made, trackmdp\.world\.kernels:no_such_kernel: module"):
+        maker(Absent)
+    with pytest.raises(UserError, match="kernel/no_such_kernel: no such config"):
+        conf_file("kernel/no_such_kernel")
