@@ -2,9 +2,12 @@
 
     import trackmdp as tm
 
-    world = tm.make_world("random_support", size=10, cost=0.16)
-    run = tm.train(world, "hindsight", seed=0)
-    env = tm.TrackEnv(world, 64)
+    world = tm.make_world("random_support", size=10, support_size=5, cost=0.16, t_max=1)
+    run = tm.train(world, "hindsight", seed=0)               # policy, evaluation, metrics; no folder needed
+    best = tm.solve(world)                                   # policy, lower, upper, certified
+    tm.evaluate(world, run.policy)                           # exact figures
+    episodes = tm.simulate(world, run.policy, 100, seed=0)   # what the log, the page and the picture are made of
+    env = tm.TrackEnv(world, 64)                             # TorchRL; any batch size
 
 Every name below is imported from its module when it is first used: ``import trackmdp`` loads neither torch nor scipy.
 """

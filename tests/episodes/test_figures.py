@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from tests.helpers import BASELINES, algorithm, evaluate_config, hop_world, limited, small_world
-from trackmdp.build import make_baseline
 from trackmdp.episodes.figures import Simulation
 from trackmdp.episodes.simulate import simulate
 from trackmdp.policies.policy import Policy, as_policy
+from trackmdp.solvers.solve import baseline_policy
 from trackmdp.training.evaluator import ExactEvaluator
 from trackmdp.world.make import build_world
 from trackmdp.world.model import World
@@ -36,10 +36,7 @@ def test_exact_and_simulated_figures_agree_for_every_baseline(name: str, max_ste
     words = ("grid.size=3", "grid.t_max=2", "kernel.exit_probability=0.2", "cost.sensor=0.25", f"baseline={name}")
     cfg = evaluate_config(*words)
     world = limited(build_world(cfg), max_steps)
-    chains = make_baseline(cfg.baseline, world)
-    policy = Policy.from_dense(world, chains)
-    if not policy.deterministic:
-        policy = Policy.random_k(world, cfg.baseline.k)
+    policy = baseline_policy(world, cfg.baseline)
     assert_close(world, policy, simulate(world, policy, 10_000, seed=3).figures())
 
 

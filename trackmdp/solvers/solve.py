@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from inspect import signature
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from trackmdp.config.baselines import BaselineConfig
 from trackmdp.config.compose import compose, default, given
@@ -13,8 +13,12 @@ from trackmdp.config.registry import make, maker
 from trackmdp.errors import UserError
 from trackmdp.solvers.solution import SearchProgress, Solution, bracketed
 from trackmdp.world.model import World
+from trackmdp.world.tracks import Problem
 
-__all__ = ["run_solver", "solve"]
+if TYPE_CHECKING:  # torch is loaded where a policy is to act
+    from trackmdp.policies.policy import Policy
+
+__all__ = ["baseline_policy", "run_solver", "solve"]
 
 
 def solve(
@@ -60,3 +64,17 @@ def run_solver(
     started = time.monotonic()
     made = make(choice, world, **watched)
     return made if isinstance(made, Solution) else bracketed(world, made, time.monotonic() - started)
+
+
+def baseline_policy(problem: Problem, choice: BaselineConfig) -> Policy:
+    """The policy of a fixed rule or of a solver.
+
+    Raises:
+        UserError: it needs a motion model, and recorded tracks have none.
+    """
+    from trackmdp.policies.policy import as_policy
+
+    if choice.reads_motion and not isinstance(problem, World):
+        raise UserError(f"baseline={choice.name}: needs a motion model; recorded tracks have none")
+    made = make(choice, problem)
+    return made.policy if isinstance(made, Solution) else as_policy(problem, made)

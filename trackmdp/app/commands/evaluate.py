@@ -11,8 +11,7 @@ from rich.console import Console
 
 from trackmdp.app.commands import held_out, playback
 from trackmdp.app.commands.trained import trained
-from trackmdp.build import make_baseline
-from trackmdp.config import EvaluateConfig, McapConfig, PlaybackConfig, RandomKConfig, load_run_config, to_yaml
+from trackmdp.config import EvaluateConfig, McapConfig, PlaybackConfig, load_run_config, to_yaml
 from trackmdp.durable import write_json, write_text
 from trackmdp.episodes.batch import Episodes
 from trackmdp.episodes.figures import Simulation
@@ -21,6 +20,7 @@ from trackmdp.episodes.simulate import simulate
 from trackmdp.policies.policy import Policy
 from trackmdp.reports.picture import draw
 from trackmdp.solvers import estimator
+from trackmdp.solvers.solve import baseline_policy
 from trackmdp.training.devices import make_device
 from trackmdp.training.display import make_console, table
 from trackmdp.training.evaluator import ExactEvaluator, Score, figures
@@ -93,9 +93,7 @@ def _trained(cfg: EvaluateConfig, device: torch.device) -> tuple[Problem, Policy
 def _baseline(cfg: EvaluateConfig, problem: Problem | None) -> tuple[Problem, Policy, str]:
     assert cfg.baseline is not None
     world = make_problem(cfg) if problem is None else problem
-    if isinstance(cfg.baseline, RandomKConfig):
-        return world, Policy.random_k(world, cfg.baseline.k), cfg.baseline.name
-    return world, Policy.from_dense(world, make_baseline(cfg.baseline, world)), cfg.baseline.name
+    return world, baseline_policy(world, cfg.baseline), cfg.baseline.name
 
 
 def _report(subject: str, evaluator: ExactEvaluator, score: Score, simulation: Simulation | None) -> dict[str, Any]:
