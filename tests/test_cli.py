@@ -106,6 +106,8 @@ def test_unknown_credit_is_refused(algo: str, bad: str, capsys: pytest.CaptureFi
         ("train hydra.searchpath=[pkg://os]", "hydra.searchpath=pkg://os: expected a folder"),
         ("train hydra.searchpath=[nowhere]", "hydra.searchpath nowhere: no such folder"),
         ("train -m seed=0,1 hydra/launcher=basic,joblib", "hydra/launcher=basic,joblib: expected one launcher"),
+        (f"train seed={'1' * 5000}", f"seed={'1' * 5000}: expected option=value"),
+        (f"train quiet=true device=cuda:{'9' * 20}", f"device=cuda:{'9' * 20}: no such device"),
         ("train hydra.sizzle=1", "Could not override 'hydra.sizzle': Key 'sizzle' not in 'HydraConf'"),
         ("evaluate", "expected exactly one of run=FOLDER and baseline=NAME, got neither"),
         ("evaluate run=nowhere", "run="),

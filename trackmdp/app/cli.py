@@ -79,6 +79,12 @@ def _dispatch(words: list[str]) -> int:
         else:
             sys.stderr.write(f"trackmdp {command}: {_printable(f'{error.filename}: {error.strerror}')}\n")
         return FAILED
+    except (MemoryError, RuntimeError) as error:
+        if not isinstance(error, MemoryError) and "can't allocate memory" not in str(error):  # torch's own words
+            traceback.print_exc()
+        else:
+            sys.stderr.write(f"trackmdp {command}: not enough memory for what is asked for\n")
+        return FAILED
     except Exception:  # a bug: whoever reads it needs all of it
         traceback.print_exc()
         return FAILED

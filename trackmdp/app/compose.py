@@ -16,7 +16,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+from omegaconf.errors import OmegaConfBaseException
 
 from trackmdp.app.diagnose import diagnose
 from trackmdp.app.sources import searched
@@ -27,7 +27,7 @@ from trackmdp.config.resolvers import register_resolvers
 from trackmdp.config.untrusted import names_code
 from trackmdp.errors import UserError
 
-__all__ = ["Composer", "folder_of", "run_words", "register"]
+__all__ = ["Composer", "run_words", "register"]
 
 _LOGGING = {"class": {"logging.StreamHandler", "logging.FileHandler", "logging.NullHandler"}}
 _LOG_FILE = "${hydra.runtime.output_dir}/${hydra.job.name}.log"
@@ -124,29 +124,6 @@ class Composer:
 def run_words(words: Iterable[str]) -> list[str]:
     """The words that say something of the runs, not of Hydra."""
     return [word for word in words if not word.lstrip("+~").startswith(("hydra.", "hydra/"))]
-
-
-def folder_of(cfg: DictConfig, key: str) -> Path:
-    """The folder at a dotted key, such as ``hydra.run.dir``, its interpolations resolved.
-
-    Raises:
-        UserError: it is missing or no folder's name, or an interpolation in it leads nowhere.
-    """
-    try:
-        value = OmegaConf.select(cfg, key, throw_on_missing=True)
-    except MissingMandatoryValue:
-        value = None
-    except Exception as error:  # a resolver of `${name:...}` raises what it likes
-        said = str(error).strip().splitlines() or [type(error).__name__]
-        raise UserError(f"{key}: {said[0]}") from error
-    if not isinstance(value, str):
-        raise UserError(f"{key}: missing, expected a folder")
-    folder = Path(value)
-    try:
-        folder.exists()
-    except OSError as error:
-        raise UserError(f"{key}={value}: expected a folder that can be written to ({error.strerror})") from error
-    return folder
 
 
 def _refuse_code(cfg: DictConfig, words: Sequence[str]) -> None:

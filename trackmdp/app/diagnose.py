@@ -36,7 +36,7 @@ def diagnose(error: Exception, command: str, words: Sequence[str], compose: Comp
     for word in words:
         try:
             parsed.append(parser.parse_override(word))
-        except HydraException:
+        except (HydraException, ValueError):  # ValueError: an integer of thousands of digits
             return UserError(f"{word}: expected option=value (a value with blanks or commas needs quotes)")
     for override in parsed:
         if refusal := _renamed(override):

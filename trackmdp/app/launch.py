@@ -14,9 +14,9 @@ from hydra.core.utils import configure_log, run_job
 from hydra.types import HydraContext
 from omegaconf import DictConfig, OmegaConf, read_write
 
-from trackmdp.app.compose import Composer, folder_of, run_words
-from trackmdp.app.outputs import make_folder, remove_if_empty
-from trackmdp.app.prepare import Prepared, announce, prepare, typed_config
+from trackmdp.app.compose import Composer, run_words
+from trackmdp.app.outputs import folder_of, make_folder, remove_if_empty
+from trackmdp.app.prepare import Prepared, announce, prepare
 from trackmdp.app.questions import answer, is_question, parse
 from trackmdp.app.sweep.schema import BlocksConfig, OptunaConfig, SweeperConfig, plugin
 from trackmdp.errors import UserError
@@ -45,9 +45,7 @@ def launch(command: str, words: Sequence[str]) -> int:
 
 def _run_once(compose: Composer) -> int:
     cfg = compose(compose.words)
-    typed = typed_config(compose.command, cfg, Path.cwd())
-    folder = folder_of(cfg, "hydra.run.dir")
-    ready = prepare(compose.command, typed, folder, run_words(compose.words))
+    ready = prepare(compose.command, cfg, run_words(compose.words))
     made = make_folder("hydra.run.dir", ready.folder)
     with read_write(cfg.hydra):
         cfg.hydra.run.dir = str(ready.folder)  # a run that is resumed writes to its own

@@ -7,9 +7,35 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import MissingMandatoryValue
+
 from trackmdp.errors import UserError
 
-__all__ = ["make_folder", "remove_if_empty"]
+__all__ = ["folder_of", "make_folder", "remove_if_empty"]
+
+
+def folder_of(cfg: DictConfig, key: str) -> Path:
+    """The folder at a dotted key, such as ``hydra.run.dir``, its interpolations resolved.
+
+    Raises:
+        UserError: it is missing or no folder's name, or an interpolation in it leads nowhere.
+    """
+    try:
+        value = OmegaConf.select(cfg, key, throw_on_missing=True)
+    except MissingMandatoryValue:
+        value = None
+    except Exception as error:  # a resolver of `${name:...}` raises what it likes
+        said = str(error).strip().splitlines() or [type(error).__name__]
+        raise UserError(f"{key}: {said[0]}") from error
+    if not isinstance(value, str):
+        raise UserError(f"{key}: missing, expected a folder")
+    folder = Path(value)
+    try:
+        folder.exists()
+    except OSError as error:
+        raise UserError(f"{key}={value}: expected a folder that can be written to ({error.strerror})") from error
+    return folder
 
 
 def make_folder(key: str, folder: Path) -> list[Path]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig
 
+from trackmdp.app.outputs import folder_of
 from trackmdp.config import (
     ROOTS,
     CommandConfig,
@@ -30,7 +31,7 @@ from trackmdp.errors import UserError
 if TYPE_CHECKING:
     from trackmdp.world.tracks import Problem
 
-__all__ = ["Prepared", "announce", "prepare", "say", "shown", "typed_config"]
+__all__ = ["Prepared", "announce", "check", "prepare", "say", "shown", "typed_config"]
 
 WORLD_KEYS = ("grid", "kernel", "cost")
 
@@ -79,7 +80,17 @@ class Prepared:
         return run(self.cfg, self.folder)
 
 
-def prepare(command: str, cfg: CommandConfig, folder: Path, words: Sequence[str]) -> Prepared:
+def prepare(command: str, composed: DictConfig, words: Sequence[str]) -> Prepared:
+    """From what Hydra composed to a command that can be run in the current folder, by every check there is.
+
+    Raises:
+        UserError: an option is not allowed, or what it names is not there or not what is expected.
+    """
+    cfg = typed_config(command, composed, Path.cwd())
+    return check(command, cfg, folder_of(composed, "hydra.run.dir"), words)
+
+
+def check(command: str, cfg: CommandConfig, folder: Path, words: Sequence[str]) -> Prepared:
     """Check what the config names: runs, sweeps, files to write, tables of motion and prices.
 
     Args:

@@ -15,7 +15,7 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
-from trackmdp.app.prepare import announce, prepare
+from trackmdp.app.prepare import announce, check
 from trackmdp.app.sweep.plan import Job
 from trackmdp.errors import FAILED, USER_MISTAKE, Preempted, RunError, UserError
 
@@ -174,7 +174,7 @@ def _run(job: Job) -> Outcome:
     """Run the command; whatever it raises becomes an `Outcome`."""
     assert job.cfg is not None
     try:
-        ready = prepare(job.command, job.cfg, job.folder, job.words)
+        ready = check(job.command, job.cfg, job.folder, job.words)
         announce(job.command, ready.cfg, job.folder, job.label)
         value = ready.run()
         return Outcome(0, float(value) if isinstance(value, (int, float)) else None)
