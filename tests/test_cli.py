@@ -188,7 +188,7 @@ def test_full_error_shows_the_traceback_of_a_mistake(
     assert main(["train", "grid.size=2"]) == 2
     said = capsys.readouterr().err.splitlines()
     assert said[0].startswith("Traceback")
-    assert said[-1] == "trackmdp train: grid.size=2: expected an integer from 3 to 64 (cells)"
+    assert said[-1] == "trackmdp train: grid.size=2: expected an integer >= 3, or a pair of them (cells)"
 
 
 def test_a_run_gets_its_config_and_its_folder(

@@ -122,9 +122,9 @@ def announce(command: str, cfg: CommandConfig, folder: Path, label: str = "") ->
     if isinstance(cfg, EvaluateConfig) and cfg.run is not None:
         say(f"{label}evaluate {cfg.run} -> {shown(folder)}")
         return
-    n = cfg.grid.size
+    rows, columns = cfg.grid.sides
     seed = f", seed {cfg.seed}" if hasattr(cfg, "seed") else ""
-    where = f"on a {n}x{n} grid, T_max {cfg.grid.t_max}, kernel {cfg.kernel.name}{seed}"
+    where = f"on a {rows}x{columns} grid, T_max {cfg.grid.t_max}, kernel {cfg.kernel.name}{seed}"
     say(label + " ".join(f"{command} {what} {where} -> {shown(folder)}".split()))
 
 

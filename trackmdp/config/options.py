@@ -68,6 +68,7 @@ class Option:
     pattern: str = ""
     path: bool = False
     words: tuple[str, ...] = ()
+    pair: bool = False
     kind: Any = None
     nullable: bool = False
 
@@ -76,6 +77,7 @@ class Option:
         """What a value must be, in words: ``an integer from 3 to 64 (cells)``."""
         words = self.expects or (f"one of {', '.join(self.choices)}" if self.choices else self._kind_in_range())
         words = f"a list, each {words}" if self._element else words
+        words += ", or a pair of them" if self.pair else ""
         words += " or null" if self.nullable else ""
         return words + (f" ({self.unit})" if self.unit else "")
 
@@ -85,6 +87,8 @@ class Option:
             return self.nullable
         if self._element:
             return isinstance(value, list) and len(value) > 0 and all(map(self._element.allows, value))
+        if self.pair and isinstance(value, (list, tuple)):
+            return len(value) == 2 and all(map(dataclasses.replace(self, pair=False).allows, value))
         if self.kind is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
         if self.kind in _KINDS and type(value) is not self.kind:
@@ -132,6 +136,7 @@ def option(
     pattern: str = "",
     path: bool = False,
     words: tuple[str, ...] = (),
+    pair: bool = False,
 ) -> Any:
     """A dataclass field without a default, described for `--help` and for `validate`.
 
@@ -147,8 +152,9 @@ def option(
         pattern: regular expression that a text must match as a whole.
         path: a text is a path, relative to where the command is typed.
         words: texts that are no path although others are.
+        pair: a whole number, or a list of two; the field's type is ``Any``, as OmegaConf has no such union.
     """
-    described = Option(help, unit, ge, gt, le, lt, choices, expects, pattern, path, words)
+    described = Option(help, unit, ge, gt, le, lt, choices, expects, pattern, path, words, pair)
     return dataclasses.field(metadata={"option": described})
 
 
@@ -162,6 +168,7 @@ def options(schema: type[Any]) -> dict[str, Option | type[Any]]:
         if dataclasses.is_dataclass(kind) and isinstance(kind, type):
             found[field.name] = kind
         elif isinstance(described, Option):
+            kind = int if described.pair else kind
             found[field.name] = dataclasses.replace(described, kind=kind, nullable=nullable)
         else:
             raise TypeError(f"{schema.__name__}.{field.name} is neither an option nor a nested config")

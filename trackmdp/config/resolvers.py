@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 from omegaconf import OmegaConf
@@ -23,4 +24,7 @@ def _first_given(*values: Any) -> Any:
 
 def _per_cell(count: int, size: Any) -> int:
     """`count` for each cell of a grid of N x N cells, or of [rows, columns]."""
-    return count * (size**2 if isinstance(size, int) else math.prod(size))
+    sides = (size, size) if isinstance(size, int) else size
+    if not isinstance(sides, Sequence) or not all(isinstance(side, int) for side in sides):
+        return count  # such a size is refused when its own option is checked
+    return count * math.prod(sides)

@@ -28,16 +28,30 @@ BORDERS = ("renormalize", "inside", "clip", "exit")
 class GridConfig(NodeConfig):
     """The grid of cells, one sensor in each, and the limits on an episode."""
 
-    size: int = option("N, cells along one side; M = N² cells and sensors", unit="cells", ge=3, le=64)
+    size: Any = option(
+        "N, cells along each side, or [rows, columns]; M cells and sensors in all", unit="cells", ge=3, pair=True
+    )
     t_max: int = option("T_max: free choices at n = 0 ... t_max, then the safe action", unit="steps", ge=0, le=16)
     max_steps: int | None = option(
         "truncate an episode after so many steps; null = only the exit ends it", unit="steps", ge=1
+    )
+    window: int | None = option(
+        "W: only the sensors up to W rows and columns from the last located cell can be chosen; null = all",
+        unit="cells",
+        ge=0,
     )
 
     @property
     def num_cells(self) -> int:
         """M."""
-        return self.size**2
+        rows, columns = self.sides
+        return rows * columns
+
+    @property
+    def sides(self) -> tuple[int, int]:
+        """(rows, columns)."""
+        rows, columns = (self.size, self.size) if isinstance(self.size, int) else self.size
+        return rows, columns
 
 
 @dataclass(kw_only=True)

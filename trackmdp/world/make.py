@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from trackmdp.errors import UserError
 from trackmdp.world import kernels
 from trackmdp.world.checks import canonical_kernel, check_kernel
 from trackmdp.world.files import read_numbers
-from trackmdp.world.model import Array, World
+from trackmdp.world.model import Array, Size, World, grid_size
 from trackmdp.world.tracks import Problem, Recorded, check_tracks, read_tracks, split
 
 __all__ = ["build_world", "load_tracks", "make_problem", "make_world", "paper_cost", "recorded"]
@@ -24,12 +25,13 @@ __all__ = ["build_world", "load_tracks", "make_problem", "make_world", "paper_co
 def make_world(
     kernel: str = default("kernel"),
     *,
-    size: int | tuple[int, int] = default("grid.size"),
+    size: Size = default("grid.size"),
     t_max: int = default("grid.t_max"),
     cost: npt.ArrayLike | str = default("cost.sensor"),
     safe_cost: float | None = default("cost.safe"),
     reward: float = default("cost.reward"),
     max_steps: int | None = default("grid.max_steps"),
+    window: int | None = default("grid.window"),
     **kernel_options: Any,
 ) -> World:
     """A world with one of the motion kernels; for a table of your own take `World` itself.
@@ -45,6 +47,7 @@ def make_world(
         safe_cost: D; None: the sum of all sensors' prices.
         reward: r, earned by a detection.
         max_steps: episodes are truncated after so many steps; None: never.
+        window: W; only sensors up to W rows and columns from the last located cell can be chosen. None: all can.
         **kernel_options: the kernel's own, such as ``support_size=5`` (``trackmdp solve --help`` lists them).
 
     Raises:
@@ -54,20 +57,21 @@ def make_world(
         >>> make_world("drift", size=5, direction=90).num_cells
         25
     """
-    of_task = _task_words(size, t_max, cost, safe_cost, reward, max_steps)
+    of_task = _task_words(size, t_max, cost, safe_cost, reward, max_steps, window)
     own = {f"kernel.{name}": value for name, value in kernel_options.items()}
     return build_world(compose("solve", given({"kernel": kernel}) | of_task | own))
 
 
 def load_tracks(
     path: str | Path,
-    size: int | tuple[int, int] = default("grid.size"),
+    size: Size = default("grid.size"),
     *,
     t_max: int = default("grid.t_max"),
     cost: npt.ArrayLike | str = default("cost.sensor"),
     safe_cost: float | None = default("cost.safe"),
     reward: float = default("cost.reward"),
     max_steps: int | None = default("grid.max_steps"),
+    window: int | None = default("grid.window"),
     **track_options: Any,
 ) -> Recorded:
     """Recorded tracks in place of a motion model: most of them to learn from, the others held out to evaluate on.
@@ -80,12 +84,13 @@ def load_tracks(
         safe_cost: D.
         reward: r.
         max_steps: tracks are cut after so many steps; None: never.
+        window: W.
         **track_options: those of ``kernel=tracks``: `ends`, `starts`, `held_out`, `seed`, `min_length`, `markov`.
 
     Raises:
         UserError: the file is not of that form, a track is too short, or an option is wrong.
     """
-    of_task = _task_words(size, t_max, cost, safe_cost, reward, max_steps)
+    of_task = _task_words(size, t_max, cost, safe_cost, reward, max_steps, window)
     own = {f"kernel.{name}": value for name, value in track_options.items()}
     made = make_problem(compose("train", {"kernel": "tracks", "kernel.path": path} | of_task | own))
     assert isinstance(made, Recorded)
@@ -110,18 +115,18 @@ def build_world(cfg: WorldConfig) -> World:
     Raises:
         UserError: a file is missing or malformed, or the kernel breaks a rule (`checks.check_kernel`).
     """
-    size, source = cfg.grid.size, cfg.kernel.source
+    size, source = cfg.grid.sides, cfg.kernel.source
     options = dict(vars(cfg.kernel))
     homogeneous = options.pop("homogeneous")
-    kernel = canonical_kernel(maker(cfg.kernel)(size, **options), source)
-    check_kernel(kernel, (size, size), truncates=cfg.grid.max_steps is not None, source=source)
+    kernel = canonical_kernel(maker(cfg.kernel)(cfg.grid.size, **options), source)
+    check_kernel(kernel, size, truncates=cfg.grid.max_steps is not None, source=source)
     if homogeneous:
         kernels.check_homogeneous(kernel, size, source)
     return World(kernel, size, homogeneous=homogeneous, **_of_task(cfg))
 
 
 def recorded(
-    size: int,
+    size: Size,
     *,
     path: str,
     ends: str,
@@ -146,25 +151,27 @@ def recorded(
     return Recorded(mine, size, held_out=apart, **assumed, **of_task)
 
 
-def paper_cost(size: int, *, reward: float, sensor: float | list[float] | str, safe: float | None) -> dict[str, Any]:
+def paper_cost(size: Size, *, reward: float, sensor: float | list[float] | str, safe: float | None) -> dict[str, Any]:
     """r, c and D as arguments of `Task`.
 
     Raises:
         UserError: a file of prices is missing or malformed, or does not have one price per cell.
     """
-    return {"reward": reward, "cost": _price_per_cell(sensor, size**2), "safe_cost": safe}
+    return {"reward": reward, "cost": _price_per_cell(sensor, math.prod(grid_size(size))), "safe_cost": safe}
 
 
-def _task_words(size: Any, t_max: Any, cost: Any, safe_cost: Any, reward: Any, max_steps: Any) -> dict[str, Any]:
+def _task_words(
+    size: Any, t_max: Any, cost: Any, safe_cost: Any, reward: Any, max_steps: Any, window: Any
+) -> dict[str, Any]:
     """What was given of a task, by the names of the command line."""
-    grid = {"grid.size": size, "grid.t_max": t_max, "grid.max_steps": max_steps}
+    grid = {"grid.size": size, "grid.t_max": t_max, "grid.max_steps": max_steps, "grid.window": window}
     return given(grid | {"cost.sensor": cost, "cost.safe": safe_cost, "cost.reward": reward})
 
 
 def _of_task(cfg: WorldConfig) -> dict[str, Any]:
     """Costs and limits of a world config, as arguments of `Task`."""
     costs: dict[str, Any] = make(cfg.cost, cfg.grid.size)
-    return costs | {"t_max": cfg.grid.t_max, "max_steps": cfg.grid.max_steps}
+    return costs | {"t_max": cfg.grid.t_max, "max_steps": cfg.grid.max_steps, "window": cfg.grid.window}
 
 
 def _price_per_cell(sensor: float | list[float] | str, cells: int) -> Array:

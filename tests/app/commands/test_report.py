@@ -107,7 +107,7 @@ def test_a_sweep_as_typed_is_reported_with_what_failed(capsys: pytest.CaptureFix
     capsys.readouterr()
     assert main(["report", "sweep=all"]) == 0, capsys.readouterr().err
     lines = capsys.readouterr().out.splitlines()
-    assert "failed: grid.size=2: expected an integer from 3 to 64 (cells) and 1 more" in lines[0]
+    assert "failed: grid.size=2: expected an integer >= 3, or a pair of them (cells) and 1 more" in lines[0]
     assert lines[1].startswith("2 runs; report in")
     page = Path("all/report/report.html").read_text(encoding="utf-8")
     assert "2 of 4 planned runs" in page

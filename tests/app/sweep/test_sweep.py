@@ -67,7 +67,7 @@ def test_a_mistake_in_one_run_is_told_and_the_others_go_on(here: Path, capfd: py
     assert swept("grid.size=3,2,4,99") == 2
     assert states(here / "all") == ["done", "failed", "done", "failed"]
     captured = capfd.readouterr()
-    reason = "grid.size=2: expected an integer from 3 to 64 (cells)"
+    reason = "grid.size=2: expected an integer >= 3, or a pair of them (cells)"
     said = captured.err.splitlines()
     assert said[0].startswith("trackmdp train: size_2-")
     assert said[0].endswith(f" failed: {reason}")
