@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from trackmdp.statistics import Estimate, iqm, mean_over_groups, share
+from trackmdp.statistics import Estimate, iqm, mean_over_groups, ratio, share
 
 Draw = Callable[[np.random.Generator, int], np.ndarray]
 
@@ -88,3 +88,69 @@ def test_intervals_of_shares_cover_by_their_exact_law(chance: float, count: int)
     found = [share(part, count) for part in range(count + 1)]
     inside = [(e.low or 0.0) <= chance <= (e.high or 0.0) for e in found]
     assert stats.binom.pmf(np.arange(count + 1), count, chance) @ inside >= 0.95
+
+
+def test_a_ratio_is_that_of_the_sums_and_its_interval_is_the_same_each_time() -> None:
+    part, whole = np.array([1.0, 2.0, 6.0, 3.0]), np.array([2.0, 3.0, 9.0, 4.0])
+    found = ratio(part, whole)
+    assert (found.mean, found.n) == (12 / 18, 4)
+    assert found.low is not None
+    assert found.high is not None
+    assert found.low < 12 / 18 < found.high
+    assert found == ratio(part, whole)
+    assert ratio(part[:2], whole[:2]).low is None
+    assert math.isnan(ratio(part, np.zeros(4)).mean)
+
+
+def test_the_bootstrap_t_resamples_the_statistic() -> None:
+    """Against a loop that resamples indices and divides each time."""
+    rng = np.random.default_rng(1)
+    part, whole = rng.gamma(2.0, size=30), rng.gamma(5.0, size=30)
+    mean = part.sum() / whole.sum()
+
+    def error(p: np.ndarray, w: np.ndarray) -> float:
+        return float((p - p.sum() / w.sum() * w).std(ddof=1) / (w.mean() * np.sqrt(len(p))))
+
+    drawn = []
+    for _ in range(4000):
+        at = rng.integers(30, size=30)
+        drawn.append((part[at].sum() / whole[at].sum() - mean) / error(part[at], whole[at]))
+    low, high = np.quantile(drawn, [0.025, 0.975])
+    found = ratio(part, whole)
+    width = (high - low) * error(part, whole)
+    assert [found.low, found.high] == pytest.approx(
+        [mean - high * error(part, whole), mean - low * error(part, whole)], abs=0.1 * width
+    )
+
+
+def test_events_that_were_never_seen_may_happen_all_the_same() -> None:
+    found = ratio(np.zeros(25), np.ones(25), events=True)
+    assert (found.mean, found.low) == (0.0, 0.0)
+    assert found.high == pytest.approx(1 - 0.025 ** (1 / 25))
+    assert ratio(np.zeros(25), np.ones(25)).high == 0.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tracks", [25, 100])
+def test_intervals_over_tracks_cover(tracks: int) -> None:
+    """Tracks of 30 steps on average; how often the target is missed differs between them, and rarely it takes D."""
+    rng, trials = np.random.default_rng(2), 1000
+    hits = dict.fromkeys(["missed", "safe", "reward"], 0)
+
+    def drawn(count: int) -> dict[str, np.ndarray]:
+        steps = 1.0 + rng.geometric(1 / 30, size=count)
+        missed = rng.binomial(steps.astype(int), rng.beta(2.0, 8.0, size=count)).astype(float)
+        safe = rng.binomial(missed.astype(int), 0.05).astype(float)
+        return {"steps": steps, "missed": missed, "safe": safe, "reward": steps - missed - 3.0 * safe}
+
+    many = drawn(1_000_000)
+    truth = {name: many[name].sum() / many["steps"].sum() for name in hits}
+    for _ in range(trials):
+        sample = drawn(tracks)
+        for name in hits:
+            found = ratio(sample[name], sample["steps"], events=name != "reward")
+            assert found.low is not None
+            assert found.high is not None
+            hits[name] += found.low <= truth[name] <= found.high
+    # .93, less twice the error of the simulation, .008
+    assert min(hits.values()) / trials >= 0.93 - 0.016, hits

@@ -123,14 +123,17 @@ def test_intervals_cover_the_exact_value_19_times_of_20() -> None:
         mine = np.arange(len(tracks)) // 60 == trial
         for name, interval in replayed(world, tracks.select(mine), chains).intervals().items():
             truth = exact.aihtr / exact.expected_length if name == "reward_per_step" else getattr(exact, name)
+            assert interval.low is not None
+            assert interval.high is not None
             covered[name] += interval.low <= truth <= interval.high
-    assert all(0.90 * trials < count < 0.985 * trials for count in covered.values()), covered
+    assert all(count > 0.92 * trials for count in covered.values()), covered
+    assert all(covered[name] < 0.985 * trials for name in ("aihtr", "reward_per_step", "sensors_per_step")), covered
 
 
 def test_a_single_track_has_no_interval() -> None:
     alone = replayed(recorded(by_hand([0, 1])), by_hand([0, 1]), CHAINS).intervals()
     assert alone["aihtr"].mean == pytest.approx(0.8)
-    assert np.isnan([alone["aihtr"].low, alone["aihtr"].high]).all()
+    assert (alone["aihtr"].low, alone["aihtr"].high) == (None, None)
 
 
 def test_probabilities_give_the_mean_over_draws() -> None:

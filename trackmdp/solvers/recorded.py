@@ -11,19 +11,11 @@ from scipy.sparse.linalg import spsolve_triangular
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.evaluation import Evaluation, pooled
 from trackmdp.solvers.renewal import IndexArray
+from trackmdp.statistics import Estimate, ratio
 from trackmdp.world.model import Array, Task
 from trackmdp.world.tracks import Recorded, Tracks
 
-__all__ = ["Interval", "ReplayedTracks", "evaluate_recorded", "replay"]
-
-
-@dataclass(frozen=True)
-class Interval:
-    """A mean over tracks, or a ratio of such means, and its 95 % confidence interval (nan for a single track)."""
-
-    mean: float
-    low: float
-    high: float
+__all__ = ["ReplayedTracks", "evaluate_recorded", "replay"]
 
 
 @dataclass(frozen=True)
@@ -59,17 +51,17 @@ class ReplayedTracks:
             safe_actions=safe,
         )
 
-    def intervals(self) -> dict[str, Interval]:
+    def intervals(self) -> dict[str, Estimate]:
         """Figure -> its mean and interval, the tracks taken as independent."""
         reward, steps, detections, sensors, safe = self.totals.T
         one = np.ones_like(steps)
         return {
-            "aihtr": _interval(reward, one),
-            "reward_per_step": _interval(reward, self.length),
-            "accuracy": _interval(detections, steps),
-            "sensors_per_step": _interval(sensors, steps),
-            "safe_per_episode": _interval(safe, one),
-            "expected_length": _interval(self.length, one),
+            "aihtr": ratio(reward, one),
+            "reward_per_step": ratio(reward, self.length),
+            "accuracy": _complement(ratio(steps - detections, steps, events=True)),
+            "sensors_per_step": ratio(sensors, steps),
+            "safe_per_episode": ratio(safe, one, events=True),
+            "expected_length": ratio(self.length, one),
         }
 
 
@@ -136,16 +128,7 @@ def _renewals(
     return list(figures), (start, end, weight)
 
 
-def _interval(part: Array, whole: Array) -> Interval:
-    """Σ part / Σ whole over the tracks; its spread by the delta method, with Student's t."""
-    count, total = len(part), whole.sum()
-    if not total:
-        return Interval(np.nan, np.nan, np.nan)
-    ratio = float(part.sum() / total)
-    if count < 2:
-        return Interval(ratio, np.nan, np.nan)
-    from scipy.special import stdtrit  # a quarter of a second to load
-
-    error = (part - ratio * whole).std(ddof=1) / (total / count * np.sqrt(count))
-    margin = float(stdtrit(count - 1, 0.975) * error)
-    return Interval(ratio, ratio - margin, ratio + margin)
+def _complement(missed: Estimate) -> Estimate:
+    """1 less a share, with its interval."""
+    low, high = (None if end is None else 1.0 - end for end in (missed.high, missed.low))
+    return Estimate(1.0 - missed.mean, None if low is None else max(low, 0.0), high, missed.n)

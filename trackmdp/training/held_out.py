@@ -14,7 +14,8 @@ from trackmdp.solvers import qmdp
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.kernel_estimate import KernelEstimate
-from trackmdp.solvers.recorded import Interval, replay
+from trackmdp.solvers.recorded import replay
+from trackmdp.statistics import Estimate
 from trackmdp.training.evaluator import Evaluator, ExactEvaluator
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Problem, Recorded, Tracks
@@ -51,7 +52,7 @@ class HeldOutEvaluator(Evaluator):
         """Figures of a policy on the held-out tracks."""
         return evaluate(self.world, policy)
 
-    def intervals(self, policy: PolicyTable) -> dict[str, Interval]:
+    def intervals(self, policy: PolicyTable) -> dict[str, Estimate]:
         """Figure -> its mean over the held-out tracks with a 95 % confidence interval."""
         return replay(self.world, self.tracks, policy).intervals()
 

@@ -56,6 +56,7 @@ def show_held_out(console: Console, subject: str, report: dict[str, Any]) -> Non
     console.print(table(title, ["policy", "AIHTR", "reward per step", "accuracy", "sensors per step"], rows))
 
 
-def _shown(interval: dict[str, float], digits: int, scale: float = 1.0, unit: str = "") -> str:
-    mean, low, high = (f"{scale * interval[key]:,.{digits}f}" for key in ("mean", "low", "high"))
+def _shown(interval: dict[str, float | None], digits: int, scale: float = 1.0, unit: str = "") -> str:
+    known = [interval[key] for key in ("mean", "low", "high")]
+    mean, low, high = ("–" if value is None else f"{scale * value:,.{digits}f}" for value in known)
     return f"{mean}{unit} ({low} ... {high})"
