@@ -13,9 +13,11 @@ import torch
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from tests.episodes.logs import CONFIG, WORLD, policy, recorded, rewritten, write
+from tests.episodes.test_simulate import WINDOWED
 from trackmdp.episodes import schema
 from trackmdp.episodes.episode import first_difference
 from trackmdp.episodes.reader import EpisodeReader
+from trackmdp.episodes.recover import recover
 from trackmdp.episodes.verify import verify
 from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.errors import UserError
@@ -32,7 +34,7 @@ def test_episodes_come_back_bit_for_bit_in_any_order(log: Path) -> None:
         assert len(reader) == 30
         for number in (29, 0, 17, 16, 29):
             assert first_difference(recorded(30)[number], reader.read(number)) is None
-        expected = [episode.to_tensordict(WORLD.t_max) for episode in recorded(30)]
+        expected = [episode.to_tensordict(WORLD) for episode in recorded(30)]
         for mine, theirs in zip(expected, reader, strict=True):
             assert (mine == theirs).all()
             assert torch.equal(mine["next", "reward"], theirs["next", "reward"])
@@ -55,6 +57,23 @@ def test_a_random_policy_and_cut_episodes_come_back_too(tmp_path: Path) -> None:
         assert any(row["truncated"] for row in reader.rows)
         assert reader[0]["step_count"].tolist() == list(range(len(reader.read(0))))
     assert rewritten(file, tmp_path / "b.mcap").read_bytes() == file.read_bytes()
+
+
+@pytest.mark.parametrize("k", [None, 2])
+def test_a_rectangle_with_a_window_comes_back_and_verifies(k: int | None, tmp_path: Path) -> None:
+    acting = Policy.all_on(WINDOWED) if k is None else Policy.random_k(WINDOWED, k)
+    episodes = recorded(10, acting=acting, world=WINDOWED)
+    file = write(tmp_path / "a.mcap", episodes, acting=acting, world=WINDOWED)
+    with EpisodeReader(file) as reader:
+        assert (reader.world().size, reader.world().window) == ((3, 4), 1)
+        assert all(first_difference(a, b) is None for a, b in zip(episodes, reader.episodes(), strict=True))
+        assert verify(reader).difference is None
+        assert reader[0]["action"].shape[1:] == (9,)
+        assert reader.read(0).action.sum(1).max() <= (9 if k is None else k)
+    file.replace(tmp_path / "b.mcap.part")
+    saved = recover(tmp_path / "b.mcap.part")
+    with EpisodeReader(saved.file) as reader:
+        assert all(first_difference(a, b) is None for a, b in zip(episodes, reader.episodes(), strict=True))
 
 
 def test_it_feeds_a_replay_buffer(log: Path) -> None:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 
 from tests.episodes.logs import WORLD, policy, recorded
-from tests.helpers import hop_world, limited, small_world
+from tests.helpers import hop_world, limited, random_kernel, small_world
 from tests.tracks import by_hand
 from tests.tracks import recorded as recorded_tracks
 from trackmdp.episodes.episode import Episode, first_difference
@@ -38,13 +38,24 @@ ACTING = {
 }
 
 
-def stepped_alone(seed: int, max_steps: int | None) -> TensorDict:
+WINDOWED = World(
+    random_kernel(np.random.default_rng(0), 12, 0.04), (3, 4), cost=np.linspace(0.1, 0.3, 12), t_max=2, window=1
+)
+
+
+def in_window(share: float = 0.5) -> Policy:
+    """Some of the sensors that can be chosen."""
+    near = Policy.all_on(WINDOWED).dense()
+    return Policy.from_dense(WINDOWED, near & (np.random.default_rng(5).random(near.shape) < share))
+
+
+def stepped_alone(world: World, acting: Policy, seed: int) -> TensorDict:
     """The episode as the environment itself makes it, one row, from the same draws."""
     rng = torch.Generator().manual_seed(seed)
-    start, motion = torch.randint(16, (1,), generator=rng), Motion(WORLD.kernel)
-    env = TrackEnv(limited(WORLD, max_steps), 1)
+    start, motion = torch.randint(world.num_cells, (1,), generator=rng), Motion(world.kernel)
+    env = TrackEnv(world, 1)
     state = env.reset().set("target", start).set("last_cell", start.clone())
-    acting, steps = policy(), []
+    steps: list[TensorDict] = []
     while True:
         if len(steps) % 256 == 0:
             block = motion.draw(256, rng)
@@ -58,10 +69,14 @@ def stepped_alone(seed: int, max_steps: int | None) -> TensorDict:
 
 
 @pytest.mark.parametrize("max_steps", [None, 7])
-def test_an_episode_is_what_the_environment_makes_of_its_draws(max_steps: int | None) -> None:
-    for number, episode in enumerate(recorded(12, max_steps=max_steps)):
-        mine = episode.to_tensordict(WORLD.t_max, max_steps)
-        theirs = stepped_alone(derive(0, "episode", number), max_steps)
+@pytest.mark.parametrize("window", [None, 1])
+def test_an_episode_is_what_the_environment_makes_of_its_draws(max_steps: int | None, window: int | None) -> None:
+    """On a square, and on a rectangle of which only a window can be sensed, with actions in its own numbers."""
+    world = limited(WORLD if window is None else WINDOWED, max_steps)
+    acting = policy() if window is None else in_window()
+    for number, episode in enumerate(simulate(world, acting, 12)):
+        mine = episode.to_tensordict(world)
+        theirs = stepped_alone(world, acting, derive(0, "episode", number))
         assert set(mine.keys(True, True)) == set(theirs.keys(True, True))
         for key in theirs.keys(True, True):
             assert mine[key].dtype == theirs[key].dtype, key
@@ -72,7 +87,7 @@ def test_an_episode_is_what_the_environment_makes_of_its_draws(max_steps: int | 
 def test_its_keys_are_those_of_a_rollout(max_steps: int | None) -> None:
     env = TrackEnv(limited(WORLD, max_steps), 1)
     rollout = env.rollout(3, policy())
-    mine = recorded(1, max_steps=max_steps)[0].to_tensordict(WORLD.t_max, max_steps)
+    mine = recorded(1, max_steps=max_steps)[0].to_tensordict(limited(WORLD, max_steps))
     assert set(mine.keys(True, True)) == set(rollout.keys(True, True))
     for key in mine.keys(True, True):
         assert mine[key].dtype == rollout[key].dtype

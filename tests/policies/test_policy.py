@@ -12,10 +12,11 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from tests.helpers import ALGORITHMS, algorithm, random_state, small_world
+from tests.helpers import ALGORITHMS, algorithm, random_kernel, random_state, small_world
 from trackmdp.errors import UserError
 from trackmdp.policies import lookup, policy
 from trackmdp.policies.policy import Policy, as_policy
+from trackmdp.world.model import World
 
 WORLD = small_world(t_max=2)
 M, CHOICES = WORLD.num_cells, WORLD.num_choices
@@ -227,3 +228,68 @@ def test_a_sparse_table_is_brought_into_order_and_left_alone() -> None:
     assert (made.sets.indices == ordered.indices).all()
     assert (made.dense() == on).all()
     assert (jumbled.indices == indices).all()
+
+
+def windowed() -> World:
+    return World(random_kernel(np.random.default_rng(0), 12, 0.1), (3, 4), cost=0.2, t_max=2, window=1)
+
+
+def test_all_on_is_all_of_the_window() -> None:
+    world = windowed()
+    made = Policy.all_on(world)
+    assert made.deterministic
+    assert made.as_lists()["sets"]["0"] == [[0, 1, 4, 5]] * 3
+    assert made.as_lists()["sets"]["6"] == [[1, 2, 3, 5, 6, 7, 9, 10, 11]] * 3
+    state = {"last_cell": torch.tensor([0, 6]), "steps_since_detection": torch.tensor([0, 3])}
+    action = made(TensorDict(state, [2]))["action"]
+    assert [on.nonzero().flatten().tolist() for on in action] == [[4, 5, 7, 8], list(range(9))]
+    assert made.spent(1, world.cost) == pytest.approx(0.2 * made.dense()[:, 1].sum(1))
+    assert not Policy.none(world)(TensorDict(state, [2]))["action"].any()
+
+
+@pytest.mark.parametrize("dense_up_to", [0, policy._DENSE])
+def test_in_a_window_policies_act_and_are_asked_in_its_numbers(
+    dense_up_to: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(policy, "_DENSE", dense_up_to)
+    monkeypatch.setattr("trackmdp.policies.unroll._HISTORY_AT_ONCE", 5 * 3 * 9)
+    world = windowed()
+    near = Policy.all_on(world).dense()
+    table = near & (np.random.default_rng(0).random(near.shape) < 0.5)
+    acting = Policy.from_dense(world, table)
+    asked = TensorDictModule(
+        lambda x, n, h: (
+            acting(TensorDict({"last_cell": x, "steps_since_detection": n}, [len(x)]))["action"]
+            | h.new_ones(len(x), 1) & (torch.arange(9) == 0)
+        ),
+        in_keys=["last_cell", "steps_since_detection", "action_history"],
+        out_keys=["action"],
+    )
+    read = as_policy(world, asked).dense()
+    upper_left = np.zeros_like(near)
+    for x in range(12):
+        if x >= 5 and x % 4:
+            upper_left[x, :, x - 5] = True
+    assert (read == table | upper_left).all()
+
+
+def test_random_k_of_a_window() -> None:
+    world = windowed()
+    drawing = Policy.random_k(world, 5)
+    assert drawing.on(0, np.array([0, 6, 0]), np.array([5, 1, 2])) == pytest.approx([1.0, 5 / 9, 0.0])
+    torch.manual_seed(0)
+    state = {
+        "last_cell": torch.tensor([0, 6]).repeat(500),
+        "steps_since_detection": torch.zeros(1000, dtype=torch.int64),
+    }
+    action = drawing(TensorDict(state, [1000]))["action"]
+    assert action.shape == (1000, 9)
+    assert action.sum(1).tolist() == [4, 5] * 500
+    assert action[1::2].double().mean(0) == pytest.approx(np.full(9, 5 / 9), abs=5 * 0.5 / 500**0.5)
+
+
+def test_a_sensor_outside_the_window_is_refused() -> None:
+    on = np.zeros((12, 3, 12), dtype=bool)
+    on[0, 2, 2] = True
+    with pytest.raises(UserError, match=r"sensor 2 cannot be chosen from cell 0 with grid\.window=1"):
+        Policy.from_dense(windowed(), on)

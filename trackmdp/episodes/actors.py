@@ -21,6 +21,7 @@ from trackmdp.policies.policy import DrawsError, Policy, PolicyLike, as_policy, 
 from trackmdp.policies.unroll import Rule
 from trackmdp.world.costs import Costs
 from trackmdp.world.model import Task
+from trackmdp.world.windows import Window
 
 __all__ = ["Actor", "Asking", "Choice", "Drawing", "Following", "Issuing", "States", "Uniform", "actor_of"]
 
@@ -182,12 +183,14 @@ class Issuing:
     num_draws, most_rows, policy = 0, 256, None
 
     def __init__(self, playback: Playback, costs: Costs) -> None:
-        self._playback, self._costs = playback, costs
+        self._playback, self._costs, self._window = playback, costs, Window.of(playback.task)
 
     def decide(self, states: States, draws: Tensor) -> Choice:  # noqa: ARG002
         """See `Actor`."""
-        action = self._playback.at(states.step)
-        return _Written(action.expand(len(states.row), -1).contiguous(), self._costs)
+        action = self._playback.at(states.step).expand(len(states.row), -1).contiguous()
+        if self._window.is_local:  # what lies outside the window cannot be chosen
+            action = self._window.to_global(states.last_cell, self._window.to_local(states.last_cell, action))
+        return _Written(action, self._costs)
 
 
 class Asking:
@@ -196,10 +199,10 @@ class Asking:
     num_draws, policy = 0, None
 
     def __init__(self, task: Task, rule: Rule, costs: Costs) -> None:
-        self._rule, self._costs = rule, costs
+        self._rule, self._costs, self._window = rule, costs, Window.of(task)
         self._slots = torch.arange(task.num_choices)
-        self.most_rows = max(1, _HISTORY // (task.num_choices * task.num_cells))
-        self._history = torch.zeros(self.most_rows, task.num_choices, task.num_cells, dtype=torch.bool)
+        self.most_rows = max(1, min(_MOST_ROWS, _HISTORY // (task.num_choices * task.num_sensors)))
+        self._history = torch.zeros(self.most_rows, task.num_choices, task.num_sensors, dtype=torch.bool)
 
     def decide(self, states: States, draws: Tensor) -> Choice:  # noqa: ARG002
         """See `Actor`."""
@@ -209,7 +212,7 @@ class Asking:
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             action = self._rule(states.last_cell, states.misses, history)
         self._history[states.row, states.misses.clamp_max(len(self._slots) - 1)] = action
-        return _Written(action, self._costs)
+        return _Written(self._window.to_global(states.last_cell, action), self._costs)
 
 
 def actor_of(task: Task, policy: PolicyLike | Playback, costs: Costs) -> Actor:

@@ -11,7 +11,8 @@ import numpy.typing as npt
 import torch
 from tensordict import TensorDict
 
-from trackmdp.world.model import BoolArray
+from trackmdp.world.model import BoolArray, Task
+from trackmdp.world.windows import Window
 
 __all__ = ["Episode", "Floats", "Integers", "first_difference", "last_cells"]
 
@@ -79,21 +80,23 @@ class Episode:
         exited = self.target == self.action.shape[1]
         return (self.misses > t_max) & ~exited
 
-    def to_tensordict(self, t_max: int, max_steps: int | None = None) -> TensorDict:
+    def to_tensordict(self, task: Task) -> TensorDict:
         """`[T]` steps under the keys of `TrackEnv`, as a rollout has them: the outcome of each step under `next`.
 
         Args:
-            t_max: T_max of the world.
-            max_steps: where set, `step_count` is among the keys.
+            task: of the world; with a window actions are in its local numbers, as the environment takes them, and with
+                `max_steps` there is a `step_count`.
         """
-        history = self._history(t_max)
+        t_max, max_steps = task.t_max, task.max_steps
+        action = Window.of(task).to_local(torch.from_numpy(self.last_cell), torch.from_numpy(self.action)).numpy()
+        history = _history(action, self.misses, t_max)
         after = np.concatenate([self.misses[1:], [0]])
         after[-1] = 0 if self.located[-1] or self.terminated else self.misses[-1] + 1
         following = {
             "target": self.target,
             "last_cell": np.where(self.located, self.target, self.last_cell),
             "steps_since_detection": after,
-            "action_history": np.concatenate([history[1:], self._final_history(history[-1], t_max)[None]]),
+            "action_history": np.concatenate([history[1:], self._final_history(history[-1], action[-1], t_max)[None]]),
             "reward": self.reward[:, None],
             **_ends(len(self), self.terminated, self.truncated),
         }
@@ -102,7 +105,7 @@ class Episode:
             "last_cell": self.last_cell,
             "steps_since_detection": self.misses,
             "action_history": history,
-            "action": self.action,
+            "action": action,
             **_ends(len(self), terminated=False, truncated=False),
         }
         if max_steps:
@@ -112,20 +115,24 @@ class Episode:
         nested = TensorDict({key: torch.as_tensor(value) for key, value in following.items()}, [len(self)])
         return TensorDict({**made, "next": nested}, [len(self)])
 
-    def _history(self, t_max: int) -> BoolArray:
-        """`[T, t_max+1, M]` h before each step: slot s holds the action at s misses, empty from slot n on."""
-        slots = np.arange(t_max + 1)
-        steps = np.arange(len(self))[:, None] - self.misses[:, None] + slots
-        filled = slots < self.misses[:, None]
-        return self.action[np.where(filled, steps, 0)] & filled[..., None]
-
-    def _final_history(self, history: BoolArray, t_max: int) -> BoolArray:
-        """`[t_max+1, M]` h after the last step."""
+    def _final_history(self, history: BoolArray, action: BoolArray, t_max: int) -> BoolArray:
+        """`[t_max+1, K]` h after the last step, from h and the action before it."""
         if self.located[-1] or self.terminated:
             return np.zeros_like(history)
         kept = history.copy()
-        kept[min(int(self.misses[-1]), t_max)] = self.action[-1]
+        kept[min(int(self.misses[-1]), t_max)] = action
         return kept
+
+
+def _history(action: BoolArray, misses: Integers, t_max: int) -> BoolArray:
+    """`[T, t_max+1, K]` h before each step: slot s holds the action at s misses, empty from slot n on.
+
+    Step t with n misses before it has in slot s the action of step t - n + s.
+    """
+    slots = np.arange(t_max + 1)
+    steps = np.arange(len(misses))[:, None] - misses[:, None] + slots
+    filled = slots < misses[:, None]
+    return action[np.where(filled, steps, 0)] & filled[..., None]
 
 
 def last_cells(start: int, target: Integers, located: BoolArray) -> Integers:

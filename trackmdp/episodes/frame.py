@@ -23,9 +23,9 @@ def outcome(episode: Episode, t: int, task: Task) -> str:
     return "detected" if episode.located[t] else "missed"
 
 
-def where(cell: int, size: int) -> str:
-    """A cell in words."""
-    return f"row {cell // size + 1}, column {cell % size + 1}" if cell < size**2 else "outside"
+def where(cell: int, columns: int) -> str:
+    """A cell in words, counted from 1."""
+    return f"row {cell // columns + 1}, column {cell % columns + 1}"
 
 
 def sentence(episode: Episode, t: int, task: Task) -> str:

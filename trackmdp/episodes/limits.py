@@ -13,7 +13,7 @@ from typing import Any
 
 from trackmdp.episodes import schema
 
-__all__ = ["check_policy", "check_row", "check_run", "check_steps"]
+__all__ = ["check_policy", "check_row", "check_run", "check_steps", "size_of_grid"]
 
 _MOST = 10**9
 """Steps, episodes, T_max: beyond any log, and small enough to be multiplied without overflow."""
@@ -30,6 +30,9 @@ def check_run(run: Mapping[str, str]) -> None:
         ValueError: they do not.
     """
     _count(run, "size", 1, _LARGEST_GRID)
+    for name in ("columns", "window"):  # of rectangles, and of worlds with a window
+        if run.get(name):
+            _count(run, name, 0 if name == "window" else 1, _LARGEST_GRID)
     _count(run, "t_max", 0, _MOST)
     if run["max_steps"]:
         _count(run, "max_steps", 1, _MOST)
@@ -38,6 +41,11 @@ def check_run(run: Mapping[str, str]) -> None:
             raise ValueError(f"{name} {run[name]}")
     if not run.get("trackmdp"):
         raise ValueError("no version of trackmdp")
+
+
+def size_of_grid(run: Mapping[str, str]) -> tuple[int, int]:
+    """(rows, columns) of a log's grid; `columns` is said of rectangles alone."""
+    return int(run["size"]), int(run.get("columns") or run["size"])
 
 
 def check_policy(facts: Mapping[str, str], cells: int) -> None:

@@ -46,12 +46,13 @@ def row_of(episode: Episode, t_max: int, first_tick: int) -> dict[str, Any]:
     }
 
 
-def step_messages(episode: Episode, size: int, t_max: int) -> Iterator[bytes]:
+def step_messages(episode: Episode, size: tuple[int, int], t_max: int) -> Iterator[bytes]:
     """The `/step` messages."""
-    cells, last = size**2, len(episode) - 1
+    (rows, columns), last = size, len(episode) - 1
+    cells = rows * columns
     target = np.where(episode.target == cells, -1, episode.target)
-    x = np.where(target < 0, -1, target % size)
-    y = np.where(target < 0, -1, size - 1 - target // size)
+    x = np.where(target < 0, -1, target % columns)
+    y = np.where(target < 0, -1, rows - 1 - target // columns)
     steps, ids = np.nonzero(episode.action)
     active = [",".join(map(str, each.tolist())) for each in np.split(ids, np.searchsorted(steps, range(1, last + 1)))]
     known = (episode.misses, episode.last_cell, episode.action.sum(1), episode.forced(t_max))
@@ -67,17 +68,18 @@ def step_messages(episode: Episode, size: int, t_max: int) -> Iterator[bytes]:
         ).encode()
 
 
-def grid_messages(episode: Episode, size: int, first_tick: int) -> Iterator[bytes]:
+def grid_messages(episode: Episode, size: tuple[int, int], first_tick: int) -> Iterator[bytes]:
     """The `/grid` messages; the grid is turned upside down, since a viewer's first row is the lowest."""
-    cells = np.zeros((len(episode), size**2 + 1), _CELL)
+    rows, columns = size
+    cells = np.zeros((len(episode), rows * columns + 1), _CELL)
     cells["belief"][:, :-1] = episode.belief
     cells["policy"][:, :-1] = episode.probability
     cells["active"][:, :-1] = episode.action
     cells["target"][np.arange(len(episode)), episode.target] = 1
-    turned = np.ascontiguousarray(cells[:, :-1].reshape(-1, size, size)[:, ::-1])
+    turned = np.ascontiguousarray(cells[:, :-1].reshape(-1, rows, columns)[:, ::-1])
     stride = _CELL.itemsize
-    constant = {"frame_id": "grid", "pose": _POSE, "column_count": size, "cell_size": {"x": 1, "y": 1}}
-    constant |= {"row_stride": size * stride, "cell_stride": stride, "fields": _FIELDS}
+    constant = {"frame_id": "grid", "pose": _POSE, "column_count": columns, "cell_size": {"x": 1, "y": 1}}
+    constant |= {"row_stride": columns * stride, "cell_stride": stride, "fields": _FIELDS}
     head = json.dumps(constant, separators=(",", ":")).encode()[1:]
     for t, grid in enumerate(turned):
         seconds, rest = divmod(time_of(first_tick + t), 1_000_000_000)
@@ -85,13 +87,15 @@ def grid_messages(episode: Episode, size: int, first_tick: int) -> Iterator[byte
         yield b'%s%s,"data":"%s"}' % (stamp, head[:-1], base64.b64encode(grid.tobytes()))
 
 
-def decode(row: dict[str, Any], steps: list[bytes], grids: list[bytes], size: int, first_tick: int) -> Episode:
+def decode(
+    row: dict[str, Any], steps: list[bytes], grids: list[bytes], size: tuple[int, int], first_tick: int
+) -> Episode:
     """The episode that these messages were made from.
 
     Raises:
         UserError: they do not fit together.
     """
-    number, count, m = row["episode"], row["length"], size**2
+    number, count, m = row["episode"], row["length"], size[0] * size[1]
     said = [json.loads(step) for step in steps]
     # Lengths first: what a row claims is no length to count up to.
     if (len(said), len(grids)) != (count, count) or any(
@@ -100,7 +104,7 @@ def decode(row: dict[str, Any], steps: list[bytes], grids: list[bytes], size: in
         raise UserError(f"episode={number}: its steps do not fit together")
     check_steps(said, m)
     packed = b"".join(base64.b64decode(json.loads(grid)["data"], validate=True) for grid in grids)
-    cells = np.frombuffer(packed, _CELL).reshape(count, size, size)[:, ::-1].reshape(count, m)
+    cells = np.frombuffer(packed, _CELL).reshape(count, *size)[:, ::-1].reshape(count, m)
     target = np.array([each["target"] for each in said], dtype=np.int64)
     action = np.zeros((count, m), dtype=bool)
     for t, each in enumerate(said):

@@ -54,7 +54,8 @@ def _content(reader: EpisodeReader, episode: Episode) -> dict[str, Any]:
         about += f"; the first {MOST_STEPS:,} steps are shown"
     assert episode.belief is not None  # a logged episode has it
     return {
-        "size": world.rows,
+        "rows": world.rows,
+        "columns": world.columns,
         "about": about,
         "bound": float(bound[episode.start]),
         "target": target[shown].tolist(),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 from bisect import bisect_left
 from collections.abc import Iterator
 from itertools import pairwise
@@ -46,6 +47,7 @@ class EpisodeReader:
     def __init__(self, file: Path | str) -> None:
         self.file = Path(file)
         self._container = Container(self.file)
+        self._built: World | None = None
         try:
             self._open()
         except BaseException:
@@ -69,7 +71,7 @@ class EpisodeReader:
 
     def _index(self, index: bytes) -> None:
         """Policies and episodes, held against each other."""
-        cells = int(self.run["size"]) ** 2
+        cells = math.prod(limits.size_of_grid(self.run))
         self.policies = [self._told(f"{schema.POLICY}.{k}") for k in range(int(self.end["policies"]))]
         for facts in self.policies:
             check_policy(facts, cells)
@@ -103,7 +105,7 @@ class EpisodeReader:
 
     def __getitem__(self, number: int) -> TensorDict:
         """Episode `number` as a TensorDict `[T]`, keys as in `TrackEnv`."""
-        return self.read(number).to_tensordict(self.t_max, self.max_steps)
+        return self.read(number).to_tensordict(self.world())
 
     @property
     def t_max(self) -> int:
@@ -140,7 +142,7 @@ class EpisodeReader:
             mine.setdefault(message.topic, []).append(message.data)
         if self._checked(lambda: [json.loads(text) for text in mine["/episode"]]) != [row]:
             raise self._damage(f"episode {number} is not what the index says")
-        size = int(self.run["size"])
+        size = limits.size_of_grid(self.run)
         return self._checked(decode, row, mine["/step"], mine["/grid"], size, schema.tick_of(begin))
 
     def _between(self, begin: int, end: int) -> list[Message]:
@@ -178,26 +180,29 @@ class EpisodeReader:
         return Policy.from_dense(task, self._checked(self._unpacked, table))
 
     def _unpacked(self, table: bytes) -> BoolArray:
-        cells, bits = int(self.run["size"]) ** 2, _load(table)
+        cells, bits = math.prod(limits.size_of_grid(self.run)), _load(table)
         if bits.dtype != np.uint8 or bits.shape != (cells, self.t_max + 1, -(-cells // 8)):
             raise Damaged("the table of a policy")
         return np.unpackbits(bits.astype(np.uint8), axis=-1, count=cells).astype(bool)
 
     def world(self) -> World:
         """The world in which the episodes were recorded."""
-        return self._checked(self._world)
+        if self._built is None:
+            self._built = self._checked(self._world)
+        return self._built
 
     def _world(self) -> World:
         run = self.run
         kernel, cost = (_load(self.attachment(name)) for name in ("kernel.npy", "cost.npy"))
         return World(
             kernel,
-            int(run["size"]),
+            limits.size_of_grid(run),
             cost=cost,
             safe_cost=float(run["safe_cost"]),
             t_max=self.t_max,
             reward=float(run["reward"]),
             max_steps=self.max_steps,
+            window=int(run["window"]) if run.get("window") else None,
         )
 
     def check_all(self) -> None:

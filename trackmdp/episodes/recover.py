@@ -13,7 +13,7 @@ from typing import Any
 
 from trackmdp.episodes import container, schema
 from trackmdp.episodes.container import Damaged
-from trackmdp.episodes.limits import check_policy, check_row
+from trackmdp.episodes.limits import check_policy, check_row, size_of_grid
 from trackmdp.episodes.messages import decode
 from trackmdp.episodes.reader import check_run
 from trackmdp.episodes.writer import EpisodeWriter
@@ -113,7 +113,7 @@ def _rewrite(file: Path, target: Path, damaged: list[str], most: float = math.in
             try:
                 if writer is None:
                     raise Damaged("what says how it was recorded")
-                row = check_row(json.loads(data), int(found.metadata[schema.RUN]["size"]) ** 2)
+                row = check_row(json.loads(data), math.prod(size_of_grid(found.metadata[schema.RUN])))
                 if row["policy"] >= most:
                     break
                 _policies_up_to(row["policy"], writer, found, policies)
@@ -181,7 +181,7 @@ def _policies_up_to(number: int, writer: EpisodeWriter, found: _Found, done: set
         if not facts:
             raise Damaged(f"policy {each} is lost")
         writer.flush()  # as when it was recorded, so that a copy has the same bytes
-        check_policy(facts, int(found.metadata[schema.RUN]["size"]) ** 2)
+        check_policy(facts, math.prod(size_of_grid(found.metadata[schema.RUN])))
         sha256, table = facts.pop("table.sha256"), found.attachments.get(f"policy-{each}.npy")
         if sha256 and (table is None or schema.digest(table) != sha256):
             raise Damaged(f"policy {each} is lost")
@@ -194,6 +194,6 @@ def _copy(row: dict[str, Any], found: _Found, writer: EpisodeWriter) -> int:
     begin, end = int(row["start_time"]), int(row["end_time"])
     steps = [data for time, data in found.steps.items() if begin <= time <= end]
     grids = [data for time, data in found.grids.items() if begin <= time <= end]
-    size = int(found.metadata[schema.RUN]["size"])
+    size = size_of_grid(found.metadata[schema.RUN])
     writer.add(decode(row, steps, grids, size, schema.tick_of(begin)))
     return 1

@@ -17,6 +17,7 @@ from mcap.writer import Writer
 from trackmdp.durable import sync_folder
 from trackmdp.episodes import messages, schema
 from trackmdp.episodes.episode import Episode
+from trackmdp.episodes.limits import size_of_grid
 from trackmdp.episodes.schema import time_of
 from trackmdp.policies.policy import Policy
 from trackmdp.world.model import World
@@ -50,6 +51,8 @@ class EpisodeWriter:
             **facts,
             "format_version": schema.FORMAT,
             "size": str(world.rows),
+            **({} if world.rows == world.columns else {"columns": str(world.columns)}),
+            **({} if world.window is None else {"window": str(world.window)}),
             "t_max": str(world.t_max),
             "max_steps": "" if world.max_steps is None else str(world.max_steps),
             "reward": repr(float(world.reward)),
@@ -57,14 +60,14 @@ class EpisodeWriter:
             "tick_ns": str(schema.TICK_NS),
             **{f"{name}.sha256": schema.digest(content) for name, content in tables.items()},
         }
-        self._size, self._t_max = world.rows, world.t_max
+        self._size, self._t_max = world.size, world.t_max
         self._open(file, run, tables)
 
     @classmethod
     def copy(cls, file: Path, run: Mapping[str, str], tables: Mapping[str, bytes]) -> EpisodeWriter:
         """A log that starts with the metadata `trackmdp.run` and the attachments of another."""
         writer = cls.__new__(cls)
-        writer._size, writer._t_max = int(run["size"]), int(run["t_max"])
+        writer._size, writer._t_max = size_of_grid(run), int(run["t_max"])
         writer._open(file, dict(run), dict(tables))
         return writer
 

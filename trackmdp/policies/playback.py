@@ -28,6 +28,7 @@ class Playback:
     def __init__(self, task: Task, actions: BoolArray) -> None:
         if actions.shape[1:] != (task.num_cells,):
             raise UserError(f"playback: actions for {actions.shape[1:]} cells, expected {task.num_cells}")
+        self.task = task
         self.actions = torch.as_tensor(actions, dtype=torch.bool)
 
     def at(self, step: int) -> Tensor:

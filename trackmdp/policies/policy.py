@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar, TypeAlias
 
+import numpy as np
 import torch
 from scipy import sparse
 from tensordict import TensorDictBase
@@ -24,6 +25,7 @@ from trackmdp.policies.saved import load_policy, save_policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.policies.unroll import STATE_KEYS, Rule, draws, function_rule, module_rule, unrolled
 from trackmdp.world.model import Array, Task
+from trackmdp.world.windows import Window
 
 __all__ = ["DrawsError", "Policy", "PolicyLike", "as_policy", "rule_of"]
 
@@ -49,7 +51,7 @@ class Policy(TensorDictModuleBase, PolicyTable):
             in x. Bool entries are sensors on; entries in (0, 1] are the probabilities of switching them on,
             independently of each other and of the history.
         probability: the same for every sensor in every state, instead of `sets`.
-        k: with `probability` k / M: exactly k sensors are on, each such subset equally likely.
+        k: exactly k sensors are on, each such subset equally likely; `probability` is then k / M.
 
     Attributes:
         deterministic: whether the policy is the same function of the state each time.
@@ -75,19 +77,29 @@ class Policy(TensorDictModuleBase, PolicyTable):
         self.k = k
         self.generator: torch.Generator | None = None
         self._lookup: DenseTable | SparseTable | None = None
+        self._local: DenseTable | SparseTable | None = None  # of the window's sensors alone
 
     @classmethod
     def random_k(cls, task: Task, k: int) -> Policy:
-        """Of the M sensors k, drawn anew at every step, each subset of that size equally likely."""
-        return cls(task, probability=k / task.num_cells, k=k)
+        """Of the sensors that can be chosen k, drawn anew at every step, each subset of that size equally likely.
+
+        In a window that the border leaves fewer than k sensors, all of them are on.
+        """
+        if task.window is None:
+            return cls(task, probability=k / task.num_cells, k=k)
+        near = PolicyTable.all_on(task).sets
+        assert near is not None
+        count = np.diff(near.indptr)
+        share = np.repeat(np.minimum(k / count, 1.0), count)
+        return cls(task, sparse.csr_array((share, near.indices, near.indptr), shape=near.shape), k=k)
 
     @classmethod
     def from_function(
         cls, task: Task, function: Callable[..., Any], *, device: torch.device | str = "cpu", check: bool = True
     ) -> Policy:
-        """The table of `function(last_cell [B], steps_since_detection [B], action_history [B, t_max+1, M])`.
+        """The table of `function(last_cell [B], steps_since_detection [B], action_history [B, t_max+1, K])`.
 
-        It returns bool `[B, M]`, a tensor or an array, and is called for all M * (t_max + 1) states, a few blocks of
+        It returns bool `[B, K]`, a tensor or an array, and is called for all M * (t_max + 1) states, a few blocks of
         located cells at a time, so that its memory stays bounded.
 
         Args:
@@ -139,8 +151,9 @@ class Policy(TensorDictModuleBase, PolicyTable):
         assert draws is not None
         if self.k is None:
             return draws < probability
+        largest = draws.masked_fill(probability == 0, -1.0).topk(self.k, dim=-1).indices
         on = torch.zeros_like(draws, dtype=torch.bool)
-        return on.scatter_(-1, draws.topk(self.k, dim=-1).indices, value=True)
+        return on.scatter_(-1, largest, value=True) & (probability > 0)
 
     def probabilities(self, last_cell: Tensor, steps_since_detection: Tensor) -> Tensor:
         """`[*B, M]` with which each sensor is switched on: bool for a deterministic policy, else float32."""
@@ -159,18 +172,38 @@ class Policy(TensorDictModuleBase, PolicyTable):
         """The rows of `sets` on a device."""
         assert self.sets is not None
         if self._lookup is None or self._lookup.device != device:
-            form = DenseTable if self.sets.shape[0] * self.sets.shape[1] <= _DENSE else SparseTable
-            self._lookup = form(self.sets, device)
+            self._lookup = _made(self.sets, device)
         return self._lookup
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write `action` `[*B, M]`."""
+        """Write `action` `[*B, K]`: over all cells, or in the local numbers of the window around `last_cell`."""
         last_cell, n = tensordict["last_cell"], tensordict["steps_since_detection"]
         if self.deterministic:
-            return tensordict.set("action", self.act(last_cell, n))
+            return tensordict.set("action", self._near(last_cell, n))
         device = last_cell.device if self.generator is None else self.generator.device
         draws = torch.rand((*last_cell.shape, self.num_draws), generator=self.generator, device=device)
-        return tensordict.set("action", self.act(last_cell, n, draws))
+        action = self.act(last_cell, n, draws)
+        if self.task.window is not None:
+            action = Window.of(self.task, last_cell.device).to_local(last_cell, action)
+        return tensordict.set("action", action)
+
+    def _near(self, last_cell: Tensor, steps_since_detection: Tensor) -> Tensor:
+        """`[*B, K]` bool, the action of a deterministic policy as the environment takes it."""
+        if self.task.window is None:
+            return self.act(last_cell, steps_since_detection)
+        if self.sets is None:
+            shape = (*last_cell.shape, self.task.num_sensors)
+            return torch.zeros(shape, dtype=torch.bool, device=last_cell.device)
+        if self._local is None or self._local.device != last_cell.device:
+            row = np.repeat(np.arange(self.sets.shape[0]), np.diff(self.sets.indptr))
+            start = torch.as_tensor(row // self.task.num_choices)
+            cells = torch.as_tensor(self.sets.indices, dtype=torch.int64)
+            # Local numbers are in the order of the cells they stand for, so that the columns of a row stay in order.
+            local = Window.of(self.task).find(start, cells).numpy()
+            shape = (self.sets.shape[0], self.task.num_sensors)
+            table = sparse.csr_array((self.sets.data, local, self.sets.indptr), shape=shape)
+            self._local = _made(table, last_cell.device)
+        return self._local(self.row(last_cell, steps_since_detection))
 
     # Files.
 
@@ -234,3 +267,8 @@ def _device_of(policy: TensorDictModuleBase | Callable[..., Any]) -> torch.devic
         return torch.device("cpu")
     first = next(itertools.chain(policy.parameters(), policy.buffers()), None)
     return torch.device("cpu") if first is None else first.device
+
+
+def _made(table: sparse.csr_array, device: torch.device) -> DenseTable | SparseTable:
+    """The faster way to look up rows of a table that does not cost too much memory."""
+    return (DenseTable if table.shape[0] * table.shape[1] <= _DENSE else SparseTable)(table, device)

@@ -26,7 +26,8 @@ class PolicyTable:
         sets: `[M * (t_max + 1), M]` sparse; row `x * (t_max + 1) + n` is the set at n misses after locating the target
             in x. Bool entries are sensors on; entries in (0, 1] are the probabilities of switching them on,
             independently of each other and of the history.
-        probability: the same for every sensor in every state, instead of `sets`.
+        probability: the same for every sensor in every state, instead of `sets`; in a task with a window, for every
+            sensor in the window of the located cell, which is then written out as `sets`.
 
     Attributes:
         deterministic: whether the policy is the same function of the state each time.
@@ -40,6 +41,9 @@ class PolicyTable:
             raise UserError("policy: expected either sets or one probability for all sensors")
         if probability is not None and not 0.0 <= probability <= 1.0:
             raise UserError(f"policy: expected a probability between 0 and 1, got {probability}")
+        if probability and task.window is not None:
+            # Which sensors there are depends on where the target was located: no longer the same everywhere.
+            sets, probability = _window_sets(task, probability), None
         self.task, self.probability = task.task, probability
         self.sets = None if sets is None else _checked(task, sets)
         self.deterministic = probability in (0.0, 1.0) if self.sets is None else self.sets.dtype == np.bool_
@@ -143,4 +147,31 @@ def _checked(task: Task, sets: sparse.csr_array) -> sparse.csr_array:
         sets = sets.astype(np.bool_ if np.isin(sets.data, (0, 1)).all() else np.float64)
     sets.sum_duplicates()  # sorts the columns of each row as well
     sets.eliminate_zeros()
+    if task.window is not None:
+        start = np.repeat(np.arange(sets.shape[0]), np.diff(sets.indptr)) // task.num_choices
+        far = _distance(task, start, sets.indices) > task.window
+        if far.any():
+            x, cell = int(start[far][0]), int(sets.indices[far][0])
+            raise UserError(f"policy: sensor {cell} cannot be chosen from cell {x} with grid.window={task.window}")
     return sets
+
+
+def _distance(task: Task, start: npt.NDArray[Any], cell: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """How far cells are from others, in rows or in columns, whichever is more."""
+    row, column = np.divmod(start, task.columns)
+    other_row, other_column = np.divmod(cell, task.columns)
+    return np.maximum(np.abs(row - other_row), np.abs(column - other_column))
+
+
+def _window_sets(task: Task, probability: float) -> sparse.csr_array:
+    """`[M (t_max + 1), M]`, every sensor of the window around each located cell, with one probability."""
+    assert task.window is not None
+    m, reach = task.num_cells, np.arange(-task.window, task.window + 1)
+    row, column = np.divmod(np.arange(m), task.columns)
+    rows = (row[:, None, None] + reach[:, None]).repeat(len(reach), axis=2)
+    columns = (column[:, None, None] + reach).repeat(len(reach), axis=1)
+    inside = (rows >= 0) & (rows < task.rows) & (columns >= 0) & (columns < task.columns)
+    cells, count = (rows * task.columns + columns)[inside], inside.sum(axis=(1, 2))
+    begin = np.concatenate([[0], np.cumsum(count)])
+    near = sparse.csr_array((np.full(len(cells), probability), cells, begin), shape=(m, m))
+    return near[np.repeat(np.arange(m), task.num_choices)]

@@ -20,13 +20,16 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from trackmdp.errors import UserError
 from trackmdp.seeding import preserved_global_rng
 from trackmdp.world.model import BoolArray, Task
+from trackmdp.world.windows import Window
 
 __all__ = ["Rule", "STATE_KEYS", "draws", "function_rule", "module_rule", "unrolled"]
 
 STATE_KEYS = ("last_cell", "steps_since_detection", "action_history")
 
 Rule: TypeAlias = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""`last_cell` `[B]`, `steps_since_detection` `[B]`, `action_history` `[B, t_max+1, M]` -> bool `[B, M]`."""
+"""`last_cell` `[B]`, `steps_since_detection` `[B]`, `action_history` `[B, t_max+1, K]` -> bool `[B, K]`.
+
+K = M, or with a window the sensors around `last_cell`, in the local numbers of `Window`."""
 
 _HISTORY_AT_ONCE = 2**22  # entries of the action history in one block; a net's activations follow from it
 
@@ -35,12 +38,12 @@ def function_rule(task: Task, function: Callable[..., Any]) -> Rule:
     """A user's function as a rule, what it returns checked.
 
     Raises:
-        UserError: when asked, it returns something else than bool `[B, M]`.
+        UserError: when asked, it returns something else than bool `[B, K]`.
     """
 
     def rule(last_cell: Tensor, steps_since_detection: Tensor, action_history: Tensor) -> Tensor:
         action = torch.as_tensor(function(last_cell, steps_since_detection, action_history))
-        return _checked(action, (len(last_cell), task.num_cells), "the function returned")
+        return _checked(action, (len(last_cell), task.num_sensors), "the function returned")
 
     return rule
 
@@ -59,7 +62,7 @@ def module_rule(task: Task, module: TensorDictModuleBase) -> Rule:
 
     def rule(*state: Tensor) -> Tensor:
         batch = TensorDict(dict(zip(STATE_KEYS, state, strict=True)), state[0].shape, device=state[0].device)
-        return _checked(module(batch)["action"], (len(state[0]), task.num_cells), "the module's action is")
+        return _checked(module(batch)["action"], (len(state[0]), task.num_sensors), "the module's action is")
 
     return rule
 
@@ -97,15 +100,23 @@ def draws(task: Task, rule: Rule, device: torch.device, sets: sparse.csr_array) 
 
 @torch.no_grad()
 def _table(task: Task, rule: Rule, device: torch.device) -> sparse.csr_array:
-    m, choices = task.num_cells, task.num_choices
-    at_once = max(1, _HISTORY_AT_ONCE // (choices * m))
+    m, k, choices = task.num_cells, task.num_sensors, task.num_choices
+    at_once = max(1, _HISTORY_AT_ONCE // (choices * k))
+    window = Window.of(task, device)
     columns, lengths = [], []
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         for begin in range(0, m, at_once):
             cells = torch.arange(begin, min(begin + at_once, m), device=device)
-            # The history [B, t_max+1, M] in row-major order is B * (t_max+1) rows of the table, in the table's order.
-            on = _followed(rule, cells, choices, m).reshape(-1, m)
-            columns.append(np.flatnonzero(on) % m)
+            # The history [B, t_max+1, K] in row-major order is B * (t_max+1) rows of the table, in the table's order.
+            on = _followed(rule, cells, choices, k).reshape(-1, k)
+            chosen = np.flatnonzero(on) % k
+            if window.is_local:
+                # A window's local numbers go through it row by row, as the cells do: columns stay in order.
+                inside = window.inside(cells).repeat_interleave(choices, dim=0).cpu().numpy()
+                on &= inside
+                row, local = np.nonzero(on)
+                chosen = window.around(cells).cpu().numpy()[row // choices, local]
+            columns.append(chosen)
             lengths.append(np.count_nonzero(on, axis=1))
     indptr = np.concatenate([[0], np.cumsum(np.concatenate(lengths))])
     indices = np.concatenate(columns)
@@ -113,7 +124,7 @@ def _table(task: Task, rule: Rule, device: torch.device) -> sparse.csr_array:
 
 
 def _followed(rule: Rule, cells: Tensor, choices: int, sensors: int) -> BoolArray:
-    """`[B, t_max+1, M]` the sets chosen at n = 0, 1, ... misses from located `cells` `[B]`."""
+    """`[B, t_max+1, K]` the sets chosen at n = 0, 1, ... misses from located `cells` `[B]`."""
     history = torch.zeros(len(cells), choices, sensors, dtype=torch.bool, device=cells.device)
     for n in range(choices):
         # Copies, for a rule may keep what it is given, or write to it.

@@ -10,6 +10,7 @@ from rich.console import Console
 from trackmdp.config import EvaluateConfig, PlaybackConfig
 from trackmdp.durable import write_json
 from trackmdp.episodes.episode import Episode
+from trackmdp.episodes.limits import size_of_grid
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.episodes.simulate import resimulate, simulate
 from trackmdp.errors import UserError
@@ -31,10 +32,11 @@ def run(cfg: EvaluateConfig, folder: Path, console: Console, problem: Problem | 
     world = build_world(cfg) if problem is None else problem
     assert isinstance(world, World)  # recorded tracks are refused
     with EpisodeReader(cfg.baseline.file) as reader:
-        if int(reader.run["size"]) != world.rows:
+        recorded = size_of_grid(reader.run)
+        if recorded != world.size:
             raise UserError(
-                f"baseline.file={cfg.baseline.file}: recorded on a grid of size {reader.run['size']}, "
-                f"expected grid.size={world.rows}"
+                f"baseline.file={cfg.baseline.file}: recorded on a grid of size {_size(*recorded)}, "
+                f"expected grid.size={_size(*world.size)}"
             )
         logged = reader.read(cfg.baseline.episode)
     again = reissued(world, logged)
@@ -56,6 +58,10 @@ def run(cfg: EvaluateConfig, folder: Path, console: Console, problem: Problem | 
     console.print(table(f"actions of episode {logged.number}", ["", "return"], rows))
     console.print(f"results in {folder}")
     return simulation.aihtr.mean
+
+
+def _size(rows: int, columns: int) -> str:
+    return str(rows) if rows == columns else f"[{rows},{columns}]"
 
 
 def reissued(world: World, logged: Episode) -> Episode:

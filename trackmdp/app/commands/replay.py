@@ -9,6 +9,7 @@ from rich.console import Console
 
 from trackmdp.config import ReplayConfig, TableConfig, world_of
 from trackmdp.episodes.layout import write_layout
+from trackmdp.episodes.limits import size_of_grid
 from trackmdp.episodes.page import write_page
 from trackmdp.episodes.player import play
 from trackmdp.episodes.reader import EpisodeReader
@@ -106,9 +107,10 @@ def _kernel_difference(reader: EpisodeReader) -> str | None:
 
 def _list(console: Console, reader: EpisodeReader) -> None:
     steps = sum(row["length"] for row in reader.rows)
-    n, seed = reader.run["size"], reader.run.get("seed", "")
-    console.print(f"{len(reader)} episodes, {steps:,} steps on a {n}x{n} grid, T_max {reader.t_max}, seed {seed}")
-    rows = [
+    (rows, columns), seed = size_of_grid(reader.run), reader.run.get("seed", "")
+    grid = f"{rows}x{columns} grid"
+    console.print(f"{len(reader)} episodes, {steps:,} steps on a {grid}, T_max {reader.t_max}, seed {seed}")
+    entries = [
         [
             str(row["episode"]),
             reader.policies[row["policy"]].get("label", ""),
@@ -116,9 +118,9 @@ def _list(console: Console, reader: EpisodeReader) -> None:
             f"{row['return']:,.2f}",
             str(row["detections"]),
             str(row["forced"]),
-            "exited" if row["terminated"] else "cut",
+            "exited" if row["terminated"] else "truncated",
         ]
         for row in reader.rows
     ]
-    columns = ["episode", "policy", "steps", "return", "located", "forced", "end"]
-    console.print(table(str(reader.file), columns, rows))
+    names = ["episode", "policy", "steps", "return", "located", "forced", "end"]
+    console.print(table(str(reader.file), names, entries))
