@@ -56,12 +56,12 @@ def test_a_policy_is_read_back_as_it_was_written(tmp_path: Path) -> None:
 
 
 def test_limits_and_probabilities_are_kept(tmp_path: Path) -> None:
-    task = Task((2, 3), cost=0.5, t_max=1, max_steps=7, window=1, markov=False)
+    task = Task((2, 3), cost=0.5, t_max=1, max_steps=7, window=2, markov=False)
     half = Policy(task, sparse.csr_array(np.full((12, 6), 0.5)))
     for policy in (half, Policy.none(task), Policy(task, probability=0.25)):
         policy.save(tmp_path / "policy.npz")
         found = Policy.load(tmp_path / "policy.npz")
-        assert (found.task.max_steps, found.task.window, found.task.markov) == (7, 1, False)
+        assert (found.task.max_steps, found.task.window, found.task.markov) == (7, 2, False)
         assert (found.deterministic, found.probability) == (policy.deterministic, policy.probability)
         assert found.on(1, np.arange(6), np.arange(6)) == pytest.approx(policy.on(1, np.arange(6), np.arange(6)))
 
