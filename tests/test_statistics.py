@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from trackmdp.statistics import Estimate, iqm, mean_over_groups, ratio, share
+from trackmdp.statistics import MeanInterval, iqm, mean_over_groups, ratio, share
 
 Draw = Callable[[np.random.Generator, int], np.ndarray]
 
@@ -55,7 +55,7 @@ def test_none_of_many_still_allows_for_some() -> None:
     found = share(0, 100)
     assert (found.mean, found.low) == (0.0, 0.0)
     assert found.high == pytest.approx(1 - 0.025 ** (1 / 100))
-    assert share(2, 2) == Estimate(1.0, None, None, 2)
+    assert share(2, 2) == MeanInterval(1.0, None, None, 2)
     assert share(0, 0).n == 0
 
 

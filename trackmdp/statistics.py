@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from trackmdp.seeding import derive
 
-__all__ = ["FEWEST", "LEVEL", "Estimate", "iqm", "mean_over_groups", "ratio", "share"]
+__all__ = ["FEWEST", "LEVEL", "MeanInterval", "iqm", "mean_over_groups", "ratio", "share"]
 
 Values: TypeAlias = npt.NDArray[np.float64]
 
@@ -25,7 +25,7 @@ FEWEST = 3
 
 
 @dataclass(frozen=True)
-class Estimate:
+class MeanInterval:
     """A mean of `n` values with its 95 % interval; `low` and `high` are None where too few values stand behind it."""
 
     mean: float
@@ -34,7 +34,7 @@ class Estimate:
     n: int
 
 
-def mean_over_groups(groups: Sequence[Sequence[float]]) -> Estimate:
+def mean_over_groups(groups: Sequence[Sequence[float]]) -> MeanInterval:
     """The mean over groups (worlds) of the mean within each (over seeds), every group with the same weight.
 
     The groups are fixed, the values within them drawn: a group of n values adds the variance s²/n of its own mean. The
@@ -45,18 +45,18 @@ def mean_over_groups(groups: Sequence[Sequence[float]]) -> Estimate:
     filled = [np.asarray(group, dtype=float) for group in groups if len(group)]
     count = sum(map(len, filled))
     if not count:
-        return Estimate(math.nan, None, None, 0)
+        return MeanInterval(math.nan, None, None, 0)
     mean = float(np.mean([group.mean() for group in filled]))
     if min(map(len, filled)) < FEWEST:
-        return Estimate(mean, None, None, count)
+        return MeanInterval(mean, None, None, count)
     parts = np.array([group.var(ddof=1) / len(group) for group in filled]) / len(filled) ** 2
     variance = parts.sum()
     # values that are equal differ by rounding once they have been summed
     if variance <= (1e-12 * max(1.0, abs(mean))) ** 2:
-        return Estimate(mean, None, None, count)
+        return MeanInterval(mean, None, None, count)
     freedom = variance**2 / (parts**2 / [len(group) - 1 for group in filled]).sum()
     margin = _student(freedom) * math.sqrt(variance)
-    return Estimate(mean, mean - margin, mean + margin, count)
+    return MeanInterval(mean, mean - margin, mean + margin, count)
 
 
 def iqm(groups: Sequence[Sequence[float]]) -> float:
@@ -68,25 +68,25 @@ def iqm(groups: Sequence[Sequence[float]]) -> float:
     return float(np.mean(trimmed or [math.nan]))
 
 
-def share(part: int, whole: int) -> Estimate:
+def share(part: int, whole: int) -> MeanInterval:
     """`part` of `whole` trials with the interval of Clopper and Pearson (1934), which covers at every n.
 
     None of n seen still allows for about 3/n: the interval ends there, not at 0. Trials of unlike chances, as runs
     in several worlds are, spread less than the binomial law says (Hoeffding 1956), so it holds for them as well.
     """
     if not whole:
-        return Estimate(math.nan, None, None, 0)
+        return MeanInterval(math.nan, None, None, 0)
     if whole < FEWEST:
-        return Estimate(part / whole, None, None, whole)
+        return MeanInterval(part / whole, None, None, whole)
     from scipy.special import betaincinv  # a quarter of a second to load
 
     tail = (1 - LEVEL) / 2
     low = float(betaincinv(part, whole - part + 1, tail)) if part else 0.0
     high = float(betaincinv(part + 1, whole - part, 1 - tail)) if part < whole else 1.0
-    return Estimate(part / whole, low, high, whole)
+    return MeanInterval(part / whole, low, high, whole)
 
 
-def ratio(part: Values, whole: Values, *, events: bool = False) -> Estimate:
+def ratio(part: Values, whole: Values, *, events: bool = False) -> MeanInterval:
     """Σ part / Σ whole over independent units `[n]`, such as tracks, with its bootstrap-t interval (Efron 1979).
 
     Ratios of a few dozen units are skewed, and Student's t on them covers .8 to .9 only; the bootstrap takes the shape
@@ -100,10 +100,10 @@ def ratio(part: Values, whole: Values, *, events: bool = False) -> Estimate:
     """
     count, total = len(part), float(whole.sum())
     if not total:
-        return Estimate(math.nan, None, None, count)
+        return MeanInterval(math.nan, None, None, count)
     mean = float(part.sum() / total)
     if count < FEWEST:
-        return Estimate(mean, None, None, count)
+        return MeanInterval(mean, None, None, count)
     low, high = _bootstrap_t(part, whole, mean)
     if events:
         having = part > 1e-9  # more than rounding
@@ -112,7 +112,7 @@ def ratio(part: Values, whole: Values, *, events: bool = False) -> Estimate:
         low = min(low, (known.low or 0.0) * size * count / total)
         high = max(high, (known.high or 1.0) * size * count / total)
         low = max(low, 0.0)
-    return Estimate(mean, low, high, count)
+    return MeanInterval(mean, low, high, count)
 
 
 def _bootstrap_t(part: Values, whole: Values, mean: float) -> tuple[float, float]:

@@ -105,7 +105,7 @@ def test_a_map_draws_what_can_happen(results: Results) -> None:
     name = "hindsight-0.16-0"
     kept = next(policy for run, policy in results.policies.items() if run.startswith("hindsight-0.16"))
     motion = results.motions["a2c-0.16-0"]
-    figure = maps.policy_map(name, "here", kept, motion)
+    figure = maps.policy_map(name, "here", kept, motion, (3, 3))
     assert figure
     for located, n, on, possible, cells in figure.table.rows:
         assert on == kept.chains[located, n].sum() == len(str(cells).split())  # type: ignore[index]
@@ -114,7 +114,7 @@ def test_a_map_draws_what_can_happen(results: Results) -> None:
     first = [row for row in figure.table.rows if row[1] == 0]
     assert len(first) == 9
     everything = type(kept)(np.ones_like(kept.chains), kept.value)
-    drawn = maps.policy_map(name, "here", everything, motion)
+    drawn = maps.policy_map(name, "here", everything, motion, (3, 3))
     assert drawn
     assert {row[1] for row in drawn.table.rows} == {0}  # no miss can happen, so there is no second set
 
@@ -122,14 +122,14 @@ def test_a_map_draws_what_can_happen(results: Results) -> None:
 def test_a_value_map_holds_every_cell(results: Results) -> None:
     name, kept = next(iter(results.policies.items()))
     motion = results.motions["a2c-0.16-0"]
-    figure = maps.value_map(name, "here", kept, motion)
+    figure = maps.value_map(name, "here", kept, motion, (3, 3))
     assert figure
     assert [row[3] for row in figure.table.rows] == kept.value.tolist()
     assert figure.table.rows[5][:3] == [5, 2, 3]
     assert [row[4] for row in figure.table.rows] == pytest.approx(motion.clocked - kept.value)
     assert [row[5] for row in figure.table.rows] == pytest.approx(motion.clocked - motion.qmdp)
     large = type(kept)(np.zeros((900, 1, 900), dtype=bool), np.zeros(900))
-    assert maps.value_map(name, "here", large, motion) is None
+    assert maps.value_map(name, "here", large, motion, (30, 30)) is None
 
 
 def test_the_same_figure_has_the_same_bytes_and_no_date(grouped: Study, panel: Panel) -> None:
@@ -163,3 +163,12 @@ def test_without_matplotlib_one_line_says_what_to_install(monkeypatch: pytest.Mo
 def test_files_are_named_after_what_they_show() -> None:
     assert figures.slug("a2c, gamma=0.9-Z=5, c=0.16") == "a2c-gamma-0-9-z-5-c-0-16"
     assert "/" not in figures.slug("kernel=table, path=/a/b")
+
+
+def test_a_map_of_a_rectangle_has_its_rows_and_columns(results: Results) -> None:
+    name, kept = next(iter(results.policies.items()))
+    motion = results.motions["a2c-0.16-0"]
+    flat = maps.value_map(name, "here", kept, motion, (1, 9))
+    assert flat
+    assert [row[1:3] for row in flat.table.rows] == [[1, column] for column in range(1, 10)]
+    assert maps.policy_map(name, "here", kept, motion, (1, 9))

@@ -29,6 +29,7 @@ PRINTED_TMDP: Mapping[tuple[int, float], float] = {
 _FIXED = {
     "grid.size": SIZE,
     "grid.max_steps": None,
+    "grid.window": None,
     "kernel.name": "random_support",
     "kernel.radius": RADIUS,
     "kernel.low_probability": LOW_PROBABILITY,

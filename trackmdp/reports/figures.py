@@ -13,7 +13,7 @@ from trackmdp.reports.grouping import Study
 from trackmdp.reports.style import INK, LOOKS, Figure, draw, legend, look_of, tidy
 from trackmdp.reports.summaries import estimate_cells, estimate_columns
 from trackmdp.reports.tables import Cell, Column, Table
-from trackmdp.statistics import Estimate, mean_over_groups
+from trackmdp.statistics import MeanInterval, mean_over_groups
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -115,7 +115,7 @@ def regret_against_cost(study: Study, panel: Panel, threshold: float | None) -> 
     return draw(f"regret-{panel.name}", title, _spoken(panel, learned, exact, digits=4), table, 3.4, paint)
 
 
-def _estimates(study: Study, panel: Panel, *, regret: bool) -> dict[str, list[Estimate]]:
+def _estimates(study: Study, panel: Panel, *, regret: bool) -> dict[str, list[MeanInterval]]:
     found = {}
     for method in study.methods:
         groups = [
@@ -141,7 +141,7 @@ def _qmdp_regret(study: Study, world: str) -> float:
 
 
 def _learned_lines(
-    axes: Axes, panel: Panel, learned: Mapping[str, Sequence[Estimate]], floor: float = -math.inf
+    axes: Axes, panel: Panel, learned: Mapping[str, Sequence[MeanInterval]], floor: float = -math.inf
 ) -> None:
     """Lines with error bars, a little apart so that the bars can be told from each other."""
     step = min(np.diff(panel.costs), default=0.02) * 0.04
@@ -195,7 +195,7 @@ def _break(upper: Axes, lower: Axes, bottom: float, lower_end: float, upper_star
 
 def _cost_table(
     panel: Panel,
-    learned: Mapping[str, Sequence[Estimate]],
+    learned: Mapping[str, Sequence[MeanInterval]],
     exact: Mapping[str, Sequence[float]],
     kind: str,
     label: str,
@@ -212,7 +212,7 @@ def _cost_table(
 
 
 def _spoken(
-    panel: Panel, learned: Mapping[str, Sequence[Estimate]], exact: Mapping[str, Sequence[float]], digits: int
+    panel: Panel, learned: Mapping[str, Sequence[MeanInterval]], exact: Mapping[str, Sequence[float]], digits: int
 ) -> str:
     lines = {method: [e.mean for e in row] for method, row in learned.items()} | dict(exact)
     costs = ", ".join(f"{cost:g}" for cost in panel.costs)
@@ -220,7 +220,7 @@ def _spoken(
     return f"At c = {costs}. {'; '.join(said)}."
 
 
-def _n_text(learned: Mapping[str, Sequence[Estimate]]) -> str:
+def _n_text(learned: Mapping[str, Sequence[MeanInterval]]) -> str:
     """`n = 5 seeds (ppo 2)`: how many runs stand behind a point."""
     counts = {method: sorted({e.n for e in row if e.n}) for method, row in learned.items()}
     return "seeds per point: " + ", ".join(

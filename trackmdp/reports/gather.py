@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -17,6 +18,7 @@ from trackmdp.errors import UserError
 from trackmdp.reports import policy
 from trackmdp.reports.finished import plain_config, read_curve, read_run
 from trackmdp.reports.grouping import Study, study, world_key
+from trackmdp.reports.maps import MOST_CELLS
 from trackmdp.reports.results import Anomaly, FinishedRun, Motion, Results
 from trackmdp.solvers import bounds, qmdp
 from trackmdp.solvers.evaluate import evaluate
@@ -24,6 +26,7 @@ from trackmdp.training.folders import FAILED, PLAN, SUMMARY, read_json
 from trackmdp.training.sealing import check_files, read_summary
 from trackmdp.untrusted import printable
 from trackmdp.world.make import build_world
+from trackmdp.world.model import grid_size
 
 __all__ = ["gather", "planned", "run_folders"]
 
@@ -149,6 +152,8 @@ def _policies(folder: Path, grouped: Study) -> tuple[dict[str, policy.Policy], l
     found: dict[str, policy.Policy] = {}
     anomalies = []
     for runs in grouped.groups.values():
+        if not _is_drawn(runs[0]):
+            continue
         ranked = sorted(runs, key=lambda run: (run.figure("aihtr"), run.seed))
         middle = (len(ranked) - 1) / 2
         for _, run in sorted(enumerate(ranked), key=lambda item: abs(item[0] - middle)):
@@ -161,6 +166,11 @@ def _policies(folder: Path, grouped: Study) -> tuple[dict[str, policy.Policy], l
     return found, anomalies
 
 
+def _is_drawn(run: FinishedRun) -> bool:
+    """Whether its policy is drawn cell by cell; only then policy and motion are kept."""
+    return math.prod(grid_size(run.settings["grid.size"])) <= MOST_CELLS
+
+
 def _motions(folder: Path, runs: Iterable[FinishedRun]) -> tuple[dict[str, Motion], list[Anomaly]]:
     """Motion and references of each world, from the `kernel.npz` of its first run."""
     found: dict[str, Motion] = {}
@@ -169,8 +179,8 @@ def _motions(folder: Path, runs: Iterable[FinishedRun]) -> tuple[dict[str, Motio
         if world_key(run) in seen:
             continue
         seen.add(world_key(run))
-        if run.settings["kernel.name"] == "tracks":
-            continue  # no motion is known there
+        if run.settings["kernel.name"] == "tracks" or not _is_drawn(run):
+            continue  # no motion is known there, or the grid is too large for a map
         try:
             check_files(folder / run.name, read_summary(folder / run.name), "kernel.npz")
             world = build_world(_world_config(folder / run.name))

@@ -145,5 +145,5 @@ def _short(key: str) -> str:
 
 def _text(value: Any) -> str:
     if isinstance(value, list):
-        return f"a list of {len(value)}"
+        return "x".join(map(str, value)) if len(value) == 2 else f"a list of {len(value)}"
     return f"{value:g}" if isinstance(value, float) else str(value)

@@ -14,7 +14,7 @@ from trackmdp.reports.results import CurvePoint, FinishedRun
 from trackmdp.reports.style import INK, Figure, draw, legend, look_of, tidy
 from trackmdp.reports.summaries import estimate_cells, estimate_columns
 from trackmdp.reports.tables import Cell, Column, Table
-from trackmdp.statistics import Estimate, mean_over_groups, share
+from trackmdp.statistics import MeanInterval, mean_over_groups, share
 from trackmdp.world.model import Array
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def curves(study: Study, points: Mapping[str, Sequence[CurvePoint]], by: str) ->
 
 def _averaged(
     study: Study, method: str, points: Mapping[str, Sequence[CurvePoint]], by: str
-) -> tuple[Array, list[Estimate]] | None:
+) -> tuple[Array, list[MeanInterval]] | None:
     """Positions `[G]` and the estimates there over all runs of a method; None where no curve is known.
 
     The positions begin where every run has been judged, and end with the longest.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,13 +25,12 @@ LEVELS = 24
 ON, OFF, IDLE = "#0072b2", "#dcebf4", "#d55e01"
 
 
-def policy_map(name: str, where: str, policy: Policy, motion: Motion) -> Figure | None:
+def policy_map(name: str, where: str, policy: Policy, motion: Motion, size: tuple[int, int]) -> Figure | None:
     """Around each located cell, the sensors that are on after no miss and after one; None for a large grid.
 
     Where the first set leaves nothing out, a miss cannot happen, and nothing is drawn for it.
     """
     cells, choices, _ = policy.chains.shape
-    size = math.isqrt(cells)
     if cells > MOST_CELLS:
         return None
     shown = list(range(min(choices, 2)))
@@ -44,7 +42,13 @@ def policy_map(name: str, where: str, policy: Policy, motion: Motion) -> Figure 
             axes.set_title("just located (n = 0)" if n == 0 else "after one miss (n = 1)", fontsize=8.5)
 
     rows: list[list[Cell]] = [
-        [int(x), n, int(policy.chains[x, n].sum()), int(possible[n][x].sum()), _cells_text(policy.chains[x, n], size)]
+        [
+            int(x),
+            n,
+            int(policy.chains[x, n].sum()),
+            int(possible[n][x].sum()),
+            _cells_text(policy.chains[x, n], size[1]),
+        ]
         for x in range(cells)
         for n in range(choices)
         if n < len(shown) and possible[n][x].any()
@@ -65,9 +69,8 @@ def policy_map(name: str, where: str, policy: Policy, motion: Motion) -> Figure 
     return draw(f"sets-{name}", title, text, table, 0.4 + 3.9 * len(shown), paint)
 
 
-def value_map(name: str, where: str, policy: Policy, motion: Motion) -> Figure | None:
+def value_map(name: str, where: str, policy: Policy, motion: Motion, size: tuple[int, int]) -> Figure | None:
     """Exact value per start cell, and what the policy and Q_MDP miss to the clocked bound; None for a large grid."""
-    size = math.isqrt(len(policy.value))
     if len(policy.value) > MOST_CELLS:
         return None
     layers = {
@@ -78,12 +81,12 @@ def value_map(name: str, where: str, policy: Policy, motion: Motion) -> Figure |
 
     def paint(figure: Canvas) -> None:
         for place, (axes, (label, values)) in enumerate(zip(figure.subplots(1, 3), layers.items(), strict=True)):
-            _shade(figure, axes, values.reshape(size, size), "viridis" if place == 0 else "magma_r")
+            _shade(figure, axes, values.reshape(size), "viridis" if place == 0 else "magma_r")
             axes.set_title(label, fontsize=6.8)
 
     columns = [Column("start cell"), Column("row"), Column("column"), *(Column(label, 3) for label in layers)]
     rows = [
-        [x, x // size + 1, x % size + 1, *(float(values[x]) for values in layers.values())]
+        [x, x // size[1] + 1, x % size[1] + 1, *(float(values[x]) for values in layers.values())]
         for x in range(len(policy.value))
     ]
     title = f"Value of each start cell, {where}"
@@ -127,23 +130,25 @@ def _possible(policy: Policy, motion: Motion, steps: int) -> list[BoolArray]:
     return found
 
 
-def _tiles(axes: Axes, on: BoolArray, possible: BoolArray, size: int, reach: int) -> None:
+def _tiles(axes: Axes, on: BoolArray, possible: BoolArray, size: tuple[int, int], reach: int) -> None:
     """One tile per located cell, `2 reach + 1` cells wide; cells farther away that are possible widen all tiles."""
+    rows, columns = size
     on = on & possible.any(axis=1, keepdims=True)  # elsewhere it never comes to this
-    reach = max(reach, _farthest(possible | on, size))
+    reach = max(reach, _farthest(possible | on, columns))
     side = 2 * reach + 2
     groups: dict[str, list[tuple[float, float]]] = {ON: [], OFF: [], IDLE: []}
-    for x in range(size * size):
-        row, column = divmod(x, size)
+    for x in range(rows * columns):
+        row, column = divmod(x, columns)
         for j in np.flatnonzero(possible[x] | on[x]):
-            down, right = j // size - row, j % size - column
+            down, right = j // columns - row, j % columns - column
             colour = IDLE if not possible[x, j] else ON if on[x, j] else OFF
             groups[colour].append((float(column * side + reach + right), float(row * side + reach + down)))
     _squares(axes, groups)
-    centres = [(x % size * side + reach + 0.5, x // size * side + reach + 0.5) for x in range(size * size)]
+    places = (divmod(x, columns) for x in range(rows * columns))
+    centres = [(column * side + reach + 0.5, row * side + reach + 0.5) for row, column in places]
     axes.plot(*np.array(centres).T, ".", color=INK, markersize=12 / side)
-    axes.set_xlim(-1, size * side)
-    axes.set_ylim(size * side, -1)
+    axes.set_xlim(-1, columns * side)
+    axes.set_ylim(rows * side, -1)
     axes.set_aspect("equal")
     axes.set_xticks([])
     axes.set_yticks([])
@@ -165,13 +170,13 @@ def _squares(axes: Axes, groups: dict[str, list[tuple[float, float]]]) -> None:
         axes.add_patch(PathPatch(path, facecolor=colour, edgecolor="none"))
 
 
-def _farthest(cells: BoolArray, size: int) -> int:
+def _farthest(cells: BoolArray, columns: int) -> int:
     located, sensed = np.nonzero(cells)
     if not len(located):
         return 0
-    away = np.maximum(np.abs(located // size - sensed // size), np.abs(located % size - sensed % size))
+    away = np.maximum(np.abs(located // columns - sensed // columns), np.abs(located % columns - sensed % columns))
     return min(int(away.max()), 3)
 
 
-def _cells_text(on: Array | BoolArray, size: int) -> str:
-    return " ".join(f"{j // size + 1}.{j % size + 1}" for j in np.flatnonzero(on))
+def _cells_text(on: Array | BoolArray, columns: int) -> str:
+    return " ".join(f"{j // columns + 1}.{j % columns + 1}" for j in np.flatnonzero(on))

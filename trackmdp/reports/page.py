@@ -15,6 +15,7 @@ from trackmdp.reports.grouping import Study, study
 from trackmdp.reports.results import Results
 from trackmdp.reports.style import Figure
 from trackmdp.reports.tables import Table
+from trackmdp.world.model import grid_size
 
 __all__ = ["Folded", "Part", "Report", "Section", "build"]
 
@@ -173,8 +174,9 @@ def _maps(results: Results, grouped: Study) -> list[Section]:
                 continue
             name, policy = figures.slug(f"{method}-{world}"), results.policies[run.name]
             where = f"{method}, {world}, seed {run.seed} (n = 1)"
-            sets.append(maps.policy_map(name, where, policy, motion))
-            values.append(maps.value_map(name, where, policy, motion))
+            size = grid_size(run.settings["grid.size"])
+            sets.append(maps.policy_map(name, where, policy, motion, size))
+            values.append(maps.value_map(name, where, policy, motion, size))
     shown = [[figure for figure in group if figure is not None] for group in (values, sets)]
     if not any(shown):
         return []

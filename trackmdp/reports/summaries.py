@@ -9,7 +9,7 @@ import numpy as np
 from trackmdp.reports.grouping import Study
 from trackmdp.reports.results import Anomaly, FinishedRun
 from trackmdp.reports.tables import Cell, Column, Table
-from trackmdp.statistics import Estimate, iqm, mean_over_groups
+from trackmdp.statistics import MeanInterval, iqm, mean_over_groups
 
 __all__ = ["estimate_cells", "estimate_columns", "groups_table", "methods_table", "missing_table", "runs_table"]
 
@@ -21,7 +21,7 @@ def estimate_columns(label: str, digits: int) -> list[Column]:
     return [Column(label, digits), Column("95 % from", digits), Column("to", digits)]
 
 
-def estimate_cells(found: Estimate) -> list[Cell]:
+def estimate_cells(found: MeanInterval) -> list[Cell]:
     """Mean and interval as cells."""
     return [found.mean, found.low, found.high]
 

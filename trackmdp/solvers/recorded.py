@@ -11,7 +11,7 @@ from scipy.sparse.linalg import spsolve_triangular
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.evaluation import Evaluation, pooled
 from trackmdp.solvers.renewal import IndexArray
-from trackmdp.statistics import Estimate, ratio
+from trackmdp.statistics import MeanInterval, ratio
 from trackmdp.world.model import Array, Task
 from trackmdp.world.tracks import Recorded, Tracks
 
@@ -51,7 +51,7 @@ class ReplayedTracks:
             safe_actions=safe,
         )
 
-    def intervals(self) -> dict[str, Estimate]:
+    def intervals(self) -> dict[str, MeanInterval]:
         """Figure -> its mean and interval, the tracks taken as independent."""
         reward, steps, detections, sensors, safe = self.totals.T
         one = np.ones_like(steps)
@@ -128,7 +128,7 @@ def _renewals(
     return list(figures), (start, end, weight)
 
 
-def _complement(missed: Estimate) -> Estimate:
+def _complement(missed: MeanInterval) -> MeanInterval:
     """1 less a share, with its interval."""
     low, high = (None if end is None else 1.0 - end for end in (missed.high, missed.low))
-    return Estimate(1.0 - missed.mean, None if low is None else max(low, 0.0), high, missed.n)
+    return MeanInterval(1.0 - missed.mean, None if low is None else max(low, 0.0), high, missed.n)

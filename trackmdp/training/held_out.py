@@ -15,7 +15,7 @@ from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.kernel_estimate import KernelEstimate
 from trackmdp.solvers.recorded import replay
-from trackmdp.statistics import Estimate
+from trackmdp.statistics import MeanInterval
 from trackmdp.training.evaluator import Evaluator, ExactEvaluator
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Problem, Recorded, Tracks
@@ -52,7 +52,7 @@ class HeldOutEvaluator(Evaluator):
         """Figures of a policy on the held-out tracks."""
         return evaluate(self.world, policy)
 
-    def intervals(self, policy: PolicyTable) -> dict[str, Estimate]:
+    def intervals(self, policy: PolicyTable) -> dict[str, MeanInterval]:
         """Figure -> its mean over the held-out tracks with a 95 % confidence interval."""
         return replay(self.world, self.tracks, policy).intervals()
 
