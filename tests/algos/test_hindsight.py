@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -14,7 +12,7 @@ from trackmdp.solvers import bounds
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import regret_per_step
 from trackmdp.world.kernels import random_walk
-from trackmdp.world.model import World
+from trackmdp.world.model import Task, World
 
 
 @pytest.mark.parametrize("t_max", [0, 2])
@@ -50,8 +48,8 @@ def test_a_target_that_goes_farther_than_the_nets_see_is_gone() -> None:
     """On a 3x3 grid: 0 -> 1 -> 4 are steps of one, 4 -> 0 is diagonal, 1 -> 7 and 0 -> 2 are two; 9 is outside."""
     paths = torch.tensor([[0, 1, 4, 0], [1, 7, 4, 1], [0, 1, 9, 9], [4, 3, 0, 2]]).T
     expected = [[0, 1, 4, 0], [1, 9, 9, 9], [0, 1, 9, 9], [4, 3, 0, 9]]
-    assert _within(paths, 1, 3).T.tolist() == expected
-    assert torch.equal(_within(paths, 2, 3), paths)
+    assert _within(paths, 1, Task(3, cost=0.1, t_max=1)).T.tolist() == expected
+    assert torch.equal(_within(paths, 2, Task(3, cost=0.1, t_max=1)), paths)
 
 
 def test_frames_without_a_move_are_refused_in_one_line() -> None:
@@ -68,13 +66,12 @@ def test_where_the_target_moves_alike_few_frames_are_enough() -> None:
     """144 cells and 12,000 frames: too few for each cell alone, plenty for all of them together."""
     kernel = random_walk(12, stay=0.2, diagonal=False, exit_probability=0.02, border="renormalize")
     alone = World(kernel, 12, cost=np.full(144, 0.16), safe_cost=144 * 0.16, t_max=1)
-    together = replace(alone, homogeneous=True)
     data = batches(alone, 47)
     upper = float(bounds.clocked(alone).mean())
     words = ("algo.updates=150", "algo.updates_per_iteration=150", "algo.batch_size=4096", "algo.hidden=32")
-    regrets = [
-        regret_per_step(upper, evaluate(world, policy(learn(world, data, "algo.total_frames=12032", *words), world)))
-        for world in (alone, together)
+    learners = [
+        learn(alone, data, "algo.total_frames=12032", f"algo.share_cells={shared}", *words) for shared in (False, True)
     ]
+    regrets = [regret_per_step(upper, evaluate(alone, policy(learner, alone))) for learner in learners]
     assert regrets[1] < 0.5 * regrets[0]
     assert regrets[1] < 0.02

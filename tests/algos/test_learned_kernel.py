@@ -8,6 +8,7 @@ import torch
 
 from tests.helpers import algorithm, collect, hop_world, small_world
 from trackmdp.algos.learned_kernel import observed_paths
+from trackmdp.policies.policy import Policy
 from trackmdp.solvers import optimal
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.world.model import World
@@ -23,7 +24,7 @@ def test_paths_are_read_from_what_the_tracker_saw() -> None:
     """Nothing is sensed: the target hops on unseen, is located by the safe action, or exits; `target` is not read."""
     world = hop_world(t_max=1)
     learner = algorithm("learned_kernel", world)
-    learner.policy.chains.zero_()
+    learner.policy = Policy.none(world)
     batch = collect(world, learner.policy, 64, 30)
     paths = observed_paths(batch.exclude("target", ("next", "target")), world)
     located = paths.end < 4
@@ -41,7 +42,7 @@ def test_it_finds_the_optimum_of_a_small_world(sensing: str) -> None:
     warm_up = ["algo.warm_up=5000"] if sensing == "chosen" else []
     learner, _ = learn(world, 12, f"algo.sensing={sensing}", *warm_up)
     best = optimal.solve(world)
-    found = evaluate(world, learner.actor.chains.numpy())
+    found = evaluate(world, learner.actor)
     assert found.aihtr == pytest.approx(best.lower, abs=0.01)
     all_on = evaluate(world, np.ones((9, 2, 9), dtype=bool))
     assert found.aihtr > all_on.aihtr + 1
@@ -54,14 +55,14 @@ def test_chosen_sets_cost_less() -> None:
     assert fully[-1]["sensors_per_frame"] == pytest.approx(9.0)
     assert chosen[0]["sensors_per_frame"] == pytest.approx(9.0)
     assert chosen[-1]["sensors_per_frame"] < 5.0
-    assert not learner.policy.chains.all()
+    assert not (learner.policy.bits == 255).all()
 
 
 def test_its_uncertainty_shrinks_and_covers_the_truth() -> None:
     world = small_world(3)
     learner, rows = learn(world, 12, "algo.samples=50")
     assert rows[-1]["believed_deviation"] < 0.6 * rows[0]["believed_deviation"]
-    truth = evaluate(world, learner.actor.chains.numpy()).aihtr
+    truth = evaluate(world, learner.actor).aihtr
     assert abs(rows[-1]["believed_aihtr"] - truth) < 4 * rows[-1]["believed_deviation"]
     visits = [row["least_visits"] for row in rows]
     assert visits == sorted(visits)
@@ -77,8 +78,8 @@ def test_a_resumed_learner_goes_on_as_the_first() -> None:
     second.load_state_dict(first.state_dict())
     batch = collect(world, first.policy, 64, 20, seed=7)
     assert first.step(batch) == second.step(batch)
-    assert torch.equal(first.policy.chains, second.policy.chains)
-    assert torch.equal(first.actor.chains, second.actor.chains)
+    assert torch.equal(first.policy.bits, second.policy.bits)
+    assert (first.actor.dense() == second.actor.dense()).all()
 
 
 def test_the_state_is_plain_tensors_and_words(tmp_path) -> None:
@@ -88,4 +89,4 @@ def test_the_state_is_plain_tensors_and_words(tmp_path) -> None:
     state = torch.load(tmp_path / "state.pt", weights_only=True)
     again = algorithm("learned_kernel", small_world(3))
     again.load_state_dict(state)
-    assert torch.equal(again.actor.chains, learner.actor.chains)
+    assert (again.actor.dense() == learner.actor.dense()).all()

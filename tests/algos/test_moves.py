@@ -8,7 +8,8 @@ from tensordict import TensorDict
 
 from tests.helpers import collect, small_world
 from trackmdp.algos.moves import MoveBuffer, sensed_moves
-from trackmdp.policies.fixed import AllOnOrChain
+from trackmdp.policies.explore import Exploring
+from trackmdp.policies.policy import Policy
 from trackmdp.world.model import World
 
 M = 9
@@ -123,7 +124,8 @@ def test_a_mixture_shows_the_motion_as_it_is() -> None:
     world = small_world()
     chains = np.zeros((9, 2, 9), dtype=bool)
     chains[np.arange(9), 0, world.kernel.toarray().argmax(1)] = True
-    policy = AllOnOrChain(chains)
+    policy = Exploring(world)
+    policy.renew(Policy.from_dense(world, chains))
     policy.explore.fill_(0.3)
     torch.manual_seed(0)
     frames = collect(world, policy, 128, 800)

@@ -39,7 +39,6 @@ FILES = {
 
         stay: 0.5
         exit_probability: 0.1
-        homogeneous: false
     """,
     # An algorithm.
     "outside/lazy.py": """

@@ -8,7 +8,10 @@ import torch
 from tensordict import TensorDict
 
 from tests.helpers import random_state, small_world
-from trackmdp.policies.fixed import AllOn, AllOnOrChain, ChainPolicy, RandomK, RandomSubset
+from trackmdp.policies.explore import Exploring
+from trackmdp.policies.fixed import AllOn, ChainPolicy, RandomK, RandomSubset
+from trackmdp.policies.policy import Policy
+from trackmdp.world.model import Task
 
 
 @pytest.mark.parametrize("on", [True, False])
@@ -29,9 +32,11 @@ def test_a_chain_is_looked_up_by_cell_and_misses() -> None:
 
 @pytest.mark.parametrize("explore", [0.0, 0.25, 1.0])
 def test_everything_is_sensed_now_and_then_and_only_where_the_target_is_located(explore: float) -> None:
+    task = Task(2, cost=0.1, t_max=1)
     chains = np.zeros((4, 2, 4), dtype=bool)
     chains[1, 0, 2] = chains[1, 1, 3] = True
-    policy = AllOnOrChain(chains)
+    policy = Exploring(task)
+    policy.renew(Policy.from_dense(task, chains))
     policy.explore.fill_(explore)
     torch.manual_seed(0)
     rows = {"last_cell": torch.full((8000,), 1), "steps_since_detection": torch.arange(8000) % 2}

@@ -12,12 +12,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy import sparse
 
 from tests.helpers import configured
 from tests.world.kernels import paper
 from trackmdp.errors import UserError
-from trackmdp.world.kernels import check_homogeneous, load_table, random_walk
+from trackmdp.world.kernels import load_table
 from trackmdp.world.make import build_world
 from trackmdp.world.model import World
 
@@ -175,21 +174,3 @@ def test_rounding_of_a_row_sum_is_forgiven() -> None:
     table[0] *= 0.5
     table[4] += 1e-11
     assert np.array_equal(World(table, 3, cost=0.1, t_max=1).kernel.toarray(), table)
-
-
-def test_a_kernel_that_only_claims_to_be_homogeneous_is_refused() -> None:
-    with pytest.raises(
-        UserError, match=r"kernel=random_support: kernel.homogeneous=true, but from cell \d+ the target"
-    ):
-        build_world(configured("train", "kernel.homogeneous=true"))
-
-
-def test_one_changed_row_is_found() -> None:
-    table = random_walk(6, stay=0.4, diagonal=False, exit_probability=0.01, border="clip").toarray()
-    check_homogeneous(sparse.csr_array(table), 6, "kernel")
-    at_the_border = table.copy()
-    at_the_border[3] = 0.0
-    check_homogeneous(sparse.csr_array(at_the_border), 6, "kernel")
-    table[14, 14], table[14, 15] = table[14, 15], table[14, 14]
-    with pytest.raises(UserError, match=r"from cell 14 the target moves otherwise than from cell 7"):
-        check_homogeneous(sparse.csr_array(table), 6, "kernel")

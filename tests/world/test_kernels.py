@@ -187,13 +187,5 @@ def test_the_drift_heads_where_it_is_told(direction: float) -> None:
 
 
 def test_all_kernels_are_listed() -> None:
-    made = set(kernels.__all__) - {"Border", "load_table", "check_homogeneous"}
+    made = set(kernels.__all__) - {"Border", "load_table"}
     assert made == set(KERNELS)
-
-
-@pytest.mark.parametrize("border", BORDERS)
-@pytest.mark.parametrize("kernel", ["random_walk", "drift"])
-def test_walks_and_drifts_are_homogeneous_with_every_border(kernel: str, border: str) -> None:
-    cfg = configured("train", f"kernel={kernel}", f"kernel.border={border}", "grid.size=6")
-    assert cfg.kernel.homogeneous
-    assert build_world(cfg).task.homogeneous

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy import sparse
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -23,7 +24,8 @@ from trackmdp.algos.moves import MoveBuffer
 from trackmdp.algos.segments import SegmentBuffer
 from trackmdp.config.per_sensor import PerSensorConfig
 from trackmdp.errors import UserError
-from trackmdp.policies.fixed import AllOn, AllOnOrChain, ChainPolicy
+from trackmdp.policies.explore import Exploring
+from trackmdp.policies.policy import Policy
 from trackmdp.seeding import generator
 from trackmdp.world.model import Task
 
@@ -59,9 +61,10 @@ class Hindsight:
         self._buffer = _buffer(task, cfg.buffer_size, self._generator)
         self._learner: _Learner | None = None
         self._seen: int | None = None
-        nothing = np.zeros((task.num_cells, task.num_choices, task.num_cells), dtype=bool)
-        self.policy = AllOnOrChain(nothing, device) if self._mixed else AllOn(task.num_cells)
-        self.actor = ChainPolicy(nothing, device)
+        if cfg.share_cells and (task.cost != task.cost[0]).any():
+            raise UserError("algo.share_cells=true: sensors of different prices, expected one price for all")
+        self.actor = Policy.none(task)
+        self.policy = Exploring(task, device) if self._mixed else Policy.all_on(task)
 
     def step(self, batch: TensorDictBase | None) -> dict[str, float]:
         """Store one batch `[B, time]`, then `updates_per_iteration` updates if enough batches are in."""
@@ -78,11 +81,10 @@ class Hindsight:
                 progress = self._update / self.updates
                 learner.loss.actor_loss.prepare(self._update, progress)
                 cells = self._buffer.paths(cfg.batch_size, self.task.t_max + 2)
-                cells = _within(cells, learner.loss.reach, self.task.rows) if farther else cells
+                cells = _within(cells, learner.loss.reach, self.task) if farther else cells
                 averages.add(**learner.update(cells, cfg.learning_rate.at(progress), cfg.blend.at(progress)))
                 self._update += 1
-            self.actor.chains.copy_(learner.chains())
-            self._renew_policy()
+            self._renew_policy(learner)
         losses = averages.means() or dict.fromkeys(_LOSSES, math.nan)
         return {"moves": len(self._buffer), "updates": self._update} | {f"loss_{k}": v for k, v in losses.items()}
 
@@ -94,7 +96,6 @@ class Hindsight:
             "update": self._update,
             "generator": self._generator.get_state(),
             "buffer": self._buffer.state_dict(),
-            "chains": self.actor.chains.clone(),
             "learner": None if learner is None else learner.state_dict(),
         }
 
@@ -103,18 +104,18 @@ class Hindsight:
         self._iteration, self._update = state["iteration"], state["update"]
         self._buffer.load_state_dict(state["buffer"])
         self._seen = None
-        self.actor.chains.copy_(state["chains"])
         self._learner = None
         if state["learner"] is not None:
             self._learner = self._make_learner(state["learner"]["reach"])
             self._learner.load_state_dict(state["learner"])
-            self._renew_policy()
+            self._renew_policy(self._learner)
         self._generator.set_state(state["generator"].cpu())
 
-    def _renew_policy(self) -> None:
-        """What the next batch is collected with."""
-        if isinstance(self.policy, AllOnOrChain):
-            self.policy.chains.copy_(self.actor.chains)
+    def _renew_policy(self, learner: _Learner) -> None:
+        """What is evaluated, and what the next batch is collected with."""
+        self.actor = Policy(self.task, learner.sets(self.task))
+        if isinstance(self.policy, Exploring):
+            self.policy.renew(self.actor)
             self.policy.explore.fill_(self.cfg.explore.at(self._iteration / self._collecting))
 
     def _make_learner(self, reach: int) -> _Learner:
@@ -125,6 +126,7 @@ class Hindsight:
             hidden=self.hidden,
             discount=self.cfg.gamma,
             generator=self._generator,
+            share_cells=self.cfg.share_cells,
             max_entries=self.cfg.max_entries,
         )
         return _Learner(loss, self.cfg.ema_decay)
@@ -141,7 +143,7 @@ class Hindsight:
         if not len(self._buffer):
             raise UserError("algo.total_frames: in none of them was a target located and sensed again; expected more")
         if self._seen is None:
-            self._seen = int(_distance(*self._buffer.moves(), self.task.rows).max())
+            self._seen = int(_distance(*self._buffer.moves(), self.task).max())
         return self._seen
 
 
@@ -152,16 +154,17 @@ def _buffer(task: Task, capacity: int, rng: torch.Generator) -> MoveBuffer | Seg
     return SegmentBuffer(task.num_cells, task.t_max + 2, capacity, rng)
 
 
-def _distance(start: Tensor, end: Tensor, size: int) -> Tensor:
+def _distance(start: Tensor, end: Tensor, task: Task) -> Tensor:
     """How far moves go, in rows or in columns; 0 where they end outside, in M."""
-    moved = torch.maximum((start // size - end // size).abs(), (start % size - end % size).abs())
-    return moved.masked_fill_(end == size**2, 0)
+    columns = task.columns
+    moved = torch.maximum((start // columns - end // columns).abs(), (start % columns - end % columns).abs())
+    return moved.masked_fill_(end == task.num_cells, 0)
 
 
-def _within(cells: Tensor, reach: int, size: int) -> Tensor:
+def _within(cells: Tensor, reach: int, task: Task) -> Tensor:
     """Paths `[steps + 1, B]` on which the target is outside, M, from its first move of more than `reach` on."""
-    gone = (_distance(cells[:-1], cells[1:], size) > reach).cummax(0).values
-    return torch.cat([cells[:1], cells[1:].masked_fill(gone, size**2)])
+    gone = (_distance(cells[:-1], cells[1:], task) > reach).cummax(0).values
+    return torch.cat([cells[:1], cells[1:].masked_fill(gone, task.num_cells)])
 
 
 class _Learner:
@@ -194,9 +197,15 @@ class _Learner:
         """`[M, T+1, K]`, the sensors on, as the actor's outputs."""
         return torch.cat([self.ema(rows) > 0 for rows in self.loss.slices()])
 
-    def chains(self) -> Tensor:
-        """`[M, T+1, M]` bool, the policy."""
-        return self.loss.view.spread(self._on())
+    def sets(self, task: Task) -> sparse.csr_array:
+        """`[M * (T+1), M]` bool, the policy's table."""
+        cells = self.loss.view.cells
+        on = self._on() & (cells < task.num_cells).unsqueeze(1)
+        # Entry (x, n, k) is sensor cells[x, k] in row x (T+1) + n of the table; `nonzero` lists them row by row.
+        start, n, local = on.nonzero(as_tuple=True)
+        row, column = (start * task.num_choices + n).cpu().numpy(), cells[start, local].cpu().numpy()
+        shape = (task.num_cells * task.num_choices, task.num_cells)
+        return sparse.csr_array((np.ones(len(row), dtype=bool), (row, column)), shape=shape)
 
     def state_dict(self) -> dict[str, Any]:
         return {

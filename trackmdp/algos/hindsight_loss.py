@@ -62,6 +62,7 @@ class HindsightLoss(nn.Module):
         hidden: hidden units of each net.
         discount: γ of the credit.
         generator: draws the initial weights.
+        share_cells: the target moves alike from all cells away from the border.
         max_entries: entries (x, n, sensor) of a table at most, where that leaves one cell; what has more is gone
             through in parts, a few cells at a time. The losses are the same, up to rounding.
     """
@@ -79,16 +80,17 @@ class HindsightLoss(nn.Module):
         hidden: int,
         discount: float,
         generator: torch.Generator,
+        share_cells: bool = False,
         max_entries: int = 2**62,
     ) -> None:
         super().__init__()
         m, choices, device = task.num_cells, task.num_choices, generator.device
-        self.reach, self.near = reach, Window.reaching(task, reach, device)
-        self.view = Window.reaching(task, choices * reach, device)
-
-        # Where the target moves alike and sensors cost alike, what to sense is learned once for all such cells; values
-        # stay each cell's own.
-        alike = task.homogeneous and bool((task.cost == task.cost[0]).all())
+        self.reach, self._window = reach, task.window
+        # One move takes the target to a cell that is near; t_max + 1 of them, to one in view.
+        self.near, self.view = Window.reaching(task, reach, device), _in_view(task, choices * reach, device)
+        # The border looks alike from two cells where it is equally far, or out of reach until the safe action.
+        # What to sense is then learned once for both; values stay each cell's own.
+        groups = Window(task, choices * reach, device).groups() if share_cells else None
 
         def net(clocks: int, outputs: int, bias: float, groups: Tensor | None = None) -> CellClockNet:
             return CellClockNet(
@@ -96,7 +98,8 @@ class HindsightLoss(nn.Module):
             )
 
         def decisions(seen: Window) -> CellClockNet:
-            return net(choices, seen.width, -1.0, self.view.groups() if alike and seen.is_local else None)
+            # Where the window is the whole grid an output stands for a cell, and cannot be shared.
+            return net(choices, seen.width, -1.0, groups if seen.is_local else None)
 
         self.actor, self.critic = decisions(self.view), net(1, 1, 0.0)
         self.clocked_actor, self.clocked_critic = decisions(self.near), net(choices + 1, 1, 0.0)
@@ -181,6 +184,10 @@ class HindsightLoss(nn.Module):
         stays, visits = moved.sum(-1), torch.bincount(start - first, minlength=count).unsqueeze(-1)
         gain = moved * sensing_gain(advantage[:, nearby].transpose(0, 1), reward=1.0, discount=self.discount)
         chosen, cost = logits.detach() > 0, self.cost[nearby].unsqueeze(1)
+        if self._window is not None and self._window < self.reach:
+            # Sensors outside the window cannot be chosen: they neither gain nor cost, nor are they learned about.
+            allowed = self._choosable(nearby, rows).unsqueeze(1)
+            chosen, gain, cost = chosen & allowed, gain * allowed, cost * allowed
         following = self.discount * torch.bmm(moved, known[nearby]).squeeze(1)
         free = following[:, 1:] + (gain * chosen).sum(-1) - stays * (chosen * cost).sum(-1)
         target = torch.cat([free, following[:, :1] + self.safe * stays], dim=1) / visits.clamp(min=1)
@@ -193,7 +200,9 @@ class HindsightLoss(nn.Module):
         start, moves, end = cells[0], cells[1:], cells[1:-1]
         row = start * choices + self.clocks
         entry = row * k + self.view.index(start, end)
-        hits, inside = gather(on, entry) & (end < m), moves < m
+        # Where the target has left the grid or the view, `entry` is that of some other sensor.
+        seen = end < m if self._window is None else self.view.contains(start.expand_as(end), end)
+        hits, inside = gather(on, entry) & seen, moves < m
         located = gather(pad(value, (0, 1)), moves)
         spent = gather(torch.cat([self._set_cost(on[rows], rows) for rows in self.slices()]), row)
         discount, safe_cost = self.discount, 1.0 - self.safe
@@ -204,7 +213,15 @@ class HindsightLoss(nn.Module):
         for n in range(1, choices):
             alive[n] &= alive[n - 1] & ~hits[n - 1]
         visits = torch.bincount(start, minlength=m)
-        return _Replayed(row, entry, alive, gain * alive, scatter_add(returns[0], start, m) / visits.clamp(min=1))
+        gain = gain * (alive if self._window is None else alive & seen)
+        return _Replayed(row, entry, alive, gain, scatter_add(returns[0], start, m) / visits.clamp(min=1))
+
+    def _choosable(self, nearby: Tensor, rows: slice) -> Tensor:
+        """`[rows, K]` bool, which of the sensors `nearby` `[rows, K]` of the cells `rows` can be chosen."""
+        near = self.near
+        start = torch.arange(near.num_cells, device=nearby.device)[rows]
+        window = Window((near.rows, near.columns), self._window, nearby.device)
+        return window.contains(start[:, None].expand_as(nearby), nearby)
 
     def _set_cost(self, on: Tensor, rows: slice) -> Tensor:
         """C(A) `[rows, T+1]` of the sets `on` of the cells `rows`."""
@@ -225,6 +242,13 @@ class HindsightLoss(nn.Module):
         """`[T+1]`: each clock by its own number of rows and its running mean gain, so that rare clocks count."""
         self.gain_scale[which].lerp_(gain / count.clamp(min=1), _GAIN_SCALE_RATE)
         return 1.0 / (count.clamp(min=_FEWEST_ROWS) * self.gain_scale[which].clamp(min=_LEAST_GAIN))
+
+
+def _in_view(task: Task, radius: int, device: torch.device) -> Window:
+    """The sensors that are of use from a located cell until the safe action: in reach, and in the task's window."""
+    if task.window is None:
+        return Window.reaching(task, radius, device)
+    return Window(task, min(radius, task.window), device)
 
 
 def _squared_error(values: Tensor, targets: Tensor, visits: Tensor) -> Tensor:

@@ -15,12 +15,14 @@ from scipy import sparse
 from tensordict import TensorDictBase
 
 from trackmdp.config.learned_kernel import LearnedKernelConfig
-from trackmdp.policies.fixed import ChainPolicy
+from trackmdp.policies.explore import RenewedTable
+from trackmdp.policies.policy import Policy, as_policy
+from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
 from trackmdp.solvers import search
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.kernel_estimate import KernelEstimate, ObservedPaths
-from trackmdp.world.model import BoolArray, Task, World
+from trackmdp.world.model import Task, World
 from trackmdp.world.windows import Window
 
 __all__ = ["LearnedKernel", "observed_paths"]
@@ -45,9 +47,8 @@ class LearnedKernel:
         self._rng = np.random.default_rng(derive(seed, "learned_kernel"))
         self._chooses, self._warm_up = cfg.sensing == "chosen", cfg.warm_up
         self._iteration, self._spent = 0, np.zeros(2)
-        shape = (task.num_cells, task.num_choices, task.num_cells)
-        self.policy = ChainPolicy(np.ones(shape, dtype=bool), device)
-        self.actor = ChainPolicy(np.ones(shape, dtype=bool), device)
+        self.actor = Policy.all_on(task)
+        self.policy = RenewedTable(task, device, on=True) if self._chooses else Policy.all_on(task)
 
     def step(self, batch: TensorDictBase | None) -> dict[str, float]:
         """Take in one batch `[B, time]`, plan, and choose the sets of the next one."""
@@ -56,12 +57,11 @@ class LearnedKernel:
             self._estimate.add(observed_paths(batch, self.task))
             self._spent += [batch.numel(), _sensors_on(batch)]
         self._estimate.fit(self.cfg.rounds_at_end if self._iteration == self.iterations else self.cfg.rounds)
-        chains = search.solve(self._world(self._estimate.mean())).dense()
-        self.actor.chains.copy_(torch.as_tensor(chains))
-        if self._chooses and self._spent[0] >= self._warm_up:
-            drawn = search.solve(self._world(self._estimate.sample(self._rng))).dense()
-            self.policy.chains.copy_(torch.as_tensor(drawn))
-        return self._diagnostics(chains)
+        plan = search.solve(self._world(self._estimate.mean()))
+        self.actor = as_policy(self.task, plan)
+        if isinstance(self.policy, RenewedTable) and self._spent[0] >= self._warm_up:
+            self.policy.renew(search.solve(self._world(self._estimate.sample(self._rng))))
+        return self._diagnostics(plan)
 
     def _world(self, kernel: sparse.csr_array) -> World:
         """The task with the `[M, M + 1]` kernel believed."""
@@ -70,13 +70,13 @@ class LearnedKernel:
             kernel[:, :-1], task.size, cost=task.cost, safe_cost=task.safe_cost, t_max=task.t_max, reward=task.reward
         )
 
-    def _diagnostics(self, chains: BoolArray) -> dict[str, float]:
+    def _diagnostics(self, plan: PolicyTable) -> dict[str, float]:
         """What the plan is believed to be worth, how sure that is, and what learning has cost so far."""
         drawn = [self._world(self._estimate.sample(self._rng)) for _ in range(self.cfg.samples)]
-        believed = np.array([evaluate(world, chains).aihtr for world in drawn])
+        believed = np.array([evaluate(world, plan).aihtr for world in drawn])
         frames, sensors = self._spent
         return {
-            "believed_aihtr": evaluate(self._world(self._estimate.mean()), chains).aihtr,
+            "believed_aihtr": evaluate(self._world(self._estimate.mean()), plan).aihtr,
             "believed_deviation": float(believed.std()),
             "least_visits": float(self._estimate.visits.min()),
             "sensors_per_frame": sensors / max(frames, 1.0),
@@ -89,8 +89,8 @@ class LearnedKernel:
             "spent": torch.as_tensor(self._spent),
             "rng": _rng_state(self._rng),
             "estimate": {name: torch.as_tensor(part) for name, part in self._estimate.state().items()},
-            "policy": self.policy.chains.clone(),
-            "actor": self.actor.chains.clone(),
+            "policy": self.policy.state_dict(),
+            "actor": _packed(self.actor),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -98,8 +98,8 @@ class LearnedKernel:
         self._iteration, self._spent = state["iteration"], state["spent"].cpu().numpy().copy()
         self._rng.bit_generator.state = _unpacked(state["rng"])
         self._estimate.load_state({name: part.cpu().numpy() for name, part in state["estimate"].items()})
-        self.policy.chains.copy_(state["policy"])
-        self.actor.chains.copy_(state["actor"])
+        self.policy.load_state_dict(state["policy"])
+        self.actor = Policy.all_on(self.task) if state["actor"] is None else _policy(self.task, state["actor"])
 
 
 def observed_paths(batch: TensorDictBase, task: Task) -> ObservedPaths:
@@ -137,3 +137,16 @@ def _rng_state(rng: np.random.Generator) -> dict[str, Any]:
 
 def _unpacked(state: dict[str, Any]) -> dict[str, Any]:
     return {**state, "state": {name: int(value) for name, value in state["state"].items()}}
+
+
+def _packed(policy: PolicyTable) -> dict[str, torch.Tensor] | None:
+    """The table's sparse matrix as tensors; None for all sensors on, before the first plan."""
+    if policy.sets is None:
+        return None
+    return {"indices": torch.as_tensor(policy.sets.indices), "indptr": torch.as_tensor(policy.sets.indptr)}
+
+
+def _policy(task: Task, packed: dict[str, torch.Tensor]) -> Policy:
+    indices, indptr = packed["indices"].cpu().numpy().copy(), packed["indptr"].cpu().numpy().copy()
+    shape = (task.num_cells * task.num_choices, task.num_cells)
+    return Policy(task, sparse.csr_array((np.ones(len(indices), dtype=bool), indices, indptr), shape=shape))

@@ -54,6 +54,10 @@ class PerSensorConfig(AlgoConfig):
         "units of each net's hidden layer; null: by the size of the problem", unit="units", ge=1, le=4096
     )
     buffer_size: int = option("path segments kept for replay", unit="segments", ge=1)
+    share_cells: bool = option(
+        "assume that the target moves alike from all cells away from the border, and learn one policy for them all; "
+        "with one price for all sensors"
+    )
     max_entries: int = option(
         "entries (located cell, misses, sensor) of the losses' tables at once; larger ones are gone through in parts",
         unit="entries",

@@ -62,10 +62,6 @@ class KernelConfig(ChoiceConfig):
     """
 
     is_motion: ClassVar[bool] = True
-    homogeneous: bool = option(
-        "the target moves alike from all cells away from the border, so that hindsight learns one policy for them all; "
-        "checked where there is a kernel"
-    )
 
     @property
     def source(self) -> str:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from trackmdp.world.model import BoolArray
 
-__all__ = ["AllOn", "AllOnOrChain", "ChainPolicy", "RandomK", "RandomSubset"]
+__all__ = ["AllOn", "ChainPolicy", "RandomK", "RandomSubset"]
 
 
 class AllOn(TensorDictModuleBase):
@@ -89,24 +89,3 @@ class ChainPolicy(TensorDictModuleBase):
         """Write `action` `[B, M]`; where the safe action is forced the last set stands in, unused."""
         n = tensordict["steps_since_detection"].clamp_max(self.chains.shape[1] - 1)
         return tensordict.set("action", self.chains[tensordict["last_cell"], n])
-
-
-class AllOnOrChain(ChainPolicy):
-    """Every sensor on with probability `explore` where the target is located, else a table of chains.
-
-    The coin is tossed before the target moves, so that what is seen on the steps with all sensors on is what all steps
-    from there are like, however the chains choose.
-    """
-
-    explore: Tensor
-
-    def __init__(self, chains: BoolArray, device: torch.device | str = "cpu") -> None:
-        super().__init__(chains, device)
-        self.register_buffer("explore", torch.ones((), device=device))
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write `action` `[B, M]`."""
-        n = tensordict["steps_since_detection"]
-        everything = (torch.rand(n.shape, device=n.device) < self.explore) & (n == 0)
-        action = super().forward(tensordict)["action"]
-        return tensordict.set("action", action | everything.unsqueeze(-1))

@@ -14,13 +14,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from trackmdp.errors import UserError
 from trackmdp.world.checks import canonical_kernel
 from trackmdp.world.files import read_matrix
 from trackmdp.world.model import Array, BoolArray, Size, grid_size
 from trackmdp.world.rows import pairwise_row_sums
 
-__all__ = ["Border", "random_support", "random_walk", "drift", "load_table", "check_homogeneous"]
+__all__ = ["Border", "random_support", "random_walk", "drift", "load_table"]
 
 Border: TypeAlias = Literal["renormalize", "inside", "clip", "exit"]
 
@@ -105,32 +104,6 @@ def load_table(size: Size, *, path: str | Path) -> sparse.csr_array:  # noqa: AR
         UserError: there is no such file, or it holds no square table of numbers.
     """
     return canonical_kernel(read_matrix("kernel.path", path, name="kernel"), f"kernel.path={path}")
-
-
-def check_homogeneous(kernel: sparse.csr_array, size: Size, source: str) -> None:
-    """See that the target moves alike from all cells whose moves stay clear of the border.
-
-    Raises:
-        UserError: from two such cells it does not; `source` is named at the start of the message.
-    """
-    rows, columns = grid_size(size)
-    cell, (start, end) = np.arange(rows * columns), kernel.nonzero()
-    row, column = np.divmod(cell, columns)
-    reach = max(np.abs(row[start] - row[end]).max(initial=0), np.abs(column[start] - column[end]).max(initial=0))
-    clear = np.minimum(np.minimum(row, rows - 1 - row), np.minimum(column, columns - 1 - column))
-    inner = cell[clear >= reach]
-    if not len(inner):
-        return
-    # Column start - end + M: the same for the same displacement, for away from the border no move wraps around.
-    shift = (end - start) + rows * columns
-    moves = sparse.csr_array((kernel.data, (start, shift)), shape=(len(cell), 2 * rows * columns))[inner]
-    first = sparse.csr_array(np.ones((len(inner), 1))) @ moves[[0]]
-    differs = np.flatnonzero(abs(moves - first).max(axis=1).toarray().ravel() > 1e-9)
-    if len(differs):
-        raise UserError(
-            f"{source}: kernel.homogeneous=true, but from cell {inner[differs[0]]} the target moves otherwise than "
-            f"from cell {inner[0]}; expected alike away from the border"
-        )
 
 
 def _window(radius: int) -> _Offsets:

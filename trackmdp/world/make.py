@@ -11,9 +11,8 @@ import numpy.typing as npt
 
 from trackmdp.config import WorldConfig
 from trackmdp.config.compose import compose, default, given
-from trackmdp.config.registry import make, maker
+from trackmdp.config.registry import make
 from trackmdp.errors import UserError
-from trackmdp.world import kernels
 from trackmdp.world.checks import canonical_kernel, check_kernel
 from trackmdp.world.files import read_numbers
 from trackmdp.world.model import Array, Size, World, grid_size
@@ -116,13 +115,9 @@ def build_world(cfg: WorldConfig) -> World:
         UserError: a file is missing or malformed, or the kernel breaks a rule (`checks.check_kernel`).
     """
     size, source = cfg.grid.sides, cfg.kernel.source
-    options = dict(vars(cfg.kernel))
-    homogeneous = options.pop("homogeneous")
-    kernel = canonical_kernel(maker(cfg.kernel)(cfg.grid.size, **options), source)
+    kernel = canonical_kernel(make(cfg.kernel, cfg.grid.size), source)
     check_kernel(kernel, size, truncates=cfg.grid.max_steps is not None, source=source)
-    if homogeneous:
-        kernels.check_homogeneous(kernel, size, source)
-    return World(kernel, size, homogeneous=homogeneous, **_of_task(cfg))
+    return World(kernel, size, **_of_task(cfg))
 
 
 def recorded(
@@ -135,7 +130,6 @@ def recorded(
     seed: int,
     min_length: int | None,
     markov: bool,
-    homogeneous: bool,
     **of_task: Any,
 ) -> Recorded:
     """The recorded tracks in a file, those held out set apart; see `TracksConfig` for the options.
@@ -147,8 +141,7 @@ def recorded(
     shortest = max(min_length or of_task["t_max"] + 3, 1 if ends == "exit" else 2)  # a cut track of one has no step
     check_tracks(tracks, shortest, f"kernel.path={path}")
     mine, apart = split(tracks, held_out, seed)
-    assumed = {"markov": markov, "homogeneous": homogeneous, "anywhere": starts == "anywhere"}
-    return Recorded(mine, size, held_out=apart, **assumed, **of_task)
+    return Recorded(mine, size, held_out=apart, markov=markov, anywhere=starts == "anywhere", **of_task)
 
 
 def paper_cost(size: Size, *, reward: float, sensor: float | list[float] | str, safe: float | None) -> dict[str, Any]:

@@ -43,7 +43,6 @@ class Task:
         window: W; only the sensors up to W rows and columns from the last located cell can be chosen. None: all can.
         markov: whether the next move depends on the target's cell alone, so that a learner may put paths together from
             moves seen on different ones.
-        homogeneous: whether the target moves alike from all cells away from the border.
 
     Raises:
         UserError: a number is out of its range, or `cost` does not have one price per cell.
@@ -57,7 +56,6 @@ class Task:
     max_steps: int | None
     window: int | None
     markov: bool
-    homogeneous: bool
 
     def __init__(
         self,
@@ -70,7 +68,6 @@ class Task:
         max_steps: int | None = None,
         window: int | None = None,
         markov: bool = True,
-        homogeneous: bool = False,
     ) -> None:
         rows, columns = grid_size(size)
         prices = _prices(cost, rows * columns)
@@ -83,7 +80,6 @@ class Task:
             "max_steps": None if max_steps is None else _at_least(1, "max_steps", max_steps),
             "window": None if window is None else _at_least(0, "window", window),
             "markov": markov,
-            "homogeneous": homogeneous,
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)  # the dataclass is frozen
@@ -152,7 +148,6 @@ class World(Task):
         max_steps: int | None = None,
         window: int | None = None,
         markov: bool = True,
-        homogeneous: bool = False,
     ) -> None:
         super().__init__(
             size,
@@ -163,7 +158,6 @@ class World(Task):
             max_steps=max_steps,
             window=window,
             markov=markov,
-            homogeneous=homogeneous,
         )
         canonical = canonical_kernel(kernel)
         check_kernel(canonical, self.size, truncates=max_steps is not None)

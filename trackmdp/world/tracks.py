@@ -108,7 +108,6 @@ class Recorded(Task):
         max_steps: int | None = None,
         window: int | None = None,
         markov: bool = True,
-        homogeneous: bool = False,
         anywhere: bool = False,
     ) -> None:
         super().__init__(
@@ -120,7 +119,6 @@ class Recorded(Task):
             max_steps=max_steps,
             window=window,
             markov=markov,
-            homogeneous=homogeneous,
         )
         for name, value in (("tracks", tracks), ("held_out", held_out), ("anywhere", anywhere)):
             object.__setattr__(self, name, value)  # the dataclass is frozen

@@ -1,0 +1,79 @@
+"""Policies for collecting: a table that is renewed as learning goes on, and one that at times senses everything."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from trackmdp.policies.table import PolicyTable
+from trackmdp.world.model import Task
+
+__all__ = ["Exploring", "RenewedTable"]
+
+_ROWS_AT_ONCE = 2**12
+
+
+class RenewedTable(TensorDictModuleBase):
+    """Acts as a deterministic policy that is replaced from time to time.
+
+    The table is a buffer of fixed shape, for collectors hand buffers on to their worker processes; so it holds a bit
+    for every entry and not the entries stored, which change in number.
+
+    Args:
+        task: what it acts in.
+        device: where it acts.
+        on: whether all sensors are on at first, or none.
+    """
+
+    in_keys: ClassVar = ["last_cell", "steps_since_detection"]
+    out_keys: ClassVar = ["action"]
+    bits: Tensor
+    _place: Tensor
+
+    def __init__(self, task: Task, device: torch.device | str = "cpu", *, on: bool = False) -> None:
+        super().__init__()
+        self.num_cells, self.num_choices = task.num_cells, task.num_choices
+        shape = (task.num_cells * task.num_choices, -(-task.num_cells // 8))
+        self.register_buffer("bits", torch.full(shape, 255 * on, dtype=torch.uint8, device=device))
+        # numpy.packbits puts the first of eight entries into the highest bit.
+        self.register_buffer("_place", torch.arange(7, -1, -1, device=device), persistent=False)
+
+    def renew(self, policy: PolicyTable) -> None:
+        """Act as the deterministic `policy` from now on."""
+        assert policy.sets is not None
+        for begin in range(0, len(self.bits), _ROWS_AT_ONCE):
+            rows = policy.sets[begin : begin + _ROWS_AT_ONCE].toarray()
+            self.bits[begin : begin + len(rows)].copy_(torch.as_tensor(np.packbits(rows, axis=1)))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write `action` `[*B, M]`."""
+        cell, n = tensordict["last_cell"], tensordict["steps_since_detection"]
+        packed = self.bits[cell * self.num_choices + n.clamp_max(self.num_choices - 1)]
+        chosen = (packed.unsqueeze(-1) >> self._place) & 1
+        return tensordict.set("action", chosen.flatten(-2)[..., : self.num_cells].bool())
+
+
+class Exploring(RenewedTable):
+    """Every sensor on with probability `explore` where the target is located, else the table.
+
+    The coin is tossed before the target moves, so that what is seen on the steps with all sensors on is what all steps
+    from there are like, however the table chooses.
+    """
+
+    explore: Tensor
+
+    def __init__(self, task: Task, device: torch.device | str = "cpu") -> None:
+        super().__init__(task, device)
+        self.register_buffer("explore", torch.ones((), device=device))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write `action` `[*B, M]`."""
+        n = tensordict["steps_since_detection"]
+        everything = (torch.rand(n.shape, device=n.device) < self.explore) & (n == 0)
+        action = super().forward(tensordict)["action"]
+        return tensordict.set("action", action | everything.unsqueeze(-1))
