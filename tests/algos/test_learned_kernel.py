@@ -87,6 +87,6 @@ def test_the_state_is_plain_tensors_and_words(tmp_path) -> None:
     learner, _ = learn(small_world(3), 2, "algo.sensing=chosen", "algo.warm_up=0")
     torch.save(learner.state_dict(), tmp_path / "state.pt")
     state = torch.load(tmp_path / "state.pt", weights_only=True)
-    again = algorithm("learned_kernel", small_world(3))
+    again = algorithm("learned_kernel", small_world(3), "algo.sensing=chosen")
     again.load_state_dict(state)
     assert (again.actor.dense() == learner.actor.dense()).all()
