@@ -42,16 +42,10 @@ def policy_map(name: str, where: str, policy: Policy, motion: Motion, size: tupl
             axes.set_title("just located (n = 0)" if n == 0 else "after one miss (n = 1)", fontsize=8.5)
 
     rows: list[list[Cell]] = [
-        [
-            int(x),
-            n,
-            int(policy.chains[x, n].sum()),
-            int(possible[n][x].sum()),
-            _cells_text(policy.chains[x, n], size[1]),
-        ]
+        [x, n, int((on := policy.chains[x, n]).sum()), int(possible[n][x].sum()), _cells_text(on, size[1])]
         for x in range(cells)
-        for n in range(choices)
-        if n < len(shown) and possible[n][x].any()
+        for n in shown
+        if possible[n][x].any()
     ]
     columns = [Column("located in cell"), Column("misses n"), Column("sensors on"), Column("possible cells")]
     title = f"Sets sensed around each located cell, {where}"
