@@ -217,7 +217,7 @@ def test_bad_input_ends_in_one_clear_line(tmp_path: Path, log: Path, monkeypatch
         (lambda: holding(log.read_bytes()[:20]), "damaged (the record at byte 8 reaches beyond"),
         (lambda: foreign(tmp_path / "f.mcap", "ros2"), "not a log of trackmdp (profile 'ros2')"),
         (lambda: foreign(tmp_path / "g.mcap", ""), "not a log of trackmdp (it has no metadata trackmdp.run)"),
-        (lambda: of_format(tmp_path / "h.mcap", {"FORMAT": "9"}, monkeypatch), "format 9 (trackmdp "),
+        (lambda: of_format(tmp_path / "h.mcap", {"LOG_FORMAT": "9"}, monkeypatch), "format 9 (trackmdp "),
     ]
     for make, message in cases:
         file = make()

@@ -38,7 +38,7 @@ def doctored(log: Path, file: Path, change: Callable[[Parts], Any]) -> Path:
     """The log with changed parts, every digest and checksum right: metadata `m`, attachments `a`, messages `x`."""
     read = make_reader(io.BytesIO(log.read_bytes()))
     parts: Parts = {
-        "m": {each.name: schema.unsealed(each.name, dict(each.metadata)) for each in read.iter_metadata()},
+        "m": {each.name: schema.unsealed_record(each.name, dict(each.metadata)) for each in read.iter_metadata()},
         "a": {each.name: each.data for each in read.iter_attachments()},
         "x": {},
     }

@@ -31,7 +31,7 @@ def checked(solutions: Sequence[Solution] = SOLUTIONS) -> dict[Key, Check]:
     """Every claim by its name and the first words of its statement, where it comes out worst in both worlds."""
     found: dict[Key, Check] = {}
     for world, solution in zip(WORLDS, solutions, strict=True):
-        for row in theorems.check(world, solution, 1e-9):
+        for row in theorems.check_theorems(world, solution, 1e-9):
             key = row.name, " ".join(row.statement.split()[:3])
             if row.expected and (key not in found or ORDER.index(row.verdict) < ORDER.index(found[key].verdict)):
                 found[key] = row
@@ -195,7 +195,7 @@ def test_the_last_line_counts_claims_apart_from_forms_that_are_not_claimed() -> 
         Check("c", "", 3.0, holds=False, closed=False),
         Check("d", "", 3.0, holds=False, expected=False),
     ]
-    assert theorems.summary(rows) == (
+    assert theorems.summarize_checks(rows) == (
         "of 3 claims 1 hold, 1 have no case in this world, 1 are open, 0 FAIL; "
         "of 1 looser forms, not claimed, 1 do not hold"
     )

@@ -21,7 +21,7 @@ from trackmdp.world.model import BoolArray, World
 
 def checks(world: World, solution: Solution | None = None) -> dict[tuple[str, str], Check]:
     solved = optimal.solve(world, tolerance=1e-9, time_limit=20) if solution is None else solution
-    return {(row.name, row.statement): row for row in theorems.check(world, solved, 1e-8)}
+    return {(row.name, row.statement): row for row in theorems.check_theorems(world, solved, 1e-8)}
 
 
 def named(rows: dict[tuple[str, str], Check], name: str) -> list[Check]:
@@ -73,7 +73,7 @@ def test_with_a_cheap_safe_action_being_overdue_is_worth_more_than_being_located
 
 
 def test_the_remark_on_worlds_where_qmdp_is_optimal() -> None:
-    rows = {row.name: row for row in remarks.check(1e-9)}
+    rows = {row.name: row for row in remarks.check_remarks(1e-9)}
     assert rows["remark, c = 0.14, Z = 4"].holds
     world = paper_world(4, 0.14, 1)
     np.testing.assert_array_equal(qmdp.solve(world).dense()[:, 0], world.kernel.toarray() > 0)
@@ -81,7 +81,7 @@ def test_the_remark_on_worlds_where_qmdp_is_optimal() -> None:
 
 
 def test_the_printed_bound_is_exceeded() -> None:
-    (row,) = [row for row in remarks.check(1e-9) if row.name == "the printed bound"]
+    (row,) = [row for row in remarks.check_remarks(1e-9) if row.name == "the printed bound"]
     world = worlds.paper_world(worlds.paper_kernel(5, 5, "inside"), 0.16, 5)
     attained = evaluate(world, clocked.solve(world)).aihtr
     assert attained > bounds.paper(world).mean() + 0.5

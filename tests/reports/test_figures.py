@@ -12,14 +12,14 @@ from tests.reports.sweeps import write_sweep
 from trackmdp.errors import UserError
 from trackmdp.reports import figures, learning, maps, style
 from trackmdp.reports.figures import Panel
-from trackmdp.reports.gather import gather
+from trackmdp.reports.gather import gather_runs
 from trackmdp.reports.grouping import Study, study
 from trackmdp.reports.results import Results
 
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
-    return gather(write_sweep(tmp_path_factory.mktemp("sweep")))
+    return gather_runs(write_sweep(tmp_path_factory.mktemp("sweep")))
 
 
 @pytest.fixture(scope="module")
@@ -157,7 +157,7 @@ def test_in_the_page_a_figure_has_a_text_alternative_and_the_colours_of_the_page
 def test_without_matplotlib_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(UserError, match=r"trackmdp\[report\]"):
-        style.require()
+        style.require_matplotlib()
 
 
 def test_files_are_named_after_what_they_show() -> None:

@@ -14,7 +14,7 @@ from trackmdp.durable import write_json
 from trackmdp.errors import UserError
 from trackmdp.reports import policy, results
 from trackmdp.reports.finished import MOST_POINTS
-from trackmdp.reports.gather import gather
+from trackmdp.reports.gather import gather_runs
 from trackmdp.reports.results import Results
 from trackmdp.solvers import bounds, qmdp
 from trackmdp.solvers.evaluate import evaluate
@@ -45,7 +45,7 @@ def plan(folder: Path, *names: str) -> None:
 
 
 def test_every_figure_of_a_run_is_read(whole: Path) -> None:
-    found = gather(whole)
+    found = gather_runs(whole)
     assert len(found.runs) == 12
     assert not found.anomalies
     run = next(run for run in found.runs if run.name == "a2c-0.22-1")
@@ -61,7 +61,7 @@ def test_every_figure_of_a_run_is_read(whole: Path) -> None:
 
 
 def test_one_policy_per_group_is_kept_that_of_the_run_in_the_middle(whole: Path) -> None:
-    found = gather(whole)
+    found = gather_runs(whole)
     assert len(found.policies) == 4
     for name, kept in found.policies.items():
         group = [run for run in found.runs if run.name.rsplit("-", 1)[0] == name.rsplit("-", 1)[0]]
@@ -70,7 +70,7 @@ def test_one_policy_per_group_is_kept_that_of_the_run_in_the_middle(whole: Path)
 
 
 def test_motion_and_references_are_kept_per_world(whole: Path) -> None:
-    found = gather(whole)
+    found = gather_runs(whole)
     assert sorted(found.motions) == ["a2c-0.16-0", "a2c-0.22-0"]
     from trackmdp.config import load_run_config
 
@@ -82,7 +82,7 @@ def test_motion_and_references_are_kept_per_world(whole: Path) -> None:
 
 
 def test_stored_results_read_back_the_same_and_are_small(whole: Path, tmp_path: Path) -> None:
-    found = gather(whole)
+    found = gather_runs(whole)
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
     results.save_results(found, tmp_path / "a")
@@ -109,7 +109,7 @@ def test_stored_results_read_back_the_same_and_are_small(whole: Path, tmp_path: 
 def test_no_path_of_the_machine_is_kept(sweep: Path, tmp_path: Path) -> None:
     plan(sweep, "a2c-0.16-0")
     (tmp_path / "out").mkdir()
-    results.save_results(gather(sweep), tmp_path / "out")
+    results.save_results(gather_runs(sweep), tmp_path / "out")
     for file in ("manifest.json", "runs.csv"):
         assert str(tmp_path) not in (tmp_path / "out" / file).read_text()
     assert results.load_results(tmp_path / "out").manifest["line"] == "trackmdp train -m"
@@ -118,7 +118,7 @@ def test_no_path_of_the_machine_is_kept(sweep: Path, tmp_path: Path) -> None:
 def test_a_curve_keeps_its_ends_and_few_points(sweep: Path) -> None:
     values = np.linspace(-5.0, 5.0, 300)
     write_curve(sweep / "a2c-0.16-0", values)
-    curve = gather(sweep).curves["a2c-0.16-0"]
+    curve = gather_runs(sweep).curves["a2c-0.16-0"]
     assert len(curve) <= MOST_POINTS
     assert (curve[0].aihtr, curve[-1].aihtr, curve[-1].iteration) == (values[0], values[-1], 600)
     gaps = np.diff([point.iteration for point in curve])
@@ -129,7 +129,7 @@ def test_a_curve_keeps_its_ends_and_few_points(sweep: Path) -> None:
 def test_a_failure_or_a_plan_that_says_nothing_is_no_obstacle(sweep: Path, text: str) -> None:
     for name in ("a2c-0.16-0/failed.json", "sweep.json"):
         (sweep / name).write_text(text)
-    found = gather(sweep)
+    found = gather_runs(sweep)
     assert problems(found)["a2c-0.16-0"] == "failed: no reason given"
     assert found.manifest["planned"] is None
 
@@ -144,7 +144,7 @@ def test_what_is_wrong_with_a_run_is_named(sweep: Path) -> None:
     for seed in range(3):
         (sweep / f"hindsight-0.22-{seed}/policy.npz").write_bytes(b"nothing")
     (sweep / "hindsight-0.16-0/kernel.npz").unlink()
-    found = gather(sweep)
+    found = gather_runs(sweep)
     said = problems(found)
     assert len(found.runs) == 7
     assert said["a2c-0.16-0"] == "cut: it has no summary.json"
@@ -166,7 +166,7 @@ def test_a_run_of_a_version_with_other_options_counts(sweep: Path) -> None:
         file.read_text().replace("  radius: 1\n", "  radius: 1\n  later: 3\n").replace("algo:", "algo:\n  x: 1")
     )
     write_summary(file.parent, read_summary(file.parent))
-    found = gather(sweep)
+    found = gather_runs(sweep)
     assert len(found.runs) == 12
     assert "a2c-0.16-0" in found.motions
 
@@ -174,18 +174,18 @@ def test_a_run_of_a_version_with_other_options_counts(sweep: Path) -> None:
 def test_a_run_under_way_is_not_called_cut(sweep: Path) -> None:
     (sweep / "a2c-0.16-0/summary.json").unlink()
     with locked(sweep / "a2c-0.16-0"):
-        assert problems(gather(sweep))["a2c-0.16-0"] == "still running"
+        assert problems(gather_runs(sweep))["a2c-0.16-0"] == "still running"
 
 
 def test_a_missing_seed_is_named(sweep: Path) -> None:
     shutil.rmtree(sweep / "a2c-0.16-1")
-    assert problems(gather(sweep)) == {"a2c, Z=5, c=0.16": "seed 1 missing"}
+    assert problems(gather_runs(sweep)) == {"a2c, Z=5, c=0.16": "seed 1 missing"}
 
 
 def test_what_was_planned_and_is_not_there_is_named(sweep: Path) -> None:
     names = sorted(path.name for path in sweep.iterdir())
     plan(sweep, *names, "ppo-0.16-0")
-    found = gather(sweep)
+    found = gather_runs(sweep)
     assert problems(found) == {"ppo-0.16-0": "not started"}
     assert found.manifest["planned"] == 13
 
@@ -194,7 +194,7 @@ def test_runs_of_other_versions_and_repeated_runs_are_named(sweep: Path) -> None
     shutil.rmtree(sweep / "a2c-0.16-1")
     write_run(sweep / "a2c-0.16-1", "grid.size=3", "algo=a2c", seed=1, versions=VERSIONS | {"torch": "1.0"})
     shutil.copytree(sweep / "a2c-0.22-0", sweep / "z")
-    found = gather(sweep)
+    found = gather_runs(sweep)
     assert problems(found) == {
         "a2c-0.16-1": "other versions: torch 1.0, most have 2.13.0",
         "z": "the same config as a2c-0.22-0, which counts",
@@ -208,7 +208,7 @@ def test_a_folder_without_runs_is_refused(content: str | None, tmp_path: Path) -
         (tmp_path / content).parent.mkdir()
         (tmp_path / content).touch()
     with pytest.raises(UserError, match="no runs in there"):
-        gather(tmp_path)
+        gather_runs(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -216,7 +216,7 @@ def test_a_folder_without_runs_is_refused(content: str | None, tmp_path: Path) -
     [("runs.csv", "run\nx\n"), ("policies.npz", "PK"), ("worlds.npz", ""), ("curves.csv", "run,iteration\n99,1\n")],
 )
 def test_damaged_stored_results_are_refused_in_one_line(file: str, content: str, whole: Path, tmp_path: Path) -> None:
-    results.save_results(gather(whole), tmp_path)
+    results.save_results(gather_runs(whole), tmp_path)
     (tmp_path / file).write_text(content)
     with pytest.raises(UserError, match="not stored results that can be read") as caught:
         results.load_results(tmp_path)

@@ -16,7 +16,7 @@ from trackmdp.paper.critique import checks
 from trackmdp.paper.openings import Openings
 from trackmdp.paper.printed import pairs
 from trackmdp.paper.sections import accuracy_table, sections
-from trackmdp.reports.gather import gather
+from trackmdp.reports.gather import gather_runs
 from trackmdp.reports.grouping import study
 from trackmdp.reports.page import Report, build
 from trackmdp.reports.results import Anomaly, Results
@@ -36,7 +36,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
             for seed in range(2):
                 words = (f"kernel.support_size={z}", f"algo={algo}")
                 write_run(folder / f"{algo}-{z}-{cost}-{seed}", *words, cost=cost, seed=seed, wrong=wrong)
-    found = gather(folder)
+    found = gather_runs(folder)
     found.anomalies.append(Anomaly("</script><b>", "cut & gone"))  # type: ignore[attr-defined]
     return found
 
@@ -142,7 +142,7 @@ def test_runs_on_recorded_tracks_have_neither_bound_nor_regret(tmp_path: Path) -
         config = (place / "config.yaml").read_text()
         (place / "config.yaml").write_text(config.replace("name: random_support", "name: tracks"))
         write_summary(place, {key: value for key, value in summary.items() if key != "sha256"})
-    found = gather(tmp_path)
+    found = gather_runs(tmp_path)
     assert not found.anomalies
     assert not found.motions
     made = build(found)

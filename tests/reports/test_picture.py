@@ -8,7 +8,7 @@ from trackmdp.episodes.batch import Episodes
 from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.simulate import simulate
 from trackmdp.policies.policy import Policy
-from trackmdp.reports.picture import LEGEND, draw
+from trackmdp.reports.picture import PICTURE_LEGEND, draw_picture
 from trackmdp.world.model import World
 
 
@@ -25,20 +25,20 @@ def from_the_middle(world: World, on: np.ndarray) -> Episode:
 def test_a_detection_by_hand() -> None:
     on = np.zeros((9, 1, 9), dtype=bool)
     on[4, 0, [4, 5]] = True
-    expected = ["step 1", "· · ·", "· ▪ ●", "· · ·", "", LEGEND, ""]
-    assert draw([from_the_middle(right_mover(), on)], right_mover()).split("\n") == expected
+    expected = ["step 1", "· · ·", "· ▪ ●", "· · ·", "", PICTURE_LEGEND, ""]
+    assert draw_picture([from_the_middle(right_mover(), on)], right_mover()).split("\n") == expected
 
 
 def test_a_miss_by_hand() -> None:
     on = np.zeros((9, 1, 9), dtype=bool)
     on[4, 0, 3] = True
-    expected = ["step 1", "· · ·", "▪ · ○", "· · ·", "", LEGEND, ""]
-    assert draw([from_the_middle(right_mover(), on)], right_mover(), steps=1).split("\n") == expected
+    expected = ["step 1", "· · ·", "▪ · ○", "· · ·", "", PICTURE_LEGEND, ""]
+    assert draw_picture([from_the_middle(right_mover(), on)], right_mover(), steps=1).split("\n") == expected
 
 
 def test_the_safe_action_follows_the_last_free_miss() -> None:
     stay = World(np.eye(9), 3, cost=np.full(9, 0.1), safe_cost=0.9, t_max=0, max_steps=4)
-    lines = draw([from_the_middle(stay, np.zeros((9, 1, 9), dtype=bool))], stay, steps=3).split("\n")
+    lines = draw_picture([from_the_middle(stay, np.zeros((9, 1, 9), dtype=bool))], stay, steps=3).split("\n")
     assert lines[:4] == [
         "step 1   step 2   step 3",
         "· · ·    ▪ ▪ ▪    · · ·",
@@ -51,7 +51,7 @@ def test_drawn_is_the_first_that_lasts_or_the_longest() -> None:
     world = World(np.eye(9) * 0.8, 3, cost=0.1, t_max=0)
     episodes: Episodes = simulate(world, Policy.all_on(world), 40)
     lasting = next(episode for episode in episodes if len(episode) > 6)
-    assert draw(episodes, world) == draw([lasting], world)
+    assert draw_picture(episodes, world) == draw_picture([lasting], world)
     short = [episode for episode in episodes if len(episode) <= 6]
-    assert draw(short, world) == draw([max(short, key=len)], world)
-    assert draw(short[:1], world) != draw([lasting], world)
+    assert draw_picture(short, world) == draw_picture([max(short, key=len)], world)
+    assert draw_picture(short[:1], world) != draw_picture([lasting], world)

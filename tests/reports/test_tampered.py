@@ -18,7 +18,7 @@ from tests.reports.sweeps import write_run
 from trackmdp.durable import write_sealed
 from trackmdp.errors import UserError
 from trackmdp.reports import watch
-from trackmdp.reports.gather import gather
+from trackmdp.reports.gather import gather_runs
 from trackmdp.reports.page import build
 from trackmdp.reports.results import is_stored, load_results, save_results
 from trackmdp.reports.tables import Column, Table
@@ -96,7 +96,7 @@ def _edit(run: Path, **figures: Any) -> None:
 def test_a_run_that_was_changed_is_named_and_the_others_are_read(case: str, sweep: Path) -> None:
     change, said = SPOILT[case]
     change(sweep / "a")
-    found = gather(sweep)
+    found = gather_runs(sweep)
     assert [run.name for run in found.runs] == ["b", "c"]
     (anomaly,) = [each for each in found.anomalies if each.run == "a"]
     assert anomaly.text.startswith(said)
@@ -108,7 +108,7 @@ def test_what_another_run_left_is_not_used(name: str, sweep: Path) -> None:
     content = bytearray((sweep / "a" / name).read_bytes())
     content[-30] ^= 1
     (sweep / "a" / name).write_bytes(content)
-    found = gather(sweep)
+    found = gather_runs(sweep)
     assert any(each.run == "a" and f"{name}: not the file that this run left" in each.text for each in found.anomalies)
     assert "a" not in (found.policies if name == "policy.npz" else found.motions)
 
@@ -127,7 +127,7 @@ def test_what_another_run_left_is_not_used(name: str, sweep: Path) -> None:
 )
 def test_a_curve_of_rubbish_is_no_curve(rows: str, sweep: Path) -> None:
     (sweep / "a/metrics.csv").write_text("iteration,frames,aihtr,seconds\n" + rows)
-    found = gather(sweep)
+    found = gather_runs(sweep)
     assert "a" not in found.curves
     assert any((each.run, each.text) == ("a", "no learning curve") for each in found.anomalies)
 
@@ -140,7 +140,7 @@ def test_a_plan_does_not_lead_out_of_the_sweep(folder: str, sweep: Path) -> None
     (sweep / "link").symlink_to(outside)
     jobs = [{"folder": folder.format(outside=outside), "overrides": []}]
     (sweep / "sweep.json").write_text(json.dumps({"command": "train", "line": "", "jobs": jobs}))
-    assert not any("SECRET" in each.text for each in gather(sweep).anomalies)
+    assert not any("SECRET" in each.text for each in gather_runs(sweep).anomalies)
     assert not any("SECRET" in each.reason for each in watch.statuses(sweep))
 
 
@@ -149,7 +149,7 @@ def test_a_plan_does_not_lead_out_of_the_sweep(folder: str, sweep: Path) -> None
 )
 def test_a_plan_of_rubbish_is_passed_over(jobs: Any, sweep: Path) -> None:
     (sweep / "sweep.json").write_text(json.dumps({"command": "train", "line": [1], "jobs": jobs}))
-    assert len(gather(sweep).runs) == 3
+    assert len(gather_runs(sweep).runs) == 3
     assert watch.watch(sweep, Console(quiet=True), 0.01) == 3
 
 
@@ -176,7 +176,7 @@ def test_watching_survives_what_it_reads(name: str, content: str, sweep: Path) -
 def test_stored_results_that_were_changed_are_refused(sweep: Path, tmp_path: Path) -> None:
     stored = tmp_path / "stored"
     stored.mkdir()
-    save_results(gather(sweep), stored)
+    save_results(gather_runs(sweep), stored)
     assert len(load_results(stored).runs) == 3
     whole = {file.name: file.read_bytes() for file in stored.iterdir()}
     for name, content in whole.items():
@@ -204,7 +204,7 @@ def test_a_folders_name_is_a_name_everywhere(evil: str, sweep: Path, capsys: pyt
     name = evil.replace("/", "")
     (sweep / "a").rename(sweep / name)
     (sweep / "b/failed.json").write_text(json.dumps({"reason": evil}))
-    report = build(gather(sweep))
+    report = build(gather_runs(sweep))
     page = report.html()
     assert "<script>alert" not in page
     assert page.count("</body>") == 1

@@ -85,7 +85,10 @@ def test_the_newest_are_kept_and_the_best_for_ever(tmp_path: Path) -> None:
         checkpoint.save(tmp_path, iteration, state(iteration), keep=2, best=iteration == 2)
     assert names(tmp_path) == ["best.pt", "iteration-00000004.pt", "iteration-00000005.pt", "last.pt"]
     assert [checkpoint.load(tmp_path / name)["iteration"] for name in (checkpoint.BEST, checkpoint.LAST)] == [2, 5]
-    assert [file.name for file in checkpoint.available(tmp_path)] == ["iteration-00000005.pt", "iteration-00000004.pt"]
+    assert [file.name for file in checkpoint.available_checkpoints(tmp_path)] == [
+        "iteration-00000005.pt",
+        "iteration-00000004.pt",
+    ]
 
 
 def test_two_hundred_random_corruptions_are_all_refused(tmp_path: Path) -> None:
@@ -115,7 +118,7 @@ class Doctored:
 def test_code_in_a_checkpoint_is_not_run(tmp_path: Path) -> None:
     file, marker = tmp_path / "iteration-00000001.pt", tmp_path / "executed"
     zipped = io.BytesIO()
-    torch.save({"format": checkpoint.FORMAT, "evil": Doctored(marker)}, zipped)
+    torch.save({"format": checkpoint.CHECKPOINT_FORMAT, "evil": Doctored(marker)}, zipped)
     for payload in (zipped.getvalue(), pickle.dumps(Doctored(marker)), b"", b"\x80\x02."):
         file.write_bytes(sealed(payload))
         with pytest.raises(UserError, match="not a checkpoint that can be read"):
@@ -139,8 +142,10 @@ def test_another_format_is_refused(tmp_path: Path, content: Any) -> None:
 
 def test_an_older_format_is_named(tmp_path: Path) -> None:
     file = checkpoint.save(tmp_path, 1, state(), keep=1)
-    file.write_bytes(file.read_bytes().replace(f"checkpoint {checkpoint.FORMAT} ".encode(), b"checkpoint 1 "))
-    with pytest.raises(UserError, match=f"format 1, expected {checkpoint.FORMAT}"):
+    file.write_bytes(
+        file.read_bytes().replace(f"checkpoint {checkpoint.CHECKPOINT_FORMAT} ".encode(), b"checkpoint 1 ")
+    )
+    with pytest.raises(UserError, match=f"format 1, expected {checkpoint.CHECKPOINT_FORMAT}"):
         checkpoint.load(file)
 
 
@@ -151,7 +156,7 @@ def test_a_full_disk_leaves_the_older_checkpoints_whole(tmp_path: Path, room: in
     with disk_of(room), pytest.raises(OSError, match="too large"):
         checkpoint.save(tmp_path, 2, state(2), keep=1, best=True)
     assert names(tmp_path) == before
-    assert checkpoint.load(checkpoint.available(tmp_path)[0])["counter"] == 1
+    assert checkpoint.load(checkpoint.available_checkpoints(tmp_path)[0])["counter"] == 1
     checkpoint.save(tmp_path, 2, state(2), keep=1, best=True)
     assert checkpoint.load(tmp_path / checkpoint.LAST)["counter"] == 2
 
@@ -180,7 +185,7 @@ def test_a_failure_at_any_step_leaves_a_whole_checkpoint(
         with pytest.raises(OSError, match="No space"):
             checkpoint.save(tmp_path, 2, state(2), keep=2)
     assert not [name for name in names(tmp_path) if name.endswith(".part")]
-    newest = checkpoint.load(checkpoint.available(tmp_path)[0])
+    newest = checkpoint.load(checkpoint.available_checkpoints(tmp_path)[0])
     assert newest["counter"] == newest["iteration"]
 
 
@@ -231,9 +236,9 @@ def test_what_is_no_ordinary_file_is_neither_read_nor_removed(tmp_path: Path) ->
     (tmp_path / "iteration-00000007.pt").mkdir()
     os.mkfifo(tmp_path / "iteration-00000008.pt")
     (tmp_path / "iteration-00000009.pt").symlink_to(mine)
-    assert checkpoint.available(tmp_path) == [mine]
+    assert checkpoint.available_checkpoints(tmp_path) == [mine]
     newer = checkpoint.save(tmp_path, 2, state(2), keep=1)
-    assert checkpoint.available(tmp_path) == [newer]
+    assert checkpoint.available_checkpoints(tmp_path) == [newer]
     for number, kind in ((7, "a folder"), (8, "a pipe"), (9, "a symbolic link")):
         with pytest.raises(UserError, match=f"iteration-0000000{number}.pt: {kind}"):
             checkpoint.load(tmp_path / f"iteration-0000000{number}.pt")

@@ -37,7 +37,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def saved(folder: Path) -> list[int]:
     """Iterations of the checkpoints, all of which can be read; nothing half-written lies about."""
     assert not list(folder.rglob("*.part"))
-    return [checkpoint.load(file)["iteration"] for file in checkpoint.available(folder / "checkpoints")]
+    return [checkpoint.load(file)["iteration"] for file in checkpoint.available_checkpoints(folder / "checkpoints")]
 
 
 def test_a_disk_that_fills_up_costs_nothing_but_a_call(

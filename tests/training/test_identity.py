@@ -104,7 +104,9 @@ def test_a_signal_that_ends_the_workers_while_weights_are_sent_costs_nothing(
         with pytest.raises(Preempted) as told:
             train(tmp_path, "checkpoint.every=0")
     assert told.value.signal == signal.SIGTERM
-    assert [file.name for file in checkpoint.available(tmp_path / "checkpoints")] == ["iteration-00000003.pt"]
+    assert [file.name for file in checkpoint.available_checkpoints(tmp_path / "checkpoints")] == [
+        "iteration-00000003.pt"
+    ]
     train(tmp_path, "resume=auto")
     assert_same_run(tmp_path, whole)
 

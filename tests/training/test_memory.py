@@ -13,7 +13,7 @@ from trackmdp.algos.dqn import DQN
 from trackmdp.app.cli import main
 from trackmdp.config import DqnConfig
 from trackmdp.errors import UserError
-from trackmdp.training.memory import available, check, needs
+from trackmdp.training.memory import available_bytes, check_memory, needs
 
 CPU = torch.device("cpu")
 
@@ -62,7 +62,7 @@ def test_a_buffer_that_cannot_fit_is_refused_before_anything_is_written(
 def test_batches_that_cannot_fit_are_named() -> None:
     cfg = train_config("algo=ppo", "collector.frames_per_batch=2560000000", "collector.total_frames=2560000000")
     with pytest.raises(UserError, match=r"^collector.frames_per_batch=2560000000: needs about [\d,.]+ GiB, "):
-        check(cfg, small_world().task, CPU)
+        check_memory(cfg, small_world().task, CPU)
 
 
 def test_a_run_says_what_it_takes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -90,8 +90,8 @@ def test_a_run_says_what_it_takes(tmp_path: Path, capsys: pytest.CaptureFixture[
     ],
 )
 def test_the_job_may_have_less_than_the_machine(tmp_path: Path, cgroup: dict[str, str], kib: int) -> None:
-    assert available(CPU, system(tmp_path, 8000, **cgroup)) == kib * 1024
+    assert available_bytes(CPU, system(tmp_path, 8000, **cgroup)) == kib * 1024
 
 
 def test_a_system_that_does_not_say_counts_as_unlimited(tmp_path: Path) -> None:
-    assert available(CPU, tmp_path) == 2**63
+    assert available_bytes(CPU, tmp_path) == 2**63

@@ -96,7 +96,7 @@ def test_a_checkpoint_that_is_named_is_taken_or_refused(
 
 
 def test_no_run_starts_anew_where_every_checkpoint_is_damaged(half: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for file in checkpoint.available(half / "checkpoints"):
+    for file in checkpoint.available_checkpoints(half / "checkpoints"):
         file.write_bytes(b"")
     before = files(half)
     assert typed(half, "resume=auto") == 2

@@ -17,8 +17,8 @@ from torchrl.objectives import LossModule, SoftUpdate
 from trackmdp.algos.common import Averages, clipped_step, set_learning_rate
 from trackmdp.algos.prioritized import PrioritizedSampler
 from trackmdp.config.learning import DqnConfig
-from trackmdp.policies.actor_critic import STATE_KEYS
 from trackmdp.policies.qvalue import EpsilonFlip, joint_value, make_qvalue
+from trackmdp.policies.unroll import STATE_KEYS
 from trackmdp.seeding import generator
 from trackmdp.world.model import Task
 

@@ -13,7 +13,8 @@ from torchrl.objectives.value import GAE
 
 from trackmdp.algos.common import explained_variance, set_learning_rate
 from trackmdp.config.learning import ActorCriticConfig
-from trackmdp.policies.actor_critic import STATE_KEYS, make_actor, make_critic
+from trackmdp.policies.actor_critic import make_actor, make_critic
+from trackmdp.policies.unroll import STATE_KEYS
 from trackmdp.world.model import Task
 
 __all__ = ["OnPolicy"]

@@ -20,7 +20,7 @@ from trackmdp import untrusted
 from trackmdp.errors import UserError
 from trackmdp.untrusted import reason
 
-__all__ = ["MAGIC", "Body", "Chunk", "Container", "Damaged", "Message", "opened", "records", "unpacked"]
+__all__ = ["MAGIC", "Body", "Chunk", "Container", "Damaged", "Message", "opened_log", "records", "unpacked"]
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
@@ -95,7 +95,7 @@ class Container:
 
     def __init__(self, file: Path) -> None:
         self.file = file
-        self.stream = opened(file)
+        self.stream = opened_log(file)
         try:
             self.profile, self.made_by = self._header()
             self._summary()
@@ -219,7 +219,7 @@ class Container:
             raise Damaged("no checksum over the data section")
 
 
-def opened(file: Path) -> BinaryIO:
+def opened_log(file: Path) -> BinaryIO:
     """The file, if it begins as an MCAP file does.
 
     Raises:

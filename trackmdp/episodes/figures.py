@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 from trackmdp.world.model import Array
 
-__all__ = ["Estimate", "Simulation", "summary"]
+__all__ = ["MeanEstimate", "Simulation", "summary"]
 
 
 @dataclass(frozen=True)
-class Estimate:
+class MeanEstimate:
     """A mean over simulated episodes with its standard error (nan for a single episode)."""
 
     mean: float
@@ -26,12 +26,12 @@ class Simulation:
     """
 
     episodes: int
-    aihtr: Estimate
-    accuracy: Estimate
-    episode_accuracy: Estimate
-    sensors_per_step: Estimate
-    safe_per_episode: Estimate
-    expected_length: Estimate
+    aihtr: MeanEstimate
+    accuracy: MeanEstimate
+    episode_accuracy: MeanEstimate
+    sensors_per_step: MeanEstimate
+    safe_per_episode: MeanEstimate
+    expected_length: MeanEstimate
 
 
 def summary(totals: Array) -> Simulation:
@@ -52,21 +52,21 @@ def summary(totals: Array) -> Simulation:
     )
 
 
-def _mean(values: Array) -> Estimate:
+def _mean(values: Array) -> MeanEstimate:
     if len(values) == 0:
-        return Estimate(math.nan, math.nan)
+        return MeanEstimate(math.nan, math.nan)
     error = float(values.std(ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else math.nan
-    return Estimate(float(values.mean()), error)
+    return MeanEstimate(float(values.mean()), error)
 
 
-def _ratio(part: Array, whole: Array) -> Estimate:
+def _ratio(part: Array, whole: Array) -> MeanEstimate:
     """Σ part / Σ whole; its standard error by the delta method.
 
     The ratio R = mean(p) / mean(w) errs to first order by mean(p - R w) / mean(w), a mean over episodes.
     """
     if not whole.any():
-        return Estimate(math.nan, math.nan)
+        return MeanEstimate(math.nan, math.nan)
     ratio = float(part.sum() / whole.sum())
     residual = part - ratio * whole
     scale = float(whole.mean()) * math.sqrt(len(part))
-    return Estimate(ratio, float(residual.std(ddof=1)) / scale if len(part) > 1 else math.nan)
+    return MeanEstimate(ratio, float(residual.std(ddof=1)) / scale if len(part) > 1 else math.nan)

@@ -26,7 +26,7 @@ from trackmdp.policies.policy import Policy
 from trackmdp.untrusted import decoded, reason
 from trackmdp.world.model import Array, BoolArray, World
 
-__all__ = ["EpisodeReader", "check_run"]
+__all__ = ["EpisodeReader", "checked_run"]
 
 R = TypeVar("R")
 
@@ -59,7 +59,7 @@ class EpisodeReader:
         if container.profile or schema.RUN not in container.metadata:
             kind = f"profile {container.profile!r}" if container.profile else f"it has no metadata {schema.RUN}"
             raise UserError(f"file={file}: not a log of trackmdp ({kind})")
-        self.run = check_run(file, self._checked(self._told, schema.RUN))
+        self.run = checked_run(file, self._checked(self._told, schema.RUN))
         if container.made_by != f"trackmdp {self.run['trackmdp']}":
             raise self._damage("the header")
         if schema.END not in container.metadata:
@@ -214,7 +214,7 @@ class EpisodeReader:
             self.policy_table(number)
 
     def _told(self, name: str) -> dict[str, str]:
-        content = schema.unsealed(name, self._container.tell(name))
+        content = schema.unsealed_record(name, self._container.tell(name))
         if content is None:
             raise Damaged(f"metadata {name} is not what was written")
         return content
@@ -232,16 +232,16 @@ class EpisodeReader:
         return UserError(f"file={self.file}: damaged ({what}); recover=true saves what can be read")
 
 
-def check_run(file: Path, run: dict[str, str]) -> dict[str, str]:
+def checked_run(file: Path, run: dict[str, str]) -> dict[str, str]:
     """The metadata `trackmdp.run`, if it is of this format.
 
     Raises:
         UserError: it is of another.
     """
     found = run.get("format_version")
-    if found != schema.FORMAT:
+    if found != schema.LOG_FORMAT:
         writer = run.get("trackmdp", "unknown")
-        raise UserError(f"file={file}: format {found} (trackmdp {writer}), expected format {schema.FORMAT}")
+        raise UserError(f"file={file}: format {found} (trackmdp {writer}), expected format {schema.LOG_FORMAT}")
     with decoded(f"file={file}", "a log of trackmdp"):
         limits.check_run(run)
     return run

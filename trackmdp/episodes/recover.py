@@ -15,7 +15,7 @@ from trackmdp.episodes import container, schema
 from trackmdp.episodes.container import Damaged
 from trackmdp.episodes.limits import check_policy, check_row, size_of_grid
 from trackmdp.episodes.messages import decode
-from trackmdp.episodes.reader import check_run
+from trackmdp.episodes.reader import checked_run
 from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.errors import UserError
 from trackmdp.untrusted import reason
@@ -104,7 +104,7 @@ def _rewrite(file: Path, target: Path, damaged: list[str], most: float = math.in
     """Copy what is whole of the first `most` policies and their episodes."""
     found, writer, episodes = _Found(), None, 0
     policies: set[int] = set()
-    with container.opened(file) as stream:
+    with container.opened_log(file) as stream:
         for topic, time, data in _whole(stream, found, damaged):
             found.hold(topic, time, data)
             if topic != "/episode":
@@ -147,7 +147,7 @@ def _whole(stream: Any, found: _Found, damaged: list[str]) -> Iterator[tuple[str
                 return
             if opcode == container.METADATA:
                 name, content = container.metadata_of(body)
-                plain = schema.unsealed(name, content)
+                plain = schema.unsealed_record(name, content)
                 if plain is None:
                     raise Damaged(f"metadata {name}")
                 found.metadata[name] = plain
@@ -167,7 +167,7 @@ def _begin(file: Path, target: Path, found: _Found) -> EpisodeWriter | None:
     """The new log, if all that it starts with has been found."""
     if schema.RUN not in found.metadata:
         return None
-    run = check_run(file, found.metadata[schema.RUN])
+    run = checked_run(file, found.metadata[schema.RUN])
     tables = {name: found.attachments.get(name, b"") for name in _TABLES}
     if any(schema.digest(content) != run.get(f"{name}.sha256") for name, content in tables.items()):
         return None

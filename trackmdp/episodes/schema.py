@@ -12,7 +12,7 @@ from trackmdp import __version__
 
 __all__ = [
     "END",
-    "FORMAT",
+    "LOG_FORMAT",
     "POLICY",
     "RUN",
     "SCHEMAS",
@@ -21,12 +21,12 @@ __all__ = [
     "seal",
     "tick_of",
     "time_of",
-    "unsealed",
+    "unsealed_record",
     "versions",
     "versions_apart",
 ]
 
-FORMAT = "1"
+LOG_FORMAT = "1"
 """Version of this layout; a reader refuses any other."""
 
 RUN, POLICY, END = "trackmdp.run", "trackmdp.policy", "trackmdp.end"
@@ -131,7 +131,7 @@ def seal(name: str, content: dict[str, str]) -> dict[str, str]:
     return content | {"sha256": _seal(name, content)}
 
 
-def unsealed(name: str, content: dict[str, str]) -> dict[str, str] | None:
+def unsealed_record(name: str, content: dict[str, str]) -> dict[str, str] | None:
     """Metadata without its seal; None if it is not what was sealed."""
     plain = {key: value for key, value in content.items() if key != "sha256"}
     return plain if content.get("sha256") == _seal(name, plain) else None

@@ -49,7 +49,7 @@ class EpisodeWriter:
         run = {
             **schema.versions(),
             **facts,
-            "format_version": schema.FORMAT,
+            "format_version": schema.LOG_FORMAT,
             "size": str(world.rows),
             **({} if world.rows == world.columns else {"columns": str(world.columns)}),
             **({} if world.window is None else {"window": str(world.window)}),

@@ -21,7 +21,7 @@ def checks(seed: int, *, border: str, t_max: int) -> list[Check]:
     """The paper's theorems on the world with Z = 5 at the lowest price, and the two remarks."""
     world = paper_world(paper_kernel(HARDEST, seed, border), COSTS[0], t_max)  # type: ignore[arg-type]
     solution = optimal.solve(world, tolerance=TOLERANCE)
-    return [*theorems.check(world, solution, TOLERANCE), *remarks.check(TOLERANCE)]
+    return [*theorems.check_theorems(world, solution, TOLERANCE), *remarks.check_remarks(TOLERANCE)]
 
 
 def checks_table(found: Iterable[Check]) -> Table:

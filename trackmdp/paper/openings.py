@@ -24,9 +24,9 @@ from trackmdp.paper.calibration import (
 from trackmdp.paper.theorems import Check
 from trackmdp.paper.worlds import SUPPORTS
 
-__all__ = ["FILE", "Openings", "compute", "load_openings", "save_openings"]
+__all__ = ["OPENINGS_FILE", "Openings", "compute", "load_openings", "save_openings"]
 
-FILE = "paper.json"
+OPENINGS_FILE = "paper.json"
 _DIGITS = 6
 
 
@@ -52,7 +52,7 @@ def compute(say: Callable[[str], None]) -> Openings:
 
 def save_openings(openings: Openings, folder: Path) -> None:
     """Write `paper.json`."""
-    write_text(folder / FILE, json.dumps(_packed(openings), separators=(",", ":"), ensure_ascii=False) + "\n")
+    write_text(folder / OPENINGS_FILE, json.dumps(_packed(openings), separators=(",", ":"), ensure_ascii=False) + "\n")
 
 
 def load_openings(folder: Path) -> Openings | None:
@@ -61,7 +61,7 @@ def load_openings(folder: Path) -> Openings | None:
     Raises:
         UserError: it cannot be read.
     """
-    file = folder / FILE
+    file = folder / OPENINGS_FILE
     if not file.is_file():
         return None
     try:

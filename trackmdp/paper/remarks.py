@@ -9,10 +9,10 @@ from trackmdp.paper.worlds import paper_kernel, paper_world
 from trackmdp.solvers import bounds, clocked, optimal, qmdp
 from trackmdp.solvers.evaluate import evaluate
 
-__all__ = ["check"]
+__all__ = ["check_remarks"]
 
 
-def check(tolerance: float) -> Iterator[Check]:
+def check_remarks(tolerance: float) -> Iterator[Check]:
     """Both remarks, each with its figures."""
     yield _support(tolerance)
     yield _printed_bound(tolerance)

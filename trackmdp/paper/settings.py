@@ -10,7 +10,7 @@ import numpy as np
 from trackmdp.paper.calibration import BORDER, DRAWS, SEEDS, T_MAX, Candidate, Setting, Spread, chosen
 from trackmdp.paper.printed import PRINTED_QMDP
 from trackmdp.paper.worlds import COSTS, SUPPORTS
-from trackmdp.reports.style import INK, LOOKS, Figure, draw, legend, tidy
+from trackmdp.reports.style import INK, LOOKS, Figure, draw_figure, legend, tidy
 from trackmdp.reports.tables import Cell, Column, Table
 from trackmdp.world.model import Array
 
@@ -62,7 +62,7 @@ def calibration_figure(every: Sequence[Candidate]) -> Figure:
     title = f"Candidate kernels by their distance to the printed Q_MDP accuracy, n = {len(every) // 3} for each Z"
     best = {c.support_size: c for c in every if seeds[c.support_size] == c.seed}
     text = "; ".join(f"Z = {z}: seed {c.seed}, {c.deviation:.2f} points" for z, c in sorted(best.items()))
-    return draw("calibration", title, f"Chosen, {text}.", candidates_table(every), 2.8, paint)
+    return draw_figure("calibration", title, f"Chosen, {text}.", candidates_table(every), 2.8, paint)
 
 
 def fit_table(settings: Sequence[Setting]) -> Table:
@@ -133,7 +133,7 @@ def _ranges(
     columns = [Column("border"), Column("T_max"), Column("Z"), Column("median", 2), Column("low", 2), Column("high", 2)]
     numbers: list[list[Cell]] = [[s.border, s.t_max, s.support_size, *vars(of(s)).values()] for s in settings]
     table = Table(f"sensitivity-{name}", title, columns, numbers)
-    return draw(f"sensitivity-{name}", title, text, table, 4.2, paint)
+    return draw_figure(f"sensitivity-{name}", title, text, table, 4.2, paint)
 
 
 def _bars(axes: Axes, support_size: int, y: Array, spreads: Sequence[Spread]) -> None:

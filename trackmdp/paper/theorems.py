@@ -24,7 +24,7 @@ from trackmdp.solvers.search import InnerProblem
 from trackmdp.solvers.solution import Solution
 from trackmdp.world.model import Array, BoolArray, World
 
-__all__ = ["Check", "changed", "check", "corner", "dearer", "summary"]
+__all__ = ["Check", "changed", "check_theorems", "corner", "dearer", "summarize_checks"]
 
 SLACK = 1e-10
 SEARCHED = 1e-6
@@ -74,7 +74,7 @@ class Check:
         return self.verdict != "FAILS"
 
 
-def check(world: World, solution: Solution, tolerance: float) -> Iterator[Check]:
+def check_theorems(world: World, solution: Solution, tolerance: float) -> Iterator[Check]:
     """Every statement in the paper's order, for the optimal policy in `solution`.
 
     Args:
@@ -94,7 +94,7 @@ def check(world: World, solution: Solution, tolerance: float) -> Iterator[Check]
         yield replace(row, holds=row.deviation <= scale, closed=solution.certified)
 
 
-def summary(found: Sequence[Check]) -> str:
+def summarize_checks(found: Sequence[Check]) -> str:
     """How many claims came out how, in one line; forms that are not claimed are not among them."""
     claims = [check.verdict for check in found if check.expected]
     counts = {verdict: claims.count(verdict) for verdict in ("holds", "no case", "open", "FAILS")}

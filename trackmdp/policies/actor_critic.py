@@ -11,11 +11,10 @@ from torch import distributions as dist
 from torchrl.modules import ProbabilisticActor, ValueOperator
 
 from trackmdp.policies.encoder import RelativeBias, StateNetwork
+from trackmdp.policies.unroll import STATE_KEYS
 from trackmdp.world.model import Task
 
-__all__ = ["STATE_KEYS", "SubsetDistribution", "make_actor", "make_critic"]
-
-STATE_KEYS = ["last_cell", "steps_since_detection", "action_history"]
+__all__ = ["SubsetDistribution", "make_actor", "make_critic"]
 
 
 class SubsetDistribution(dist.Independent):  # type: ignore[type-arg]
@@ -55,7 +54,7 @@ def make_actor(task: Task, hidden: int, initial_logit: float) -> ProbabilisticAc
     nn.init.constant_(head.bias, initial_logit)
     network = _Logits(StateNetwork(task, hidden, head), RelativeBias(task))
     return ProbabilisticActor(
-        TensorDictModule(network, in_keys=STATE_KEYS, out_keys=["logits"]),
+        TensorDictModule(network, in_keys=list(STATE_KEYS), out_keys=["logits"]),
         in_keys=["logits"],
         distribution_class=SubsetDistribution,
         return_log_prob=True,
@@ -79,4 +78,4 @@ def make_critic(task: Task, hidden: int) -> ValueOperator:
     head = nn.Linear(hidden, 1)
     nn.init.orthogonal_(head.weight)
     nn.init.zeros_(head.bias)
-    return ValueOperator(StateNetwork(task, hidden, head), in_keys=STATE_KEYS)
+    return ValueOperator(StateNetwork(task, hidden, head), in_keys=list(STATE_KEYS))

@@ -10,8 +10,8 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from trackmdp.policies.actor_critic import STATE_KEYS
 from trackmdp.policies.encoder import StateEncoder
+from trackmdp.policies.unroll import STATE_KEYS
 from trackmdp.world.model import Task
 
 __all__ = ["AdditiveQ", "EpsilonFlip", "joint_value", "make_qvalue"]
@@ -77,4 +77,4 @@ class EpsilonFlip(TensorDictModuleBase):
 
 def make_qvalue(task: Task, hidden: int, scale: float) -> TensorDictModule:
     """State -> `base` `[B, 1]`, `sensor_value` `[B, M]`, for rewards multiplied by `scale`."""
-    return TensorDictModule(AdditiveQ(task, hidden, scale), in_keys=STATE_KEYS, out_keys=["base", "sensor_value"])
+    return TensorDictModule(AdditiveQ(task, hidden, scale), in_keys=list(STATE_KEYS), out_keys=["base", "sensor_value"])

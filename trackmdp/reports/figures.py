@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from trackmdp.reports.grouping import Study
-from trackmdp.reports.style import INK, LOOKS, Figure, draw, legend, look_of, tidy
+from trackmdp.reports.style import INK, LOOKS, Figure, draw_figure, legend, look_of, tidy
 from trackmdp.reports.summaries import estimate_cells, estimate_columns
 from trackmdp.reports.tables import Cell, Column, Table
 from trackmdp.statistics import MeanInterval, mean_over_groups
@@ -84,7 +84,7 @@ def against_cost(study: Study, panel: Panel) -> Figure:
         " The axis is broken between the groups of values." if split else ""
     )
     title = f"AIHTR against the price of a sensor, {panel.title}; {_n_text(learned)}"
-    return draw(f"aihtr-{panel.name}", title, text, table, 3.9, paint)
+    return draw_figure(f"aihtr-{panel.name}", title, text, table, 3.9, paint)
 
 
 def regret_against_cost(study: Study, panel: Panel, threshold: float | None) -> Figure:
@@ -112,7 +112,7 @@ def regret_against_cost(study: Study, panel: Panel, threshold: float | None) -> 
 
     table = _cost_table(panel, learned, exact, "regret", "regret per step", digits=5)
     title = f"Regret per step to the proved upper bound, {panel.title}; {_n_text(learned)}"
-    return draw(f"regret-{panel.name}", title, _spoken(panel, learned, exact, digits=4), table, 3.4, paint)
+    return draw_figure(f"regret-{panel.name}", title, _spoken(panel, learned, exact, digits=4), table, 3.4, paint)
 
 
 def _estimates(study: Study, panel: Panel, *, regret: bool) -> dict[str, list[MeanInterval]]:

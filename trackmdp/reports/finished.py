@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 from trackmdp.config.untrusted import MAX_BYTES, parse_yaml
 from trackmdp.errors import UserError
 from trackmdp.reports.results import FIGURES, Anomaly, CurvePoint, FinishedRun
-from trackmdp.training.folders import FAILED, read_json, run_of
+from trackmdp.training.folders import FAILED_FILE, read_run_json, run_of
 from trackmdp.training.sealing import SUMMARY, check_files, read_summary
 from trackmdp.untrusted import decoded, printable, read_text
 
@@ -34,8 +34,9 @@ _LARGE = 1e15
 def read_run(folder: Path, name: str) -> tuple[FinishedRun, Mapping[str, Any]] | Anomaly:
     """A run and its summary, or why there is none."""
     place = folder / name
-    if (place / FAILED).is_file():
-        return Anomaly(name, f"failed: {printable(str(read_json(place / FAILED).get('reason', 'no reason given')))}")
+    if (place / FAILED_FILE).is_file():
+        reason = read_run_json(place / FAILED_FILE).get("reason", "no reason given")
+        return Anomaly(name, f"failed: {printable(str(reason))}")
     if not place.is_dir() or not (place / "config.yaml").is_file():
         return Anomaly(name, "not started")
     if not (place / SUMMARY).is_file():

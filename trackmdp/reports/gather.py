@@ -18,23 +18,23 @@ from trackmdp.errors import UserError
 from trackmdp.reports import policy
 from trackmdp.reports.finished import plain_config, read_curve, read_run
 from trackmdp.reports.grouping import Study, study, world_key
-from trackmdp.reports.maps import MOST_CELLS
-from trackmdp.reports.results import Anomaly, FinishedRun, Motion, Results
+from trackmdp.reports.maps import MOST_MAP_CELLS
+from trackmdp.reports.results import Anomaly, FinishedRun, MotionTable, Results
 from trackmdp.solvers import bounds, qmdp
 from trackmdp.solvers.evaluate import evaluate
-from trackmdp.training.folders import FAILED, PLAN, SUMMARY, read_json
-from trackmdp.training.sealing import check_files, read_summary
+from trackmdp.training.folders import FAILED_FILE, PLAN, read_run_json
+from trackmdp.training.sealing import SUMMARY, check_files, read_summary
 from trackmdp.untrusted import printable
 from trackmdp.world.make import build_world
 from trackmdp.world.model import grid_size
 
-__all__ = ["gather", "planned", "run_folders"]
+__all__ = ["gather_runs", "planned", "run_folders"]
 
 _LONGEST = 4096
 """Letters of a path."""
 
 
-def gather(folder: Path) -> Results:
+def gather_runs(folder: Path) -> Results:
     """Read every run below `folder`.
 
     Args:
@@ -73,7 +73,7 @@ def gather(folder: Path) -> Results:
 
 def planned(folder: Path) -> Mapping[str, Any] | None:
     """The content of `sweep.json`, where there is a readable one."""
-    plan = read_json(folder / PLAN)
+    plan = read_run_json(folder / PLAN)
     return plan if isinstance(plan.get("jobs"), list) else None
 
 
@@ -85,7 +85,7 @@ def run_folders(folder: Path, plan: Mapping[str, Any] | None) -> list[str]:
     jobs = plan["jobs"] if plan else []
     listed = [job["folder"] for job in jobs if isinstance(job, dict) and isinstance(job.get("folder"), str)]
     named = {_relative(folder, name) for name in listed if 0 < len(name) < _LONGEST and "\0" not in name}
-    marks = ("config.yaml", FAILED, SUMMARY)
+    marks = ("config.yaml", FAILED_FILE, SUMMARY)
     found = {file.parent.relative_to(folder).as_posix() for mark in marks for file in folder.rglob(mark)}
     root = folder.resolve()
     inside = {name for name in named | found if (folder / name).resolve().is_relative_to(root)}
@@ -147,9 +147,9 @@ def _missing_seeds(grouped: Study) -> list[Anomaly]:
     return found
 
 
-def _policies(folder: Path, grouped: Study) -> tuple[dict[str, policy.Policy], list[Anomaly]]:
+def _policies(folder: Path, grouped: Study) -> tuple[dict[str, policy.StoredPolicy], list[Anomaly]]:
     """Of each world and method the policy of the run in the middle, or of the one next to it that can be read."""
-    found: dict[str, policy.Policy] = {}
+    found: dict[str, policy.StoredPolicy] = {}
     anomalies = []
     for runs in grouped.groups.values():
         if not _is_drawn(runs[0]):
@@ -158,8 +158,8 @@ def _policies(folder: Path, grouped: Study) -> tuple[dict[str, policy.Policy], l
         middle = (len(ranked) - 1) / 2
         for _, run in sorted(enumerate(ranked), key=lambda item: abs(item[0] - middle)):
             try:
-                check_files(folder / run.name, read_summary(folder / run.name), policy.FILE)
-                found[run.name] = policy.read(folder / run.name / policy.FILE)
+                check_files(folder / run.name, read_summary(folder / run.name), policy.POLICY_FILE)
+                found[run.name] = policy.read(folder / run.name / policy.POLICY_FILE)
                 break
             except UserError as error:
                 anomalies.append(Anomaly(run.name, str(error).removeprefix(f"{folder / run.name}/")))
@@ -168,12 +168,12 @@ def _policies(folder: Path, grouped: Study) -> tuple[dict[str, policy.Policy], l
 
 def _is_drawn(run: FinishedRun) -> bool:
     """Whether its policy is drawn cell by cell; only then policy and motion are kept."""
-    return math.prod(grid_size(run.settings["grid.size"])) <= MOST_CELLS
+    return math.prod(grid_size(run.settings["grid.size"])) <= MOST_MAP_CELLS
 
 
-def _motions(folder: Path, runs: Iterable[FinishedRun]) -> tuple[dict[str, Motion], list[Anomaly]]:
-    """Motion and references of each world, from the `kernel.npz` of its first run."""
-    found: dict[str, Motion] = {}
+def _motions(folder: Path, runs: Iterable[FinishedRun]) -> tuple[dict[str, MotionTable], list[Anomaly]]:
+    """MotionTable and references of each world, from the `kernel.npz` of its first run."""
+    found: dict[str, MotionTable] = {}
     seen, anomalies = set[str](), list[Anomaly]()
     for run in runs:
         if world_key(run) in seen:
@@ -187,7 +187,7 @@ def _motions(folder: Path, runs: Iterable[FinishedRun]) -> tuple[dict[str, Motio
         except UserError as error:
             anomalies.append(Anomaly(run.name, f"its world cannot be built ({error})"))
             continue
-        found[run.name] = Motion(world.kernel, evaluate(world, qmdp.solve(world)).value, bounds.clocked(world))
+        found[run.name] = MotionTable(world.kernel, evaluate(world, qmdp.solve(world)).value, bounds.clocked(world))
     return found, anomalies
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from trackmdp.reports.figures import FLOOR
 from trackmdp.reports.grouping import Study
 from trackmdp.reports.results import CurvePoint, FinishedRun
-from trackmdp.reports.style import INK, Figure, draw, legend, look_of, tidy
+from trackmdp.reports.style import INK, Figure, draw_figure, legend, look_of, tidy
 from trackmdp.reports.summaries import estimate_cells, estimate_columns
 from trackmdp.reports.tables import Cell, Column, Table
 from trackmdp.statistics import MeanInterval, mean_over_groups, share
@@ -57,7 +57,7 @@ def curves(study: Study, points: Mapping[str, Sequence[CurvePoint]], by: str) ->
     title = f"Regret while learning against {unit}: mean over worlds and seeds with 95 % interval; {counts}"
     ends = ", ".join(f"{m} {row[-1].mean:.4f} after {grid[-1]:,.0f}" for m, (grid, row) in found.items())
     table = Table(f"learning-{by}", title, columns, rows)
-    return draw(f"learning-{by}", title, f"Regret per step at the end: {ends} {unit}.", table, 3.3, paint)
+    return draw_figure(f"learning-{by}", title, f"Regret per step at the end: {ends} {unit}.", table, 3.3, paint)
 
 
 def _averaged(
@@ -110,7 +110,7 @@ def profiles(study: Study, threshold: float | None) -> Figure | None:
     columns = [Column("method"), Column("n"), *(Column(f"≤ {mark:g}", 2) for mark in marks)]
     rows: list[list[Cell]] = [[m, len(v), *(float((v <= mark).mean()) for mark in marks)] for m, v in regrets.items()]
     said = [f"{m}: half of the runs at most {np.median(v):.4f}, all at most {v.max():.4f}" for m, v in regrets.items()]
-    return draw("profiles", title, "; ".join(said) + ".", Table("profiles", title, columns, rows), 3.3, paint)
+    return draw_figure("profiles", title, "; ".join(said) + ".", Table("profiles", title, columns, rows), 3.3, paint)
 
 
 def _steps(study: Study, run: FinishedRun, world: str, curves: Mapping[str, Sequence[CurvePoint]], by: str) -> Array:

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from trackmdp.reports.policy import Policy
-from trackmdp.reports.results import Motion
-from trackmdp.reports.style import INK, LINE, Figure, draw
+from trackmdp.reports.policy import StoredPolicy
+from trackmdp.reports.results import MotionTable
+from trackmdp.reports.style import INK, LINE, Figure, draw_figure
 from trackmdp.reports.tables import Cell, Column, Table
 from trackmdp.world.model import Array, BoolArray
 
@@ -16,22 +16,24 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Canvas
 
-__all__ = ["MOST_CELLS", "policy_map", "value_map"]
+__all__ = ["MOST_MAP_CELLS", "policy_map", "value_map"]
 
-MOST_CELLS = 400
+MOST_MAP_CELLS = 400
 """Cells of a grid that is still drawn cell by cell."""
 LEVELS = 24
 """Shades of a colour scale."""
 ON, OFF, IDLE = "#0072b2", "#dcebf4", "#d55e01"
 
 
-def policy_map(name: str, where: str, policy: Policy, motion: Motion, size: tuple[int, int]) -> Figure | None:
+def policy_map(
+    name: str, where: str, policy: StoredPolicy, motion: MotionTable, size: tuple[int, int]
+) -> Figure | None:
     """Around each located cell, the sensors that are on after no miss and after one; None for a large grid.
 
     Where the first set leaves nothing out, a miss cannot happen, and nothing is drawn for it.
     """
     cells, choices, _ = policy.chains.shape
-    if cells > MOST_CELLS:
+    if cells > MOST_MAP_CELLS:
         return None
     shown = list(range(min(choices, 2)))
     possible = _possible(policy, motion, len(shown))
@@ -60,12 +62,12 @@ def policy_map(name: str, where: str, policy: Policy, motion: Motion, size: tupl
         f"At n = {n}: {on:.2f} sensors on, {off:.2f} possible cells left out on average."
         for n, on, off in zip(shown, mean, unsensed, strict=True)
     )
-    return draw(f"sets-{name}", title, text, table, 0.4 + 3.9 * len(shown), paint)
+    return draw_figure(f"sets-{name}", title, text, table, 0.4 + 3.9 * len(shown), paint)
 
 
-def value_map(name: str, where: str, policy: Policy, motion: Motion, size: tuple[int, int]) -> Figure | None:
+def value_map(name: str, where: str, policy: StoredPolicy, motion: MotionTable, size: tuple[int, int]) -> Figure | None:
     """Exact value per start cell, and what the policy and Q_MDP miss to the clocked bound; None for a large grid."""
-    if len(policy.value) > MOST_CELLS:
+    if len(policy.value) > MOST_MAP_CELLS:
         return None
     layers = {
         "value V(x)": policy.value,
@@ -88,7 +90,7 @@ def value_map(name: str, where: str, policy: Policy, motion: Motion, size: tuple
         f"{label}: mean {values.mean():.2f}, from {values.min():.2f} to {values.max():.2f}"
         for label, values in layers.items()
     )
-    return draw(f"value-{name}", title, f"{text}.", Table(f"value-{name}", title, columns, rows), 2.1, paint)
+    return draw_figure(f"value-{name}", title, f"{text}.", Table(f"value-{name}", title, columns, rows), 2.1, paint)
 
 
 def _shade(figure: Canvas, axes: Axes, values: Array, colours: str) -> None:
@@ -114,7 +116,7 @@ def _rounded(values: Array) -> Array:
     return np.where(np.abs(values) < 1e-9, 0.0, values)
 
 
-def _possible(policy: Policy, motion: Motion, steps: int) -> list[BoolArray]:
+def _possible(policy: StoredPolicy, motion: MotionTable, steps: int) -> list[BoolArray]:
     """`[M, M]` each: where the target may be after n misses and one more move."""
     mass = motion.kernel.toarray()
     found = []

@@ -9,14 +9,14 @@ import numpy as np
 from trackmdp.episodes.episode import Episode
 from trackmdp.world.model import BoolArray, Task
 
-__all__ = ["LEGEND", "draw"]
+__all__ = ["PICTURE_LEGEND", "draw_picture"]
 
 FOUND, MISSED, ON, OFF = "●", "○", "▪", "·"
-LEGEND = f"{FOUND} target, detected   {MISSED} target, missed   {ON} sensor on   {OFF} sensor off"
+PICTURE_LEGEND = f"{FOUND} target, detected   {MISSED} target, missed   {ON} sensor on   {OFF} sensor off"
 MARGIN = "   "
 
 
-def draw(episodes: Sequence[Episode], task: Task, *, steps: int = 6) -> str:
+def draw_picture(episodes: Sequence[Episode], task: Task, *, steps: int = 6) -> str:
     """The first `steps` steps of an episode, side by side, under the legend.
 
     Args:
@@ -29,7 +29,7 @@ def draw(episodes: Sequence[Episode], task: Task, *, steps: int = 6) -> str:
     columns = [[f"step {k}", *frame] for k, frame in enumerate(frames, start=1)]
     wide = [[row.ljust(max(map(len, column))) for row in column] for column in columns]
     lines = [MARGIN.join(rows) for rows in zip(*wide, strict=True)]
-    return "\n".join([*(line.rstrip() for line in lines), "", LEGEND, ""])
+    return "\n".join([*(line.rstrip() for line in lines), "", PICTURE_LEGEND, ""])
 
 
 def _steps(episode: Episode, task: Task, steps: int) -> Iterator[tuple[int, BoolArray]]:

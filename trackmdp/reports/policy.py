@@ -16,13 +16,13 @@ from trackmdp.errors import UserError
 from trackmdp.policies.saved import load_policy
 from trackmdp.world.model import Array, BoolArray
 
-__all__ = ["FILE", "Policy", "arrays", "pack_all", "read", "unpack_all"]
+__all__ = ["POLICY_FILE", "StoredPolicy", "arrays", "pack_all", "read", "unpack_all"]
 
-FILE = "policy.npz"
+POLICY_FILE = "policy.npz"
 
 
 @dataclass(frozen=True, eq=False)
-class Policy:
+class StoredPolicy:
     """A deterministic policy.
 
     Attributes:
@@ -44,7 +44,7 @@ def arrays(content: bytes, *keys: str) -> list[npt.NDArray[Any]]:
     return [found[key] for key in keys]
 
 
-def pack_all(policies: Mapping[str, Policy]) -> bytes:
+def pack_all(policies: Mapping[str, StoredPolicy]) -> bytes:
     """The bytes of a file with many policies, each under a name."""
     every = list(policies.values())
     packed = {
@@ -58,7 +58,7 @@ def pack_all(policies: Mapping[str, Policy]) -> bytes:
     return stream.getvalue()
 
 
-def unpack_all(content: bytes) -> dict[str, Policy]:
+def unpack_all(content: bytes) -> dict[str, StoredPolicy]:
     """What `pack_all` packed.
 
     Raises:
@@ -69,10 +69,12 @@ def unpack_all(content: bytes) -> dict[str, Policy]:
     flat = np.unpackbits(bits, count=int(sizes.sum())).astype(np.bool_)
     chains = np.split(flat, np.cumsum(sizes)[:-1]) if len(names) else []
     value = np.split(values, np.cumsum(shapes[:, 0])[:-1]) if len(names) else []
-    return {str(name): Policy(c.reshape(s), v) for name, c, s, v in zip(names, chains, shapes, value, strict=True)}
+    return {
+        str(name): StoredPolicy(c.reshape(s), v) for name, c, s, v in zip(names, chains, shapes, value, strict=True)
+    }
 
 
-def read(file: Path) -> Policy:
+def read(file: Path) -> StoredPolicy:
     """Read a policy back.
 
     Raises:
@@ -81,4 +83,4 @@ def read(file: Path) -> Policy:
     table, value = load_policy(file)
     if value is None:
         raise UserError(f"{file}: not the policy of a run (it has no values)")
-    return Policy(table.dense(), value)
+    return StoredPolicy(table.dense(), value)

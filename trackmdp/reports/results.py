@@ -20,14 +20,14 @@ from scipy import sparse
 
 from trackmdp.durable import write_bytes, write_text
 from trackmdp.errors import UserError
-from trackmdp.reports.policy import Policy, arrays, pack_all, unpack_all
+from trackmdp.reports.policy import StoredPolicy, arrays, pack_all, unpack_all
 from trackmdp.untrusted import decoded, read_bytes, read_object, read_text, sealed, unsealed
 from trackmdp.world.model import Array
 
 __all__ = [
     "FIGURES",
-    "FORMAT",
-    "Motion",
+    "RESULTS_FORMAT",
+    "MotionTable",
     "CurvePoint",
     "Anomaly",
     "Results",
@@ -37,7 +37,7 @@ __all__ = [
     "save_results",
 ]
 
-FORMAT = "trackmdp results 2"
+RESULTS_FORMAT = "trackmdp results 2"
 MANIFEST, FILES = "manifest.json", ("runs.csv", "curves.csv", "policies.npz", "worlds.npz")
 LARGEST = 2**28
 """Bytes of the longest of these files."""
@@ -116,7 +116,7 @@ class Anomaly:
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class MotionTable:
     """A world's motion and two references.
 
     Attributes:
@@ -145,8 +145,8 @@ class Results:
 
     runs: Sequence[FinishedRun]
     curves: Mapping[str, Sequence[CurvePoint]] = field(default_factory=dict)
-    policies: Mapping[str, Policy] = field(default_factory=dict)
-    motions: Mapping[str, Motion] = field(default_factory=dict)
+    policies: Mapping[str, StoredPolicy] = field(default_factory=dict)
+    motions: Mapping[str, MotionTable] = field(default_factory=dict)
     anomalies: Sequence[Anomaly] = ()
     manifest: Mapping[str, Any] = field(default_factory=dict)
 
@@ -154,7 +154,7 @@ class Results:
 def is_stored(folder: Path) -> bool:
     """Whether `folder` holds stored results and not the runs themselves."""
     try:
-        return bool(read_object(folder / MANIFEST).get("format") == FORMAT)
+        return bool(read_object(folder / MANIFEST).get("format") == RESULTS_FORMAT)
     except UserError:
         return False
 
@@ -182,7 +182,7 @@ def save_results(results: Results, folder: Path) -> None:
     write_bytes(folder / "policies.npz", pack_all({name: results.policies[name] for name in sorted(results.policies)}))
     write_bytes(folder / "worlds.npz", _pack_motions(results.motions))
     manifest = {
-        "format": FORMAT,
+        "format": RESULTS_FORMAT,
         **results.manifest,
         "problems": [vars(anomaly) for anomaly in results.anomalies],
         "settings": common,
@@ -257,7 +257,7 @@ def _value(text: str) -> Any:
         return text
 
 
-def _pack_motions(motions: Mapping[str, Motion]) -> bytes:
+def _pack_motions(motions: Mapping[str, MotionTable]) -> bytes:
     names = sorted(motions)
     each = [motions[name] for name in names]
     packed = {
@@ -275,7 +275,7 @@ def _pack_motions(motions: Mapping[str, Motion]) -> bytes:
     return stream.getvalue()
 
 
-def _unpack_motions(content: bytes) -> dict[str, Motion]:
+def _unpack_motions(content: bytes) -> dict[str, MotionTable]:
     keys = ("runs", "cells", "entries", "data", "indices", "indptr", "qmdp", "clocked")
     stored = dict(zip(keys, arrays(content, *keys), strict=True))
     found, cell, entry = {}, 0, 0
@@ -285,7 +285,7 @@ def _unpack_motions(content: bytes) -> dict[str, Motion]:
         rows = (stored["data"][inner], stored["indices"][inner], stored["indptr"][outer])
         cells = slice(cell, cell + m)
         kernel = sparse.csr_array(rows, shape=(m, m))
-        found[str(name)] = Motion(kernel, stored["qmdp"][cells], stored["clocked"][cells])
+        found[str(name)] = MotionTable(kernel, stored["qmdp"][cells], stored["clocked"][cells])
         cell, entry = cell + m, entry + nnz
     return found
 

@@ -18,7 +18,19 @@ if TYPE_CHECKING:  # an extra, and a second to import
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Canvas
 
-__all__ = ["INK", "LINE", "PALETTE", "Figure", "Look", "Say", "draw", "legend", "look_of", "require", "tidy"]
+__all__ = [
+    "INK",
+    "LINE",
+    "PALETTE",
+    "Figure",
+    "Look",
+    "Say",
+    "draw_figure",
+    "legend",
+    "look_of",
+    "require_matplotlib",
+    "tidy",
+]
 
 Say: TypeAlias = Callable[[str], None]
 """Told in a few words what is under way."""
@@ -97,7 +109,7 @@ class Figure:
         )
 
 
-def require() -> None:
+def require_matplotlib() -> None:
     """Raise a `UserError` where matplotlib is not installed."""
     try:
         import matplotlib  # noqa: F401
@@ -120,7 +132,9 @@ def canvas(height: float, name: str, width: float = WIDTH) -> Iterator[Canvas]:
         yield New(figsize=(width, height), dpi=_DPI, layout="constrained")
 
 
-def draw(name: str, title: str, text: str, table: Table, height: float, paint: Callable[[Canvas], None]) -> Figure:
+def draw_figure(
+    name: str, title: str, text: str, table: Table, height: float, paint: Callable[[Canvas], None]
+) -> Figure:
     """Paint and write one figure."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.backends.backend_svg import FigureCanvasSVG

@@ -17,7 +17,7 @@ from rich.text import Text
 
 from trackmdp.errors import UserError
 from trackmdp.reports.gather import planned, run_folders
-from trackmdp.training.folders import read_json, run_of
+from trackmdp.training.folders import read_run_json, run_of
 from trackmdp.untrusted import decoded, opened, printable
 
 __all__ = ["Status", "statuses", "watch"]
@@ -104,7 +104,7 @@ def _going(sweep: Path, found: Sequence[Status]) -> bool:
 
 
 def _status(place: Path, name: str) -> Status:
-    found, plan = run_of(place), read_json(place / "plan.json")
+    found, plan = run_of(place), read_run_json(place / "plan.json")
     if found.state == FAILED:
         return Status(name, FAILED, reason=found.reason)
     upper, last = _number(plan, "upper_bound"), _last_rows(place / "metrics.csv")

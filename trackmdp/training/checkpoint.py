@@ -21,9 +21,9 @@ from trackmdp.durable import own_folder, second_name, sync_folder, whole_file
 from trackmdp.errors import UserError
 from trackmdp.untrusted import decoded, opened
 
-__all__ = ["BEST", "FORMAT", "LAST", "available", "load", "named", "newest", "point", "save"]
+__all__ = ["BEST", "CHECKPOINT_FORMAT", "LAST", "available_checkpoints", "load", "named", "newest", "point", "save"]
 
-FORMAT = 4
+CHECKPOINT_FORMAT = 4
 BEST, LAST = "best.pt", "last.pt"
 _SEAL = 128
 _SMALL, _LARGEST = 2**20, 2**38
@@ -41,7 +41,7 @@ def save(folder: Path, iteration: int, state: dict[str, Any], *, keep: int, best
     file = named(folder, iteration)
     with whole_file(file) as stream:
         hashed = _Hashed(stream)
-        hashed.save({"format": FORMAT, "iteration": iteration, **state})
+        hashed.save({"format": CHECKPOINT_FORMAT, "iteration": iteration, **state})
         stream.write(_seal(hashed.digest.hexdigest()))
     point(file, best=best)
     for old in _numbered(folder)[:-keep]:
@@ -64,7 +64,7 @@ def point(file: Path, *, best: bool) -> None:
     sync_folder(file.parent)
 
 
-def available(folder: Path) -> list[Path]:
+def available_checkpoints(folder: Path) -> list[Path]:
     """The checkpoints in a run's folder of checkpoints, the newest first."""
     return _numbered(folder)[::-1]
 
@@ -75,7 +75,7 @@ def newest(run: Path) -> Path:
     Raises:
         UserError: the run has none.
     """
-    files = available(run / "checkpoints")
+    files = available_checkpoints(run / "checkpoints")
     if not files:
         raise UserError(f"run={run}: no checkpoint in {run / 'checkpoints'}; the run has not saved one yet")
     return files[0]
@@ -95,7 +95,7 @@ def load(file: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
             state = torch.load(str(file), map_location=device, mmap=True, weights_only=True)
         except pickle.UnpicklingError as error:  # torch advises to switch weights_only off
             raise ValueError("it holds more than tensors and plain values") from error
-        if not isinstance(state, dict) or type(state.get("format")) is not int or state["format"] != FORMAT:
+        if not isinstance(state, dict) or type(state.get("format")) is not int or state["format"] != CHECKPOINT_FORMAT:
             raise UserError(f"{file}: not the state of a run")
         _take_out(state)
     return state
@@ -137,7 +137,7 @@ class _Hashed:
 
 
 def _seal(digest: str) -> bytes:
-    return f"\ntrackmdp checkpoint {FORMAT} sha256 {digest}".encode().ljust(_SEAL - 1) + b"\n"
+    return f"\ntrackmdp checkpoint {CHECKPOINT_FORMAT} sha256 {digest}".encode().ljust(_SEAL - 1) + b"\n"
 
 
 def _check(file: Path, stream: BinaryIO) -> int:
@@ -147,8 +147,8 @@ def _check(file: Path, stream: BinaryIO) -> int:
     found = re.fullmatch(rb"\ntrackmdp checkpoint (\d+) sha256 ([0-9a-f]{64}) *\n", stream.read())
     if found is None:
         raise UserError(f"{file}: damaged, or not a checkpoint of this program")
-    if int(found[1]) != FORMAT:
-        raise UserError(f"{file}: checkpoint format {int(found[1])}, expected {FORMAT}")
+    if int(found[1]) != CHECKPOINT_FORMAT:
+        raise UserError(f"{file}: checkpoint format {int(found[1])}, expected {CHECKPOINT_FORMAT}")
     stream.seek(0)
     digest = hashlib.sha256()
     while left:

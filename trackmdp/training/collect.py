@@ -89,7 +89,7 @@ def ray(
 
     env = _env_options(cfg, seed)
     workers = [partial(_remote_env, problem, f"{worker}-{done}", env, cfg.threads) for worker in range(cfg.workers)]
-    return on_ray.make_collector(workers, policy, cfg, _common(cfg, device, done))
+    return on_ray.make_ray_collector(workers, policy, cfg, _common(cfg, device, done))
 
 
 def _env_options(cfg: CollectorConfig, seed: int) -> dict[str, Any]:

@@ -10,12 +10,22 @@ from typing import Any
 from trackmdp.durable import write_json
 from trackmdp.errors import UserError
 from trackmdp.training.lock import is_locked
-from trackmdp.training.sealing import SUMMARY, read_summary
+from trackmdp.training.sealing import read_summary
 from trackmdp.untrusted import read_object
 
-__all__ = ["DONE", "FAILED", "PLAN", "SUMMARY", "RunState", "read_json", "read_plan", "run_of", "runs_of", "write_plan"]
+__all__ = [
+    "DONE",
+    "FAILED_FILE",
+    "PLAN",
+    "RunState",
+    "read_run_json",
+    "read_plan",
+    "run_of",
+    "runs_of",
+    "write_plan",
+]
 
-PLAN, FAILED, DONE = "sweep.json", "failed.json", "done.json"
+PLAN, FAILED_FILE, DONE = "sweep.json", "failed.json", "done.json"
 """Files: of a sweep; of a run that failed, of a run of another command than `train` that ended."""
 
 
@@ -50,7 +60,7 @@ def read_plan(sweep: Path) -> dict[str, Any]:
     Raises:
         UserError: the folder is not that of a sweep.
     """
-    content = read_json(sweep / PLAN)
+    content = read_run_json(sweep / PLAN)
     jobs = content.get("jobs")
     whole = isinstance(jobs, list) and all(
         isinstance(job, dict) and isinstance(job.get("folder"), str) and isinstance(job.get("overrides"), list)
@@ -76,7 +86,7 @@ def run_of(folder: Path, overrides: tuple[str, ...] = ()) -> RunState:
         return RunState(folder, overrides, "running")
     if result := _result(folder):
         return RunState(folder, overrides, "done", "", result)
-    if failed := read_json(folder / FAILED):
+    if failed := read_run_json(folder / FAILED_FILE):
         return RunState(folder, overrides, "failed", str(failed.get("reason", "")))
     return RunState(folder, overrides, "cut" if (folder / "config.yaml").is_file() else "waiting")
 
@@ -86,10 +96,10 @@ def _result(folder: Path) -> dict[str, Any]:
     try:
         return read_summary(folder)
     except UserError:
-        return read_json(folder / DONE)
+        return read_run_json(folder / DONE)
 
 
-def read_json(file: Path) -> dict[str, Any]:
+def read_run_json(file: Path) -> dict[str, Any]:
     """The content of a file that is whole or absent; empty where it is absent or no object."""
     try:
         return read_object(file)

@@ -11,7 +11,7 @@ from trackmdp.config.options import nodes
 from trackmdp.errors import UserError
 from trackmdp.world.model import Task
 
-__all__ = ["available", "check", "needs"]
+__all__ = ["available_bytes", "check_memory", "needs"]
 
 _GIB = 2**30
 _CGROUPS = (
@@ -20,13 +20,13 @@ _CGROUPS = (
 )
 
 
-def check(cfg: TrainConfig, task: Task, device: torch.device) -> str:
+def check_memory(cfg: TrainConfig, task: Task, device: torch.device) -> str:
     """One line about the memory that the run needs and what there is on `device`.
 
     Raises:
         UserError: it cannot fit; the option that takes most of it is named.
     """
-    parts, free = needs(cfg, task), available(device)
+    parts, free = needs(cfg, task), available_bytes(device)
     total = sum(parts.values())
     if total > free:
         key = max(parts, key=lambda name: parts[name])
@@ -44,7 +44,7 @@ def needs(cfg: TrainConfig, task: Task) -> dict[str, int]:
     return parts
 
 
-def available(device: torch.device, root: Path = Path("/")) -> int:
+def available_bytes(device: torch.device, root: Path = Path("/")) -> int:
     """Bytes that can still be had on `device`: on the CPU what the system, and the job's own limit, leave.
 
     A system that does not say counts as unlimited. `root` is where its files are.

@@ -15,13 +15,13 @@ from trackmdp.errors import UserError, require
 from trackmdp.training.signals import kept_sigterm
 from trackmdp.world.env import TrackEnv
 
-__all__ = ["make_collector"]
+__all__ = ["make_ray_collector"]
 
 _STORE = 2**30
 """Bytes for the batches on their way, of a cluster that is started here."""
 
 
-def make_collector(
+def make_ray_collector(
     envs: Sequence[Callable[[], TrackEnv]], policy: TensorDictModuleBase, cfg: RayWorkersConfig, common: dict[str, Any]
 ) -> BaseCollector:
     """A collector whose batches `[B, time]` hold the rows of all workers, one after the other.

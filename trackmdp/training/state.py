@@ -100,7 +100,7 @@ def find(cfg: TrainConfig, folder: Path, device: torch.device) -> tuple[dict[str
     if cfg.resume is None:
         return None, []
     named = Path(cfg.resume)
-    files = [named] if named.is_file() else checkpoint.available(folder / "checkpoints")
+    files = [named] if named.is_file() else checkpoint.available_checkpoints(folder / "checkpoints")
     if not files and cfg.resume == "auto":
         return None, []
     passed_over: list[str] = []

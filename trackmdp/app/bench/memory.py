@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from trackmdp.app.bench.process import trained
+from trackmdp.app.bench.process import timed_training
 from trackmdp.app.bench.speed import train_config
 from trackmdp.config import BenchmarkConfig
 from trackmdp.training.memory import needs
@@ -26,5 +26,5 @@ def memory(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator
         words = [f"algo={algo}", f"grid.size={size}", f"collector.total_frames={FRAMES}", "optimal.enabled=false"]
         train = train_config(words)
         expected = sum(needs(train, build_world(train).task).values())
-        peak = trained(*words, f"threads={cfg.threads}", f"device={device}").usage.peak_mib
+        peak = timed_training(*words, f"threads={cfg.threads}", f"device={device}").usage.peak_mib
         yield {"part": "memory", "algo": algo, "N": size, "expected_mib": expected / 2**20, "peak_mib": peak}

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from trackmdp.app.bench.process import Usage, measured, on_one_core, trained, typed
+from trackmdp.app.bench.process import Usage, measured, on_one_core, timed_training, typed
 from trackmdp.config import BenchmarkConfig
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
@@ -88,7 +88,7 @@ def _scripts(cfg: BenchmarkConfig) -> list[tuple[Path, str]]:
 
 def _ours(cfg: BenchmarkConfig, seed: int, device: torch.device) -> Learned:
     own = [f"seed={seed}", f"threads={cfg.threads}", f"device={device}", "evaluation.every=1", "optimal.enabled=false"]
-    run = trained(*typed("grid", "kernel", "cost"), *own)
+    run = timed_training(*typed("grid", "kernel", "cost"), *own)
     points = [(float(row["seconds"]), int(row["frames"]), float(row["regret_per_step"])) for row in run.curve]
     return Learned("trackmdp hindsight", seed, _from_start(points, run.usage), run.usage)
 

@@ -17,7 +17,7 @@ from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 
-__all__ = ["Trained", "Usage", "measured", "on_one_core", "trained", "typed"]
+__all__ = ["TimedTraining", "Usage", "measured", "on_one_core", "timed_training", "typed"]
 
 _WRAPPER = """
 import json, re, resource, runpy, sys
@@ -48,7 +48,7 @@ class Usage:
 
 
 @dataclass(frozen=True)
-class Trained:
+class TimedTraining:
     """A training run: its `summary.json`, the rows of `metrics.csv` that were judged, and what it took."""
 
     summary: dict[str, Any]
@@ -78,14 +78,14 @@ def measured(*words: str, script: str | None = None, python: str = sys.executabl
         return Usage(wall, **json.loads(report.read_text()))
 
 
-def trained(*words: str) -> Trained:
+def timed_training(*words: str) -> TimedTraining:
     """Run `trackmdp train words...` in a process of its own."""
     with tempfile.TemporaryDirectory() as folder:
         usage = measured("train", *words, "quiet=true", f"hydra.run.dir={folder}/run")
         summary = json.loads(Path(folder, "run", "summary.json").read_text())
         with Path(folder, "run", "metrics.csv").open() as stream:
             curve = [row for row in csv.DictReader(stream) if row["regret_per_step"]]
-    return Trained(summary, curve, usage)
+    return TimedTraining(summary, curve, usage)
 
 
 def typed(*keys: str) -> list[str]:

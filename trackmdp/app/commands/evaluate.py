@@ -18,7 +18,7 @@ from trackmdp.episodes.figures import Simulation
 from trackmdp.episodes.log import EpisodeLog
 from trackmdp.episodes.simulate import simulate
 from trackmdp.policies.policy import Policy
-from trackmdp.reports.picture import draw
+from trackmdp.reports.picture import draw_picture
 from trackmdp.solvers import estimator
 from trackmdp.solvers.solve import baseline_policy
 from trackmdp.training.devices import make_device
@@ -55,7 +55,7 @@ def run(cfg: EvaluateConfig, folder: Path, problem: Problem | None = None) -> fl
     write_json(folder / "evaluation.json", report)
     if policy.deterministic:
         write_json(folder / "sets.json", policy.as_lists())
-    write_text(folder / "picture.txt", draw(episodes, world))
+    write_text(folder / "picture.txt", draw_picture(episodes, world))
     _show(console, subject, evaluator, score, simulation, folder)
     if cfg.log is not None:
         _log_episodes(cfg, world, episodes, subject, folder, console)

@@ -10,7 +10,7 @@ from rich.console import Console
 from trackmdp.durable import write_json, write_text
 from trackmdp.episodes.simulate import simulate
 from trackmdp.policies.policy import Policy
-from trackmdp.reports.picture import draw
+from trackmdp.reports.picture import draw_picture
 from trackmdp.training.display import table
 from trackmdp.training.held_out import HeldOutEvaluator
 from trackmdp.world.tracks import Recorded
@@ -34,7 +34,7 @@ def run(
     write_json(folder / "evaluation.json", content)
     if policy.deterministic:
         write_json(folder / "sets.json", policy.as_lists())
-    write_text(folder / "picture.txt", draw(simulate(world, policy, 16, seed=seed), world))
+    write_text(folder / "picture.txt", draw_picture(simulate(world, policy, 16, seed=seed), world))
     show_held_out(console, subject, report)
     console.print(f"results in {folder}")
     return float(report["figures"]["policy"]["aihtr"]["mean"])

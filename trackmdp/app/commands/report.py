@@ -13,7 +13,7 @@ from trackmdp.paper.openings import compute, load_openings, save_openings
 from trackmdp.paper.printed import pairs
 from trackmdp.paper.sections import sections
 from trackmdp.reports import style, watch
-from trackmdp.reports.gather import gather
+from trackmdp.reports.gather import gather_runs
 from trackmdp.reports.grouping import study
 from trackmdp.reports.page import Report, Section, build
 from trackmdp.reports.results import Results, is_stored, load_results, save_results
@@ -32,13 +32,13 @@ def run(cfg: ReportConfig, folder: Path) -> float:
     sweep, console = Path(cfg.sweep), make_console(cfg.quiet)
     if cfg.watch:
         return float(watch.watch(sweep, console, cfg.every))
-    style.require()
+    style.require_matplotlib()
     with console.status("reading runs") as status:
 
         def say(line: str) -> None:
             status.update(Text(printable(line)))
 
-        found = load_results(sweep) if is_stored(sweep) else gather(sweep)
+        found = load_results(sweep) if is_stored(sweep) else gather_runs(sweep)
         save_results(found, folder)
         found = load_results(folder)
         _write(build(found, cfg.threshold, _about_the_paper(cfg, sweep, found, folder, say), say), folder)

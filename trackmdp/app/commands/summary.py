@@ -9,10 +9,10 @@ from trackmdp.training.display import table
 from trackmdp.training.run import Run
 from trackmdp.training.trainer import Trainer
 
-__all__ = ["show"]
+__all__ = ["show_summary"]
 
 
-def show(console: Console, trainer: Trainer, run: Run) -> None:
+def show_summary(console: Console, trainer: Trainer, run: Run) -> None:
     """The learned policy beside Q_MDP, all sensors on, and the optimum where it was solved for."""
     evaluator, solution = trainer.evaluator, run.solution
     policies = {f"learned ({trainer.config.algo.name})": run.evaluation}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from trackmdp.app.commands.held_out import show_held_out
-from trackmdp.app.commands.summary import show
+from trackmdp.app.commands.summary import show_summary
 from trackmdp.config import TrainConfig
 from trackmdp.config.resume import finished
 from trackmdp.errors import RunError
@@ -52,7 +52,7 @@ def _run(cfg: TrainConfig, folder: Path, problem: Problem | None) -> float:
     trainer = Trainer(problem or make_problem(cfg), cfg, folder=folder, console=console)
     done = complete(trainer)
     if done.summary["held_out"] is None:
-        show(console, trainer, done)
+        show_summary(console, trainer, done)
     else:
         show_held_out(console, f"learned ({cfg.algo.name})", done.summary["held_out"])
     console.print(f"{done.summary['wall_seconds']:.1f} s; results in {folder}")

@@ -47,7 +47,7 @@ def write_checks(world: World, tolerance: float, folder: Path) -> list[Check]:
     solution = optimal.solve(world, time_limit=TIME_LIMIT, tolerance=tolerance)
     if solution.interrupted:
         raise KeyboardInterrupt
-    checks = [*theorems.check(world, solution, tolerance), *remarks.check(tolerance)]
+    checks = [*theorems.check_theorems(world, solution, tolerance), *remarks.check_remarks(tolerance)]
     content = {
         "optimum": {"lower": solution.lower, "upper": solution.upper, "certified": solution.certified},
         "tolerance": tolerance,
@@ -65,7 +65,7 @@ def show_checks(console: Console, checks: list[Check], folder: Path) -> None:
     for check in checks:
         shown.add_row(check.name, check.statement, _deviation(check), check.verdict, check.note)
     console.print(shown)
-    console.print(f"{theorems.summary(checks)}; results in {folder}", markup=False)
+    console.print(f"{theorems.summarize_checks(checks)}; results in {folder}", markup=False)
 
 
 def _deviation(check: Check) -> str:

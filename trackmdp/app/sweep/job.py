@@ -15,7 +15,8 @@ from trackmdp.app.sweep.process import Outcome, run_in_process
 from trackmdp.config import TrainConfig
 from trackmdp.durable import write_json
 from trackmdp.errors import USER_MISTAKE
-from trackmdp.training.folders import DONE, FAILED, SUMMARY, run_of
+from trackmdp.training.folders import DONE, FAILED_FILE, run_of
+from trackmdp.training.sealing import SUMMARY
 
 __all__ = ["STOP", "Launch", "fail", "run_job", "stop_signal"]
 
@@ -37,7 +38,7 @@ def run_job(job: Job) -> None:
     if not _is_free(job):
         _say(job, "is run by another process")
         return
-    (job.folder / FAILED).unlink(missing_ok=True)
+    (job.folder / FAILED_FILE).unlink(missing_ok=True)
     (job.folder / DONE).unlink(missing_ok=True)
     if job.cfg is None:
         fail(job, Outcome(USER_MISTAKE, reason=job.refusal))
@@ -55,7 +56,7 @@ def run_job(job: Job) -> None:
 def fail(job: Job, outcome: Outcome) -> None:
     """Leave in the run's folder why it failed, and say so."""
     job.folder.mkdir(parents=True, exist_ok=True)
-    write_json(job.folder / FAILED, {"reason": outcome.reason, "status": outcome.status})
+    write_json(job.folder / FAILED_FILE, {"reason": outcome.reason, "status": outcome.status})
     _say(job, f"failed: {outcome.reason}")
 
 

@@ -49,7 +49,7 @@ def _parallel(cfg: LauncherConfig) -> Launch:
     require("ray", "ray", option)
     from trackmdp.app.sweep import ray_cluster
 
-    return partial(ray_cluster.launch, cfg)
+    return partial(ray_cluster.launch_on_ray, cfg)
 
 
 @contextmanager

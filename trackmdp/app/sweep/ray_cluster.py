@@ -11,13 +11,13 @@ from trackmdp.app.sweep.schema import RayConfig
 from trackmdp.errors import UserError
 from trackmdp.training.signals import kept_sigterm
 
-__all__ = ["launch"]
+__all__ = ["launch_on_ray"]
 
 _STORE = 100 * 2**20
 """Bytes for the objects of a cluster started here; the runs hand over none."""
 
 
-def launch(cfg: RayConfig, jobs: Sequence[Job]) -> None:
+def launch_on_ray(cfg: RayConfig, jobs: Sequence[Job]) -> None:
     """Run `jobs` as tasks of a Ray cluster, which is left, or ended where it was started here.
 
     Raises:

@@ -15,13 +15,13 @@ from trackmdp.app.sweep.job import STOP, Launch, fail
 from trackmdp.app.sweep.launchers import threads_of
 from trackmdp.app.sweep.plan import Job
 from trackmdp.app.sweep.process import Outcome
-from trackmdp.app.sweep.table import show, status_of, write_table
+from trackmdp.app.sweep.table import show_runs, status_of, write_table
 from trackmdp.config import TrainConfig
 from trackmdp.config.resume import continued, finished
-from trackmdp.errors import FAILED as FAILED_STATUS
-from trackmdp.errors import Preempted, UserError
-from trackmdp.training.folders import DONE, FAILED, SUMMARY, RunState, run_of, runs_of, write_plan
+from trackmdp.errors import FAILED, Preempted, UserError
+from trackmdp.training.folders import DONE, FAILED_FILE, RunState, run_of, runs_of, write_plan
 from trackmdp.training.lock import locked
+from trackmdp.training.sealing import SUMMARY
 from trackmdp.training.signals import Signals
 
 __all__ = ["sweep"]
@@ -61,7 +61,7 @@ def sweep(
                 break
         runs = runs_of(folder)
         write_table(folder, runs)
-        show(console, runs, skipped, folder)
+        show_runs(console, runs, skipped, folder)
     if stop.received:
         raise Preempted(stop.received)
     _report_failures(command, runs)
@@ -87,7 +87,7 @@ def _is_finished(job: Job) -> bool:
 
 def _remove_results(job: Job) -> None:
     """Remove what an earlier call left of a run that is to be run now."""
-    for name in (FAILED, DONE, SUMMARY):
+    for name in (FAILED_FILE, DONE, SUMMARY):
         (job.folder / name).unlink(missing_ok=True)
 
 
@@ -106,7 +106,7 @@ def _launch(jobs: Sequence[Job], launch: Launch, stop: _Stop) -> None:
     if stop.received:
         return
     for job in jobs:
-        fail(job, Outcome(FAILED_STATUS, reason=reason))
+        fail(job, Outcome(FAILED, reason=reason))
 
 
 def _opening(jobs: Sequence[Job], skipped: Collection[Path], folder: Path) -> str:

@@ -12,19 +12,18 @@ from rich.console import Console
 
 from trackmdp.app.prepare import shown
 from trackmdp.durable import write_text
-from trackmdp.errors import FAILED as FAILED_STATUS
-from trackmdp.errors import USER_MISTAKE
+from trackmdp.errors import FAILED, USER_MISTAKE
 from trackmdp.training.display import table
-from trackmdp.training.folders import FAILED, RunState, read_json
+from trackmdp.training.folders import FAILED_FILE, RunState, read_run_json
 
-__all__ = ["TABLE", "figures", "show", "status_of", "write_table"]
+__all__ = ["TABLE", "run_figures", "show_runs", "status_of", "write_table"]
 
 TABLE = "runs.csv"
 
 _FIGURES = ("aihtr", "regret_per_step", "accuracy", "sensors_per_step", "frames")
 
 
-def show(console: Console, runs: Sequence[RunState], skipped: Collection[Path], sweep: Path) -> None:
+def show_runs(console: Console, runs: Sequence[RunState], skipped: Collection[Path], sweep: Path) -> None:
     """Every run with its state, AIHTR and regret per step, or why it failed."""
     names = [run.folder.name.rpartition("-")[0] for run in runs]
     if len(set(names)) < len(names):
@@ -49,7 +48,7 @@ def write_table(sweep: Path, runs: Sequence[RunState]) -> None:
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(["folder", "state", *_FIGURES, "reason", *keys])
     for run, pairs in zip(runs, words, strict=True):
-        found = figures(run)
+        found = run_figures(run)
         row = [run.folder.name, run.state, *(found.get(name) for name in _FIGURES), run.reason]
         writer.writerow([*row, *(pairs.get(key) for key in keys)])
     write_text(sweep / TABLE, stream.getvalue())
@@ -59,16 +58,16 @@ def status_of(runs: Sequence[RunState]) -> int:
     """The exit status: 0 if all is done, 2 if only mistakes of the user failed, else 1."""
     if all(run.state == "done" for run in runs):
         return 0
-    statuses = [read_json(run.folder / FAILED).get("status") for run in runs if run.state == "failed"]
+    statuses = [read_run_json(run.folder / FAILED_FILE).get("status") for run in runs if run.state == "failed"]
     unfinished = any(run.state not in ("done", "failed") for run in runs)
-    return FAILED_STATUS if unfinished or any(status != USER_MISTAKE for status in statuses) else USER_MISTAKE
+    return FAILED if unfinished or any(status != USER_MISTAKE for status in statuses) else USER_MISTAKE
 
 
 def _state(run: RunState, skipped: Collection[Path]) -> str:
     return "skipped" if run.folder in skipped and run.state == "done" else run.state
 
 
-def figures(run: RunState) -> dict[str, Any]:
+def run_figures(run: RunState) -> dict[str, Any]:
     """The figures of a training run; of another command's the one value that it returns."""
     if "policy" not in run.result:
         return {"aihtr": run.result.get("value")}
@@ -76,7 +75,7 @@ def figures(run: RunState) -> dict[str, Any]:
 
 
 def _short(run: RunState) -> list[str]:
-    found = figures(run)
+    found = run_figures(run)
     aihtr, regret = found.get("aihtr"), found.get("regret_per_step")
     return [f"{aihtr:,.3f}" if aihtr is not None else "", f"{round(regret, 4) + 0.0:.4f}" if regret is not None else ""]
 
