@@ -73,6 +73,11 @@ def test_runs_are_counted_up_to_the_threshold_where_one_is_given(results: Result
     assert "≤ 0.02" not in build(results).tables[0].html()
 
 
+def test_a_budget_below_the_shipped_one_is_said(results: Results) -> None:
+    page = build(results).html()  # the stand-ins for runs have 4,000 steps
+    assert "a2c: 4,000 of 4,096,000; hindsight: 4,000 of 300,000" in page
+
+
 def test_accuracies_stand_beside_the_printed_ones(results: Results) -> None:
     grouped = study(results.runs)
     rows = {tuple(row[:2]): row for row in accuracy_table(grouped, pairs(grouped)).rows}

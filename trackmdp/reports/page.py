@@ -107,7 +107,11 @@ def build(
         return Report(_about(results), [missing])
     say("figures")
     grouped = study(results.runs)
-    sections = [Section("outcome", "Outcome", [summaries.methods_table(grouped, threshold)])]
+    outcome: list[Part] = [summaries.methods_table(grouped, threshold)]
+    if cut := summaries.shortened(grouped):
+        said = html.escape("; ".join(cut))
+        outcome.append(f"<p>Fewer env steps than the algorithm's own options give it: {said}.</p>")
+    sections = [Section("outcome", "Outcome", outcome)]
     sections += [missing] if results.anomalies else []
     sections += [*_against_cost(grouped, threshold), *_learning(results, grouped, threshold), *_maps(results, grouped)]
     by_group = Folded("By world and method", summaries.groups_table(grouped, threshold))
