@@ -78,6 +78,7 @@ def clocked_table(world: World) -> ClockedBound:
     The greedy policy of a table Û within rho of its own equation gives U <= Û + rho · (longest expected episode): the
     clocked process is left at every step with the target's probability of exit, whatever is chosen.
     """
+    # all on is a policy of finite value; from there each round is worth more, and there are finitely many policies
     sensed = np.ones((world.num_choices, world.kernel.nnz), dtype=bool)
     table, exact = _value(world, sensed)
     while True:
@@ -104,6 +105,7 @@ def _improve(world: World, table: Array, sensed: BoolArray) -> BoolArray:
     rows, cells, p = row_index(world.kernel), world.kernel.indices, world.kernel.data
     cost = world.cost[cells] * world.stay_probability[rows]
     gain = p * (world.reward + table[cells, 0] - table[cells, 1:].T) - cost
+    # without a margin, rounding could switch a tied choice to and fro for ever
     tie = 1e-12 * (1.0 + np.abs(table).max())
     return np.where(np.abs(gain) <= tie, sensed, gain > 0)
 
@@ -124,6 +126,8 @@ def _value(world: World, sensed: BoolArray) -> tuple[Array, bool]:
     """
     moves = world.kernel
     rows, cells = row_index(moves), moves.indices
+    # With t_max = 1: reach[2] = P, reach[1] = hit_1 + miss_1 P, reach[0] = hit_0 + miss_0 reach[1]. Only the last is
+    # solved with; the others give U(., n) by one product each.
     earned = [(world.reward - world.safe_cost) * world.stay_probability]
     reach = [moves]
     gain = moves.data * world.reward - world.cost[cells] * world.stay_probability[rows]

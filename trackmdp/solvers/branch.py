@@ -177,6 +177,7 @@ class Tree:
 
     def _decide(self, choices: _Choices) -> None:
         """Split every choice on its next cell; a choice without one goes on to the next step."""
+        # what was worth looking at when it was pushed may not be so any more: the best plans have become better since
         choices = choices.pick(self._hopeful(choices.start, choices.bound))
         frontier, k = choices.frontier, choices.decided
         done = frontier.count[choices.state] <= k
@@ -189,6 +190,8 @@ class Tree:
         sensed = split.relaxed - frontier.regret[split.state, k]
         left = split.left.copy()
         left[:, k] = True
+        # Two children each: cell k sensed, which costs its regret; or left, which costs what it loses together with
+        # the cells left before it. A child's bound never exceeds its parent's, nor does it pay for the same loss twice.
         for cells, relaxed, lost in (
             (split.left, sensed, split.lost),
             (left, split.relaxed, self._joint_loss(split, left)),
@@ -202,6 +205,9 @@ class Tree:
 
     def _loss(self, mass: sparse.csr_array, sets_left: int) -> Array:
         """`[P]` how much less one more set chosen jointly is worth than the position revealed at once."""
+        # Revealed at once, the mass is worth sum_j z_j R(e_j); one set for all of it, revealed after that, is worth less:
+        # with z = (.2 at a, .2 at b) and the target going on to c from either, one sensor at c serves both; if it goes
+        # on to different cells, two sensors are paid for .4 of mass in place of one each for .2.
         return np.maximum(mass @ self._revealed[sets_left] - self._one_more_set(mass, sets_left)[0], 0.0)
 
     def _least_loss(self, frontier: _Frontier) -> Array:
@@ -213,6 +219,7 @@ class Tree:
         count, width = len(frontier.start), frontier.cells.shape[1]
         if not 2 <= width <= MOST_PAIRED:
             return np.zeros((count, width + 1))
+        # pair[s, a, b]: what cells a and b of state s lose when both are left; infinite where one of them is padding
         pair = np.full((count, width, width), np.inf)
         for shift in range(1, width):
             state, place = np.nonzero(np.arange(shift, width) < frontier.count[:, None])
@@ -221,6 +228,9 @@ class Tree:
         rest = np.zeros((count, width + 1))
         present = np.arange(width) < frontier.count[:, None]
         for k in range(width):
+            # Each cell from the k-th on costs its regret, or is left together with another one. Averaging over all
+            # pairings of the cells left, cell a takes at least half of its cheapest pair's loss.
+            # That holds where two or more are left; with one or none, all the others cost their regret.
             later = pair[:, k:, k:].min(axis=2)
             regret = np.where(present[:, k:], frontier.regret[:, k:], 0.0)
             several = np.where(present[:, k:], np.minimum(later / 2.0, regret), 0.0).sum(axis=1)
@@ -235,6 +245,8 @@ class Tree:
         return self._loss(mass, frontier.sets_left - 1)
 
     def _left_mass(self, choices: _Choices, left: BoolArray) -> sparse.csr_array:
+        # Choice p of state s = choices.state[p] leaves the cells at the places where left[p] is True: with cells[s] =
+        # (4, 7, 9) and left[p] = (1, 0, 1), row p of the result has the mass of cells 4 and 9.
         row, place = np.nonzero(left)
         state = choices.state[row]
         cells, mass = choices.frontier.cells[state, place], choices.frontier.mass[state, place]
@@ -257,6 +269,7 @@ class Tree:
         sets_left = choices.frontier.sets_left - 1
         mass = self._left_mass(choices, choices.left)
         earned = choices.relaxed - mass @ self._revealed[sets_left]
+        # `relaxed` counted the cells left at their revealed worth; that is taken out and the rest searched for anew
         self._open(choices.start, earned, mass, sets_left, choices)
 
     def _open(
@@ -289,6 +302,7 @@ class Tree:
     def _record(
         self, start: IndexArray, worth: Array, moved: sparse.csr_array, left: BoolArray, origin: _Choices | None
     ) -> None:
+        # best first, so that of many plans for one problem all but the first are passed over
         order = np.argsort(-worth, kind="stable")
         for place in order[self._hopeful(start[order], worth[order])]:
             x = int(start[place])
@@ -306,6 +320,8 @@ class Tree:
         choices = choices.pick(self._hopeful(choices.start, choices.bound))
         excess = choices.bound - self.best[choices.start]
         order = np.argsort(-excess, kind="stable")
+        # a heap of batches, each under its best excess; the ticket settles ties in the order of pushing, and is what
+        # makes two runs look at the same choices in the same order
         for first in range(0, len(order), LARGEST_BATCH):
             part = order[first : first + LARGEST_BATCH]
             heapq.heappush(self._heap, (-float(excess[part[0]]), -next(self._ticket), choices.pick(part)))
@@ -321,10 +337,13 @@ def _frontier(
     origin: _Choices | None,
 ) -> _Frontier:
     """The states `kept`, with the entries of `moved` whose `regret` is positive, the likeliest first."""
+    # The entries of `moved` are a ragged table: row s has count[s] of them. They are set into rectangles [B, K]; the
+    # column of an entry is its number among those of its row: rows (0, 0, 2) have columns (0, 1, 0).
     place = np.full(len(start), -1)
     place[kept] = np.arange(len(kept))
     rows = place[row_index(moved)]
     entry = np.flatnonzero((regret > 0) & (rows >= 0))
+    # a cell whose regret is not positive is sensed in every choice, and is not decided on
     entry = entry[np.lexsort((-moved.data[entry], rows[entry]))]
     count = np.bincount(rows[entry], minlength=len(kept))
     column = np.arange(len(entry)) - np.repeat(np.cumsum(count) - count, count)

@@ -114,6 +114,7 @@ def accuracy(world: World, policy: PolicyTable, value: Array | None = None) -> E
 def _estimate(
     world: World, n: int, layer: Layer, predicted: Array, before: Array, value: Array, later: Array, unsensed: BoolArray
 ) -> PositionEstimate:
+    # joint probabilities become beliefs: divided by that of the misses so far
     reached = np.flatnonzero(predicted > 0)
     rows, cells = layer.rows[reached], layer.cells[reached]
     p = predicted[reached] / before[rows]
@@ -130,6 +131,7 @@ def _estimate(
 def _best(rows: IndexArray, score: Array, allowed: BoolArray) -> IndexArray:
     """The allowed entry of highest score in each row; of scores equal but for rounding, the first."""
     entries = np.flatnonzero(allowed)
+    # rounding decides no tie: scores equal to nine digits are equal
     rounded = score[entries].round(9)
     order = entries[np.lexsort((entries, -rounded, rows[entries]))]
     return order[np.unique(rows[order], return_index=True)[1]]

@@ -156,6 +156,7 @@ class KernelEstimate:
     def _parameters(self) -> tuple[sparse.csr_array, Array]:
         """Dirichlet parameters `[M, M]` of the moves and Beta parameters `[M, 2]` of the exit."""
         moved, left = self.counts[:, :-1], self.counts[:, [-1]].toarray()[:, 0]
+        # half an exit in one more move keeps the pooled probability between 0 and 1 before any exit is seen
         pooled = (left.sum() + 0.5) / (self.counts.sum() + 1.0)
         exits = np.stack([left + self.exit_weight * pooled, moved.sum(axis=1) + self.exit_weight * (1 - pooled)], 1)
         moves = sparse.csr_array(moved + self.weight * self._typical_moves(sparse.csr_array(moved)))
@@ -244,6 +245,7 @@ def _merged(paths: ObservedPaths) -> tuple[ObservedPaths, Array]:
     path, miss = np.divmod(row_index(paths.sensed), choices)
     read = miss < paths.misses[path]
     marks = np.random.default_rng(0).integers(2**63, size=(2, choices * m), dtype=np.uint64)
+    # path k's sum is over its own entries, in any order: equal sets have equal sums
     sums = np.zeros((2, len(paths.start)), dtype=np.uint64)
     for mark, total in zip(marks, sums, strict=True):  # unsigned sums wrap around, which is what is wanted
         np.add.at(total, path[read], mark[(miss * m + paths.sensed.indices)[read]])
@@ -268,6 +270,7 @@ def _expected_moves(kernel: sparse.csr_array, paths: ObservedPaths, copies: Arra
         forward = [_counted(each, some.start, np.ones(len(part)), (len(part), m))]
         for t in range(n):
             forward.append(_hidden(forward[t] @ moves, sensed[t]))
+        # row `end` of P^T is the likelihood of ending there, by the cell before
         later = backward[some.end]
         weight = copies[part] / np.maximum(forward[n].multiply(later).sum(axis=1), 1e-300)
         expected = expected + forward[n].T @ _counted(each, some.end, weight, (len(part), m + 1))

@@ -17,6 +17,7 @@ __all__ = ["first_guess", "next_table", "tables"]
 
 def first_guess(problem: InnerProblem, known: list[Array], mass: Array) -> list[BoolArray]:
     """Sets found by a homotopy from the credit r + V - R, `known` being R_0 ... R_{H-1}; see `search`."""
+    # with H sets, after set t there are H - 1 - t left: credit_t(j) = r + V(j) - R_{H-1-t}(j)
     credit = [problem.detected - known[problem.length - 1 - t] for t in range(problem.length)]
     sets = problem.none_sensed()
     for optimism in np.linspace(1.0, 0.0, 11):
@@ -56,6 +57,7 @@ def tables(
         go_on: asked now and then whether to look further.
         layers: possible positions, where they are known already.
     """
+    # R_h needs h layers only, the first ones of those that are there
     layers = reachable_layers(world, length) if layers is None else layers
     known = [missed]
     for sets in range(1, length + 1):

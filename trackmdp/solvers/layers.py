@@ -88,6 +88,7 @@ def sensed_csr(task: Task, parts: Sequence[tuple[IndexArray, IndexArray]]) -> sp
     """`[M * (t_max + 1), M]` bool, the sets of a `PolicyTable`, from what is sensed at each n: (rows, cells)."""
     choices, m = task.num_choices, task.num_cells
     # Located in x after n misses is row x (t_max + 1) + n: with t_max = 1, (x, n) = (3, 1) is row 7.
+    # rows of several n interleave, so that the table is sorted once all are there
     rows = np.concatenate([part[0] * choices + n for n, part in enumerate(parts)])
     cells = np.concatenate([part[1] for part in parts])
     table = sparse.csr_array((np.ones(len(rows), dtype=bool), (rows, cells)), shape=(m * choices, m))

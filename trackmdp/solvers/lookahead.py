@@ -37,6 +37,7 @@ def solve(world: World, *, depth: int = 2, tail: Tail = "clocked") -> PolicyTabl
     sets: list[BoolArray] = []
     mass = np.ones(world.num_cells)
     for n in range(world.num_choices):
+        # the safe action ends every plan: n + ahead is at most t_max + 1
         ahead = min(depth, world.num_choices - n)
         problem = InnerProblem(world, layers[n : n + ahead + 1], world.reward + table[:, 0], table[:, n + ahead])
         sets.append(_first_set(problem, layers, mass))
@@ -56,6 +57,7 @@ def _first_set(problem: InnerProblem, layers: list[Layer], mass: Array) -> BoolA
     world, known = problem.world, _known(problem, layers)
     sets = first_guess(problem, known, mass)
     origin, after = problem.layers[:2]
+    # one problem per located cell: its undetected mass after the sets carried out so far
     here = sparse.csr_array((mass, (origin.rows, origin.cells)), shape=(world.num_cells, world.num_cells))
     here.eliminate_zeros()
     tree = Tree(world, problem.detected, known, problem.worth(sets, mass), SLACK, here)

@@ -127,6 +127,7 @@ class _Run:
             return
         self.ground = _Ground(self.world)
         layers = self.ground.layers
+        # first the policy, then the proof: branch and bound is the faster the better its start
         self.use(policy_table(self.world, layers, follow_credit(self.world, layers, layer_sets(layers, self.policy))))
         self.report()
         patience = FIRST_NODES
@@ -143,6 +144,7 @@ class _Run:
         # `longest` expected steps has at most as many renewals.
         slack = 0.5 * self.gap_allowed / self.ground.longest
         problem = InnerProblem.of(self.world, self.ground.layers, self.value)
+        # R_1, R_2, ...: what 1, 2, ... more sets are worth from a known position, each from those before
         revealed = [problem.missed]
         for length in range(1, self.world.num_choices):
             revealed.append(self.revealed(problem, revealed, length, patience, slack))
@@ -178,6 +180,7 @@ class _Run:
         def go_on(tree: Tree) -> bool:
             nonlocal reported, next_look
             now = time.monotonic()
+            # the clock decides what is shown and when the search ends, never which plan is looked at next
             if now - reported > 1.0:
                 reported = now
                 self.tighten(tree)
@@ -196,6 +199,8 @@ class _Run:
 
     def tighten(self, tree: Tree) -> None:
         """Use what the tree has proved so far: V* <= V + (I - P)^-1 (T V - V), for any V, also one off by its error."""
+        # The tree bounds T V from above, cell by cell, also where it was stopped early. The clocked bound and all that
+        # earlier rounds proved hold as well: the least of them is kept, cell by cell.
         residual = np.maximum(tree.upper() - self.value, 0.0)
         met = self.ground.paths.upper(residual, self.ground.longest)
         self.bound = np.minimum(self.bound, self.value + met)

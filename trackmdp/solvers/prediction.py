@@ -38,6 +38,7 @@ class Prediction:
     def part(self, share: Array | BoolArray) -> sparse.csr_array:
         """`[M, M]` the mass, of each entry the `share` `[E]` given; entries without mass are dropped."""
         mass, count = self.mass * share, len(self.before)
+        # entries are in order of their rows, so that counting those kept gives the row pointer
         kept = mass > 0
         pointer = np.concatenate([[0], np.cumsum(np.bincount(self.rows[kept], minlength=count))])
         return sparse.csr_array((mass[kept], self.cells[kept], pointer), shape=(count, count))
@@ -45,6 +46,7 @@ class Prediction:
 
 def predict(world: World, undetected: sparse.csr_array, n: int) -> Prediction:
     """The prediction from `[M, M]` undetected mass after n misses, row x being that of plans made in x."""
+    # the sum over a row of `undetected` is the probability of the misses: mass is joint, not conditioned on them
     moved = sparse.csr_array(undetected @ world.kernel)
     moved.sort_indices()
     rows, before = row_index(moved), per_row(row_index(undetected), undetected.data, world.num_cells)
@@ -78,6 +80,7 @@ def renewal(world: World, policy: PolicyTable) -> Iterator[tuple[sparse.csr_arra
     for n in range(world.num_choices):
         seen = predict(world, undetected, n)
         on = policy.on(n, seen.rows, seen.cells)
+        # sensors are paid while the target is in the grid, whether or not it is where they look
         hit, undetected = seen.part(on), seen.part(1.0 - on)
         detected = per_row(seen.rows, seen.mass * on, m)
         reward = world.reward * detected - policy.spent(n, world.cost) * seen.inside

@@ -86,6 +86,8 @@ def replay(task: Task, tracks: Tracks, policy: PolicyTable) -> ReplayedTracks:
     figures, hits = _renewals(task, line.cells, last, policy)
     reached = np.zeros(points)
     reached[line.first[:-1]] = 1.0
+    # Point p of the recording is reached with probability reached[p]; located there, the plan is missed up to the next
+    # detection at a later point of the same track. So reached = first points + onward^T reached, which is triangular.
     start, end, weight = hits
     onward = sparse.csr_array((weight, (end, start)), shape=(points, points))
     reached = spsolve_triangular(sparse.eye_array(points, format="csr") - onward, reached, unit_diagonal=True)
@@ -106,10 +108,12 @@ def _renewals(
     figures, hits = np.zeros((6, len(cells))), []
     at, undetected = points[cells < m], np.ones(int((cells < m).sum()))
     for n in range(task.num_choices + 1):
+        # at: points whose plan is still running after n misses; `undetected`: with what probability
         going = (at + n + 1 <= last[at]) & (undetected > 0)
         at, undetected = at[going], undetected[going]
         cell = cells[at + n + 1]
         inside = cell < m
+        # the exit is a step as well, and costs nothing; a recording that stops has none (`Tracks.closed`)
         figures[5, at] += undetected
         at, undetected, cell = at[inside], undetected[inside], cell[inside]
         if n < task.num_choices:

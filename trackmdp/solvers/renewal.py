@@ -56,6 +56,7 @@ class RenewalSystem:
     def __init__(
         self, transition: sparse.csr_array, size: tuple[int, int] | None = None, *, direct: int = DIRECT_CELLS
     ) -> None:
+        # I - T is an M-matrix with a dominant diagonal: its inverse is non-negative, and no pivoting is needed.
         self._system = sparse.csr_array(sparse.eye_array(transition.shape[0], format="csr") - transition)
         self.exact = size is None or transition.shape[0] <= direct
         if self.exact or size is None:
@@ -100,6 +101,7 @@ class RenewalSystem:
         """BiCGSTAB, started anew while that makes the true residual (the recursive one drifts off) much smaller."""
         best, products = start, 0
         residual = self.residual(gathered, best)
+        # Rounding alone leaves a residual of about 1e-16 times the solution; nothing is gained below the target.
         while True:
             target = _TOLERANCE * (np.abs(gathered).max(axis=0) + np.abs(best).max(axis=0))
             if (np.abs(residual).max(axis=0) <= target).all() or products > _MOST_PRODUCTS:
@@ -118,6 +120,7 @@ class RenewalSystem:
         rho = alpha = omega = np.ones(residual.shape[1])
         while products < _MOST_PRODUCTS:
             active = np.abs(residual).max(axis=0) > target
+            # a column that has arrived, or broken down, stays as it is: its alpha and omega are zero from then on
             correlation = (shadow * residual).sum(axis=0)
             if not (active & (correlation != 0)).any():
                 break
@@ -136,6 +139,7 @@ class RenewalSystem:
 
     def _precondition(self, residual: Array) -> Array:
         """A damped Jacobi sweep, the correction on the blocks, and a sweep again."""
+        # 0.8 / diagonal takes out what differs from cell to cell; what is smooth over a block is left to the blocks
         guess = self._damping * residual
         left = residual - self._system @ guess
         guess = guess + self._blocks @ self._coarse.solve(self._blocks.T @ left)

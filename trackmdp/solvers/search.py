@@ -59,6 +59,8 @@ class InnerProblem:
 
     def undetected(self, sets: list[BoolArray]) -> list[Array]:
         """W_t per entry of each layer: what follows when the target is there, undetected, and `sets` go on."""
+        # W_t(i) = sum_j P_ij [r + V(j) if j is sensed, else W_{t+1}(j)] - c(A_t) P_in(i), from the last set backwards.
+        # A set belongs to a located cell, so its price c(A_t) is that of the entry's row.
         later = [self.missed[self.layers[-1].cells]]
         for before, layer, on in reversed(list(zip(self.layers, self.layers[1:], sets, strict=False))):
             paid = per_row(layer.rows, on * self.world.cost[layer.cells], self.world.num_cells)
@@ -102,6 +104,8 @@ class InnerProblem:
                 now = now * ~chosen[-1]
             if all((new == old).all() for new, old in zip(chosen, sets, strict=True)):
                 break
+            # All steps are replaced at once, each against the sets before it in this sweep and those after it in the
+            # last one: the order of the forward-and-backward method, and each sweep is worth no less than the last.
             sets = chosen
         return sets
 
@@ -127,11 +131,13 @@ def follow_credit(
 ) -> list[BoolArray]:
     """The homotopy from the clocked bound's credit to the exact one, from the clocked policy's `sets`."""
     table = clocked_table(world).table
+    # sensing j at n misses gains r + U(j, 0) where leaving it would go on with U(j, n + 1)
     credit = list((world.reward + table[:, :1] - table[:, 1:]).T)
     value, located = table[:, 0], np.ones(world.num_cells)
     for step in range(steps + 1):
         problem = InnerProblem.of(world, layers, value)
         sets = problem.ascend(sets, located, sweeps=sweeps, optimism=1.0 - step / steps, credit=credit)
+        # each step of the homotopy moves few sets, so that the value before is a good guess
         value = located_value(world, layers, sets, value)
     return improve(world, layers, sets, value)
 
@@ -163,6 +169,7 @@ def located_value(world: World, layers: list[Layer], sets: list[BoolArray], gues
         earned += world.reward * per_row(layer.rows[on], now[on], m) - paid * inside
         hits.append((now[on], layer.rows[on], layer.cells[on]))
         mass = now * ~on
+    # what is left after the last set moves once more and is located by the safe action
     left = mass > 0
     missed = sparse.csr_array((mass[left], (layers[-1].rows[left], layers[-1].cells[left])), shape=(m, m))
     forced = missed @ world.kernel
