@@ -205,7 +205,7 @@ class Tree:
 
     def _loss(self, mass: sparse.csr_array, sets_left: int) -> Array:
         """`[P]` how much less one more set chosen jointly is worth than the position revealed at once."""
-        # Revealed at once, the mass is worth sum_j z_j R(e_j); one set for all of it, revealed after that, is worth less:
+        # Revealed at once, the mass is worth sum_j z_j R(e_j); one set for all, revealed only then, is worth less:
         # with z = (.2 at a, .2 at b) and the target going on to c from either, one sensor at c serves both; if it goes
         # on to different cells, two sensors are paid for .4 of mass in place of one each for .2.
         return np.maximum(mass @ self._revealed[sets_left] - self._one_more_set(mass, sets_left)[0], 0.0)
