@@ -16,12 +16,15 @@ from tests.episodes.logs import CONFIG, WORLD, policy, recorded, rewritten, writ
 from tests.episodes.test_simulate import WINDOWED
 from trackmdp.episodes import schema
 from trackmdp.episodes.episode import first_difference
+from trackmdp.episodes.page import page
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.episodes.recover import recover
 from trackmdp.episodes.verify import verify
 from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
+from trackmdp.world.kernels import random_walk
+from trackmdp.world.model import World
 
 
 @pytest.fixture(scope="module")
@@ -155,3 +158,14 @@ def test_grid_messages_keep_to_the_rules_of_viewers(log: Path) -> None:
     lowest = np.frombuffer(data[:4], "<f4")[0]  # belief of the first cell of the last of our rows
     assert lowest == recorded(1)[0].belief[0, 12]
     assert "null" not in json.dumps(list(schema.SCHEMAS.values()))
+
+
+def test_a_log_of_a_rectangle_comes_back(tmp_path: Path) -> None:
+    kernel = random_walk((3, 5), stay=0.3, diagonal=True, exit_probability=0.1, border="clip")
+    world = World(kernel, (3, 5), cost=0.2, t_max=1)
+    episodes = recorded(6, world=world)
+    with EpisodeReader(write(tmp_path / "a.mcap", episodes, world=world)) as reader:
+        assert (reader.world().size, reader.run["size"], reader.run["columns"]) == ((3, 5), "3", "5")
+        assert all(first_difference(a, b) is None for a, b in zip(episodes, reader.episodes(), strict=True))
+        assert verify(reader).difference is None
+        assert '"columns":5' in page(reader, reader.read(0))

@@ -63,11 +63,13 @@ class RelativeBias(nn.Module):
 
     def __init__(self, task: Task) -> None:
         super().__init__()
-        side, m = 2 * task.columns - 1, task.num_cells
-        self.table = nn.Parameter(torch.zeros(task.t_max + 2, side**2))
-        cell = torch.arange(m)
+        # Displacements (row, column) from (1 - rows, 1 - columns) to (rows - 1, columns - 1), row by row; (0, 0) is the
+        # one in the middle.
+        side, places = 2 * task.columns - 1, (2 * task.rows - 1) * (2 * task.columns - 1)
+        self.table = nn.Parameter(torch.zeros(task.t_max + 2, places))
+        cell = torch.arange(task.num_cells)
         code = cell // task.columns * side + cell % task.columns
-        self.register_buffer("_index", code - code.unsqueeze(-1) + side**2 // 2, persistent=False)
+        self.register_buffer("_index", code - code.unsqueeze(-1) + places // 2, persistent=False)
 
     def forward(self, last_cell: Tensor, steps_since_detection: Tensor) -> Tensor:
         """`[..., M]` of a batch of any shape `[...]`."""
