@@ -59,35 +59,33 @@ def _dispatch(words: list[str]) -> int:
         if command not in COMMANDS:
             raise UserError(f"unknown command {command!r}: expected one of {', '.join(COMMANDS)}")
         return _run(command, words[1:])
-    except KeyboardInterrupt:
-        sys.stderr.write(f"trackmdp {command}: interrupted\n")
-        return INTERRUPTED
-    except Preempted as error:
-        sys.stderr.write(f"trackmdp {command}: {error}\n")
-        return 128 + error.signal
-    except (UserError, RunError) as error:
-        if os.environ.get("HYDRA_FULL_ERROR") == "1":
-            traceback.print_exc()
-        name = f"trackmdp {command}" if command in COMMANDS else "trackmdp"
-        sys.stderr.write(f"{name}: {_printable(str(error))}\n")
-        return USER_MISTAKE if isinstance(error, UserError) else FAILED
     except BrokenPipeError:
         raise
-    except OSError as error:
-        if error.filename is None or error.errno not in _OF_FILES:
-            traceback.print_exc()
-        else:
-            sys.stderr.write(f"trackmdp {command}: {_printable(f'{error.filename}: {error.strerror}')}\n")
-        return FAILED
-    except (MemoryError, RuntimeError) as error:
-        if not isinstance(error, MemoryError) and "can't allocate memory" not in str(error):  # torch's own words
-            traceback.print_exc()
-        else:
-            sys.stderr.write(f"trackmdp {command}: not enough memory for what is asked for\n")
-        return FAILED
-    except Exception:  # a bug: whoever reads it needs all of it
-        traceback.print_exc()
-        return FAILED
+    except (Exception, KeyboardInterrupt, Preempted) as error:
+        return _report(command, error)
+
+
+def _report(command: str, error: BaseException) -> int:
+    """Say why a command ended, in one line unless it is a bug; returns the exit status."""
+    line, status = str(error), FAILED
+    if isinstance(error, KeyboardInterrupt):
+        line, status = "interrupted", INTERRUPTED
+    elif isinstance(error, Preempted):
+        status = 128 + error.signal
+    elif isinstance(error, (UserError, RunError)):
+        status = USER_MISTAKE if isinstance(error, UserError) else FAILED
+        if os.environ.get("HYDRA_FULL_ERROR") == "1":
+            traceback.print_exception(error)
+    elif isinstance(error, OSError) and error.filename is not None and error.errno in _OF_FILES:
+        line = f"{error.filename}: {error.strerror}"
+    elif isinstance(error, MemoryError) or "can't allocate memory" in line:  # torch's words, in a RuntimeError
+        line = "not enough memory for what is asked for"
+    else:  # a bug: whoever reads it needs all of it
+        traceback.print_exception(error)
+        return status
+    name = f"trackmdp {command}" if command in COMMANDS else "trackmdp"
+    sys.stderr.write(f"{name}: {_printable(line)}\n")
+    return status
 
 
 def _run(command: str, words: list[str]) -> int:

@@ -31,16 +31,10 @@ def diagnose(error: Exception, command: str, words: Sequence[str], compose: Comp
     """
     if isinstance(error, UserError):  # a file of the user's was refused
         return error
-    parser = OverridesParser.create()
-    parsed = []
-    for word in words:
-        try:
-            parsed.append(parser.parse_override(word))
-        except (HydraException, ValueError):  # ValueError: an integer of thousands of digits
-            return UserError(f"{word}: expected option=value (a value with blanks or commas needs quotes)")
-    for override in parsed:
-        if refusal := _renamed(override):
-            return refusal
+    try:
+        parsed = [_parse(word) for word in words]
+    except UserError as misspelt:
+        return misspelt
     sweeps = [override.input_line for override in parsed if override.is_sweep_override()]
     if sweeps and ("multirun" in str(error).lower()):
         return UserError(f"{sweeps[0]}: expected one value; add -m to run once for each")
@@ -62,15 +56,20 @@ def diagnose(error: Exception, command: str, words: Sequence[str], compose: Comp
     return UserError(_plain(error))
 
 
-def _renamed(override: Override) -> UserError | None:
-    """The refusal of an option or a choice by its former name."""
+def _parse(word: str) -> Override:
+    """A word as Hydra reads it.
+
+    Raises:
+        UserError: it cannot be read, or it has the former name of an option or of a choice.
+    """
     try:
-        refuse_renamed(override.key_or_group)
-        for value in _values(override):
-            refuse_renamed(override.key_or_group, str(value))
-    except UserError as refusal:
-        return refusal
-    return None
+        override = OverridesParser.create().parse_override(word)
+    except (HydraException, ValueError) as error:  # ValueError: an integer of thousands of digits
+        raise UserError(f"{word}: expected option=value (a value with blanks or commas needs quotes)") from error
+    refuse_renamed(override.key_or_group)
+    for value in _values(override):
+        refuse_renamed(override.key_or_group, str(value))
+    return override
 
 
 def _group(override: Override, command: str) -> str:
