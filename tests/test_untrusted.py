@@ -76,6 +76,11 @@ def test_a_changed_number_breaks_the_seal() -> None:
             untrusted.unsealed(changed, "x")
 
 
+def test_the_clock_is_no_part_of_the_seal() -> None:
+    one, other = ({"aihtr": 1.5, "wall_seconds": time, "optimal": {"seconds": time}} for time in (3.0, 4.0))
+    assert untrusted.sealed(one)["sha256"] == untrusted.sealed(other)["sha256"]
+
+
 def test_whatever_a_decoder_raises_is_one_line() -> None:
     for error in (
         RecursionError("deep"),

@@ -117,6 +117,7 @@ def second_name(file: Path, name: Path) -> None:
             shutil.copyfileobj(source, stream)
         return
     part.replace(name)
+    part.unlink(missing_ok=True)  # rename does nothing where both are names of one file already
 
 
 def sync(stream: BinaryIO, file: Path) -> None:

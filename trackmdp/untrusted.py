@@ -187,6 +187,7 @@ def _refused(word: str) -> Any:
     raise ValueError(f"{word} is not JSON")
 
 
+_TIMED = re.compile("second|time|per_s$")
 _UNPRINTABLE = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
@@ -201,7 +202,8 @@ def printable(text: str) -> str:
 def sealed(content: Mapping[str, Any]) -> dict[str, Any]:
     """`content` with a digest of itself, so that a changed number in it is noticed.
 
-    It is no signature: who means to deceive can compute it anew.
+    What the clock decides is left out of the digest, so that a run repeated has the same one. It is no signature: who
+    means to deceive can compute it anew.
     """
     return {**content, "sha256": _digest(content)}
 
@@ -219,4 +221,10 @@ def unsealed(content: Mapping[str, Any], source: str) -> dict[str, Any]:
 
 
 def _digest(content: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(_timeless(content), sort_keys=True).encode()).hexdigest()
+
+
+def _timeless(content: Any) -> Any:
+    if isinstance(content, Mapping):
+        return {str(key): _timeless(value) for key, value in content.items() if not _TIMED.search(str(key))}
+    return [_timeless(item) for item in content] if isinstance(content, (list, tuple)) else content

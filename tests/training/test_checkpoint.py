@@ -269,3 +269,20 @@ def test_a_run_killed_between_two_names_gets_them_when_it_resumes(tmp_path: Path
     file = checkpoint.save(tmp_path, 2, state(2), keep=2)
     checkpoint.point(file, best=True)
     assert [checkpoint.load(tmp_path / name)["counter"] for name in (checkpoint.BEST, checkpoint.LAST)] == [2, 2]
+
+
+def test_a_name_given_twice_leaves_nothing_behind(tmp_path: Path) -> None:
+    file = checkpoint.save(tmp_path, 1, state(1), keep=2, best=True)
+    checkpoint.point(file, best=True)
+    assert names(tmp_path) == ["best.pt", "iteration-00000001.pt", "last.pt"]
+
+
+def test_a_tensor_that_reaches_beyond_what_is_stored_is_refused(tmp_path: Path) -> None:
+    file, packed = checkpoint.save(tmp_path, 1, state(), keep=1), io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(file.read_bytes()[:-128])) as old, zipfile.ZipFile(packed, "w") as new:
+        for member in old.infolist():
+            content = old.read(member)
+            new.writestr(member.filename, content[:4] if member.filename.endswith("/data/0") else content)
+    file.write_bytes(sealed(packed.getvalue()))
+    with pytest.raises(UserError, match="not a checkpoint that can be read"):
+        checkpoint.load(file)

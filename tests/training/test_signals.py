@@ -9,15 +9,29 @@ import pytest
 from trackmdp.training.signals import Signals, kept_sigterm
 
 
-def test_the_first_signal_is_noted_and_the_second_acts_as_before() -> None:
-    before = signal.getsignal(signal.SIGUSR1)
-    with Signals() as signals:
-        assert signals.received == 0
-        signal.raise_signal(signal.SIGUSR1)
-        assert (signals.received, signal.getsignal(signal.SIGUSR1)) == (signal.SIGUSR1, before)
-        signal.raise_signal(signal.SIGTERM)
-        assert signals.received == signal.SIGTERM
-    assert signal.getsignal(signal.SIGTERM) != signals._note
+def test_the_first_signal_is_noted_and_a_later_one_acts_as_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    heard: list[int] = []
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+    for number in before:
+        signal.signal(number, lambda number, frame: heard.append(number))
+    try:
+        with Signals() as signals:
+            assert signals.received == 0
+            signal.raise_signal(signal.SIGTERM)
+            signal.raise_signal(signal.SIGTERM)  # `timeout` signals the process, and then its group once more
+            assert (signals.received, heard) == (signal.SIGTERM, [])
+            monkeypatch.setattr("trackmdp.training.signals._ONE", 0.0)
+            signal.raise_signal(signal.SIGTERM)
+            assert heard == [signal.SIGTERM]
+            monkeypatch.undo()
+            signal.raise_signal(signal.SIGINT)
+            assert (signals.received, heard) == (signal.SIGINT, [signal.SIGTERM])
+            signal.raise_signal(signal.SIGINT)
+            assert heard == [signal.SIGTERM, signal.SIGINT]
+        assert signals.heard()
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def test_outside_the_main_thread_signals_are_not_touched() -> None:

@@ -136,7 +136,7 @@ def build_config(plain: Mapping[Any, Any], schema: type[Any], prefix: str = "", 
     values = dict(plain)
     if group in GROUPS and issubclass(schema, ChoiceConfig):
         name = values.pop("name", None)
-        if name not in GROUPS[group]:
+        if not isinstance(name, str) or name not in GROUPS[group]:
             raise UserError(f"{prefix}name={name}: expected one of {', '.join(GROUPS[group])}")
         schema = GROUPS[group][name]
     known = options(schema)

@@ -28,6 +28,8 @@ def parse_yaml(text: str, source: str) -> DictConfig | ListConfig:
     """
     try:
         _check_size(text)
+        if not isinstance(yaml.safe_load(text), (dict, list, type(None))):  # OmegaConf asserts it
+            raise ValueError("expected a mapping")
         config: Any = OmegaConf.create(text)
         plain = OmegaConf.to_container(config, resolve=False)
     except (yaml.YAMLError, OmegaConfBaseException, ValueError, RecursionError, AttributeError, TypeError) as error:

@@ -90,15 +90,29 @@ def load(file: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
         UserError: the file is missing, damaged, foreign, or of another format.
     """
     with opened(file, most=_LARGEST) as stream, decoded(str(file), "a checkpoint that can be read"):
-        _check_archive(stream, _check(file, stream))
+        stored = _check_archive(stream, _check(file, stream))
         try:
             state = torch.load(str(file), map_location=device, mmap=True, weights_only=True)
         except pickle.UnpicklingError as error:  # torch advises to switch weights_only off
             raise ValueError("it holds more than tensors and plain values") from error
         if not isinstance(state, dict) or type(state.get("format")) is not int or state["format"] != CHECKPOINT_FORMAT:
             raise UserError(f"{file}: not the state of a run")
+        if sum(_storages(state).values()) != stored:
+            raise ValueError("tensors that reach beyond what is stored of them")
         _take_out(state)
     return state
+
+
+def _storages(value: Any) -> dict[int, int]:
+    """Address -> bytes of each storage; as pages of a file, torch takes the length that a tensor claims for its own."""
+    if isinstance(value, torch.Tensor):
+        storage = value.untyped_storage()
+        return {storage.data_ptr(): storage.nbytes()} if storage.nbytes() else {}
+    found: dict[int, int] = {}
+    if isinstance(value, (Mapping, list, tuple)):
+        for part in value.values() if isinstance(value, Mapping) else value:
+            found |= _storages(part)
+    return found
 
 
 def _take_out(value: Any) -> None:
@@ -160,14 +174,18 @@ def _check(file: Path, stream: BinaryIO) -> int:
     return size
 
 
-def _check_archive(stream: BinaryIO, size: int) -> None:
-    """See that the archive holds no more than its own bytes: `torch.load` would unfold a deflated one of any size."""
+def _check_archive(stream: BinaryIO, size: int) -> int:
+    """See that the archive holds no more than its own bytes: `torch.load` would unfold a deflated one of any size.
+
+    Returns the bytes of all tensors stored in it.
+    """
     with zipfile.ZipFile(stream) as archive:
         members = archive.infolist()
     if any(member.compress_type != zipfile.ZIP_STORED for member in members):
         raise ValueError("a compressed archive")
     if sum(member.file_size for member in members) > size:
         raise ValueError("an archive that claims more bytes than it has")
+    return sum(member.file_size for member in members if re.search(r"/data/[0-9]+$", member.filename))
 
 
 def _numbered(folder: Path) -> list[Path]:

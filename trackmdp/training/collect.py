@@ -124,7 +124,10 @@ def _workers(problem: Problem, cfg: WorkersConfig, env: dict[str, Any], done: in
 
 def _worker_env(world: Problem, worker: str, env: dict[str, Any]) -> TrackEnv:
     """Built in a worker process: its own stream for the targets, and for the actions sampled there."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the workers as well; the learner tells them to end
+    # Ctrl-C, and a scheduler's SIGTERM, go to the workers as well. They must not die of them: the learner would wait
+    # for an answer of theirs while it should save. It tells them to end, and kills those that do not.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
     torch.manual_seed(derive(env["seed"], "torch", worker))
     return TrackEnv(world, stream=f"world-{worker}", **env)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 import time
@@ -13,16 +14,20 @@ from typing import Self
 __all__ = ["Signals", "kept_sigterm"]
 
 _HEARD = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
+_ONE = 2.0
+"""Seconds in which two count as one: `timeout` and some schedulers signal the process, and then its group once more."""
 
 
 class Signals:
     """While entered, SIGTERM, SIGINT and SIGUSR1 are noted in `received` instead of ending the process.
 
-    A second one of the same kind acts as it did before. Outside the main thread signals are not touched.
+    A second one of the same kind acts as it did before, Ctrl-C at once, another after two seconds. Outside the main
+    thread signals are not touched.
     """
 
     def __init__(self) -> None:
         self.received = 0
+        self._first: dict[signal.Signals, float] = {}
 
     def __enter__(self) -> Self:
         self._before = {}
@@ -48,8 +53,13 @@ class Signals:
         return False
 
     def _note(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
-        self.received = number
-        signal.signal(number, self._before[signal.Signals(number)])
+        kind, now = signal.Signals(number), time.monotonic()
+        if kind not in self._first:
+            self._first[kind], self.received = now, number
+        if kind is signal.SIGINT or now - self._first[kind] >= _ONE:
+            signal.signal(number, self._before[kind])
+        if now - self._first[kind] >= _ONE:
+            os.kill(os.getpid(), number)
 
 
 @contextmanager
