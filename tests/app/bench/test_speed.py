@@ -28,6 +28,11 @@ def test_the_environment_at_every_size(tmp_path: Path) -> None:
     assert rows[2]["per_second"] > rows[0]["per_second"]
 
 
+def test_the_environment_with_a_window(tmp_path: Path) -> None:
+    (row,) = measured(tmp_path / "run", "part=env", "batch_sizes=[64]", "grid.window=1")
+    assert row["envs"] == 64
+
+
 @pytest.mark.slow
 def test_the_collector_with_every_policy(tmp_path: Path) -> None:
     rows = measured(tmp_path / "run", "part=collector")

@@ -30,7 +30,7 @@ def env_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[
     rows = []
     for envs in cfg.batch_sizes:
         env = TrackEnv(world, envs, seed=cfg.seed, device=device)
-        policy = RandomSubset(world.num_cells, generator(cfg.seed, "benchmark", device=device))
+        policy = RandomSubset(world.num_sensors, generator(cfg.seed, "benchmark", device=device))
         state = env.reset()
 
         def step(env: TrackEnv = env, policy: TensorDictModuleBase = policy) -> int:
@@ -46,8 +46,8 @@ def env_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[
 def collector_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[Row]:
     """Frames of the collector that training uses, 32 steps a batch, for policies from free to a network."""
     policies: dict[str, TensorDictModuleBase] = {
-        "random": RandomSubset(world.num_cells, generator(cfg.seed, "benchmark", device=device)),
-        "all_on": AllOn(world.num_cells),
+        "random": RandomSubset(world.num_sensors, generator(cfg.seed, "benchmark", device=device)),
+        "all_on": AllOn(world.num_sensors),
         "actor": make_actor(world.task, 128, 0.0).to(device),
     }
     rows = []
