@@ -28,6 +28,7 @@ from trackmdp.policies.explore import Exploring
 from trackmdp.policies.policy import Policy
 from trackmdp.seeding import generator
 from trackmdp.world.model import Task
+from trackmdp.world.windows import Window
 
 __all__ = ["Hindsight", "budget"]
 
@@ -59,6 +60,8 @@ class Hindsight:
         self.iterations = iterations + max(0, -(-(self.updates - alongside) // cfg.updates_per_iteration))
         self._generator = generator(seed, "hindsight", device=device)
         self._buffer = _buffer(task, cfg.buffer_size, self._generator)
+        window = Window.of(task, device)
+        self._outside = window.cells == task.num_cells if window.is_local else None
         self._learner: _Learner | None = None
         self._seen: int | None = None
         if cfg.share_cells and (task.cost != task.cost[0]).any():
@@ -70,6 +73,10 @@ class Hindsight:
         """Store one batch `[B, time]`, then `updates_per_iteration` updates if enough batches are in."""
         self._iteration += 1
         if batch is not None:
+            if self._outside is not None:
+                # Sensors of the window outside the grid are off, whoever acts; nothing is missed there, so that a step
+                # with all others on is fully sensed.
+                batch["action"] = batch["action"] | self._outside[batch["last_cell"]]
             self._buffer.extend(batch)
             self._seen = None
         averages, cfg = Averages(), self.cfg

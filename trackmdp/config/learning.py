@@ -85,6 +85,10 @@ class ActorCriticConfig(AlgoConfig):
     initial_logit: float = option("actor's output bias at the start", unit="logits", ge=-20, le=20)
     reward_scale: float = option("factor on rewards while learning", gt=0)
 
+    def check(self, key: str, root: Any) -> None:
+        """The networks have an output for every sensor."""
+        refuse_window(self.name, root)
+
     def memory(self, task: Sizes, root: Any) -> dict[str, int]:
         """The two networks and their optimiser."""
         return {"algo.hidden": networks(task, self.hidden)}
@@ -107,6 +111,7 @@ class PpoConfig(ActorCriticConfig):
 
     def check(self, key: str, root: Any) -> None:
         """The parts of a batch are of one size."""
+        super().check(key, root)
         frames = root.collector.frames_per_batch
         if frames % self.minibatches:
             expected = f"a divisor of collector.frames_per_batch={frames}"
@@ -146,6 +151,7 @@ class DqnConfig(AlgoConfig):
 
     def check(self, key: str, root: Any) -> None:
         """The replay buffer holds what is collected and what is drawn at once."""
+        refuse_window(self.name, root)
         frames = root.collector.frames_per_batch
         if self.buffer_size < max(frames, self.batch_size):
             expected = f"at least collector.frames_per_batch={frames} and {key}.batch_size={self.batch_size}"
@@ -286,3 +292,13 @@ def networks(task: Sizes, hidden: int | None) -> int:
     inputs = task.num_cells * (2 * task.num_choices + 3) + task.num_choices + 1
     weights = (hidden or 256) * (inputs + task.num_cells)
     return 2 * weights * 4 * BYTES["float32"]  # weight, gradient, two moments
+
+
+def refuse_window(algo: str, root: Any) -> None:
+    """Refuse `grid.window` for an algorithm whose networks have an output for every sensor of the grid.
+
+    Raises:
+        UserError: there is a window.
+    """
+    if root.grid.window is not None:
+        raise refuse("grid.window", root.grid.window, f"null with algo={algo} credit=joint; others act in a window")

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from trackmdp.policies.table import PolicyTable
 from trackmdp.world.model import Task
+from trackmdp.world.windows import Window
 
 __all__ = ["Exploring", "RenewedTable"]
 
@@ -38,6 +39,7 @@ class RenewedTable(TensorDictModuleBase):
     def __init__(self, task: Task, device: torch.device | str = "cpu", *, on: bool = False) -> None:
         super().__init__()
         self.num_cells, self.num_choices = task.num_cells, task.num_choices
+        self.window = Window.of(task, device)
         shape = (task.num_cells * task.num_choices, -(-task.num_cells // 8))
         self.register_buffer("bits", torch.full(shape, 255 * on, dtype=torch.uint8, device=device))
         # numpy.packbits puts the first of eight entries into the highest bit.
@@ -51,11 +53,11 @@ class RenewedTable(TensorDictModuleBase):
             self.bits[begin : begin + len(rows)].copy_(torch.as_tensor(np.packbits(rows, axis=1)))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write `action` `[*B, M]`."""
+        """Write `action` `[*B, K]`, local to `last_cell` where the task has a window."""
         cell, n = tensordict["last_cell"], tensordict["steps_since_detection"]
         packed = self.bits[cell * self.num_choices + n.clamp_max(self.num_choices - 1)]
-        chosen = (packed.unsqueeze(-1) >> self._place) & 1
-        return tensordict.set("action", chosen.flatten(-2)[..., : self.num_cells].bool())
+        chosen = ((packed.unsqueeze(-1) >> self._place) & 1).flatten(-2)[..., : self.num_cells].bool()
+        return tensordict.set("action", self.window.to_local(cell, chosen))
 
 
 class Exploring(RenewedTable):

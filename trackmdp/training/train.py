@@ -87,6 +87,7 @@ def _described(problem: Problem, folder: Path | None) -> dict[str, Any]:
         "grid.size": problem.rows if problem.rows == problem.columns else list(problem.size),
         "grid.t_max": problem.t_max,
         "grid.max_steps": problem.max_steps,
+        "grid.window": problem.window,
         "cost.reward": problem.reward,
         "cost.sensor": float(price[0]) if uniform else price.tolist(),
         "cost.safe": None if np.isclose(problem.safe_cost, price.sum(), rtol=1e-15) else problem.safe_cost,
