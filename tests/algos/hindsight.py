@@ -43,7 +43,7 @@ def learn(world: World, data: list[Any], *overrides: str, name: str = "hindsight
 
 
 def policy(learner: Any, world: World) -> Any:
-    return as_policy(world, learner.actor).dense()
+    return as_policy(world, learner.actor)
 
 
 def assert_it_learns(name: str, words: tuple[str, ...], t_max: int) -> None:

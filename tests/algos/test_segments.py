@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 from tests.helpers import algorithm, collect, small_world
 from tests.tracks import by_hand, drawn, recorded
 from trackmdp.algos.segments import SegmentBuffer
-from trackmdp.policies.fixed import AllOn
-from trackmdp.policies.policy import as_policy
+from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.solvers.recorded import replay
 
 M = 9
@@ -31,7 +30,9 @@ def segments(made: SegmentBuffer) -> list[tuple[int, ...]]:
 
 
 def frames(*tracks: list[int], exits: bool = True, envs: int = 1, time: int = 12, max_steps: int | None = None) -> Any:
-    return collect(recorded(by_hand(*tracks, exits=exits)), AllOn(M), envs, time, max_steps=max_steps)
+    return collect(
+        setting := recorded(by_hand(*tracks, exits=exits)), Policy.all_on(setting), envs, time, max_steps=max_steps
+    )
 
 
 def test_segments_are_those_of_the_track_by_hand() -> None:
@@ -53,7 +54,7 @@ def test_a_recording_that_stops_ends_its_segments() -> None:
 
 @pytest.mark.parametrize("cut", [1, 2, 5, 20])
 def test_batches_in_pieces_give_what_they_give_in_one(cut: int) -> None:
-    batch = collect(SETTING, AllOn(M), 16, 40)
+    batch = collect(SETTING, Policy.all_on(SETTING), 16, 40)
     whole, pieces = buffer(), buffer()
     whole.extend(batch)
     for part in batch.split(cut, dim=1):
@@ -64,7 +65,7 @@ def test_batches_in_pieces_give_what_they_give_in_one(cut: int) -> None:
 
 def test_rows_of_workers_are_rows() -> None:
     """Collectors with worker processes stack their batches."""
-    batch = collect(SETTING, AllOn(M), 16, 40)
+    batch = collect(SETTING, Policy.all_on(SETTING), 16, 40)
     one, stacked = buffer(), buffer()
     one.extend(batch)
     for part in batch.split(8, dim=1):
@@ -73,7 +74,10 @@ def test_rows_of_workers_are_rows() -> None:
 
 
 def test_rows_that_are_others_are_not_joined() -> None:
-    first, second = collect(SETTING, AllOn(M), 16, 8, seed=0), collect(SETTING, AllOn(M), 16, 8, seed=1)
+    first, second = (
+        collect(SETTING, Policy.all_on(SETTING), 16, 8, seed=0),
+        collect(SETTING, Policy.all_on(SETTING), 16, 8, seed=1),
+    )
     made, apart = buffer(), [buffer(), buffer()]
     for batch, alone in zip((first, second), apart, strict=True):
         made.extend(batch)
@@ -92,7 +96,7 @@ def test_a_step_that_was_not_fully_sensed_breaks_a_segment() -> None:
 def test_nothing_is_read_that_was_not_sensed() -> None:
     """Where the target and the recording are, rewards, histories, and cells after steps that did not sense all."""
     rng = torch.Generator().manual_seed(0)
-    batch = collect(SETTING, AllOn(M), 16, 40)
+    batch = collect(SETTING, Policy.all_on(SETTING), 16, 40)
     batch["action"] &= torch.rand(*batch.shape, 1, generator=rng) < 0.8
     poisoned = batch.clone()
     for place in (poisoned, poisoned["next"]):
@@ -111,7 +115,7 @@ def test_nothing_is_read_that_was_not_sensed() -> None:
 
 def test_paths_start_everywhere_and_are_whole_segments() -> None:
     made = buffer()
-    made.extend(collect(SETTING, AllOn(M), 16, 60))
+    made.extend(collect(SETTING, Policy.all_on(SETTING), 16, 60))
     seen = set(segments(made))
     cells = made.paths(40 * M, 3)
     assert torch.bincount(cells[0], minlength=M).tolist() == [40] * M
@@ -153,7 +157,7 @@ def test_moves_are_all_of_the_segments() -> None:
 def test_segments_are_pieces_of_tracks(seed: int, steps: int, time: int) -> None:
     tracks = drawn(small_world(exit_probability=0.2).kernel, 20, seed)
     made = buffer(steps)
-    for part in collect(recorded(tracks), AllOn(M), 5, 24, seed=seed).split(time, dim=1):
+    for part in collect(setting := recorded(tracks), Policy.all_on(setting), 5, 24, seed=seed).split(time, dim=1):
         made.extend(part)
     lines = [[*tracks.cells[a:b], *[M] * steps] for a, b in zip(tracks.first[:-1], tracks.first[1:], strict=True)]
     pieces = {tuple(map(int, line[i : i + steps + 1])) for line in lines for i in range(len(line) - steps)}
@@ -161,7 +165,7 @@ def test_segments_are_pieces_of_tracks(seed: int, steps: int, time: int) -> None
 
 
 def test_a_saved_buffer_goes_on_the_same() -> None:
-    batch = collect(SETTING, AllOn(M), 16, 40)
+    batch = collect(SETTING, Policy.all_on(SETTING), 16, 40)
     one, other = buffer(seed=3), buffer(seed=3)
     one.extend(batch[:, :17])
     other.load_state_dict(one.state_dict())
@@ -191,9 +195,9 @@ def test_what_depends_on_more_than_the_cell_is_learned_from_whole_paths_only() -
             learner.step(part)
         while learner.step(None)["updates"] < 300:
             pass
-        chains = as_policy(setting, learner.actor).dense()
-        earned[markov] = replay(setting, tracks, chains).intervals()["reward_per_step"].mean
+        policy = as_policy(setting, learner.actor)
+        earned[markov] = replay(setting, tracks, policy).intervals()["reward_per_step"].mean
         if not markov:
-            assert chains[[3, 5]].nonzero()[1].tolist() == [1, 1]
+            assert policy.dense()[[3, 5]].nonzero()[1].tolist() == [1, 1]
     assert earned[False] > 0.19
     assert earned[True] < 0.11

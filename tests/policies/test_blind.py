@@ -9,16 +9,25 @@ import pytest
 import torch
 
 from tests.helpers import ALGORITHMS, algorithm, random_state, small_world
-from trackmdp.policies.fixed import AllOn, ChainPolicy, RandomK, RandomSubset
+from trackmdp.policies.fixed import ChainPolicy, RandomSubset
+from trackmdp.policies.policy import Policy
 
 WORLD = small_world(t_max=1)
 
 
 LEARNED = [f"{name} {role}" for name in ALGORITHMS for role in ("policy", "actor")]
+
+
+def random_k() -> Policy:
+    drawing = Policy.random_k(WORLD, 3)
+    drawing.generator = torch.Generator()
+    return drawing
+
+
 FIXED = {
-    "all on": AllOn(9),
+    "all on": Policy.all_on(WORLD),
     "random subset": RandomSubset(9, torch.Generator()),
-    "random k": RandomK(9, 3, torch.Generator()),
+    "random k": random_k(),
     "chains": ChainPolicy(np.random.default_rng(0).random((9, 2, 9)) > 0.5),
 }
 

@@ -1,4 +1,4 @@
-"""Policies that learn nothing."""
+"""Modules that act while frames are collected."""
 
 from __future__ import annotations
 
@@ -7,17 +7,10 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.helpers import random_state, small_world
 from trackmdp.policies.explore import Exploring
-from trackmdp.policies.fixed import AllOn, ChainPolicy, RandomK, RandomSubset
+from trackmdp.policies.fixed import ChainPolicy, RandomSubset
 from trackmdp.policies.policy import Policy
 from trackmdp.world.model import Task
-
-
-@pytest.mark.parametrize("on", [True, False])
-def test_all_on_and_none(on: bool) -> None:
-    acted = AllOn(9, on)(random_state(small_world(), 5, seed=0))
-    assert acted["action"].tolist() == [[on] * 9] * 5
 
 
 def test_a_chain_is_looked_up_by_cell_and_misses() -> None:
@@ -45,18 +38,6 @@ def test_everything_is_sensed_now_and_then_and_only_where_the_target_is_located(
     everything = action[::2].all(-1)
     assert (action[::2][~everything] == torch.tensor([False, False, True, False])).all()
     assert everything.float().mean().item() == pytest.approx(explore, abs=5 * (explore * (1 - explore) / 4000) ** 0.5)
-
-
-@pytest.mark.parametrize("k", [0, 1, 3, 9])
-def test_random_k_draws_exactly_k_from_its_own_generator(k: int) -> None:
-    rows = TensorDict({"last_cell": torch.zeros(20_000, dtype=torch.int64)}, [20_000])
-    before = torch.get_rng_state()
-    action = RandomK(9, k, torch.Generator().manual_seed(0))(rows)["action"].clone()
-    assert torch.equal(RandomK(9, k, torch.Generator().manual_seed(0))(rows)["action"], action)
-    assert torch.equal(torch.get_rng_state(), before)
-    assert (action.sum(-1) == k).all()
-    share = k / 9
-    assert (action.double().mean(0) - share).abs().max() <= 5 * (share * (1 - share) / 20_000) ** 0.5
 
 
 def test_random_subsets_are_fair_coins_of_their_own_generator() -> None:

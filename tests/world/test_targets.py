@@ -6,11 +6,12 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from tests.helpers import limited, small_world
 from tests.tracks import by_hand, drawn, recorded
-from trackmdp.policies.fixed import AllOn, RandomSubset
+from trackmdp.policies.fixed import RandomSubset
 from trackmdp.seeding import generator
 from trackmdp.world.env import TrackEnv
 
@@ -26,11 +27,15 @@ def rollout(env: TrackEnv, steps: int, policy: Any = None) -> list[Any]:
     return frames
 
 
+def all_on(rows: TensorDict) -> TensorDict:
+    return rows.set("action", torch.ones_like(rows["action_history"][..., 0, :]))
+
+
 def followed(env: TrackEnv, steps: int) -> list[list[tuple[int, ...]]]:
     """Per row, the cells of each episode, M for the exit, `()` closing one that was truncated."""
     paths: list[list[tuple[int, ...]]] = [[] for _ in range(env.num_envs)]
     now: list[tuple[int, ...]] = [()] * env.num_envs
-    for frame in rollout(env, steps, AllOn(env.num_cells)):
+    for frame in rollout(env, steps, all_on):
         after = frame["next"]
         for row in range(env.num_envs):
             now[row] = (now[row] or (int(frame["target"][row]),)) + (int(after["target"][row]),)

@@ -47,7 +47,7 @@ class Body:
 
     def numbers(self, layout: str) -> tuple[int, ...]:
         """Little-endian numbers of a `struct` layout."""
-        values = struct.unpack_from(f"<{layout}", self.data, self.place)
+        values = struct.unpack_from(f"<{layout}", self.data, self.place)  # "<": MCAP is little-endian throughout
         self.place += struct.calcsize(f"<{layout}")
         return values
 
@@ -114,6 +114,8 @@ class Container:
 
     def _summary(self) -> None:
         """Read the index of chunks, attachments and metadata; its checksum covers the footer as well."""
+        # A finished file ends in: the summary's records, the footer record, the magic bytes. The footer's content is
+        # where the summary starts, where its offsets start (unused here), and a CRC-32 over summary and footer.
         self.length = self.stream.seek(0, 2)
         if self.length < 2 * len(MAGIC) + _FOOTER_LENGTH:
             raise UserError(_cut(self.file))
@@ -121,6 +123,7 @@ class Container:
         footer, magic = self.stream.read(_FOOTER_LENGTH), self.stream.read()
         if magic != MAGIC:
             raise UserError(_cut(self.file))
+        # A record is its opcode (1 byte), the length of its content (8 bytes), and the content.
         opcode, size, self.summary_start, _, checksum = struct.unpack("<BQQQI", footer)
         summary_length = self.length - _FOOTER_LENGTH - len(MAGIC) - self.summary_start
         if (opcode, size) != (FOOTER, 20) or not len(MAGIC) < self.summary_start or summary_length <= 0:
@@ -185,6 +188,7 @@ class Container:
 
     def chunks_between(self, begin: int, end: int) -> list[Chunk]:
         """The chunks with messages from log time `begin` to `end`, in their order; logs are in order of time."""
+        # Chunks follow each other in time, so that the first one that ends at `begin` or later is found by bisection.
         found = []
         for chunk in self.chunks[bisect_left(self._ends, begin) :]:
             if chunk.begin > end:
@@ -196,6 +200,7 @@ class Container:
         """All messages of a chunk, its checksum checked."""
         body = self._record(CHUNK, chunk.offset, chunk.length)
         said, content = unpacked(body)
+        # A chunk's checksum covers its content alone; its head is held against the summary, which has its own.
         if said != (chunk.begin, chunk.end, chunk.size, chunk.compression, chunk.compressed):
             raise Damaged(f"the chunk at byte {chunk.offset}")
         return list(messages_of(content, dict(self.channels)))
@@ -206,6 +211,7 @@ class Container:
         Raises:
             Damaged: it differs.
         """
+        # The record that closes the data section, 9 + 4 bytes before the summary, holds a CRC-32 of all before itself.
         end = self.summary_start - 13
         self.stream.seek(0)
         checksum, left = 0, end

@@ -102,6 +102,8 @@ def taken_over(file: Path, target: Path, policies: int) -> tuple[EpisodeWriter, 
 
 def _rewrite(file: Path, target: Path, damaged: list[str], most: float = math.inf) -> tuple[EpisodeWriter | None, int]:
     """Copy what is whole of the first `most` policies and their episodes."""
+    # From front to back, since a log that was cut off has no index: steps and grids are kept until the `/episode`
+    # message that closes their episode, which is the last one of it that was written.
     found, writer, episodes = _Found(), None, 0
     policies: set[int] = set()
     with container.opened_log(file) as stream:

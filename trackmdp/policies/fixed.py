@@ -1,4 +1,7 @@
-"""Policies that learn nothing: fixed subsets, random subsets, and tables of chains."""
+"""Modules that act while frames are collected or measured: random subsets, and a table that a learner rewrites.
+
+`Policy` stands for a policy that is finished; a learner writes into the tables here after every update.
+"""
 
 from __future__ import annotations
 
@@ -11,24 +14,7 @@ from torch import Tensor
 
 from trackmdp.world.model import BoolArray
 
-__all__ = ["AllOn", "ChainPolicy", "RandomK", "RandomSubset"]
-
-
-class AllOn(TensorDictModuleBase):
-    """Every sensor on (or, with `on=False`, none) at every step."""
-
-    in_keys: ClassVar = ["last_cell"]
-    out_keys: ClassVar = ["action"]
-
-    def __init__(self, num_cells: int, on: bool = True) -> None:
-        super().__init__()
-        self.num_cells, self.on = num_cells, on
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write `action` `[B, M]`."""
-        cell = tensordict["last_cell"]
-        action = torch.full((*cell.shape, self.num_cells), self.on, dtype=torch.bool, device=cell.device)
-        return tensordict.set("action", action)
+__all__ = ["ChainPolicy", "RandomSubset"]
 
 
 class RandomSubset(TensorDictModuleBase):
@@ -51,26 +37,8 @@ class RandomSubset(TensorDictModuleBase):
         return tensordict.set("action", bits.flatten(-2)[..., :m].bool())
 
 
-class RandomK(TensorDictModuleBase):
-    """k sensors drawn anew at every step, each subset of that size equally likely."""
-
-    in_keys: ClassVar = ["last_cell"]
-    out_keys: ClassVar = ["action"]
-
-    def __init__(self, num_cells: int, k: int, generator: torch.Generator) -> None:
-        super().__init__()
-        self.num_cells, self.k, self.generator = num_cells, k, generator
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write `action` `[B, M]`: the k largest of M uniform draws."""
-        shape = (*tensordict["last_cell"].shape, self.num_cells)
-        draws = torch.rand(shape, generator=self.generator, device=self.generator.device)
-        action = torch.zeros(shape, dtype=torch.bool, device=draws.device)
-        return tensordict.set("action", action.scatter_(-1, draws.topk(self.k, dim=-1).indices, value=True))
-
-
 class ChainPolicy(TensorDictModuleBase):
-    """A deterministic policy as a table: the sensors on at n misses after locating the target in x.
+    """A table on the learner's device, rewritten in place: the sensors on at n misses after locating the target in x.
 
     Args:
         chains: `[M, t_max+1, M]` bool.

@@ -61,6 +61,19 @@ def test_evaluate_logs_as_many_episodes_as_it_simulates(log: Path) -> None:
     assert all(panel["topics"]["/grid"]["visible"] for panel in maps)
 
 
+def test_simulated_figures_are_those_of_the_episodes_in_the_log(log: Path) -> None:
+    said = json.loads((log.parent / "evaluation.json").read_text())["simulated"]
+    with EpisodeReader(log) as reader:
+        episodes, m = list(reader.episodes()), reader.world().num_cells
+    lengths = np.array([len(episode) for episode in episodes])
+    assert said["episodes"] == len(episodes)
+    assert said["aihtr"]["mean"] == pytest.approx(np.mean([episode.returns[-1] for episode in episodes]), abs=1e-9)
+    assert said["expected_length"]["mean"] == pytest.approx(lengths.mean())
+    assert said["expected_length"]["standard_error"] == pytest.approx(lengths.std(ddof=1) / len(episodes) ** 0.5)
+    in_grid = sum(int((episode.target < m).sum()) for episode in episodes)
+    assert said["accuracy"]["mean"] == pytest.approx(sum(int(each.located.sum()) for each in episodes) / in_grid)
+
+
 def test_the_same_seed_gives_the_same_file(log: Path, tmp_path: Path) -> None:
     words = ["evaluate", "baseline=qmdp", *WORLD, "log=mcap", "log.layout=true", "episodes=30", "quiet=true"]
     assert main([*words, "seed=3", f"hydra.run.dir={tmp_path / 'a'}"]) == 0

@@ -14,7 +14,8 @@ from torchrl.collectors import Collector
 from trackmdp.app.bench.machine import rate
 from trackmdp.config import GROUPS, BenchmarkConfig, TrainConfig, from_hydra
 from trackmdp.policies.actor_critic import make_actor
-from trackmdp.policies.fixed import AllOn, RandomSubset
+from trackmdp.policies.fixed import RandomSubset
+from trackmdp.policies.policy import Policy
 from trackmdp.seeding import generator
 from trackmdp.training.make import make_algorithm, make_collector
 from trackmdp.world.env import TrackEnv
@@ -47,7 +48,7 @@ def collector_speed(cfg: BenchmarkConfig, world: World, device: torch.device) ->
     """Frames of the collector that training uses, 32 steps a batch, for policies from free to a network."""
     policies: dict[str, TensorDictModuleBase] = {
         "random": RandomSubset(world.num_sensors, generator(cfg.seed, "benchmark", device=device)),
-        "all_on": AllOn(world.num_sensors),
+        "all_on": Policy.all_on(world),
         "actor": make_actor(world.task, 128, 0.0).to(device),
     }
     rows = []
