@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from trackmdp import untrusted
+from trackmdp.arrays import load_npy
 from trackmdp.durable import create, own_folder, reopen, whole_file
 from trackmdp.errors import UserError
 
@@ -31,6 +35,24 @@ def test_only_an_ordinary_file_of_bounded_size_is_read(tmp_path: Path, make: Any
     with pytest.raises(UserError) as refused:
         untrusted.read_bytes(file, most=100)
     assert str(refused.value) == f"{file}: {said}"
+
+
+def test_a_small_file_takes_little_memory_whatever_the_bound(tmp_path: Path) -> None:
+    (tmp_path / "small").write_bytes(b"1")
+    tracemalloc.start()
+    try:
+        assert untrusted.read_bytes(tmp_path / "small", most=2**40) == b"1"
+        assert tracemalloc.get_traced_memory()[1] < 2**20
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("version", [(1, 0), (2, 0)])
+def test_an_array_of_either_version_is_read(version: tuple[int, int]) -> None:
+    stream = io.BytesIO()
+    np.lib.format.write_array(stream, np.arange(6.0).reshape(2, 3), version=version)
+    stream.seek(0)
+    assert np.array_equal(load_npy(stream, len(stream.getvalue())), np.arange(6.0).reshape(2, 3))
 
 
 def test_a_file_that_the_user_named_may_be_a_link(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import os
 import zipfile
@@ -44,12 +45,15 @@ def load_npy(stream: Any, size: int) -> npt.NDArray[Any]:
         ValueError: they are something else, hold Python objects, or are more or fewer than their header claims.
         Exception: whatever NumPy raises over a header; call it inside `untrusted.decoded`.
     """
-    if np.lib.format.read_magic(stream) != (
-        1,
-        0,
-    ):  # the others have headers of up to 4 GiB, and what we read needs none
-        raise ValueError("an .npy file of another version than 1.0")
-    shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream, max_header_size=_HEADER)
+    version = np.lib.format.read_magic(stream)
+    if version not in ((1, 0), (2, 0)):
+        raise ValueError("an .npy file of another version than 1.0 and 2.0")
+    # Version 2.0 has headers of up to 4 GiB, which NumPy would read whole before it looks at their length.
+    length = int.from_bytes(stream.read(2 if version == (1, 0) else 4), "little")
+    if length > _HEADER:
+        raise ValueError(f"a header of {length:,} bytes")
+    head = io.BytesIO(length.to_bytes(2, "little") + stream.read(length))
+    shape, fortran, dtype = np.lib.format.read_array_header_1_0(head, max_header_size=_HEADER)
     if dtype.hasobject or dtype.kind == "V":
         raise ValueError(f"an array of {dtype}")
     if any(length < 0 for length in shape):

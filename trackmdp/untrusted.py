@@ -120,10 +120,8 @@ def read_bytes(file: Path, *, most: int = SMALL, source: str = "", links: bool =
     """
     source = source or str(file)
     with opened(file, most=most, source=source, links=links) as stream, decoded(source, "a file that can be read"):
-        content = stream.read(most + 1)  # one more: it may have grown
-    if len(content) > most:
-        raise UserError(f"{source}: longer than {most:,} bytes")
-    return content
+        # As long as it was a moment ago: read(most) would allocate that much at once, and a file may be growing.
+        return stream.read(os.fstat(stream.fileno()).st_size)
 
 
 def read_text(file: Path, *, most: int = SMALL, source: str = "", links: bool = False) -> str:
