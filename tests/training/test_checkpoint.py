@@ -282,7 +282,7 @@ def test_a_tensor_that_reaches_beyond_what_is_stored_is_refused(tmp_path: Path) 
     with zipfile.ZipFile(io.BytesIO(file.read_bytes()[:-128])) as old, zipfile.ZipFile(packed, "w") as new:
         for member in old.infolist():
             content = old.read(member)
-            new.writestr(member.filename, content[:4] if member.filename.endswith("/data/0") else content)
+            new.writestr(member.filename, content[:-4] if member.filename.endswith("/data/0") else content)
     file.write_bytes(sealed(packed.getvalue()))
     with pytest.raises(UserError, match="not a checkpoint that can be read"):
         checkpoint.load(file)
