@@ -1,0 +1,93 @@
+"""The examples run as they stand, in under 60 lines each, and what they print is so."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+EXAMPLES = ROOT / "scripts" / "examples"
+SOURCES = sorted(EXAMPLES.rglob("*.py"))
+PLUGIN = EXAMPLES / "plugin"
+
+
+def numbers(line: str) -> list[float]:
+    return [float(each) for each in re.findall(r"-?\d+\.\d+", line)]
+
+
+def run(*words: str, path: tuple[Path, ...] = ()) -> list[str]:
+    """The lines that a new process prints."""
+    python_path = os.pathsep.join(str(each) for each in (*path, ROOT))
+    environment = {**os.environ, "PYTHONPATH": python_path, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run([sys.executable, *words], env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    return done.stdout.splitlines()
+
+
+def example(name: str) -> list[str]:
+    return run(str(EXAMPLES / f"{name}.py"))
+
+
+@pytest.mark.parametrize("source", SOURCES, ids=lambda source: source.stem)
+def test_an_example_is_short(source: Path) -> None:
+    assert len(source.read_text(encoding="utf-8").splitlines()) <= 60
+
+
+@pytest.mark.slow
+def test_own_kernel() -> None:
+    """Learned from 20,000 steps, the policy is the optimum, which earns more than Q_MDP."""
+    qmdp, learned, optimal, proved = (numbers(line) for line in example("own_kernel"))
+    assert qmdp[0] < learned[0] == optimal[0] == proved[0]
+
+
+@pytest.mark.slow
+def test_own_policy() -> None:
+    """The simulated value is the exact one, up to four standard errors."""
+    exact, simulated, optimal = (numbers(line) for line in example("own_policy"))
+    assert abs(exact[0] - simulated[0]) < 4 * simulated[1]
+    assert exact[0] < optimal[0]
+
+
+@pytest.mark.slow
+def test_torchrl_ppo() -> None:
+    """At 11.184 the optimum; all off gets -8.4."""
+    ((learned, optimum),) = (numbers(line) for line in example("torchrl_ppo"))
+    assert 0.85 * optimum < learned <= optimum + 1e-9
+
+
+@pytest.mark.slow
+def test_recorded_tracks() -> None:
+    learned, all_on, none, _ = (numbers(line.split("step")[1])[0] for line in example("recorded_tracks"))
+    assert learned > max(all_on, none)
+
+
+@pytest.mark.slow
+def test_sweep() -> None:
+    """Six worlds, each learned within .01 per step of a bound that no policy exceeds."""
+    _, *rows = example("sweep")
+    assert len(rows) == 6
+    for _, learned, upper, regret in map(numbers, rows):
+        assert learned <= upper + 1e-3
+        assert -1e-5 <= regret < 0.01
+
+
+@pytest.mark.slow
+def test_the_plugin_learns_by_its_name(tmp_path: Path) -> None:
+    """Installed, the algorithm is found by its name; what it learns is worth about as much as Q_MDP."""
+    info = tmp_path / "trackmdp_counts-0.1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: trackmdp-counts\nVersion: 0.1\n")
+    (info / "entry_points.txt").write_text("[trackmdp.plugins]\ncounts = trackmdp_counts\n")
+    code = (
+        "import trackmdp as tm; w = tm.make_world(size=5, cost=0.16); "
+        "run = tm.train(w, 'counts', seed=0, total_frames=50_000, prior=5); "
+        "print(run.evaluation.aihtr, tm.evaluate(w, tm.solve(w, 'qmdp').policy).aihtr, tm.solve(w).upper)"
+    )
+    (line,) = run("-c", code, path=(PLUGIN, tmp_path))
+    learned, qmdp, upper = numbers(line)
+    assert 0.9 * qmdp < learned <= upper
