@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import shlex
@@ -19,7 +20,7 @@ TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
 BLOCKS = [line[4:] for line in TEXT.splitlines() if line.startswith("    ")]
 SETUP = [line for line in BLOCKS if line.startswith("pip install")]
 COMMANDS = [line for line in BLOCKS if line.startswith(("python ", "trackmdp "))]
-OURS = [line for line in COMMANDS if not line.startswith("python -c")]
+OURS = [line for line in COMMANDS if not line.startswith(("python -c", "python -m venv"))]
 SHORT = {
     "train": [
         "collector.total_frames=8192",
@@ -71,7 +72,7 @@ def test_the_picture_is_the_one_its_command_draws(tmp_path: Path, monkeypatch: p
 def test_named_files_and_choices_exist() -> None:
     for path in set(re.findall(r"`((?:trackmdp|conf|scripts)/[\w/.]+)`", TEXT)):
         assert (ROOT / path).exists() or "mine" in path, path
-    named = re.search(r"judged the same way: (.*?)\.\n", TEXT, flags=re.DOTALL)
+    named = re.search(r"evaluated in the same way: (.*?)\.\n", TEXT, flags=re.DOTALL)
     assert named
     assert set(re.findall(r"`(\w+)`", named[1])) == set(GROUPS["baseline"])
 
@@ -84,9 +85,27 @@ def few(line: str) -> list[str]:
 
 
 @pytest.mark.slow
+def test_the_lines_of_python_run(tmp_path: Path) -> None:
+    """What they print: the learned value, close below the bound."""
+    start = BLOCKS.index("import trackmdp as tm")
+    block = itertools.takewhile(lambda line: "tm" in line, BLOCKS[start:])
+    words = [sys.executable, "-c", "\n".join([*block, "print(len(episodes), env.batch_size)"])]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    figures, sizes = done.stdout.splitlines()
+    learned, upper = map(float, figures.split())
+    assert upper - 0.5 < learned < upper
+    assert sizes == "100 torch.Size([64])"
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
 def test_the_commands_run_in_this_order(tmp_path: Path) -> None:
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     for line in COMMANDS:
+        if "venv" in line or "benchmark" in line:  # the peers' packages, gigabytes of them, and their minutes
+            continue
         if line in OURS:
             command, *words = words_of(line)
             typed = [sys.executable, "-m", "trackmdp.app.cli", command, *words, *SHORT.get(command, []), *few(line)]
