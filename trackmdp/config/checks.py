@@ -22,8 +22,11 @@ def validate(cfg: Any) -> None:
 
 def absolute_paths(cfg: Any, folder: Path) -> None:
     """Resolve every path of the config against `folder`, where the user typed the command."""
+    # Saved as absolute paths, they still mean the same files when the run is resumed from another folder.
     for _, node in nodes(cfg):
         for name, described in options(type(node)).items():
             value = vars(node)[name]
             if isinstance(described, Option) and described.path and isinstance(value, str):
+                # resume=auto is a word, not a file called `auto`. `folder / value` is `value`
+                # itself where that is absolute.
                 setattr(node, name, value if value in described.words else str(folder / value))

@@ -45,11 +45,15 @@ def compose(command: str, overrides: Mapping[str, Any] | None = None, *, folder:
     root = _read(command)
     schema = ROOTS[command]
     chosen = _chosen(root, schema, typed)
+    # Only what the schema names: the files of the commands also have `defaults` and `hydra`, which are for the
+    # command line.
     values: dict[str, Any] = {key: value for key, value in root.items() if key in options(schema)}
     for group, name in chosen.items():
         if group in options(schema):
             values[group] = None if name is None else _choice(group, name, chosen)
     known = dict(_known(schema, values))
+    # After all choices are merged, so that `algo.epochs` is looked up among the options of the algorithm that
+    # was chosen.
     for key, value in typed.items():
         if key not in chosen:
             _put(values, key, value, known)
@@ -91,6 +95,9 @@ def given(arguments: Mapping[str, Any]) -> dict[str, Any]:
 def _chosen(root: Mapping[str, Any], schema: type[Any], typed: Mapping[str, Any]) -> dict[str, str | None]:
     """Group or selector -> its choice: that of the defaults list, unless another is given."""
     chosen: dict[str, str | None] = {}
+    # An entry is a text (`base_train`, `_self_`, `hydra/folders`) or one pair (`kernel: random_support`); of
+    # the pairs, `experiment: null` and `override hydra/sweeper: ...` are neither a selector nor an option of
+    # the schema.
     for entry in root["defaults"]:
         pairs = entry.items() if isinstance(entry, dict) else ()
         chosen |= {key: name for key, name in pairs if key in SELECTORS or key in options(schema)}
@@ -108,6 +115,9 @@ def _chosen(root: Mapping[str, Any], schema: type[Any], typed: Mapping[str, Any]
 
 def _choice(group: str, name: str, chosen: Mapping[str, str | None]) -> dict[str, Any]:
     """The values of one choice with its `name`, its defaults list followed."""
+    # Example: algo=ppo credit=per_sensor. conf/algo/ppo.yaml names /credit@_here_: '${credit}/ppo', hence
+    # conf/credit/per_sensor/ppo.yaml, whose own list names /algo/base_ppo_per_sensor@_here_: the choice's name
+    # is ppo_per_sensor.
     values = _read(f"{group}/{name}")
     merged: dict[str, Any] = {}
     for entry in values.pop("defaults", []):
@@ -118,6 +128,7 @@ def _choice(group: str, name: str, chosen: Mapping[str, str | None]) -> dict[str
             for selector, selected in chosen.items():
                 other = other.replace(f"${{{selector}}}", str(selected))
             merged |= _choice(target.strip("/").split("@")[0], other, chosen)
+    # The file's own values win over those of its defaults list, as in Hydra (1.1 and later) without `_self_`.
     return merged | values
 
 
@@ -127,6 +138,7 @@ def _known(schema: type[Any], values: Any, prefix: str = "") -> Iterator[tuple[s
         if isinstance(item, Option):
             yield f"{prefix}{name}", item
             continue
+        # A group that is null (`baseline: null`) has no options.
         inner = values.get(name) if values else None
         if inner is not None:
             yield from _known(GROUPS[name][inner["name"]] if name in GROUPS else item, inner, f"{prefix}{name}.")
@@ -149,11 +161,16 @@ def _resolved(values: dict[str, Any], known: Mapping[str, Option]) -> dict[str, 
     """The values with every ``${...}`` replaced by what it stands for."""
     register_resolvers()
     config = OmegaConf.create(values)
+    # Looked for before resolving, which would leave `???` in place; sorted, since a set names another key at
+    # each call.
     for key in sorted(OmegaConf.missing_keys(config)):
         raise UserError(f"{key}: missing, expected {known[key].expected}")
     try:
+        # Resolved last: `${algo.total_frames}` in the collector must stand for the value that was given,
+        # not for the default.
         plain: Any = OmegaConf.to_container(config, resolve=True)
     except OmegaConfBaseException as error:
+        # OmegaConf's further lines (full_key, object_type) are of no use to whoever typed the option.
         raise UserError(str(error).splitlines()[0]) from error
     return dict(plain)
 
@@ -161,12 +178,15 @@ def _resolved(values: dict[str, Any], known: Mapping[str, Option]) -> dict[str, 
 def _read(name: str) -> dict[str, Any]:
     """A file of `conf/`, uninterpreted."""
     file = conf_file(name)
+    # A copy, since the callers pop and set keys, and the cached dict is shared by every later call. The time of
+    # the last change is part of the cache's key, so that an edited file is read again.
     return copy.deepcopy(_load(file, file.stat().st_mtime_ns))
 
 
 @lru_cache(maxsize=128)  # parsing is nine tenths of composing
 def _load(file: Path, stamp: int) -> dict[str, Any]:  # noqa: ARG001  (the stamp tells a file from what it was before)
     plain = OmegaConf.to_container(OmegaConf.load(file))
+    # YAML keys may be numbers; dataclass fields are named by texts.
     assert isinstance(plain, dict), file
     return {str(key): value for key, value in plain.items()}
 

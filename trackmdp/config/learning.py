@@ -51,10 +51,13 @@ class ScheduleConfig(NodeConfig):
 
     def at(self, progress: float) -> float:
         """The value when the fraction `progress` of the run is over."""
+        # `end` first: where begin == until (a jump) the division below would be by zero, and is never
+        # reached.
         if progress >= self.until:
             return self.end
         if progress <= self.begin:
             return self.start
+        # Example: start 1, end 0.02, begin 0.1, until 0.2: at 0.15 half the way is done, 0.51.
         return self.start + (self.end - self.start) * (progress - self.begin) / (self.until - self.begin)
 
 
@@ -113,6 +116,7 @@ class PpoConfig(ActorCriticConfig):
         """The parts of a batch are of one size."""
         super().check(key, root)
         frames = root.collector.frames_per_batch
+        # Minibatches of unequal size would weigh their frames unequally in the mean loss.
         if frames % self.minibatches:
             expected = f"a divisor of collector.frames_per_batch={frames}"
             raise refuse(f"{key}.minibatches", self.minibatches, expected)
@@ -159,6 +163,8 @@ class DqnConfig(AlgoConfig):
 
     def memory(self, task: Sizes, root: Any) -> dict[str, int]:
         """The replay buffer, whose transitions hold two states; the networks."""
+        # State and next state, the action's M bits as bools, two float32 and one flag (reward, discount,
+        # terminated), an index.
         transition = 2 * state_bytes(task) + task.num_cells + 2 * BYTES["float32"] + 1 + BYTES["int64"]
         priority = BYTES["float64"] if self.prioritized.enabled else 0
         return {
@@ -185,6 +191,8 @@ class CollectorConfig(ChoiceConfig):
 
     def check(self, key: str, root: Any) -> None:
         """A batch is a whole number of steps of all environments, and a run at least one batch."""
+        # A batch is `[B, time]`, B environments for equally many steps: TorchRL would round it up, and the
+        # frames collected would not be those of the config.
         if self.frames_per_batch % self.stepped:
             factors = f"{key}.envs" + (f" x {key}.workers" if self.stepped > self.envs else "")
             expected = f"a multiple of {self.stepped} ({factors})"

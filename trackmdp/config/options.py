@@ -89,8 +89,11 @@ class Option:
             return isinstance(value, list) and len(value) > 0 and all(map(self._element.allows, value))
         if self.pair and isinstance(value, (list, tuple)):
             return len(value) == 2 and all(map(dataclasses.replace(self, pair=False).allows, value))
+        # `cost.reward=10` is a number to whoever types it, but an int to YAML. `True` is an int to Python,
+        # and no number.
         if self.kind is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
+        # `type`, not isinstance: True would pass as the integer 1.
         if self.kind in _KINDS and type(value) is not self.kind:
             return False
         if self.choices:
@@ -104,9 +107,13 @@ class Option:
         """What the elements must be, if this is a list."""
         if typing.get_origin(self.kind) is not list:
             return None
+        # Range and choices of a list are those of its elements: list[int] with ge=1 holds positive
+        # integers.
         return dataclasses.replace(self, kind=typing.get_args(self.kind)[0], nullable=False)
 
     def _in_range(self, value: float) -> bool:
+        # Without this an option that has no upper bound would let .inf pass, and one that has no bound at
+        # all .nan: YAML has words for both.
         return math.isfinite(value) and (
             (self.ge is None or value >= self.ge)
             and (self.gt is None or value > self.gt)
@@ -160,6 +167,7 @@ def option(
 
 def options(schema: type[Any]) -> dict[str, Option | type[Any]]:
     """Fields of a schema in order: an `Option` for a value, the dataclass (or group base) for a nested config."""
+    # `from __future__ import annotations` leaves the annotations as text; this evaluates them.
     hints = typing.get_type_hints(schema)
     found: dict[str, Option | type[Any]] = {}
     for field in dataclasses.fields(schema):
@@ -194,6 +202,8 @@ def choice(group: str, name: str, *, makes: str) -> typing.Callable[[type[T]], t
     """
 
     def register(schema: type[T]) -> type[T]:
+        # setdefault keeps the first comer, so that a plugin cannot replace a choice by registering its name
+        # once more; registering the very same class twice (a module imported again) does no harm.
         known = GROUPS.setdefault(group, {}).setdefault(name, schema)
         if known is not schema:
             raise UserError(f"{group}={name}: offered by {known.__module__} and by {schema.__module__}")
@@ -227,6 +237,7 @@ def refuse(key: str, value: object, expected: str) -> UserError:
 
 
 def _strip_none(hint: Any) -> tuple[Any, bool]:
+    # `Optional[int]` has the origin typing.Union, `int | None` has types.UnionType.
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
         rest = [part for part in typing.get_args(hint) if part is not type(None)]
         if len(rest) == 1:

@@ -1,4 +1,4 @@
-"""Going on with a run: its saved config rules, and only some options may differ."""
+"""Resuming a run: its saved config holds, and only the options of `CHANGEABLE` may differ."""
 
 from __future__ import annotations
 
@@ -27,11 +27,13 @@ CHANGEABLE = (
     "collector.device",
     "quiet",
 )
-"""Options, or groups of them, that may differ when a run goes on: budget, solving, logging, saving and devices."""
+"""Options, or groups of them, that may differ when a run is resumed: budget, solving, logging, saving and devices."""
 
 
 def config_text(cfg: TrainConfig) -> str:
-    """The text of `config.yaml`; how a run was gone on with is not part of it."""
+    """The text of `config.yaml`, without `resume`."""
+    # With `resume` in it, config.yaml and its digest would differ between a run and the same run interrupted
+    # and resumed.
     return to_yaml(dataclasses.replace(cfg, resume=None))
 
 
@@ -47,6 +49,7 @@ def finished(cfg: TrainConfig, folder: Path) -> dict[str, Any] | None:
         summary = unsealed(read_object(file), str(file))
     except UserError:
         return None
+    # `quiet` changes what is shown and nothing else, but stands in the config: both texts are this run.
     mine = summary.get("config_sha256") in [
         config_digest(dataclasses.replace(cfg, quiet=quiet)) for quiet in (True, False)
     ]
@@ -54,10 +57,10 @@ def finished(cfg: TrainConfig, folder: Path) -> dict[str, Any] | None:
 
 
 def run_folder(cfg: TrainConfig, chosen: Path) -> Path:
-    """The folder that the run writes to: that of the run it goes on with, else `chosen`.
+    """The folder that the run writes to: that of the run it resumes, else `chosen`.
 
     Raises:
-        UserError: `resume` names what is no run, or `chosen` holds a run and `resume` does not say to go on with it.
+        UserError: `resume` names what is no run, or `chosen` holds a run and `resume` is null.
     """
     if cfg.resume is None:
         if (chosen / "config.yaml").is_file():
@@ -68,6 +71,7 @@ def run_folder(cfg: TrainConfig, chosen: Path) -> Path:
     if cfg.resume == "auto":
         return chosen
     named = Path(cfg.resume)
+    # A checkpoint is RUN/checkpoints/iteration-00000012.pt.
     folder = named.parent.parent if named.is_file() else named
     if not (folder / "config.yaml").is_file():
         raise UserError(f"resume={cfg.resume}: expected auto, the folder of a run, or one of its checkpoints")
@@ -89,17 +93,23 @@ def continued(cfg: TrainConfig, folder: Path, words: Sequence[str]) -> TrainConf
         return cfg
     saved = load_run_config(folder)
     for word in words:
+        # Hydra's grammar: `algo.epochs=3`, `+key=1` adds, `~key` removes, `group@package=name`,
+        # `hydra/launcher=joblib`.
         key = word.lstrip("+~").split("=", 1)[0].split("@")[0].replace("/", ".")
         if key.split(".")[0] in ("hydra", "resume"):
             continue
         old, new = _look(saved, key), _look(cfg, key)
         if key in SELECTORS:
+            # `credit` is no field of the config: the algorithm that was chosen knows its own.
             old, new = _look(saved, f"{SELECTORS[key].group}.{key}"), word.partition("=")[2]
         if _same(old, new):
             continue
+        # With the dot, so that `log` allows `log.every` but not an option that merely begins with these
+        # letters.
         if not any(key == allowed or key.startswith(f"{allowed}.") for allowed in CHANGEABLE):
             raise UserError(f"{key}: the run has {_shown(old)}, typed was {_shown(new)}; it cannot change on resume")
         _put(saved, key, new)
+    # Once more: a new budget may break a rule against an option that was not typed, such as frames per batch.
     validate(saved)
     return dataclasses.replace(saved, resume=cfg.resume)
 

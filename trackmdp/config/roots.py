@@ -120,6 +120,7 @@ class EvaluateConfig(WorldConfig):
 
     def check(self, key: str, root: Any) -> None:
         """One policy is valued, and of its log only the episodes are written."""
+        # Neither and both are one mistake: the two name the same thing, the policy to be valued.
         if (self.run is None) == (self.baseline is None):
             given = "neither" if self.run is None else "both"
             raise UserError(f"expected exactly one of run=FOLDER and baseline=NAME, got {given}")
@@ -156,6 +157,7 @@ class BenchmarkConfig(WorldConfig):
     seconds: float = option("least time spent on each figure of speed", unit="s", gt=0)
     batch_sizes: list[int] = option("`env`: environments stepped together", unit="environments", ge=1)
     sizes: list[int] = option("`size`: sides of the grid", unit="cells", ge=3)
+    # Evaluated while this module is imported, before plugins are: only this package's own algorithms.
     algos: list[str] = option("`memory`: algorithms that train", choices=tuple(GROUPS["algo"]))
     seeds: list[int] = option("`peers`: seeds that all train with", ge=0)
     peers: str = option(

@@ -21,6 +21,7 @@ __all__ = ["make_algorithm", "make_collector", "make_loggers"]
 
 def make_algorithm(cfg: TrainConfig, task: Task, device: torch.device) -> Algorithm:
     """The learner; it is given the task, never the motion."""
+    # Rounded up: 100,001 frames in batches of 10,000 are 11 iterations, the last one whole as well.
     batches = -(-cfg.collector.total_frames // cfg.collector.frames_per_batch)
     made: Algorithm = maker(cfg.algo)(task.task, cfg.algo, iterations=batches, seed=cfg.seed, device=device)
     return made
@@ -38,4 +39,6 @@ def make_collector(
 def make_loggers(cfg: TrainConfig, folder: Path) -> list[Callback]:
     """What the run writes of itself while it learns."""
     csv = CsvLogger(cfg.log, folder)
+    # metrics.csv is written whatever the log is: reports and `Run.metrics` read it. The other logger is imported by
+    # the name in its schema, since the packages it may need (mcap) are not to load without it.
     return [csv] if cfg.log.name == "csv" else [csv, maker(cfg.log)(cfg.log, folder)]

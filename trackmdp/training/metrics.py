@@ -38,12 +38,16 @@ class CsvLogger(Callback):
         Raises:
             UserError: the file is a link, or not the one that the earlier process left.
         """
+        # The columns are read and checked before the file is opened for writing: a file that is refused
+        # stays as it was.
         names = _names(self._path, self._position) if self._position else None
         mode = "r+" if self._position else "w"
         self._file = os.fdopen(reopen(self._path, mode), "r+", newline="", encoding="utf-8")
         self._writer: csv.DictWriter[str] | None = None
         if names is not None:
             self._writer = csv.DictWriter(self._file, fieldnames=names)
+            # Rows after the checkpoint are of iterations that are run again: left in place they would
+            # stand there twice.
             self._file.truncate(self._position)
             self._file.seek(0, os.SEEK_END)
 
@@ -58,6 +62,8 @@ class CsvLogger(Callback):
             self._writer = csv.DictWriter(self._file, fieldnames=list(row))
             self._writer.writeheader()
         self._writer.writerow(_known(row))
+        # Flushed to the operating system, not synced: after a kill the rows are there, and others can watch
+        # them grow; fsync for each row would cost more than some iterations.
         self._file.flush()
 
     def on_end(self, trainer: Training) -> None:  # noqa: ARG002
@@ -92,6 +98,8 @@ class TensorboardLogger(Callback):
 
         own_folder(self._folder)
         frames = trainer.position.frames
+        # TensorBoard reads all event files of a folder together and cannot be told to drop a part of one; a
+        # new file with purge_step hides the events of that step and later ones.
         self._events = SummaryWriter(self._folder, purge_step=frames + 1 if frames else None)
 
     def on_update(self, trainer: Training, row: Row) -> None:
@@ -117,6 +125,8 @@ def _names(file: Path, position: int) -> list[str]:
     """
     with opened(file, most=2**36) as stream, decoded(str(file), "the metrics of this run"):
         head = stream.readline(2**16)
+        # Shorter than the checkpoint remembers, or without a row's end there: the file was changed or
+        # replaced meanwhile, and truncating it at this byte would leave half a row.
         if stream.seek(0, os.SEEK_END) < position:
             raise ValueError(f"{stream.tell():,} bytes, the checkpoint was saved after {position:,}")
         stream.seek(position - 1)
