@@ -38,6 +38,8 @@ def paper(world: World) -> Array:
     The reward is not, so this can lie below what a policy attains; see `valid`. It knows no `max_steps`.
     """
     rows, p = row_index(world.kernel), world.kernel.data
+    # max{P_xj r - c_j, 0} for each possible move: here c_j is not multiplied by the probability of staying in the grid,
+    # which is the difference to `_best_step`.
     gain = np.maximum(p * world.reward - world.cost[world.kernel.indices], 0.0)
     return accumulate(world.kernel, per_row(rows, gain, world.num_cells), world.size)
 
@@ -63,8 +65,12 @@ def clocked(world: World) -> Array:
 def _best_step(world: World) -> Array:
     """`[M]` the most that one step is worth from a known position: the best free choice or the safe action."""
     rows, p = row_index(world.kernel), world.kernel.data
+    # The reward is 0 on the exit step, costs included (eq. reward_func), so a sensor costs c_j P_in(x).
     cost = world.cost[world.kernel.indices] * world.stay_probability[rows]
+    # Sensors add up: each is on where it gains, and a cell that cannot be reached never is.
     free = per_row(rows, np.maximum(p * world.reward - cost, 0.0), world.num_cells)
+    # D is free to be anything: a safe action cheaper than the sensors it stands for is worth more than any free choice,
+    # and would lie above the bound if it were left out.
     return np.maximum(free, (world.reward - world.safe_cost) * world.stay_probability)
 
 
@@ -79,6 +85,8 @@ def clocked_table(world: World) -> ClockedBound:
     clocked process is left at every step with the target's probability of exit, whatever is chosen.
     """
     # all on is a policy of finite value; from there each round is worth more, and there are finitely many policies
+    # [t_max + 1, E], one choice per n and possible move: with the position known, sets need not be the same for all
+    # paths.
     sensed = np.ones((world.num_choices, world.kernel.nnz), dtype=bool)
     table, exact = _value(world, sensed)
     while True:
@@ -89,6 +97,8 @@ def clocked_table(world: World) -> ClockedBound:
         if candidate.sum() <= table.sum():  # only rounding is left to gain
             break
         sensed, table = improved, candidate
+    # Iterated solves leave Û off by a little; with rho the excess of one improvement step over Û, and at most `longest`
+    # steps to collect it on, U <= Û + longest * rho (theory-extensions, section 0).
     error = 0.0 if exact else float(expected_steps(world).max()) * _excess(world, table)
     return ClockedBound(table, error)
 
@@ -103,6 +113,8 @@ def _gains(world: World, table: Array) -> tuple[Array, Array]:
 def _improve(world: World, table: Array, sensed: BoolArray) -> BoolArray:
     """`[t_max + 1, E]` the choice for each possible move; a tie leaves the present choice."""
     rows, cells, p = row_index(world.kernel), world.kernel.indices, world.kernel.data
+    # Both sides of the comparison are multiplied by the probability of the move: sense iff p (r + U(j,0)) - c > p
+    # U(j,n+1).
     cost = world.cost[cells] * world.stay_probability[rows]
     gain = p * (world.reward + table[cells, 0] - table[cells, 1:].T) - cost
     # without a margin, rounding could switch a tied choice to and fro for ever
@@ -114,6 +126,7 @@ def _excess(world: World, table: Array) -> float:
     """The most by which the best choices, one step ahead, exceed `table`."""
     rows, (sense, leave) = row_index(world.kernel), _gains(world, table)
     best = [per_row(rows, np.maximum(sense, left), world.num_cells) for left in leave]
+    # The last column has no choice: the safe action is forced.
     best.append(world.kernel @ (world.reward - world.safe_cost + table[:, 0]))
     return max(float((np.stack(best, axis=1) - table).max()), 0.0)
 
@@ -130,6 +143,7 @@ def _value(world: World, sensed: BoolArray) -> tuple[Array, bool]:
     # solved with; the others give U(., n) by one product each.
     earned = [(world.reward - world.safe_cost) * world.stay_probability]
     reach = [moves]
+    # What a sensed move earns at once; the value of being located is in `reach`.
     gain = moves.data * world.reward - world.cost[cells] * world.stay_probability[rows]
     for choice in sensed[::-1]:
         hit, miss = _masked(moves, choice), _masked(moves, ~choice)
@@ -162,6 +176,7 @@ def _truncated_clocked(world: World, max_steps: int) -> Array:
     moves, m = world.kernel, world.num_cells
     rows, cells, p = row_index(moves), moves.indices, moves.data
     cost = world.cost[cells] * world.stay_probability[rows]
+    # U_h(x, n) with h steps left, from U_0 = 0: each round adds one step in front.
     table = np.zeros((m, world.num_choices + 1))
     for _ in range(max_steps):
         located = table[cells, 0]
@@ -169,6 +184,7 @@ def _truncated_clocked(world: World, max_steps: int) -> Array:
             per_row(rows, np.maximum(p * (world.reward + located) - cost, p * table[cells, n + 1]), m)
             for n in range(world.num_choices)
         ]
+        # n = t_max + 1: r - D, and located again, whose clock is 0.
         forced = per_row(rows, p * (world.reward - world.safe_cost + located), m)
         table = np.stack([*gains, forced], axis=1)
     return table[:, 0]

@@ -1,12 +1,12 @@
 """Best-first branch and bound for the search for a moving target, from many located cells at once.
 
-F_h(z) is the most that h more sets can earn for undetected mass z, the value V of being located given. It is a maximum
-of linear functions of z (one per chain of sets), so F_h(z) <= sum_j z_j F_h(e_j): the position may be revealed *once*,
-after any step. Two things follow for the set of the next step, with m = zP and R_h(j) = F_h(e_j):
+F_h(z) is the largest expected reward of h more sets for undetected mass z, the value V of being located given. It is a
+maximum of linear functions of z (one per sequence of sets), so F_h(z) <= sum_j z_j F_h(e_j), where the position is
+revealed *once*, after any step. With m = zP and R_h(j) = F_h(e_j), two facts about the next set follow:
 
 * a cell whose sensing is worth more than leaving it alone, m_j (r + V(j)) - c_j sum(m) >= m_j R_{h-1}(j), is sensed;
-* a choice N of cells to leave, among the others, is worth at most what is sensed plus min{R_{h-1} z_N, one more set
-  chosen jointly and revealed only then}.
+* leaving the cells N unsensed and sensing all others is worth at most what is sensed plus the lesser of two bounds on
+  the mass z_N left: the position revealed at once, R_{h-1} z_N, or revealed after one more set chosen for all of it.
 
 The loss against revealing at once is superadditive, so what two cells lose when both are left bounds what any set
 of undecided cells takes away (`Tree._least_loss`).
@@ -31,7 +31,10 @@ from trackmdp.world.model import Array, BoolArray, World
 
 __all__ = ["LeftOut", "Tree"]
 
+# Choices under one heap entry: enough of them for array arithmetic to pay, and not so many that poor ones are expanded
+# along with the best one, which gives the batch its place in the heap.
 LARGEST_BATCH = 4096
+# Finite on purpose: regrets are summed and their maximum is taken out again (`_least_loss`), and inf - inf is nan.
 FORBIDDEN = 1e30
 MOST_PAIRED = 10
 """Cells of one state up to which every pair is looked at for a better bound."""
@@ -106,6 +109,8 @@ class LeftOut:
 
     def has(self, rows: IndexArray, cells: IndexArray) -> BoolArray:
         """`[E]` whether problem `rows` leaves `cells` out."""
+        # With M = 16 and the keys 37, 41 (cells 5 and 9 of problem 2), (2, 9) gives 41: found at place 1; (2, 6) gives
+        # 38: place 1 as well, another key. `minimum` is for keys beyond the last one, whose place is the length.
         wanted = rows * self.num_cells + cells
         place = np.minimum(np.searchsorted(self.keys, wanted), max(len(self.keys) - 1, 0))
         return self.keys[place] == wanted if len(self.keys) else np.zeros(len(wanted), dtype=bool)
@@ -145,9 +150,11 @@ class Tree:
         self._world, self._detected, self._revealed, self._slack = world, detected, revealed, slack
         self.best = lower.copy()
         self.nodes = 0
+        # Problem -> cells left unsensed at each step, for the problems with a better plan than `lower`.
         self._leaves: dict[int, list[IndexArray]] = {}
         self._heap: list[tuple[float, int, _Choices]] = []
         self._ticket = itertools.count()
+        # Nothing is earned yet, all H sets are to be chosen, and no batch came before.
         start = sparse.eye_array(world.num_cells, format="csr") if mass is None else mass
         self._open(np.arange(len(lower)), np.zeros(len(lower)), start, len(revealed), None)
 
@@ -158,6 +165,8 @@ class Tree:
 
     def upper(self) -> Array:
         """`[B]` proved upper bound of F_H."""
+        # What was discarded was worth at most best + slack at the time, and best only grows; what is open still has its
+        # own bound. So this holds whenever it is asked, also of a search that was stopped early.
         bound = self.best + self._slack
         for _, _, choices in self._heap:
             np.maximum.at(bound, choices.start, choices.bound)
@@ -180,6 +189,7 @@ class Tree:
         # what was worth looking at when it was pushed may not be so any more: the best plans have become better since
         choices = choices.pick(self._hopeful(choices.start, choices.bound))
         frontier, k = choices.frontier, choices.decided
+        # States of one batch have different numbers of cells to decide; those with k or fewer are complete.
         done = frontier.count[choices.state] <= k
         if done.any():
             self._advance(choices.pick(done))
@@ -233,13 +243,17 @@ class Tree:
             # That holds where two or more are left; with one or none, all the others cost their regret.
             later = pair[:, k:, k:].min(axis=2)
             regret = np.where(present[:, k:], frontier.regret[:, k:], 0.0)
+            # Why half, with n cells left: z_N is 1/(n-1) times the sum of its pairs, and the loss is superadditive and
+            # homogeneous, so loss(z_N) >= 1/(n-1) sum over pairs of loss(a, b) >= sum over a of min_b loss(a, b) / 2.
             several = np.where(present[:, k:], np.minimum(later / 2.0, regret), 0.0).sum(axis=1)
+            # One cell left: all others cost their regret, at best all but the largest.
             rest[:, k] = np.minimum(several, regret.sum(axis=1) - regret.max(axis=1))
         return rest
 
     def _pair_loss(self, frontier: _Frontier, state: IndexArray, a: IndexArray, b: IndexArray) -> Array:
         cells = np.stack([frontier.cells[state, a], frontier.cells[state, b]], axis=1)
         masses = np.stack([frontier.mass[state, a], frontier.mass[state, b]], axis=1)
+        # CSR rows of exactly two entries each: row p is entries 2p and 2p + 1.
         pointer = np.arange(len(state) + 1) * 2
         mass = sparse.csr_array((masses.ravel(), cells.ravel(), pointer), shape=(len(state), self._world.num_cells))
         return self._loss(mass, frontier.sets_left - 1)
@@ -254,7 +268,15 @@ class Tree:
         return sparse.csr_array((mass, cells, pointer), shape=(len(left), self._world.num_cells))
 
     def _one_more_set(self, mass: sparse.csr_array, sets_left: int) -> tuple[Array, sparse.csr_array, Array, Array]:
-        """Bound of F on each row, one more set chosen jointly; also the prediction, worth of sensing and of leaving."""
+        """Upper bound of F on each row of `mass` `[P, M]`: one more set for all of it, then the position is revealed.
+
+        Returns:
+            `[P]` the bound; `[P, M]` the mass after the move; and per stored entry of it, the worth of sensing the cell
+            and of leaving it.
+        """
+        # Row q of `mass` [P, M] is a vector of undetected mass, `moved` is q P. Revealed after this set, each cell
+        # counts by itself, m_j (r + V(j)) - c_j |m| or m_j R_{h-1}(j), and the best set takes the larger one cell by
+        # cell.
         moved = mass @ self._world.kernel
         rows, cells = row_index(moved), moved.indices
         sense = (
@@ -281,6 +303,7 @@ class Tree:
         sense = self._within(start[rows], moved.indices, sense)
         relaxed = earned + per_row(rows, np.maximum(sense, leave), len(start))
         if sets_left == 1:  # the last set is separable: this is its exact value
+            # `leave` is m_j R_0(j) here, and R_0 is exact, unlike the bounds R_1 ... used further up.
             self._record(start, relaxed, moved, leave > sense, origin)
             return
         kept = np.flatnonzero(self._hopeful(start, relaxed))
@@ -319,9 +342,11 @@ class Tree:
     def _push(self, choices: _Choices) -> None:
         choices = choices.pick(self._hopeful(choices.start, choices.bound))
         excess = choices.bound - self.best[choices.start]
+        # Sorted by bound - best, not by bound: problems differ in value, and a choice matters by what it may still
+        # gain.
         order = np.argsort(-excess, kind="stable")
-        # a heap of batches, each under its best excess; the ticket settles ties in the order of pushing, and is what
-        # makes two runs look at the same choices in the same order
+        # A heap of batches, each under its best excess. Of equal ones the batch pushed last comes first, which goes
+        # deeper; the ticket also keeps two runs in the same order, and heapq from comparing `_Choices`.
         for first in range(0, len(order), LARGEST_BATCH):
             part = order[first : first + LARGEST_BATCH]
             heapq.heappush(self._heap, (-float(excess[part[0]]), -next(self._ticket), choices.pick(part)))
@@ -339,6 +364,7 @@ def _frontier(
     """The states `kept`, with the entries of `moved` whose `regret` is positive, the likeliest first."""
     # The entries of `moved` are a ragged table: row s has count[s] of them. They are set into rectangles [B, K]; the
     # column of an entry is its number among those of its row: rows (0, 0, 2) have columns (0, 1, 0).
+    # place[s] is the row of state s in the new batch, -1 for one that is not kept.
     place = np.full(len(start), -1)
     place[kept] = np.arange(len(kept))
     rows = place[row_index(moved)]
@@ -363,6 +389,8 @@ def _sets_left_out(choices: _Choices | None, place: int) -> list[IndexArray]:
     while choices is not None:
         frontier, state = choices.frontier, choices.state[place]
         steps.insert(0, frontier.cells[state][choices.left[place]])
+        # origin = (choices, kept): the state's place among those kept leads to its place among the choices it came
+        # from.
         if frontier.origin is None:
             break
         choices, place = frontier.origin[0], int(frontier.origin[1][state])

@@ -1,8 +1,9 @@
 """Theorem 3: the position of a target that was missed, estimated from Q-values alone.
 
-With ã all sensors and ã_x all but the one at x, Q(s, ã) - Q(s, ã_x) = p(x) (r + V(x) - W(x)) - c_x p_in, W(x) what
-follows when the target is known to be at x but the clock runs on. The paper takes W = V, which holds for the position
-but not for the clock; with W as it is, the belief's probability p(x) comes out exactly.
+Let ã be all sensors on, and ã_x all but the one at x. Then Q(s, ã) - Q(s, ã_x) = p(x) (r + V(x) - W(x)) - c_x p_in:
+a miss under ã_x reveals the position x, but the clock runs on, and W(x) is the value from there. The paper (Theorem 3)
+sets W = V, which is right about the position but not about the clock. With the true W, solving for p(x) returns the
+belief's probability exactly.
 """
 
 from __future__ import annotations
@@ -68,9 +69,11 @@ class EstimatorAccuracy:
 
 def known_positions(world: World, value: Array) -> list[Array]:
     """W after n + 1 misses, for n = 0 ... t_max, each `[M]`: best play from a known position, V = `value`."""
+    # r + V(j) for a detection; after the last free choice, R_0(x) = sum_j P_xj (r - D + V(j)).
     detected = world.reward + value
     forced = world.kernel @ (detected - world.safe_cost)
     known = tables(world, detected, forced, world.t_max, slack=1e-9, go_on=_go_on)
+    # `tables` counts sets left (R_0 first), here misses: after n + 1 misses there are t_max - n sets left.
     return known[::-1]
 
 
@@ -103,10 +106,13 @@ def accuracy(world: World, policy: PolicyTable, value: Array | None = None) -> E
     visits = _visits(world, policy)
     missed, right = 0.0, np.zeros(3)
     for estimate in positions(world, policy, own):
+        # Expected number of such misses per episode: renewals in the row's cell, times the joint probability within
+        # one.
         weight = visits[estimate.rows] * estimate.missed
         missed += float(weight.sum())
         for which, score in enumerate((estimate.paper, estimate.exact, estimate.belief)):
             right[which] += float(weight[_best(estimate.rows, score, estimate.missed > 0)].sum())
+    # Rounding may leave a share of 1 + 1e-16.
     paper, exact, bayes = np.minimum(right / missed, 1.0) if missed else np.ones(3)
     return EstimatorAccuracy(float(paper), float(exact), float(bayes), missed)
 
@@ -123,6 +129,7 @@ def _estimate(
     all_on = p * (world.reward + value[cells]) - world.cost[cells] * inside
     difference = all_on - p * later[cells]
     paper = (difference + world.cost[cells]) / world.reward
+    # Where being detected is worth nothing, Q says nothing about x, and the estimate is 0.
     worth = world.reward + value[cells] - later[cells]
     exact = np.divide(difference + world.cost[cells] * inside, worth, out=np.zeros_like(p), where=worth != 0.0)
     return PositionEstimate(n, rows, cells, p, paper, exact, predicted[reached] * unsensed[reached])
@@ -140,6 +147,7 @@ def _best(rows: IndexArray, score: Array, allowed: BoolArray) -> IndexArray:
 def _visits(world: World, policy: PolicyTable) -> Array:
     """`[M]` expected renewals that start in each cell, per episode from a uniform start: s (I - T)^-1."""
     start = np.full(world.num_cells, 1.0 / world.num_cells)
+    # T, the sum over the steps of a renewal; visits w solve w = s + w T, that is (I - T^T) w = s.
     located = sum((hit for hit, _ in renewal(world, policy)), sparse.csr_array((world.num_cells, world.num_cells)))
     return accumulate(sparse.csr_array(located.T), start, world.size)
 

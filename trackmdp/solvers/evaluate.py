@@ -52,6 +52,7 @@ def _whole_episodes(world: World, policy: PolicyTable) -> Evaluation:
     for hit, earned in renewal(world, policy):
         located, gathered = located + hit, gathered + earned
     system = RenewalSystem(located, world.size)
+    # All six totals by one factorisation: reward, steps in the grid, detections, sensors, safe actions, steps [M, 6].
     totals = system.solve(gathered)
     check_length(totals[:, 5])
     error = 0.0

@@ -25,6 +25,7 @@ def truncated_value(world: World, policy: PolicyTable, max_steps: int) -> Evalua
     steps = list(renewal(world, policy))
     left = [np.zeros((world.num_cells, 6))]  # V_{h-1}, V_{h-2}, ...
     for h in range(1, max_steps + 1):
+        # zip stops at the shorter one: with h steps left only the first h steps of a renewal happen.
         now = sum(earned + hit @ later for (hit, earned), later in zip(steps[:h], left, strict=False))
         left = [np.asarray(now), *left[: len(steps) - 1]]
     return pooled(left[0][:, :5], left[0][:, 5])

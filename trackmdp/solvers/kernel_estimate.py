@@ -1,7 +1,8 @@
 """The target's kernel estimated from what a tracker sees: detections, exits, and misses, which are censored moves.
 
-A miss tells that the target is among the cells not sensed, and no more. Expectation-maximisation shares each such
-path among the moves it may have been (a forward and a backward pass), so that chosen sets give consistent estimates.
+A miss says that the target is in one of the cells not sensed, and nothing else. Expectation-maximisation (Baum-Welch: a
+forward and a backward pass) replaces each path with misses by the expected number of moves i -> j on it, so that
+estimates stay consistent when the sets were chosen rather than all sensors on.
 
 Counts and kernels are sparse, `[M, M + 1]` with the exit in the last column: their memory follows the moves that were
 seen, and those that the prior adds, which puts the displacements seen anywhere down at every cell.
@@ -20,9 +21,9 @@ from trackmdp.world.model import Array, grid_size
 __all__ = ["KernelEstimate", "ObservedPaths"]
 
 OPEN = 0.01
-"""Share of the first round's kernel that allows moves not seen yet."""
+"""Weight, in the first round's kernel, of moves that were not seen yet."""
 NEGLIGIBLE = 1e-3
-"""Expected number of moves that is none."""
+"""Expected counts below this are dropped, so that the counts stay sparse."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,7 @@ class ObservedPaths:
 
     def pick(self, paths: IndexArray) -> ObservedPaths:
         """The `paths` of these numbers, in their order."""
+        # With t_max = 1, path 3 has the rows 3 * 2 + (0, 1) = 6, 7.
         rows = (paths[:, None] * self.choices + np.arange(self.choices)).ravel()
         return ObservedPaths(self.start[paths], self.misses[paths], self.sensed[rows], self.end[paths])
 
@@ -79,6 +81,8 @@ class KernelEstimate:
 
     def add(self, paths: ObservedPaths) -> None:
         """Take note of `paths`."""
+        # Without a miss both ends of the move are known; no expectation is needed, and the path itself need not be
+        # kept.
         at_once = paths.misses == 0
         self.add_moves(paths.start[at_once], paths.end[at_once])
         if not at_once.all():
@@ -86,6 +90,7 @@ class KernelEstimate:
 
     def add_moves(self, start: IndexArray, end: IndexArray) -> None:
         """Take note of moves `[K]` that were seen; `end` is M at the exit."""
+        # Before the first fit the two are one matrix, and stay so; after it, counts wait for the next `fit`.
         unfitted = self.counts is self.direct
         self.direct = self.direct + _counted(start, end, np.ones(len(start)), self.direct.shape)
         self.counts = self.direct if unfitted else self.counts
@@ -120,6 +125,7 @@ class KernelEstimate:
         if not self._censored:
             self.counts = self.direct.copy()  # a fit of its own, not what is added later
             return
+        # Policies repeat themselves: equal paths have equal expectations, and are worked out once.
         paths, copies = _merged(_joined(self._censored))
         for first in [True, *[False] * (rounds - 1)]:
             kernel = (1.0 - OPEN) * self.mean() + OPEN * self._open_moves(paths) if first else self.mean()
@@ -149,6 +155,7 @@ class KernelEstimate:
 
     def _kernel(self, moves: sparse.csr_array, leave: Array) -> sparse.csr_array:
         """`[M, M + 1]` from weights of the moves and `[M]` exit probabilities."""
+        # The exit has a Beta of its own, so the moves share what it leaves: rows [stay, exit] sum to 1.
         scale = (1.0 - leave) / moves.sum(axis=1)
         stay = sparse.csr_array((moves.data * scale[row_index(moves)], moves.indices, moves.indptr), shape=moves.shape)
         return sparse.csr_array(sparse.hstack([stay, sparse.csr_array(leave[:, None])], format="csr"))
@@ -158,6 +165,7 @@ class KernelEstimate:
         moved, left = self.counts[:, :-1], self.counts[:, [-1]].toarray()[:, 0]
         # half an exit in one more move keeps the pooled probability between 0 and 1 before any exit is seen
         pooled = (left.sum() + 0.5) / (self.counts.sum() + 1.0)
+        # Beta(exits + w p, moves + w (1 - p)), with p the pooled exit probability and w the weight of the prior.
         exits = np.stack([left + self.exit_weight * pooled, moved.sum(axis=1) + self.exit_weight * (1 - pooled)], 1)
         moves = sparse.csr_array(moved + self.weight * self._typical_moves(sparse.csr_array(moved)))
         moves.eliminate_zeros()
@@ -168,6 +176,7 @@ class KernelEstimate:
         """`[M, M + 1]` uniform over the cells that one move may reach, judging by the fastest path seen."""
         inside = paths.end < self.num_cells
         gone = self._distance(paths.start[inside], paths.end[inside])
+        # A path that got 5 columns away with 1 miss made 2 moves, so one of them went at least ceil(5 / 2) = 3.
         fastest = np.ceil(gone / (paths.misses[inside] + 1)).max(initial=1)
         near = self._near(int(max(fastest, self._farthest(self.direct[:, :-1]))) + 1)
         return sparse.csr_array(sparse.hstack([near, sparse.csr_array((self.num_cells, 1))], format="csr"))
@@ -176,6 +185,8 @@ class KernelEstimate:
         """`[M, M]` pooled displacements, put down at every cell, scaled to 1; see the class for where none fits."""
         start, end, data = row_index(moved), moved.indices, moved.data
         seen = data > 1e-9
+        # Shares within each row, not counts: a cell the target visits often says no more about the typical move than
+        # others.
         start, end, share = start[seen], end[seen], (data / moved.sum(axis=1)[start])[seen]
         # On 10 x 10 cells, 2 rows down and 1 column to the left is the shift (2 + 10) · 20 + (-1 + 10) = 249.
         width = 2 * self.columns
@@ -188,6 +199,8 @@ class KernelEstimate:
         without = np.flatnonzero(total <= 0)
         if len(without):
             near = self._near(self._farthest(moved))
+            # A diagonal of ones at the rows where no displacement fits: keep @ near has the rows of `near` there, and
+            # none elsewhere.
             keep = sparse.csr_array((np.ones(len(without)), (without, without)), shape=near.shape)
             typical, total = typical + keep @ near, np.where(total > 0, total, 1.0)
         return sparse.csr_array(sparse.diags_array(1.0 / total) @ typical)
@@ -204,6 +217,7 @@ class KernelEstimate:
         cells = np.arange(self.num_cells)
         row, column = cells[:, None] // self.columns + rows, cells[:, None] % self.columns + columns
         inside = (row >= 0) & (row < self.rows) & (column >= 0) & (column < self.columns)
+        # [M, S] in row-major order, as `end` below lists its entries.
         start, which = np.nonzero(inside)
         end = (row * self.columns + column)[inside]
         return _counted(start, end, weight[which], (self.num_cells, self.num_cells))
@@ -242,6 +256,8 @@ def _merged(paths: ObservedPaths) -> tuple[ObservedPaths, Array]:
     Sets are told apart by two sums of 64 random bits per (miss, cell): unequal ones agree with probability 2^-128.
     """
     choices, m = paths.choices, paths.sensed.shape[1]
+    # Row k * (t_max + 1) + t belongs to miss t of path k; rows of t >= n were never used, and must not tell paths
+    # apart.
     path, miss = np.divmod(row_index(paths.sensed), choices)
     read = miss < paths.misses[path]
     marks = np.random.default_rng(0).integers(2**63, size=(2, choices * m), dtype=np.uint64)
@@ -266,6 +282,7 @@ def _expected_moves(kernel: sparse.csr_array, paths: ObservedPaths, copies: Arra
     for n in np.unique(paths.misses):
         part = np.flatnonzero(paths.misses == n)
         some, each = paths.pick(part), np.arange(len(part))
+        # Rows t, t + (t_max + 1), ...: the set of miss t of every path, [paths, M].
         sensed = [some.sensed[t :: some.choices].astype(np.float64) for t in range(n)]
         forward = [_counted(each, some.start, np.ones(len(part)), (len(part), m))]
         for t in range(n):
@@ -273,11 +290,13 @@ def _expected_moves(kernel: sparse.csr_array, paths: ObservedPaths, copies: Arra
         # row `end` of P^T is the likelihood of ending there, by the cell before
         later = backward[some.end]
         weight = copies[part] / np.maximum(forward[n].multiply(later).sum(axis=1), 1e-300)
+        # The last move ends in the known cell, or in the exit, column M: f_n(i) at (i, end), weighted.
         expected = expected + forward[n].T @ _counted(each, some.end, weight, (len(part), m + 1))
         for t in range(n - 1, -1, -1):
             later = _hidden(later, sensed[t])
             moved = sparse.csr_array(forward[t].T @ (sparse.diags_array(weight) @ later))
             expected = expected + sparse.hstack([moved, sparse.csr_array((m, 1))], format="csr")
+            # l_t(i) = sum_j P_ij l_{t+1}(j), with l zero where the cell was sensed: there it would have been detected.
             later = later @ moves.T
     return sparse.csr_array(sparse.csr_array(expected).multiply(kernel))
 

@@ -1,4 +1,4 @@
-"""What h more sets can earn where the target's position is known but the clock runs on: R_h(j) = F_h(e_j)."""
+"""R_h(j) = F_h(e_j): the largest expected reward of h more sets when the target is known to be in j and n runs on."""
 
 from __future__ import annotations
 

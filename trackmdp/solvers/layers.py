@@ -1,4 +1,4 @@
-"""The possible positions after each move from each located cell: the ground on which sets are planned.
+"""The positions that the target can reach from each located cell, move by move: what plans of sets are indexed by.
 
 Layer t holds one entry per pair (located cell x, cell j reachable from x in t moves), so that work on all located
 cells at once is a few sparse products whose cost and memory follow the support of the kernel, not M².
@@ -58,12 +58,17 @@ def reachable(kernel: sparse.csr_array, start: IndexArray, length: int, task: Ta
         task: whose window limits the sensors, row k being located in cell k; None for no limit.
     """
     m = kernel.shape[0]
+    # Layer 0: entry k is (row k, cell start[k]), before any move.
     rows, cells = np.arange(len(start), dtype=np.int64), start.astype(np.int64)
     layers = [Layer(rows, cells, sparse.eye_array(len(start), format="csr"))]
     for _ in range(length):
+        # [E, M], row e the moves out of the cell of entry e: one kernel row per entry, however many entries share a
+        # cell.
         step = kernel[cells]
         # The pair (row 2, cell 5) of a grid of 16 cells has the key 2 * 16 + 5 = 37; sorted keys are the new entries.
         keys, target = np.unique(rows[row_index(step)] * m + step.indices, return_inverse=True)
+        # The moves keep their order and row pointer; only the columns are renamed, from cells to entries of the new
+        # layer.
         moves = sparse.csr_array((step.data, target, step.indptr), shape=(len(rows), len(keys)))
         rows, cells = np.divmod(keys, m)
         layers.append(Layer(rows, cells, moves, None if task is None else within_window(task, rows, cells)))
@@ -98,6 +103,7 @@ def sensed_csr(task: Task, parts: Sequence[tuple[IndexArray, IndexArray]]) -> sp
 
 def policy_table(task: Task, layers: Sequence[Layer], sets: Sequence[BoolArray]) -> PolicyTable:
     """The policy whose `sets` are given on layers 1 ... t_max + 1."""
+    # Layer n + 1 is where the target may be when it is looked for after n misses: zip starts at layers[1].
     sensed = [(layer.rows[on], layer.cells[on]) for layer, on in zip(layers[1:], sets, strict=True)]
     return PolicyTable(task, sensed_csr(task, sensed))
 

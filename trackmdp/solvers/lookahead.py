@@ -39,6 +39,8 @@ def solve(world: World, *, depth: int = 2, tail: Tail = "clocked") -> PolicyTabl
     for n in range(world.num_choices):
         # the safe action ends every plan: n + ahead is at most t_max + 1
         ahead = min(depth, world.num_choices - n)
+        # table[:, n + ahead]: after `ahead` misses more the clock reads n + ahead, and the tail's value is that of this
+        # column.
         problem = InnerProblem(world, layers[n : n + ahead + 1], world.reward + table[:, 0], table[:, n + ahead])
         sets.append(_first_set(problem, layers, mass))
         mass = (mass @ layers[n + 1].moves) * ~sets[-1]

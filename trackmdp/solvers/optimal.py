@@ -64,7 +64,7 @@ def solve(
 
 @dataclass
 class _Ground:
-    """What the search stands on, built once it is needed: layers, and the system of all paths, I - P."""
+    """What every round uses, built only if there is a search: layers, the system I - P, the longest expected episode."""
 
     world: World
     layers: list[Layer] = field(init=False)
@@ -90,6 +90,7 @@ class _Run:
         self.world, self.tolerance, self.on_progress = world, tolerance, on_progress
         self.started = time.monotonic()
         self.ends = self.started + time_limit
+        # U(x, 0) >= V*(x) before anything is searched; `tighten` only lowers it.
         self.bound = clocked_table(world).value
         self.nodes = 0
         self.policy = clocked.solve(world)
@@ -134,6 +135,7 @@ class _Run:
         while not self.certified and time.monotonic() < self.ends:
             improved = self.round(patience)
             self.report()
+            # No better plan: the tree was searched to its end, or time is over.
             if not improved:
                 return
             patience *= 2

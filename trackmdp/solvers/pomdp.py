@@ -56,6 +56,7 @@ class FiniteMdp:
         pointer = np.concatenate([[0], np.cumsum([len(successors) for successors, _ in self.successors])])
         moves = sparse.csr_array((data, columns, pointer), shape=(len(self.state), states))
         reward, state = np.array(self.reward), np.array(self.state)
+        # Rows of states 0 0 0 1 1 2 give first = (0, 3, 5), the segments that reduceat takes the maximum over.
         first = np.flatnonzero(np.diff(state, prepend=-1))
         choice, value = first, accumulate(moves[first], reward[first])
         while True:
@@ -91,6 +92,7 @@ def _enumerate(world: World, most_beliefs: int) -> tuple[FiniteMdp, int]:
     problem = FiniteMdp()
     for i, (belief, n) in enumerate(beliefs):  # grows while it is gone through
         predicted = belief @ kernel
+        # After t_max + 1 misses the safe action is forced: one action, and every position is located.
         if n == world.num_choices:
             problem.add(i, (world.reward - world.safe_cost) * float(predicted.sum()), *_sparse(predicted))
             continue
@@ -131,4 +133,5 @@ def _sparse(vector: Array) -> tuple[list[int], list[float]]:
 
 
 def _key(belief: Array, n: int) -> tuple[int, bytes]:
+    # + 0.0 turns -0.0 into 0.0, whose bytes differ.
     return n, (belief.round(DIGITS) + 0.0).tobytes()

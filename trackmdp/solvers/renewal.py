@@ -1,7 +1,8 @@
-"""Linear systems over located cells: what is gathered until the target exits.
+"""Linear systems over located cells: expected totals of an episode, V = (I - T)^-1 b (theory: exact evaluation).
 
-A policy starts afresh each time the target is located (a renewal), so whatever it gathers over an episode solves
-``v = b + T v``, b what one renewal gathers and T where the target is located next.
+A policy starts afresh each time the target is located (a renewal). Any total over an episode (reward, steps,
+detections) therefore solves ``v = b + T v``: b is its expectation from one detection to the next, and T(x, j) the
+probability that a target located in x is located next in j.
 """
 
 from __future__ import annotations
@@ -24,10 +25,15 @@ IndexArray: TypeAlias = npt.NDArray[np.integer[Any]]
 DIRECT_CELLS = 20_000
 """Cells up to which systems are factorised. The factors of a grid fill about M^1.4 entries: 75 a cell at M = 16,384."""
 
+# Side of the square blocks of the coarse level, doubled while there would be more than _MOST_BLOCKS of them: the coarse
+# system is factorised, and has to stay small beside the fine one.
 _BLOCK = 8
 _MOST_BLOCKS = 4096
+# Residual aimed at, relative to the size of right-hand side and solution: some 50 units of rounding of float64.
 _TOLERANCE = 1e-14
 _MOST_PRODUCTS = 20_000
+# Where some cells have no way out, I - P is singular; if rounding lets the solve pass, lengths come out negative or
+# about 1 / 1e-16. No kernel that is meant to end comes near 1e12 steps.
 _LONGEST_EPISODE = 1e12
 _ENDLESS = (
     "kernel: from some cell the target never exits, so no value is finite: expected an exit reachable from each cell"
@@ -64,7 +70,10 @@ class RenewalSystem:
             return
         rows, columns = size
         self._blocks = _blocks(rows, columns)
+        # Galerkin: with B [M, blocks] the indicator of the blocks, B^T (I - T) B is the system seen by vectors that are
+        # constant on each block.
         self._coarse = _factorise(sparse.csr_array(self._blocks.T @ self._system @ self._blocks))
+        # [M, 1], to multiply all right-hand sides [M, K] at once; 0.8 is the usual damping of Jacobi as a smoother.
         self._damping = 0.8 / self._system.diagonal()[:, None]
 
     def solve(self, gathered: Array, guess: Array | None = None) -> Array:
@@ -77,9 +86,11 @@ class RenewalSystem:
         if self.exact:
             total: Array = self._factors.solve(wanted)
         else:
+            # [M] becomes [M, 1]: the iteration treats all right-hand sides as columns.
             columns = wanted.reshape(len(wanted), -1)
             start = np.zeros_like(columns) if guess is None else guess.reshape(columns.shape)
             total = self._iterate(columns, start).reshape(wanted.shape)
+        # A singular system may be factorised all the same, and then gives inf or nan in place of an error.
         if not np.isfinite(total).all():
             raise UserError(_ENDLESS)
         return total
@@ -115,6 +126,7 @@ class RenewalSystem:
 
     def _bicgstab(self, solution: Array, residual: Array, target: Array) -> tuple[Array, int]:
         """Van der Vorst's method, right-preconditioned, on all columns at once, each with scalars of its own."""
+        # The names of van der Vorst (1992): shadow r^, direction p, image A M^-1 p, half s, moved t = A M^-1 s.
         shadow, products = residual, 0
         direction = image = np.zeros_like(residual)
         rho = alpha = omega = np.ones(residual.shape[1])
@@ -158,6 +170,7 @@ def expected_steps(world: World) -> Array:
     Raises:
         UserError: from some cell the target never exits.
     """
+    # L = 1 + P L: every step counts once, whatever is sensed, so that P stands in place of T.
     steps = accumulate(world.kernel, np.ones(world.num_cells), world.size)
     check_length(steps)
     return steps
@@ -176,6 +189,7 @@ def per_row(rows: IndexArray, values: Array, count: int) -> Array:
 
 def row_index(matrix: sparse.csr_array) -> IndexArray:
     """`[nnz]` the row of each stored entry."""
+    # indptr = (0, 2, 2, 5) has rows of 2, 0 and 3 entries: 0 0 2 2 2.
     return np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
 
 
@@ -201,6 +215,7 @@ def _blocks(rows: int, columns: int) -> sparse.csr_array:
     side = _BLOCK
     while -(-rows // side) * -(-columns // side) > _MOST_BLOCKS:
         side *= 2
+    # -(-a // b) is a / b rounded up: the last blocks of a row or column may be cut off by the border.
     row, column = np.divmod(np.arange(rows * columns), columns)
     block = row // side * -(-columns // side) + column // side
     return sparse.csr_array((np.ones(len(block)), (np.arange(len(block)), block)))

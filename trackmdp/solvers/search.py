@@ -1,10 +1,11 @@
 """Forward-and-backward search (Brown 1980, Washburn 1983) for plans of sets, led by a homotopy from the clocked bound.
 
-With the value V of being located fixed, the sets after each located cell are an optimal search for a moving target:
-given the sets before, the undetected mass m_t; given the sets after, the value W_t(j) of the target going on undetected
-from j; then the best set of step t is {j : m_t(j) (r + V(j) - W_t(j)) > c_j sum(m_t)}. No single step can improve
-what the ascent ends at, but sets may have to change together. Starting from the optimistic credit of the clocked
-bound, r + U(j, 0) - U(j, n + 1), and going over to the exact one by and by finds most of those joint optima.
+With the value V of being located fixed, choosing the sets after each located cell is an optimal search for a moving
+target. The sets before step t give the undetected mass m_t; the sets after it give W_t(j), the value of going on with
+the target in j, undetected; and the best set of step t is {j : m_t(j) (r + V(j) - W_t(j)) > c_j sum(m_t)}. The ascent
+ends where no change of one step's set gains, but sets may have to change together: to leave a cell out pays only if it
+is looked at next. Starting from the optimistic credit of the clocked bound, r + U(j, 0) - U(j, n + 1), and moving
+gradually to the exact one finds most of those joint optima (theory: continuation).
 """
 
 from __future__ import annotations
@@ -93,8 +94,11 @@ class InnerProblem:
         for _ in range(sweeps):
             later, now, chosen = self.undetected(sets), mass, []
             for t, layer in enumerate(self.layers[1:]):
+                # Row vectors: `now` [E_before] is undetected mass per entry, and `moves` [E_before, E] carries it one
+                # step on.
                 now = now @ layer.moves
                 inside = per_row(layer.rows, now, self.world.num_cells)
+                # later[0] belongs to layer 0, so what follows a miss at step t is later[t + 1].
                 gain = self.detected[layer.cells] - later[t + 1]
                 if credit is not None:
                     gain = optimism * credit[t][layer.cells] + (1.0 - optimism) * gain
@@ -122,6 +126,7 @@ def solve(world: World, *, steps: int = 30, sweeps: int = 3) -> PolicyTable:
     layers = reachable_layers(world, world.num_choices)
     first = layer_sets(layers, clocked.solve(world))
     sets = follow_credit(world, layers, first, steps, sweeps)
+    # The homotopy follows a credit that changes, so that it may end below the clocked policy it began with.
     found, simple = (located_value(world, layers, each) for each in (sets, first))
     return policy_table(world, layers, sets if found.sum() >= simple.sum() else first)
 
@@ -133,9 +138,11 @@ def follow_credit(
     table = clocked_table(world).table
     # sensing j at n misses gains r + U(j, 0) where leaving it would go on with U(j, n + 1)
     credit = list((world.reward + table[:, :1] - table[:, 1:]).T)
+    # The renewals all start with mass 1 in the located cell: layer 0 is the identity, one entry per cell.
     value, located = table[:, 0], np.ones(world.num_cells)
     for step in range(steps + 1):
         problem = InnerProblem.of(world, layers, value)
+        # Value and credit change together: V starts as U(., 0), and is the policy's own from the first step on.
         sets = problem.ascend(sets, located, sweeps=sweeps, optimism=1.0 - step / steps, credit=credit)
         # each step of the homotopy moves few sets, so that the value before is a good guess
         value = located_value(world, layers, sets, value)
@@ -153,6 +160,7 @@ def improve(
         if all((new == old).all() for new, old in zip(candidate, sets, strict=True)):
             return sets
         better = located_value(world, layers, candidate, value)
+        # Sums over all cells: V is compared from a uniform start, as AIHTR does; the margin is rounding.
         if better.sum() <= value.sum() + 1e-12 * np.abs(value).sum():
             return sets
         sets, value = candidate, better
@@ -165,8 +173,10 @@ def located_value(world: World, layers: list[Layer], sets: list[BoolArray], gues
     for layer, on in zip(layers[1:], sets, strict=True):
         now = mass @ layer.moves
         inside = per_row(layer.rows, now, m)
+        # c(A_t(x)); paid as long as the target is undetected and in the grid, so times the mass `inside`.
         paid = per_row(layer.rows[on], world.cost[layer.cells[on]], m)
         earned += world.reward * per_row(layer.rows[on], now[on], m) - paid * inside
+        # The entries of T(x, j): mass located in j after a plan made in x.
         hits.append((now[on], layer.rows[on], layer.cells[on]))
         mass = now * ~on
     # what is left after the last set moves once more and is located by the safe action
