@@ -64,7 +64,7 @@ def solve(
 
 @dataclass
 class _Ground:
-    """What every round uses, built only if there is a search: layers, the system I - P, the longest expected episode."""
+    """What every round uses, built once there is a search: layers, the system I - P, the longest expected episode."""
 
     world: World
     layers: list[Layer] = field(init=False)
