@@ -76,9 +76,11 @@ def __getattr__(name: str) -> Any:
     """Import a public name (PEP 562); Python calls this only for names that are not there yet."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    # Kept among the module's globals: the next access is an ordinary look-up that does not come here.
     found = globals()[name] = getattr(importlib.import_module(_HOMES[name]), name)
     return found
 
 
 def __dir__() -> list[str]:
+    # Without this, completion would offer only the names that have been used already.
     return sorted({*globals(), *__all__})

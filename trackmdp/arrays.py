@@ -45,6 +45,9 @@ def load_npy(stream: Any, size: int) -> npt.NDArray[Any]:
         ValueError: they are something else, hold Python objects, or are more or fewer than their header claims.
         Exception: whatever NumPy raises over a header; call it inside `untrusted.decoded`.
     """
+    # An .npy file: 6 bytes magic (\x93NUMPY), 2 of version, 2 (version 1.0) or 4 (2.0) with the header's length, the
+    # header as the text of a Python dict such as {'descr': '<f8', 'fortran_order': False, 'shape': (3, 4)}, then the
+    # numbers. Version 3.0 differs in allowing any UTF-8 in field names, which arrays without fields do not have.
     version = np.lib.format.read_magic(stream)
     if version not in ((1, 0), (2, 0)):
         raise ValueError("an .npy file of another version than 1.0 and 2.0")
@@ -52,22 +55,27 @@ def load_npy(stream: Any, size: int) -> npt.NDArray[Any]:
     length = int.from_bytes(stream.read(2 if version == (1, 0) else 4), "little")
     if length > _HEADER:
         raise ValueError(f"a header of {length:,} bytes")
+    # Handed to NumPy as version 1.0, whose length has 2 bytes: the header has just been found to be short enough.
     head = io.BytesIO(length.to_bytes(2, "little") + stream.read(length))
     shape, fortran, dtype = np.lib.format.read_array_header_1_0(head, max_header_size=_HEADER)
+    # Objects would be unpickled, which runs code; V is structured or raw, which no file of ours is.
     if dtype.hasobject or dtype.kind == "V":
         raise ValueError(f"an array of {dtype}")
     if any(length < 0 for length in shape):
         raise ValueError(f"a shape of {shape}")
+    # Python's integers do not overflow: a shape of (2**40, 2**40) cannot wrap around to a small product.
     claimed, left = math.prod(shape) * dtype.itemsize, size - stream.tell()
     if claimed != left:
         raise ValueError(f"its header claims {claimed:,} bytes of numbers, there are {left:,}")
     content = bytearray()
     while piece := stream.read(2**20):  # to the very end, where zipfile compares the checksum
+        # Piece by piece: a zip member may unfold to more than its entry says, and is given up as soon as it does.
         content += piece
         if len(content) > claimed:
             raise ValueError("more bytes than its header claims")
     if len(content) != claimed:
         raise ValueError("fewer bytes than its header claims")
+    # frombuffer refuses an empty buffer.
     flat = np.frombuffer(content, dtype) if content else np.zeros(0, dtype)
     return flat.reshape(shape, order="F" if fortran else "C")
 
@@ -85,10 +93,12 @@ def load_npz(stream: BinaryIO, names: Iterable[str] | None = None) -> dict[str, 
         members = archive.infolist()
         if len(members) > _MEMBERS:
             raise ValueError(f"{len(members):,} arrays")
+        # The sizes that the archive's directory claims; that each member keeps to its own is seen to while it is read.
         unfolded = sum(member.file_size for member in members)
         if unfolded > min(LARGE, max(_FREE, _RATIO * packed)):
             raise ValueError(f"{packed:,} bytes that unfold to {unfolded:,}")
         for member in members:
+            # Bit 0 of the flags: encrypted. NumPy writes stored and deflated members only.
             if member.compress_type not in _METHODS or member.flag_bits & 1:
                 raise ValueError(f"{member.filename!r} is encrypted, or neither stored nor deflated")
         known = {member.filename.removesuffix(".npy"): member for member in members}

@@ -50,12 +50,16 @@ def whole_file(file: Path) -> Iterator[BinaryIO]:
 
     Where `file` is a symbolic link, the link is replaced, and what it leads to stays as it is.
     """
+    # In the same folder, since a rename is atomic within one file system only.
     part = file.with_name(f"{file.name}.part")
     try:
         with create(part) as stream:
             yield stream
             sync(stream, part)
+        # After the sync: a rename may reach the disk before the bytes do, and a power failure would leave an empty
+        # file under the final name.
         part.replace(file)
+    # Ctrl-C as well, which is no Exception.
     except BaseException:
         part.unlink(missing_ok=True)
         raise
@@ -64,6 +68,8 @@ def whole_file(file: Path) -> Iterator[BinaryIO]:
 def create(file: Path) -> BinaryIO:
     """A new file, open for writing; whatever had its name, a link included, is removed first, not followed."""
     file.unlink(missing_ok=True)
+    # O_EXCL: if somebody puts a link under this name after the unlink, the call fails instead of writing where it
+    # leads.
     return os.fdopen(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666), "wb")
 
 
@@ -74,11 +80,13 @@ def reopen(file: Path, mode: str) -> int:
         UserError: it is a symbolic link, which may lead out of the folder, or no ordinary file.
     """
     try:
+        # No O_TRUNC: a device or a file that is not ours must be recognised before anything of it is lost.
         descriptor = os.open(file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
     except OSError as error:
         if error.errno in (errno.ELOOP, errno.EISDIR, errno.ENXIO):
             raise UserError(f"{file}: a link, a folder or a device, expected an ordinary file") from None
         raise
+    # Asked of the descriptor: the name may stand for another file by the time a second call looks at it.
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
         raise UserError(f"{file}: a pipe or a device, expected an ordinary file")
@@ -108,6 +116,8 @@ def second_name(file: Path, name: Path) -> None:
     part = name.with_suffix(".part")
     part.unlink(missing_ok=True)
     try:
+        # os.link cannot replace a name, a rename can: link to a third name, then rename it over the old one. In this
+        # order there is a whole `name` at every moment.
         os.link(file, part)
     except OSError as error:
         if error.errno not in _NO_LINKS:
@@ -128,6 +138,7 @@ def sync(stream: BinaryIO, file: Path) -> None:
 
 def sync_folder(folder: Path) -> None:
     """Make renames in `folder` survive a power failure."""
+    # A rename changes the folder, not the file: syncing the file alone does not keep its new name.
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         _fsync(descriptor, folder)
@@ -177,6 +188,7 @@ def _finite(content: Any) -> Any:
         return {str(key): _finite(value) for key, value in content.items()}
     if isinstance(content, (list, tuple)):
         return [_finite(value) for value in content]
+    # json.dumps writes NaN and Infinity, which are no JSON: a browser's JSON.parse refuses the whole file.
     if isinstance(content, float) and not math.isfinite(content):
         return None
     return content

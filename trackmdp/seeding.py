@@ -19,6 +19,8 @@ __all__ = ["derive", "generator", "seed_global", "preserved_global_rng"]
 
 def derive(seed: int, *names: str | int) -> int:
     """A 63-bit seed for the stream called `names`, for example ``derive(0, "world", 3)``."""
+    # Hashed, so that neighbouring seeds and names give unrelated streams: with seed + worker, worker 1 of run 0 and
+    # worker 0 of run 1 would draw the same numbers. `>> 1` leaves 63 bits, which fit a signed 64-bit integer.
     text = "/".join([str(int(seed)), *map(str, names)])
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 1
 
@@ -42,6 +44,7 @@ def preserved_global_rng() -> Iterator[None]:
     """Leave torch's global generators as they were, whatever is drawn inside."""
     import torch
 
+    # Named, since fork_rng by default warns where there are several GPUs.
     devices = list(range(torch.cuda.device_count())) if torch.cuda.is_available() else []
     with torch.random.fork_rng(devices=devices):
         yield

@@ -49,11 +49,14 @@ def mean_over_groups(groups: Sequence[Sequence[float]]) -> MeanInterval:
     mean = float(np.mean([group.mean() for group in filled]))
     if min(map(len, filled)) < FEWEST:
         return MeanInterval(mean, None, None, count)
+    # The mean of G group means has the variance Σ_g v_g with v_g = s_g² / (n_g G²), s_g² the variance within group g.
     parts = np.array([group.var(ddof=1) / len(group) for group in filled]) / len(filled) ** 2
     variance = parts.sum()
     # values that are equal differ by rounding once they have been summed
     if variance <= (1e-12 * max(1.0, abs(mean))) ** 2:
         return MeanInterval(mean, None, None, count)
+    # Welch-Satterthwaite: ν = (Σ v_g)² / Σ (v_g² / (n_g - 1)). For G = 1 that is n - 1; for G equal groups of n it is
+    # G (n - 1).
     freedom = variance**2 / (parts**2 / [len(group) - 1 for group in filled]).sum()
     margin = _student(freedom) * math.sqrt(variance)
     return MeanInterval(mean, mean - margin, mean + margin, count)
@@ -64,6 +67,7 @@ def iqm(groups: Sequence[Sequence[float]]) -> float:
 
     A quarter of the values, rounded down, is left out at each end of a group.
     """
+    # Of 10 values 10 // 4 = 2 are left out at each end, of 3 none.
     trimmed = [np.sort(group)[len(group) // 4 : len(group) - len(group) // 4].mean() for group in groups if len(group)]
     return float(np.mean(trimmed or [math.nan]))
 
@@ -71,7 +75,7 @@ def iqm(groups: Sequence[Sequence[float]]) -> float:
 def share(part: int, whole: int) -> MeanInterval:
     """`part` of `whole` trials with the interval of Clopper and Pearson (1934), which covers at every n.
 
-    None of n seen still allows for about 3/n: the interval ends there, not at 0. Trials of unlike chances, as runs
+    None of n seen still allows for about 3.7/n: the interval ends there, not at 0. Trials of unlike chances, as runs
     in several worlds are, spread less than the binomial law says (Hoeffding 1956), so it holds for them as well.
     """
     if not whole:
@@ -80,6 +84,9 @@ def share(part: int, whole: int) -> MeanInterval:
         return MeanInterval(part / whole, None, None, whole)
     from scipy.special import betaincinv  # a quarter of a second to load
 
+    # The limits solve P(X >= k | low) = α/2 and P(X <= k | high) = α/2 for X ~ Binomial(n, p). By the identity of
+    # binomial tails and the incomplete beta function, low is the α/2 quantile of Beta(k, n - k + 1) and high the 1 -
+    # α/2 quantile of Beta(k + 1, n - k). At k = 0: high = 1 - (α/2)^(1/n), about -ln(0.025)/n = 3.7/n.
     tail = (1 - LEVEL) / 2
     low = float(betaincinv(part, whole - part + 1, tail)) if part else 0.0
     high = float(betaincinv(part + 1, whole - part, 1 - tail)) if part < whole else 1.0
@@ -107,6 +114,8 @@ def ratio(part: Values, whole: Values, *, events: bool = False) -> MeanInterval:
     low, high = _bootstrap_t(part, whole, mean)
     if events:
         having = part > 1e-9  # more than rounding
+        # Example: 40 tracks, none with a safe action. The bootstrap resamples zeros and would end at 0; the share of
+        # tracks that have one may be up to 8.8 %, each with one event (`size`), over `total` steps.
         known = share(int(having.sum()), count)
         size = float(part[having].mean()) if having.any() else 1.0
         low = min(low, (known.low or 0.0) * size * count / total)
@@ -119,19 +128,25 @@ def _bootstrap_t(part: Values, whole: Values, mean: float) -> tuple[float, float
     """The ends mean - t e, t the quantiles of (resampled - mean) / (its own error)."""
     count = len(part)
     rest = part - mean * whole
+    # Delta method: part/whole - mean ≈ mean(part - mean·whole) / mean(whole), a mean over n units.
     error = float(rest.std(ddof=1) / (whole.mean() * math.sqrt(count)))
     if count > LARGE or not error:
         margin = _student(count - 1) * error
         return mean - margin, mean + margin
     rng = np.random.default_rng(derive(0, "bootstrap"))
+    # `[resamples, n]`: how often each unit is in each resample, so that all resampled sums are one matrix product. The
+    # generator is seeded with a constant: the same figures give the same interval in every report.
     weights = rng.multinomial(count, np.full(count, 1 / count), size=RESAMPLES).astype(np.float64)
     base = weights @ whole
+    # A resample may hold units of `whole` = 0 only: its ratio is nan, and it is left out below.
     with np.errstate(divide="ignore", invalid="ignore"):
         ratios = (weights @ part) / base
         # Σ w (part - r whole)² from the three sums of squares, so that no [resamples, n] array is made again
         squares = weights @ part**2 - 2 * ratios * (weights @ (part * whole)) + ratios**2 * (weights @ whole**2)
         statistic = (ratios - mean) / (np.sqrt(np.maximum(squares, 0.0) * count / (count - 1)) / base)
     low, high = np.quantile(statistic[np.isfinite(statistic)], [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    # The quantiles change sides: t = (estimate - truth) / error is at most `high` exactly where truth is at least
+    # estimate - high·error.
     return float(mean - high * error), float(mean - low * error)
 
 

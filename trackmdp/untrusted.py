@@ -72,6 +72,7 @@ def opened(file: Path, *, most: int, source: str = "", links: bool = False) -> B
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise UserError(f"{source}: {reason(error)}") from None
     try:
+        # Of the open descriptor, not of the name, which may be exchanged between a check and the opening.
         found = os.fstat(descriptor)
         if not stat.S_ISREG(found.st_mode):
             kind = _KINDS.get(stat.S_IFMT(found.st_mode), "something else")
@@ -186,6 +187,9 @@ def _refused(word: str) -> Any:
 
 
 _TIMED = re.compile("second|time|per_s$")
+# \x0b-\x1f has the carriage return, by which a name could overwrite the line it stands in, and escape; \x7f-\x9f the
+# C1 controls; \u200e... and \u2066... turn the direction of text; surrogates cannot be encoded, so that printing them
+# raises.
 _UNPRINTABLE = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
@@ -219,6 +223,7 @@ def unsealed(content: Mapping[str, Any], source: str) -> dict[str, Any]:
 
 
 def _digest(content: Mapping[str, Any]) -> str:
+    # Sorted keys: the digest must not depend on the order in which a dict was filled.
     return hashlib.sha256(json.dumps(_timeless(content), sort_keys=True).encode()).hexdigest()
 
 

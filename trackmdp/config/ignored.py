@@ -32,6 +32,7 @@ def refuse_ignored(cfg: Any, typed: Mapping[str, Any], choices: Mapping[str, Any
         for name, why in node.ignored(cfg).items():
             key = f"{place}.{name}".lstrip(".")
             for given in typed:
+                # `explore` without effect covers `algo.explore.start`, but not `algo.explored`.
                 if given == key or given.startswith(f"{key}."):
                     raise UserError(f"{given}={typed[given]}: without effect {why}")
 

@@ -45,6 +45,8 @@ def unknown_option(key: str, known: Mapping[str, Option]) -> UserError:
     """The refusal of a dotted key that does not exist, naming those that stand beside it."""
     parent = key.rpartition(".")[0]
     beside = [name for name in known if name.startswith(f"{parent}.")] if parent else []
+    # For `algo.epoch` the options of the algorithm; for a misspelt group (`alg.epochs`) the first parts of all keys,
+    # each once and in their order, which a set would not keep.
     names = beside or list(dict.fromkeys(name.split(".")[0] for name in known))
     return UserError(f"{key}: unknown option{suggestion(key, known, names)}")
 

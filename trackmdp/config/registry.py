@@ -40,6 +40,7 @@ def maker(node: ChoiceConfig | type[ChoiceConfig]) -> Callable[..., Any]:
     module, _, attribute = node.makes.partition(":")
     try:
         found: Any = importlib.import_module(module)
+        # The attribute may be a method: `trackmdp.policies.policy:Policy.random_k`.
         for name in attribute.split("."):
             found = getattr(found, name)
     except (ImportError, AttributeError) as error:
@@ -67,6 +68,7 @@ def load_plugins() -> tuple[Path, ...]:
     folders = []
     # `name` sorts them: the order of installation must not decide anything.
     for entry in sorted(importlib.metadata.entry_points(group=ENTRY_POINTS), key=lambda each: each.name):
+        # Importing the plugin registers its choices: what is in GROUPS afterwards and was not before is what it adds.
         known = {(group, name) for group, members in GROUPS.items() for name in members}
         try:
             module = entry.load()
@@ -79,6 +81,8 @@ def load_plugins() -> tuple[Path, ...]:
         folder = Path(module.__file__).parent / "conf"
         folders.append(folder)
         for group, name in {(group, name) for group, members in GROUPS.items() for name in members} - known:
+            # Told now, and with the plugin's name: Hydra would tell it when the choice is typed, as a file of ours
+            # that is missing.
             if not (folder / group / f"{name}.yaml").is_file():
                 raise UserError(
                     f"plugin {entry.name}: no {folder / group / name}.yaml with the values of {group}={name}"
@@ -98,6 +102,8 @@ def conf_dir() -> str:
         UserError: none of them holds a `train.yaml`.
     """
     package, chosen = Path(__file__).resolve().parents[1], os.environ.get("TRACKMDP_CONF")
+    # An installed package lies in site-packages, where a folder `conf` may be anybody's; a clone has a pyproject.toml
+    # beside it.
     clone = package.parent / "conf" if (package.parent / "pyproject.toml").is_file() else None
     for folder in [Path(chosen)] if chosen else [clone, package / "conf"]:
         if folder is not None and (folder / "train.yaml").is_file():
@@ -112,6 +118,7 @@ def conf_file(name: str) -> Path:
     Raises:
         UserError: there is none.
     """
+    # Our own folder first: a plugin adds choices, it does not replace the values of ours.
     for folder in (Path(conf_dir()), *load_plugins()):
         if (file := folder / f"{name}.yaml").is_file():
             return file

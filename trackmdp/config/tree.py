@@ -40,8 +40,11 @@ def from_hydra(cfg: DictConfig, root: type[C], folder: Path) -> C:
         UserError: an unknown key (even one added with `+`), a missing value, a wrong type, or a broken rule.
     """
     try:
+        # Sorted, since missing_keys is a set: the same mistake must always give the same message.
         for key in sorted(OmegaConf.missing_keys(cfg)):
             raise UserError(f"{key}: missing, expected {_expected(cfg, root, key)}")
+        # to_object makes the dataclasses; a key added with `+sead=3` is accepted by OmegaConf and becomes an attribute
+        # of them, which is why the next line walks over all attributes.
         typed = OmegaConf.to_object(cfg)
         refuse_unknown(typed, root)
     except OmegaConfBaseException as error:
@@ -55,6 +58,7 @@ def from_hydra(cfg: DictConfig, root: type[C], folder: Path) -> C:
 def refuse_unknown(cfg: Any, schema: type[Any], prefix: str = "") -> None:
     """Raise a `UserError` for a key the schema does not have, naming the known ones."""
     known = options(schema)
+    # vars, not fields: what does not belong to the schema is in the former alone.
     for name, value in vars(cfg).items():
         if name not in known:
             raise UserError(f"{prefix}{name}: unknown key{suggestion(name, known)}")
@@ -64,6 +68,8 @@ def refuse_unknown(cfg: Any, schema: type[Any], prefix: str = "") -> None:
 
 def to_dict(cfg: Any) -> dict[str, Any]:
     """A plain copy of the config; the option chosen from a group stands under `name`."""
+    # A choice's name is an attribute of its class, no field: without it a saved `kernel: {...}` could not be told from
+    # another choice with the same options.
     plain: dict[str, Any] = {"name": cfg.name} if hasattr(type(cfg), "name") else {}
     for key in options(type(cfg)):
         value = vars(cfg)[key]
@@ -84,6 +90,7 @@ def load_config(file: Path, root: type[C]) -> C:
     """
     if not file.exists():
         raise UserError(f"{file}: no such file")
+    # Not resolved: every value of a saved config is plain, and `${oc.env:NAME}` in a foreign one must stay a text.
     plain = OmegaConf.to_container(parse_yaml(read_text(file, most=MAX_BYTES), str(file)))
     if not isinstance(plain, Mapping):
         raise UserError(f"{file}: not a config (expected a mapping)")
@@ -105,6 +112,7 @@ def world_of(text: str) -> WorldConfig:
     if not isinstance(plain, Mapping):
         raise UserError("config.yaml: not a config (expected a mapping)")
     known = options(WorldConfig)
+    # The other keys belong to the command, and each command has its own.
     typed: WorldConfig = build_config({key: value for key, value in plain.items() if key in known}, WorldConfig)
     validate(typed)
     return typed
@@ -151,6 +159,8 @@ def build_config(plain: Mapping[Any, Any], schema: type[Any], prefix: str = "", 
             if not isinstance(value, Mapping):
                 raise UserError(f"{prefix}{key}={value}: expected a mapping")
             values[key] = build_config(value, described, f"{prefix}{key}.", key)
+        # `reward: 10` in a file is an int to YAML; `type` leaves True alone, which is an int as well, for `validate`
+        # to refuse.
         elif isinstance(described, Option) and described.kind is float and type(value) is int:
             values[key] = float(value)
     return schema(**values)
@@ -161,6 +171,7 @@ def _expected(cfg: DictConfig, schema: type[Any], key: str) -> str:
     *parents, last = key.split(".")
     for name in parents:
         cfg = cfg[name]
+        # The type of a choice is known to the node alone: the field says only `KernelConfig`.
         schema = OmegaConf.get_type(cfg) or schema
     described = options(schema)[last]
     return described.expected if isinstance(described, Option) else f"{key}=NAME"

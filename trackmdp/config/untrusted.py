@@ -31,6 +31,7 @@ def parse_yaml(text: str, source: str) -> DictConfig | ListConfig:
         if not isinstance(yaml.safe_load(text), (dict, list, type(None))):  # OmegaConf asserts it
             raise ValueError("expected a mapping")
         config: Any = OmegaConf.create(text)
+        # Not resolved: `${oc.env:NAME}` would copy a variable of the reader's environment into the config.
         plain = OmegaConf.to_container(config, resolve=False)
     except (yaml.YAMLError, OmegaConfBaseException, ValueError, RecursionError, AttributeError, TypeError) as error:
         said = " ".join(str(error).split()) or type(error).__name__
@@ -48,6 +49,7 @@ def names_code(plain: Any, prefix: str = "") -> str:
     if not isinstance(plain, dict):
         return ""
     for key, value in plain.items():
+        # `_target_: os.system` is what hydra.utils.instantiate calls, `(): ...` what logging.config.dictConfig calls.
         if key in _CODE:
             return f"{prefix}{key}"
         if found := names_code(value, f"{prefix}{key}."):
@@ -69,8 +71,11 @@ def _check_size(text: str) -> None:
     count = 0
     for event in yaml.parse(text, Loader=yaml.SafeLoader):
         if isinstance(event, yaml.AliasEvent):
+            # An anchor is in `sizes` once its collection is closed: an alias within it would unfold for ever.
             if event.anchor not in sizes:
                 raise ValueError(f"alias *{event.anchor} stands inside its own anchor, or before it")
+            # Example: `a: &x [1, 2]` closes with sizes[x] = 3 (the list and its two items); `b: [*x, *x]` then counts
+            # 1 + 3 + 3.
             count += sizes[event.anchor]
         elif isinstance(event, yaml.CollectionStartEvent):
             opened.append((event.anchor, count))

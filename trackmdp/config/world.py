@@ -199,6 +199,8 @@ class PaperCostConfig(CostConfig):
             if Path(price).suffix not in (".npy", ".csv"):
                 raise refuse(f"{key}.sensor", price, expected)
             return
+        # `sensor` is declared Any, since OmegaConf has no union of number, list and text; so its values are checked
+        # here.
         number = Option("", ge=0, kind=float)
         if not isinstance(price, list):
             if price is None or not number.allows(price):
