@@ -1,7 +1,8 @@
 """Losses of an actor that has one logit z per sensor, all four from the same gains of sensing.
 
-Each pushes z up exactly where sensing pays, G⁺ - G⁻ > c, and z > 0 is on. They differ in how far a gain reaches: what
-the policy-gradient forms learn is scaled by σ(z)(1-σ(z)), what the two others learn is not.
+z > 0 means on, and each loss has its optimum at z > 0 exactly where sensing pays, G⁺ - G⁻ > c. They differ in their
+gradients: those of the policy-gradient forms carry the factor σ(z)(1-σ(z)), which vanishes at saturated logits; the
+two others do not.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ from trackmdp.config.learning import ScheduleConfig
 
 __all__ = ["ActorLoss", "Decision", "PolicyGradient", "Poisson", "SensorCredit", "Surrogate", "decision_loss"]
 
+# σ(20) differs from 1 by 2e-9: no probability is told from certainty beyond. e^6 = 403: gains up to 403 times the cost
+# are told apart. |z| = 4 is a probability of 1.8 or 98.2 %.
 _LARGEST_LOGIT = 20.0
 _LARGEST_LOG_RATIO = 6.0
 _SOFT_LIMIT = 4.0
@@ -45,6 +48,8 @@ class SensorCredit:
     @cached_property
     def _sums(self) -> Tensor:
         size = self.price.numel()
+        # One scatter for both signs: with 32 entries, a gain of -.5 at entry 30 adds .5 to place 30 + 32 = 62, the
+        # second half.
         negative = self.entry + size * (self.gain < 0)
         return scatter_add(self.gain.abs(), negative, 2 * size).view(2, *self.price.shape)
 
@@ -74,13 +79,17 @@ class SensorCredit:
             generator: draws the sets.
         """
         size, shape = on.numel(), on.shape
+        # A gain of 0 is a path that did not get to this clock, or moved out of view: no sensor earns anything there.
         moved = self.gain != 0
         drawn = torch.rand(self.gain.shape, generator=generator, device=on.device) < gather(on, self.entry)
         moves, gains = scatter_add(moved.float(), self.entry, size), scatter_add(self.gain, self.entry, size)
         moves_on = scatter_add((moved & drawn).float(), self.entry, size).view(shape)
         gains_on = scatter_add(self.gain * drawn, self.entry, size).view(shape)
         arrivals = self.arrivals.unsqueeze(-1)
+        # On the other paths at this row the sensor's draw matters only through how many came up on: a binomial number,
+        # one draw for the sensor in place of one per path.
         paths_on = moves_on + torch.binomial(arrivals - moves.view(shape), on, generator=generator)
+        # `price` is over all arrivals; per path it is c.
         unit = self.price / arrivals.clamp(min=1)
         return gains_on - unit * paths_on, gains.view(shape) - gains_on - unit * (arrivals - paths_on)
 
@@ -134,6 +143,7 @@ class PolicyGradient(ActorLoss):
 
     def objective(self, logits: Tensor, credit: SensorCredit) -> Tensor:
         """What the policy gains, to be maximised."""
+        # The expected value of a set is Σ_j σ(z_j) Δ_j: gains add over sensors, and no set need be drawn.
         return logits.sigmoid() * credit.advantage
 
 
@@ -172,16 +182,21 @@ class Surrogate(PolicyGradient):
         old = self.old[credit.rows]
         if self._renew:
             old.copy_(logits.detach())
+        # Sensor on is worth Δ, off 0, on average pΔ: advantages (1 - p) Δ and -pΔ, each weighted by the paths that have
+        # it.
         p = old.sigmoid()
         if self._generator is None:
             on, off = p * credit.advantage, (1 - p) * credit.advantage
         else:
             on, off = credit.sampled(p, self._generator)
+        # Ratios as differences of logarithms: σ(z) / σ(z_old) would be 0 / 0 at very negative logits.
         up = (logsigmoid(logits) - logsigmoid(old)).exp()
         down = (logsigmoid(-logits) - logsigmoid(-old)).exp()
         return self._clipped(up, (1 - p) * on) + self._clipped(down, -p * off)
 
     def _clipped(self, ratio: Tensor, advantage: Tensor) -> Tensor:
+        # The lesser of the two: no reward for leaving the clip range, no protection for having left it the wrong way
+        # (Schulman et al. 2017, eq. 7).
         near = ratio.clamp(1 - self._epsilon, 1 + self._epsilon)
         return torch.minimum(ratio * advantage, near * advantage)
 
@@ -196,6 +211,7 @@ class Poisson(ActorLoss):
     def forward(self, logits: Tensor, credit: SensorCredit) -> Tensor:
         """C e^z - (G⁺ - G⁻) z, z no larger than what any gain comes to."""
         z = logits.clamp(-_LARGEST_LOGIT, _LARGEST_LOG_RATIO)
+        # Derivative in z: c e^z - (G⁺ - G⁻), zero at e^z = (G⁺ - G⁻) / c, which is above 1 exactly where sensing pays.
         return credit.price * z.exp() - (credit.plus - credit.minus) * z
 
 
@@ -213,4 +229,6 @@ def decision_loss(logits: Tensor, plus: Tensor, minus: Tensor, price: Tensor) ->
     """
     # Beyond the clamp nothing is left to learn, and without it logits run off to where floats lose precision.
     logits = logits.clamp(-_LARGEST_LOGIT, _LARGEST_LOGIT)
+    # softplus(-z) = softplus(z) - z, so one softplus does for both terms. Derivative: (c + G⁻) σ(z) - G⁺ (1 - σ(z)),
+    # zero at e^z = G⁺ / (c + G⁻).
     return (price + minus + plus) * softplus(logits) - plus * logits

@@ -59,6 +59,7 @@ class Averages:
         Raises:
             FloatingPointError: one is not finite; the learner is lost, and what it has written since is no good.
         """
+        # One `item` per diagnostic and iteration: each waits for the device.
         means = {name: torch.stack(values).mean().item() for name, values in self._values.items()}
         for name, value in means.items():
             if not math.isfinite(value):
@@ -80,6 +81,7 @@ def clipped_step(
     Raises:
         FloatingPointError: the loss is not finite; the parameters are left as they were.
     """
+    # Before `backward`: a nan in Adam's moments would stay there for good.
     if not torch.isfinite(loss):
         raise FloatingPointError(f"the loss is {loss.item()}")
     optimizer.zero_grad(set_to_none=True)

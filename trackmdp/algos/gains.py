@@ -29,6 +29,7 @@ def sensing_gain(
         discount: γ of the credit.
         blend: λ.
     """
+    # lerp(a, b, λ) = a + λ (b - a).
     advantage = clocked if own is None else torch.lerp(clocked, own, blend)
     return reward + discount * advantage
 
@@ -39,6 +40,7 @@ def clocked_advantage(clocked: Tensor) -> Tensor:
     Args:
         clocked: `[M, T+2]`, U(y,n), the value when the position is revealed after every action but the clock runs on.
     """
+    # Column 0 is U(y, 0), column n + 1 is the clock after one more miss: [M, T + 1], transposed.
     return (clocked[:, :1] - clocked[:, 1:]).T.contiguous()
 
 
@@ -63,6 +65,8 @@ def chain_returns(
         `[T+2, B]`.
     """
     found = reward + discount * value
+    # The forced step has no set to pay for and always locates. Each G is 0 where the target has left by then, so that a
+    # plan that misses until the exit has paid for its sets in the grid alone.
     returns = [(found[-1] - safe_cost) * inside[-1]]
     for n in reversed(range(len(hits))):
         outcome = torch.where(hits[n], found[n], discount * returns[-1]) - set_cost[n]

@@ -54,16 +54,21 @@ class Hindsight:
         self.updates, self.hidden = budget(task, cfg)
         self._collecting, self._iteration, self._update = iterations, 0, 0
         self._mixed = cfg.collect == "mixed"
+        # With `mixed`, learning starts when exploration begins to fall; before, every batch is fully sensed as without
+        # it.
         share = cfg.explore.begin if self._mixed else 1.0
         self._collect_first = max(1, round(share * iterations))
         alongside = (iterations - self._collect_first) * cfg.updates_per_iteration
+        # Updates not done beside the collecting are done after it, updates_per_iteration at a time, rounded up.
         self.iterations = iterations + max(0, -(-(self.updates - alongside) // cfg.updates_per_iteration))
         self._generator = generator(seed, "hindsight", device=device)
         self._buffer = _buffer(task, cfg.buffer_size, self._generator)
         window = Window.of(task, device)
+        # [M, K], the sensors of each window that the border cuts off.
         self._outside = window.cells == task.num_cells if window.is_local else None
         self._learner: _Learner | None = None
         self._seen: int | None = None
+        # Cells that share weights share decisions, which with different prices are not the same.
         if cfg.share_cells and (task.cost != task.cost[0]).any():
             raise UserError("algo.share_cells=true: sensors of different prices, expected one price for all")
         self.actor = Policy.none(task)
@@ -87,6 +92,7 @@ class Hindsight:
             for _ in range(min(cfg.updates_per_iteration, self.updates - self._update)):
                 progress = self._update / self.updates
                 learner.loss.actor_loss.prepare(self._update, progress)
+                # Located cell, T + 1 free choices, and the forced step: t_max + 2 moves, [T + 3, B] cells.
                 cells = self._buffer.paths(cfg.batch_size, self.task.t_max + 2)
                 cells = _within(cells, learner.loss.reach, self.task) if farther else cells
                 averages.add(**learner.update(cells, cfg.learning_rate.at(progress), cfg.blend.at(progress)))
@@ -116,6 +122,7 @@ class Hindsight:
             self._learner = self._make_learner(state["learner"]["reach"])
             self._learner.load_state_dict(state["learner"])
             self._renew_policy(self._learner)
+        # Last: making the learner above drew its initial weights from it.
         self._generator.set_state(state["generator"].cpu())
 
     def _renew_policy(self, learner: _Learner) -> None:
@@ -170,6 +177,7 @@ def _distance(start: Tensor, end: Tensor, task: Task) -> Tensor:
 
 def _within(cells: Tensor, reach: int, task: Task) -> Tensor:
     """Paths `[steps + 1, B]` on which the target is outside, M, from its first move of more than `reach` on."""
+    # cummax keeps the flag up from the first such move on: 0 1 0 becomes 0 1 1.
     gone = (_distance(cells[:-1], cells[1:], task) > reach).cummax(0).values
     return torch.cat([cells[:1], cells[1:].masked_fill(gone, task.num_cells)])
 
@@ -179,6 +187,8 @@ class _Learner:
 
     def __init__(self, loss: HindsightLoss, ema_decay: float) -> None:
         self.loss, self._decay, self._count = loss, ema_decay, 0
+        # Paths are replayed with the average, whose decisions change less from update to update than those of the
+        # weights.
         self.ema = copy.deepcopy(loss.actor).requires_grad_(False)
         self.optimizer = torch.optim.Adam(loss.parameters(), lr=0.0, betas=(0.9, 0.99), fused=True)
 
@@ -188,6 +198,7 @@ class _Learner:
         self.optimizer.zero_grad()
         losses: dict[str, Tensor] = {}
         for part in self.loss.parts(cells, self._on(), blend):
+            # Gradients add up over the parts; only one part's graph is in memory.
             torch.stack(list(part.values())).sum().backward()
             losses |= {name: loss.detach() + losses.get(name, 0.0) for name, loss in part.items()}
         self.optimizer.step()

@@ -18,6 +18,8 @@ from trackmdp.world.windows import Window
 
 __all__ = ["HindsightLoss"]
 
+# Weights of the clocks (`_weights`): the running mean gain moves a tenth of the way at each update; a clock with fewer
+# than 20 rows, or a mean gain under .2 r, is not magnified any further, or a handful of rows would rule the step.
 _GAIN_SCALE_RATE = 0.1
 _FEWEST_ROWS = 20
 _LEAST_GAIN = 0.2
@@ -25,14 +27,14 @@ _LEAST_GAIN = 0.2
 
 @dataclass(frozen=True)
 class _Replayed:
-    """What the policy's own chains come to on every path.
+    """The policy's own plans followed on every path, as tables for the actor's loss.
 
     Attributes:
         row: `[T+1, B]`, the place in `[M, T+1]` of the path's first cell.
         entry: `[T+1, B]`, the place in `[M, T+1, K]` of the sensor the target moved to.
         alive: bool `[T+1, B]`, whether the target is in the grid and was not yet located.
         gain: `[T+1, B]`, what having that sensor on gains, 0 where not alive.
-        target: `[M]`, mean return of the paths from each cell.
+        target: `[M]`, mean return of the paths from each cell, the critic's target.
     """
 
     row: Tensor
@@ -58,7 +60,7 @@ class HindsightLoss(nn.Module):
     Args:
         task: grid, rewards and costs.
         actor_loss: of the actor; the clocked actor always has the decision loss.
-        reach: the target gets no farther in one step, in rows and in columns.
+        reach: rows and columns that the target moves in one step, at most.
         hidden: hidden units of each net.
         discount: γ of the credit.
         generator: draws the initial weights.
@@ -84,6 +86,7 @@ class HindsightLoss(nn.Module):
         max_entries: int = 2**62,
     ) -> None:
         super().__init__()
+        # Shapes below: M cells, T + 1 = t_max + 1 clocks, B paths, K sensors of a window around the located cell.
         m, choices, device = task.num_cells, task.num_choices, generator.device
         self.reach, self._window = reach, task.window
         # One move takes the target to a cell that is near; t_max + 1 of them, to one in view.
@@ -101,15 +104,20 @@ class HindsightLoss(nn.Module):
             # Where the window is the whole grid an output stands for a cell, and cannot be shared.
             return net(choices, seen.width, -1.0, groups if seen.is_local else None)
 
+        # Bias -1 starts all sensors off (z > 0 is on). U has T + 2 clocks: also n = T + 1, where the safe action is
+        # forced.
         self.actor, self.critic = decisions(self.view), net(1, 1, 0.0)
         self.clocked_actor, self.clocked_critic = decisions(self.near), net(choices + 1, 1, 0.0)
         actor_loss.allocate((m, choices, self.view.width), device)
         self.actor_loss = actor_loss
+        # What the forced step earns, in units of r: (r - D) / r.
         self.discount, self.safe = discount, 1.0 - task.safe_cost / task.reward
         self._cells_at_once = max(1, max_entries // (choices * self.view.width))
         cost = torch.as_tensor(task.cost / task.reward, dtype=torch.float32, device=device)
+        # [M + 1]: cell M, outside the grid, costs nothing, so that windows cut off by the border need no mask here.
         self.register_buffer("cost", pad(cost, (0, 1)))
         self.register_buffer("clocks", torch.arange(choices, device=device).unsqueeze(-1))
+        # Row 0 for the clocked actor, row 1 for the actor.
         self.register_buffer("gain_scale", torch.ones(2, choices, device=device))
 
     def forward(self, cells: Tensor, on: Tensor, blend: float) -> dict[str, Tensor]:
@@ -120,7 +128,9 @@ class HindsightLoss(nn.Module):
         return losses
 
     def parts(self, cells: Tensor, on: Tensor, blend: float) -> Iterator[dict[str, Tensor]]:
-        """The losses of a few located cells after the others', with the critics' at the end; each can be let go of.
+        """The losses, a few located cells at a time; the critics' come with the last part.
+
+        The parts share no graph: the caller may call `backward` on each and free it before asking for the next one.
 
         Args:
             cells: int64 `[T+3, B]`, paths: the located cell, then the cells sensed next, M once outside.
@@ -130,12 +140,14 @@ class HindsightLoss(nn.Module):
         clocked, value = self.clocked_critic().squeeze(-1), self.critic().view(-1)
         # U(x, T+1) holds r - D for certain; the net learns the rest.
         clocked = torch.cat([clocked[:, :-1], clocked[:, -1:] + self.safe], dim=1)
+        # [T + 1, M + 1], nothing gained by sensing what has exited. Detached: decisions do not train the values.
         advantage = pad(clocked_advantage(clocked.detach()), (0, 1))
         replayed = self._replay(cells, on, advantage, value.detach(), blend)
         weights = (
             self._weights(0, *self._first_gains(cells[1], advantage)),
             self._weights(1, replayed.alive.sum(1), replayed.gain.abs().sum(1)),
         )
+        # [M + 1, T + 2], U = 0 once exited.
         known, targets = pad(clocked.detach(), (0, 0, 0, 1)), []
         slices = self.slices()
         for rows in slices:
@@ -143,9 +155,13 @@ class HindsightLoss(nn.Module):
             loss, target = self._clocked(cells[:2, chosen], rows, advantage, known)
             own = self._own(replayed, rows, chosen)
             targets.append(target)
+            # The actor's rows are those of the policy's own plans, the clocked actor's every (x, n) that a move was
+            # seen from.
             losses = {"actor": (own * weights[1]).sum(), "clocked_actor": (loss * weights[0]).sum()}
             if rows is slices[-1]:
                 visits = torch.bincount(cells[0], minlength=len(value))
+                # The squared error per cell times its number of paths is, up to a constant, the sum over paths of (V -
+                # return)^2.
                 losses["critic"] = _squared_error(value, replayed.target, visits) / cells.shape[1]
                 error = _squared_error(clocked, torch.cat(targets), visits.unsqueeze(-1))
                 losses["clocked_critic"] = error / cells.shape[1]
@@ -164,6 +180,7 @@ class HindsightLoss(nn.Module):
 
     def _first_gains(self, end: Tensor, advantage: Tensor) -> tuple[Tensor, Tensor]:
         """How many paths stay in the grid for a move, and the sum of what sensing gains there, `[T+1]`."""
+        # The gain depends on the end y and the clock alone, so moves are counted by y: [T + 1, M] @ [M].
         arrived = torch.bincount(end, minlength=advantage.shape[1])[:-1].float()
         gain = sensing_gain(advantage[:, :-1], reward=1.0, discount=self.discount)
         return arrived.sum(), gain.abs() @ arrived
@@ -179,41 +196,63 @@ class HindsightLoss(nn.Module):
         count, k = nearby.shape
         start, end = moves
         first = rows.start or 0
+        # Flat place in [rows, K] of a move: with K = 9, from cell 7 to its local sensor 5 is 7 * 9 + 5 = 68; where the
+        # slice begins at cell 4, 68 - 36 = 32. Exits have weight 0, wherever `index` puts them.
         place = start * k + near.index(start, end) - first * k
         moved = scatter_add((end < m).float(), place, count * k).view(count, 1, k)
+        # moved [x, 1, K] counts moves by their end; stays [x, 1] those that stay in the grid, visits [x, 1] all. Their
+        # quotients are the empirical kernel: moved / visits for P_xj, stays / visits for P_in(x).
         stays, visits = moved.sum(-1), torch.bincount(start - first, minlength=count).unsqueeze(-1)
+        # advantage[:, nearby] is [T + 1, x, K]: transposed to the layout [x, T + 1, K] of the logits.
         gain = moved * sensing_gain(advantage[:, nearby].transpose(0, 1), reward=1.0, discount=self.discount)
         chosen, cost = logits.detach() > 0, self.cost[nearby].unsqueeze(1)
         if self._window is not None and self._window < self.reach:
             # Sensors outside the window cannot be chosen: they neither gain nor cost, nor are they learned about.
             allowed = self._choosable(nearby, rows).unsqueeze(1)
             chosen, gain, cost = chosen & allowed, gain * allowed, cost * allowed
+        # [x, 1, K] @ [x, K, T + 2]: gamma sum_j moved_j U(j, n), for all n by one product.
         following = self.discount * torch.bmm(moved, known[nearby]).squeeze(1)
+        # U(x, n) = sum_j P_xj gamma U(j, n + 1), if nothing is sensed; each sensor on adds its gain, which turns gamma
+        # U(j, n + 1) into r + gamma U(j, 0), and takes its cost away. At n = T + 1 all are located: r - D + gamma U(j,
+        # 0).
         free = following[:, 1:] + (gain * chosen).sum(-1) - stays * (chosen * cost).sum(-1)
         target = torch.cat([free, following[:, :1] + self.safe * stays], dim=1) / visits.clamp(min=1)
+        # All moves to a cell have the same gain, so its sign says whether it is part of G⁺ or G⁻; the price is c for
+        # every move that stays in the grid.
         loss = decision_loss(logits, gain.clamp(min=0), gain.clamp(max=0).neg(), stays.unsqueeze(-1) * cost)
         return loss.sum((0, 2)), target
 
     def _replay(self, cells: Tensor, on: Tensor, advantage: Tensor, value: Tensor, blend: float) -> _Replayed:
         """From whole paths: the policy's chain is followed from their first cell until it detects or is forced."""
         m, choices, k = on.shape
+        # [B], [T + 2, B] and [T + 1, B]: the free choices are for the first T + 1 moves, the last one is the forced
+        # step.
         start, moves, end = cells[0], cells[1:], cells[1:-1]
+        # clocks [T + 1, 1] broadcasts over paths. With M = K = 4 and T = 1: located in 3, n = 1 is row 7, and the
+        # target moving to 2 makes entry 7 * 4 + 2 = 30.
         row = start * choices + self.clocks
         entry = row * k + self.view.index(start, end)
         # Where the target has left the grid or the view, `entry` is that of some other sensor.
         seen = end < m if self._window is None else self.view.contains(start.expand_as(end), end)
         hits, inside = gather(on, entry) & seen, moves < m
         located = gather(pad(value, (0, 1)), moves)
+        # Set costs are computed once per (x, n) and looked up by the paths, however many there are.
         spent = gather(torch.cat([self._set_cost(on[rows], rows) for rows in self.slices()]), row)
         discount, safe_cost = self.discount, 1.0 - self.safe
         returns = chain_returns(hits, inside, spent, located, reward=1.0, safe_cost=safe_cost, discount=discount)
+        # advantage is [T + 1, M + 1]: entry (n, y) is n (M + 1) + y.
         clocked = gather(advantage, self.clocks * (m + 1) + end)
+        # V(y) - G_{n+1}: located at y now, against the plan's return on the rest of this very path. The target's true
+        # cell is known because it was sensed, not because the simulator tells it.
         gain = sensing_gain(clocked, located[:-1] - returns[1:], reward=1.0, discount=discount, blend=blend)
+        # Clock n is reached if no earlier set of the plan hit; other rows are not states of this policy. The move has
+        # to stay in the grid, too: an exit step earns and costs nothing.
         alive = inside[:-1].clone()
         for n in range(1, choices):
             alive[n] &= alive[n - 1] & ~hits[n - 1]
         visits = torch.bincount(start, minlength=m)
         gain = gain * (alive if self._window is None else alive & seen)
+        # Cells without a path get the target 0, and with `visits` 0 no weight in the critic's loss.
         return _Replayed(row, entry, alive, gain, scatter_add(returns[0], start, m) / visits.clamp(min=1))
 
     def _choosable(self, nearby: Tensor, rows: slice) -> Tensor:
@@ -233,6 +272,7 @@ class HindsightLoss(nn.Module):
         count, choices, k = logits.shape
         first = (rows.start or 0) * choices
         row, entry, alive, gain = replayed.of(chosen, first, first * k)
+        # Paths that reach each (x, n); every sensor on costs c on each of them, the one the target moves to included.
         arrivals = scatter_add(alive.float(), row, count * choices).view(count, choices)
         price = arrivals.unsqueeze(-1) * self.cost[self.view.cells[rows]].unsqueeze(1)
         credit = SensorCredit(entry, gain, arrivals, price, rows)
@@ -240,6 +280,7 @@ class HindsightLoss(nn.Module):
 
     def _weights(self, which: int, count: Tensor, gain: Tensor) -> Tensor:
         """`[T+1]`: each clock by its own number of rows and its running mean gain, so that rare clocks count."""
+        # Few paths are missed twice, and late gains differ in size: each clock's loss is scaled to order 1.
         self.gain_scale[which].lerp_(gain / count.clamp(min=1), _GAIN_SCALE_RATE)
         return 1.0 / (count.clamp(min=_FEWEST_ROWS) * self.gain_scale[which].clamp(min=_LEAST_GAIN))
 

@@ -59,6 +59,8 @@ class LearnedKernel:
         self._estimate.fit(self.cfg.rounds_at_end if self._iteration == self.iterations else self.cfg.rounds)
         plan = search.solve(self._world(self._estimate.mean()))
         self.actor = as_policy(self.task, plan)
+        # Acting on a draw, not on the mean: where the estimate is unsure the draws differ, and so moves get sensed that
+        # the mean may leave out for good.
         if isinstance(self.policy, RenewedTable) and self._spent[0] >= self._warm_up:
             self.policy.renew(search.solve(self._world(self._estimate.sample(self._rng))))
         return self._diagnostics(plan)
@@ -110,6 +112,8 @@ def observed_paths(batch: TensorDictBase, task: Task) -> ObservedPaths:
     after = batch["next"]
     exited = after["terminated"].squeeze(-1)
     ended = exited | (after["steps_since_detection"] == 0)
+    # Of the step that ended the path: its history holds the sets of all misses since the detection, wherever the batch
+    # began.
     start, misses, history = (batch[key][ended] for key in ("last_cell", "steps_since_detection", "action_history"))
     end = torch.where(exited, task.num_cells, after["last_cell"])[ended]
     # Sensors are numbered within the window of the located cell; those outside the grid sense nothing.
@@ -124,6 +128,7 @@ def observed_paths(batch: TensorDictBase, task: Task) -> ObservedPaths:
 
 def _sensors_on(batch: TensorDictBase) -> float:
     """Sensors switched on by choice in a batch."""
+    # At n = t_max + 1 the safe action replaces the policy's, whose sensors are not switched on.
     free = batch["steps_since_detection"] < batch["action_history"].shape[-2]
     return (batch["action"].sum(-1) * free).sum().item()
 
@@ -131,6 +136,7 @@ def _sensors_on(batch: TensorDictBase) -> float:
 def _rng_state(rng: np.random.Generator) -> dict[str, Any]:
     """PCG64's state without integers beyond 64 bits."""
     state = rng.bit_generator.state
+    # PCG64 counts with 128 bits, more than a checkpoint's integers hold.
     inner = {name: str(value) for name, value in state["state"].items()}
     return {**state, "state": inner}
 

@@ -25,7 +25,7 @@ class MoveBuffer:
 
     def __init__(self, num_cells: int, capacity: int, generator: torch.Generator) -> None:
         self.num_cells, self._capacity, self._generator = num_cells, capacity, generator
-        # Oldest first; no grid has more cells than 16 bits count.
+        # Oldest first; 16 bits hold M up to 32,767, a square of 181 x 181 cells.
         self._moves = torch.empty(2, 0, dtype=torch.int16, device=generator.device)
         self._index: tuple[Tensor, CellIndex] | None = None
 
@@ -52,6 +52,7 @@ class MoveBuffer:
         start, draws = stratified_starts(count, steps, self.num_cells, self._generator)
         cells = [start]
         for draw in draws:
+            # M starts no move: its place is the entry behind all moves, which is M again.
             cells.append(ends.index_select(0, index.pick(cells[-1], draw)))
         return torch.stack(cells)
 
@@ -62,6 +63,8 @@ class MoveBuffer:
         """
         m = self.num_cells
         start, end = self.moves()
+        # With M = 4, the move 2 -> 3 has the key 2 * 5 + 3 = 13, and 13 mod 5 = 3 gives its end back. One sort orders
+        # the moves by start; that the ends of a start are sorted too makes stratified draws cover them in proportion.
         ends = torch.cat([(start * (m + 1) + end).sort().values % (m + 1), end.new_tensor([m])])
         return ends, CellIndex.of(start, m)
 

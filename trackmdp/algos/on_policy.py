@@ -54,6 +54,7 @@ class OnPolicy:
         rate, entropy = self._settings.learning_rate.at(progress), self._settings.entropy.at(progress)
         set_learning_rate(self.optimizer, rate)
         self.loss.entropy_coeff.fill_(entropy)
+        # Before the advantage, so that the critic's targets are scaled as well; evaluation never sees scaled rewards.
         batch["next", "reward"] = batch["next", "reward"] * self._settings.reward_scale
         with torch.no_grad():
             self.advantage(batch)
@@ -88,6 +89,7 @@ def _normalised(advantage: Tensor, misses: Tensor, t_max: int) -> Tensor:
     for n in range(t_max + 1):
         counted = misses == n
         chosen = advantage[counted]
+        # The standard deviation of one number is nan.
         if len(chosen) > 1:
             normalised[counted] = (chosen - chosen.mean()) / (chosen.std() + 1e-8)
     return normalised

@@ -12,11 +12,11 @@ __all__ = ["CellIndex", "sensed_steps", "stratified_starts"]
 
 
 class CellIndex(NamedTuple):
-    """Where those of each cell begin, among entries in the order of the cell they start in.
+    """Row pointer of entries sorted by the cell they start in.
 
     Attributes:
-        first: `[M + 1]` int64; of a cell without entries, the place after the last one.
-        share: `[M + 1]` float, how many they are, at least one, less what keeps a draw close to 1 among them.
+        first: `[M + 1]` int64, place of the first entry of each cell; for a cell without entries, the place after all.
+        share: `[M + 1]` float, number of entries of each cell, at least one, and slightly reduced (see `of`).
     """
 
     first: Tensor
@@ -26,6 +26,8 @@ class CellIndex(NamedTuple):
     def of(cls, start: Tensor, num_cells: int) -> CellIndex:
         """Index entries `[K]` by the cells they start in, in whatever order they come."""
         seen = torch.bincount(start, minlength=num_cells + 1)
+        # Starts 0 0 2: seen 2 0 1, first 0 3 2. A cell without entries leads to place 3, where the buffers keep an
+        # exit.
         first = torch.where(seen > 0, seen.cumsum(0) - seen, len(start))
         # Half a float's spacing below the count, so that a draw close to 1 does not round up to the next cell's.
         return cls(first, seen.clamp(min=1).float() * (1.0 - 2.0**-24))
@@ -44,6 +46,8 @@ def stratified_starts(count: int, steps: int, num_cells: int, generator: torch.G
     order = torch.arange(count, device=device)
     offset = torch.randint(m, (1,), generator=generator, device=device)
     draws = torch.rand(steps, count, generator=generator, device=device)
+    # 10 paths on 4 cells: 3, 3, 2 and 2 of them start in cells 0, 1, 2 and 3 (up to the offset). The i-th of k draws
+    # from [i/k, (i+1)/k).
     same_start = (m - 1 + count - order % m).div(m, rounding_mode="floor")
     draws[0] = (order // m + draws[0]) / same_start
     return (order + offset) % m, draws
@@ -59,5 +63,7 @@ def sensed_steps(batch: TensorDictBase, num_cells: int) -> tuple[Tensor, Tensor]
     after = batch["next"]
     exited = after["terminated"].squeeze(-1)
     located = (after["steps_since_detection"] == 0) | exited
+    # `all(-1)` is decided before the move, so that steps are not selected by where the target goes; with all M sensors
+    # on, a step ends located or exited.
     whole = batch["action"].all(-1) & (batch["steps_since_detection"] == 0) & located
     return whole, torch.where(exited, num_cells, after["last_cell"])

@@ -15,6 +15,7 @@ from torchrl.data.replay_buffers.storages import Storage
 
 __all__ = ["PrioritizedSampler"]
 
+# An item of priority 0 would never be drawn again.
 _SMALLEST = 1e-8
 
 
@@ -34,7 +35,10 @@ class PrioritizedSampler(Sampler):
         mass = self._mass[: len(storage)]
         edges = mass.cumsum(0)
         draws = torch.rand(batch_size, dtype=torch.float64, generator=self._rng, device=mass.device)
+        # Inverse of the distribution function: masses 1, 0, 3 have edges 1 1 4; with right=True a draw of exactly 1
+        # falls to item 2. The clamp is for rounding at the last edge.
         index = torch.searchsorted(edges, draws * edges[-1], right=True).clamp_max(len(mass) - 1)
+        # (N P(i))^-beta over its maximum, which the item of least mass has: N and the sum cancel.
         weight = (mass[index] / mass.min()) ** -self.beta
         return index, {"priority_weight": weight.float()}
 

@@ -29,7 +29,7 @@ class SegmentBuffer:
 
     def __init__(self, num_cells: int, steps: int, capacity: int, generator: torch.Generator) -> None:
         self.num_cells, self.steps, self._capacity, self._generator = num_cells, steps, capacity, generator
-        # Oldest first; no grid has more cells than 16 bits count.
+        # Oldest first; 16 bits hold M up to 32,767, a square of 181 x 181 cells.
         self._segments = torch.empty(steps + 1, 0, dtype=torch.int16, device=generator.device)
         self._tail: dict[str, Tensor] = {}
         self._index: tuple[Tensor, CellIndex] | None = None
@@ -40,14 +40,17 @@ class SegmentBuffer:
     def extend(self, batch: TensorDictBase) -> None:
         """Add the segments of a collected batch `[B, time]` or `[workers, B, time]`.
 
-        Its rows go on where those of the batch before ended.
+        Each row continues that of the batch before, so that segments may reach over the border between the two.
         """
         rows = _frames(batch.reshape(-1, batch.shape[-1]), self.num_cells)
         frames = {key: value.to(self._segments.device) for key, value in rows.items()}
         if self._tail and _goes_on(self._tail, frames):
+            # Segments that began in the last steps - 1 frames of the batch before, and could not be completed there,
+            # are now.
             frames = {key: torch.cat([self._tail[key], frames[key]], dim=1) for key in frames}
         fresh = _segments(frames, self.steps, self.num_cells)
         self._segments = torch.cat([self._segments, fresh], dim=1)[:, -self._capacity :].contiguous()
+        # The frames at which a segment may begin that this batch is too short for.
         self._tail = {key: value[:, value.shape[1] - self.steps + 1 :].clone() for key, value in frames.items()}
         self._index = None
 
@@ -60,9 +63,11 @@ class SegmentBuffer:
 
         The first moves are stratified: out of each cell the paths leave in the proportions of the moves seen.
         """
+        # Sorted at the first draw after an `extend`, not at every one.
         segments, index = self._index = self._index or self._sort()
         start, (draws,) = stratified_starts(count, 1, self.num_cells, self._generator)
         cells = segments[: steps + 1].index_select(1, index.pick(start, draws)).long()
+        # Cells in which no segment begins were given the column of M alone; their paths leave at once.
         cells[0] = start
         return cells
 
@@ -73,6 +78,7 @@ class SegmentBuffer:
         """
         m = self.num_cells
         start, end = self._segments[:2].long()
+        # Sorted by (start, end): with M = 4, the move 2 -> 3 has the key 2 * 5 + 3 = 13, and an exit from 2 the key 14.
         order = (start * (m + 1) + end).argsort(stable=True)
         return pad(self._segments.index_select(1, order), (0, 1), value=m), CellIndex.of(start, m)
 
@@ -102,6 +108,7 @@ def _goes_on(before: dict[str, Tensor], frames: dict[str, Tensor]) -> bool:
     """Whether each row that had not ended begins where it stood: not so where workers deliver in any order."""
     if not before["end"].shape[1] or len(before["end"]) != len(frames["start"]):
         return False
+    # Only rows where both frames were sensed and the episode went on can be compared; the others prove nothing.
     same = before["end"][:, -1] == frames["start"][:, 0]
     known = before["whole"][:, -1] & frames["whole"][:, 0] & ~before["done"][:, -1]
     return bool((same | ~known).all())
@@ -109,6 +116,7 @@ def _goes_on(before: dict[str, Tensor], frames: dict[str, Tensor]) -> bool:
 
 def _segments(frames: dict[str, Tensor], steps: int, num_cells: int) -> Tensor:
     """`[steps + 1, K]` int16, the segments that are complete: fully sensed to their end or to the exit."""
+    # 5 frames and segments of 3 steps: they may begin at frames 0, 1 and 2.
     count = frames["start"].shape[1] - steps + 1
     if count < 1:
         return frames["start"].new_empty(steps + 1, 0)
@@ -117,9 +125,11 @@ def _segments(frames: dict[str, Tensor], steps: int, num_cells: int) -> Tensor:
     gone = ~complete
     for step in range(steps):
         end, whole, done = (frames[key][:, step : step + count] for key in ("end", "whole", "done"))
+        # Once the target is gone, M fills the rest, and the frames there, of the next episode, are not asked about.
         complete = complete & (whole | gone)
         cells.append(torch.where(gone, num_cells, end))
         gone = gone | (end == num_cells)
         if step < steps - 1:
+            # Done without an exit is a truncation: what follows belongs to another episode.
             complete = complete & (gone | ~done)
     return torch.stack(cells)[:, complete]

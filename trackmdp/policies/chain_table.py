@@ -47,15 +47,19 @@ class CellClockNet(nn.Module):
         def normal(*shape: int, std: float) -> nn.Parameter:
             return nn.Parameter(std * torch.randn(shape, generator=generator, device=generator.device))
 
+        # [M, 1, H] + [C, H] + [M, C, H] broadcast to [M, C, H]: cell and clock share what they can, the pair learns the
+        # rest.
         self.cell = normal(num_cells, 1, hidden, std=0.3)
         self.clock = normal(num_clocks, hidden, std=0.3)
         self.pair = normal(num_cells, num_clocks, hidden, std=0.3)
+        # Std 1 / sqrt(H) keeps the outputs' size independent of the width.
         self.weight = normal(hidden, outputs, std=hidden**-0.5)
         self.bias = nn.Parameter(torch.full((outputs,), bias, device=generator.device))
 
     def forward(self, cells: slice = slice(None)) -> Tensor:
         """`[M, num_clocks, outputs]`, the outputs of every row, or of the rows of some `cells` alone."""
         embedding = self.cell + self.clock + self.pair
+        # With groups the embedding has a row per group and not per cell; the wanted cells are picked at the end.
         if self.groups is None and cells != slice(None):
             embedding = embedding[cells]
         rows = embedding.relu() @ self.weight + self.bias

@@ -40,6 +40,7 @@ class RenewedTable(TensorDictModuleBase):
         super().__init__()
         self.num_cells, self.num_choices = task.num_cells, task.num_choices
         self.window = Window.of(task, device)
+        # Row x (t_max + 1) + n, as in `PolicyTable`; 8 sensors per byte: 10 x 10 cells take 13 bytes a row.
         shape = (task.num_cells * task.num_choices, -(-task.num_cells // 8))
         self.register_buffer("bits", torch.full(shape, 255 * on, dtype=torch.uint8, device=device))
         # numpy.packbits puts the first of eight entries into the highest bit.
@@ -55,7 +56,9 @@ class RenewedTable(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action` `[*B, K]`, local to `last_cell` where the task has a window."""
         cell, n = tensordict["last_cell"], tensordict["steps_since_detection"]
+        # n = t_max + 1 has no row of its own: the safe action replaces whatever is written there.
         packed = self.bits[cell * self.num_choices + n.clamp_max(self.num_choices - 1)]
+        # [*B, bytes, 1] >> [8] = [*B, bytes, 8], flattened to bits in the order of the sensors; the padding is cut off.
         chosen = ((packed.unsqueeze(-1) >> self._place) & 1).flatten(-2)[..., : self.num_cells].bool()
         return tensordict.set("action", self.window.to_local(cell, chosen))
 
@@ -76,6 +79,7 @@ class Exploring(RenewedTable):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action` `[*B, M]`."""
         n = tensordict["steps_since_detection"]
+        # Only at n = 0: after a miss the cell before the move is not known, and the step would show no move.
         everything = (torch.rand(n.shape, device=n.device) < self.explore) & (n == 0)
         action = super().forward(tensordict)["action"]
         return tensordict.set("action", action | everything.unsqueeze(-1))

@@ -31,6 +31,7 @@ class RandomSubset(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action` `[B, M]`: the bits of random 63-bit words."""
         shape, m = tensordict["last_cell"].shape, self.num_cells
+        # 63 bits a word: `random_` fills int64 from 0 to 2^63 - 1, so that the sign bit is never set.
         words = torch.empty(*shape, -(-m // 63), dtype=torch.int64, device=self.generator.device)
         words.random_(generator=self.generator)
         bits = (words.unsqueeze(-1) >> self._shifts) & 1

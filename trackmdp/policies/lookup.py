@@ -20,6 +20,7 @@ class DenseTable:
     def __init__(self, table: sparse.csr_array, device: torch.device) -> None:
         self.device = device
         dense = torch.as_tensor(table.toarray(), device=device)
+        # Probabilities are compared with float32 draws, so they are held as such.
         self._rows = dense if dense.dtype == torch.bool else dense.float()
 
     def __call__(self, row: Tensor) -> Tensor:
@@ -66,6 +67,8 @@ class SparseTable:
         """`[*B]`, the entries at (`row`, `column`), both `[*B]`."""
         if not len(self._place):
             return torch.zeros(row.shape, dtype=self._data.dtype, device=self.device)
+        # With M = 4: entry (3, 2) is place 3 * 4 + 2 = 14. Found at the first stored place that is no smaller, unless
+        # that is another one; the clamp is for places beyond the last.
         wanted = row * self._columns + column
         found = torch.searchsorted(self._place, wanted).clamp_max(len(self._place) - 1)
         return self._data[found] * (self._place[found] == wanted)

@@ -90,6 +90,7 @@ class Policy(TensorDictModuleBase, PolicyTable):
         near = PolicyTable.all_on(task).sets
         assert near is not None
         count = np.diff(near.indptr)
+        # Each sensor's own probability of being among the k of its window.
         share = np.repeat(np.minimum(k / count, 1.0), count)
         return cls(task, sparse.csr_array((share, near.indices, near.indptr), shape=near.shape), k=k)
 
@@ -151,6 +152,8 @@ class Policy(TensorDictModuleBase, PolicyTable):
         assert draws is not None
         if self.k is None:
             return draws < probability
+        # The k largest of independent uniforms are a uniformly random subset of size k. Sensors that cannot be chosen
+        # get -1 and come last; where fewer than k can, some of those are among the k all the same, and are taken out.
         largest = draws.masked_fill(probability == 0, -1.0).topk(self.k, dim=-1).indices
         on = torch.zeros_like(draws, dtype=torch.bool)
         return on.scatter_(-1, largest, value=True) & (probability > 0)
@@ -180,6 +183,7 @@ class Policy(TensorDictModuleBase, PolicyTable):
         last_cell, n = tensordict["last_cell"], tensordict["steps_since_detection"]
         if self.deterministic:
             return tensordict.set("action", self._near(last_cell, n))
+        # A generator draws on its own device only.
         device = last_cell.device if self.generator is None else self.generator.device
         draws = torch.rand((*last_cell.shape, self.num_draws), generator=self.generator, device=device)
         action = self.act(last_cell, n, draws)

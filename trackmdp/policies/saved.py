@@ -34,6 +34,7 @@ def save_policy(file: Path, policy: PolicyTable, value: Array | None = None) -> 
     if policy.sets is None:
         content["probability"] = np.float64(policy.probability)
     else:
+        # Fixed integer widths: SciPy's own choice depends on the number of entries, and the bytes would with it.
         content |= {"indices": policy.sets.indices.astype(np.int32), "indptr": policy.sets.indptr.astype(np.int64)}
         if not policy.deterministic:  # else every entry stored is a sensor on
             content["data"] = policy.sets.data

@@ -87,6 +87,7 @@ class PolicyTable:
         if self.sets is None:
             assert self.probability is not None
             return np.full(self.task.num_cells, self.probability * price.sum())
+        # Rows n, n + (t_max + 1), ...: those of (0, n), (1, n), ..., one per located cell.
         rows = self.sets[n :: self.task.num_choices]
         return rows.astype(np.float64) @ price
 
@@ -144,6 +145,7 @@ def _checked(task: Task, sets: sparse.csr_array) -> sparse.csr_array:
     if sets.dtype != np.bool_:
         if not ((sets.data >= 0) & (sets.data <= 1)).all():
             raise UserError("policy: expected probabilities between 0 and 1")
+        # All entries 0 or 1: nothing is drawn, and the policy can be valued and acted out as deterministic.
         sets = sets.astype(np.bool_ if np.isin(sets.data, (0, 1)).all() else np.float64)
     sets.sum_duplicates()  # sorts the columns of each row as well
     sets.eliminate_zeros()
@@ -168,6 +170,7 @@ def _window_sets(task: Task, probability: float) -> sparse.csr_array:
     assert task.window is not None
     m, reach = task.num_cells, np.arange(-task.window, task.window + 1)
     row, column = np.divmod(np.arange(m), task.columns)
+    # [M, 2W + 1, 2W + 1] each, rows varying along the second axis and columns along the third.
     rows = (row[:, None, None] + reach[:, None]).repeat(len(reach), axis=2)
     columns = (column[:, None, None] + reach).repeat(len(reach), axis=1)
     inside = (rows >= 0) & (rows < task.rows) & (columns >= 0) & (columns < task.columns)

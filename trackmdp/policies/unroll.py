@@ -1,7 +1,7 @@
-"""From anything that acts to a table: every state a policy can bring about is asked once.
+"""From any deterministic rule to a table, by calling it on every state that it can reach.
 
 After a miss the next state is known in advance: the same located cell, n + 1, and the history with the set just chosen.
-So M * (t_max + 1) questions, put n by n, say all there is to say about a policy that does not draw.
+So M * (t_max + 1) states, visited in order of n, determine a policy that does not draw.
 """
 
 from __future__ import annotations
@@ -54,6 +54,7 @@ def module_rule(task: Task, module: TensorDictModuleBase) -> Rule:
     Raises:
         UserError: it reads or writes other keys, or its action has another form.
     """
+    # The true position is in the environment's state too; a module that reads it is no policy of the tracker.
     others = [str(key) for key in module.in_keys if key not in STATE_KEYS]
     if others:
         raise UserError(f"policy: the module reads {', '.join(others)}, expected {', '.join(STATE_KEYS)} at most")
@@ -101,6 +102,7 @@ def draws(task: Task, rule: Rule, device: torch.device, sets: sparse.csr_array) 
 @torch.no_grad()
 def _table(task: Task, rule: Rule, device: torch.device) -> sparse.csr_array:
     m, k, choices = task.num_cells, task.num_sensors, task.num_choices
+    # One located cell takes a history of (t_max + 1) K bools; blocks keep M of them from being there at once.
     at_once = max(1, _HISTORY_AT_ONCE // (choices * k))
     window = Window.of(task, device)
     columns, lengths = [], []
@@ -109,6 +111,8 @@ def _table(task: Task, rule: Rule, device: torch.device) -> sparse.csr_array:
             cells = torch.arange(begin, min(begin + at_once, m), device=device)
             # The history [B, t_max+1, K] in row-major order is B * (t_max+1) rows of the table, in the table's order.
             on = _followed(rule, cells, choices, k).reshape(-1, k)
+            # Row-major order: flat place p of [rows, K] is column p mod K. Without a window K = M and columns are
+            # cells.
             chosen = np.flatnonzero(on) % k
             if window.is_local:
                 # A window's local numbers go through it row by row, as the cells do: columns stay in order.
@@ -117,6 +121,7 @@ def _table(task: Task, rule: Rule, device: torch.device) -> sparse.csr_array:
                 row, local = np.nonzero(on)
                 chosen = window.around(cells).cpu().numpy()[row // choices, local]
             columns.append(chosen)
+            # Sensors on per row, whose running sum is the CSR row pointer.
             lengths.append(np.count_nonzero(on, axis=1))
     indptr = np.concatenate([[0], np.cumsum(np.concatenate(lengths))])
     indices = np.concatenate(columns)
@@ -125,6 +130,7 @@ def _table(task: Task, rule: Rule, device: torch.device) -> sparse.csr_array:
 
 def _followed(rule: Rule, cells: Tensor, choices: int, sensors: int) -> BoolArray:
     """`[B, t_max+1, K]` the sets chosen at n = 0, 1, ... misses from located `cells` `[B]`."""
+    # Slot n is written after the call for n: at n misses the rule sees slots 0 ... n - 1, as in the environment.
     history = torch.zeros(len(cells), choices, sensors, dtype=torch.bool, device=cells.device)
     for n in range(choices):
         # Copies, for a rule may keep what it is given, or write to it.

@@ -39,7 +39,9 @@ class BeliefFilter:
         Where that event has probability zero the prediction itself is returned, normalised over the grid: the
         observation cannot have happened, and the belief stays finite.
         """
+        # Bayes with a perfect sensor: a miss has likelihood 0 where a sensor is on and 1 elsewhere.
         unseen = predicted * ~action
         mass = unseen.sum(-1, keepdim=True)
         grid = predicted / predicted.sum(-1, keepdim=True).clamp_min(torch.finfo(predicted.dtype).tiny)
+        # `where` evaluates both sides; the clamps keep 0 / 0 out of the one that is not taken.
         return torch.where(mass > 0, unseen / mass.clamp_min(torch.finfo(predicted.dtype).tiny), grid)

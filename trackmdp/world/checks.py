@@ -22,6 +22,7 @@ def canonical_kernel(kernel: Any, source: str = "kernel") -> sparse.csr_array:
         UserError: it is no square table of real numbers; `source` is named at the start of the message.
     """
     table = kernel if sparse.issparse(kernel) else np.asarray(kernel)
+    # bool, signed, unsigned, float: complex numbers would lose their imaginary part below.
     if table.dtype.kind not in "biuf":
         raise UserError(f"{source}: not a table of numbers (but of {table.dtype})")
     if table.ndim != 2 or table.shape[0] != table.shape[1]:
@@ -62,6 +63,8 @@ def check_kernel(kernel: sparse.csr_array, size: tuple[int, int], *, truncates: 
 
 def _can_exit(kernel: sparse.csr_array, sums: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
     """`[M]` whether the exit can be reached from each cell: a search against the moves, from the exit."""
+    # Vertex M is the exit; 1e-12 is rounding in a row that sums to 1. Edges are turned round, so that one search from M
+    # reaches every cell that has a way out.
     m, leaves = kernel.shape[0], np.flatnonzero(sums < 1 - 1e-12)
     rows = np.repeat(np.arange(m), np.diff(kernel.indptr))
     back = np.concatenate([kernel.indices, np.full(len(leaves), m)]), np.concatenate([rows, leaves])

@@ -32,6 +32,7 @@ class Costs:
     def sensing_cost(self, action: Tensor, last_cell: Tensor) -> Tensor:
         """`[B]` price of the sensors in `action` `[B, K]`, seen from `last_cell` `[B]`: c·|a|, or the sum of c."""
         if self._window.is_local and self._uniform:
+            # One price for all: a count of bits and one product, the same float32 whatever the order of the sensors.
             return self.price_of(action & self._window.inside(last_cell))
         if self._window.is_local:
             price = self._steps[self._window.around(last_cell)]
@@ -68,11 +69,14 @@ class Costs:
 
     def reward_of(self, spent: Tensor, sensed: Tensor, forced: Tensor, in_grid: Tensor) -> Tensor:
         """`pseudo_reward` where the price `spent` `[B]` of the sensors on is known."""
+        # Costs are zeroed on the exit step together with the reward (eq. reward_func multiplies all of it).
         chosen = self.reward * sensed - spent
         return torch.where(forced, self.reward - self.safe_cost, chosen) * in_grid
 
 
 def _whole_steps(cost: Array) -> Array:
     """`[M]` float64 prices rounded to 2^-40 of the largest: their sums are exact, whatever the order and the batch."""
+    # Prices become at most 2^40 steps each, and float64 adds integers exactly up to 2^53: 8,192 sensors of the highest
+    # price.
     step = 2.0 ** (np.ceil(np.log2(max(cost.max(), 1e-300))) - 40)
     return np.round(cost / step) * step

@@ -68,6 +68,7 @@ class TrackEnv(EnvBase):
         self._window = Window.of(world, self.device)
         self._costs = Costs(world, self.device)
         self._rows = torch.arange(self.num_envs, device=self.device)
+        # Shared by all steps that truncate nothing; handed out as a clone only.
         self._no = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
         self._make_specs()
         self._set_seed(seed)
@@ -82,6 +83,8 @@ class TrackEnv(EnvBase):
         b, m, k, choices = self.batch_size, self.num_cells, self._window.width, self.t_max + 1
         index: dict[str, Any] = {"shape": b, "dtype": torch.int64, "device": self.device}
         observation = Composite(
+            # m + 1 values: cell M is the exit. n takes t_max + 2: 0 ... t_max + 1, the last one with the safe action
+            # forced.
             target=Categorical(m + 1, **index),
             last_cell=Categorical(m, **index),
             steps_since_detection=Categorical(choices + 1, **index),
@@ -110,13 +113,15 @@ class TrackEnv(EnvBase):
         self._targets.load_state(state)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDictBase:
-        """Fresh rows for the whole batch; TorchRL merges in those that its mask asks for."""
+        """Initial states for the whole batch; TorchRL takes from them the rows whose `_reset` mask is set."""
         mask = None if tensordict is None else tensordict.get("_reset", None)
+        # TorchRL resets only the rows of its mask. The others are made as well, so that shapes stay fixed, and thrown
+        # away.
         rows = None if mask is None else mask.view(-1).nonzero().squeeze(-1)
         return self._shaped(self._fresh(rows))
 
     def _fresh(self, rows: Tensor | None = None) -> dict[str, Tensor]:
-        """Located where the target starts: s_0 = (x_0, 0, ∅); of the rows only `rows` are used, None for all."""
+        """Initial states s_0 = (x_0, 0, ∅), the target located; the caller uses only `rows` of them, None for all."""
         state = self._targets.start(self.num_envs, rows)
         start = state["target"]
         state |= {
@@ -158,12 +163,17 @@ class TrackEnv(EnvBase):
         in_grid = target < self.num_cells
         # The sensor that could see the target: K, none, where it has exited or left the window.
         sensor = self._window.find(last, target)
+        # Indexing needs a valid number, so K is clamped to K - 1, and what was read there is discarded by the
+        # comparison.
         sensed = action[self._rows, sensor.clamp_max(self._window.width - 1)] & (sensor < self._window.width)
+        # n = t_max + 1: the policy's action does not count any more.
         forced = n > self.t_max
         located = (sensed | forced) & in_grid
         missed = in_grid & ~located
         following = moved | {
+            # On the exit step `last` stays: the spec has no cell M for it, and done ends the row anyway.
             "last_cell": torch.where(located, target, last),
+            # n + 1 on a miss, 0 on a detection and on the exit step.
             "steps_since_detection": (n + 1) * missed,
             "action_history": self._remember(state["action_history"], action, n, missed),
             "reward": self._costs.pseudo_reward(action, last, sensed, forced, in_grid).unsqueeze(-1),
@@ -173,12 +183,16 @@ class TrackEnv(EnvBase):
         truncated = self._no if cut is None else cut.unsqueeze(-1)
         if self.max_steps:
             following["step_count"] = state["step_count"] + 1
+            # Time limit and exit on one step: the exit counts, for nothing is left to bootstrap from.
             truncated = (following["step_count"] >= self.max_steps).unsqueeze(-1) & ~terminated | truncated
+        # A clone, for `truncated` may be the shared `_no`.
         following |= {"terminated": terminated, "truncated": truncated.clone(), "done": terminated | truncated}
         return following
 
     def _remember(self, history: Tensor, action: Tensor, n: Tensor, missed: Tensor) -> Tensor:
         """h_{k+1}: `action` in slot n where the target was missed, empty elsewhere; misses are few."""
+        # With t_max = 1: missed at n = 0 gives slots (a, -), missed again at n = 1 gives (a, b); n = 2 is forced and
+        # never missed.
         kept = torch.zeros_like(history)
         rows = missed.nonzero().squeeze(-1)
         kept[rows] = history[rows]
@@ -187,6 +201,8 @@ class TrackEnv(EnvBase):
 
     def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         """TorchRL's step and auto-reset in one pass; bit-equal to the stock path, twice as fast."""
+        # `next` holds the state that was reached, the returned tensordict the one to act on: where an episode ended
+        # they differ.
         following = self._stepped(tensordict)
         tensordict.set("next", self._shaped(following))
         done = following["done"]

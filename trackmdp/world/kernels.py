@@ -47,6 +47,7 @@ def random_support(
     grid, window, rng = grid_size(size), _window(radius), np.random.default_rng(seed)
     lows = [_one_low(count, low_probability, exit_probability) for count in range(1, support_size + 1)]
     weights = np.array([np.pad(low, (0, support_size - len(low))) for low in lows])
+    # Row k - 1 of `weights` is for k positions left, padded with zeros to Z; totals[k - 1] is its sum, 1 - p_exit.
     totals = np.array([low.sum() for low in lows])
     blocks = []
     for cells in _blocks(grid):
@@ -86,6 +87,8 @@ def drift(
     """
     window = _window(1)
     weights = np.full(len(window), (1.0 - persistence) / len(window))
+    # 30 degrees is 2/3 of the way from right (0) to up-right (45): those get 1/3 and 2/3. Rows count downwards, so up
+    # is -sin.
     eighth, share = divmod((direction % 360.0) / 45.0, 1.0)
     for step, part in ((int(eighth), 1.0 - share), (int(eighth) + 1, share)):
         angle = math.radians(45.0 * step)
@@ -122,6 +125,7 @@ def _one_low(count: int, low: float, exit_probability: float) -> Array:
     """`[count]` probabilities: the first `low`, the others equal; all of it where there is only one."""
     if count == 1:
         return np.array([1.0 - exit_probability])
+    # Z = 3, low = .1, p_exit = .05: .1, .425, .425.
     rest = (1.0 - low - exit_probability) / (count - 1)
     return np.array([low] + [rest] * (count - 1))
 
@@ -148,14 +152,17 @@ def _place(
     position = np.stack(np.divmod(cells, grid[1]), axis=-1)[:, None] + offsets
     if border == "clip":
         position = position.clip(0, np.array(grid) - 1)
+    # A weight of 0 makes no entry: the padding of rows with fewer positions, above all.
     inside = ((position >= 0) & (position < grid)).all(axis=-1) & (weights != 0)
     row = np.nonzero(inside)[0]
+    # (row, column) . (columns, 1) = row * columns + column, the cell's number.
     target = position[inside] @ (grid[1], 1)
     rows = _summed(row, target, weights[inside], (len(cells), grid[0] * grid[1]))
     if border in ("renormalize", "inside"):
         empty = np.flatnonzero(np.diff(rows.indptr) == 0)
         stays = sparse.csr_array((np.ones(len(empty)), (empty, cells[empty])), shape=rows.shape)
         rows = sparse.csr_array(rows + stays)
+        # All of a row by one factor, so that the exit keeps its probability and the positions their proportions.
         rows.data *= np.repeat(totals / pairwise_row_sums(rows), np.diff(rows.indptr))
     return rows
 

@@ -159,6 +159,8 @@ class World(Task):
             window=window,
             markov=markov,
         )
+        # Checked after it is canonical: duplicates are added up and zeros dropped, so that the checks see what solvers
+        # will.
         canonical = canonical_kernel(kernel)
         check_kernel(canonical, self.size, truncates=max_steps is not None)
         object.__setattr__(self, "kernel", canonical)
@@ -166,6 +168,7 @@ class World(Task):
     @cached_property
     def stay_probability(self) -> Array:
         """`[M]` probability of still being in the grid after one step, 1 - p_exit."""
+        # Not kernel.sum(axis=1), which may differ in the last digit from the sums of the same kernel written out.
         return pairwise_row_sums(self.kernel)
 
 

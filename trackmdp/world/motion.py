@@ -32,10 +32,14 @@ class Motion:
         m = kernel.shape[0]
         if m > _MOST_CELLS:
             raise UserError(f"kernel: {m:,} cells, expected at most {_MOST_CELLS:,}")
+        # Worked example, two cells, in units of 2^40: P_01 = .5, P_10 = .25, P_11 = .5. The ends within the rows are .5
+        # and .25, .75; shifted by the cell and closed by the exit at 1 and 2, and by the exited target's own stretch at
+        # 3, the line is edges .5 1 1.25 1.75 2 3 with successors 1 M 0 1 M M.
         ends = _running_sums(kernel)
         # A successor whose share ends at e is drawn for u < e. With u = k / 2^40 that is k < ceil(e · 2^40), exactly.
         edges = np.ceil(np.minimum(ends, 1.0) * _RESOLUTION).astype(np.int64)
         # What is left of 1 is the exit's. A row that reaches 1, up to rounding, leaves nothing.
+        # after[x] is the end of cell x's stretch; `insert` puts it behind the row's own edges, at indptr[x + 1].
         after = np.arange(1, m + 1, dtype=np.int64) * _RESOLUTION
         edges += np.repeat(after - _RESOLUTION, np.diff(kernel.indptr))
         closed = np.append(np.insert(edges, kernel.indptr[1:], after), (m + 1) * _RESOLUTION)
@@ -45,11 +49,14 @@ class Motion:
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """`[count]` float64 uniform draws for `move`."""
+        # Whole numbers over 2^40 are exact in float64 (53 bits), so `move` gets back the very integer that was drawn.
         draws = torch.randint(_RESOLUTION, (count,), generator=generator, device=self._edges.device)
         return draws.double() / _RESOLUTION
 
     def move(self, cells: Tensor, draws: Tensor) -> Tensor:
         """`[B]` next cells of the targets at `cells` `[B]` under uniform `draws` `[B]`; M means exited."""
+        # The first edge beyond x + u: from cell 0, u = .3 finds edge .5 (to cell 1) and u = .7 finds 1 (exit).
+        # right=True, since an edge is the first draw that no longer belongs to its successor.
         place = (draws * _RESOLUTION).long().add_(cells, alpha=_RESOLUTION)
         return self._successors[torch.searchsorted(self._edges, place, right=True)]
 

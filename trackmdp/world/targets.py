@@ -18,7 +18,7 @@ __all__ = ["RecordedTargets", "SampledTargets", "Targets", "make_targets"]
 
 
 class Targets(Protocol):
-    """A batch of targets; where they are lies in the environment's state, here are only the generators."""
+    """A batch of targets. Their positions are in the environment's state; this object holds only the generators."""
 
     hidden: Mapping[str, int]
     """Keys of the state beside `target`, and how many values each may have."""
@@ -28,7 +28,7 @@ class Targets(Protocol):
         ...
 
     def state(self) -> dict[str, Tensor]:
-        """How far the draws are, for a checkpoint."""
+        """State of the generators, for a checkpoint."""
         ...
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
@@ -40,7 +40,7 @@ class Targets(Protocol):
         ...
 
     def draw(self, count: int) -> Tensor:
-        """What chance has a part in the next move of each."""
+        """The random numbers for the next move of `count` targets, `[count]`; empty where moves are not random."""
         ...
 
     def move(self, state: Mapping[str, Tensor], draws: Tensor) -> dict[str, Tensor]:
@@ -48,7 +48,7 @@ class Targets(Protocol):
         ...
 
     def cut(self, moved: Mapping[str, Tensor]) -> Tensor | None:
-        """`[B]` whether no more is known of the target after this move; None if that never is so."""
+        """`[B]` whether the recording stops after this move (the episode is truncated); None if it never does."""
         ...
 
 
@@ -129,6 +129,7 @@ class RecordedTargets:
         """See `Targets`."""
         wanted = torch.arange(count, device=self._device) if rows is None else rows
         point = self._starts.new_zeros(count)
+        # Rows that are not wanted use up no start, or tracks would be left out; they stand at point 0, unused.
         point[wanted] = self._next(len(wanted))
         return {"target": self._cells[point], "point": point}
 
@@ -137,8 +138,11 @@ class RecordedTargets:
         if count == 0:
             return self._starts[:0]
         length = len(self._starts)
+        # 5 starts, 3 drawn so far, 4 wanted: rounds 0 and 1 are laid end to end and places 3 ... 6 taken. Only the
+        # count is saved in a checkpoint; the orders follow from the seed.
         begin, end = self._drawn, self._drawn + count
         rounds = range(begin // length, (end - 1) // length + 1)
+        # Rounds before the first one needed are dropped: at most a few orders are held.
         self._orders = {
             number: self._orders[number] if number in self._orders else self._order(number) for number in rounds
         }
@@ -152,7 +156,7 @@ class RecordedTargets:
         return self._starts[order.to(self._device)]
 
     def draw(self, count: int) -> Tensor:  # noqa: ARG002
-        """Nothing is left to chance."""
+        """Empty: a recorded target's next move is known."""
         return torch.empty(0, device=self._device)
 
     def move(self, state: Mapping[str, Tensor], draws: Tensor) -> dict[str, Tensor]:  # noqa: ARG002
@@ -166,7 +170,15 @@ class RecordedTargets:
 
 
 def _line(tracks: Tracks, num_cells: int, *, anywhere: bool) -> tuple[np.ndarray, ...]:
-    """The line of all points: its cells (M for an exit), what follows each point, the starts, and where it is cut."""
+    """All tracks end to end, the exit closing those that have one.
+
+    Returns:
+        `[P]` cells, M for an exit; `[P]` the point after each; the points where episodes may start; `[P]` bool, where a
+        recording stops without an exit.
+    """
+    # Track 3 4, which exits, and track 7 8, which stops: cells 3 4 M 7 8, following 1 2 2 4 4 (the last point of a
+    # track stays where it is), cut at point 4, starts 0 and 3. With `anywhere` episodes may start at 0, 1 and 3:
+    # neither at an exit, nor where no next step is known.
     closed = tracks.closed(num_cells)
     last = closed.first[1:] - 1
     following = np.arange(len(closed.cells)) + 1

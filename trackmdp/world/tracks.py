@@ -64,12 +64,16 @@ class Tracks:
         if max_steps is None:
             return self
         lengths = self.lengths
+        # Place in its own track of each point: tracks of 3 and 2 cells count 0 1 2 0 1.
         step = np.arange(len(self.cells)) - np.repeat(self.first[:-1], lengths)
+        # max_steps moves have max_steps + 1 cells. A track cut short has no exit any more; one of max_steps + 1 cells
+        # leaves on a step too many.
         kept = np.minimum(lengths, max_steps + 1)
         return Tracks(self.cells[step <= max_steps], _ends(kept), self.exits & (lengths <= max_steps), self.names)
 
     def closed(self, num_cells: int) -> Tracks:
         """The tracks with the exit, a cell called M, as the last one where the target left."""
+        # np.insert takes places in the old array: M goes before the first cell of the next track.
         cells = np.insert(self.cells, self.first[1:][self.exits], num_cells)
         return Tracks(cells, _ends(self.lengths + self.exits), self.exits, self.names)
 
@@ -162,6 +166,7 @@ def _load(path: str | Path, size: tuple[int, int], exits: bool, stamp: tuple[int
         raise UserError(f"{source}: no tracks, expected at least two")
     numbers = {name: _integers(source, name, column) for name, column in columns.items()}
     track, cell = numbers["track"], _cells(source, numbers, size)
+    # Last key first: by track, then by step. Without steps the sort is stable, so that the file's order stays.
     order = np.lexsort((numbers.get("step", np.zeros_like(track)), track))
     track, cell = track[order], cell[order]
     if "step" in numbers:
@@ -207,6 +212,7 @@ def _ends(lengths: Indices) -> Indices:
 
 
 def _integers(source: str, name: str, column: Array) -> Indices:
+    # Beyond 2^53 float64 skips integers, and two ids could become one; ~(<) is True for nan as well.
     bad = ~(np.abs(column) < 2**53) | (column != np.floor(column))
     if bad.any():
         entry = int(np.flatnonzero(bad)[0])

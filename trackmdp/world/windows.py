@@ -122,6 +122,7 @@ class Window(nn.Module):
         step = torch.arange(side**2, device=start.device)
         row = (self._row[start] - self.radius).unsqueeze(-1) + step // side
         column = (self._column[start] - self.radius).unsqueeze(-1) + step % side
+        # Without this test a sensor left of column 0 would wrap round to the end of the row above.
         inside = (row >= 0) & (row < self.rows) & (column >= 0) & (column < self.columns)
         return torch.where(inside, row * self.columns + column, self.num_cells)
 
@@ -160,6 +161,7 @@ class Window(nn.Module):
         if self.radius is None:
             return local
         spread = local.new_zeros(*local.shape[:-1], self.num_cells + 1)
+        # Column M takes what lies outside the grid and is cut off again.
         return spread.scatter_(-1, self.around(start), local)[..., : self.num_cells]
 
     def to_local(self, start: Tensor, everywhere: Tensor) -> Tensor:
@@ -179,5 +181,6 @@ class Window(nn.Module):
     def groups(self) -> Tensor:
         """`[M]` int64, the same number for cells from which the border looks alike within the radius."""
         row, column = self._row[:-1], self._column[:-1]
+        # Distances to the four borders, up to the radius: all cells farther inside are of one group.
         margins = torch.stack([row, self.rows - 1 - row, column, self.columns - 1 - column], dim=1)
         return torch.unique(margins.clamp(max=self.radius), dim=0, return_inverse=True)[1]
