@@ -39,12 +39,17 @@ def save(folder: Path, iteration: int, state: dict[str, Any], *, keep: int, best
     for left in folder.glob("*.part"):  # of a process that was killed while it saved
         left.unlink()
     file = named(folder, iteration)
+    # Three steps, and the process may be killed between any two: the new file (whole or absent), the names last.pt and
+    # best.pt (put right by the run that resumes), the removal of old files (done by the next saving).
     with whole_file(file) as stream:
         hashed = _Hashed(stream)
         hashed.save({"format": CHECKPOINT_FORMAT, "iteration": iteration, **state})
+        # Behind the archive, where the hash of all before it is known without going back. Zip readers look for their
+        # directory backwards from the end of the file, and 128 bytes more do not hide it.
         stream.write(_seal(hashed.digest.hexdigest()))
     point(file, best=best)
     for old in _numbered(folder)[:-keep]:
+        # best.pt may be another name of this file: the bytes then stay, under that name.
         old.unlink()
     return file
 
@@ -92,11 +97,15 @@ def load(file: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
     with opened(file, most=_LARGEST) as stream, decoded(str(file), "a checkpoint that can be read"):
         stored = _check_archive(stream, _check(file, stream))
         try:
+            # weights_only: the unpickler builds tensors and plain containers and calls nothing else. mmap needs a
+            # file's name.
             state = torch.load(str(file), map_location=device, mmap=True, weights_only=True)
         except pickle.UnpicklingError as error:  # torch advises to switch weights_only off
             raise ValueError("it holds more than tensors and plain values") from error
+        # type(...): `True == 1`, and a tensor compared with 4 would give a tensor.
         if not isinstance(state, dict) or type(state.get("format")) is not int or state["format"] != CHECKPOINT_FORMAT:
             raise UserError(f"{file}: not the state of a run")
+        # A tensor whose size goes beyond its own member of the archive would show the bytes that follow in the file.
         if sum(_storages(state).values()) != stored:
             raise ValueError("tensors that reach beyond what is stored of them")
         _take_out(state)
@@ -107,6 +116,7 @@ def _storages(value: Any) -> dict[int, int]:
     """Address -> bytes of each storage; as pages of a file, torch takes the length that a tensor claims for its own."""
     if isinstance(value, torch.Tensor):
         storage = value.untyped_storage()
+        # By address, since tensors may share a storage (views); an empty storage has no address of its own.
         return {storage.data_ptr(): storage.nbytes()} if storage.nbytes() else {}
     found: dict[int, int] = {}
     if isinstance(value, (Mapping, list, tuple)):
@@ -119,6 +129,7 @@ def _take_out(value: Any) -> None:
     """Copy the small tensors out of the file's pages, so that at most a large one keeps the file open."""
     if isinstance(value, torch.Tensor):
         if value.nbytes <= _SMALL:
+            # `.data`, so that the tensor object in its place in the nested state is changed, not a copy of it.
             value.data = value.clone()
     elif isinstance(value, (Mapping, list, tuple)):
         for part in value.values() if isinstance(value, Mapping) else value:
@@ -156,6 +167,7 @@ def _seal(digest: str) -> bytes:
 
 def _check(file: Path, stream: BinaryIO) -> int:
     """The bytes before the seal, once their hash is the one that it names."""
+    # The last 128 bytes: a newline, `trackmdp checkpoint 4 sha256 ` and 64 hexadecimal digits, blanks, a newline.
     size = left = max(stream.seek(0, os.SEEK_END) - _SEAL, 0)
     stream.seek(size)
     found = re.fullmatch(rb"\ntrackmdp checkpoint (\d+) sha256 ([0-9a-f]{64}) *\n", stream.read())
@@ -181,14 +193,18 @@ def _check_archive(stream: BinaryIO, size: int) -> int:
     """
     with zipfile.ZipFile(stream) as archive:
         members = archive.infolist()
+    # torch.save stores, so that a deflated member is not its work; unpacked it might fill the memory.
     if any(member.compress_type != zipfile.ZIP_STORED for member in members):
         raise ValueError("a compressed archive")
     if sum(member.file_size for member in members) > size:
         raise ValueError("an archive that claims more bytes than it has")
+    # The archive's members: NAME/data.pkl (the structure), NAME/data/0, NAME/data/1, ... (one for each storage), and a
+    # few bytes of version and byte order.
     return sum(member.file_size for member in members if re.search(r"/data/[0-9]+$", member.filename))
 
 
 def _numbered(folder: Path) -> list[Path]:
     """The checkpoints, the oldest first; what is no ordinary file is somebody else's, not to be read or removed."""
     found = [file for file in folder.glob("iteration-*.pt") if _NAME.fullmatch(file.name)]
+    # By name, which is by number, since the names have eight digits each. lstat: a link is not followed.
     return sorted(file for file in found if stat.S_ISREG(file.lstat().st_mode))

@@ -40,6 +40,8 @@ def single(
         done: of `cfg.total_frames`, made up to whole batches, so many were collected by an earlier process.
     """
     env, common = _env_options(cfg, seed), _common(cfg, device, done)
+    # Trajectory numbers are read by no learner here, take a tenth of the collecting time, and would be one more state
+    # to save.
     return Collector(TrackEnv(problem, **env), policy, track_traj_ids=False, **common)
 
 
@@ -88,6 +90,8 @@ def ray(
     from trackmdp.training import on_ray
 
     env = _env_options(cfg, seed)
+    # `done` in the name of the stream: a resumed run, whose workers start new episodes, must not collect the first
+    # ones again.
     workers = [partial(_remote_env, problem, f"{worker}-{done}", env, cfg.threads) for worker in range(cfg.workers)]
     return on_ray.make_ray_collector(workers, policy, cfg, _common(cfg, device, done))
 
@@ -104,7 +108,11 @@ def _common(cfg: CollectorConfig, device: torch.device, done: int) -> dict[str, 
     """
     return {
         "frames_per_batch": cfg.frames_per_batch,
+        # What is left, rounded up to whole batches: 100,000 frames in batches of 30,000 are 120,000, or 60,000 where
+        # 60,000 are done.
         "total_frames": -(-(cfg.total_frames - done) // cfg.frames_per_batch) * cfg.frames_per_batch,
+        # True would wrap the environment in an InitTracker: a transformed environment does not call the environment's
+        # own `_step_and_maybe_reset`, and is slower. Left unset, TorchRL warns.
         "auto_register_policy_transforms": False,
         "env_device": make_device(cfg.device, "collector.device"),
         "policy_device": device,
@@ -146,6 +154,8 @@ def collector_state(collector: BaseCollector) -> dict[str, Any] | None:
     if not isinstance(collector, Collector):
         return None
     return {
+        # Private, but in no state_dict of TorchRL: the observations with which the next batch begins, rows in
+        # mid-episode. A clone, since the collector goes on writing into its own.
         "carrier": collector._carrier.clone().to_dict(),
         "environment": collector.env.generator_state(),
     }
@@ -154,5 +164,6 @@ def collector_state(collector: BaseCollector) -> dict[str, Any] | None:
 def load_collector_state(collector: Collector, state: dict[str, Any]) -> None:
     """Go on where `collector_state` was taken; call before the first batch."""
     rows = TensorDict.from_dict(state["carrier"], batch_size=collector._carrier.batch_size)
+    # An emptied copy keeps batch size and device, and has only the keys that were saved.
     collector._carrier = collector._carrier.empty().update(rows)
     collector.env.set_generator_state(state["environment"])

@@ -88,6 +88,7 @@ class Display(Callback):
     def _line(self, iteration: int, iterations: int, figures: str) -> None:
         """A line after the first iteration, after the last, and every two seconds between."""
         now, first = time.monotonic(), self._first.iteration
+        # The first line at once, so that whoever waits sees the speed; the last one, so that a log ends at 100 %.
         ends = iteration in (first + 1, iterations)
         if not ends and now - self._last_line < _SECONDS_BETWEEN_LINES:
             return

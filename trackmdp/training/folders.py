@@ -82,6 +82,7 @@ def runs_of(sweep: Path) -> list[RunState]:
 
 def run_of(folder: Path, overrides: tuple[str, ...] = ()) -> RunState:
     """One run, as its folder shows it."""
+    # Asked first: a resumed run is running although an earlier failure or summary may still be in its folder.
     if is_locked(folder):
         return RunState(folder, overrides, "running")
     if result := _result(folder):

@@ -82,8 +82,11 @@ def estimated_kernel(tracks: Tracks, size: tuple[int, int]) -> sparse.csr_array:
     estimate = KernelEstimate(size, weight=1.0, exit_weight=1.0)
     line = tracks.closed(estimate.num_cells)
     moves = np.ones(len(line.cells), dtype=bool)
+    # Example: the tracks 3 4 (exit) and 7 8 stand end to end as cells = 3 4 M 7 8 with first = 0 3 5. Every place but
+    # a track's last one (2 and 4) begins a move: 3 to 4, 4 to M, 7 to 8.
     moves[line.first[1:] - 1] = False
     at = np.flatnonzero(moves)
     estimate.add_moves(line.cells[at], line.cells[at + 1])
     estimate.fit(1)
+    # `[M, M + 1]`, the last column being the exit, which a kernel `[M, M]` leaves to its rows' missing mass.
     return sparse.csr_array(estimate.mean()[:, :-1])

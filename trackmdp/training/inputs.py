@@ -27,6 +27,7 @@ def write_inputs(config: TrainConfig, problem: Problem, folder: Path, *, resumed
         UserError: the run that is resumed was begun with another kernel, or with other tracks.
     """
     file, content = folder / _name(problem), _content(problem)
+    # Before anything is written: a run that is refused must keep the inputs that its results belong to.
     if resumed:
         check_inputs(problem, folder)
     write_text(folder / "config.yaml", config_text(config))

@@ -40,6 +40,8 @@ def locked(folder: Path, key: str = "hydra.run.dir") -> Iterator[None]:
         UserError: another process holds it, or the lock is no ordinary file.
     """
     file = folder / _LOCK
+    # Never emptied or replaced while in use: flock belongs to the open file, and a new file of the same name would
+    # have a lock of its own.
     descriptor = reopen(file, "r+")
     try:
         taken = _take(descriptor, file)
@@ -62,6 +64,8 @@ def is_locked(folder: Path) -> bool:
     """Whether a process is running in the folder, as far as its lock tells."""
     try:
         with opened(folder / _LOCK, most=2**20) as stream:
+            # A shared lock, so that several who watch do not see each other as the owner; closing the file lets go of
+            # it.
             fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
         return True
@@ -74,9 +78,12 @@ def is_locked(folder: Path) -> bool:
 
 def _take(descriptor: int, file: Path) -> bool | None:
     """Whether the lock could be had, None where there are no locks; who only looks at it holds it for an instant."""
+    # More than once: `is_locked` of somebody who watches holds the file for an instant.
     for _ in range(_TRIES):
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            # Between our opening the file and locking it, an owner that ended may have removed it: then this is a lock
+            # on a file without a name, which nobody else will ever look at.
             return os.fstat(descriptor).st_ino == file.stat().st_ino  # not one that was just removed
         except OSError as error:
             if error.errno in UNSUPPORTED:
@@ -102,6 +109,7 @@ def _owned(folder: Path, key: str) -> Iterator[None]:
     if _said(file).get("token") != token:
         raise UserError(f"{key}={folder}: another process is running in this folder{_who(file)}")
     over = threading.Event()
+    # A daemon thread: it must not keep a process alive whose main thread has ended.
     beat = threading.Thread(target=_beat, args=(file, over), daemon=True)
     beat.start()
     try:
@@ -109,6 +117,7 @@ def _owned(folder: Path, key: str) -> Iterator[None]:
     finally:
         over.set()
         beat.join()
+        # Only our own: a host that was suspended for a minute may find that another has taken the folder over.
         if _said(file).get("token") == token:
             file.unlink(missing_ok=True)
 
@@ -130,6 +139,7 @@ def _is_alive(file: Path) -> bool:
         return False
     if said.get("host") == socket.gethostname() and isinstance(said.get("pid"), int):
         return _runs(said["pid"])
+    # A new file shows the time by the clock that also stamps the owner's file, that of the file server.
     now = file.with_name(f"{_OWNER}.{secrets.token_hex(4)}")
     try:
         with create(now):
@@ -142,6 +152,8 @@ def _is_alive(file: Path) -> bool:
 
 def _runs(pid: int) -> bool:
     try:
+        # Signal 0 is not sent; the call only says whether there is such a process. PermissionError: there is, another
+        # user's.
         os.kill(pid, 0)
     except PermissionError:
         return True

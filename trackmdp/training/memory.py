@@ -54,6 +54,9 @@ def available_bytes(device: torch.device, root: Path = Path("/")) -> int:
     free = [_entry(root / "proc/meminfo", "MemAvailable:", 1024)]
     for limit, used, cache in _CGROUPS:
         for folder in (root / "sys/fs/cgroup", root / "sys/fs/cgroup/memory"):
+            # A job's own limit (version 2 of cgroups, then version 1) may be far below what the machine has; the
+            # kernel kills whoever exceeds it without a message. Pages of files that are not in use count as used, but
+            # are given back.
             most, now = _number(folder / limit), _number(folder / used)
             if most is not None and now is not None:
                 free.append(most - now + (_entry(folder / "memory.stat", cache, 1) or 0))
@@ -74,6 +77,7 @@ def _number(file: Path) -> int | None:
         text = file.read_text().strip()
     except OSError:
         return None
+    # Version 2 writes `max` where there is no limit.
     return int(text) if text.isdigit() else None
 
 

@@ -36,6 +36,7 @@ def make_ray_collector(
         UserError: Ray is not installed, or there is no such cluster.
     """
     require("ray", "ray", "collector=ray")
+    # RayCollector has no such argument; the collectors that it makes in its workers have.
     register = common.pop("auto_register_policy_transforms")
     try:
         with kept_sigterm():  # a scheduler's signal must reach the run
@@ -44,6 +45,8 @@ def make_ray_collector(
                 policy,
                 sync=True,
                 ray_init_config=_cluster(cfg),
+                # Both are always given: TorchRL asks for 0.2 GPUs by default, and on a cluster without GPUs no worker
+                # would ever start.
                 remote_configs={"num_cpus": cfg.cpus_per_worker, "num_gpus": cfg.gpus_per_worker},
                 collector_kwargs={"auto_register_policy_transforms": register, "track_traj_ids": False},
                 postproc=_rows,
@@ -77,6 +80,8 @@ def _cluster(cfg: RayWorkersConfig) -> dict[str, Any]:
     """Arguments of `ray.init`; a cluster that is joined has its own resources."""
     quiet: dict[str, Any] = {"logging_level": "error", "log_to_driver": False}
     if cfg.address is not None:
+        # Ray refuses num_cpus and object_store_memory together with an address: they were fixed when the cluster
+        # started.
         return {"address": cfg.address, **quiet}
     cpus = max(1, round(cfg.workers * cfg.cpus_per_worker))
     return {"num_cpus": cpus, "object_store_memory": _STORE, "include_dashboard": False, **quiet}

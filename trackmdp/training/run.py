@@ -148,4 +148,5 @@ def _cell(text: str) -> float | int | None:
     """A number as it was logged: whole where it was, None where there is none."""
     if not text:
         return None
+    # A float is logged with a point or an exponent (2.0, 1e-05), so that digits alone are an int.
     return int(text) if text.lstrip("-").isdigit() else float(text)

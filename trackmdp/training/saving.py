@@ -67,6 +67,8 @@ class Checkpoints(Callback):
         By time not before training took 50 times as long as the last saving, which would else take too much of it.
         """
         every, saved = self._cfg.every, self._saved
+        # Multiples that were passed, since batches seldom end on one: every=30,000 with batches of 20,000 saves at
+        # 40,000, 60,000 and 100,000.
         frames = every and at.frames // every > saved.frames // every
         seconds = self._cfg.seconds is not None and at.seconds - saved.seconds >= max(self._cfg.seconds, self._rest)
         return bool(frames or seconds)
@@ -75,10 +77,12 @@ class Checkpoints(Callback):
         """Save the run as it is, and tell the callbacks."""
         begin, aihtr = time.monotonic(), self._attained(trainer)
         self._is_best, self._best = aihtr > self._best, max(self._best, aihtr)
-        # Its own state first: that of the others is as they wrote their rows and episodes before this.
+        # `_best` and `_is_best` are part of the state, so they are set before it is taken. The logs are called before
+        # this callback: the lengths of files in their states include this iteration's row and episodes.
         named = {each.name: each.state_dict() for each in trainer.callbacks if each.name}
         state = capture(trainer.config, trainer.algorithm, trainer.collector, trainer.position, named)
         file = checkpoint.save(self._folder, trainer.position.iteration, state, keep=self._cfg.keep, best=self._is_best)
+        # Measured, since saving a large replay buffer to a slow disk may take longer than the interval asked for.
         self._saved, self._rest = trainer.position, _SAVING * (time.monotonic() - begin)
         for callback in trainer.callbacks:
             callback.on_checkpoint(trainer, file)
@@ -92,6 +96,7 @@ class Checkpoints(Callback):
         iteration, aihtr = self._evaluated
         if iteration == trainer.position.iteration:
             return aihtr
+        # Evaluating draws from no generator of the run, so that saving more often leaves the run as it is.
         return trainer.evaluator.score(trainer.policy()).evaluation.aihtr
 
     def state_dict(self) -> dict[str, Any]:

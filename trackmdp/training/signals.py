@@ -1,4 +1,4 @@
-"""Asked to stop: a scheduler's signal is heard at once and answered between two iterations."""
+"""Signals that ask a run to stop: noted when they come, acted upon between two iterations."""
 
 from __future__ import annotations
 
@@ -31,6 +31,7 @@ class Signals:
 
     def __enter__(self) -> Self:
         self._before = {}
+        # Python allows signal.signal in the main thread alone; `train` called from another one runs without.
         if threading.current_thread() is threading.main_thread():
             self._before = {number: signal.signal(number, self._note) for number in _HEARD}
         return self
@@ -46,6 +47,7 @@ class Signals:
 
         A scheduler signals a whole group of processes; a worker may die of it before this one is told.
         """
+        # Half a second in all.
         for _ in range(20):
             if self.received:
                 return True
@@ -56,15 +58,19 @@ class Signals:
         kind, now = signal.Signals(number), time.monotonic()
         if kind not in self._first:
             self._first[kind], self.received = now, number
+        # After the first Ctrl-C its former handler is back, so that a second one interrupts at once: whoever sits at a
+        # terminal may not want to wait for the end of the iteration.
         if kind is signal.SIGINT or now - self._first[kind] >= _ONE:
             signal.signal(number, self._before[kind])
         if now - self._first[kind] >= _ONE:
+            # Sent again, now that the former handler is back: this call of ours has consumed the signal.
             os.kill(os.getpid(), number)
 
 
 @contextmanager
 def kept_sigterm() -> Iterator[None]:
     """Afterwards SIGTERM acts as before, though what is done inside takes it over, as Ray does when it starts."""
+    # Ray installs a handler of its own, which exits: the run would end without its checkpoint.
     before = signal.getsignal(signal.SIGTERM)
     try:
         yield

@@ -40,6 +40,8 @@ class Position:
 def identity(cfg: TrainConfig) -> str:
     """SHA-256 of all options that must not change when a run is resumed."""
     plain = to_dict(cfg)
+    # What may change is taken out; repr of the rest writes floats with all digits, so that equal hashes mean equal
+    # options.
     for key in (*CHANGEABLE, "resume"):
         *parents, last = key.split(".")
         node = plain
@@ -82,6 +84,8 @@ def restore(state: Mapping[str, Any], algorithm: Algorithm, collector: BaseColle
     algorithm.load_state_dict(state["algorithm"])
     if state["collector"] is not None and isinstance(collector, Collector):
         load_collector_state(collector, state["collector"])
+    # Last, since building the learner and the collector (which resets its environments) draws numbers. `.cpu()`: with
+    # device=cuda the checkpoint's tensors were loaded to the GPU, generators' states must lie on the CPU.
     torch.set_rng_state(state["random"]["cpu"].cpu())
     if state["random"]["cuda"] and torch.cuda.is_available():
         torch.cuda.set_rng_state_all([rng.cpu() for rng in state["random"]["cuda"]])
@@ -100,6 +104,7 @@ def find(cfg: TrainConfig, folder: Path, device: torch.device) -> tuple[dict[str
     if cfg.resume is None:
         return None, []
     named = Path(cfg.resume)
+    # Newest first: after a power failure the last one may be damaged while the one before is whole.
     files = [named] if named.is_file() else checkpoint.available_checkpoints(folder / "checkpoints")
     if not files and cfg.resume == "auto":
         return None, []
@@ -107,6 +112,7 @@ def find(cfg: TrainConfig, folder: Path, device: torch.device) -> tuple[dict[str
     for file in files:
         try:
             state = checkpoint.load(file, device)
+            # Refused before anything is put back: half a state would be worse than none.
             _check(state, cfg, file)
         except UserError as error:
             passed_over.append(str(error))
@@ -130,6 +136,8 @@ def take_weights(algorithm: Algorithm, run: Path, device: torch.device) -> list[
     with torch.no_grad(), decoded(str(file), "the weights of a run"):
         for name, tensor in _weights(own):
             if name in given and given[name].shape == tensor.shape:
+                # Into the tensors of our own state, which is then loaded as a whole: state_dict may have handed out
+                # copies.
                 tensor.copy_(given[name])
                 taken.append(name)
     if not taken:
@@ -161,10 +169,12 @@ def _check(state: Mapping[str, Any], cfg: TrainConfig, file: Path) -> None:
     with decoded(str(file), "the state of a run"):
         if state["versions"].keys() != set(_EXACT):
             raise ValueError(f"versions of other packages than {', '.join(_EXACT)}")
+        # Another version may draw or round otherwise: the run would go on, but not as the one that was interrupted.
         for name, written in state["versions"].items():
             if written != version(name):
                 raise UserError(f"{file}: written with {name} {written}, this is {version(name)}; expected the same")
         at = Position(**state["position"])
+        # 2^53: up to there a float holds every integer, as metrics and JSON readers need.
         if any(type(each) is not int or not 0 <= each < 2**53 for each in (at.iteration, at.frames)):
             raise ValueError("a position that is none")
         if not (0 <= at.seconds < math.inf and math.isfinite(at.reward)) or at.iteration != state["iteration"]:

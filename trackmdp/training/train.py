@@ -90,6 +90,8 @@ def _described(problem: Problem, folder: Path | None) -> dict[str, Any]:
         "grid.window": problem.window,
         "cost.reward": problem.reward,
         "cost.sensor": float(price[0]) if uniform else price.tolist(),
+        # null means the sum of all prices: that is what most problems have, up to the rounding of a sum in another
+        # order.
         "cost.safe": None if np.isclose(problem.safe_cost, price.sum(), rtol=1e-15) else problem.safe_cost,
     }
     if isinstance(problem, World):
@@ -100,4 +102,5 @@ def _described(problem: Problem, folder: Path | None) -> dict[str, Any]:
             "folder: recorded tracks that were loaded in Python have no file to resume from; use trackmdp train "
             "kernel=tracks kernel.path=..., or folder=None"
         )
+    # A path must be given, and nothing reads it: the tracks are in memory, and no folder keeps this config.
     return given | {"kernel": "tracks", "kernel.path": "tracks.csv", "kernel.markov": problem.markov}

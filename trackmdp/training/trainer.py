@@ -73,6 +73,8 @@ class Trainer:
         self.device = make_device(config.device)
         self.callbacks = [*callbacks, Display(self.console, f"{config.algo.name} seed {config.seed}")]
         if folder is not None:
+            # Order: logs, the user's callbacks, checkpoints, display. A checkpoint holds how far the logs are written,
+            # so that they must have written this iteration's row before it is saved; the display shows it afterwards.
             self.callbacks[-1:-1] = [Checkpoints(config.checkpoint, folder / "checkpoints")]
             self.callbacks[:0] = make_loggers(config, folder)
         self.start, self.position = Position(), Position()
@@ -103,6 +105,7 @@ class Trainer:
         """
         began = time.monotonic()
         with ExitStack() as opened:
+            # The number of threads is the whole process's: whoever calls `train` from Python gets their own back.
             opened.callback(torch.set_num_threads, torch.get_num_threads())
             torch.set_num_threads(self.config.threads)
             self._build(opened)
@@ -111,11 +114,15 @@ class Trainer:
             self._watch = opened.enter_context(Watch(self.collector))
             for callback in self.callbacks:
                 callback.on_start(self)
+                # Registered one by one: if the third callback cannot start, the first two are still ended, in reverse
+                # order.
                 opened.callback(callback.on_end, self)
+            # As if the run had begun so much earlier: seconds go on counting where the earlier process stopped.
             self._began = time.monotonic() - self.start.seconds
             try:
                 self._loop()
             except BaseException as error:
+                # on_end is called after this, and reads it: only Preempted leaves a state that is worth saving.
                 self.error = error
                 raise
         self.position = replace(self.position, seconds=time.monotonic() - began + self.start.seconds)
@@ -132,6 +139,7 @@ class Trainer:
         self.algorithm = make_algorithm(config, problem.task, self.device)
         done = state["position"]["frames"] if state else 0
         self.collector = make_collector(config, problem, self.algorithm.policy, self.device, done=done)
+        # At once, so that worker processes end as well if what follows (a damaged checkpoint, say) raises.
         opened.callback(self.collector.shutdown)
         self.evaluator = make_evaluator(problem)
         self.start = self._restore(state)
@@ -159,6 +167,7 @@ class Trainer:
 
     def _loop(self) -> None:
         self._batches = iter(self.collector)
+        # Before any learning: rows between evaluations and the display use the last score, and there must be one.
         self.score = self.evaluator.score(self.policy())
         for iteration in range(self.position.iteration + 1, self.iterations + 1):
             batch = self._collect(iteration)
@@ -175,6 +184,7 @@ class Trainer:
         """The next batch, None once all frames are in."""
         try:
             with _named(iteration), self._watch.waiting():
+                # None after the last batch: learners that replay have more iterations than batches.
                 batch = next(self._batches, None)
         except RunError:
             if not self._signals.heard():

@@ -22,6 +22,7 @@ class Watch:
     """
 
     def __init__(self, collector: BaseCollector) -> None:
+        # TorchRL keeps them as `procs`; a collector in this process, or on Ray, has none.
         self._processes: list[Any] = list(getattr(collector, "procs", ()))
         self._waiting = False
 
@@ -52,11 +53,16 @@ class Watch:
             self._waiting = False
 
     def _heard(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
+        # Only while the collector waits: an exception out of a signal handler anywhere else, in the middle of an
+        # optimizer step or of a saving, would leave half a state. A worker that dies at such a moment is found by the
+        # next call.
         if self._waiting:
             self._check()
 
     def _check(self) -> None:
         for index, process in enumerate(self._processes):
+            # `exitcode` raises on a process object that was closed. None: still running; negative: the number of the
+            # signal that killed it.
             code = None if process._closed else process.exitcode
             if code is not None:
                 self._waiting = False  # the others end next, when the collector is shut down
