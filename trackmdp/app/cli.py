@@ -37,11 +37,14 @@ _OF_FILES = {
 def main(argv: list[str] | None = None) -> int:
     """Run one command; returns the exit status: 0, or one of `trackmdp.errors`, or 128 + the signal that ended it."""
     words = sys.argv[1:] if argv is None else argv
+    # Set before TorchRL is imported, which reads it then.
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL reports every buffer it makes
     try:
         status = _dispatch(words)
+        # Now, not at the interpreter's end: there a closed pipe could no longer be answered by an exit status.
         sys.stdout.flush()
         return status
+    # The interpreter flushes stdout once more when it ends, and would complain again; so it is pointed at /dev/null.
     except BrokenPipeError:  # `trackmdp train --help | head`: nobody listens any more
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
@@ -61,6 +64,7 @@ def _dispatch(words: list[str]) -> int:
         return _run(command, words[1:])
     except BrokenPipeError:
         raise
+    # Named one by one: SystemExit passes, with which argparse ends after `--version`.
     except (Exception, KeyboardInterrupt, Preempted) as error:
         return _report(command, error)
 
@@ -76,6 +80,7 @@ def _report(command: str, error: BaseException) -> int:
         status = USER_MISTAKE if isinstance(error, UserError) else FAILED
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             traceback.print_exception(error)
+    # Without a file's name it is not about what the user named, and is reported as a bug.
     elif isinstance(error, OSError) and error.filename is not None and error.errno in _OF_FILES:
         line = f"{error.filename}: {error.strerror}"
     elif isinstance(error, MemoryError) or "can't allocate memory" in line:  # torch's words, in a RuntimeError

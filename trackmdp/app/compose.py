@@ -48,13 +48,17 @@ def register() -> None:
     plugin_folders()  # installed packages add their choices to `GROUPS`
     store = ConfigStore.instance()
     for command, root in ROOTS.items():
+        # A config typed by a dataclass is what makes Hydra refuse an unknown key or a wrong type while it composes.
         store.store(name=f"base_{command}", node=root)
     for group, members in GROUPS.items():
         for name, schema in members.items():
             store.store(group=group, name=f"base_{name}", node=schema)
+    # First load Hydra's plugins, then take out what they stored: what they store later would stay.
     Plugins.instance()  # Hydra's plugins store launchers and sweepers of the same names, which ours replace
     for group, members in PLUGINS.items():
         for name, schema in members.items():
+            # Where `hydra-joblib-launcher` is installed, Hydra would take the `hydra/launcher/joblib` that it stores
+            # for the schema of our file of that name.
             store.repo["hydra"][group].pop(f"{name}.yaml", None)
             store.store(group=f"hydra/{group}", name=f"base_{name}", node=schema)
 
@@ -82,6 +86,7 @@ class Composer:
         extra: str | None = None,
     ) -> None:
         self.command, self.name = command, name or command
+        # Left in, Hydra would read those folders itself, without the checks of `UserFolder`.
         self.words = [word for word in words if not _is_search_path(word)]
         """What was typed, but for search paths."""
         named = [path for word in words if _is_search_path(word) for path in _search_path(word)]
@@ -91,15 +96,19 @@ class Composer:
         self._opened = ExitStack()
 
     def __enter__(self) -> Self:
+        # Plugins of this package's are loaded by it, and their folders are searched as soon as Hydra is initialised.
         register()
         main = str(self._main) if self._main else conf_dir()
         self._opened.enter_context(searched(self._users, plugin_folders(), main_is_users=self._main is not None))
+        # Without `version_base` Hydra warns, and behaves as its version 1.1. An absolute folder works for a clone, an
+        # editable install and a wheel; a relative one works for a clone alone.
         self._opened.enter_context(initialize_config_dir(main, job_name="trackmdp", version_base="1.3"))
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
+        # In this order: closing restores what was initialised before, and Hydra's state is a global of the process.
         self._opened.close()
         GlobalHydra.instance().clear()
 
@@ -113,11 +122,15 @@ class Composer:
             cfg = self._compose(words)
         except Exception as error:  # Hydra raises many kinds, ValueError among them; all are about what was typed
             raise diagnose(error, self.command, words, self._compose) from error
+        # Composing makes no object of what a config names; what would comes later, so this is early enough.
         _refuse_code(cfg, words)
+        # `compose`, unlike Hydra's own entry point, leaves this to the caller; without it `${hydra:...}` cannot be
+        # resolved.
         HydraConfig.instance().set_config(cfg)
         return cfg
 
     def _compose(self, words: Sequence[str]) -> DictConfig:
+        # With Hydra's part, which says where to write, what to log, and how a sweep is run.
         return compose(self.name, overrides=list(words), return_hydra_config=True)
 
 
@@ -132,13 +145,18 @@ def _refuse_code(cfg: DictConfig, words: Sequence[str]) -> None:
     Raises:
         UserError: it names a callable, a callback, a launcher or a sweeper that is none of ours, or logging of its own.
     """
+    # Unresolved: resolving would already call resolvers, before anything is checked.
     plain = OmegaConf.to_container(cfg, resolve=False)
     assert isinstance(plain, dict)
     for group, members in PLUGINS.items():
+        # It names a class by `_target_`, which the search for names of code at the end would find.
         if plain["hydra"][group] == _HYDRAS_OWN:
             del plain["hydra"][group]
+        # The type of a node is the schema it was composed from, another for the launcher of another package. Keys that
+        # `+` adds to ours keep the type, and are looked through at the end.
         elif OmegaConf.get_type(cfg.hydra, group) not in members.values():
             raise UserError(f"hydra/{group}: expected one of {', '.join(members)}")
+    # Hydra would make an object of each entry, by its `_target_`.
     if cfg.hydra.callbacks:
         raise UserError(f"hydra.callbacks.{next(iter(cfg.hydra.callbacks))}: a config names no code to call")
     verbose = plain["hydra"]["verbose"]
@@ -147,8 +165,10 @@ def _refuse_code(cfg: DictConfig, words: Sequence[str]) -> None:
         or (isinstance(verbose, list) and all(isinstance(name, str) for name in verbose))
     ):
         raise UserError(f"hydra.verbose={verbose}: expected true, false, or a list of loggers")
+    # PATH or LD_PRELOAD from a file that came with a data set would decide what every child process runs.
     if cfg.hydra.job.env_set and not any("hydra.job.env_" in word for word in words):
         raise UserError("hydra.job.env_set: not taken from a file; set the environment in the shell")
+    # Hydra appends it to the run's folder: `../other` would be written to as well.
     if Path(cfg.hydra.output_subdir or "x").name != (cfg.hydra.output_subdir or "x"):
         raise UserError(f"hydra.output_subdir={cfg.hydra.output_subdir}: expected a name, or null")
     for name in ("job_logging", "hydra_logging"):
@@ -162,6 +182,8 @@ def _check_logging(hydra: DictConfig, name: str) -> None:
     """Logging may only be one of Hydra's own choices: its configs name classes, factories and files."""
     node = hydra[name]
     plain = OmegaConf.to_container(node, resolve=False) if node is not None else {}
+    # Python's `logging.config` calls what "()" and "class" name, opens what "filename" names, and looks up "ext://..."
+    # among all modules. Hydra's own choices use some of that, so each entry is compared with what those hold.
     known = {"none", "default", "stdout", "disabled", "colorlog", None}
     if hydra.runtime.choices.get(f"hydra/{name}") not in known:
         raise UserError(f"hydra/{name}: expected one of none, default, stdout, disabled, colorlog")
@@ -170,6 +192,7 @@ def _check_logging(hydra: DictConfig, name: str) -> None:
         allowed = {
             "class": value in _LOGGING["class"],
             "()": value == "colorlog.ColoredFormatter",
+            # The name of the job is part of the file's name, and could lead out of the run's folder.
             "filename": value == _LOG_FILE and "/" not in str(hydra.job.name),
         }.get(key, not str(value).startswith(("ext://", "cfg://")) or value in ("ext://sys.stdout", "ext://sys.stderr"))
         if not allowed:
@@ -187,12 +210,14 @@ def _entries(plain: Any, prefix: str) -> Iterable[tuple[str, Any]]:
 
 
 def _is_search_path(word: str) -> bool:
+    # `++` forces an override in Hydra's grammar and `+` adds one: both are the same option.
     return word.lstrip("+").startswith("hydra.searchpath=")
 
 
 def _search_path(word: str) -> list[str]:
     """The folders that `hydra.searchpath=[...]` names."""
     try:
+        # Parsed as Hydra parses it, so that quotes and escapes within the list mean the same.
         value = OverridesParser.create().parse_override(word).value()
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(f"{word}: expected hydra.searchpath=[FOLDER, ...]") from error

@@ -32,20 +32,26 @@ def diagnose(error: Exception, command: str, words: Sequence[str], compose: Comp
     if isinstance(error, UserError):  # a file of the user's was refused
         return error
     try:
+        # Composing stops at the first mistake in its own order, and its message names Hydra's internals. The words are
+        # gone through again here, to name the one that is wrong with what was expected instead.
         parsed = [_parse(word) for word in words]
     except UserError as misspelt:
         return misspelt
+    # Hydra says that a sweep "requires --multirun"; nothing is wrong with the value itself.
     sweeps = [override.input_line for override in parsed if override.is_sweep_override()]
     if sweeps and ("multirun" in str(error).lower()):
         return UserError(f"{sweeps[0]}: expected one value; add -m to run once for each")
     groups = [override for override in parsed if _group(override, command)]
     files = [override for override in parsed if _is_choice(override, command)]
+    # Choices before values: with algo=pppo every algo.* would be unknown, though only the choice is wrong.
     for override in files:
         if refusal := _bad_file(override, error):
             return refusal
     for override in groups:
         if refusal := _bad_choice(override, _group(override, command), error):
             return refusal
+    # What options there are depends on the choices: in algo=a2c,ppo algo.epochs is an option of one of them. The first
+    # combination that composes and shows a mistake decides.
     for overrides in _jobs([*files, *groups]):
         known = _known(command, overrides, compose)
         if known is None:
@@ -53,6 +59,7 @@ def diagnose(error: Exception, command: str, words: Sequence[str], compose: Comp
         for override in parsed:
             if override not in [*files, *groups] and (refusal := _bad_value(override, known)):
                 return refusal
+    # No word is at fault: an interpolation, a defaults list or a user's file; Hydra's message is all there is.
     return UserError(_plain(error))
 
 
@@ -74,6 +81,8 @@ def _parse(word: str) -> Override:
 
 def _group(override: Override, command: str) -> str:
     """The group a word chooses from, `""` if it sets a value."""
+    # A selector such as credit=joint picks a file within its group (`algo`), and belongs to the command if the group
+    # does.
     key = override.key_or_group
     chosen = SELECTORS[key].group if key in SELECTORS else key
     return key if chosen in GROUPS and chosen in options(ROOTS[command]) else ""
@@ -102,6 +111,8 @@ def _bad_file(override: Override, error: Exception) -> UserError | None:
     said = str(error)
     if f"Could not find '{key}/{values[0]}'" not in said:
         return None
+    # Hydra ends its message with one option a line, each after a tab. Schemas are stored as `base_...`, and are no
+    # choices.
     listed = said.partition(f"Available options in '{key}':")[2].splitlines()[1:]
     names = [line.strip() for line in itertools.takewhile(lambda line: line.startswith("\t"), listed)]
     known = [name for name in names if not name.startswith("base_")]
@@ -127,6 +138,7 @@ def _options_of(node: Any, schema: type[Any], prefix: str) -> Iterator[tuple[str
         if isinstance(item, Option):
             yield f"{prefix}{name}", item
             continue
+        # `node[name]` would resolve interpolations and raise at values that are missing; only the type is asked for.
         child = node._get_node(name)
         kind = OmegaConf.get_type(child) if isinstance(child, DictConfig) and not child._is_none() else None
         if kind is not None:
@@ -135,10 +147,12 @@ def _options_of(node: Any, schema: type[Any], prefix: str) -> Iterator[tuple[str
 
 def _bad_value(override: Override, known: dict[str, Option]) -> UserError | None:
     key = override.key_or_group
+    # Hydra's own options have no schema of ours; `group@package` moves a choice to a place that is not known here.
     if key.split(".")[0] == "hydra" or "@" in key:
         return None
     if key not in known:
         return _unknown(override, known)
+    # Every option exists already: `+` would add a second meaning, `~` would leave a hole in the typed config.
     if override.is_delete() or override.is_add():
         return UserError(f"{override.input_line}: expected {key}=value, without + or ~")
     for value in _values(override):
@@ -169,6 +183,7 @@ def _shown(value: Any) -> Any:
 
 def _plain(error: Exception) -> str:
     """What an error and its cause say, in one line."""
+    # Hydra wraps OmegaConf's error, and each says a part: where, and what.
     said = [str(each).strip() for each in (error, error.__cause__) if each is not None]
     lines = [line.strip(" .:") for text in said for line in text.splitlines()[:2]]
     told = [line for line in lines if line and not line.startswith(("To append", "full_key"))]

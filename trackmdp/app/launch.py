@@ -35,6 +35,7 @@ def launch(command: str, words: Sequence[str]) -> int:
     """
     args = parse(words)
     with Composer(command, args.overrides, args.config_name, args.config_path, args.config_dir) as compose:
+        # Before anything is checked or made: `--cfg job` also shows a config that a run would refuse.
         if is_question(args):
             answer(compose, args)
             return 0
@@ -45,14 +46,17 @@ def launch(command: str, words: Sequence[str]) -> int:
 
 def _run_once(compose: Composer) -> int:
     cfg = compose(compose.words)
+    # All checks come first, so that a mistyped line leaves no folder behind.
     ready = prepare(compose.command, cfg, run_words(compose.words))
     made = make_folder("hydra.run.dir", ready.folder)
+    # Hydra marks its part read-only once it is composed.
     with read_write(cfg.hydra):
         cfg.hydra.run.dir = str(ready.folder)  # a run that is resumed writes to its own
     try:
         announce(compose.command, ready.cfg, ready.folder)
         _run_in_hydra(cfg, ready)
     finally:
+        # A run that failed before its first file leaves nothing; one that wrote something keeps it.
         remove_if_empty(made)
     return 0
 
@@ -60,8 +64,11 @@ def _run_once(compose: Composer) -> int:
 def _run_in_hydra(cfg: DictConfig, ready: Prepared) -> None:
     """Run with what Hydra's own settings ask for: logging, environment, current folder, `.hydra`."""
     configure_log(cfg.hydra.hydra_logging, cfg.hydra.verbose)
+    # Made absolute here, while the current folder is still the one that relative names are meant from:
     task = _Task(replace(ready, folder=ready.folder.absolute()))  # hydra.job.chdir moves the current folder
     loader = GlobalHydra.instance().config_loader()
+    # Hydra's public call below its command line: it makes `.hydra`, changes folder and sets the environment, as a user
+    # of Hydra expects, without its own parsing of sys.argv and its handling of errors.
     run_job(
         task,
         cfg,
@@ -69,6 +76,7 @@ def _run_in_hydra(cfg: DictConfig, ready: Prepared) -> None:
         job_subdir_key=None,
         hydra_context=HydraContext(loader, _NoCallbacks()),  # type: ignore[arg-type]
     )
+    # Only now, after Hydra has restored the environment and the current folder.
     if task.raised is not None:
         raise task.raised
 
@@ -83,6 +91,7 @@ class _Task:
     def __call__(self, _: DictConfig) -> Any:
         try:
             return self.ready.run()
+        # KeyboardInterrupt and `Preempted` are no `Exception`: they pass through Hydra as they are.
         except Exception as error:
             self.raised = error
             return None
@@ -105,16 +114,23 @@ def _sweep(compose: Composer) -> int:
     from trackmdp.training.display import make_console
 
     command, words = compose.command, run_words(compose.words)
+    # Hydra refuses words with several values outside its own multirun; what concerns the sweep as a whole has one
+    # value.
     cfg = compose([word for word in compose.words if not _has_values(word)])
     sweeper, launcher = plugin("sweeper", cfg.hydra.sweeper), plugin("launcher", cfg.hydra.launcher)
+    # Now, so that a missing package is told before anything is planned or written.
     launch_jobs = make_launcher(launcher)
     grids = (sweeper.blocks or []) if isinstance(sweeper, BlocksConfig) else [sweeper.name]
+    # `hydra.sweep.dir` says `${sweep_name:}`, which is resolved in the next line: the same words find the same folder
+    # again, and with it the runs that are done. Hydra's own time stamp would begin anew each time.
     OmegaConf.register_new_resolver("sweep_name", lambda: sweep_name(command, words, grids), replace=True)
     folder = folder_of(cfg, "hydra.sweep.dir")
+    # Absolute: runs start in processes, perhaps on other machines, whose current folder is another.
     batches = _batches(compose, sweeper, words, folder.absolute())
     line = shlex.join(["trackmdp", command, "-m", *compose.words])
     made = make_folder("hydra.sweep.dir", folder)
     try:
+        # A grid has been composed and checked to the last run by now; a search plans its runs as it goes.
         return sweep(folder.absolute(), command, line, batches, launch_jobs, make_console(cfg.quiet))
     finally:
         remove_if_empty(made)

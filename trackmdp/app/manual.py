@@ -60,8 +60,10 @@ def manual(command: str, words: Sequence[str] = ()) -> str:
     Raises:
         UserError: a choice is unknown.
     """
+    # Installed packages add choices, which are listed like our own.
     load_plugins()
     typed = _choices(command, words)
+    # The YAML files are read as they stand: composing would need a choice for every group, and the help is about all.
     values = _read(Path(conf_dir()) / f"{command}.yaml")
     blocks = [f"usage: trackmdp {command} [option=value ...] [group=choice ...]", *_wrapped(_about(ROOTS[command])), ""]
     if typed:
@@ -149,7 +151,9 @@ def _example(command: str, chosen: str, group: str, name: str) -> Iterator[str]:
         return
     for key, value in _values(group, name, {}).items():
         if isinstance(options(_members(group)[name]).get(key), Option) and not isinstance(value, (dict, list)):
+            # "???" is OmegaConf's mark of a value that must be given.
             shown = "FILE" if value == "???" else json.dumps(value)
+            # An interpolation is not something to type after a `=`: the shell would take the `$`.
             if "$" not in shown:
                 flag = "-m " if group.startswith("hydra/") else ""
                 yield f"  trackmdp {command} {flag}{chosen} {group.replace('/', '.')}.{key}={shown}"
@@ -168,6 +172,7 @@ def _read_selectors(group: str, name: str, typed: dict[str, str]) -> Iterator[st
     """The selectors that a choice reads, as its file says: ``defaults: [{/credit@_here_: '${credit}/ppo'}]``."""
     if group in SELECTORS:
         return
+    # A choice reads a selector where its defaults interpolate it.
     source = str(_read(conf_file(f"{group}/{name}")).get("defaults"))
     read = {key: typed.get(key, next(iter(item.choices))) for key, item in SELECTORS.items() if f"${{{key}}}" in source}
     yield from _selectors(group, read)

@@ -22,6 +22,7 @@ def folder_of(cfg: DictConfig, key: str) -> Path:
         UserError: it is missing or no folder's name, or an interpolation in it leads nowhere.
     """
     try:
+        # `select` gives None for a missing key, but raises for "???" only where it is told to.
         value = OmegaConf.select(cfg, key, throw_on_missing=True)
     except MissingMandatoryValue:
         value = None
@@ -32,6 +33,8 @@ def folder_of(cfg: DictConfig, key: str) -> Path:
         raise UserError(f"{key}: missing, expected a folder")
     folder = Path(value)
     try:
+        # Asked for its error alone: a name that is too long, or a folder that may not be looked into, is refused here
+        # in one line.
         folder.exists()
     except OSError as error:
         raise UserError(f"{key}={value}: expected a folder that can be written to ({error.strerror})") from error
@@ -44,9 +47,11 @@ def make_folder(key: str, folder: Path) -> list[Path]:
     Raises:
         UserError: it cannot be made or written to. Nothing is left behind then.
     """
+    # Noted before anything is made, so that exactly these are taken away again.
     made = _missing(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        # A folder that was there already may be read-only: mkdir does not complain, the first file would.
         if not os.access(folder, os.W_OK | os.X_OK):
             raise PermissionError(errno.EACCES, "it cannot be written to")
     except OSError as error:

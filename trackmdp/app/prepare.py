@@ -47,10 +47,12 @@ def typed_config(command: str, cfg: DictConfig, folder: Path) -> CommandConfig:
     if "hydra" in cfg:
         words = (word.lstrip("+~").partition("=") for word in cfg.hydra.overrides.task)
         given, choices = {key: value for key, _, value in words}, cfg.hydra.runtime.choices
+        # The caller still needs Hydra's part; "struct" would forbid to delete it here, where no schema has it.
         cfg = cfg.copy()
         cfg._set_flag("struct", False)
         del cfg["hydra"]
     typed = from_hydra(cfg, ROOTS[command], folder)
+    # Only what was typed: a default that nothing reads is no mistake of the user's.
     refuse_ignored(typed, given, choices)
     return typed
 
@@ -74,6 +76,8 @@ class Prepared:
 
     def run(self) -> Any:
         """Run the command; returns what it returns."""
+        # Not at the top of the file: a command imports torch and TorchRL, which takes seconds, and a mistyped option
+        # is refused before.
         run: Callable[..., Any] = importlib.import_module(f"trackmdp.app.commands.{self.command}").run
         if isinstance(self.cfg, WorldConfig):
             return run(self.cfg, self.folder, self.problem)
@@ -104,9 +108,12 @@ def check(command: str, cfg: CommandConfig, folder: Path, words: Sequence[str]) 
     """
     try:
         if isinstance(cfg, TrainConfig):
+            # A resumed run goes on under its saved config, so that everything after this line looks at that one.
             folder = run_folder(cfg, folder)
             cfg = continued(cfg, folder, words)
         _check_files(cfg, words)
+        # A world from options alone cannot fail once they are in range; one from files can, and is refused before a
+        # folder is made.
         problem = _problem(cfg) if isinstance(cfg, WorldConfig) and _reads_files(cfg) else None
     except OSError as error:
         raise UserError(f"{error.filename}: cannot be read ({error.strerror})") from error
@@ -148,6 +155,7 @@ def _problem(cfg: WorldConfig) -> Problem:
 
 def _reads_files(cfg: WorldConfig) -> bool:
     """Whether building the world can still fail: it is read from files, or its target may never exit."""
+    # Where the target never exits, the undiscounted value is infinite, which only building the world finds out.
     exits = getattr(cfg.kernel, "exit_probability", 0.0) > 1e-9
     return not exits or isinstance(getattr(cfg.cost, "sensor", None), str)
 
@@ -155,6 +163,7 @@ def _reads_files(cfg: WorldConfig) -> bool:
 def _check_files(cfg: CommandConfig, words: Sequence[str]) -> None:
     if isinstance(cfg, EvaluateConfig) and cfg.run is not None:
         for word in words:
+            # `kernel@kernel=drift` and `kernel.radius=2` both are about the kernel.
             key = word.lstrip("+~").split("=")[0]
             if key.split(".")[0].split("@")[0] in WORLD_KEYS:
                 raise UserError(f"{word}: not together with run={cfg.run}, whose own world is used")

@@ -23,7 +23,9 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     Raises:
         UserError: a flag is unknown, lacks its value, or does not go with another.
     """
+    # Intermixed: Hydra users write flags between overrides, `train algo=ppo -m seed=0,1`.
     args = _parser().parse_intermixed_args(list(words))
+    # It is offered by the parser all the same, so that the refusal can say why.
     if args.experimental_rerun is not None:
         raise UserError("--experimental-rerun: not offered, it would unpickle a file; start from the run's config.yaml")
     asked = [args.cfg, args.info, args.hydra_help or None, args.shell_completion or None, args.multirun or None]
@@ -73,6 +75,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _parser() -> argparse.ArgumentParser:
+    # An abbreviation that works today would be ambiguous once another flag begins alike.
     parser = _Parser(add_help=False, allow_abbrev=False)
     flag = parser.add_argument
     flag("overrides", nargs="*", help="option=value, to set a value or choose from a group")

@@ -43,9 +43,13 @@ def searched(users: Sequence[Path], plugins: Sequence[Path], *, main_is_users: b
         main_is_users: the main folder is one of the user's as well.
     """
     global _main_is_users
+    # Hydra makes both itself, without arguments, when it is initialised: they learn what to do from this module's
+    # state.
     for kind in (UserFolder, _Folders):
         Plugins.instance().register(kind)  # what is registered already stays
+    # Hydra picks the class that reads a folder by the scheme before `://`; "data" is ours, "file" is Hydra's own.
     _folders[:] = [("command-line", f"{UserFolder.scheme()}://{folder.absolute()}") for folder in users]
+    # An installed package has run its code already: its files are read as those of `conf/` are.
     _folders.extend(("plugin", f"file://{folder.absolute()}") for folder in plugins)
     _main_is_users = main_is_users
     try:
@@ -60,9 +64,11 @@ class _Folders(SearchPathPlugin):
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         for element in search_path.get_path():
+            # Hydra has put the main folder there under `file://` itself; only here can its reader be changed.
             if element.provider == "main" and _main_is_users:
                 element.path = f"{UserFolder.scheme()}://{element.path}"
         for provider, path in _folders:
+            # After `conf/`: where both have a file of one name, Hydra takes the first.
             search_path.append(provider, path)
 
 
@@ -83,11 +89,15 @@ class UserFolder(ConfigSource):
         file = self._file(config_path)
         if not file.is_file():
             raise ConfigLoadError(f"Config not found : {file}")
+        # The user named this folder, so links in it are the user's; a pipe or a device would block for ever, and is
+        # refused.
         text = read_text(file, most=MAX_BYTES, links=True)
         config = parse_yaml(text, str(file))
         if not isinstance(config, DictConfig):
             raise UserError(f"{file}: not a config (expected a mapping)")
         try:
+            # Lines such as `# @package _global_`; Hydra's own reader looks for them in the first 512 characters as
+            # well.
             header = self._get_header_dict(text[:512])
         except ValueError as error:
             raise UserError(f"{file}: not a config ({error})") from error
@@ -115,6 +125,7 @@ class UserFolder(ConfigSource):
 
 def _refuse_settings(config: DictConfig, package: str, file: Path) -> None:
     """Refuse what `_FORBIDDEN` names, wherever the file's package puts its keys."""
+    # A file with `# @package hydra.job` that says `env_set: {...}` sets hydra.job.env_set without ever naming it.
     prefix = [] if package in ("", "_global_") else package.split(".")
     plain = OmegaConf.to_container(config, resolve=False)
     for name in reversed(prefix):

@@ -14,6 +14,7 @@ from trackmdp.solvers import optimal
 __all__ = ["bounds_table", "checks", "checks_table", "points"]
 
 TOLERANCE = 1e-9
+# Z = 5 is where Q_MDP fails: each likely move has (1 - 0.15 - 0.005) / 4 = 0.211, below c/r = 0.22.
 HARDEST = 5
 
 
@@ -38,9 +39,13 @@ def bounds_table(study: Study, pairs: Mapping[tuple[int, float], str]) -> Table:
     """The bounds of each pair beside the optimum: where the printed one is below what a policy earns."""
     rows: list[list[Cell]] = []
     for (support_size, cost), world in pairs.items():
+        # Bounds are the world's, so that any run has them; the optimum is the best bracket that some run closed.
         run, best, upper = study.in_world(world)[0], study.lower(world), study.upper(world)
         printed = run.figure("bound_paper")
+        # Relative: the solver's bracket is closed to rounding of values that grow with the episode's length.
         proved = None if best is None else upper - best <= 1e-6 * max(1.0, abs(best))
+        # eq. upper_bound_v charges sensors on the exit step, the reward (eq. reward_func) does not: a policy may earn
+        # more.
         below = None if best is None else best > printed + 1e-9
         row: list[Cell] = [support_size, cost, run.figure("qmdp_aihtr"), best, upper, proved]
         rows.append([*row, run.figure("bound_clocked"), run.figure("bound_valid"), printed, below])
@@ -82,6 +87,7 @@ def points(study: Study, pairs: Mapping[tuple[int, float], str], found: Sequence
 
 def _exit_price(study: Study, pairs: Mapping[tuple[int, float], str], found: Sequence[Check]) -> str:
     table = bounds_table(study, pairs)
+    # `is True`: the last column is None where no optimum is known.
     exceeded = [f"(Z = {row[0]}, c = {row[1]:g})" for row in table.rows if row[-1] is True]
     remark = next((check.note for check in found if check.name == "the printed bound"), "")
     return (
@@ -108,6 +114,8 @@ def _hardest(study: Study, pairs: Mapping[tuple[int, float], str]) -> str:
     short = {}
     for (support_size, cost), world in pairs.items():
         bound, best = study.in_world(world)[0].figure("bound_clocked"), study.lower(world)
+        # U is attained where at most one cell of positive probability is left unsensed, which then is a policy;
+        # elsewhere the optimum takes a search, and lies below.
         if best is not None and bound - best > 1e-6 * max(1.0, abs(bound)):
             short[f"Z = {support_size}, c = {cost:g}"] = bound - best
     missed = "; ".join(f"{pair} (by {gap:.3f})" for pair, gap in short.items())

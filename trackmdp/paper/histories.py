@@ -47,8 +47,10 @@ def solve_histories(world: World) -> HistoryQ:
     index = {state: place for place, state in enumerate(states)}
     problem, inside, rows = FiniteMdp(), {}, {}
     for place, (x, history) in enumerate(states):  # grows while it is gone through
+        # `[M]`, conditioned on the misses of this history; its sum is below 1 by the probability of exit.
         reach = _next_cells(kernel, x, [actions[number] for number in history])
         inside[x, history] = float(reach.sum())
+        # n = t_max + 1: the safe action locates the target in any case, at price D, and only in the grid.
         if len(history) == world.num_choices:
             problem.add(place, (world.reward - world.safe_cost) * reach.sum(), list(range(m)), reach.tolist())
             continue
@@ -63,6 +65,8 @@ def solve_histories(world: World) -> HistoryQ:
                     index[after] = len(states)
                     states.append(after)
                 targets, probability = [*targets, index[after]], [*probability, missed]
+            # eq. reward_func: nothing is paid on the exit step, hence times the probability of still being in the
+            # grid.
             price = float(world.cost[action].sum()) * reach.sum()
             problem.add(place, world.reward * found.sum() - price, targets, probability)
     value, worth = problem.solve(len(states))

@@ -47,6 +47,7 @@ def compute(say: Callable[[str], None]) -> Openings:
     settings = list(sensitivity())
     say("the paper's theorems")
     found = critique.checks(chosen(every)[critique.HARDEST], border=BORDER, t_max=T_MAX)
+    # Through the stored form even now: a report made from `paper.json` later has to give the same bytes as this one.
     return _unpacked(_packed(Openings(every, settings, found)))
 
 
@@ -87,6 +88,8 @@ def _packed(openings: Openings) -> dict[str, Any]:
             ]
             for s in openings.settings
         ],
+        # Two digits: further ones of a deviation at rounding level say nothing. As text, since JSON has no -inf ("no
+        # case").
         "checks": [asdict(c) | {"deviation": repr(float(f"{c.deviation:.2g}"))} for c in openings.checks],
     }
 

@@ -14,6 +14,8 @@ __all__ = ["PRINTED_QMDP", "PRINTED_TMDP", "pair_of", "pairs"]
 PRINTED_QMDP: Mapping[tuple[int, float], float] = {
     **{(3, c): 90.74 for c in COSTS},
     **{(4, c): 88.82 for c in COSTS},
+    # The drop at c = 0.22: all probabilities lie below c/r, and Q_MDP senses only when it is forced (remark on Figure
+    # z_5).
     **{(5, c): 89.95 for c in COSTS[:3]},
     (5, 0.22): 54.3,
 }
@@ -42,6 +44,7 @@ _FIXED = {
 
 def pair_of(settings: Mapping[str, Any]) -> tuple[int, float] | None:
     """(Z, c) of a run in one of the paper's worlds, else None."""
+    # T_max, border and seed of the kernel are not compared: the paper does not give them.
     if any(settings.get(key) != value for key, value in _FIXED.items()):
         return None
     pair = settings.get("kernel.support_size"), settings.get("cost.sensor")

@@ -19,17 +19,23 @@ def check_remarks(tolerance: float) -> Iterator[Check]:
 
 
 def _support(tolerance: float) -> Check:
+    # The paper's remark: at c = 0.14 both probabilities of Z = 4, 0.15 and (1 - 0.15 - 0.005) / 3 = 0.28, exceed c/r.
+    # Renormalizing at the border only raises them, so that the remark holds for every draw; this is one.
     world = paper_world(paper_kernel(4, seed=4, border="renormalize"), 0.14, 1)
     support = world.kernel.toarray() > 0
     best, simple = optimal.solve(world), qmdp.solve(world)
+    # `[M, M]` sets of n = 0 alone: where the support is sensed no miss follows, and later sets are never used.
     wrong = sum(int((table.dense()[:, 0] != support).sum()) for table in (best.table, simple))
     missed = 1.0 - best.evaluation.accuracy
+    # One wrong sensor already counts as 1, far above any tolerance.
     deviation = max(float(wrong), missed)
     statement = "optimum and Q_MDP sense exactly the support, accuracy 100 %: sensors that differ"
     return Check("remark, c = 0.14, Z = 4", statement, deviation, deviation <= tolerance, note="N = 10, t_max 1")
 
 
 def _printed_bound(tolerance: float) -> Check:
+    # A counter-example, not a typical world: with all moves inside and t_max 5 the policy of the clocked bound loses
+    # little, while the printed bound still charges c for every sensor on the exit step.
     world = paper_world(paper_kernel(5, seed=5, border="inside"), 0.16, 5)
     printed, achieved = bounds.paper(world).mean(), evaluate(world, clocked.solve(world)).aihtr
     note = f"bound {printed:.2f}, a policy attains {achieved:.2f} (border inside, Z = 5, c = 0.16, t_max 5)"

@@ -29,6 +29,7 @@ def sections(study: Study, openings: Openings) -> list[Section]:
 def accuracy_table(study: Study, chosen: Mapping[tuple[int, float], str]) -> Table:
     """Table II of the paper beside exact accuracies: of Q_MDP, and of each method the mean over seeds."""
     rows: list[list[Cell]] = []
+    # The order of Table II: by price, and Z = 5, 4, 3 within one.
     for (support_size, cost), world in sorted(chosen.items(), key=lambda item: (item[0][1], -item[0][0])):
         first = study.in_world(world)[0]
         row: list[Cell] = [support_size, cost, PRINTED_QMDP[support_size, cost], 100 * first.figure("qmdp_accuracy")]
@@ -49,6 +50,7 @@ def _about_accuracy(study: Study, chosen: Mapping[tuple[int, float], str]) -> st
     printed = PRINTED_TMDP.values()
     text = "Of the paper's results this table alone is set beside printed numbers; its Figures 3 to 5 print no values. "
     a2c = [100 * run.figure("accuracy") for world in chosen.values() for run in study.of(world, "a2c")]
+    # Said only where the two ranges are apart; where they overlap nothing is claimed.
     if not a2c or min(a2c) <= max(printed):
         return text
     return text + (
@@ -61,6 +63,7 @@ def _about_accuracy(study: Study, chosen: Mapping[tuple[int, float], str]) -> st
 
 def _worlds(openings: Openings) -> Section:
     best = settings.fit_table(openings.settings)
+    # `fit_table` puts the best setting first.
     border, t_max, *_, worst = best.rows[0]
     note = (
         f"<p>Nothing in the paper tells the settings apart but the printed accuracy of Q_MDP. Of those tried, border "

@@ -25,6 +25,7 @@ RULE = (
     "one whose exact pooled accuracy of Q_MDP deviates least from the printed column, the largest deviation of the "
     "four prices counting; ties go to the lower seed. What a learned policy does plays no part in it."
 )
+# One colour per Z through all figures of this part; they are those of methods, which do not occur here.
 COLOURS = {3: LOOKS["a2c"], 4: LOOKS["ppo"], 5: LOOKS["hindsight"]}
 
 
@@ -46,14 +47,18 @@ def calibration_figure(every: Sequence[Candidate]) -> Figure:
         axes = figure.subplots()
         for support_size, style in COLOURS.items():
             mine = sorted((c for c in every if c.support_size == support_size), key=lambda c: c.seed)
+            # One band per Z; within it the seed is the height, only to keep the dots apart.
             height = [support_size + 0.6 * (c.seed / len(mine) - 0.5) for c in mine]
             axes.plot([c.deviation for c in mine], height, ".", color=style.colour, markersize=4, alpha=0.7)
             best = next(c for c in mine if c.seed == seeds[support_size])
             place = support_size + 0.6 * (best.seed / len(mine) - 0.5)
             axes.plot([best.deviation], [place], "o", color=INK, markersize=8, markerfacecolor="none")
+            # To the left: the chosen one is the leftmost of its band, so that the label meets no other dot.
             label, at = f"seed {best.seed}", (best.deviation, place)
             axes.annotate(label, at, (-8, 0), textcoords="offset points", ha="right", va="center", fontsize=8)
+        # Deviations differ by factors, and the choice is among the smallest.
         axes.set_xscale("log")
+        # Room for the labels on the left.
         axes.margins(x=0.3)
         axes.set_yticks(list(COLOURS), [f"Z = {support_size}" for support_size in COLOURS])
         axes.set_xlabel("largest deviation from the printed accuracy (points)")
@@ -69,6 +74,7 @@ def fit_table(settings: Sequence[Setting]) -> Table:
     """How well the best draw of each setting fits the printed column."""
     fits: dict[tuple[str, int], dict[int, float]] = {}
     for setting in settings:
+        # `deviation` covers all prices, so the settings of one Z that differ in c write the same number.
         fits.setdefault((setting.border, setting.t_max), {})[setting.support_size] = setting.deviation
     ordered = sorted(fits.items(), key=lambda item: max(item[1].values()))
     rows: list[list[Cell]] = [[*setting, *(fit[z] for z in SUPPORTS), max(fit.values())] for setting, fit in ordered]
@@ -93,6 +99,7 @@ def sensitivity_table(settings: Sequence[Setting]) -> Table:
 
 def sensitivity_figures(settings: Sequence[Setting]) -> list[Figure]:
     """Accuracy of Q_MDP, its AIHTR and the clocked bound under each setting, at the lowest price."""
+    # At the lowest price all probabilities but 0.15 exceed c/r, and Table II prints one accuracy for three prices.
     cost = COSTS[0]
     mine = [setting for setting in settings if setting.cost == cost]
     return [
@@ -114,6 +121,7 @@ def _ranges(
 
     def paint(figure: Canvas) -> None:
         axes = figure.subplots()
+        # The three Z of a setting stand in one row, a little apart.
         for offset, support_size in zip((-0.24, 0.0, 0.24), COLOURS, strict=True):
             spreads = [of(s) for s in settings if s.support_size == support_size]
             _bars(axes, support_size, np.arange(len(rows), dtype=np.float64) + offset, spreads)
@@ -121,6 +129,7 @@ def _ranges(
                 colour = COLOURS[support_size].colour
                 axes.axvline(PRINTED_QMDP[support_size, COSTS[0]], color=colour, linewidth=0.8, linestyle=":")
         axes.set_yticks(range(len(rows)), [f"{border}, T_max {t_max}" for border, t_max in rows])
+        # The first setting on top, as in the table.
         axes.invert_yaxis()
         axes.set_xlabel(label)
         tidy(axes)
@@ -140,6 +149,8 @@ def _bars(axes: Axes, support_size: int, y: Array, spreads: Sequence[Spread]) ->
     """Median and range, one row each."""
     style = COLOURS[support_size]
     middle, low, high = (np.array([getattr(spread, part) for spread in spreads]) for part in ("median", "low", "high"))
+    # `[2, settings]`, lengths below and above the median. The range and no interval: draws are all there is, not a
+    # sample.
     bars = np.stack([middle - low, high - middle])
     axes.errorbar(
         middle,

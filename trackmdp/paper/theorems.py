@@ -26,7 +26,9 @@ from trackmdp.world.model import Array, BoolArray, World
 
 __all__ = ["Check", "changed", "check_theorems", "corner", "dearer", "summarize_checks"]
 
+# Relative rounding that equalities are allowed, and the gap at which a search for the optimum ends.
 SLACK = 1e-10
+# How far below the plan being followed the search of Lemma 1 begins.
 SEARCHED = 1e-6
 MOST_NODES = 500_000
 CORNER = 2
@@ -59,7 +61,7 @@ class Check:
 
     @property
     def verdict(self) -> str:
-        """Of a claim: holds, FAILS, no case (the world has none to check) or open; of a looser form, that it is one."""
+        """`holds`, `FAILS`, `no case` (nothing to check here) or `open` (solver cut short), or not claimed."""
         if self.deviation == -np.inf:
             return "no case"
         if not self.holds and not self.closed:
@@ -82,12 +84,16 @@ def check_theorems(world: World, solution: Solution, tolerance: float) -> Iterat
         solution: the optimum; where it is not certified, deviations include what is open.
         tolerance: deviation, relative to the largest value, that counts as equal.
     """
+    # Values grow with the length of an episode (200 steps at p_exit = 0.005), and rounding with them.
     scale = tolerance * max(1.0, float(np.abs(solution.bound).max()))
+    # The proofs let a policy imitate the forced action by all sensors; with D below their price that is a loss.
     dear = world.safe_cost >= float(world.cost.sum()) * (1.0 - SLACK)
+    # These rest on the optimal policy, so that an open gap of the solver leaves a violation open, not proved.
     for row in (*_track_property(world, solution), *_tower_lemma(world, solution)):
         note = row.note or ("" if dear else "the proof needs D >= the price of all sensors")
         closed = row.closed and solution.certified
         yield replace(row, holds=row.deviation <= scale, expected=dear, note=note, closed=closed)
+    # These need no optimum of the whole world: a violation is one.
     for row in (*_as_pomdp(world), *_estimator(world, solution), *_qmdp_derivation(world)):
         yield replace(row, holds=row.deviation <= scale)
     for row in _order(world, solution):
@@ -105,11 +111,13 @@ def summarize_checks(found: Sequence[Check]) -> str:
     return f"of {len(claims)} claims {', '.join(said)}; of {len(loose)} looser forms, not claimed, {broken} do not hold"
 
 
+# `holds` is set by `check_theorems`, which alone knows the tolerance.
 def _row(name: str, statement: str, deviation: float, *, expected: bool = True, note: str = "") -> Check:
     return Check(name, statement, float(deviation), holds=False, expected=expected, note=note)
 
 
 def _track_property(world: World, solution: Solution) -> Iterator[Check]:
+    # -inf stands for "no case": max(..., initial=-inf) leaves it where no cell is left unsensed.
     worst = {"printed": -np.inf, "sharp": -np.inf}
     states = 0
 
@@ -117,6 +125,9 @@ def _track_property(world: World, solution: Solution) -> Iterator[Check]:
         nonlocal states
         states += int((seen.before > 0).sum())
         sensed = solution.table.on(seen.n, seen.rows, seen.cells) > 0
+        # Theorem tracking_property: Pr(X_{k+1} = b | s_k) > c/r is sensed. `mass` and `inside` are joint with the
+        # misses, so both sides are divided by Pr(misses) = `before`. "printed" pays c on every step, "sharp" only in
+        # the grid, as the reward of eq. reward_func does.
         earned = seen.mass * world.reward
         for which, mass in (("printed", seen.before), ("sharp", seen.inside)):
             gain = (earned - world.cost[seen.cells] * mass[seen.rows]) / seen.before[seen.rows]
@@ -133,13 +144,17 @@ def _tower_lemma(world: World, solution: Solution) -> Iterator[Check]:
     layers = reachable_layers(world, world.num_choices)
     sets = layer_sets(layers, solution.table)
     problem = InnerProblem.of(world, layers, solution.value)
+    # `later[n]` `[E_n]`: W, what follows with the target at the entry's cell, missed, and the plan going on. `mass`
+    # `[E_n]`: joint probability of being there after n misses; it begins with 1 in each located cell.
     later, mass, first = problem.undetected(sets), np.ones(world.num_cells), -np.inf
     second, closed = -np.inf, True
     known = tables(world, problem.detected, problem.missed, world.t_max, slack=SLACK, go_on=_go_on, layers=layers)
     for n, layer in enumerate(layers[1:]):
         mass = (mass @ layer.moves) * ~sets[n]
         missed = mass > 0
+        # eq. vis_p1: E[V(x_l, n + 1, h) | X = b] = W(b) against V(b, 0, {}); only where the miss can happen.
         first = max(first, float((later[n + 1] - solution.value[layer.cells])[missed].max(initial=-np.inf)))
+        # n + 1 of the t_max + 1 free sets are chosen here; after the last one the safe action leaves nothing to plan.
         if n < world.t_max:
             loss, done = _one_cell_less(problem, layer, later[n + 1], mass, known[: world.t_max - n])
             second, closed = max(second, loss), closed and done
@@ -151,19 +166,23 @@ def _tower_lemma(world: World, solution: Solution) -> Iterator[Check]:
 def _one_cell_less(
     problem: InnerProblem, layer: Layer, later: Array, mass: Array, known: list[Array]
 ) -> tuple[float, bool]:
-    """Largest loss of the best plan, one missed cell taken out, against the plan being followed (by joint probability).
+    """Second inequality of Lemma 1: how much less the best plan for the mass without one missed cell earns.
 
     The best plan is searched for anew, from a little below what it has to reach. Second: whether that came to its end.
     """
     entries = np.flatnonzero(mass)
+    # eq. vis_pr2 conditions on X being neither sensed nor b: for each missed entry e, the missed entries of the same
+    # located cell without e. A row with e alone has nothing left to compare.
     others = [np.setdiff1d(entries[layer.rows[entries] == layer.rows[e]], [e]) for e in entries]
     others = [rest for rest in others if len(rest)]
     if not others:
         return -np.inf, True
     row = np.repeat(np.arange(len(others)), [len(rest) for rest in others])
     entry = np.concatenate(others)
+    # `[problems, M]`: one search problem per entry taken out, since a set sensed there too would have located it.
     left = sparse.csr_array((mass[entry], (row, layer.cells[entry])), shape=(len(others), problem.world.num_cells))
     going_on = per_row(row, mass[entry] * later[entry], len(others))
+    # `tree.best` is at least where it begins: begun at `going_on` itself, a loss would never show.
     tree = Tree(problem.world, problem.detected, known, going_on - SEARCHED, SLACK, left, windowed=False)
     tree.run(_go_on)
     return float((going_on - tree.best).max()), tree.closed
@@ -171,16 +190,21 @@ def _one_cell_less(
 
 def _as_pomdp(world: World) -> Iterator[Check]:
     """Theorem 2 on the world itself where it is small enough, else on its corner; at its own prices, and dearer."""
+    # Every set is an action: 2^9 = 512 per belief state at most. `changed` without changes drops `max_steps` and the
+    # window.
     own = changed(world) if world.num_cells <= MOST_CELLS and world.t_max <= 1 else corner(world)
+    # At the paper's prices a miss is so rare that a wrong clock would hardly show; hence once more where misses pay.
     for small, prices in ((own, "its own prices"), (dearer(own), "prices at which the safe action is used")):
         try:
             beliefs = pomdp.solve(small, most_beliefs=MOST_BELIEFS)
+        # More belief states than MOST_BELIEFS; the corner, of at most four cells and t_max 2, has few.
         except UserError:
             small = corner(small)
             beliefs = pomdp.solve(small)
         best = optimum.solve(small, tolerance=SLACK, time_limit=20.0)
         where = "the world itself" if small.num_cells == world.num_cells else f"its {CORNER}x{CORNER} corner"
         note = f"on {where}, {prices}, t_max {small.t_max}, {beliefs.beliefs} belief states"
+        # Theorem thm:optimalaspomdp: V_TMDP((b, 0, {})) = V_POMDP((e_b, 0)) for every cell b.
         deviation = float(np.abs(beliefs.value - best.value).max())
         yield _row("Theorem 2", "V*_TMDP = V*_POMDP, by plans of sets and over belief states", deviation, note=note)
 
@@ -189,8 +213,12 @@ def corner(world: World) -> World:
     """The top left cells alone; leaving them is exiting."""
     columns = min(CORNER, world.columns)
     cells = (np.arange(min(CORNER, world.rows))[:, None] * world.columns + np.arange(columns)).ravel()
+    # `[4, 4]` for a corner of 2 x 2. What led out of it is mass that is gone, which is what exit means to `World`.
     kernel = world.kernel[cells][:, cells].toarray()
+    # The value is undiscounted, and finite only where the target exits. Rows above 0.99 are scaled to 0.99, since a
+    # target that never leaves the corner would have no value there.
     kernel *= 0.99 / np.maximum(kernel.sum(axis=1, keepdims=True), 0.99)
+    # D = N^2 c by default, so it shrinks with the number of sensors.
     share = len(cells) / world.num_cells
     return World(
         kernel,
@@ -204,12 +232,13 @@ def corner(world: World) -> World:
 
 def dearer(world: World) -> World:
     """The world with sensors a little dearer than the likeliest move is worth, so that misses and the clock count."""
+    # Above r max P nothing is worth sensing right after a detection: misses follow, beliefs spread and the clock runs.
     cost = np.maximum(world.cost, 1.05 * world.reward * float(world.kernel.max()))
     return changed(world, cost=cost, safe_cost=max(world.safe_cost, float(cost.sum())))
 
 
 def changed(world: World, **changes: Any) -> World:
-    """The world with other words of its task."""
+    """A whole-episode copy of the world, all sensors allowed, with some of cost, safe_cost, t_max, reward replaced."""
     own = {name: getattr(world, name) for name in ("cost", "safe_cost", "t_max", "reward")}
     return World(world.kernel, world.size, **(own | changes))
 
@@ -217,9 +246,12 @@ def changed(world: World, **changes: Any) -> World:
 def _estimator(world: World, solution: Solution) -> Iterator[Check]:
     yield _from_histories(world)
     found = estimator.positions(world, solution.table, solution.value)
+    # Theorem thm:estimator sets the value after a miss equal to V(x, 0, {}), which forgets the clock n + 1, and adds c
+    # where the exit step costs nothing (c p_in).
     paper = max(float(np.abs(e.paper - e.belief).max(initial=0.0)) for e in found)
     scored = estimator.accuracy(world, solution.table, solution.value)
     note = f"argmax right on {scored.paper:.2%} of missed steps, the belief's on {scored.bayes:.2%}"
+    # With one candidate per info state the argmax is right whatever the numbers: a rate of 100 % then proves nothing.
     if all(np.bincount(e.rows[e.missed > 0]).max(initial=0) <= 1 for e in found):
         note = "a miss leaves one cell at most, so that every argmax is right"
     statement = "the printed form is the belief (it takes W = V and charges the exit step)"
@@ -231,6 +263,7 @@ def _from_histories(world: World) -> Check:
     small = changed(dearer(corner(world)), t_max=min(world.t_max, 1))
     solved = histories.solve_histories(small)
     worst = -np.inf
+    # Forced states have no Q: nothing is chosen there.
     for state in solved.q:
         belief = histories.filtered(small, solved, state)
         for cell, estimate in histories.estimates(small, solved, state).items():
@@ -240,6 +273,8 @@ def _from_histories(world: World) -> Check:
 
 
 def _qmdp_derivation(world: World) -> Iterator[Check]:
+    # Lemma lem:qmdp_pol: Q_MDP's action separates into the sensors, each on iff p r >= c (or c p_in, as the reward
+    # charges).
     for in_grid, threshold in ((False, "c/r"), (True, "c p_in / r")):
         policy, worst = qmdp.solve(world, in_grid=in_grid), -np.inf
 
@@ -248,11 +283,13 @@ def _qmdp_derivation(world: World) -> Iterator[Check]:
             sensed = policy.on(seen.n, seen.rows, seen.cells) > 0
             charged = (seen.inside if in_grid else seen.before)[seen.rows]
             gain = (seen.mass * world.reward - world.cost[seen.cells] * charged) / seen.before[seen.rows]
+            # Switching a sensor on gains `gain`, switching it off -gain; none may be positive.
             worst = max(worst, float(np.where(sensed, -gain, gain).max(initial=-np.inf)))
             return sensed
 
         unroll(world, follow)
         yield _row("Q_MDP", f"threshold {threshold}: largest gain of switching one sensor over", worst)
+    # eq. upper_bound_v at a known position, gamma = 1: V(x) = sum_j max(P_xj r - c_j, 0) + sum_j P_xj V(j).
     value, move = bounds.paper(world), world.kernel
     gain = np.maximum(move.data * world.reward - world.cost[move.indices], 0.0)
     residual = per_row(row_index(move), gain, world.num_cells) + move @ value - value
@@ -260,6 +297,8 @@ def _qmdp_derivation(world: World) -> Iterator[Check]:
 
 
 def _order(world: World, solution: Solution) -> Iterator[Check]:
+    # Each relaxes the next: play without knowing, known with the clock, known without it. The inequality holds cell by
+    # cell, so the largest difference over start cells is what is checked; the notes give the means, which are AIHTRs.
     clocked, valid = bounds.clocked(world), bounds.valid(world)
     gap = f"gap {solution.upper - solution.lower:.2g}"
     best = solution.bound

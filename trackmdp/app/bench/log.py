@@ -34,6 +34,7 @@ def log_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[
             def record(policy: Policy = policy) -> int:
                 return sum(map(len, simulate(world, policy, _EPISODES, seed=cfg.seed).complete()))
 
+            # Simulated once, outside of what is timed: "write" is to measure the log alone.
             episodes = list(simulate(world, policy, _EPISODES, seed=cfg.seed).complete())
 
             def write(policy: Policy = policy, episodes: list[Episode] = episodes) -> int:
@@ -43,6 +44,7 @@ def log_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[
                 with EpisodeReader(file) as reader:
                     return sum(map(len, reader.episodes()))
 
+            # The file has to be there before it can be measured and read.
             steps = write()
             size = file.stat().st_size / steps
             for what, work in (("record", record), ("write", write), ("read", read)):

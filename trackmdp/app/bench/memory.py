@@ -23,8 +23,10 @@ SIZES, FRAMES = (5, 10, 20), 300_000
 def memory(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator[dict[str, Any]]:  # noqa: ARG001
     """One row per algorithm and grid size: peak of the whole process, Python and torch included, of 300 k frames."""
     for algo, size in itertools.product(cfg.algos, SIZES):
+        # Without the solver: its memory is not what `needs` expects of training.
         words = [f"algo={algo}", f"grid.size={size}", f"collector.total_frames={FRAMES}", "optimal.enabled=false"]
         train = train_config(words)
+        # What the check before a run adds up, without Python and torch, which `peak_mib` includes.
         expected = sum(needs(train, build_world(train).task).values())
         peak = timed_training(*words, f"threads={cfg.threads}", f"device={device}").usage.peak_mib
         yield {"part": "memory", "algo": algo, "N": size, "expected_mib": expected / 2**20, "peak_mib": peak}

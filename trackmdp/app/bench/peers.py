@@ -38,6 +38,8 @@ class Learned:
     def reached(self, *, settled: bool) -> tuple[float, int] | None:
         """Seconds and env steps at which the regret was `GOAL` or less: at first, or `settled` to the end."""
         within = [regret <= GOAL for _, _, regret in self.curve]
+        # "Settled": no later policy is worse than the goal. A curve that touches the goal once by luck has not
+        # learned.
         places = [place for place, found in enumerate(within) if (all(within[place:]) if settled else found)]
         return self.curve[places[0]][:2] if places else None
 
@@ -60,6 +62,7 @@ def peers(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[dict
     runs = []
     with on_one_core(), tempfile.TemporaryDirectory() as folder:
         instance = Path(folder, "instance.npz")
+        # A peer gets the world as plain arrays, since it runs without this package.
         np.savez_compressed(
             instance,
             kernel=world.kernel.toarray(),
@@ -68,9 +71,11 @@ def peers(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[dict
             reward=world.reward,
             t_max=world.t_max,
         )
+        # Seed by seed, all learners in turn: a machine that slows down in between slows all of them.
         for seed in cfg.seeds:
             runs.append(_ours(cfg, seed, device))
             runs += [_peer(script, python, instance, seed, cfg, evaluator) for script, python in scripts]
+    # `_ours` comes first of each seed, and is what the others are compared with.
     return [_row(run, next(each for each in runs if each.seed == run.seed)) for run in runs]
 
 
@@ -87,6 +92,7 @@ def _scripts(cfg: BenchmarkConfig) -> list[tuple[Path, str]]:
 
 
 def _ours(cfg: BenchmarkConfig, seed: int, device: torch.device) -> Learned:
+    # `evaluation.every=1` gives the curve its points; solving for the optimum is not learning, and is left out.
     own = [f"seed={seed}", f"threads={cfg.threads}", f"device={device}", "evaluation.every=1", "optimal.enabled=false"]
     run = timed_training(*typed("grid", "kernel", "cost"), *own)
     points = [(float(row["seconds"]), int(row["frames"]), float(row["regret_per_step"])) for row in run.curve]
@@ -100,7 +106,10 @@ def _peer(
     words = [str(instance), str(record), "--seed", str(seed), "--seconds", str(cfg.peers_seconds)]
     usage = measured(*words, script=str(script), python=python, quiet=True)
     task = evaluator.world
+    # `[M, t_max + 1, M]`: from each located cell, after n misses, the sensors that are on; stored as bits, 8 to a
+    # byte.
     shape = (task.num_cells, task.num_choices, task.num_cells)
+    # A pickle in a peer's record would be code, run in this process.
     with np.load(record, allow_pickle=False) as stored:
         tables = [np.unpackbits(bits, count=math.prod(shape)).astype(bool).reshape(shape) for bits in stored["sets"]]
         times, steps = stored["seconds"].tolist(), stored["steps"].tolist()
@@ -111,6 +120,8 @@ def _peer(
 
 def _from_start(points: Sequence[tuple[float, int, float]], usage: Usage) -> list[tuple[float, int, float]]:
     """Seconds of learning as seconds of the process: what it spent outside of learning counts as spent before."""
+    # Wall time of the process less the clock of the last point. It includes what comes after learning, which counts
+    # against every learner alike.
     outside = usage.wall_seconds - points[-1][0]
     return [(outside + seconds, steps, regret) for seconds, steps, regret in points]
 
@@ -149,6 +160,7 @@ def chart(rows: list[dict[str, Any]], seed: int) -> str:
     lines = [[" "] * _WIDTH for _ in range(_HEIGHT)]
     for row in shown:
         for at, regret in zip(row["curve"]["seconds"], row["curve"]["regret"], strict=True):
+            # Later learners overwrite earlier ones where two letters meet.
             lines[_line(regret)][min(int(at / end * _WIDTH), _WIDTH - 1)] = row["learner"].split()[0][0]
     labels = {_line(level): f"{level:g}" for level in _LEVELS}
     drawn = [f"{labels.get(line, ''):>7} |{''.join(text).rstrip()}" for line, text in enumerate(lines)]
@@ -162,5 +174,6 @@ def chart(rows: list[dict[str, Any]], seed: int) -> str:
 def _line(regret: float) -> int:
     """The line of a regret: logarithmic from the first of `_LEVELS`, at the top, to the last."""
     top, bottom = math.log10(_LEVELS[0]), math.log10(_LEVELS[-1])
+    # Regrets below the last level, zero among them, are drawn on the last line: their logarithm would leave the chart.
     share = (top - math.log10(max(regret, _LEVELS[-1]))) / (top - bottom)
     return min(max(round(share * (_HEIGHT - 1)), 0), _HEIGHT - 1)

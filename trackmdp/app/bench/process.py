@@ -19,6 +19,7 @@ from hydra.core.hydra_config import HydraConfig
 
 __all__ = ["TimedTraining", "Usage", "measured", "on_one_core", "timed_training", "typed"]
 
+# Runs in the child, around the program: only a process itself can read its own peak memory when it ends.
 _WRAPPER = """
 import json, re, resource, runpy, sys
 from pathlib import Path
@@ -70,6 +71,7 @@ def measured(*words: str, script: str | None = None, python: str = sys.executabl
     """
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder, "usage.json")
+        # As a user starts it, imports included, not by a call within this process, which has imported everything.
         program = ("module", "trackmdp.app.cli") if script is None else ("script", script)
         output = subprocess.DEVNULL if quiet else None
         started = time.perf_counter()
@@ -84,6 +86,7 @@ def timed_training(*words: str) -> TimedTraining:
         usage = measured("train", *words, "quiet=true", f"hydra.run.dir={folder}/run")
         summary = json.loads(Path(folder, "run", "summary.json").read_text())
         with Path(folder, "run", "metrics.csv").open() as stream:
+            # Rows between two evaluations have no regret.
             curve = [row for row in csv.DictReader(stream) if row["regret_per_step"]]
     return TimedTraining(summary, curve, usage)
 
@@ -99,6 +102,8 @@ def on_one_core() -> Iterator[None]:
     if not hasattr(os, "sched_setaffinity"):
         yield
         return
+    # Processes started inside inherit the choice. On one core they take turns, and none is timed on a faster or busier
+    # one.
     cores: Sequence[int] = sorted(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {cores[-1]})
     try:

@@ -37,6 +37,7 @@ def size(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator[d
                 n, f"solve, c = {cost:g}", "regret_per_step", "solution.json", "solve", *at, f"cost.sensor={cost}"
             )
         yield _row(n, "train hindsight", "regret_per_step", "summary.json", "train", *at, *own)
+        # A benchmark within the benchmark, so that each size has a process, and a peak memory, of its own.
         steps = ["benchmark", "part=env", f"batch_sizes=[{ENVS}]", f"seconds={cfg.seconds}", *at, *own]
         yield _row(n, f"env, B = {ENVS}", "per_second", "benchmark.json", *steps)
         window = f"env, B = {ENVS}, window {WINDOW}"
@@ -49,6 +50,7 @@ def _row(n: int, what: str, figure: str, file: str, *words: str) -> dict[str, An
     with tempfile.TemporaryDirectory() as folder:
         try:
             usage = asdict(measured(*words, "quiet=true", f"hydra.run.dir={folder}/run"))
+        # Refused for lack of memory: that is a result as well, and the larger sizes are still of interest.
         except subprocess.CalledProcessError:
             return row
         result = json.loads(Path(folder, "run", file).read_text())

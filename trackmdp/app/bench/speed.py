@@ -34,8 +34,10 @@ def env_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[
         policy = RandomSubset(world.num_sensors, generator(cfg.seed, "benchmark", device=device))
         state = env.reset()
 
+        # Bound as defaults: a closure over the loop's variables would see those of the last round.
         def step(env: TrackEnv = env, policy: TensorDictModuleBase = policy) -> int:
             nonlocal state
+            # 20 steps a call, so that reading the clock does not show.
             for _ in range(20):
                 _, state = env.step_and_maybe_reset(policy(state))
             return 20 * env.num_envs
@@ -59,7 +61,10 @@ def collector_speed(cfg: BenchmarkConfig, world: World, device: torch.device) ->
                 env,
                 policy,
                 frames_per_batch=32 * envs,
+                # Without end: how many batches are taken is a question of time.
                 total_frames=-1,
+                # As in training, whose collector this is to measure: trajectory ids are not used, and cost a part of
+                # each step.
                 track_traj_ids=False,
                 auto_register_policy_transforms=False,
             )
@@ -83,12 +88,14 @@ def train_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> lis
     rows = []
     for name in GROUPS["algo"]:
         train = train_config([f"algo={name}", f"seed={cfg.seed}", f"threads={cfg.threads}"])
+        # Every algorithm in the world of this benchmark, with its own options as shipped.
         train.grid, train.kernel, train.cost = cfg.grid, cfg.kernel, cfg.cost
         algorithm = make_algorithm(train, world, device)
         collector = make_collector(train, world, algorithm.policy, device)
         batches, frames, done = iter(collector), 0, 0
         wall, cpu = time.perf_counter(), time.process_time()
         while done < algorithm.iterations and time.perf_counter() - wall < 5 * cfg.seconds:
+            # None once the frames are used up: updates that follow are timed as well, up to `iterations`.
             batch = next(batches, None)
             frames, done = frames + (batch.numel() if batch is not None else 0), done + 1
             algorithm.step(batch)

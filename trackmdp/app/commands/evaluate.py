@@ -44,12 +44,14 @@ def run(cfg: EvaluateConfig, folder: Path, problem: Problem | None = None) -> fl
     if cfg.run is None and isinstance(cfg.baseline, PlaybackConfig):
         return playback.run(cfg, folder, console, problem)
     world, policy, subject = _trained(cfg, device) if cfg.run else _baseline(cfg, problem)
+    # Recorded tracks have no kernel, hence no exact value and no bound: figures come from the held-out tracks.
     if isinstance(world, Recorded):
         return held_out.run(world, policy, subject, folder, console, cfg.seed)
     evaluator = ExactEvaluator(world)
     score = evaluator.score(policy)
     episodes = simulate(world, policy, cfg.episodes or _FOR_THE_PICTURE, seed=cfg.seed)
     simulation = episodes.figures() if cfg.episodes else None
+    # Theorem thm:estimator is about Q of whole episodes and of a policy that is a table.
     estimate = estimator.accuracy(world, policy) if policy.deterministic and world.max_steps is None else None
     report = _report(subject, evaluator, score, simulation) | {"estimator": asdict(estimate) if estimate else None}
     write_json(folder / "evaluation.json", report)

@@ -56,6 +56,7 @@ def run(cfg: ExportConfig, folder: Path) -> None:
 
 def to_torch(policy: Policy, about: dict[str, str]) -> bytes:
     """What `torch.export.load` reads; `about` stands beside it as text."""
+    # Traced with 2 states: a batch of 1 would be taken for a constant.
     batch = torch.export.Dim("batch")
     states = tuple(torch.zeros(2, dtype=torch.int64) for _ in _INPUTS)
     program = torch.export.export(_Table(policy), states, dynamic_shapes=({0: batch}, {0: batch}))
@@ -77,6 +78,8 @@ def to_onnx(policy: Policy, about: dict[str, str]) -> bytes:
         raise UserError("format=onnx: needs the package onnx, as in pip install 'trackmdp[onnx]'") from None
 
     table = _table(policy)
+    # table[last_cell, min(n, last_row)]: GatherND wants its indices as one `[B, 2]` array, which the nodes put
+    # together.
     constants = {"table": table, "last_row": np.array(table.shape[1] - 1), "column": np.array([1])}
     nodes = [
         helper.make_node("Min", ["steps_since_detection", "last_row"], ["row"]),
@@ -116,4 +119,5 @@ class _Table(nn.Module):
 def _table(policy: Policy) -> BoolArray:
     """`[M, t_max+2, M]`, the sets and after them the forced safe action."""
     sets = policy.dense()
+    # Row t_max + 1 is all sensors on: the file's reader then needs no rule for the forced action.
     return np.concatenate([sets, np.ones_like(sets[:, :1])], axis=1)

@@ -39,6 +39,8 @@ def run(cfg: EvaluateConfig, folder: Path, console: Console, problem: Problem | 
                 f"expected grid.size={_size(*world.size)}"
             )
         logged = reader.read(cfg.baseline.episode)
+    # The logged episode's own seed gives its own target again, so that both returns agree where nothing has changed
+    # since.
     again = reissued(world, logged)
     simulation = simulate(world, Playback(world, logged.action), cfg.episodes, seed=cfg.seed).figures()
     report = {

@@ -35,6 +35,7 @@ def run(cfg: ReplayConfig, folder: Path) -> None:  # noqa: ARG001  what is writt
     if cfg.recover:
         file = _recover(console, file)
     with EpisodeReader(file) as reader:
+        # Said at once: other versions of NumPy or torch may draw other numbers, which is not damage.
         if apart := versions_apart(reader.run):
             console.print(f"made by other versions: {apart}", markup=False)
         asked = _exports(console, cfg, reader)
@@ -77,6 +78,7 @@ def _exports(console: Console, cfg: ReplayConfig, reader: EpisodeReader) -> bool
 
 
 def _verify(console: Console, cfg: ReplayConfig, reader: EpisodeReader) -> None:
+    # First: with another kernel every episode differs, and the kernel is what has to be named.
     difference = _kernel_difference(reader)
     if difference is None:
         numbers = None if cfg.episode is None else [reader.row(cfg.episode)["episode"]]
@@ -101,6 +103,7 @@ def _kernel_difference(reader: EpisodeReader) -> str | None:
     places = (described != logged).tocoo()
     if not places.nnz:
         return None
+    # The first entry that differs, by rows, whatever order the sparse difference has.
     x, y = min(zip(places.row.tolist(), places.col.tolist(), strict=True))
     return f"kernel from cell {x} to {y}: logged {logged[x, y]}, the config gives {described[x, y]}"
 

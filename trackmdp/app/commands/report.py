@@ -36,9 +36,12 @@ def run(cfg: ReportConfig, folder: Path) -> float:
     with console.status("reading runs") as status:
 
         def say(line: str) -> None:
+            # `Text`: a label may hold square brackets, which rich would take for markup.
             status.update(Text(printable(line)))
 
         found = load_results(sweep) if is_stored(sweep) else gather_runs(sweep)
+        # Stored first, and read back: the page is made from what is stored, so that it can be made again from that
+        # alone.
         save_results(found, folder)
         found = load_results(folder)
         _write(build(found, cfg.threshold, _about_the_paper(cfg, sweep, found, folder, say), say), folder)

@@ -44,6 +44,7 @@ def run(cfg: SolveConfig, folder: Path, problem: Problem | None = None) -> float
     bound = {name: float(each(world).mean()) for name, each in _BOUNDS.items()}
     write_json(folder / "solution.json", _report(cfg, solution, bound))
     _show(console, cfg, world, solution, bound, folder)
+    # After the results are written: the command still ends with the status of an interruption.
     if solution.interrupted:
         raise KeyboardInterrupt
     if cfg.verify:

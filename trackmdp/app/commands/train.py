@@ -36,6 +36,7 @@ def run(cfg: TrainConfig, folder: Path, problem: Problem | None = None) -> float
         with locked(folder):
             return _run(cfg, folder, problem)
     except OSError as error:
+        # Somebody tidied up while the run was on; "no such file" about a part of a checkpoint would puzzle.
         if not folder.is_dir():
             raise RunError(f"hydra.run.dir={folder}: the folder was removed while the run wrote to it") from error
         raise RunError(
@@ -65,6 +66,8 @@ def _finished(cfg: TrainConfig, folder: Path) -> float | None:
         return None
     summary = finished(cfg, folder)
     if summary is None:
+        # It belongs to an older config; left there, whoever looks at the folder meanwhile would take this run for
+        # done.
         (folder / "summary.json").unlink(missing_ok=True)
         return None
     return float(summary["policy"]["aihtr"])

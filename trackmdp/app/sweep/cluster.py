@@ -22,6 +22,8 @@ __all__ = ["launcher"]
 SUBMISSIONS = ".submissions"
 """Folder, in that of the sweep, of what the scheduler is given and says."""
 
+# Seconds between two looks for result files, and between two questions to the scheduler, which is shared by many
+# users.
 _POLL, _ASK = 0.5, 60.0
 
 
@@ -43,6 +45,7 @@ class Submission:
         from submitit.helpers import DelayedSubmission
 
         process.stop_all()
+        # submitit submits this once more; the run finds its folder, and resumes from its last checkpoint.
         return DelayedSubmission(self, job)
 
 
@@ -57,6 +60,7 @@ def launcher(cfg: SubmititConfig) -> Launch:
     assert isinstance(cfg, SubmititSlurmConfig)
     import submitit
 
+    # Asked here: submitting would fail only after the sweep's folder has been made.
     if submitit.SlurmExecutor.affinity() < 0:
         raise UserError("hydra/launcher=submitit_slurm: expected a machine from which jobs can be submitted (no srun)")
     return partial(_slurm, cfg)
@@ -66,10 +70,12 @@ def _local(cfg: SubmititLocalConfig, jobs: Sequence[Job]) -> None:
     import submitit
 
     executor = submitit.LocalExecutor(_submissions(jobs))
+    # 30 s before the time is out the job is told to save.
     executor.update_parameters(timeout_min=cfg.timeout_min, signal_delay_s=30)
     at_once = cfg.n_jobs or max(1, len(os.sched_getaffinity(0)) // cfg.cpus_per_task)
     running: list[Any] = []
     for job in jobs:
+        # submitit's local executor starts whatever it is given at once; the limit is kept here.
         while sum(not each.done() for each in running) >= at_once:
             time.sleep(_POLL)
         if stop_signal(job.sweep):
@@ -96,6 +102,7 @@ def _slurm(cfg: SubmititSlurmConfig, jobs: Sequence[Job]) -> None:
         slurm_setup=cfg.setup,
         slurm_additional_parameters=cfg.additional_parameters,
     )
+    # One array job, of which the scheduler runs `array_parallelism` at once; one job each would flood its queue.
     _wait(executor.map_array(Submission(), list(jobs)))
 
 

@@ -35,9 +35,12 @@ def run_job(job: Job) -> None:
     if stop_signal(job.sweep):
         return
     job.folder.mkdir(parents=True, exist_ok=True)
+    # A run whose sweep was killed saves and ends by itself, which takes a while; started beside it, this one would be
+    # refused by the lock of the folder.
     if not _is_free(job):
         _say(job, "is run by another process")
         return
+    # An earlier attempt in this folder, perhaps on a node that died, must not decide what this one came to.
     (job.folder / FAILED_FILE).unlink(missing_ok=True)
     (job.folder / DONE).unlink(missing_ok=True)
     if job.cfg is None:
@@ -48,6 +51,8 @@ def run_job(job: Job) -> None:
         _done(job, outcome)
     elif outcome.reason:
         fail(job, outcome)
+    # Stopped by a signal that the sweep knows nothing of, such as a kill by hand: a failure, else it would look
+    # unfinished.
     elif not stop_signal(job.sweep):
         fail(job, Outcome(outcome.status, reason=f"stopped by signal {outcome.status - 128}"))
     remove_if_empty([job.folder])
@@ -63,12 +68,14 @@ def fail(job: Job, outcome: Outcome) -> None:
 def stop_signal(sweep: Path) -> int:
     """The signal by which the sweep was asked to stop; 0 for none."""
     try:
+        # Empty while it is being written; 0 then, and the next look finds the number.
         return int((sweep / STOP).read_text(encoding="ascii") or 0)
     except (OSError, ValueError):
         return 0
 
 
 def _done(job: Job, outcome: Outcome) -> None:
+    # A training run leaves `summary.json` itself, and only where it came to its end.
     if not (isinstance(job.cfg, TrainConfig) and (job.folder / SUMMARY).is_file()):
         write_json(job.folder / DONE, {"value": outcome.value})
     if job.concurrent and job.cfg is not None and not job.cfg.quiet:
@@ -87,5 +94,6 @@ def _is_free(job: Job) -> bool:
 
 
 def _say(job: Job, what: str) -> None:
+    # The terminal may be gone, as after a lost connection; the run is not to fail of that.
     with contextlib.suppress(OSError):
         sys.stderr.write(f"trackmdp {job.command}: {job.name} {what}\n")

@@ -20,6 +20,7 @@ from trackmdp.errors import require
 
 __all__ = ["make_launcher", "threads_of"]
 
+# Each names the threads of one library (OpenMP, OpenBLAS, MKL), which by default take all cores, in every run at once.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -56,6 +57,7 @@ def _parallel(cfg: LauncherConfig) -> Launch:
 def threads_of(jobs: Sequence[Job]) -> Iterator[None]:
     """Processes started inside have as many threads as the runs ask for, where nothing else was asked for."""
     most = max((job.cfg.threads for job in jobs if isinstance(job.cfg, TrainConfig)), default=1)
+    # Set by the user or by the cluster: theirs counts.
     unset = [name for name in _THREADS if name not in os.environ]
     os.environ.update(dict.fromkeys(unset, str(most)))
     try:
@@ -74,6 +76,10 @@ def _joblib(cfg: JoblibConfig, jobs: Sequence[Job]) -> None:
     """In threads: each only waits for the process of its run."""
     from joblib import Parallel, delayed
 
+    # In the main thread, before joblib's threads start runs: only there can the fork server be made to ignore signals.
     context_for(jobs[0].command)
+    # Cores this process may use, which in a container or a cluster's job are fewer than the machine has.
     at_once = cfg.n_jobs or len(os.sched_getaffinity(0))
+    # Threads: joblib's own processes (loky) give up the whole sweep when one of them is killed. `batch_size=1`: a
+    # thread that took several runs at once would hold them back from threads that are idle.
     Parallel(n_jobs=at_once, backend="threading", batch_size=1)(delayed(run_job)(job) for job in jobs)

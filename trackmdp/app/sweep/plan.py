@@ -71,11 +71,15 @@ def combinations(blocks: Sequence[str], typed: Sequence[str]) -> list[list[str]]
     found: dict[tuple[str, ...], None] = {}
     for block in list(blocks) or [""]:
         axes: dict[str, list[str]] = {}
+        # `posix=False` keeps quotes: they are for Hydra's parser, which reads the word next.
         for word in [*shlex.split(block, posix=False), *typed]:
             override = _parse(word)
             if override.key_or_group == "experiment" and override.is_sweep_override():
                 raise UserError(f"{word}: expected one experiment; each is a sweep of its own")
+            # By key: what is typed comes last, and replaces the word of the block. `algo=a2c,ppo seed=0,1` makes the
+            # axes {algo: [algo=a2c, algo=ppo], seed: [seed=0, seed=1]}.
             axes[override.key_or_group] = _values(override)
+        # A dict, as a set that keeps its order: blocks may overlap, and a run that is in two of them is one run.
         found |= dict.fromkeys(itertools.product(*axes.values()))
     return [list(words) for words in found]
 
@@ -107,13 +111,20 @@ def plan(
     for words in grid:
         cfg: CommandConfig | None
         composed = compose(words)
+        # Only composing may refuse the whole sweep; a config out of range is a failed run among others, and is shown
+        # as one.
         try:
             cfg, refusal = _resumable(typed_config(command, composed, Path.cwd())), ""
         except UserError as error:
             cfg, refusal = None, str(error)
+        # Words and config: where a default in conf/ has changed, the same words make another run.
         key = _digest(_distinguishing(words), _identity(cfg))
         text = _slug([word for word in words if _key(word) in naming] or words)
+        # A wider grid varies more options, so the readable part of a run's name may change; its digest does not, and
+        # finds the folder that is there.
         name = known.get(key, f"{text}-{key}".lstrip("-"))
+        # Lines that differ only in the order of their words, or in `quiet` and `resume`, are one run: two would write
+        # to one folder at once.
         jobs.setdefault(key, Job(command, sweep, name, tuple(words), cfg, refusal))
     return [replace(job, label=f"{place}/{len(jobs)}") for place, job in enumerate(jobs.values(), 1)]
 
@@ -122,6 +133,7 @@ def sweep_name(command: str, words: Sequence[str], blocks: Sequence[str]) -> str
     """The name of a sweep's folder: the same for the same words, in whatever order; those with many values first."""
     told = _distinguishing(words)
     experiments = [word.partition("=")[2] for word in told if _key(word) == "experiment"]
+    # Stable sort: False comes first, so that words with several values lead and survive the cut at 80 letters.
     text = _slug(sorted(told, key=lambda word: not _parse(word).is_sweep_override()), experiments or [command])
     return f"{text}-{_digest(command, told, list(blocks))}"
 
@@ -131,6 +143,7 @@ def _varying(grid: Sequence[Sequence[str]]) -> set[str]:
     values: dict[str, set[str]] = {}
     for word in (word for words in grid for word in words):
         values.setdefault(_key(word), set()).add(word)
+    # An option that is missing in some words varies too, though it has one value wherever it stands.
     shared = {key for key in values if all(any(_key(word) == key for word in words) for words in grid)}
     return {key for key, found in values.items() if len(found) > 1 or key not in shared}
 
@@ -144,9 +157,11 @@ def _folders(sweep: Path) -> dict[str, str]:
 def _slug(words: Iterable[str], prefix: Sequence[str] = ()) -> str:
     """Words as a readable part of a folder's name."""
     named = {_key(word): _short(word.partition("=")[2]) for word in words if _key(word) not in _UNNAMED}
+    # `algo.gamma` is shown as `gamma`, unless another option of the runs ends alike.
     short = [key.split(".")[-1] for key in named]
     pairs = {key if short.count(last) > 1 else last: named[key] for key, last in zip(named, short, strict=True)}
     parts = [*prefix, *(f"{key}_{value}" for key, value in pairs.items())]
+    # Only letters that no file system, shell or glob takes for its own; 80 of them leave room below the usual 255.
     return "-".join(re.sub(r"[^\w.+-]+", "_", part).strip("_") for part in parts)[:80].strip("-._")
 
 
@@ -160,6 +175,7 @@ def _distinguishing(words: Iterable[str]) -> list[str]:
 
 
 def _digest(*told: Any) -> str:
+    # 8 hex digits: 32 bits, so that among 1000 runs two meet with a chance of 1 in 8600.
     return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:8]
 
 
@@ -168,6 +184,7 @@ def _identity(cfg: CommandConfig | None) -> dict[str, Any]:
     if cfg is None:
         return {}
     plain = to_dict(cfg)
+    # A default of what may change when a run is resumed does not make another run; typed, it does, as one of the words.
     for key in (*CHANGEABLE, "resume") if isinstance(cfg, TrainConfig) else ("quiet",):
         *parents, last = key.split(".")
         node = plain
@@ -205,4 +222,5 @@ def _values(override: Override) -> list[str]:
 
 
 def _key(word: str) -> str:
+    # `hydra/launcher` and `hydra.launcher` are one key here.
     return word.lstrip("+~").partition("=")[0].replace("/", ".")

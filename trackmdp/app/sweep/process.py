@@ -27,9 +27,11 @@ OUTPUT = "output.txt"
 METHOD = "forkserver"
 """The fork server imports the command once (seconds: torch, TorchRL); every run, of any launcher, is forked from it."""
 
+# For `stop_all`, which a scheduler's signal calls while another function waits for the process.
 _running: list[Any] = []
 _start_or_join = threading.RLock()
 """Held while a process is started or joined: `multiprocessing` polls all children in both, which is not thread-safe."""
+# Seconds between two looks for the file by which a sweep is told to stop.
 _POLL = 0.2
 _LOST = 255
 """What `multiprocessing` gives as the exit status of a process whose fork server is gone."""
@@ -60,6 +62,8 @@ def run_in_process(job: Job, stop: Callable[[], int]) -> Outcome:
         job: what is run.
         stop: asked every 0.2 s: the number of the signal by which the run is to stop, 0 for none.
     """
+    # The fork server is a process of its own, which the system may kill for lack of memory. The attempt that meets a
+    # dead one fails, the next starts another; if that fails as well, something else is wrong.
     for last in (False, True):
         try:
             process, ours = _start(job)
@@ -83,9 +87,11 @@ def run_in_process(job: Job, stop: Callable[[], int]) -> Outcome:
 
 def _start(job: Job) -> tuple[Any, Connection]:
     """The process of a run, and the end of the pipe on which its `Outcome` arrives."""
+    # The fork server imports what is preloaded when it starts, so that this is said before the first process.
     context = context_for(job.command)
     ours, theirs = context.Pipe(duplex=False)
     process = context.Process(target=_run_in_child, args=(job, Path.cwd(), theirs))
+    # Our copy of the writing end is closed once the child has its own: else the pipe would never report its end.
     with theirs, _start_or_join:
         process.start()
         _running.append(process)
@@ -107,8 +113,12 @@ def context_for(command: str) -> Any:
     context: Any = multiprocessing.get_context(METHOD)
     if METHOD != "forkserver":
         return context
+    # Importing torch takes seconds and memory; a fork shares both. Forking this process itself would copy its threads'
+    # locks in whatever state they are; a fork server has one thread.
     context.set_forkserver_preload([f"trackmdp.app.commands.{command}"])
+    # Python sets signal handlers from the main thread alone; hence "call it first in the main thread".
     ignored = _TERMINATING if threading.current_thread() is threading.main_thread() else ()
+    # SIG_IGN is inherited by the process that is started inside, and a handler of Python's would not be.
     before = {number: signal.signal(number, signal.SIG_IGN) for number in ignored}
     try:
         forkserver.ensure_running()
@@ -132,13 +142,17 @@ def _outcome(connection: Connection, code: int, asked: int) -> Outcome:
     """What the child sent; without that, what its exit status says."""
     with connection:
         try:
+            # `recv` unpickles, which is safe here: the other end is our own child. A child that was killed half way
+            # through sends an end of file.
             sent = connection.recv() if connection.poll() else None
         except EOFError:
             sent = None
     if isinstance(sent, Outcome):
         return sent
+    # Asked to stop, and ended without a word: it was stopped, whatever its status says.
     if asked:
         return Outcome(128 + asked)
+    # `multiprocessing` gives -N for a process that signal N ended. -9 is what Linux sends when memory runs out.
     if code < 0:
         return Outcome(FAILED, reason=f"killed by {signal.Signals(-code).name}{_MEMORY if code == -9 else ''}")
     return Outcome(FAILED, reason=f"its process ended with status {code}")
@@ -148,15 +162,20 @@ _MEMORY = ", perhaps for lack of memory"
 
 
 def _run_in_child(job: Job, folder: Path, connection: Connection) -> None:
+    # The fork server ignores these, and a fork inherits that: a run has to hear them, to save and stop.
     for number in (signal.SIGTERM, signal.SIGUSR1):
         signal.signal(number, signal.SIG_DFL)
     for number in (signal.SIGINT, signal.SIGUSR2):  # the sweep, or the cluster's job, receives these and passes them on
         signal.signal(number, signal.SIG_IGN)
+    # The fork server stays in the folder in which it was started, so that relative paths would be meant from there.
     os.chdir(folder)
+    # At the level of the descriptor, so that what libraries in C print goes to the file as well. Errors stay on the
+    # terminal.
     if job.concurrent:
         with (job.folder / OUTPUT).open("a") as stream:
             sys.stdout.flush()
             os.dup2(stream.fileno(), 1)
+    # A parent that is killed sends no signal to its children: they would go on alone, and hold their folders' locks.
     threading.Thread(target=_stop_with_parent, daemon=True).start()
     outcome = _run(job)
     with connection:
@@ -166,6 +185,7 @@ def _run_in_child(job: Job, folder: Path, connection: Connection) -> None:
 def _stop_with_parent() -> None:
     parent = multiprocessing.parent_process()
     if parent is not None:
+        # Returns when the parent's sentinel closes, which the system does however it ends.
         parent.join()
         os.kill(os.getpid(), signal.SIGUSR1)  # not SIGTERM: where one came before, a second ends the run without saving
 
@@ -174,6 +194,7 @@ def _run(job: Job) -> Outcome:
     """Run the command; whatever it raises becomes an `Outcome`."""
     assert job.cfg is not None
     try:
+        # Checked when the sweep was planned, but hours may lie between, and files may have gone since.
         ready = check(job.command, job.cfg, job.folder, job.words)
         announce(job.command, ready.cfg, job.folder, job.label)
         value = ready.run()
@@ -182,6 +203,7 @@ def _run(job: Job) -> Outcome:
         return Outcome(128 + error.signal)
     except (UserError, RunError) as error:
         return Outcome(USER_MISTAKE if isinstance(error, UserError) else FAILED, reason=_line(error))
+    # Whatever it is, SystemExit among it: the exception ends with this process, and the sweep needs a reason.
     except BaseException as error:
         traceback.print_exc()
         sys.stderr.flush()

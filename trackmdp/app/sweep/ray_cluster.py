@@ -28,6 +28,8 @@ def launch_on_ray(cfg: RayConfig, jobs: Sequence[Job]) -> None:
     with kept_sigterm():  # which asks the sweep to stop
         _join(cfg, ray)
     try:
+        # No retries by Ray: a run that was killed for lack of memory would be again; the sweep launches what is left
+        # itself.
         task = ray.remote(num_cpus=cfg.cpus_per_run, num_gpus=cfg.gpus_per_run, max_retries=0)(run_job)
         left = [task.remote(job) for job in jobs]
         while left:  # what failed stands in the folders; a task whose worker died has left nothing there
@@ -42,6 +44,7 @@ def _join(cfg: RayConfig, ray: Any) -> None:
         ray.init(num_cpus=cfg.num_cpus, object_store_memory=_STORE, **quiet)
         return
     try:
+        # Nothing about memory: Ray refuses `object_store_memory` and `num_cpus` for a cluster that runs already.
         ray.init(address=cfg.address, logging_level="error")
     except (ConnectionError, ValueError, RuntimeError) as error:
         reason = " ".join(str(error).split())

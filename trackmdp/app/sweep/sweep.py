@@ -47,11 +47,14 @@ def sweep(
         UserError: the folder is in use.
         Preempted: a signal ended the sweep; it can go on.
     """
+    # By name, since a search may come upon a run that an earlier batch had.
     jobs: dict[str, Job] = {}
     skipped: set[Path] = set()
+    # Two sweeps in one folder would start the same runs, and each remove the other's stop file.
     with locked(folder, "hydra.sweep.dir"), _Stop(folder) as stop:
         for batch in batches:
             jobs |= {job.name: job for job in batch}
+            # Before anything is run, so that `report` and `watch` know what is still to come.
             write_plan(folder, command, line, [(job.name, job.words) for job in jobs.values()])
             done = {job.folder for job in batch if _is_finished(job)}
             console.print(_opening(batch, done, folder), markup=False)
@@ -71,15 +74,19 @@ def sweep(
 def _run(jobs: Sequence[Job], launch: Launch, stop: _Stop) -> None:
     for job in jobs:
         _remove_results(job)
+    # Here and not in each launcher: the fork server, worker processes and their children all inherit the environment.
     with threads_of(jobs):
         _launch(jobs, launch, stop)
 
 
 def _is_finished(job: Job) -> bool:
     """Whether the run is done already, with the very config that is asked for."""
+    # Other commands leave no config to compare with, so that they are done again.
     if not isinstance(job.cfg, TrainConfig) or run_of(job.folder).state != "done":
         return False
     try:
+        # `continued` refuses where an option differs that must not change: what is done is another run then, and this
+        # one says so itself when it is run.
         return finished(continued(job.cfg, job.folder, job.words), job.folder) is not None
     except UserError:
         return False
@@ -88,12 +95,15 @@ def _is_finished(job: Job) -> bool:
 def _remove_results(job: Job) -> None:
     """Remove what an earlier call left of a run that is to be run now."""
     for name in (FAILED_FILE, DONE, SUMMARY):
+        # A launcher's worker may die before its run begins; an old result would then be taken for the new one.
         (job.folder / name).unlink(missing_ok=True)
 
 
 def _launch(jobs: Sequence[Job], launch: Launch, stop: _Stop) -> None:
     """Launch `jobs`, and once more what a launcher that broke down left undone."""
     reason = "it was launched, and left nothing"
+    # A pool whose worker was killed gives up all that it still had to do. What is done stands in the folders, so that
+    # the rest can simply be launched again.
     for _ in range(_ROUNDS):
         if not jobs or stop.received:
             return
@@ -102,6 +112,7 @@ def _launch(jobs: Sequence[Job], launch: Launch, stop: _Stop) -> None:
         except Exception as error:
             reason = f"the launcher broke down: {type(error).__name__}: {' '.join(str(error).split())}"
             sys.stderr.write(f"{reason}\n")
+        # Not "running": another process holds that folder, and is at it.
         jobs = [job for job in jobs if run_of(job.folder).state in ("cut", "waiting")]
     if stop.received:
         return
@@ -140,6 +151,8 @@ class _Stop(Signals):
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         try:
+            # A file, since runs may be on other machines, where no signal reaches them. `finally`: with a full disk
+            # the signal has still to be noted here.
             self._file.write_text(str(number), encoding="ascii")
         finally:
             super()._note(number, frame)

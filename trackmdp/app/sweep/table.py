@@ -25,6 +25,7 @@ _FIGURES = ("aihtr", "regret_per_step", "accuracy", "sensors_per_step", "frames"
 
 def show_runs(console: Console, runs: Sequence[RunState], skipped: Collection[Path], sweep: Path) -> None:
     """Every run with its state, AIHTR and regret per step, or why it failed."""
+    # Without the digest, where the readable part is enough to tell the runs apart.
     names = [run.folder.name.rpartition("-")[0] for run in runs]
     if len(set(names)) < len(names):
         names = [run.folder.name for run in runs]
@@ -34,6 +35,7 @@ def show_runs(console: Console, runs: Sequence[RunState], skipped: Collection[Pa
     console.print(made)
     states = [_state(run, skipped) for run in runs]
     counts = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states))
+    # `markup=False`: a folder named "[red]" is a name, not an order to rich.
     console.print(f"{counts}; {shown(sweep) / TABLE}", markup=False)
 
 
@@ -43,6 +45,7 @@ def write_table(sweep: Path, runs: Sequence[RunState]) -> None:
     Nothing in it depends on time, or on how often a run was interrupted.
     """
     words = [dict(_pair(word) for word in run.overrides) for run in runs]
+    # The union in order of appearance: runs of different blocks may have different options.
     keys = [key for key in dict.fromkeys(key for pairs in words for key in pairs) if key != "quiet"]
     stream = io.StringIO(newline="")
     writer = csv.writer(stream, lineterminator="\n")
@@ -59,6 +62,7 @@ def status_of(runs: Sequence[RunState]) -> int:
     if all(run.state == "done" for run in runs):
         return 0
     statuses = [read_run_json(run.folder / FAILED_FILE).get("status") for run in runs if run.state == "failed"]
+    # A run that is neither done nor failed is nobody's mistake, and 2 would tell a script not to try again.
     unfinished = any(run.state not in ("done", "failed") for run in runs)
     return FAILED if unfinished or any(status != USER_MISTAKE for status in statuses) else USER_MISTAKE
 
@@ -77,6 +81,7 @@ def run_figures(run: RunState) -> dict[str, Any]:
 def _short(run: RunState) -> list[str]:
     found = run_figures(run)
     aihtr, regret = found.get("aihtr"), found.get("regret_per_step")
+    # Adding 0.0 turns the -0.0 that rounding leaves into 0.0.
     return [f"{aihtr:,.3f}" if aihtr is not None else "", f"{round(regret, 4) + 0.0:.4f}" if regret is not None else ""]
 
 

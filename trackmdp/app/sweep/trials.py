@@ -48,21 +48,31 @@ def trials(
     if not searched:
         raise UserError("hydra/sweeper=optuna: expected a word to search, such as algo.gamma=interval(0.9,0.99)")
     with _study(cfg, folder) as study:
+        # The words are kept with each trial: Optuna's own parameters would have to be put into Hydra's notation again.
         told = [trial.user_attrs.get(_WORDS, []) for trial in study.trials if trial.state == _states().COMPLETE]
         earlier = [planned([*fixed, *chosen], set(searched)) for chosen in told]
+        # Handed over as a batch of its own: the sweep finds them done, and they stand in its table.
         if here := [job for job in earlier if run_of(job.folder).state == "done"]:
             yield here
+        # Failures of earlier calls do not count: whoever calls again has perhaps removed the cause, and they are tried
+        # once more.
         failed = 0
+        # `n_trials` is the whole study's, so that a call that was interrupted and is repeated comes to the same
+        # number; Optuna's own `optimize` would add so many each time.
         while missing := max(0, cfg.n_trials - _count(study, "COMPLETE") - failed):
             asked = [_ask(cfg, study, searched, place) for place in range(min(cfg.batch, missing))]
             jobs = [planned([*fixed, *chosen], set(searched)) for _, chosen in asked]
+            # A sampler may propose the same values twice within a batch: one run, whose result both trials are told.
             yield list({job.name: job for job in jobs}.values())
+            # The generator goes on only when the sweep asks for the next batch, after all runs of this one are over.
             for (trial, _), job in zip(asked, jobs, strict=True):
                 failed += _tell(cfg, study, trial, job)
 
 
 def _ask(cfg: OptunaConfig, study: Any, searched: dict[str, Override], place: int) -> tuple[Any, list[str]]:
     """The next trial and its words. Draws depend on the seed and on the results known, not on interruptions."""
+    # A sampler's state is not kept in the storage. Seeded anew from what is known, the choice after an interruption is
+    # the one that would have come without it. 2^32: NumPy takes no larger seed.
     study.sampler = _sampler(cfg, derive(cfg.seed, "optuna", _count(study, "COMPLETE"), place) % 2**32)
     trial = study.ask()
     try:
@@ -89,13 +99,16 @@ def _suggest(trial: Any, key: str, override: Override) -> Any:
     value = override.value()
     if isinstance(value, IntervalSweep):
         log = "log" in value.tags
+        # The type of the bounds decides: interval(1,8) gives whole numbers, interval(1.0,8.0) does not.
         draw = trial.suggest_int if isinstance(value.start, int) else trial.suggest_float
         return draw(key, value.start, value.end, log=log)
     if isinstance(value, RangeSweep):
         steps: Any = override.sweep_iterator()
+        # A range may fall, range(8,0,-2); Optuna wants low to high.
         values = sorted(steps)
         draw = trial.suggest_int if isinstance(values[0], int) else trial.suggest_float
         return draw(key, values[0], values[-1], step=abs(value.step))
+    # As strings in Hydra's notation, since they become words: null, [1,2] and quoted text stay what they are.
     return trial.suggest_categorical(key, list(override.sweep_string_iterator()))
 
 
@@ -106,6 +119,7 @@ def _tell(cfg: OptunaConfig, study: Any, trial: Any, job: Job) -> int:
     if value is not None:
         study.tell(trial, value)
         return 0
+    # Done without a figure counts as failed, as where the regret is searched on recorded tracks, which have no bound.
     if run.state in ("done", "failed"):
         study.tell(trial, state=_states().FAIL)
         return 1
@@ -129,6 +143,7 @@ def _study(cfg: OptunaConfig, folder: Path) -> Iterator[Any]:
         _enqueue_interrupted(study)
         yield study
     finally:
+        # Else a connection to the SQLite file stays open until the interpreter ends.
         storage.remove_session()
         storage.engine.dispose()
 
@@ -138,8 +153,11 @@ def _enqueue_interrupted(study: Any) -> None:
     done = [trial.params for trial in study.trials if trial.state == _states().COMPLETE]
     queued = [trial.system_attrs.get("fixed_params") for trial in study.trials if trial.state == _states().WAITING]
     for trial in study.trials:
+        # The process that asked for it is gone; nobody would ever tell its result.
         if trial.state == _states().RUNNING:
             study.tell(trial.number, state=_states().FAIL)
+        # `trial.state` is the state as listed above, so that a trial just told to have failed is still among those
+        # here.
         if trial.state in (_states().RUNNING, _states().FAIL) and trial.params not in [*done, *queued]:
             study.enqueue_trial(trial.params)
             queued.append(trial.params)
