@@ -129,6 +129,7 @@ class _Written:
         self.count, self.spent = action.sum(-1), costs.price_of(action)
 
     def sensed(self, cell: Tensor) -> Tensor:
+        # `[B, M]` at `[B, 1]`: of each row the entry of its own cell.
         return self._on.gather(1, cell.unsqueeze(1)).squeeze(1)
 
 
@@ -140,6 +141,7 @@ class Following:
     def __init__(self, policy: Policy, costs: Costs) -> None:
         assert policy.sets is not None
         self.policy, self._table = policy, policy.lookup(torch.device("cpu"))
+        # A CSR matrix's indptr says where each row's entries begin: 0 2 2 5 are rows of 2, 0 and 3 sensors.
         self._count = torch.as_tensor(np.diff(policy.sets.indptr).astype(np.int64))
         self._spent = costs.of_sets(policy.sets)
 
@@ -162,6 +164,7 @@ class Uniform:
     def decide(self, states: States, draws: Tensor) -> Choice:  # noqa: ARG002
         """See `Actor`."""
         b = len(states.row)
+        # expand repeats one number B times without memory of its own.
         return _Same(self._on, self._count.expand(b), self._spent.expand(b))
 
 

@@ -53,7 +53,9 @@ class Steps:
         """The columns `[S, ...]` with the steps of one episode after those of another, and `length` `[B]`."""
         columns = {name: np.concatenate(parts) for name, parts in self._taken.items()}
         row = columns.pop("row")
-        # Steps were taken in order of time; a stable sort by episode leaves them so within each.
+        # Steps were taken in order of time; a stable sort by episode leaves them so within each. Example: the rows 0 1
+        # 2, then 0 2, then 2 (episode 1 ended first): the order is 0 3 1 2 4 5, the sorted rows are 0 0 1 2 2 2,
+        # `length` is 2 1 3.
         order = np.argsort(row, kind="stable")
         return {name: column[order] for name, column in columns.items()} | {
             "length": np.bincount(row, minlength=self._episodes)
@@ -104,9 +106,11 @@ class Episodes(Sequence[Episode]):
         columns = {name: np.concatenate([part[name] for part in parts]) for name in (parts[0] if parts else ())}
         if not parts:
             none = np.zeros(0, dtype=np.int32)
+            # No episode: columns of length 0, of the types that they have otherwise.
             columns = dict.fromkeys(("misses", "target", "sensors", "length"), none)
             columns |= {"located": none > 0, "truncated": none > 0, "reward": none.astype(np.float32)}
         start = np.concatenate([np.zeros(0, dtype=np.int64), *(batch.start for batch in batches)])
+        # Lengths 2 1 3 begin at 0 2 3, and end at 6: episode i has the steps first[i] ... first[i + 1] - 1.
         first = np.concatenate([[0], np.cumsum(columns.pop("length"))])
         bits = columns.pop("bits", None)
         return cls(problem, policy, list(seeds), start, first, bits=bits, **columns)
@@ -137,12 +141,15 @@ class Episodes(Sequence[Episode]):
             target=target,
             located=located,
             reward=self.reward[steps],
+            # Cell M stands for the exit, which no later step follows.
             terminated=bool(target[-1] == self.problem.num_cells),
             truncated=bool(self.truncated[steps][-1]),
         )
 
     def _action(self, steps: slice, last_cell: Integers, misses: Integers) -> BoolArray:
         """`[T, M]`."""
+        # A policy with a table needs no bits: its action follows from (last cell, misses), and S rows of M bits are
+        # not kept.
         if self.bits is not None:
             return np.unpackbits(self.bits[steps], axis=-1, count=self.problem.num_cells).astype(np.bool_)
         assert self.policy is not None
@@ -154,6 +161,7 @@ class Episodes(Sequence[Episode]):
             return summary(np.zeros((6, 0)))
         in_grid = self.target < self.problem.num_cells
         forced = (self.misses > self.problem.t_max) & in_grid
+        # Sensors are counted where they cost: not at the exit, nor where the safe action replaced them.
         chosen = self.sensors * (in_grid & ~forced)
         every = np.ones(len(self.target))
         columns: list[npt.NDArray[Any]] = [self.reward, in_grid, self.located, chosen, forced, every]

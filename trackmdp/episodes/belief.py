@@ -31,6 +31,7 @@ def beliefs(world: World, episodes: Sequence[Episode]) -> list[Floats]:
     belief = exact.detect(torch.tensor([episode.start for episode in episodes]))
     rows = torch.arange(len(episodes))
     for t in range(int(lengths.max())):
+        # Episodes that have ended leave the batch, `rows` says which ones the rows of `belief` belong to.
         going_on = lengths[rows] > t
         rows, belief = rows[going_on], belief[going_on]
         step = first[rows] + t

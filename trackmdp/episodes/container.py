@@ -23,6 +23,10 @@ from trackmdp.untrusted import reason
 __all__ = ["MAGIC", "Body", "Chunk", "Container", "Damaged", "Message", "opened_log", "records", "unpacked"]
 
 MAGIC = b"\x89MCAP0\r\n"
+# A record is its opcode (u8), the length of its content (u64) and the content; a string is its length (u32) and UTF-8.
+# Every number is little-endian. A file's header record, right after the magic, for example:
+#     01 | 16 00 00 00 00 00 00 00 | 00 00 00 00 | 0e 00 00 00  74 72 61 63 ...
+#     HEADER, 22 bytes of content: profile "", then library, the 14 bytes of "trackmdp 0.1.0".
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
 ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = range(9, 16)
 _FOOTER_LENGTH = 1 + 8 + 20
@@ -106,6 +110,7 @@ class Container:
             raise UserError(f"file={file}: damaged ({reason(error)}); recover=true saves what can be read") from error
 
     def _header(self) -> tuple[str, str]:
+        """Profile and library, the two strings of the header record."""
         opcode, body = next(records(self.stream, len(MAGIC)), (0, b""))
         if opcode != HEADER:
             raise Damaged("its first record is not the header")
@@ -132,6 +137,8 @@ class Container:
             raise Damaged(f"a summary of {summary_length:,} bytes")
         self.stream.seek(self.summary_start)
         summary = self.stream.read(summary_length)
+        # zlib.crc32 takes the checksum so far: that of the summary goes on over the footer, opcode and length
+        # included, but for the four bytes of the checksum itself.
         if zlib.crc32(footer[:-4], zlib.crc32(summary)) != checksum:
             raise Damaged("the checksum of the summary")
         self._index(summary)
@@ -146,20 +153,26 @@ class Container:
             if opcode == CHUNK_INDEX:
                 self.chunks.append(_chunk_of(body))
             elif opcode == CHANNEL:
+                # CHANNEL: id u16, schema u16, topic, encoding, metadata; the last two are not needed.
                 number, _ = body.numbers("HH")
                 self.channels[number] = body.text()
             elif opcode == ATTACHMENT_INDEX:
+                # ATTACHMENT_INDEX: offset, length, log time, creation time, size of the data (u64 each), name, media
+                # type.
                 offset, length, *_ = body.numbers("QQQQQ")
                 self.attachments[body.text()] = offset, length
             elif opcode == METADATA_INDEX:
+                # METADATA_INDEX: offset and length of the record (u64 each), name.
                 offset, length = body.numbers("QQ")
                 self.metadata[body.text()] = offset, length
+        # Sorted for the bisection in `chunks_between`; a log's own order is the same.
         self.chunks.sort(key=lambda chunk: chunk.begin)
         self._ends = [chunk.end for chunk in self.chunks]
 
     def _record(self, opcode: int, offset: int, length: int) -> bytes:
         """The content of the record that the summary says is there."""
-        # The summary's checksum says that it is what was written, not that a kind hand wrote it.
+        # A checksum shows that the summary is what was written, not that its writer was honest: these numbers may be
+        # anything.
         if not (9 <= length <= min(_RECORD_LIMIT, self.length) and 0 <= offset <= self.length - length):
             raise Damaged(f"a record of {length:,} bytes at byte {offset:,}")
         self.stream.seek(offset)
@@ -172,6 +185,7 @@ class Container:
         """The content of the attachment `name`, its checksum checked."""
         if name not in self.attachments:
             raise Damaged(f"no attachment {name}")
+        # The name once more, in the record: an index with two offsets exchanged has a correct checksum, too.
         found, content = attachment_of(self._record(ATTACHMENT, *self.attachments[name]))
         if found != name:
             raise Damaged(f"attachment {name}")
@@ -203,6 +217,7 @@ class Container:
         # A chunk's checksum covers its content alone; its head is held against the summary, which has its own.
         if said != (chunk.begin, chunk.end, chunk.size, chunk.compression, chunk.compressed):
             raise Damaged(f"the chunk at byte {chunk.offset}")
+        # A copy, since a chunk may repeat the definitions of channels, which are added to what is handed over.
         return list(messages_of(content, dict(self.channels)))
 
     def check_data(self) -> None:
@@ -221,6 +236,7 @@ class Container:
         opcode, size, written = struct.unpack("<BQI", self.stream.read(13))
         if (opcode, size) != (DATA_END, 4) or written not in (0, checksum):
             raise Damaged("the checksum over the data section")
+        # Zero stands for `not computed` in the format. It is told apart, since the bytes may be whole.
         if written == 0:
             raise Damaged("no checksum over the data section")
 
@@ -254,6 +270,7 @@ def records(stream: BinaryIO, offset: int) -> Iterator[tuple[int, bytes]]:
     while offset < length:
         stream.seek(offset)
         head = stream.read(9)
+        # read(9) returns the 8 bytes that are left.
         if length - offset == len(MAGIC) and head == MAGIC:
             return
         size = int.from_bytes(head[1:], "little")
@@ -278,6 +295,8 @@ def _split(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _chunk_of(body: Body) -> Chunk:
+    # CHUNK_INDEX: first and last log time, offset, length (u64 each), a map channel -> offset of its message index
+    # (u32 bytes of it), length of these indexes u64, compression, compressed and uncompressed size (u64 each).
     begin, end, offset, length = body.numbers("QQQQ")
     body.sized()
     body.numbers("Q")
@@ -287,6 +306,8 @@ def _chunk_of(body: Body) -> Chunk:
 
 def attachment_of(data: bytes) -> tuple[str, bytes]:
     """Name and content of an attachment record."""
+    # ATTACHMENT: log time and creation time (u64 each), name, media type, data (u64 and bytes), CRC-32 of all before
+    # itself (u32).
     if zlib.crc32(data[:-4]) != int.from_bytes(data[-4:], "little"):
         raise Damaged("the checksum of an attachment")
     body = Body(data)
@@ -298,6 +319,7 @@ def attachment_of(data: bytes) -> tuple[str, bytes]:
 def metadata_of(data: bytes) -> tuple[str, dict[str, str]]:
     """Name and content of a metadata record."""
     body = Body(data)
+    # METADATA: name, and a map: u32 bytes of it, then key and value, key and value, ...
     name, pairs = body.text(), Body(body.sized())
     content = {}
     while pairs.place < len(pairs.data):
@@ -313,15 +335,19 @@ def unpacked(data: bytes) -> tuple[tuple[int, int, int, str, int], bytes]:
         Damaged: the checksum is missing or wrong, or the compression cannot be undone.
     """
     body = Body(data)
+    # CHUNK: first and last log time, uncompressed size (u64 each), CRC-32 of the uncompressed content (u32),
+    # compression, compressed content (u64 and bytes).
     begin, end, size, checksum = body.numbers("QQQI")
     compression = body.text()
     packed = body.sized("Q")
+    # Before decompressing: zstd packs zeros by 30,000 to one.
     if size > _CHUNK_LIMIT:
         raise Damaged(f"a chunk of {size} bytes")
     try:
         content = _UNPACK[compression](packed, size)
     except (KeyError, zstandard.ZstdError, MemoryError) as error:
         raise Damaged(f"a chunk that cannot be decompressed ({compression or 'none'})") from error
+    # A checksum of 0 means that none was written; our logs always have one.
     if len(content) != size or zlib.crc32(content) != checksum or checksum == 0:
         raise Damaged("the checksum of a chunk")
     return (begin, end, size, compression, len(packed)), content
@@ -347,6 +373,8 @@ def messages_of(content: bytes, channels: dict[int, str]) -> Iterator[Message]:
     """The messages of a chunk's content; channels it defines are added to `channels`."""
     for opcode, data in _split(content):
         if opcode == MESSAGE:
+            # MESSAGE: channel u16, sequence u32, log time u64, publish time u64, 22 bytes in all, then the data.
+            # Channels are defined before their first message, in the same chunk or an earlier one.
             number, _, log_time, _ = struct.unpack_from("<HIQQ", data)
             if number not in channels:
                 raise Damaged(f"a message of an unknown channel {number}")

@@ -90,12 +90,15 @@ class Episode:
         t_max, max_steps = task.t_max, task.max_steps
         action = Window.of(task).to_local(torch.from_numpy(self.last_cell), torch.from_numpy(self.action)).numpy()
         history = _history(action, self.misses, t_max)
+        # n after step t is n before step t + 1; behind the last step there is none to look it up in, so it follows
+        # from the outcome.
         after = np.concatenate([self.misses[1:], [0]])
         after[-1] = 0 if self.located[-1] or self.terminated else self.misses[-1] + 1
         following = {
             "target": self.target,
             "last_cell": np.where(self.located, self.target, self.last_cell),
             "steps_since_detection": after,
+            # h after step t is h before step t + 1, as for n.
             "action_history": np.concatenate([history[1:], self._final_history(history[-1], action[-1], t_max)[None]]),
             "reward": self.reward[:, None],
             **_ends(len(self), self.terminated, self.truncated),
@@ -129,9 +132,12 @@ def _history(action: BoolArray, misses: Integers, t_max: int) -> BoolArray:
 
     Step t with n misses before it has in slot s the action of step t - n + s.
     """
+    # Example: misses 0 1 2 0 (located by the third step), t_max = 2. Before step 2, n = 2: slot 0 is the action of
+    # step 0, slot 1 that of step 1, slot 2 is empty.
     slots = np.arange(t_max + 1)
     steps = np.arange(len(misses))[:, None] - misses[:, None] + slots
     filled = slots < misses[:, None]
+    # Empty slots point at steps that are not theirs: they read step 0 instead, and the mask clears what they read.
     return action[np.where(filled, steps, 0)] & filled[..., None]
 
 

@@ -40,6 +40,7 @@ def summary(totals: Array) -> Simulation:
     The rows of `totals` are reward, steps in the grid, detections, sensors on by choice, safe actions, and steps.
     """
     reward, steps, detections, sensors, forced, length = totals
+    # An episode whose first step is the exit has no step in the grid, and no accuracy.
     some = steps > 0
     return Simulation(
         episodes=len(reward),

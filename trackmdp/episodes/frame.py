@@ -47,6 +47,7 @@ def sentence(episode: Episode, t: int, task: Task) -> str:
 def frame(episode: Episode, t: int, task: Task) -> str:
     """The grid at a step: the target over the sensors that are on over the belief."""
     belief = np.zeros(task.num_cells) if episode.belief is None else episode.belief[t]
+    # digitize gives 0 below 1e-6, 1 below .05, ... 4 from .5 on: an index into the shades.
     levels = np.digitize(belief, [1e-6, 0.05, 0.2, 0.5])
     marks = np.array(list(_SHADES))[levels]
     if outcome(episode, t, task) != "forced":

@@ -80,6 +80,7 @@ def check_row(row: Any, cells: int) -> dict[str, Any]:
         raise ValueError("the return of an episode")
     _count(row, "seed", 0, 2**64)
     begin, end = (_count(row, name, schema.time_of(0), 2**63) for name in ("start_time", "end_time"))
+    # The times are used to look up messages, the length to allocate: they must agree before either is.
     if row["length"] < 1 or end - begin != (row["length"] - 1) * schema.TICK_NS:
         raise ValueError("the times of an episode are not those of its steps")
     return dict(row)

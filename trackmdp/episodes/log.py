@@ -73,6 +73,8 @@ class EpisodeLog:
         written = part if part.exists() else self.file
         if not written.exists():
             return
+        # Moved aside, since the log that goes on takes its name; put back below if not all of the policies can be
+        # read.
         written.replace(earlier)
         taken = taken_over(earlier, self.file, policies)
         if taken is None:

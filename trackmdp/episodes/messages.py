@@ -16,6 +16,8 @@ from trackmdp.errors import UserError
 
 __all__ = ["decode", "grid_messages", "row_of", "step_messages"]
 
+# Ten bytes for each cell, without padding, as `_FIELDS` tells the viewer: belief at 0, policy at 4, active at 8,
+# target at 9. A grid of 100 cells is 1,000 bytes, 1,336 characters in base64.
 _CELL = np.dtype([("belief", "<f4"), ("policy", "<f4"), ("active", "u1"), ("target", "u1")])
 _FLOAT32, _UINT8 = 7, 1  # foxglove.NumericType
 _FIELDS = [
@@ -32,6 +34,8 @@ def row_of(episode: Episode, t_max: int, first_tick: int) -> dict[str, Any]:
     """The `/episode` message."""
     return {
         "episode": episode.number,
+        # Seeds have 63 bits and times in ns 60: as JSON numbers, a viewer in JavaScript would round them, which it
+        # does beyond 2^53.
         "seed": str(episode.seed),
         "policy": episode.policy,
         "start": episode.start,
@@ -50,13 +54,19 @@ def step_messages(episode: Episode, size: tuple[int, int], t_max: int) -> Iterat
     """The `/step` messages."""
     (rows, columns), last = size, len(episode) - 1
     cells = rows * columns
+    # -1 for no cell: a schema with null is refused by viewers, topic and all.
     target = np.where(episode.target == cells, -1, episode.target)
     x = np.where(target < 0, -1, target % columns)
+    # Cells are numbered from the top left, a plot's y axis points upwards: in 3 rows of 4, cell 5 is at x = 1, y = 1,
+    # cell 0 at x = 0, y = 2.
     y = np.where(target < 0, -1, rows - 1 - target // columns)
     steps, ids = np.nonzero(episode.action)
+    # np.nonzero lists (step, cell) in order of steps: steps 0 0 1 3 with cells 2 5 4 0. searchsorted finds where steps
+    # 1, 2, 3 begin, 2 3 3, and split makes of the cells [2 5] [4] [] [0].
     active = [",".join(map(str, each.tolist())) for each in np.split(ids, np.searchsorted(steps, range(1, last + 1)))]
     known = (episode.misses, episode.last_cell, episode.action.sum(1), episode.forced(t_max))
     came = (target, x, y, episode.observation, episode.reward.astype(np.float64), episode.returns)
+    # tolist() once for each column: Python's numbers are formatted several times faster than NumPy's scalars.
     for t, (n, cell, count, forced, at, at_x, at_y, obs, reward, total) in enumerate(
         zip(*(column.tolist() for column in (*known, *came)), strict=True)
     ):
@@ -71,6 +81,7 @@ def step_messages(episode: Episode, size: tuple[int, int], t_max: int) -> Iterat
 def grid_messages(episode: Episode, size: tuple[int, int], first_tick: int) -> Iterator[bytes]:
     """The `/grid` messages; the grid is turned upside down, since a viewer's first row is the lowest."""
     rows, columns = size
+    # One cell more, for targets that exited (cell M): it is written to and dropped.
     cells = np.zeros((len(episode), rows * columns + 1), _CELL)
     cells["belief"][:, :-1] = episode.belief
     cells["policy"][:, :-1] = episode.probability
@@ -80,6 +91,7 @@ def grid_messages(episode: Episode, size: tuple[int, int], first_tick: int) -> I
     stride = _CELL.itemsize
     constant = {"frame_id": "grid", "pose": _POSE, "column_count": columns, "cell_size": {"x": 1, "y": 1}}
     constant |= {"row_stride": columns * stride, "cell_stride": stride, "fields": _FIELDS}
+    # What is the same in all messages is made once; without its braces, it is put between the time and the data.
     head = json.dumps(constant, separators=(",", ":")).encode()[1:]
     for t, grid in enumerate(turned):
         seconds, rest = divmod(time_of(first_tick + t), 1_000_000_000)
@@ -104,6 +116,7 @@ def decode(
         raise UserError(f"episode={number}: its steps do not fit together")
     check_steps(said, m)
     packed = b"".join(base64.b64decode(json.loads(grid)["data"], validate=True) for grid in grids)
+    # frombuffer and reshape refuse a length that does not fit: `count` grids of M cells of ten bytes.
     cells = np.frombuffer(packed, _CELL).reshape(count, *size)[:, ::-1].reshape(count, m)
     target = np.array([each["target"] for each in said], dtype=np.int64)
     action = np.zeros((count, m), dtype=bool)

@@ -72,6 +72,7 @@ def _content(reader: EpisodeReader, episode: Episode) -> dict[str, Any]:
 def _sparse(belief: Any) -> list[int]:
     """Cell, probability in ten-thousandths, cell, ...: the likeliest cells, in their order."""
     share = np.rint(belief * 10_000).astype(int)
+    # Stable: among equally likely cells always the same ones are kept, so that a page is the same bytes each time.
     cells = np.sort(np.argsort(-share, kind="stable")[:MOST_CELLS])
     cells = cells[share[cells] > 0]
     return np.stack([cells, share[cells]], axis=1).ravel().tolist()

@@ -101,4 +101,5 @@ def _keys() -> Iterator[int]:
 def _key(descriptor: int, timeout: float | None) -> str:
     """The next key, escape sequences whole; empty after `timeout` seconds without one."""
     ready, _, _ = select.select([descriptor], [], [], timeout)
+    # At most 8 bytes at once: an arrow key sends three (ESC [ C), and read one by one its first would count as ESC.
     return os.read(descriptor, 8).decode("utf-8", "replace") if ready else ""

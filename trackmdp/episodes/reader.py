@@ -60,6 +60,7 @@ class EpisodeReader:
             kind = f"profile {container.profile!r}" if container.profile else f"it has no metadata {schema.RUN}"
             raise UserError(f"file={file}: not a log of trackmdp ({kind})")
         self.run = checked_run(file, self._checked(self._told, schema.RUN))
+        # No checksum that is read here covers the header: it is held against the sealed metadata.
         if container.made_by != f"trackmdp {self.run['trackmdp']}":
             raise self._damage("the header")
         if schema.END not in container.metadata:
@@ -72,6 +73,7 @@ class EpisodeReader:
     def _index(self, index: bytes) -> None:
         """Policies and episodes, held against each other."""
         cells = math.prod(limits.size_of_grid(self.run))
+        # A count that is too large ends at the first name that is missing, before any list has that length.
         self.policies = [self._told(f"{schema.POLICY}.{k}") for k in range(int(self.end["policies"]))]
         for facts in self.policies:
             check_policy(facts, cells)
@@ -80,6 +82,8 @@ class EpisodeReader:
         steps = sum(row["length"] for row in self.rows)
         if (str(len(self.rows)), str(steps)) != (self.end["episodes"], self.end["steps"]):
             raise Damaged("the index of episodes")
+        # Increasing, for the bisection in `row`; not consecutive, since a recovered log lacks the episodes that were
+        # damaged.
         if any(b <= a for a, b in pairwise(self._numbers)) or any(
             row["policy"] >= len(self.policies) for row in self.rows
         ):
@@ -128,6 +132,7 @@ class EpisodeReader:
             UserError: there is no such episode.
         """
         place = bisect_left(self._numbers, number)
+        # A slice, which is empty where `place` is behind the last one.
         if self._numbers[place : place + 1] != [number]:
             ends = f"{self._numbers[0]} to {self._numbers[-1]}" if self._numbers else "none"
             raise UserError(f"episode={number}: {self.file} holds {len(self)} episodes ({ends})")
@@ -183,10 +188,12 @@ class EpisodeReader:
         cells, bits = math.prod(limits.size_of_grid(self.run)), _load(table)
         if bits.dtype != np.uint8 or bits.shape != (cells, self.t_max + 1, -(-cells // 8)):
             raise Damaged("the table of a policy")
+        # `[M, t_max+1, ceil(M/8)]` to `[M, t_max+1, M]`; `count` drops the bits that fill the last byte.
         return np.unpackbits(bits.astype(np.uint8), axis=-1, count=cells).astype(bool)
 
     def world(self) -> World:
         """The world in which the episodes were recorded."""
+        # Kept: the kernel of a large grid takes longer to build than an episode to read.
         if self._built is None:
             self._built = self._checked(self._world)
         return self._built

@@ -52,6 +52,7 @@ class _Found:
         if topic not in ("/step", "/grid"):
             return
         self.held += len(data)
+        # A file without a single `/episode` message would otherwise be held whole.
         if self.held > _MOST_HELD:
             self.release()
         (self.steps if topic == "/step" else self.grids)[time] = data
@@ -75,6 +76,7 @@ def recover(file: Path) -> Recovered:
         UserError: not a log of this format, or its first part is lost, or the new file already exists.
     """
     target = recovered_name(file)
+    # Not overwritten: it may be the result of an earlier recovery, and `file` may have been damaged further.
     if target.exists():
         raise UserError(f"file={file}: {target} already exists")
     damaged: list[str] = []
@@ -116,19 +118,23 @@ def _rewrite(file: Path, target: Path, damaged: list[str], most: float = math.in
                 if writer is None:
                     raise Damaged("what says how it was recorded")
                 row = check_row(json.loads(data), math.prod(size_of_grid(found.metadata[schema.RUN])))
+                # Episodes of policies recorded after the checkpoint: the resumed run records them again.
                 if row["policy"] >= most:
                     break
                 _policies_up_to(row["policy"], writer, found, policies)
                 episodes += _copy(row, found, writer)
+            # A full disk is no damage of the log that is read: it ends the whole copy.
             except OSError:
                 raise
             except Exception as error:  # whatever the content of one episode raises, the next may be whole
                 damaged.append(f"an episode after {episodes} whole ones: {reason(error)}")
             found.release()
         writer = writer or _begin(file, target, found)
+    # Steps that no `/episode` message closed: the episode that was being written.
     if found.steps or schema.END not in found.metadata:
         damaged.append("the end is missing")
     if writer is not None:
+        # Policies recorded after the last whole episode are copied as well: `taken_over` counts them.
         named = (re.fullmatch(rf"{re.escape(schema.POLICY)}\.([0-9]{{1,6}})", name) for name in found.metadata)
         last = max((int(name[1]) for name in named if name), default=-1)
         try:
@@ -144,11 +150,14 @@ def _whole(stream: Any, found: _Found, damaged: list[str]) -> Iterator[tuple[str
     walk = container.records(stream, len(container.MAGIC))
     while True:
         try:
+            # `next` inside the try: damage that `records` finds ends the walk by an exception, after which it yields
+            # no more and StopIteration follows; damage within a record is noted, and the walk goes on behind it.
             opcode, body = next(walk)
             if opcode == container.DATA_END:
                 return
             if opcode == container.METADATA:
                 name, content = container.metadata_of(body)
+                # The container has no checksum for metadata; the seal is our own.
                 plain = schema.unsealed_record(name, content)
                 if plain is None:
                     raise Damaged(f"metadata {name}")
@@ -171,6 +180,7 @@ def _begin(file: Path, target: Path, found: _Found) -> EpisodeWriter | None:
         return None
     run = checked_run(file, found.metadata[schema.RUN])
     tables = {name: found.attachments.get(name, b"") for name in _TABLES}
+    # Without the kernel and the prices that it names, the log could not be simulated again; a copy would look whole.
     if any(schema.digest(content) != run.get(f"{name}.sha256") for name, content in tables.items()):
         return None
     return EpisodeWriter.copy(target, run, tables)
@@ -178,6 +188,8 @@ def _begin(file: Path, target: Path, found: _Found) -> EpisodeWriter | None:
 
 def _policies_up_to(number: int, writer: EpisodeWriter, found: _Found, done: set[int]) -> None:
     """Copy the policies up to `number` that have not been copied."""
+    # All up to `number`, since a policy's number is its place: leaving out one that has no episode would shift the
+    # rest.
     for each in range(len(done), number + 1):
         facts = dict(found.metadata.get(f"{schema.POLICY}.{each}", {}))
         if not facts:
@@ -194,6 +206,7 @@ def _policies_up_to(number: int, writer: EpisodeWriter, found: _Found, done: set
 def _copy(row: dict[str, Any], found: _Found, writer: EpisodeWriter) -> int:
     """Write the episode that `row` describes, from the steps found since the one before."""
     begin, end = int(row["start_time"]), int(row["end_time"])
+    # By time: messages of an episode whose own end was lost may stand before it.
     steps = [data for time, data in found.steps.items() if begin <= time <= end]
     grids = [data for time, data in found.grids.items() if begin <= time <= end]
     size = size_of_grid(found.metadata[schema.RUN])

@@ -69,6 +69,9 @@ class _Draws:
 
     def __init__(self, source: Source, seeds: Sequence[int], per_choice: int) -> None:
         self._source, self._per_choice = source, per_choice
+        # A generator for each episode, not one for the batch: what an episode draws must not depend on how many others
+        # run beside it, nor on when they end. Moves and choices apart, so that two policies with one seed meet the
+        # same target.
         self._of_moves = [torch.Generator().manual_seed(seed) for seed in seeds]
         self._moves = torch.zeros(len(seeds), _BLOCK, dtype=torch.float64)
         if per_choice:
@@ -82,6 +85,8 @@ class _Draws:
     def at(self, step: int, rows: Tensor) -> tuple[Tensor, Tensor]:
         """Draws of the moves `[R]` and of the choices `[R, per_choice]` of the episodes `rows` `[R]` at a step."""
         place = step % _BLOCK
+        # At steps 0, 256, 512, ...: all running episodes are at the same step, and refill together; ended ones draw no
+        # more.
         if place == 0:
             for row in rows.tolist():
                 self._moves[row] = self._source.draw(_BLOCK, self._of_moves[row])
@@ -131,14 +136,19 @@ class _Batch:
         place = self._source.move(at.place, moves)
         target = self._source.cell(place)
         in_grid = target < self._task.num_cells
+        # A target that exited is at M, which is no column: it looks up the last cell, and `& in_grid` clears the
+        # answer.
         sensed = choice.sensed(target.clamp_max(self._task.num_cells - 1)) & in_grid
         forced = at.misses > self._task.t_max
         located = (sensed | forced) & in_grid
         reward = self._costs.reward_of(choice.spent, sensed, forced, in_grid)
+        # An exit on the last step allowed is an exit (terminated), not a truncation.
         truncated = self._truncated(place, step) & in_grid
         self._steps.add(
             at.row, choice, misses=at.misses, target=target, located=located, reward=reward, truncated=truncated
         )
+        # `[R']`, the positions of those still running: only they are carried over, so that a step's cost falls as
+        # episodes end.
         going_on = (in_grid & ~truncated).nonzero().squeeze(-1)
         last_cell = torch.where(located, target, at.last_cell)
         misses = torch.where(located, 0, at.misses + 1)

@@ -72,6 +72,8 @@ class _Replayed:
         line = problem.held_out.closed(problem.num_cells)
         self._line, self._first = torch.as_tensor(line.cells), torch.as_tensor(line.first[:-1])
         stops = np.zeros(len(line.cells), dtype=bool)
+        # Example: the tracks 3 4 (exit) and 7 8 (cut) are cells = 3 4 M 7 8, first = 0 3 5. The last places are 2 and
+        # 4; only at 4 the recording stops with the target in the grid.
         stops[line.first[1:] - 1] = ~line.exits
         self._stops = torch.as_tensor(stops)
 

@@ -55,6 +55,7 @@ class EpisodeWriter:
             **({} if world.window is None else {"window": str(world.window)}),
             "t_max": str(world.t_max),
             "max_steps": "" if world.max_steps is None else str(world.max_steps),
+            # repr: the shortest text that reads back as the same float64.
             "reward": repr(float(world.reward)),
             "safe_cost": repr(float(world.safe_cost)),
             "tick_ns": str(schema.TICK_NS),
@@ -76,13 +77,17 @@ class EpisodeWriter:
         self._lock, self._process = threading.Lock(), os.getpid()
         self._rows: list[dict[str, Any]] = []
         self._policies = self._unflushed = self._tick = 0
+        # Opened here and not by the Writer, which closes a file of its own in finish(), before it could be synced.
+        # CRCs over the data section are off by default; `Container.check_data` needs them.
         self._stream = self.part.open("wb")
         self._writer = Writer(self._stream, enable_data_crcs=True)
         self._writer.start(library=f"trackmdp {run['trackmdp']}")
+        # Once, and the numbers kept: registering a topic a second time would make a second channel of the same name.
         self._channels = {topic: self._register(topic) for topic in schema.SCHEMAS}
         self._tell(schema.RUN, run)
         for name, content in tables.items():
             self._attach(name, content)
+        # In the file at once: a log that is cut off later can be recovered only with what it starts with.
         self._flush()
 
     def _register(self, topic: str) -> int:
@@ -128,8 +133,11 @@ class EpisodeWriter:
         Raises:
             OSError: the disk is full, or the file cannot be written for another reason.
         """
+        # After a fork both processes would write through the same descriptor, one into the other's chunk.
         if os.getpid() != self._process:
             raise RuntimeError(f"{self.file}: opened by process {self._process}, written by {os.getpid()}")
+        # The mcap Writer is not thread-safe: messages from two threads mix within a chunk, and the file cannot be
+        # read.
         with self._lock:
             tick = self._tick if episode.first_tick is None else episode.first_tick
             row = messages.row_of(episode, self._t_max, tick)
@@ -143,12 +151,15 @@ class EpisodeWriter:
     def _add_messages(self, episode: Episode, tick: int, row: dict[str, Any]) -> None:
         if episode.belief is None or episode.probability is None:
             raise ValueError(f"episode {episode.number}: without its belief; log those of `Episodes.complete`")
+        # Before the first message of the episode: NaN is no JSON, and a time that does not fit into its field makes
+        # the Writer raise within a chunk, which finish() could then no longer write.
         if not (np.isfinite(episode.reward).all() and 0 <= tick < 2**50):
             raise ValueError(f"episode {episode.number}: a reward that is not finite, or a time out of range")
         add, step, grid = self._writer.add_message, self._channels["/step"], self._channels["/grid"]
         steps = messages.step_messages(episode, self._size, self._t_max)
         grids = messages.grid_messages(episode, self._size, tick)
         for place, (said, cells) in enumerate(zip(steps, grids, strict=True), start=tick):
+            # MCAP's sequence number has 32 bits, the log time 64.
             time, sequence = time_of(place), place & 0xFFFFFFFF
             add(step, time, said, time, sequence)
             add(grid, time, cells, time, sequence)
@@ -169,6 +180,9 @@ class EpisodeWriter:
             steps = sum(row["length"] for row in self._rows)
             counts = {"episodes": str(len(self._rows)), "steps": str(steps), "policies": str(self._policies)}
             self._tell(schema.END, {"complete": "true", **counts, "episodes.json.sha256": schema.digest(index)})
+            # finish() writes the summary: with it, under its `.part` name, the file is complete. Sync, then rename:
+            # whoever sees the final name sees all bytes. A kill before the rename leaves a `.part` that can be
+            # recovered.
             self._writer.finish()
             self._stream.flush()
             os.fsync(self._stream.fileno())
@@ -182,9 +196,12 @@ class EpisodeWriter:
         try:
             self._stream.close()
         except OSError:
+            # close() writes what is buffered, which fails again on a full disk, and would leave the descriptor open.
             self._stream.raw.close()
 
     def _flush(self) -> None:
+        # The first flush closes the chunk of the Writer, the second empties Python's buffer; neither reaches the disk:
+        # the bytes survive the end of this process, not a power failure.
         self._writer.flush()
         self._stream.flush()
         self._unflushed = 0
