@@ -29,7 +29,7 @@ _PULL = 0.1
 
 @dataclass(frozen=True)
 class SensorCredit:
-    """What replayed paths say of every sensor at every row (x, n) of the policy's table.
+    """Statistics of replayed paths for every sensor at every row (x, n) of the policy's table.
 
     Attributes:
         entry: int64 `[T+1, B]`, for each path and clock the place in `[M, T+1, K]` of the sensor the target moved to.

@@ -1,4 +1,4 @@
-"""What the training loop asks of an algorithm, and the few pieces the algorithms share."""
+"""The protocol that the training loop expects of an algorithm, and helpers that several algorithms use."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Algorithm(Protocol):
         ...
 
     def state_dict(self) -> dict[str, Any]:
-        """All that a later process needs to go on as if nothing had happened."""
+        """Everything needed to resume exactly."""
         ...
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -57,7 +57,7 @@ class Averages:
         """The mean of each diagnostic.
 
         Raises:
-            FloatingPointError: one is not finite; the learner is lost, and what it has written since is no good.
+            FloatingPointError: a mean is not finite, training has diverged.
         """
         # One `item` per diagnostic and iteration: each waits for the device.
         means = {name: torch.stack(values).mean().item() for name, values in self._values.items()}

@@ -126,7 +126,7 @@ class Hindsight:
         self._generator.set_state(state["generator"].cpu())
 
     def _renew_policy(self, learner: _Learner) -> None:
-        """What is evaluated, and what the next batch is collected with."""
+        """Rebuild the evaluated policy, and with `collect=mixed` the collecting one, from the averaged actor."""
         self.actor = Policy(self.task, learner.sets(self.task))
         if isinstance(self.policy, Exploring):
             self.policy.renew(self.actor)

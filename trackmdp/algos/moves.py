@@ -1,4 +1,4 @@
-"""What the tracker has seen of the target's motion: a replay buffer of sensed moves, and paths drawn from it."""
+"""Replay buffer of sensed moves, and paths drawn from it, for targets whose motion is Markov in the cell."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ _KEPT = [*STATE_KEYS, "action", "action_log_prob", "advantage", "value_target"]
 
 
 class OnPolicy:
-    """Actor, critic, their optimizer, and the way from a collected batch to rows with an advantage."""
+    """Actor, critic and their optimizer; turns a collected batch into rows with a GAE advantage."""
 
     loss: LossModule
 

@@ -26,8 +26,8 @@ class CellIndex(NamedTuple):
     def of(cls, start: Tensor, num_cells: int) -> CellIndex:
         """Index entries `[K]` by the cells they start in, in whatever order they come."""
         seen = torch.bincount(start, minlength=num_cells + 1)
-        # Starts 0 0 2: seen 2 0 1, first 0 3 2. A cell without entries leads to place 3, where the buffers keep an
-        # exit.
+        # Starts 0 0 2 on 3 cells: seen 2 0 1 0, first 0 3 2 3, the last one for M. A cell without entries leads to
+        # place 3, where the buffers keep an exit.
         first = torch.where(seen > 0, seen.cumsum(0) - seen, len(start))
         # Half a float's spacing below the count, so that a draw close to 1 does not round up to the next cell's.
         return cls(first, seen.clamp(min=1).float() * (1.0 - 2.0**-24))

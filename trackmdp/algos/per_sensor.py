@@ -25,6 +25,7 @@ class PerSensorPPO(Hindsight):
 
     def _actor_loss(self) -> ActorLoss:
         cfg = self.cfg
+        # Without a generator the surrogate takes its expectation over the old policy's sets.
         rng = self._generator if cfg.surrogate == "sampled" else None
         return Surrogate(cfg.entropy, clip_epsilon=cfg.clip_epsilon, minibatches=cfg.minibatches, generator=rng)
 

@@ -1,4 +1,4 @@
-"""Paths as they were sensed, whole, for targets whose next move depends on more than the cell they are in."""
+"""Replay buffer of whole path segments, for targets whose motion is not Markov in the cell."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def _frames(batch: TensorDictBase, num_cells: int) -> dict[str, Tensor]:
 
 
 def _goes_on(before: dict[str, Tensor], frames: dict[str, Tensor]) -> bool:
-    """Whether each row that had not ended begins where it stood: not so where workers deliver in any order."""
+    """Whether every row continues that of the batch before; not so where workers deliver in any order."""
     if not before["end"].shape[1] or len(before["end"]) != len(frames["start"]):
         return False
     # Only rows where both frames were sensed and the episode went on can be compared; the others prove nothing.

@@ -1,4 +1,4 @@
-"""Policies for collecting: a table that is renewed as learning goes on, and one that at times senses everything."""
+"""Policies for collecting frames: a table replaced during learning, and one that at random senses everything."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class Exploring(RenewedTable):
         self.register_buffer("explore", torch.ones((), device=device))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write `action` `[*B, M]`."""
+        """Write `action` `[*B, K]`."""
         n = tensordict["steps_since_detection"]
         # Only at n = 0: after a miss the cell before the move is not known, and the step would show no move.
         everything = (torch.rand(n.shape, device=n.device) < self.explore) & (n == 0)

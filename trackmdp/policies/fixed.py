@@ -56,5 +56,6 @@ class ChainPolicy(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action` `[B, M]`; where the safe action is forced the last set stands in, unused."""
+        # chains has no slot for n = t_max + 1.
         n = tensordict["steps_since_detection"].clamp_max(self.chains.shape[1] - 1)
         return tensordict.set("action", self.chains[tensordict["last_cell"], n])

@@ -10,7 +10,7 @@ __all__ = ["DenseTable", "SparseTable"]
 
 
 class DenseTable:
-    """All rows written out: one indexing per batch, memory for every entry.
+    """All rows as a dense tensor: one indexing operation per batch, memory for every entry.
 
     Args:
         table: `[R, M]` bool or float64.
@@ -33,7 +33,7 @@ class DenseTable:
 
 
 class SparseTable:
-    """Rows put together from the entries stored, in memory that follows their number.
+    """Rows assembled from the stored entries; memory follows their number.
 
     Args:
         table: `[R, M]` bool or float64.

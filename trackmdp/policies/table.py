@@ -93,7 +93,7 @@ class PolicyTable:
 
     @cached_property
     def _entries(self) -> npt.NDArray[np.int64]:
-        """`[nnz + 1]` numbers of the entries stored, in order; after them one that is larger than any."""
+        """`[nnz + 1]` sorted numbers r * M + j of the stored entries, closed by the largest int64 as a sentinel."""
         assert self.sets is not None
         row = np.repeat(np.arange(self.sets.shape[0], dtype=np.int64), np.diff(self.sets.indptr))
         return np.append(row * self.task.num_cells + self.sets.indices, np.iinfo(np.int64).max)
@@ -159,7 +159,7 @@ def _checked(task: Task, sets: sparse.csr_array) -> sparse.csr_array:
 
 
 def _distance(task: Task, start: npt.NDArray[Any], cell: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """How far cells are from others, in rows or in columns, whichever is more."""
+    """Chebyshev distance of cells on the grid: rows or columns apart, whichever is more."""
     row, column = np.divmod(start, task.columns)
     other_row, other_column = np.divmod(cell, task.columns)
     return np.maximum(np.abs(row - other_row), np.abs(column - other_column))

@@ -1,1 +1,1 @@
-"""What needs the motion model: exact values, bounds, one `solve(world)` per policy, the paper's theorems as facts."""
+"""Everything that reads the motion model: planners (one `solve(world)` each), bounds, exact evaluation, estimators."""

@@ -160,7 +160,7 @@ class Tree:
 
     @property
     def closed(self) -> bool:
-        """Whether nothing is left to look at."""
+        """Whether no choice is open."""
         return not self._heap
 
     def upper(self) -> Array:
@@ -173,7 +173,7 @@ class Tree:
         return bound
 
     def run(self, go_on: Callable[[Tree], bool]) -> None:
-        """Look at open choices, best first, while there are some and `go_on(self)`."""
+        """Expand open choices, best first, while there are any and `go_on(self)` holds."""
         while self._heap and go_on(self):
             self._decide(heapq.heappop(self._heap)[2])
 
@@ -185,7 +185,7 @@ class Tree:
         return better, [LeftOut.of({x: plan[t] for x, plan in self._leaves.items()}, self._world) for t in steps]
 
     def _decide(self, choices: _Choices) -> None:
-        """Split every choice on its next cell; a choice without one goes on to the next step."""
+        """Branch on the next undecided cell of every choice; complete choices go on to the next step."""
         # what was worth looking at when it was pushed may not be so any more: the best plans have become better since
         choices = choices.pick(self._hopeful(choices.start, choices.bound))
         frontier, k = choices.frontier, choices.decided
@@ -210,21 +210,21 @@ class Tree:
             self._push(_Choices(frontier, k + 1, split.state, cells, relaxed, lost, bound))
 
     def _joint_loss(self, choices: _Choices, left: BoolArray) -> Array:
-        """`[P]` least that the cells `left` lose, being left together, against each being revealed."""
+        """`[P]` lower bound on what leaving the cells `left` unsensed loses against revealing the position at once."""
         return self._loss(self._left_mass(choices, left), choices.frontier.sets_left - 1)
 
     def _loss(self, mass: sparse.csr_array, sets_left: int) -> Array:
-        """`[P]` how much less one more set chosen jointly is worth than the position revealed at once."""
+        """`[P]` worth of `mass` with the position revealed at once, less its bound with one more set before that."""
         # Revealed at once, the mass is worth sum_j z_j R(e_j); one set for all, revealed only then, is worth less:
         # with z = (.2 at a, .2 at b) and the target going on to c from either, one sensor at c serves both; if it goes
         # on to different cells, two sensors are paid for .4 of mass in place of one each for .2.
         return np.maximum(mass @ self._revealed[sets_left] - self._one_more_set(mass, sets_left)[0], 0.0)
 
     def _least_loss(self, frontier: _Frontier) -> Array:
-        """`[B, K + 1]` least that the cells from the k-th on cost against the relaxed worth, however they are decided.
+        """`[B, K + 1]` lower bound on what the cells from the k-th on take away from `relaxed`, however decided.
 
-        Sensing cell a costs its regret. Leaving several loses, F being sublinear, at least the mean over the ways to
-        pair them: half of what a loses with the partner it goes best with. Leaving one or none, all others are sensed.
+        A cell sensed costs its regret. Two or more cells left unsensed lose, F being sublinear, at least the sum over
+        them of half the smallest loss of a pair with that cell. With one or none left, all others cost their regret.
         """
         count, width = len(frontier.start), frontier.cells.shape[1]
         if not 2 <= width <= MOST_PAIRED:
@@ -315,9 +315,9 @@ class Tree:
         self._push(_Choices(frontier, 0, np.arange(len(kept)), left, frontier.relaxed, none, bound))
 
     def _within(self, start: IndexArray, cells: IndexArray, sense: Array) -> Array:
-        """`sense`, far down where a sensor cannot be chosen: finite, so that sums and differences stay numbers.
+        """`sense` `[E]`, replaced by a large negative number where the sensor lies outside the window.
 
-        The bounds on later steps, which do not use this, only get larger by counting such a sensor in.
+        Bounds on later steps do without this: counting such a sensor in only makes them larger, and still bounds.
         """
         allowed = within_window(self._world, start, cells) if self._windowed else None
         return sense if allowed is None else np.where(allowed, sense, -FORBIDDEN)

@@ -66,7 +66,7 @@ def _whole_episodes(world: World, policy: PolicyTable) -> Evaluation:
 
 
 def _table(problem: Problem, policy: PolicyLike | Array | BoolArray) -> PolicyTable:
-    """The table of whatever acts; modules and functions need torch, which is loaded for them alone."""
+    """The table of a policy in any accepted form; torch is loaded only for modules and functions."""
     if isinstance(policy, PolicyTable):
         policy.check_fits(problem)
         return policy

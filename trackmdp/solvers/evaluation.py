@@ -48,6 +48,7 @@ def pooled(totals: Array, length: Array, error: float = 0.0) -> Evaluation:
     `length` `[M]` is the expected number of steps of an episode, the exit step included.
     """
     value, steps, detections, sensors, safe = totals.T
+    # Ratios of means, not means of ratios: pooled over a uniform start, a long episode counts for all of its steps.
     in_grid = float(steps.mean())
     return Evaluation(
         aihtr=float(value.mean()),

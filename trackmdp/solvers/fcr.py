@@ -28,6 +28,8 @@ def solve(world: World, *, in_grid: bool = False) -> PolicyTable:
     for n in range(world.num_choices):
         seen = predict(world, moved, n)
         charged = seen.inside[seen.rows] if in_grid else 1.0
+        # seen.mass is e_x P^(n+1) itself: since nothing is taken away at a miss, no probability of misses has to be
+        # divided by.
         on = seen.mass * world.reward >= world.cost[seen.cells] * charged * (1.0 - TIE)
         allowed = within_window(world, seen.rows, seen.cells)
         on = on if allowed is None else on & allowed

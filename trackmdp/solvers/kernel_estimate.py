@@ -80,7 +80,7 @@ class KernelEstimate:
         self._censored: list[ObservedPaths] = []
 
     def add(self, paths: ObservedPaths) -> None:
-        """Take note of `paths`."""
+        """Add observed `paths`."""
         # Without a miss both ends of the move are known; no expectation is needed, and the path itself need not be
         # kept.
         at_once = paths.misses == 0
@@ -89,7 +89,7 @@ class KernelEstimate:
             self._censored.append(paths.pick(np.flatnonzero(~at_once)))
 
     def add_moves(self, start: IndexArray, end: IndexArray) -> None:
-        """Take note of moves `[K]` that were seen; `end` is M at the exit."""
+        """Add moves `[K]` both of whose ends were seen; `end` is M at the exit."""
         # Before the first fit the two are one matrix, and stay so; after it, counts wait for the next `fit`.
         unfitted = self.counts is self.direct
         self.direct = self.direct + _counted(start, end, np.ones(len(start)), self.direct.shape)
@@ -117,7 +117,7 @@ class KernelEstimate:
         self._censored = [ObservedPaths(start, misses, matrix("sensed", m), end)] if len(start) else []
 
     def fit(self, rounds: int) -> None:
-        """Share the censored paths among the moves, `rounds` times, each time by the kernel found before.
+        """Run `rounds` rounds of expectation-maximisation on the censored paths, from the kernel estimated so far.
 
         The first round allows every move a little farther than any that must have been made: expectation-maximisation
         never leaves a probability of zero.
@@ -182,7 +182,7 @@ class KernelEstimate:
         return sparse.csr_array(sparse.hstack([near, sparse.csr_array((self.num_cells, 1))], format="csr"))
 
     def _typical_moves(self, moved: sparse.csr_array) -> sparse.csr_array:
-        """`[M, M]` pooled displacements, put down at every cell, scaled to 1; see the class for where none fits."""
+        """`[M, M]` pooled displacements applied at every cell, rows scaled to 1; the class says what if none fits."""
         start, end, data = row_index(moved), moved.indices, moved.data
         seen = data > 1e-9
         # Shares within each row, not counts: a cell the target visits often says no more about the typical move than
@@ -302,7 +302,7 @@ def _expected_moves(kernel: sparse.csr_array, paths: ObservedPaths, copies: Arra
 
 
 def _hidden(mass: sparse.csr_array, sensed: sparse.csr_array) -> sparse.csr_array:
-    """`mass` where nothing is sensed."""
+    """`mass` with the sensed cells set to zero."""
     left = sparse.csr_array(mass - mass.multiply(sensed))
     left.eliminate_zeros()
     return left

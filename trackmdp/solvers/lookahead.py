@@ -1,4 +1,4 @@
-"""Look some sets ahead: plan them jointly, count on a simpler value after them, carry out the first, plan anew."""
+"""Receding horizon: choose `depth` sets jointly with a simpler value after them, apply the first, plan again."""
 
 from __future__ import annotations
 

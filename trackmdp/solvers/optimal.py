@@ -172,10 +172,10 @@ class _Run:
         return self.use(policy_table(self.world, layers, search.improve(self.world, layers, sets)))
 
     def explore(self, tree: Tree, patience: int) -> None:
-        """Until the tree is closed or time is over.
+        """Run the tree until it is closed or the time limit is reached.
 
-        After `patience` nodes, improvements that close a good part of the bracket end it too: what is proved for a
-        better policy is worth more, but all that is proved for this one has to be proved anew.
+        Every `patience` nodes it also ends if the improvements found close a good part of the bracket: the next round
+        starts from a better policy, but most of what this tree has ruled out has to be ruled out again.
         """
         reported, next_look = time.monotonic(), patience
 

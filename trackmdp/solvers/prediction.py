@@ -36,7 +36,7 @@ class Prediction:
     inside: Array
 
     def part(self, share: Array | BoolArray) -> sparse.csr_array:
-        """`[M, M]` the mass, of each entry the `share` `[E]` given; entries without mass are dropped."""
+        """`[M, M]` sparse, `share` `[E]` times the mass of each entry; entries without mass are dropped."""
         mass, count = self.mass * share, len(self.before)
         # entries are in order of their rows, so that counting those kept gives the row pointer
         kept = mass > 0
@@ -54,7 +54,7 @@ def predict(world: World, undetected: sparse.csr_array, n: int) -> Prediction:
 
 
 def unroll(world: World, rule: Callable[[Prediction], BoolArray]) -> PolicyTable:
-    """The policy of a `rule`, which says of a prediction what to sense (`[E]`), within the task's window.
+    """The policy of a `rule` from a prediction to the entries sensed, bool `[E]`, within the task's window.
 
     Cells of probability zero are never sensed, and after a miss that cannot happen nothing is.
     """

@@ -36,6 +36,7 @@ class ReplayedTracks:
         together = pooled(self.totals, self.length)
         count = np.bincount(starts, minlength=num_cells)
         with np.errstate(invalid="ignore"):
+            # 0 / 0 is nan on purpose: no track starts there, and 0 would read as a worth.
             by_cell = [np.bincount(starts, weights, num_cells) / count for weights in self.totals.T]
         value, steps, detections, sensors, safe = by_cell
         return Evaluation(

@@ -14,7 +14,7 @@ __all__ = ["Costs"]
 
 
 class Costs:
-    """r, c and D as tensors of one device.
+    """The reward of a step from r, c and D, on one device.
 
     Args:
         task: the prices, and which sensors can be chosen.

@@ -115,6 +115,7 @@ def build_world(cfg: WorldConfig) -> World:
         UserError: a file is missing or malformed, or the kernel breaks a rule (`checks.check_kernel`).
     """
     size, source = cfg.grid.sides, cfg.kernel.source
+    # `World` checks again; here the message names the option at fault (`source`).
     kernel = canonical_kernel(make(cfg.kernel, cfg.grid.size), source)
     check_kernel(kernel, size, truncates=cfg.grid.max_steps is not None, source=source)
     return World(kernel, size, **_of_task(cfg))
@@ -138,6 +139,8 @@ def recorded(
         UserError: the file is missing or malformed, a track is too short, or one of the two parts would be empty.
     """
     tracks = read_tracks(path, size, exits=ends == "exit")
+    # A located cell, t_max + 1 free choices and the forced step: t_max + 3 cells, the segment that hindsight learns
+    # from.
     shortest = max(min_length or of_task["t_max"] + 3, 1 if ends == "exit" else 2)  # a cut track of one has no step
     check_tracks(tracks, shortest, f"kernel.path={path}")
     mine, apart = split(tracks, held_out, seed)

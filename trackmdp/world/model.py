@@ -22,7 +22,7 @@ Array: TypeAlias = npt.NDArray[np.float64]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 
 Size: TypeAlias = int | Sequence[int]
-"""A grid as it is asked for: one number for a square, or rows and columns."""
+"""Size of a grid as a user gives it: one number for a square, or rows and columns."""
 
 
 @dataclass(frozen=True, eq=False, init=False)

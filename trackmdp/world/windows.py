@@ -179,7 +179,7 @@ class Window(nn.Module):
         return self.to_global(start[:, None].expand(m, choices), on)
 
     def groups(self) -> Tensor:
-        """`[M]` int64, the same number for cells from which the border looks alike within the radius."""
+        """`[M]` int64 group of each cell: equal where the distances to the four borders agree up to the radius."""
         row, column = self._row[:-1], self._column[:-1]
         # Distances to the four borders, up to the radius: all cells farther inside are of one group.
         margins = torch.stack([row, self.rows - 1 - row, column, self.columns - 1 - column], dim=1)
