@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["FLOOR", "Panel", "against_cost", "axis_break", "panels", "regret_against_cost", "slug"]
 
+# A policy may attain the bound itself, and zero has no logarithm: such a regret is drawn here.
 FLOOR = 1e-5
 """Smallest regret drawn on a logarithmic axis."""
 BOUNDS = {
@@ -47,8 +48,10 @@ def panels(study: Study) -> list[Panel]:
     for world in study.worlds:
         price = study.in_world(world)[0].settings.get("cost.sensor")
         if isinstance(price, (int, float)):
+            # The label without its price is what the worlds of one panel share, and is their title.
             rest = ", ".join(part for part in world.split(", ") if not part.startswith("c="))
             groups.setdefault(rest, []).append((float(price), world))
+    # One price is a point, not a curve; the tables show it.
     found = [(title, sorted(entries)) for title, entries in groups.items() if len(entries) > 1]
     return [
         Panel(slug(title), title, [cost for cost, _ in entries], [world for _, world in entries])
@@ -61,10 +64,14 @@ def against_cost(study: Study, panel: Panel) -> Figure:
     learned = _estimates(study, panel, regret=False)
     exact = {"Q_MDP": _exact(study, panel, "qmdp_aihtr")}
     exact |= {label: _exact(study, panel, key) for label, key in BOUNDS.items()}
+    # A bound that no run has, as where no optimum was solved for, gets no empty entry in the legend.
     exact = {label: values for label, values in exact.items() if not all(map(math.isnan, values))}
+    # Q_MDP falls far below 0 where only the safe action senses (Z = 5, c = 0.22); on one axis the learned policies
+    # would become one line.
     split = axis_break([e.mean for row in learned.values() for e in row] + [v for row in exact.values() for v in row])
 
     def paint(figure: Canvas) -> None:
+        # The upper part, where the methods differ, gets four fifths of the height.
         split_axes = figure.subplots(2, 1, sharex=True, height_ratios=[4, 1]) if split else [figure.subplots()]
         for axes in split_axes:
             _learned_lines(axes, panel, learned)
@@ -76,6 +83,7 @@ def against_cost(study: Study, panel: Panel) -> Figure:
             _break(split_axes[0], split_axes[1], *split)
         split_axes[0].set_ylabel("AIHTR")
         split_axes[-1].set_xlabel("c, price of a sensor for one step")
+        # Ticks at the prices that were run: between them nothing was measured.
         split_axes[-1].set_xticks(panel.costs)
         legend(figure, split_axes[0], first=list(learned))
 
@@ -94,6 +102,7 @@ def regret_against_cost(study: Study, panel: Panel, threshold: float | None) -> 
 
     def paint(figure: Canvas) -> None:
         axes = figure.subplots()
+        # Interval ends are cut at the floor as well: one at or below zero would vanish from a logarithmic axis.
         _learned_lines(axes, panel, learned, floor=FLOOR)
         style = LOOKS["Q_MDP"]
         axes.plot(
@@ -102,6 +111,7 @@ def regret_against_cost(study: Study, panel: Panel, threshold: float | None) -> 
         if threshold is not None:
             axes.axhline(threshold, color=INK, linewidth=0.6, linestyle=(0, (1, 2)))
             at, where = (1.01, threshold), ("axes fraction", "data")
+            # x in parts of the axes, y in data: right of the frame, at the height of the line.
             axes.annotate(f"{threshold:g}", at, xycoords=where, va="center", fontsize=7, clip_on=False)
         axes.set_yscale("log")
         axes.set_ylabel("regret per step")
@@ -144,13 +154,16 @@ def _learned_lines(
     axes: Axes, panel: Panel, learned: Mapping[str, Sequence[MeanInterval]], floor: float = -math.inf
 ) -> None:
     """Lines with error bars, a little apart so that the bars can be told from each other."""
+    # 4 % of the smallest distance of two prices: error bars stand side by side, and still over their price.
     step = min(np.diff(panel.costs), default=0.02) * 0.04
     for place, (method, row) in enumerate(learned.items()):
         style = look_of(method, place)
         x = np.asarray(panel.costs) + step * (place - (len(learned) - 1) / 2)
         mean = np.maximum([e.mean for e in row], floor)
+        # No interval (fewer than three seeds): a bar of length zero, which is only the point.
         low = np.maximum([e.mean if e.low is None else e.low for e in row], floor)
         high = np.maximum([e.mean if e.high is None else e.high for e in row], floor)
+        # `[2, prices]`, lengths below and above the mean; matplotlib refuses negative ones, which rounding would make.
         bars = np.stack([np.maximum(mean - low, 0), np.maximum(high - mean, 0)])
         axes.errorbar(
             x,
@@ -170,17 +183,20 @@ def axis_break(values: Sequence[float]) -> tuple[float, float, float, float] | N
 
     It breaks where the widest gap between neighbouring values takes more than half of the axis.
     """
+    # nan, where a method was not run at a price, is no value to make room for.
     ordered = np.sort([value for value in values if math.isfinite(value)])
     if len(ordered) < 3:
         return None
     gaps = np.diff(ordered)
     widest = int(gaps.argmax())
+    # Breaking an axis hides proportions; it is done only where one gap would take more room than all the values.
     if gaps[widest] <= 0.5 * (ordered[-1] - ordered[0]):
         return None
     return float(ordered[0]), float(ordered[widest]), float(ordered[widest + 1]), float(ordered[-1])
 
 
 def _break(upper: Axes, lower: Axes, bottom: float, lower_end: float, upper_start: float, top: float) -> None:
+    # `or 1.0`: all values of the upper part may be one and the same.
     margin = 0.08 * (top - upper_start or 1.0)
     upper.set_ylim(upper_start - margin, top + margin)
     small = max(0.25 * (lower_end - bottom), margin)
@@ -188,6 +204,8 @@ def _break(upper: Axes, lower: Axes, bottom: float, lower_end: float, upper_star
     lower.locator_params(axis="y", nbins=2, integer=True)
     upper.spines["bottom"].set_visible(False)
     upper.tick_params(bottom=False)
+    # Short slanted strokes at both ends of the gap, the usual sign of a broken axis; `transAxes` puts them at the
+    # corners.
     marks = {"marker": [(-1, -0.6), (1, 0.6)], "markersize": 7, "linestyle": "none", "color": INK, "clip_on": False}
     upper.plot([0], [0], transform=upper.transAxes, **marks)  # type: ignore[arg-type]
     lower.plot([0], [1], transform=lower.transAxes, **marks)  # type: ignore[arg-type]
@@ -203,6 +221,7 @@ def _cost_table(
 ) -> Table:
     rows: list[list[Cell]] = []
     for place, cost in enumerate(panel.costs):
+        # Where a method has no run at a price it gets no row; n = 0 would be read as a result.
         rows += [
             [cost, method, *estimate_cells(row[place]), row[place].n] for method, row in learned.items() if row[place].n
         ]

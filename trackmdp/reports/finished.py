@@ -39,6 +39,7 @@ def read_run(folder: Path, name: str) -> tuple[FinishedRun, Mapping[str, Any]] |
         return Anomaly(name, f"failed: {printable(str(reason))}")
     if not place.is_dir() or not (place / "config.yaml").is_file():
         return Anomaly(name, "not started")
+    # The summary is written last: without it a run is under way or was killed, and its figures are not final.
     if not (place / SUMMARY).is_file():
         running = run_of(place).state == "running"
         return Anomaly(name, "still running" if running else f"cut: it has no {SUMMARY}")
@@ -46,6 +47,8 @@ def read_run(folder: Path, name: str) -> tuple[FinishedRun, Mapping[str, Any]] |
         summary = read_summary(place)
         check_files(place, summary, "config.yaml")
         settings = flatten(plain_config(place))
+        # A config of another version may lack what runs are grouped by: that is told of this run, and the others are
+        # used.
         with decoded(str(place / "config.yaml"), "the config of a run"):
             _check_settings(settings)
         with decoded(str(place / SUMMARY), "the summary of a run"):
@@ -81,6 +84,7 @@ def _check_settings(settings: Mapping[str, Any]) -> None:
     for key in ("algo.name", "kernel.name"):
         if not isinstance(settings[key], str):
             raise TypeError(f"{key}: expected a name")
+    # `type(...) is`: True is an int to `isinstance`, and no seed.
     if type(settings["seed"]) is not int or type(settings["grid.size"]) not in (int, list):
         raise TypeError("seed, grid.size: expected whole numbers")
 
@@ -104,6 +108,7 @@ def _figures(summary: Mapping[str, Any]) -> dict[str, float | None]:
 
 
 def _number(key: str, value: Any) -> float:
+    # JSON as Python reads it knows NaN and Infinity; neither is less than _LARGE.
     if type(value) not in (int, float) or not abs(value) < _LARGE:
         raise TypeError(f"{key}: {str(value)[:40]}, expected a number")
     return float(value)
@@ -119,6 +124,7 @@ def read_curve(file: Path) -> list[CurvePoint]:
         return []
     if len(points) <= MOST_POINTS:
         return points
+    # More points early, where a curve moves; the last one always, since it is what the run came to.
     wanted = np.geomspace(1, len(points), MOST_POINTS).round().astype(int) - 1
     return [points[place] for place in sorted({*wanted.tolist(), len(points) - 1})]
 
@@ -127,6 +133,7 @@ def _points(text: str) -> list[CurvePoint]:
     """The points, in the order of iterations as they were written."""
     points: list[CurvePoint] = []
     for row in csv.DictReader(io.StringIO(text, newline="")):
+        # Most iterations are not evaluated, and have an empty field.
         if not row.get("aihtr"):
             continue
         last = points[-1] if points else CurvePoint(0, 0, 0.0, 0.0)

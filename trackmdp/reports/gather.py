@@ -50,6 +50,7 @@ def gather_runs(folder: Path) -> Results:
     anomalies: list[Anomaly] = []
     runs, summaries = [], []
     for name in names:
+        # One damaged run does not cost the report of the others: it is listed under what is missing.
         read = read_run(folder, name)
         if isinstance(read, Anomaly):
             anomalies.append(read)
@@ -57,11 +58,13 @@ def gather_runs(folder: Path) -> Results:
             runs.append(read[0])
             summaries.append(read[1])
     anomalies += [*_repeated(runs), *_mixed(runs, summaries)]
+    # A folder that was copied would count one seed twice, and narrow the interval.
     repeated = {anomaly.run for anomaly in _repeated(runs)}
     runs = [run for run in runs if run.name not in repeated]
     curves = {run.name: read_curve(folder / run.name / "metrics.csv") for run in runs}
     grouped = study(runs)
     anomalies += [Anomaly(name, "no learning curve") for name, curve in curves.items() if not curve]
+    # Nothing says otherwise what was planned: the seeds of one world are what the others are expected to have.
     anomalies += _missing_seeds(grouped) if plan is None else []  # a plan says what else there should be
     policies, unread = _policies(folder, grouped)
     motions, unbuilt = _motions(folder, runs)
@@ -83,17 +86,22 @@ def run_folders(folder: Path, plan: Mapping[str, Any] | None) -> list[str]:
     A plan that names a folder outside of the sweep's, directly or through a link, is not followed there.
     """
     jobs = plan["jobs"] if plan else []
+    # The plan may have been written by somebody else, so that every entry is looked at before it is used.
     listed = [job["folder"] for job in jobs if isinstance(job, dict) and isinstance(job.get("folder"), str)]
     named = {_relative(folder, name) for name in listed if 0 < len(name) < _LONGEST and "\0" not in name}
+    # Any of these makes a folder that of a run: it has begun, failed, or ended.
     marks = ("config.yaml", FAILED_FILE, SUMMARY)
     found = {file.parent.relative_to(folder).as_posix() for mark in marks for file in folder.rglob(mark)}
+    # Resolved, since `..` or a link within a name may lead anywhere.
     root = folder.resolve()
     inside = {name for name in named | found if (folder / name).resolve().is_relative_to(root)}
+    # `.` is the sweep's own folder, which is no run of it.
     return sorted(inside - {"."}, key=_natural)
 
 
 def _relative(folder: Path, name: str) -> str:
     path = Path(name)
+    # A plan may name folders absolutely, and the sweep's own may be given through a link.
     for base in (folder.resolve(), folder):
         if path.is_absolute() and path.is_relative_to(base):
             return path.relative_to(base).as_posix()
@@ -101,7 +109,8 @@ def _relative(folder: Path, name: str) -> str:
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    """Numbers in their order; int() would also take digits such as a raised two for some, and fail for others."""
+    """Sort key of a path: parts that are numbers by value, all others by text."""
+    # Not `isdigit`: a raised two is a digit to it, which int() refuses. 18 digits: int() of thousands is refused as well.
     return [(int(part), "") if re.fullmatch(r"[0-9]{1,18}", part) else (-1, part) for part in name.split("/")]
 
 
@@ -111,12 +120,14 @@ def _repeated(runs: Iterable[FinishedRun]) -> list[Anomaly]:
     return [
         Anomaly(run.name, f"the same config as {first[run.config_sha256]}, which counts")
         for run in runs
+        # `setdefault` gives the name that came first, which for the first itself is its own.
         if first.setdefault(run.config_sha256, run.name) != run.name
     ]
 
 
 def _mixed(runs: Sequence[FinishedRun], summaries: Sequence[Mapping[str, Any]]) -> list[Anomaly]:
     """Runs made with other versions than most."""
+    # Exact results are compared to many digits, and other versions of NumPy or torch round and draw otherwise.
     texts = [json.dumps(summary.get("versions", {}), sort_keys=True) for summary in summaries]
     if len(set(texts)) < 2:
         return []
@@ -154,10 +165,13 @@ def _policies(folder: Path, grouped: Study) -> tuple[dict[str, policy.StoredPoli
     for runs in grouped.groups.values():
         if not _is_drawn(runs[0]):
             continue
+        # The middle one by AIHTR: the best would flatter the method, and a mean of policies is not a policy.
         ranked = sorted(runs, key=lambda run: (run.figure("aihtr"), run.seed))
         middle = (len(ranked) - 1) / 2
+        # Outwards from the middle, in case its file is damaged or was tidied away.
         for _, run in sorted(enumerate(ranked), key=lambda item: abs(item[0] - middle)):
             try:
+                # Against the summary's digest: a policy copied from another run would be drawn under this one's name.
                 check_files(folder / run.name, read_summary(folder / run.name), policy.POLICY_FILE)
                 found[run.name] = policy.read(folder / run.name / policy.POLICY_FILE)
                 break
@@ -176,6 +190,7 @@ def _motions(folder: Path, runs: Iterable[FinishedRun]) -> tuple[dict[str, Motio
     found: dict[str, MotionTable] = {}
     seen, anomalies = set[str](), list[Anomaly]()
     for run in runs:
+        # Bounds and Q_MDP are the world's: computed once, not for each of its runs.
         if world_key(run) in seen:
             continue
         seen.add(world_key(run))
@@ -194,6 +209,7 @@ def _motions(folder: Path, runs: Iterable[FinishedRun]) -> tuple[dict[str, Motio
 def _world_config(place: Path) -> WorldConfig:
     """A run's world with the motion that it stored as its table, whatever made the motion."""
     plain = plain_config(place)
+    # The motion as it was stored, not drawn anew: another version of NumPy may draw another kernel from the same seed.
     kernel: dict[str, Any] = {field.name: False for field in dataclasses.fields(TableConfig)}
     kernel |= {"name": "table", "path": str(place / "kernel.npz")}
     parts = {key: plain.get(key) for key in ("grid", "cost")}
@@ -205,6 +221,7 @@ def _manifest(plan: Mapping[str, Any] | None, summaries: Sequence[Mapping[str, A
     line = plan.get("line", "") if plan else ""
     words = printable(line).split() if isinstance(line, str) else []
     return {
+        # A report is passed on, and the folders of somebody's machine are no part of the result.
         "line": " ".join(word for word in words if not word.startswith(("hydra.sweep.dir=", "hydra.run.dir="))),
         "planned": len(plan["jobs"]) if plan else None,
         "wall_seconds": round(sum(float(summary["wall_seconds"]) for summary in summaries), 1),

@@ -12,11 +12,13 @@ from trackmdp.reports.results import FinishedRun
 
 __all__ = ["Study", "study", "world_key"]
 
+# The order of legends and tables, the same in every report; an algorithm that is not listed comes after these.
 ORDER = ("a2c", "hindsight", "ppo", "dqn", "learned_kernel")
 SHORT = {"kernel.support_size": "Z", "cost.sensor": "c", "grid.size": "N", "grid.t_max": "T_max"}
 WORLD = ("grid.", "kernel.", "cost.")
 TOLD = "kernel.homogeneous"
 """What a learner is told of the motion; it is the method's, not the world's."""
+# What these hold changes how or how long a run is carried out, or which draw it is, not what is learned from.
 NOT_METHOD = ("seed", "quiet", "device", "threads", "resume", "init_from")
 NOT_METHOD_GROUPS = ("log.", "checkpoint.", "evaluation.", "optimal.")
 
@@ -47,6 +49,7 @@ class Study:
 
     def upper(self, world: str) -> float:
         """The best proved upper bound on the AIHTR in a world; nan where there is none, as on recorded tracks."""
+        # A bound holds for the world, whichever run found it: the least of all is the tightest.
         found = [run.figures[key] for run in self.in_world(world) for key in ("optimal_upper", "bound_clocked")]
         return min((value for value in found if value is not None), default=math.nan)
 
@@ -58,6 +61,7 @@ class Study:
     def regret(self, run: FinishedRun, world: str, aihtr: float | None = None) -> float:
         """Distance per step to the best proved upper bound, of the run's policy or of one that earns `aihtr`."""
         earned = run.figure("aihtr") if aihtr is None else aihtr
+        # Per step, so that worlds whose targets stay for a different time can be averaged.
         return (self.upper(world) - earned) / run.figure("expected_length")
 
     def regrets(self, world: str, method: str) -> list[float]:
@@ -70,6 +74,7 @@ def study(runs: Sequence[FinishedRun]) -> Study:
     """Group `runs`; labels name only what differs between them."""
     varied = _varied(runs)
     labels = {run.name: (_world_label(run, varied), _method_label(run, varied)) for run in runs}
+    # Reversed, so that the first of the runs with one label decides: later entries of a dict overwrite.
     order = {labels[run.name]: _order(run, varied) for run in reversed(runs)}
     groups: dict[tuple[str, str], list[FinishedRun]] = {}
     for run in sorted(runs, key=lambda run: (order[labels[run.name]], run.seed, run.name)):
@@ -89,31 +94,36 @@ def _of_world(key: str) -> bool:
 
 
 def _varied(runs: Sequence[FinishedRun]) -> list[str]:
-    """Options that tell groups apart: not all the same among the runs of one algorithm, nor the copy of another."""
+    """Options that go into labels: they differ within an algorithm (or a world) and no earlier one determines them."""
     values: dict[str, dict[str, set[str]]] = {}
     for run in runs:
         for key, value in run.settings.items():
+            # Per algorithm: that PPO and A2C have other learning rates does not tell two runs of PPO apart.
             owner = "" if _of_world(key) else run.algo
             values.setdefault(key, {}).setdefault(owner, set()).add(json.dumps(value))
     found = [key for key, owned in values.items() if any(len(each) > 1 for each in owned.values())]
     found = [key for key in found if key not in NOT_METHOD and not key.startswith(NOT_METHOD_GROUPS)]
     kept: list[str] = []
+    # Options with a short name first, since of two that go together the one found first is kept.
     for key in sorted(found, key=lambda key: (not _of_world(key), key not in SHORT, key)):
+        # A sweep over the price may set another option along with it; a label that names both says one thing twice.
         if key != "algo.name" and not any(_follows(runs, key, other) for other in kept):
             kept.append(key)
     return kept
 
 
 def _follows(runs: Iterable[FinishedRun], key: str, other: str) -> bool:
-    """Whether the value of `other` says that of `key`, both of the world or both of the method."""
+    """Whether `key` is determined by `other` on these runs; both belong to the world, or both to the method."""
     if _of_world(key) != _of_world(other):
         return False
     seen: dict[str, str] = {}
     pairs = [(run.algo + json.dumps(run.settings.get(other)), json.dumps(run.settings.get(key))) for run in runs]
+    # Whether `other` -> `key` is a function on these runs.
     return all(seen.setdefault(mine, its) == its for mine, its in pairs)
 
 
 def _world_label(run: FinishedRun, varied: Sequence[str]) -> str:
+    # Z and c name the paper's worlds, also where a sweep has one value of them.
     always = ["kernel.support_size", "cost.sensor"]
     keys = [*always, *(key for key in varied if _of_world(key) and key not in always)]
     named = [f"{_short(key)}={_text(run.settings[key])}" for key in keys if run.settings.get(key) is not None]
@@ -134,6 +144,8 @@ def _order(run: FinishedRun, varied: Sequence[str]) -> tuple[Any, Any]:
 
 
 def _sortable(value: Any) -> tuple[int, float, str]:
+    # Numbers by size, 0.16 before 0.2; everything else after them by its text. The pair keeps the two from being
+    # compared.
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         return 0, float(value), ""
     return 1, 0.0, json.dumps(value)

@@ -36,9 +36,12 @@ def curves(study: Study, points: Mapping[str, Sequence[CurvePoint]], by: str) ->
         for place, (method, (grid, row)) in enumerate(found.items()):
             style = look_of(method, place)
             mean = np.maximum([e.mean for e in row], FLOOR)
+            # A marker at every sixth position, so that curves are told apart without colours as well.
             axes.plot(grid, mean, style.line, color=style.colour, label=method, marker=style.marker, markevery=6)
             ends = [(e.mean if e.low is None else e.low, e.mean if e.high is None else e.high) for e in row]
+            # `.T` gives the two rows, lower and upper ends.
             axes.fill_between(grid, *np.maximum(ends, FLOOR).T, color=style.colour, alpha=0.18, linewidth=0)
+        # Both logarithmic: methods differ in steps and in regret by factors of ten and more.
         axes.set_xscale("log")
         axes.set_yscale("log")
         axes.set_xlabel(unit)
@@ -51,6 +54,7 @@ def curves(study: Study, points: Mapping[str, Sequence[CurvePoint]], by: str) ->
     rows = [
         [method, float(grid[place]), *estimate_cells(row[place]), row[place].n]
         for method, (grid, row) in found.items()
+        # Every third position: neighbours on the grid hardly differ.
         for place in range(0, len(grid), 3)
     ]
     counts = ", ".join(f"{method} n = {row[0].n}" for method, (_, row) in found.items())
@@ -72,8 +76,11 @@ def _averaged(
     everything = [curve for group in known for curve in group]
     if not everything:
         return None
+    # From the latest of all first points: before it some runs have no value, and the mean would be over others.
     start, end = (float(max(curve[place, 0] for curve in everything)) for place in (0, -1))
+    # 40 positions, evenly spaced on the logarithmic axis; `1.001` keeps a curve of one point from an empty range.
     grid = np.geomspace(max(start, 1e-2), max(end, start * 1.001), 40)
+    # `[world][run]` -> `[G]`; a run that has ended keeps its last value, as its policy does not change any more.
     values = [[np.array([value_at(curve, x) for x in grid]) for curve in group] for group in known]
     return grid, [mean_over_groups([[v[i] for v in g] for g in values]) for i in range(len(grid))]
 
@@ -84,6 +91,7 @@ def profiles(study: Study, threshold: float | None) -> Figure | None:
     regrets = {method: values for method, values in pooled.items() if len(values)}
     if not regrets:
         return None
+    # Up to a little above the worst run, so that every profile is seen to reach 1.
     levels = np.geomspace(1e-4, max(1.0, 1.05 * max(values.max() for values in regrets.values())), 60)
     found = {m: [share(int((values <= level).sum()), len(values)) for level in levels] for m, values in regrets.items()}
 
@@ -93,6 +101,7 @@ def profiles(study: Study, threshold: float | None) -> Figure | None:
             style, label = look_of(method, place), f"{method} (n = {row[0].n})"
             axes.plot(levels, [e.mean for e in row], style.line, color=style.colour, label=label)
             if row[0].low is not None:
+                # Clopper-Pearson intervals, one for each level: no joint band of the whole curve.
                 low, high = [e.low or 0.0 for e in row], [e.high or 0.0 for e in row]
                 axes.fill_between(levels, low, high, color=style.colour, alpha=0.18, linewidth=0)
         if threshold is not None:
@@ -117,11 +126,14 @@ def _steps(study: Study, run: FinishedRun, world: str, curves: Mapping[str, Sequ
     """`[points, 2]` position and regret of one run; of several points at one position the last counts."""
     if math.isnan(study.upper(world)):
         return np.zeros((0, 2))
+    # Seconds are rounded, so that several points may fall on one; of a dict's entries the last one stays.
     last = {float(getattr(p, by)): study.regret(run, world, p.aihtr) for p in curves.get(run.name, ())}
     return np.array(sorted(last.items()))
 
 
 def value_at(curve: Array, x: float) -> float:
     """The regret of the last policy judged at or before x; before the first, the first's."""
+    # A step function: what was valued last is what the learner has. 1e-9: the grid's ends are powers, and may fall
+    # just short of the point they were made from.
     place = int(np.searchsorted(curve[:, 0], x * (1 + 1e-9), side="right")) - 1
     return float(curve[max(place, 0), 1])

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["MOST_MAP_CELLS", "policy_map", "value_map"]
 
+# 20 x 20: with tiles of four to six cells each, more would not be seen on a page.
 MOST_MAP_CELLS = 400
 """Cells of a grid that is still drawn cell by cell."""
 LEVELS = 24
@@ -36,6 +37,7 @@ def policy_map(
     if cells > MOST_MAP_CELLS:
         return None
     shown = list(range(min(choices, 2)))
+    # `[n][M, M]`, row x belonging to the target located in x.
     possible = _possible(policy, motion, len(shown))
 
     def paint(figure: Canvas) -> None:
@@ -47,6 +49,7 @@ def policy_map(
         [x, n, int((on := policy.chains[x, n]).sum()), int(possible[n][x].sum()), _cells_text(on, size[1])]
         for x in range(cells)
         for n in shown
+        # No row where this many misses cannot happen.
         if possible[n][x].any()
     ]
     columns = [Column("located in cell"), Column("misses n"), Column("sensors on"), Column("possible cells")]
@@ -71,12 +74,15 @@ def value_map(name: str, where: str, policy: StoredPolicy, motion: MotionTable, 
         return None
     layers = {
         "value V(x)": policy.value,
+        # Both against the clocked bound, which is the optimum wherever a policy attains it.
         "missing to the clocked bound": _rounded(motion.clocked - policy.value),
         "the same, Q_MDP": _rounded(motion.clocked - motion.qmdp),
     }
 
     def paint(figure: Canvas) -> None:
         for place, (axes, (label, values)) in enumerate(zip(figure.subplots(1, 3), layers.items(), strict=True)):
+            # Two scales of colour: values and what is missing are not to be compared by shade. Bright is good in both,
+            # much in viridis and little in magma_r.
             _shade(figure, axes, values.reshape(size), "viridis" if place == 0 else "magma_r")
             axes.set_title(label, fontsize=6.8)
 
@@ -98,7 +104,9 @@ def _shade(figure: Canvas, axes: Axes, values: Array, colours: str) -> None:
     from matplotlib import colormaps
     from matplotlib.ticker import MaxNLocator
 
+    # 24 shades: the colour bar is then 24 rectangles in the SVG, and not 256.
     shade = axes.pcolormesh(values, cmap=colormaps[colours].resampled(LEVELS))
+    # Row 1 on top, as in the numbering of cells.
     axes.invert_yaxis()
     axes.set_aspect("equal")
     axes.set_xticks([])
@@ -112,12 +120,14 @@ def _shade(figure: Canvas, axes: Axes, values: Array, colours: str) -> None:
 
 
 def _rounded(values: Array) -> Array:
-    """Without what is rounding only."""
+    """`values` with entries below 1e-9, which are rounding errors, set to 0."""
     return np.where(np.abs(values) < 1e-9, 0.0, values)
 
 
 def _possible(policy: StoredPolicy, motion: MotionTable, steps: int) -> list[BoolArray]:
     """`[M, M]` each: where the target may be after n misses and one more move."""
+    # `[M, M]` joint mass: row x, the target located in x and moved once. Sensed mass is taken out before the next
+    # move: had it been there, it would have been located.
     mass = motion.kernel.toarray()
     found = []
     for n in range(steps):
@@ -127,14 +137,26 @@ def _possible(policy: StoredPolicy, motion: MotionTable, steps: int) -> list[Boo
 
 
 def _tiles(axes: Axes, on: BoolArray, possible: BoolArray, size: tuple[int, int], reach: int) -> None:
-    """One tile per located cell, `2 reach + 1` cells wide; cells farther away that are possible widen all tiles."""
+    """Draw one tile per located cell.
+
+    Args:
+        axes: where.
+        on, possible: `[M, M]`, row x for the target located in x: sensors on, cells it can be in.
+        size: rows and columns of the grid.
+        reach: cells shown on each side of the located one, at least; more where possible cells are farther away.
+    """
     rows, columns = size
+    # A stored plan has a set for every n; where the miss cannot happen it is arbitrary.
     on = on & possible.any(axis=1, keepdims=True)  # elsewhere it never comes to this
+    # After n misses n + 1 moves have been made, each to a neighbour in most worlds.
     reach = max(reach, _farthest(possible | on, columns))
+    # 2 reach + 1 cells and one between tiles.
     side = 2 * reach + 2
     groups: dict[str, list[tuple[float, float]]] = {ON: [], OFF: [], IDLE: []}
     for x in range(rows * columns):
         row, column = divmod(x, columns)
+        # The tile of x begins at (column, row) * side; its centre, x itself, is at + reach, and j is drawn relative to
+        # it. In a grid of 10 columns, x = 23 and j = 34: one down, one right.
         for j in np.flatnonzero(possible[x] | on[x]):
             down, right = j // columns - row, j % columns - column
             colour = IDLE if not possible[x, j] else ON if on[x, j] else OFF
@@ -161,6 +183,7 @@ def _squares(axes: Axes, groups: dict[str, list[tuple[float, float]]]) -> None:
     for colour, corners in groups.items():
         if not corners:
             continue
+        # 0.92 of a cell: the gap shows the grid without lines.
         points = [[(x, y), (x + 0.92, y), (x + 0.92, y + 0.92), (x, y + 0.92), (x, y)] for x, y in corners]
         path = Path(np.array(points).reshape(-1, 2), codes * len(corners))
         axes.add_patch(PathPatch(path, facecolor=colour, edgecolor="none"))
@@ -171,6 +194,8 @@ def _farthest(cells: BoolArray, columns: int) -> int:
     if not len(located):
         return 0
     away = np.maximum(np.abs(located // columns - sensed // columns), np.abs(located % columns - sensed % columns))
+    # Tiles of 7 x 7 cells at most: with far jumps they would be too small to see. Cells farther away overlap other
+    # tiles then.
     return min(int(away.max()), 3)
 
 

@@ -19,6 +19,7 @@ from trackmdp.world.model import grid_size
 
 __all__ = ["Folded", "Part", "Report", "Section", "build"]
 
+# All of them would be dozens of figures; the policies that are not drawn are in `policies.npz`.
 MAPPED = 2
 """Methods and worlds whose policies are drawn on the page."""
 
@@ -80,6 +81,7 @@ class Report:
 
     def html(self) -> str:
         """The page."""
+        # One file without anything loaded from elsewhere: it can be mailed, and opened without a network.
         page = files("trackmdp.reports").joinpath("report.html").read_text(encoding="utf-8")
         nav = "".join(f'<li><a href="#{s.anchor}">{html.escape(s.heading)}</a></li>' for s in self.sections)
         body = "\n".join(section.html() for section in self.sections)
@@ -108,6 +110,7 @@ def build(
     say("figures")
     grouped = study(results.runs)
     outcome: list[Part] = [summaries.methods_table(grouped, threshold)]
+    # Said beside the first table: a method that was stopped early is easily taken for a weak one.
     if cut := summaries.shortened(grouped):
         said = html.escape("; ".join(cut))
         outcome.append(f"<p>Fewer env steps than the algorithm's own options give it: {said}.</p>")
@@ -127,6 +130,7 @@ def _part(part: Part) -> str:
         return part.html()
     if isinstance(part, Folded):
         return f"<details><summary>{html.escape(part.summary)}</summary>{part.table.html()}</details>"
+    # Three in a row where that leaves no row with one alone.
     kind = "figures" if len(part) % 3 == 0 else "figures two"
     return f'<div class="{kind}">{"".join(figure.html() for figure in part)}</div>'
 
@@ -156,6 +160,7 @@ def _against_cost(grouped: Study, threshold: float | None) -> list[Section]:
         "the best apart.</p>"
     )
     above = [figures.against_cost(grouped, panel) for panel in found]
+    # No regret where a world has no proved bound, as one on recorded tracks.
     bounded = [panel for panel in found if not any(math.isnan(grouped.upper(world)) for world in panel.worlds)]
     below = [figures.regret_against_cost(grouped, panel, threshold) for panel in bounded]
     return [Section("figures", "Against the price of a sensor", [note, above, below])]
@@ -170,6 +175,8 @@ def _learning(results: Results, grouped: Study, threshold: float | None) -> list
 def _maps(results: Results, grouped: Study) -> list[Section]:
     """Policies and values in the first and the last world."""
     sets, values = list[Figure | None](), list[Figure | None]()
+    # The last and the first world differ most, since worlds are in the order of Z and c; a dict, as they may be the
+    # same.
     for world in dict.fromkeys((grouped.worlds[-1], grouped.worlds[0])):
         motion = next((results.motions[r.name] for r in grouped.in_world(world) if r.name in results.motions), None)
         for method in grouped.methods[:MAPPED]:

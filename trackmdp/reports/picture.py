@@ -24,6 +24,7 @@ def draw_picture(episodes: Sequence[Episode], task: Task, *, steps: int = 6) -> 
         task: where they took place.
         steps: frames drawn at most; fewer if the target exits before.
     """
+    # Longer than `steps`: the picture is then full, and does not end with the exit.
     episode = next((each for each in episodes if len(each) > steps), None) or max(episodes, key=len)
     frames = [_frame(task, cell, on) for cell, on in _steps(episode, task, steps)]
     columns = [[f"step {k}", *frame] for k, frame in enumerate(frames, start=1)]
@@ -36,6 +37,7 @@ def _steps(episode: Episode, task: Task, steps: int) -> Iterator[tuple[int, Bool
     """The target's cell and the sensors on, `[M]`, of each step in the grid; all of them where the safe action is."""
     forced = episode.forced(task.t_max)
     for t, cell in enumerate(episode.target[:steps].tolist()):
+        # The cell numbered M stands for having left the grid.
         if cell < task.num_cells:
             yield cell, episode.action[t] | forced[t]
 

@@ -49,7 +49,10 @@ def pack_all(policies: Mapping[str, StoredPolicy]) -> bytes:
     every = list(policies.values())
     packed = {
         "names": np.array(list(policies), dtype=np.str_),
+        # `reshape`: no policy at all is still a table of three columns.
         "shapes": np.array([policy.chains.shape for policy in every], dtype=np.int64).reshape(-1, 3),
+        # One bit a sensor: as bytes a grid of 10 x 10 with t_max = 1 takes 20 kB, as bits 2.5 kB. One stream for all
+        # policies, so that only its end is padded.
         "chains": np.packbits(np.concatenate([policy.chains.ravel() for policy in every] or [np.zeros(0, bool)])),
         "values": np.concatenate([policy.value for policy in every] or [np.zeros(0)]),
     }
@@ -67,6 +70,7 @@ def unpack_all(content: bytes) -> dict[str, StoredPolicy]:
     names, shapes, bits, values = arrays(content, "names", "shapes", "chains", "values")
     sizes = shapes.prod(axis=1)
     flat = np.unpackbits(bits, count=int(sizes.sum())).astype(np.bool_)
+    # The last sum is the end of the stream, not a place to cut.
     chains = np.split(flat, np.cumsum(sizes)[:-1]) if len(names) else []
     value = np.split(values, np.cumsum(shapes[:, 0])[:-1]) if len(names) else []
     return {

@@ -37,11 +37,13 @@ __all__ = [
     "save_results",
 ]
 
+# Counted up when a file changes its meaning: results of another format are then not taken for stored results.
 RESULTS_FORMAT = "trackmdp results 2"
 MANIFEST, FILES = "manifest.json", ("runs.csv", "curves.csv", "policies.npz", "worlds.npz")
 LARGEST = 2**28
 """Bytes of the longest of these files."""
 
+# A sweep may come from elsewhere, and its folders and options are named by whoever made it.
 _FORMULA = ('"', "=", "+", "-", "@", "\t", "\r")
 """What a spreadsheet would compute stands in quotes, and so does what begins with one."""
 
@@ -152,7 +154,7 @@ class Results:
 
 
 def is_stored(folder: Path) -> bool:
-    """Whether `folder` holds stored results and not the runs themselves."""
+    """Whether `folder` holds what `save_results` writes, rather than the folders of runs."""
     try:
         return bool(read_object(folder / MANIFEST).get("format") == RESULTS_FORMAT)
     except UserError:
@@ -160,25 +162,31 @@ def is_stored(folder: Path) -> bool:
 
 
 def save_results(results: Results, folder: Path) -> None:
-    """Write all of it to `folder`; the same results, the same bytes."""
+    """Write `results` to `folder` as `FILES` and the manifest; equal results give equal bytes."""
+    # `curves.csv` names a run by its row in `runs.csv`: names are long, and there are many points.
     index = {run.name: number for number, run in enumerate(results.runs)}
+    # Most options are the same in all runs: they go to the manifest once, and only the others are columns.
     common = _common(results.runs)
     varied = sorted({key for run in results.runs for key in run.settings if key not in common[run.algo]})
     rows = [
         [
             json.dumps(run.name) if run.name.startswith(_FORMULA) else run.name,
+            # An empty field says that the run has no such option; an option that is null is written as `null`.
             *(_cell(run.settings[key]) if key in run.settings else "" for key in varied),
+            # `repr` gives the shortest text that is read back as the same float.
             *("" if run.figures[key] is None else repr(run.figures[key]) for key in FIGURES),
         ]
         for run in results.runs
     ]
     write_bytes(folder / "runs.csv", _csv(["run", *varied, *FIGURES], rows))
     points = [
+        # Curves are drawn, not computed with: 7 digits of the AIHTR are more than a figure shows.
         [index[name], point.iteration, point.frames, f"{point.seconds:.4g}", f"{point.aihtr:.7g}"]
         for name, curve in sorted(results.curves.items(), key=lambda item: index[item[0]])
         for point in curve
     ]
     write_bytes(folder / "curves.csv", _csv(["run", "iteration", "frames", "seconds", "aihtr"], points))
+    # Sorted: the same results give the same bytes, whatever order they were read in.
     write_bytes(folder / "policies.npz", pack_all({name: results.policies[name] for name in sorted(results.policies)}))
     write_bytes(folder / "worlds.npz", _pack_motions(results.motions))
     manifest = {
@@ -188,6 +196,7 @@ def save_results(results: Results, folder: Path) -> None:
         "settings": common,
         "config_sha256": {run.name: run.config_sha256 for run in results.runs},
     }
+    # Last, over the files as they are on the disk; `sealed` adds a digest of the manifest itself.
     manifest["files"] = {name: _digest(folder / name) for name in FILES}
     write_text(folder / MANIFEST, json.dumps(sealed(manifest), indent=1, ensure_ascii=False) + "\n")
 
@@ -200,8 +209,10 @@ def load_results(folder: Path) -> Results:
     """
     source = f"sweep={folder}"
     manifest = unsealed(read_object(folder / MANIFEST, source=source), f"{source}: {MANIFEST}")
+    # Everything inside may meet files of somebody else's; whatever is raised there ends as one line about the sweep.
     with decoded(source, "stored results that can be read"):
         files = manifest.pop("files")
+        # The files belong together: a `runs.csv` of another report would give figures that its policies do not have.
         for name in FILES:
             if files[name] != _digest(folder / name):
                 raise ValueError(f"{name} is not the file that was stored with the others")
@@ -225,7 +236,9 @@ def _digest(file: Path) -> str:
 def _run(row: Mapping[str, str], common: Mapping[str, Any], hashes: Mapping[str, str]) -> FinishedRun:
     own = {key: _value(text) for key, text in row.items() if key not in FIGURES and key != "run" and text != ""}
     figures = {key: float(row[key]) if row[key] else None for key in FIGURES}
+    # A single algorithm needs no column for its name: then it is the one key of `common`.
     algo = own.get("algo.name") or next(iter(common))
+    # The other half of what `save_results` does to a name that looks like a formula.
     name = str(_value(row["run"])) if row["run"].startswith('"') else row["run"]
     return FinishedRun(name, {**common[algo], **own, "algo.name": algo}, figures, hashes[name])
 
@@ -239,6 +252,7 @@ def _common(runs: Iterable[FinishedRun]) -> dict[str, dict[str, Any]]:
         else:
             shared = found[run.algo]
             found[run.algo] = {k: v for k, v in shared.items() if k in run.settings and run.settings[k] == v}
+    # With several algorithms each row has to name its own, by which the rest of its options is found.
     several = len(found) > 1
     return {algo: {k: v for k, v in found[algo].items() if k != "algo.name" or not several} for algo in sorted(found)}
 
@@ -246,6 +260,7 @@ def _common(runs: Iterable[FinishedRun]) -> dict[str, dict[str, Any]]:
 def _cell(value: Any) -> str:
     """Text of a setting, from which `_value` tells a number from a word."""
     if isinstance(value, str):
+        # "3", "true" and "" as words need quotes, or `_value` would read a number, a truth value, or no option at all.
         return json.dumps(value) if _value(value) != value or value == "" or value.startswith(_FORMULA) else value
     return json.dumps(value)
 
@@ -260,6 +275,8 @@ def _value(text: str) -> Any:
 def _pack_motions(motions: Mapping[str, MotionTable]) -> bytes:
     names = sorted(motions)
     each = [motions[name] for name in names]
+    # All worlds in one row of arrays, one after the other: a file with four arrays per world would be mostly headers.
+    # A CSR matrix of m rows has m + 1 row pointers, which begin anew at 0 for each world.
     packed = {
         "runs": np.array(names, dtype=np.str_),
         "cells": np.array([len(m.qmdp) for m in each], dtype=np.int64),
@@ -281,6 +298,7 @@ def _unpack_motions(content: bytes) -> dict[str, MotionTable]:
     found, cell, entry = {}, 0, 0
     for place, name in enumerate(stored["runs"]):
         m, nnz = int(stored["cells"][place]), int(stored["entries"][place])
+        # Worlds before this one: `cell` cells, hence cell + place row pointers, and `entry` entries.
         inner, outer = slice(entry, entry + nnz), slice(cell + place, cell + place + m + 1)
         rows = (stored["data"][inner], stored["indices"][inner], stored["indptr"][outer])
         cells = slice(cell, cell + m)

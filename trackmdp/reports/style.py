@@ -38,6 +38,8 @@ Say: TypeAlias = Callable[[str], None]
 WIDTH = 4.3
 """Inches; as wide as a phone, so that letters keep their size there."""
 INK, LINE, PAGE = "#1b1b1c", "#c4c4c5", "#fffffe"
+# `_inline` replaces these very letters in the SVG: a colour that is not among them would stay as it is in the dark
+# scheme.
 PALETTE = {
     INK: "text",
     LINE: "line",
@@ -54,6 +56,7 @@ PALETTE = {
 }
 """Colours of the files, and their names in the style sheet of the page, where they change with the scheme."""
 _DPI = 160
+# Raised digits as letters: matplotlib's own powers are formulas, which are switched off (`text.parse_math`).
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -66,6 +69,7 @@ class Look:
     line: str = "-"
 
 
+# Marker and dashes differ as well as the colour, for print without colours and for who cannot tell them apart.
 LOOKS = {
     "a2c": Look("#d55e01", "o"),
     "hindsight": Look("#0072b2", "D"),
@@ -78,6 +82,7 @@ LOOKS = {
     "clocked bound": Look("#7a3e00", "", "-."),
     "optimum": Look(INK, "+", "-"),
 }
+# For labels that are not listed, as of one algorithm with several options.
 _MORE = [Look(colour, marker, "--") for marker in "Pp*h<>" for colour in ("#d55e01", "#0072b2", "#00845c", "#b0518c")]
 
 
@@ -128,6 +133,8 @@ def canvas(height: float, name: str, width: float = WIDTH) -> Iterator[Canvas]:
     import matplotlib
     from matplotlib.figure import Figure as New
 
+    # Only inside: whoever calls this from a notebook keeps their own settings. `Figure` without pyplot needs no
+    # display, and is let go of when it is no longer used.
     with matplotlib.rc_context(_settings(name)):
         yield New(figsize=(width, height), dpi=_DPI, layout="constrained")
 
@@ -139,9 +146,11 @@ def draw_figure(
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
+    # Both from one drawing. The metadata are emptied: a date or a version would change the bytes each time.
     svg, png = io.BytesIO(), io.BytesIO()
     with canvas(height, name) as figure:
         paint(figure)
+        # Lets the layout engine settle, which it does while drawing.
         figure.draw_without_rendering()
         figure.set_layout_engine("none")  # what has been laid out need not be again for each format
         # savefig would lay out and draw twice more each time
@@ -151,16 +160,18 @@ def draw_figure(
 
 
 def tidy(axes: Axes) -> None:
-    """Light grid, no box; letters between powers of ten only where there are few powers."""
+    """Light grid, no box around the axes, and tick labels for logarithmic axes of any range."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, StrMethodFormatter
 
     for axis, scale, (low, high) in (
         (axes.xaxis, axes.get_xscale(), axes.get_xlim()),
         (axes.yaxis, axes.get_yscale(), axes.get_ylim()),
     ):
+        # Over more than about two powers of ten the powers alone are labels enough.
         if scale == "log" and high > 50 * low:
             axis.set_major_formatter(FuncFormatter(_power))
             axis.set_minor_formatter(NullFormatter())
+        # Over less there may be one power or none in sight: 2 and 5 are labelled as well, as plain numbers.
         elif scale == "log":
             axis.set_minor_locator(LogLocator(subs=(2, 5)))
             for form in (axis.set_major_formatter, axis.set_minor_formatter):
@@ -172,13 +183,14 @@ def tidy(axes: Axes) -> None:
 
 
 def _power(value: float, _place: int | None = None) -> str:
-    """A power of ten, in letters that need no formula."""
+    """A power of ten as text with raised digits, such as 10⁻³."""
     return f"10{f'{math.log10(value):.0f}'.translate(_RAISED)}"
 
 
 def legend(figure: Canvas, axes: Axes, columns: int = 3, first: Sequence[str] = ()) -> None:
-    """Below the axes, `first` labels first; letters a phone still shows."""
+    """A legend below the axes, in `columns`; the labels in `first` come before the others."""
     handles, labels = axes.get_legend_handles_labels()
+    # matplotlib lists lines before error bars; False sorts first and the sort is stable.
     order = sorted(range(len(labels)), key=lambda place: labels[place] not in first)
     figure.legend(
         [handles[place] for place in order],
@@ -193,7 +205,10 @@ def legend(figure: Canvas, axes: Axes, columns: int = 3, first: Sequence[str] = 
 
 def _settings(name: str) -> Any:
     return {
+        # Ids in an SVG are random otherwise. By the figure's name, as several figures stand in one page, where ids
+        # must differ.
         "svg.hashsalt": name,
+        # Text stays text: it can be searched, read aloud, and is smaller than the outlines of its letters.
         "svg.fonttype": "none",
         "text.parse_math": False,  # a label is a name, and $x^{$ one that somebody may give
         "font.family": "DejaVu Sans",
@@ -219,11 +234,14 @@ def _settings(name: str) -> Any:
 def _inline(svg: str, name: str, title: str, text: str) -> str:
     """The drawing as part of a page."""
     body = svg[svg.index("<svg") :]
+    # Without these the drawing takes its style from the page: matplotlib's style sheet would hold for the page as a
+    # whole.
     body = re.sub(r"<metadata>.*?</metadata>", "", body, flags=re.DOTALL)
     body = re.sub(r"<style.*?</style>", "", body, flags=re.DOTALL)
     view = re.search(r'viewBox="([^"]+)"', body)
     assert view
     _, _, rest = body.partition(">")
+    # Colours become variables of the page, which has other values for them in the dark scheme.
     for colour, variable in PALETTE.items():
         rest = rest.replace(colour, f"var(--{variable})")
     rest = re.sub(r"\n\s*", "\n", rest)

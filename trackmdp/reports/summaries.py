@@ -40,6 +40,7 @@ def methods_table(study: Study, threshold: float | None) -> Table:
     """Each method over all its worlds; with a `threshold`, how many runs end at most that far from the bound."""
     rows: list[list[Cell]] = []
     for method in study.methods:
+        # Worlds stay apart until they are averaged: seeds of different worlds are no sample of one distribution.
         groups = [group for world in study.worlds if (group := study.regrets(world, method))]
         regrets = [regret for group in groups for regret in group]
         runs = [run for world in study.worlds for run in study.of(world, method)]
@@ -63,6 +64,7 @@ def shortened(study: Study) -> list[str]:
             shipped = compose("train", {"algo": run.algo, "grid.size": run.settings["grid.size"]})
         except UserError:  # an algorithm that is not installed here, or one that another word chooses
             continue
+        # As the options of today's `conf/` are; grids of another size have other budgets.
         taken, full = run.figure("frames"), shipped.algo.total_frames
         found += [f"{method}: {taken:,.0f} of {full:,}"] if taken < full else []
     return found

@@ -58,6 +58,8 @@ class Column:
             return printable(value)
         if self.digits is None:
             return f"{value:,}" if isinstance(value, int) else f"{value:g}"
+        # -0.0004 with three digits is "-0.000": shown as 0.000, since the sign of a rounding error is no result. The
+        # minus is the typographic one, as in the figures.
         shown = f"{value:,.{self.digits}f}"
         zero = f"{0.0:,.{self.digits}f}"
         return zero if shown.lstrip("+-") == zero else shown.replace("-", "−")
@@ -83,12 +85,14 @@ class Table:
 
     def latex(self) -> str:
         """A `tabular` with horizontal rules; it needs no package."""
+        # Words to the left, numbers to the right, as their digits are compared from the right.
         align = "".join("l" if self._is_text(place) else "r" for place in range(len(self.columns)))
         head = " & ".join(rf"\textbf{{{_escape(column.heading)}}}" for column in self.columns)
         body = [" & ".join(_escape(c.text(v)) for c, v in zip(self.columns, row, strict=True)) for row in self.rows]
         lines = [rf"{line} \\" for line in body]
         return "\n".join(
             [
+                # In one line: what follows a line break would no longer be a comment.
                 f"% {' '.join(self.caption.split())}",
                 rf"\begin{{tabular}}{{{align}}}",
                 r"\hline",
@@ -110,6 +114,7 @@ class Table:
         rows = "\n".join(f"<tr>{self._cells(row)}</tr>" for row in self.rows)
         caption = html.escape(self.caption)
         return (
+            # A wide table scrolls within its own box; `tabindex` lets the keyboard scroll it too.
             f'<div class="scroll" tabindex="0" role="region" aria-label="{caption}"><table class="sortable">'
             f"<caption>{caption}</caption><thead><tr>{heads}</tr></thead>\n<tbody>{rows}</tbody></table></div>"
         )
@@ -120,6 +125,7 @@ class Table:
             text = html.escape(column.text(value))
             mark = ' class="wide"' if len(text) > LONG else ""
             number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+            # The page sorts by the full number; the text of the cell is rounded and has separators.
             sort = f' data-v="{value!r}"' if number else ""
             cells.append(f"<td{mark or self._side(place)}{sort}>{text}</td>")
         return "".join(cells)
@@ -141,6 +147,7 @@ def _plain(value: Cell) -> Any:
 
 def _no_formula(text: str) -> str:
     """The text of a cell that a spreadsheet shows and does not compute, whatever somebody called a folder."""
+    # With an apostrophe before it, a spreadsheet takes it for text. Folders and options are named by whoever made the sweep.
     return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text
 
 

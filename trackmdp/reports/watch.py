@@ -23,6 +23,7 @@ from trackmdp.untrusted import decoded, opened, printable
 __all__ = ["Status", "statuses", "watch"]
 
 WAITING, RUNNING, CUT, FAILED, DONE = "waiting", "running", "cut", "failed", "done"
+# A table of metrics may be large, and is looked at every few seconds for every run; its end is enough.
 TAIL = 4096
 """Bytes read from the end of `metrics.csv`."""
 LARGE = 1e15
@@ -74,6 +75,7 @@ def statuses(sweep: Path) -> list[Status]:
 
 
 def _live(sweep: Path, console: Console, every: float, found: list[Status]) -> list[Status]:
+    # `auto_refresh=False`: a thread of rich's would draw between two looks at the disk, where nothing is new.
     with Live(_table(found, console.height), console=console, auto_refresh=False) as live:
         while _going(sweep, found):
             time.sleep(every)
@@ -83,6 +85,7 @@ def _live(sweep: Path, console: Console, every: float, found: list[Status]) -> l
 
 
 def _lines(sweep: Path, console: Console, every: float, found: list[Status]) -> list[Status]:
+    # Name -> the state last told.
     said: dict[str, str] = {}
     while True:
         for status in found:
@@ -99,6 +102,8 @@ def _lines(sweep: Path, console: Console, every: float, found: list[Status]) -> 
 
 def _going(sweep: Path, found: Sequence[Status]) -> bool:
     """Whether anything is left to wait for: a run under way, or one that the sweep, still running, has to begin."""
+    # "cut" or "waiting" with the sweep still running means: still to come; without it nothing will come, and watching
+    # ends.
     states = {status.state for status in found}
     return RUNNING in states or (bool(states & {WAITING, CUT}) and run_of(sweep).state == RUNNING)
 
@@ -107,11 +112,13 @@ def _status(place: Path, name: str) -> Status:
     found, plan = run_of(place), read_run_json(place / "plan.json")
     if found.state == FAILED:
         return Status(name, FAILED, reason=found.reason)
+    # The run is being written while it is read: a file may be missing, or of the moment before.
     upper, last = _number(plan, "upper_bound"), _last_rows(place / "metrics.csv")
     if found.state == DONE:
         summary = found.result
         earned, best = _number(summary.get("policy"), "aihtr"), _number(summary.get("optimal"), "upper")
         bounds = [bound for bound in (upper, best) if bound is not None]
+        # The solver's bound may be tighter than the clocked one of the plan.
         return Status(name, DONE, 1.0, min(bounds) - earned if bounds and earned is not None else None, 0.0)
     if not last:
         return Status(name, found.state)
@@ -119,6 +126,7 @@ def _status(place: Path, name: str) -> Status:
     share = min(1.0, last[-1]["iteration"] / planned) if planned >= 1 else 0.0
     judged = [row["aihtr"] for row in last if "aihtr" in row]
     gap = upper - judged[-1] if judged and upper is not None else None
+    # As if every iteration took the same time.
     left = last[-1]["seconds"] * (1 - share) / share if share else None
     return Status(name, found.state, share, gap, left)
 
@@ -128,6 +136,7 @@ def _number(said: Any, key: str) -> float | None:
     value = said.get(key) if isinstance(said, Mapping) else None
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return None
+    # Comparing is false for nan, so that it is left out like what is too large.
     return float(value) if abs(value) < LARGE else None
 
 
@@ -136,14 +145,17 @@ def _last_rows(file: Path) -> list[dict[str, float]]:
     try:
         with opened(file, most=2**40) as stream, decoded(str(file), "a table"):
             head = stream.readline(TAIL).decode()
+            # Not before the end of the heading, which was read on its own.
             begin = max(stream.tell(), stream.seek(0, os.SEEK_END) - TAIL)
             cut = begin > len(head.encode())
             stream.seek(begin)
             lines = stream.read(TAIL).decode(errors="replace").split("\n")
+            # Begun in the middle, the first line is only the end of one.
             lines = lines[1 if cut else 0 : -1]  # the last one may be half written
             names = next(csv.reader([head]), [])
             rows = [dict(zip(names, row, strict=True)) for row in csv.reader(lines) if len(row) == len(names)]
             wanted = ("iteration", "seconds", "aihtr")
+            # A row without an evaluation has an empty field for the AIHTR.
             found = [{key: float(row[key]) for key in wanted if row.get(key)} for row in rows]
     except UserError:
         return []
@@ -156,9 +168,12 @@ def _table(found: Sequence[Status], height: int) -> Group:
     for label in ("run", "state", "progress", "gap", "left"):
         shown.add_column(label, justify="left" if label in ("run", "state") else "right")
     order = {RUNNING: 0, FAILED: 1, CUT: 2, WAITING: 3, DONE: 4}
+    # Frame and heading take four lines, what follows the table two. A table higher than the terminal could not be
+    # redrawn in place.
     room = max(3, height - 6)
     ordered = sorted(found, key=lambda status: order[status.state])
     for status in ordered[:room]:
+        # `Text`: rich would take "[red]" in a name for markup.
         shown.add_row(Text(printable(status.name)), Text(printable(status.reason or status.state)), *_figures(status))
     more = [Text(f"and {len(found) - room} more")] if len(found) > room else []
     return Group(shown, *more, Text(_counts(found)))
