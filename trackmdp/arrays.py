@@ -75,7 +75,6 @@ def load_npy(stream: Any, size: int) -> npt.NDArray[Any]:
             raise ValueError("more bytes than its header claims")
     if len(content) != claimed:
         raise ValueError("fewer bytes than its header claims")
-    # frombuffer refuses an empty buffer.
     flat = np.frombuffer(content, dtype) if content else np.zeros(0, dtype)
     return flat.reshape(shape, order="F" if fortran else "C")
 

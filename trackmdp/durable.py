@@ -1,7 +1,7 @@
-"""Files that are whole or absent, whatever happens while they are written, and that never lead out of their folder.
+"""Atomic writes: a file is whole or absent, whatever happens meanwhile, and a link is never followed out of its folder.
 
-What a file system lacks is done without where that is safe, and said once: no hard links (exFAT, many network and FUSE
-mounts): a copy; no `fsync`: a power failure may then cost what was saved last, never what was saved before.
+Some file systems lack a call; the user is then told once. Without hard links (exFAT, many network and FUSE mounts) a
+copy is made. Without `fsync` a power failure may cost what was saved last, never what was saved before.
 """
 
 from __future__ import annotations
@@ -156,7 +156,7 @@ def _fsync(descriptor: int, folder: Path) -> None:
 
 
 def say_lacking(folder: Path, what: str, instead: str) -> None:
-    """Tell the user, once, what the file system does without."""
+    """Tell the user, once, what the file system lacks, and what is done instead."""
     if what not in _said:
         _said.add(what)
         sys.stderr.write(printable(f"{folder}: the file system has no {what}; {instead}\n"))

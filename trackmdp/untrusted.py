@@ -1,7 +1,7 @@
 """Files that others may have written, or that a power failure damaged: read within bounds, or refused in one line.
 
-Whatever reads a checkpoint, log, config, kernel, recording, result or summary begins with `opened`. What is done with
-the bytes then stands inside `decoded`. Neither ever unpickles.
+Every reader of a checkpoint, log, config, kernel, recording, result or summary opens it by `opened`, and decodes its
+bytes inside `decoded`. Neither ever unpickles.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def read_bytes(file: Path, *, most: int = SMALL, source: str = "", links: bool =
     """The content of an ordinary file; see `opened`.
 
     Raises:
-        UserError: it cannot be had.
+        UserError: it cannot be read.
     """
     source = source or str(file)
     with opened(file, most=most, source=source, links=links) as stream, decoded(source, "a file that can be read"):
@@ -129,7 +129,7 @@ def read_text(file: Path, *, most: int = SMALL, source: str = "", links: bool = 
     """The content of an ordinary file of UTF-8 text, without a byte order mark.
 
     Raises:
-        UserError: it cannot be had, or is no such text.
+        UserError: it cannot be read, or is no such text.
     """
     content = read_bytes(file, most=most, source=source, links=links)
     with decoded(source or str(file), "UTF-8 text"):
@@ -140,7 +140,7 @@ def read_json(file: Path, *, most: int = SMALL, source: str = "") -> Any:
     """The content of a file of JSON; see `parse_json`.
 
     Raises:
-        UserError: it cannot be had, or is no JSON within bounds.
+        UserError: it cannot be read, or is no JSON within bounds.
     """
     return parse_json(read_text(file, most=most, source=source), source or str(file))
 
@@ -149,7 +149,7 @@ def read_object(file: Path, *, most: int = SMALL, source: str = "") -> dict[str,
     """The JSON object in a file.
 
     Raises:
-        UserError: it cannot be had, or is something else.
+        UserError: it cannot be read, or is something else.
     """
     content = read_json(file, most=most, source=source)
     if not isinstance(content, dict):

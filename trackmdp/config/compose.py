@@ -65,7 +65,7 @@ def compose(command: str, overrides: Mapping[str, Any] | None = None, *, folder:
 
 
 class Default:
-    """Stands in a signature for a value of `conf/`, which is not written down a second time, and is shown by `help`.
+    """A default in a signature that is taken from `conf/`, where it is stated once; `help` shows its value.
 
     Args:
         key: the option, by its dotted name.

@@ -1,4 +1,4 @@
-"""What is said about a name or a value that is not allowed: one line, the same from Python and at the terminal."""
+"""Messages about names and values that are not allowed: one line, the same from Python and at the terminal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `conf/` calls by ``${name:...}``."""
+"""The OmegaConf resolvers that `conf/` uses, ``${name:...}``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["register_resolvers"]
 
 
 def register_resolvers() -> None:
-    """Make known what `conf/` calls by `${first:a,b}` and `${per_cell:count,size}`."""
+    """Register `${first:a,b}` and `${per_cell:count,size}`."""
     # replace=True: resolvers are global to the process, and a second composing would otherwise fail on the first name.
     OmegaConf.register_new_resolver("first", _first_given, replace=True)
     OmegaConf.register_new_resolver("per_cell", _per_cell, replace=True)

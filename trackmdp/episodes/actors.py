@@ -1,4 +1,4 @@
-"""How whatever acts is stepped: what it decides in a batch of states, as a function of state and draws.
+"""Actors: the decisions of a policy, playback or function in a batch of states, given the uniform draws.
 
 A step asks three things of a decision: whether the sensor where the target turns up is on, how many sensors are on, and
 what they cost. A table answers them from one row per state, so that a step costs the same on any grid; whatever else

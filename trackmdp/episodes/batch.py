@@ -1,4 +1,4 @@
-"""Simulated episodes held together: their steps as a few columns, from which an episode is made when asked for."""
+"""Simulated episodes as a few columns with the steps of all; an `Episode` is made from them on request."""
 
 from __future__ import annotations
 

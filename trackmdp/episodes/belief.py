@@ -1,4 +1,4 @@
-"""The belief along recorded episodes, worked out afterwards, for whoever shows or logs it."""
+"""The belief along episodes, computed after the simulation, for displays and logs."""
 
 from __future__ import annotations
 

@@ -30,8 +30,8 @@ class EpisodeLog:
         seed: seed of the run, from which each episode's own derives.
         config: text of the run's `config.yaml`.
         layout: write a viewer's layout next to the log.
-        policies: go on after so many policies of the log of an earlier process, what it wrote later being cut off; None
-            for a log of its own.
+        policies: resume the log of an earlier process after its first `policies` policies, and drop what it wrote later;
+            None to begin a new log.
         command: named where it is said, on standard error, that logging is over.
     """
 
@@ -67,7 +67,7 @@ class EpisodeLog:
         return 0 if self._writer is None else self._writer.policies
 
     def _take_over(self, policies: int) -> None:
-        """Go on with the log of an earlier process, which was killed (`.part`) or ended in order."""
+        """Resume the log of an earlier process, which was killed (`.part`) or ended in order."""
         part = self.file.with_name(f"{self.file.name}.part")
         earlier = self.file.with_name(f"{self.file.name}.earlier")
         written = part if part.exists() else self.file

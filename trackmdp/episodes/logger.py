@@ -60,5 +60,5 @@ class EpisodeLogger(Callback):
         return {"policies": self._log.policies}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Keep so many policies of the log."""
+        """Resume the log after the policies it held when the state was taken."""
         self._policies = state["policies"]

@@ -1,4 +1,4 @@
-"""Simulating episodes: many at once, each from its own generators, so that any of them can be simulated again alone.
+"""Simulating episodes in batches, each from its own generators, so that any one can be simulated again by itself.
 
 The log, the web page, the picture and the simulated figures of an evaluation are all made of what this module returns.
 """

@@ -17,7 +17,7 @@ __all__ = ["Source", "source_of"]
 
 
 class Source(Protocol):
-    """The targets of a problem; a place `[B]` int64 says all there is to know of where they are."""
+    """The targets of a problem; a place, int64, is the full state of a target."""
 
     def start(self, generators: Sequence[torch.Generator]) -> Tensor:
         """`[B]` places in which the targets start, one draw from each generator."""
@@ -36,7 +36,7 @@ class Source(Protocol):
         ...
 
     def stops(self, place: Tensor) -> Tensor:
-        """`[B]` bool, whether nothing is known of the target from here on."""
+        """`[B]` bool, whether the recording stops here with the target still in the grid."""
         ...
 
 

@@ -1,4 +1,4 @@
-"""Writing a log: whole episodes one after another, each safe once `add` has returned a hundred steps later."""
+"""Writing a log, episode by episode; after each `add` fewer than `FLUSH_STEPS` steps would be lost by a kill."""
 
 from __future__ import annotations
 

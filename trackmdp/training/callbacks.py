@@ -1,4 +1,4 @@
-"""What can be hooked into a training run: its logs, checkpoints and display are callbacks, and so may be the user's."""
+"""Callbacks of a training run: its logs, checkpoints and display are made of them, and users may add their own."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Training(Protocol):
         """Iterations of the whole run."""
 
     def due(self, every: int) -> bool:
-        """Whether something is to be done after this iteration that is done every so many, and at the end."""
+        """Whether this iteration is a multiple of `every`, or the last one."""
 
     def policy(self) -> Policy:
         """The policy as it is now."""

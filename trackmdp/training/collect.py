@@ -102,7 +102,7 @@ def _env_options(cfg: CollectorConfig, seed: int) -> dict[str, Any]:
 
 
 def _common(cfg: CollectorConfig, device: torch.device, done: int) -> dict[str, Any]:
-    """What TorchRL's collectors are given alike.
+    """The arguments that all of TorchRL's collectors are given.
 
     With these flags, and the environment's own `_step_and_maybe_reset`, they are as fast as a loop by hand.
     """
@@ -162,7 +162,7 @@ def collector_state(collector: BaseCollector) -> dict[str, Any] | None:
 
 
 def load_collector_state(collector: Collector, state: dict[str, Any]) -> None:
-    """Go on where `collector_state` was taken; call before the first batch."""
+    """Resume from a `collector_state`; call before the first batch."""
     rows = TensorDict.from_dict(state["carrier"], batch_size=collector._carrier.batch_size)
     # An emptied copy keeps batch size and device, and has only the keys that were saved.
     collector._carrier = collector._carrier.empty().update(rows)

@@ -1,4 +1,4 @@
-"""What a long run shows: a progress bar at a terminal, plain lines when piped, nothing when quiet."""
+"""The display of a long run: a progress bar at a terminal, plain lines when piped, nothing when quiet."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a sweep's folder says of its runs, while they run and after."""
+"""The state of a sweep's runs, read from its folder while they run and afterwards."""
 
 from __future__ import annotations
 

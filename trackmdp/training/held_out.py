@@ -57,7 +57,7 @@ class HeldOutEvaluator(Evaluator):
         return replay(self.world, self.tracks, policy).intervals()
 
     def references(self) -> dict[str, PolicyTable]:
-        """The policies to hold a learned one against, by their names in tables."""
+        """The policies that a learned one is compared with, by their names in tables."""
         task = self.world
         kernel = estimated_kernel(task.tracks, task.size)
         world = World(kernel, task.size, cost=task.cost, safe_cost=task.safe_cost, t_max=task.t_max, reward=task.reward)

@@ -1,4 +1,4 @@
-"""What a run takes in, as its folder keeps it: `config.yaml`, and `kernel.npz` or `tracks.json`."""
+"""The inputs of a run, as its folder keeps them: `config.yaml`, and `kernel.npz` or `tracks.json`."""
 
 from __future__ import annotations
 

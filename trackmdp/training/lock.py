@@ -31,7 +31,7 @@ _SETTLE = 0.2
 
 @contextmanager
 def locked(folder: Path, key: str = "hydra.run.dir") -> Iterator[None]:
-    """Hold the folder that was chosen by `key`; the system lets go of it when the process ends, however it ends.
+    """Lock the folder, which the option `key` names; the system releases the lock when the process ends, in any way.
 
     Where the file system has no locks, a file names the owner and is touched every few seconds. Where nothing else was
     written, the lock's files are gone afterwards as well.
@@ -77,7 +77,7 @@ def is_locked(folder: Path) -> bool:
 
 
 def _take(descriptor: int, file: Path) -> bool | None:
-    """Whether the lock could be had, None where there are no locks; who only looks at it holds it for an instant."""
+    """True if the lock was taken, False if another process holds it, None where the file system has no locks."""
     # More than once: `is_locked` of somebody who watches holds the file for an instant.
     for _ in range(_TRIES):
         try:
@@ -96,7 +96,7 @@ def _take(descriptor: int, file: Path) -> bool | None:
 
 @contextmanager
 def _owned(folder: Path, key: str) -> Iterator[None]:
-    """Hold the folder by a file that says who does, touched every `_BEAT` seconds."""
+    """Lock the folder by a file that names its owner, and is touched every `_BEAT` seconds."""
     say_lacking(folder, "locks", f"{_OWNER} names the process that runs in it")
     file, token = folder / _OWNER, secrets.token_hex(8)
     if _is_alive(file):

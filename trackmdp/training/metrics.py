@@ -1,4 +1,4 @@
-"""What a run writes of its iterations: `metrics.csv` and TensorBoard events."""
+"""The loggers of training: `metrics.csv` and TensorBoard events."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class CsvLogger(Callback):
         return {"position": self._file.tell()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Keep so many bytes of the file."""
+        """Resume the file at the length it had when the state was taken."""
         self._position = state["position"]
 
 

@@ -1,4 +1,4 @@
-"""What a training run has come to, in memory and in its folder."""
+"""The result of a training run, in memory and in its folder."""
 
 from __future__ import annotations
 

@@ -21,8 +21,8 @@ _ONE = 2.0
 class Signals:
     """While entered, SIGTERM, SIGINT and SIGUSR1 are noted in `received` instead of ending the process.
 
-    A second one of the same kind acts as it did before, Ctrl-C at once, another after two seconds. Outside the main
-    thread signals are not touched.
+    A second signal of the same kind has its former effect: Ctrl-C immediately, the others if they come at least two
+    seconds after the first. Outside the main thread no handler is installed.
     """
 
     def __init__(self) -> None:
@@ -69,7 +69,7 @@ class Signals:
 
 @contextmanager
 def kept_sigterm() -> Iterator[None]:
-    """Afterwards SIGTERM acts as before, though what is done inside takes it over, as Ray does when it starts."""
+    """Restore the handler of SIGTERM at the end, whatever the body installs (Ray installs one when it starts)."""
     # Ray installs a handler of its own, which exits: the run would end without its checkpoint.
     before = signal.getsignal(signal.SIGTERM)
     try:

@@ -1,4 +1,4 @@
-"""What a training run says of itself at its end: the content of `summary.json`."""
+"""The content of `summary.json`, made at the end of a training run."""
 
 from __future__ import annotations
 

@@ -87,7 +87,7 @@ class Trainer:
         return self.algorithm.iterations
 
     def due(self, every: int) -> bool:
-        """Whether something is to be done after this iteration that is done every so many, and at the end."""
+        """Whether this iteration is a multiple of `every`, or the last one."""
         return self.position.iteration == self.iterations or self.position.iteration % every == 0
 
     def policy(self) -> Policy:

@@ -15,7 +15,7 @@ __all__ = ["Watch"]
 
 
 class Watch:
-    """While entered, the end of a worker process of `collector` breaks off what waits for it.
+    """While entered, the end of a worker process of `collector` interrupts the call that waits for it.
 
     TorchRL looks for dead workers where it waits for a batch, but waits for ever where one should acknowledge new
     weights. Here SIGCHLD interrupts the wait. Outside the main thread, and without workers, nothing is done.
