@@ -64,7 +64,7 @@ def _run_once(compose: Composer) -> int:
 def _run_in_hydra(cfg: DictConfig, ready: Prepared) -> None:
     """Run with what Hydra's own settings ask for: logging, environment, current folder, `.hydra`."""
     configure_log(cfg.hydra.hydra_logging, cfg.hydra.verbose)
-    # Made absolute here, while the current folder is still the one that relative names are meant from:
+    # Absolute, from the current folder of now:
     task = _Task(replace(ready, folder=ready.folder.absolute()))  # hydra.job.chdir moves the current folder
     loader = GlobalHydra.instance().config_loader()
     # Hydra's public call below its command line: it makes `.hydra`, changes folder and sets the environment, as a user

@@ -110,7 +110,7 @@ def _relative(folder: Path, name: str) -> str:
 
 def _natural(name: str) -> list[tuple[int, str]]:
     """Sort key of a path: parts that are numbers by value, all others by text."""
-    # Not `isdigit`: a raised two is a digit to it, which int() refuses. 18 digits: int() of thousands is refused as well.
+    # Not `isdigit`: a raised two is a digit to it, which int() refuses, as it does thousands of digits.
     return [(int(part), "") if re.fullmatch(r"[0-9]{1,18}", part) else (-1, part) for part in name.split("/")]
 
 

@@ -141,7 +141,8 @@ def _tiles(axes: Axes, on: BoolArray, possible: BoolArray, size: tuple[int, int]
 
     Args:
         axes: where.
-        on, possible: `[M, M]`, row x for the target located in x: sensors on, cells it can be in.
+        on: `[M, M]`, row x: sensors on with the target located in x.
+        possible: `[M, M]`, row x: cells it can be in.
         size: rows and columns of the grid.
         reach: cells shown on each side of the located one, at least; more where possible cells are farther away.
     """

@@ -147,7 +147,7 @@ def _plain(value: Cell) -> Any:
 
 def _no_formula(text: str) -> str:
     """The text of a cell that a spreadsheet shows and does not compute, whatever somebody called a folder."""
-    # With an apostrophe before it, a spreadsheet takes it for text. Folders and options are named by whoever made the sweep.
+    # With an apostrophe before it, a spreadsheet takes it for text.
     return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text
 
 
