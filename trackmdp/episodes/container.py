@@ -185,7 +185,7 @@ class Container:
         """The content of the attachment `name`, its checksum checked."""
         if name not in self.attachments:
             raise Damaged(f"no attachment {name}")
-        # The name once more, in the record: an index with two offsets exchanged has a correct checksum, too.
+        # The name once more, in the record: an index made with two offsets exchanged has a correct checksum as well.
         found, content = attachment_of(self._record(ATTACHMENT, *self.attachments[name]))
         if found != name:
             raise Damaged(f"attachment {name}")

@@ -147,6 +147,7 @@ def last_cells(start: int, target: Integers, located: BoolArray) -> Integers:
     With detections at steps 1 and 3 of five, `latest` before each step is -1 -1 1 1 3.
     """
     found = np.where(located, np.arange(len(target)), -1)
+    # Shifted by one: a detection is known from the next step on.
     latest = np.concatenate([[-1], np.maximum.accumulate(found)[:-1]])
     return np.where(latest < 0, start, target[latest])
 
@@ -188,6 +189,7 @@ def _differing(logged: Episode, again: Episode, name: str, steps: int, tolerance
     """The first step at which the arrays called `name` differ, and how."""
     mine, other = getattr(logged, name)[:steps], getattr(again, name)[:steps]
     differs = mine != other
+    # Without a tolerance `!=`, which also tells apart what subtraction would not: a nan on one side.
     if name == "belief" and tolerance:
         differs = np.abs(mine - other) > tolerance
     if not differs.any():

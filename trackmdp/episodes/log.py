@@ -30,8 +30,8 @@ class EpisodeLog:
         seed: seed of the run, from which each episode's own derives.
         config: text of the run's `config.yaml`.
         layout: write a viewer's layout next to the log.
-        policies: resume the log of an earlier process after its first `policies` policies, and drop what it wrote later;
-            None to begin a new log.
+        policies: resume the log of an earlier process after so many of its policies, and drop what it wrote later; None
+            to begin a new log.
         command: named where it is said, on standard error, that logging is over.
     """
 

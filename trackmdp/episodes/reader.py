@@ -51,6 +51,7 @@ class EpisodeReader:
         try:
             self._open()
         except BaseException:
+            # A constructor that raises leaves nobody to close the file.
             self.close()
             raise
 
@@ -64,10 +65,12 @@ class EpisodeReader:
         if container.made_by != f"trackmdp {self.run['trackmdp']}":
             raise self._damage("the header")
         if schema.END not in container.metadata:
+            # Written last: without it the log was finished by another program, or a part was cut out.
             raise self._damage(f"no metadata {schema.END}")
         self.end = self._checked(self._told, schema.END)
         index = self.attachment("episodes.json", self.end.get("episodes.json.sha256", ""))
         self._checked(self._index, index)
+        # Short episodes share a chunk: read one after another, the chunk is decompressed once.
         self._held: tuple[int, list[Message]] = (-1, [])
 
     def _index(self, index: bytes) -> None:
@@ -145,6 +148,7 @@ class EpisodeReader:
         mine: dict[str, list[bytes]] = {"/step": [], "/grid": [], "/episode": []}
         for message in self._checked(self._between, begin, end):
             mine.setdefault(message.topic, []).append(message.data)
+        # The index at the end and the message at the episode's own place say the same, or one of them was changed.
         if self._checked(lambda: [json.loads(text) for text in mine["/episode"]]) != [row]:
             raise self._damage(f"episode {number} is not what the index says")
         size = limits.size_of_grid(self.run)
@@ -193,7 +197,7 @@ class EpisodeReader:
 
     def world(self) -> World:
         """The world in which the episodes were recorded."""
-        # Kept: the kernel of a large grid takes longer to build than an episode to read.
+        # Kept, since every episode that becomes a TensorDict needs it.
         if self._built is None:
             self._built = self._checked(self._world)
         return self._built

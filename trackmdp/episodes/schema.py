@@ -33,7 +33,7 @@ RUN, POLICY, END = "trackmdp.run", "trackmdp.policy", "trackmdp.end"
 """Names of the metadata records; a policy's is followed by its number."""
 
 TICK_NS = 100_000_000
-# 10^9 s after 1970, a day in September 2001: a fixed date that every viewer can show.
+# 10^9 s after 1970, a day in September 2001: a fixed date, the same in every log.
 _BASE_NS = 1_000_000_000 * 1_000_000_000
 GAP = 10
 """Ticks between the last step of an episode and the first of the next."""
