@@ -189,7 +189,6 @@ def _differing(logged: Episode, again: Episode, name: str, steps: int, tolerance
     """The first step at which the arrays called `name` differ, and how."""
     mine, other = getattr(logged, name)[:steps], getattr(again, name)[:steps]
     differs = mine != other
-    # Without a tolerance `!=`, which also tells apart what subtraction would not: a nan on one side.
     if name == "belief" and tolerance:
         differs = np.abs(mine - other) > tolerance
     if not differs.any():
