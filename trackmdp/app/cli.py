@@ -31,7 +31,7 @@ _OF_FILES = {
     getattr(errno, name)
     for name in ("EACCES", "EDQUOT", "EISDIR", "ELOOP", "ENAMETOOLONG", "ENOSPC", "ENOTDIR", "EPERM", "EROFS")
 }
-"""What the file system refuses, whoever wrote the code: its own words are enough."""
+"""Errors of the file system that are reported by the file's name and the system's message, without a traceback."""
 
 
 def main(argv: list[str] | None = None) -> int:

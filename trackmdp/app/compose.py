@@ -39,7 +39,7 @@ _HYDRAS_OWN = {
     "max_batch_size": None,
     "params": None,
 }
-"""What stands under `hydra.sweeper` where a primary config chooses none; it is never called."""
+"""Hydra's default under `hydra.sweeper`, where a primary config chooses no sweeper; this package never calls it."""
 
 
 def register() -> None:
@@ -135,7 +135,7 @@ class Composer:
 
 
 def run_words(words: Iterable[str]) -> list[str]:
-    """The words that say something of the runs, not of Hydra."""
+    """The overrides of the command's own config, without those of Hydra (`hydra.x=...`, `hydra/x=...`)."""
     return [word for word in words if not word.lstrip("+~").startswith(("hydra.", "hydra/"))]
 
 

@@ -98,13 +98,13 @@ def _bad_choice(override: Override, group: str, error: Exception) -> UserError |
 
 
 def _is_choice(override: Override, command: str) -> bool:
-    """Whether a word chooses an experiment, or where and how a sweep is run: one, from the files that are there."""
+    """Whether a word chooses an experiment, a launcher or a sweeper: exactly one, by the name of a file."""
     key = override.key_or_group
     return key.startswith("hydra/") or (key == "experiment" and command == "train")
 
 
 def _bad_file(override: Override, error: Exception) -> UserError | None:
-    """The refusal of a choice that is not there, or of several."""
+    """The refusal of a choice that does not exist, or of several where one is expected; None if it is right."""
     key, values = override.key_or_group, _values(override)
     if len(values) > 1:
         return UserError(f"{override.input_line}: expected one {key.split('/')[-1]}")
@@ -162,7 +162,7 @@ def _bad_value(override: Override, known: dict[str, Option]) -> UserError | None
 
 
 def _unknown(override: Override, known: dict[str, Option]) -> UserError:
-    """The refusal of a key that does not exist, naming those that stand beside it."""
+    """The refusal of a key that does not exist, with the keys that do."""
     key = override.key_or_group
     if inner := [name for name in known if name.startswith(f"{key}.")]:
         return UserError(f"{override.input_line}: expected {inner[0]}=value (known: {', '.join(inner)})")
@@ -182,7 +182,7 @@ def _shown(value: Any) -> Any:
 
 
 def _plain(error: Exception) -> str:
-    """What an error and its cause say, in one line."""
+    """The messages of an error and its cause in one line, without repetitions and hints on Hydra's syntax."""
     # Hydra wraps OmegaConf's error, and each says a part: where, and what.
     said = [str(each).strip() for each in (error, error.__cause__) if each is not None]
     lines = [line.strip(" .:") for text in said for line in text.splitlines()[:2]]

@@ -62,9 +62,8 @@ def _run_once(compose: Composer) -> int:
 
 
 def _run_in_hydra(cfg: DictConfig, ready: Prepared) -> None:
-    """Run with what Hydra's own settings ask for: logging, environment, current folder, `.hydra`."""
+    """Run under Hydra's own settings: logging, environment variables, current folder, the folder `.hydra`."""
     configure_log(cfg.hydra.hydra_logging, cfg.hydra.verbose)
-    # Absolute, from the current folder of now:
     task = _Task(replace(ready, folder=ready.folder.absolute()))  # hydra.job.chdir moves the current folder
     loader = GlobalHydra.instance().config_loader()
     # Hydra's public call below its command line: it makes `.hydra`, changes folder and sets the environment, as a user
@@ -137,7 +136,7 @@ def _sweep(compose: Composer) -> int:
 
 
 def _has_values(word: str) -> bool:
-    """Whether a word has several values; those are left to the runs.
+    """Whether a word gives an option several values, as ``seed=0,1`` does.
 
     Raises:
         UserError: it asks for several values of Hydra's own settings, of which a sweep has one.
@@ -152,7 +151,7 @@ def _has_values(word: str) -> bool:
 
 
 def _batches(compose: Composer, sweeper: SweeperConfig, words: Sequence[str], folder: Path) -> Iterable[Sequence[Job]]:
-    """The jobs of a sweep: all at once, or as a search asks for them."""
+    """Batches of jobs: one batch with the whole grid, or the batches that a search asks for."""
     from trackmdp.app.sweep.plan import combinations, plan
 
     if isinstance(sweeper, BlocksConfig):

@@ -1,4 +1,4 @@
-"""Output folders: made when all is checked, gone again when nothing was written."""
+"""Output folders: made once everything is checked, removed again if nothing was written to them."""
 
 from __future__ import annotations
 

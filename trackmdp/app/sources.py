@@ -1,4 +1,4 @@
-"""Where Hydra finds configs: `conf/`, installed plugins, and the user's folders, which are read as data and no more."""
+"""Hydra's search path: `conf/`, folders of installed plugins, and the user's folders, whose files are read as data."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ class UserFolder(ConfigSource):
 
 
 def _refuse_settings(config: DictConfig, package: str, file: Path) -> None:
-    """Refuse what `_FORBIDDEN` names, wherever the file's package puts its keys."""
+    """Refuse a file that sets a key of `_FORBIDDEN`, taking its `# @package` header into account."""
     # A file with `# @package hydra.job` that says `env_set: {...}` sets hydra.job.env_set without ever naming it.
     prefix = [] if package in ("", "_global_") else package.split(".")
     plain = OmegaConf.to_container(config, resolve=False)

@@ -1,4 +1,4 @@
-"""What the paper leaves open about its worlds: kernels chosen by one rule, and how much the rest would change.
+"""The paper's unstated settings: its kernels, chosen by one rule, and the effect of border rule and T_max.
 
 The kernels are chosen by Q_MDP's exact accuracy against the printed column alone, never by what a learned policy does.
 """

@@ -1,4 +1,4 @@
-"""Where the paper is silent, loose or wrong, with the figures that say so."""
+"""Points where the paper is silent, loose or wrong, each with computed figures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a report computes of the paper's open settings, kept with the results: `paper.json`."""
+"""Computed figures on the paper's unstated settings, stored beside the results as `paper.json`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two remarks of the paper on worlds of its own: where Q_MDP is optimal, and where its bound is none."""
+"""Two remarks of the paper, checked on one world each: Q_MDP is optimal at c = 0.14, and a policy exceeds its printed bound."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The part of a report on what the paper leaves open: which kernels were chosen, and how much hangs on it."""
+"""Figures and tables on the paper's unstated settings: the kernels chosen, and the sensitivity of the results."""
 
 from __future__ import annotations
 

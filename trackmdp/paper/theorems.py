@@ -101,7 +101,7 @@ def check_theorems(world: World, solution: Solution, tolerance: float) -> Iterat
 
 
 def summarize_checks(found: Sequence[Check]) -> str:
-    """How many claims came out how, in one line; forms that are not claimed are not among them."""
+    """The number of claims by verdict, in one line; forms that are not claimed are counted apart."""
     claims = [check.verdict for check in found if check.expected]
     counts = {verdict: claims.count(verdict) for verdict in ("holds", "no case", "open", "FAILS")}
     words = {"holds": "hold", "no case": "have no case in this world", "open": "are open", "FAILS": "FAIL"}

@@ -1,4 +1,4 @@
-"""One finished run as its folder holds it: its options, its figures and its learning curve, or why there is none."""
+"""Read a finished run from its folder: options, figures and learning curve, or the reason why that is not possible."""
 
 from __future__ import annotations
 
@@ -80,7 +80,11 @@ def flatten(plain: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _check_settings(settings: Mapping[str, Any]) -> None:
-    """See that what runs are grouped by is there and of its kind; the rest is shown as it is."""
+    """Check presence and types of the options that runs are grouped by; all others are only shown.
+
+    Raises:
+        Exception: one is missing or of another type; call it inside `untrusted.decoded`.
+    """
     for key in ("algo.name", "kernel.name"):
         if not isinstance(settings[key], str):
             raise TypeError(f"{key}: expected a name")
@@ -90,7 +94,11 @@ def _check_settings(settings: Mapping[str, Any]) -> None:
 
 
 def _check_origin(summary: Mapping[str, Any]) -> None:
-    """See that the versions and the machine are flat: they are counted, and shown."""
+    """Check that versions and machine are flat mappings: they are counted and shown.
+
+    Raises:
+        Exception: they are not; call it inside `untrusted.decoded`.
+    """
     for key in ("versions", "machine"):
         said = summary.get(key, {})
         if not isinstance(said, Mapping) or any(isinstance(value, (Mapping, list)) for value in said.values()):

@@ -31,7 +31,7 @@ from trackmdp.world.model import grid_size
 __all__ = ["gather_runs", "planned", "run_folders"]
 
 _LONGEST = 4096
-"""Letters of a path."""
+"""Characters of the longest path of a plan that is looked at."""
 
 
 def gather_runs(folder: Path) -> Results:

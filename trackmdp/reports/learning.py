@@ -1,4 +1,4 @@
-"""How the policies got there: regret while learning, and the share of runs that come close."""
+"""Learning curves and performance profiles."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A report: figures and tables made from stored results, and the page that shows them."""
+"""A report: the figures and tables of stored results, and the HTML page with them."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ LARGEST = 2**28
 
 # A sweep may come from elsewhere, and its folders and options are named by whoever made it.
 _FORMULA = ('"', "=", "+", "-", "@", "\t", "\r")
-"""What a spreadsheet would compute stands in quotes, and so does what begins with one."""
+"""A spreadsheet computes a cell that begins so: such names are quoted, as are those that begin with a quote."""
 
 FIGURES = (
     "frames",

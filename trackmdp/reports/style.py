@@ -1,4 +1,4 @@
-"""How figures look and how they are written: the same bytes each time, readable small, in light and in dark."""
+"""Style and output of figures: reproducible bytes, legible at phone width, colours for light and dark schemes."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ __all__ = [
 ]
 
 Say: TypeAlias = Callable[[str], None]
-"""Told in a few words what is under way."""
+"""Receives short progress messages."""
 
 WIDTH = 4.3
 """Inches; as wide as a phone, so that letters keep their size there."""
@@ -123,7 +123,7 @@ def require_matplotlib() -> None:
 
 
 def look_of(label: str, place: int) -> Look:
-    """How a method is drawn: by its algorithm, or where its label says more, by its place."""
+    """The look of a label: its own in `LOOKS`, else the `place`-th of a list of further ones."""
     return LOOKS.get(label) or _MORE[place % len(_MORE)]
 
 

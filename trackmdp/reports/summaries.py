@@ -1,4 +1,4 @@
-"""Tables of what came out: each method over all worlds, each world and method, every run, and what is missing."""
+"""Tables of results: by method, by world and method, by run, and of missing runs."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ __all__ = ["Cell", "Column", "Table"]
 Cell: TypeAlias = "float | int | str | bool | None"
 
 LONG = 60
-"""Letters of a cell that may be broken over lines."""
+"""A cell of more characters than this may be broken over lines."""
 _LATEX = {
     "\\": r"\textbackslash{}",
     "{": r"\{",

@@ -1,4 +1,4 @@
-"""All runs of a sweep at the terminal while they run, from what they leave on the disk."""
+"""Progress of all runs of a sweep at the terminal, read from their folders while they run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Logging episodes: what a step costs in time and in bytes, to write and to read."""
+"""Time and bytes per step of logging episodes, written and read."""
 
 from __future__ import annotations
 

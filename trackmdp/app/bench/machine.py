@@ -1,4 +1,4 @@
-"""How long to measure."""
+"""Rates and CPU time of repeated work, measured for a given time."""
 
 from __future__ import annotations
 

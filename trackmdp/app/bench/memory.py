@@ -1,4 +1,4 @@
-"""What training takes of the memory, beside what it was expected to take."""
+"""Peak memory of training, beside the estimate that is checked before a run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Beside ours what a user would pick instead: training scripts of others, in the same world and on the same core."""
+"""Other projects' training scripts against this package's learner, in the same world and on the same core."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ GOAL = 0.02
 
 @dataclass(frozen=True)
 class Learned:
-    """A learner's way: `curve` holds seconds since its process began, env steps, and regret per step."""
+    """One training run: `curve` holds (seconds since its process began, env steps, regret per step)."""
 
     learner: str
     seed: int

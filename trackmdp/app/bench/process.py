@@ -1,4 +1,4 @@
-"""A program measured as a whole: from its start to its end, with the memory it took."""
+"""Wall time, CPU time and peak memory of a whole program, from its start to its end."""
 
 from __future__ import annotations
 

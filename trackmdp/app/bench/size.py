@@ -1,4 +1,4 @@
-"""What a world costs by its size: to solve, to train in and to step, each in a process of its own."""
+"""Time and memory by grid size: solving, training and stepping, each in a process of its own."""
 
 from __future__ import annotations
 

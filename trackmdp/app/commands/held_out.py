@@ -1,4 +1,4 @@
-"""What is said and written of a policy that is evaluated on held-out tracks."""
+"""Evaluation of a policy on held-out tracks: its files and its table at the terminal."""
 
 from __future__ import annotations
 

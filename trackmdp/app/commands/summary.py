@@ -1,4 +1,4 @@
-"""A finished run at the terminal: its policy beside what there is to hold it against."""
+"""The table of a finished run at the terminal: its policy beside the references."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run has learned, from one of its checkpoints."""
+"""The policy of a run, loaded from one of its checkpoints."""
 
 from __future__ import annotations
 

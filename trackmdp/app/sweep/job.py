@@ -31,7 +31,7 @@ _PATIENCE = 60.0
 
 
 def run_job(job: Job) -> None:
-    """Run `job`, unless the sweep has been asked to stop; what comes of it stands in the run's folder."""
+    """Run `job`, unless the sweep has been asked to stop; its result or failure is written to the run's folder."""
     if stop_signal(job.sweep):
         return
     job.folder.mkdir(parents=True, exist_ok=True)

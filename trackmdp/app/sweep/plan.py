@@ -91,7 +91,7 @@ def plan(
     compose: Callable[[Sequence[str]], DictConfig],
     naming: Collection[str] = (),
 ) -> list[Job]:
-    """The jobs of a sweep, those that come out the same only once.
+    """The jobs of a sweep, without duplicates.
 
     A run's folder is named by what differs from the others, and by a digest of what was overridden and of the
     config behind it. What may change when a run is resumed (`CHANGEABLE`) counts only where it was overridden.
@@ -166,7 +166,7 @@ def _slug(words: Iterable[str], prefix: Sequence[str] = ()) -> str:
 
 
 def _short(value: str) -> str:
-    """A number of many digits in a few; the digest tells it from others."""
+    """A value, rounded to 4 digits if it is a long number: names need not be exact, digests tell runs apart."""
     return f"{float(value):.4g}" if re.fullmatch(r"-?\d*\.\d{5,}(e-?\d+)?", value) else value
 
 
@@ -180,7 +180,7 @@ def _digest(*told: Any) -> str:
 
 
 def _identity(cfg: CommandConfig | None) -> dict[str, Any]:
-    """What makes a config another one."""
+    """The options by which two configs count as different runs; empty for a config that was refused."""
     if cfg is None:
         return {}
     plain = to_dict(cfg)

@@ -33,7 +33,7 @@ _ROUNDS = 3
 def sweep(
     folder: Path, command: str, line: str, batches: Iterable[Sequence[Job]], launch: Launch, console: Console
 ) -> int:
-    """RunState what is not finished, and show what came of all; returns the exit status.
+    """Run the jobs that are not finished, and show the results of all; returns the exit status.
 
     Args:
         folder: of the sweep.

@@ -1,4 +1,4 @@
-"""What a sweep came to: a table at the terminal, and `runs.csv`."""
+"""Results of a sweep: a table at the terminal, and `runs.csv`."""
 
 from __future__ import annotations
 

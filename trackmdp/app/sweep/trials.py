@@ -113,7 +113,10 @@ def _suggest(trial: Any, key: str, override: Override) -> Any:
 
 
 def _tell(cfg: OptunaConfig, study: Any, trial: Any, job: Job) -> int:
-    """Hand over what came of a job; 1 if it failed. One that was interrupted is asked for again by the next call."""
+    """Report the result of a job to the study; returns 1 if it failed.
+
+    An interrupted one stays open, and is enqueued again by the next call.
+    """
     run = run_of(job.folder)
     value = run_figures(run).get(cfg.objective) if run.state == "done" else None
     if value is not None:
