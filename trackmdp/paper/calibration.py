@@ -25,7 +25,7 @@ SEEDS = range(100)
 # paper cannot have used it; it is kept to show how far the figures move.
 BORDERS: tuple[Border, ...] = ("renormalize", "clip", "inside", "exit")
 HORIZONS = (0, 1, 2)
-# Fewer than SEEDS: each is valued in 4 borders x 3 horizons x 12 pairs, where one median needs no more.
+# Fewer than SEEDS, since each is valued with 4 border rules, 3 values of T_max and 12 pairs.
 DRAWS = range(30)
 
 
@@ -111,8 +111,8 @@ def _candidate(support_size: int, seed: int, border: Border, t_max: int) -> Cand
 
 def _deviation(support_size: int, accuracy: Iterable[float]) -> float:
     printed = [PRINTED_QMDP[support_size, cost] for cost in COSTS]
-    # The largest of the four, not their mean: Z = 5 has one low entry (54.3 at c = 0.22), which a mean would trade
-    # away.
+    # The largest of the four, not their mean, which could trade a poor fit at c = 0.22 (54.3 for Z = 5) for good ones
+    # elsewhere.
     return max(abs(mine - theirs) for mine, theirs in zip(accuracy, printed, strict=True))
 
 

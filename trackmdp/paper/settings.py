@@ -149,8 +149,8 @@ def _bars(axes: Axes, support_size: int, y: Array, spreads: Sequence[Spread]) ->
     """Median and range, one row each."""
     style = COLOURS[support_size]
     middle, low, high = (np.array([getattr(spread, part) for spread in spreads]) for part in ("median", "low", "high"))
-    # `[2, settings]`, lengths below and above the median. The range and no interval: draws are all there is, not a
-    # sample.
+    # `[2, settings]`, lengths below and above the median. The range, not a confidence interval: how far the draw of
+    # the kernel moves a figure.
     bars = np.stack([middle - low, high - middle])
     axes.errorbar(
         middle,

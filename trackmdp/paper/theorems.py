@@ -193,7 +193,8 @@ def _as_pomdp(world: World) -> Iterator[Check]:
     # Every set is an action: 2^9 = 512 per belief state at most. `changed` without changes drops `max_steps` and the
     # window.
     own = changed(world) if world.num_cells <= MOST_CELLS and world.t_max <= 1 else corner(world)
-    # At the paper's prices a miss is so rare that a wrong clock would hardly show; hence once more where misses pay.
+    # At low prices little is missed, and a wrong treatment of misses would hardly show; hence also at prices where
+    # misses pay.
     for small, prices in ((own, "its own prices"), (dearer(own), "prices at which the safe action is used")):
         try:
             beliefs = pomdp.solve(small, most_beliefs=MOST_BELIEFS)
@@ -232,7 +233,8 @@ def corner(world: World) -> World:
 
 def dearer(world: World) -> World:
     """The world with sensors a little dearer than the likeliest move is worth, so that misses and the clock count."""
-    # Above r max P nothing is worth sensing right after a detection: misses follow, beliefs spread and the clock runs.
+    # Above r max P no sensor earns its price by the next reward alone: misses happen, beliefs spread and the clock
+    # runs.
     cost = np.maximum(world.cost, 1.05 * world.reward * float(world.kernel.max()))
     return changed(world, cost=cost, safe_cost=max(world.safe_cost, float(cost.sum())))
 

@@ -99,7 +99,8 @@ def _suggest(trial: Any, key: str, override: Override) -> Any:
     value = override.value()
     if isinstance(value, IntervalSweep):
         log = "log" in value.tags
-        # The type of the bounds decides: interval(1,8) gives whole numbers, interval(1.0,8.0) does not.
+        # Hydra gives interval(1,8) bounds that are floats; int(interval(1,8)) has whole ones, and is searched in whole
+        # numbers.
         draw = trial.suggest_int if isinstance(value.start, int) else trial.suggest_float
         return draw(key, value.start, value.end, log=log)
     if isinstance(value, RangeSweep):
