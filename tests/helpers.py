@@ -114,16 +114,16 @@ def worlds(draw: st.DrawFn) -> World:
 def random_state(world: World, rows: int, seed: int) -> TensorDict:
     """States an episode can be in: n misses, and the n actions since the detection."""
     rng = torch.Generator().manual_seed(seed)
-    m, choices = world.num_cells, world.num_choices
+    m, k, choices = world.num_cells, world.num_sensors, world.num_choices
     n = torch.randint(choices + 1, (rows,), generator=rng)
-    history = torch.rand(rows, choices, m, generator=rng) < 0.4
+    history = torch.rand(rows, choices, k, generator=rng) < 0.4
     history &= (torch.arange(choices) < n.unsqueeze(-1)).unsqueeze(-1)
     state = {
         "target": torch.randint(m, (rows,), generator=rng),
         "last_cell": torch.randint(m, (rows,), generator=rng),
         "steps_since_detection": n,
         "action_history": history,
-        "action": torch.rand(rows, m, generator=rng) < 0.4,
+        "action": torch.rand(rows, k, generator=rng) < 0.4,
     }
     return TensorDict(state, [rows])
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from tests.helpers import ALGORITHMS, algorithm, random_state, small_world
-from trackmdp.policies.fixed import ChainPolicy, RandomSubset
+from trackmdp.policies.fixed import RandomSubset
 from trackmdp.policies.policy import Policy
 
 WORLD = small_world(t_max=1)
@@ -28,7 +28,7 @@ FIXED = {
     "all on": Policy.all_on(WORLD),
     "random subset": RandomSubset(9, torch.Generator()),
     "random k": random_k(),
-    "chains": ChainPolicy(np.random.default_rng(0).random((9, 2, 9)) > 0.5),
+    "chains": Policy.from_dense(WORLD, np.random.default_rng(0).random((9, 2, 9)) > 0.5),
 }
 
 

@@ -9,7 +9,7 @@ from torch.nn.functional import one_hot
 
 from tests.helpers import random_state, small_world
 from trackmdp.policies.encoder import RelativeBias, StateEncoder, StateNetwork
-from trackmdp.world.model import World
+from trackmdp.world.model import Task, World
 
 
 def features(world: World, cell: Tensor, n: Tensor, history: Tensor) -> Tensor:
@@ -82,3 +82,32 @@ def test_the_relative_bias_is_shared_by_all_cells_and_ends_at_the_border() -> No
     at.sum().backward()
     assert bias.table.grad is not None
     assert bias.table.grad[1, right] == 6  # the pairs of cells that are so placed
+
+
+def test_the_relative_bias_of_a_large_grid_is_that_of_a_small_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Places worked out state by state, without a table of all pairs of cells."""
+    task = Task((3, 5), cost=0.2, t_max=1)
+    kept = RelativeBias(task)
+    monkeypatch.setattr("trackmdp.policies.encoder._PAIRS", 15 * 15 - 1)
+    computed = RelativeBias(task)
+    assert max(part.numel() for part in computed.buffers()) == 15
+    cell, n = torch.cartesian_prod(torch.arange(15), torch.arange(3)).view(5, 9, 2).unbind(-1)
+    values, probe = torch.randn(3, 5 * 9), torch.randn(5, 9, 15)
+    for bias in (kept, computed):
+        with torch.no_grad():
+            bias.table.copy_(values)
+        (bias(cell, n) * probe).sum().backward()
+    assert torch.equal(computed(cell, n), kept(cell, n))
+    torch.testing.assert_close(computed.table.grad, kept.table.grad)
+
+
+def test_the_relative_bias_of_a_window_is_one_number_per_sensor() -> None:
+    bias = RelativeBias(Task((3, 5), cost=0.2, t_max=1, window=2))
+    assert bias.table.shape == (3, 25)
+    assert not list(bias.buffers())
+    with torch.no_grad():
+        bias.table[1, 13] = 2.0  # one column to the right of the middle, 12
+    seen = bias(torch.tensor([[0, 7], [14, 3]]), torch.tensor([[1, 1], [1, 0]]))
+    expected = torch.zeros(2, 2, 25)
+    expected[[0, 0, 1], [0, 1, 0], 13] = 2.0
+    assert torch.equal(seen, expected)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from tests.helpers import limited, small_world
 from tests.tracks import by_hand, drawn, recorded
-from trackmdp.policies.fixed import ChainPolicy
+from trackmdp.policies.policy import Policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.recorded import ReplayedTracks, replay
@@ -69,7 +69,7 @@ def test_a_recording_that_stops_has_no_exit_step() -> None:
 def in_the_environment(setting: Recorded, chains: BoolArray, max_steps: int | None) -> np.ndarray:
     """`[K, 6]` reward, steps in the grid, detections, sensors, safe actions, length, stepping `TrackEnv`."""
     count = len(setting.tracks)
-    env, policy = TrackEnv(limited(setting, max_steps), count), ChainPolicy(chains)
+    env, policy = TrackEnv(limited(setting, max_steps), count), Policy.from_dense(setting, chains)
     state = env.reset()
     totals, running = torch.zeros(6, count), torch.ones(count, dtype=torch.bool)
     begun = state["point"]

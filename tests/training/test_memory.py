@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -34,10 +35,11 @@ def system(root: Path, free: int, **cgroup: str) -> Path:
 
 
 @pytest.mark.parametrize("prioritized", [True, False])
-@pytest.mark.parametrize("t_max", [0, 2])
-def test_the_replay_buffer_takes_what_was_estimated(prioritized: bool, t_max: int) -> None:
-    world = small_world(size=4, t_max=t_max)
+@pytest.mark.parametrize(("t_max", "window"), [(0, None), (2, None), (2, 1)])
+def test_the_replay_buffer_takes_what_was_estimated(prioritized: bool, t_max: int, window: int | None) -> None:
+    world = replace(small_world(size=4, t_max=t_max), window=window)
     words = ("algo=dqn", "algo.buffer_size=3000", "algo.updates=1", f"algo.prioritized.enabled={prioritized}")
+    words += (f"grid.window={'null' if window is None else window}",)
     cfg = train_config(*words, "algo.batch_size=64", "collector.frames_per_batch=256")
     assert isinstance(cfg.algo, DqnConfig)
     learner = DQN(world.task, cfg.algo, iterations=1, seed=0, device=CPU)

@@ -69,7 +69,13 @@ class LearnedKernel:
         """The task with the `[M, M + 1]` kernel believed."""
         task = self.task
         return World(
-            kernel[:, :-1], task.size, cost=task.cost, safe_cost=task.safe_cost, t_max=task.t_max, reward=task.reward
+            kernel[:, :-1],
+            task.size,
+            cost=task.cost,
+            safe_cost=task.safe_cost,
+            t_max=task.t_max,
+            reward=task.reward,
+            window=task.window,
         )
 
     def _diagnostics(self, plan: PolicyTable) -> dict[str, float]:

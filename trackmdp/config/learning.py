@@ -88,10 +88,6 @@ class ActorCriticConfig(AlgoConfig):
     initial_logit: float = option("actor's output bias at the start", unit="logits", ge=-20, le=20)
     reward_scale: float = option("factor on rewards while learning", gt=0)
 
-    def check(self, key: str, root: Any) -> None:
-        """The networks have an output for every sensor."""
-        refuse_window(self.name, root)
-
     def memory(self, task: Sizes, root: Any) -> dict[str, int]:
         """The two networks and their optimiser."""
         return {"algo.hidden": networks(task, self.hidden)}
@@ -114,7 +110,6 @@ class PpoConfig(ActorCriticConfig):
 
     def check(self, key: str, root: Any) -> None:
         """The parts of a batch are of one size."""
-        super().check(key, root)
         frames = root.collector.frames_per_batch
         # Minibatches of unequal size would weigh their frames unequally in the mean loss.
         if frames % self.minibatches:
@@ -155,7 +150,6 @@ class DqnConfig(AlgoConfig):
 
     def check(self, key: str, root: Any) -> None:
         """The replay buffer holds what is collected and what is drawn at once."""
-        refuse_window(self.name, root)
         frames = root.collector.frames_per_batch
         if self.buffer_size < max(frames, self.batch_size):
             expected = f"at least collector.frames_per_batch={frames} and {key}.batch_size={self.batch_size}"
@@ -163,9 +157,9 @@ class DqnConfig(AlgoConfig):
 
     def memory(self, task: Sizes, root: Any) -> dict[str, int]:
         """The replay buffer, whose transitions hold two states; the networks."""
-        # State and next state, the action's M bits as bools, two float32 and one flag (reward, discount,
+        # State and next state, the action's K bits as bools, two float32 and one flag (reward, discount,
         # terminated), an index.
-        transition = 2 * state_bytes(task) + task.num_cells + 2 * BYTES["float32"] + 1 + BYTES["int64"]
+        transition = 2 * state_bytes(task) + task.num_sensors + 2 * BYTES["float32"] + 1 + BYTES["int64"]
         priority = BYTES["float64"] if self.prioritized.enabled else 0
         return {
             "algo.buffer_size": self.buffer_size * (transition + priority),
@@ -204,7 +198,7 @@ class CollectorConfig(ChoiceConfig):
     def memory(self, task: Sizes, root: Any) -> dict[str, int]:
         """Two batches: one is collected while the other is handed over."""
         index, number = BYTES["int64"], BYTES["float32"]
-        frame = 2 * (state_bytes(task) + index + 3) + task.num_cells + number * (task.num_cells + 2)
+        frame = 2 * (state_bytes(task) + index + 3) + task.num_sensors + number * (task.num_sensors + 2)
         return {"collector.frames_per_batch": 2 * self.frames_per_batch * frame}
 
 
@@ -292,21 +286,12 @@ class McapConfig(LogConfig):
 
 def state_bytes(task: Sizes) -> int:
     """Of one observation: located cell, misses, and the actions since the detection."""
-    return 2 * BYTES["int64"] + task.num_choices * task.num_cells
+    return 2 * BYTES["int64"] + task.num_choices * task.num_sensors
 
 
 def networks(task: Sizes, hidden: int | None) -> int:
     """Bytes of two networks of one hidden layer (256 units where `hidden` is left open), with Adam's two moments."""
-    inputs = task.num_cells * (2 * task.num_choices + 3) + task.num_choices + 1
-    weights = (hidden or 256) * (inputs + task.num_cells)
+    # located cell, n and both at once by number; the history by sensor, as are the outputs
+    inputs = task.num_cells * (task.num_choices + 3) + task.num_choices * (task.num_sensors + 1) + 1
+    weights = (hidden or 256) * (inputs + task.num_sensors)
     return 2 * weights * 4 * BYTES["float32"]  # weight, gradient, two moments
-
-
-def refuse_window(algo: str, root: Any) -> None:
-    """Refuse `grid.window` for an algorithm whose networks have an output for every sensor of the grid.
-
-    Raises:
-        UserError: there is a window.
-    """
-    if root.grid.window is not None:
-        raise refuse("grid.window", root.grid.window, f"null with algo={algo} credit=joint; others act in a window")

@@ -23,6 +23,10 @@ class Sizes(Protocol):
         """t_max + 1."""
 
     @property
+    def num_sensors(self) -> int:
+        """K."""
+
+    @property
     def t_max(self) -> int:
         """T_max."""
 

@@ -36,7 +36,8 @@ class GridConfig(NodeConfig):
         "truncate an episode after so many steps; null = only the exit ends it", unit="steps", ge=1
     )
     window: int | None = option(
-        "W: only the sensors up to W rows and columns from the last located cell can be chosen; null = all",
+        "W: only the sensors up to W rows and columns from the last located cell can be chosen, and moves out of that "
+        "window are never seen; null = all",
         unit="cells",
         ge=0,
     )

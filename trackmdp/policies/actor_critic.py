@@ -13,12 +13,16 @@ from torchrl.modules import ProbabilisticActor, ValueOperator
 from trackmdp.policies.encoder import RelativeBias, StateNetwork
 from trackmdp.policies.unroll import STATE_KEYS
 from trackmdp.world.model import Task
+from trackmdp.world.windows import Window
 
 __all__ = ["SubsetDistribution", "make_actor", "make_critic"]
 
+# A logit whose sigmoid is 0 in float32: no draw from [0, 1) is below it, and log-probability and entropy are 0.
+_NEVER = -200.0
+
 
 class SubsetDistribution(dist.Independent):  # type: ignore[type-arg]
-    """Independent sensors, each on with probability sigmoid(logit); samples are `[..., M]` bool."""
+    """Independent sensors, each on with probability sigmoid(logit); samples are `[..., K]` bool."""
 
     def __init__(self, logits: Tensor) -> None:
         super().__init__(dist.Bernoulli(logits=logits, validate_args=False), 1, validate_args=False)
@@ -30,7 +34,7 @@ class SubsetDistribution(dist.Independent):  # type: ignore[type-arg]
         return torch.rand(shape, device=probability.device) < probability
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """`[...]` log-probability of the subset `value` `[..., M]`: Σ_j log σ(±z_j)."""
+        """`[...]` log-probability of the subset `value` `[..., K]`: Σ_j log σ(±z_j)."""
         logits = self.base_dist.logits
         return nn.functional.logsigmoid(torch.where(value, logits, -logits)).sum(-1)
 
@@ -48,11 +52,15 @@ class SubsetDistribution(dist.Independent):  # type: ignore[type-arg]
 
 
 def make_actor(task: Task, hidden: int, initial_logit: float) -> ProbabilisticActor:
-    """State -> `logits` `[B, M]` -> `action` `[B, M]` bool, with `action_log_prob` `[B]`."""
-    head = nn.Linear(hidden, task.num_cells)
+    """State -> `logits` `[B, K]` -> `action` `[B, K]` bool, with `action_log_prob` `[B]`.
+
+    K = M, or with `grid.window` the sensors around `last_cell`; those outside the grid are never on.
+    """
+    head = nn.Linear(hidden, task.num_sensors)
     nn.init.orthogonal_(head.weight, gain=0.01)
     nn.init.constant_(head.bias, initial_logit)
-    network = _Logits(StateNetwork(task, hidden, head), RelativeBias(task))
+    window = None if task.window is None else Window.of(task)
+    network = _Logits(StateNetwork(task, hidden, head), RelativeBias(task), window)
     return ProbabilisticActor(
         TensorDictModule(network, in_keys=list(STATE_KEYS), out_keys=["logits"]),
         in_keys=["logits"],
@@ -64,13 +72,17 @@ def make_actor(task: Task, hidden: int, initial_logit: float) -> ProbabilisticAc
 class _Logits(nn.Module):
     """A network's logits on top of those that all cells share."""
 
-    def __init__(self, network: StateNetwork, shared: RelativeBias) -> None:
+    def __init__(self, network: StateNetwork, shared: RelativeBias, window: Window | None) -> None:
         super().__init__()
-        self.network, self.shared = network, shared
+        self.network, self.shared, self.window = network, shared, window
 
     def forward(self, last_cell: Tensor, steps_since_detection: Tensor, action_history: Tensor) -> Tensor:
         own = self.network(last_cell, steps_since_detection, action_history)
-        return own + self.shared(last_cell, steps_since_detection)
+        logits = own + self.shared(last_cell, steps_since_detection)
+        if self.window is None:
+            return logits
+        inside = self.window.inside(last_cell.reshape(-1)).view(logits.shape)
+        return logits.masked_fill(~inside, _NEVER)
 
 
 def make_critic(task: Task, hidden: int) -> ValueOperator:

@@ -9,6 +9,8 @@ from trackmdp.world.model import Task
 
 __all__ = ["RelativeBias", "StateEncoder", "StateNetwork"]
 
+_PAIRS = 2**16  # pairs of cells whose displacements are kept; 16 x 16 cells have as many
+
 
 class StateEncoder(nn.Module):
     """`[..., hidden]` features of (last_cell, steps_since_detection, action_history).
@@ -23,14 +25,14 @@ class StateEncoder(nn.Module):
         self.cell = nn.Embedding(task.num_cells, hidden)
         self.stage = nn.Embedding(self.stages, hidden)
         self.cell_and_stage = nn.Embedding(task.num_cells * self.stages, hidden)
-        self.history = nn.Linear(task.num_choices * task.num_cells, hidden)
+        self.history = nn.Linear(task.num_choices * task.num_sensors, hidden)
         for table in (self.cell, self.stage, self.cell_and_stage):
             nn.init.normal_(table.weight, std=scale)
         nn.init.normal_(self.history.weight, std=history_scale)
         nn.init.zeros_(self.history.bias)
 
     def forward(self, last_cell: Tensor, steps_since_detection: Tensor, action_history: Tensor) -> Tensor:
-        """Features of a batch of any shape `[...]`; `action_history` is `[..., t_max+1, M]`."""
+        """Features of a batch of any shape `[...]`; `action_history` is `[..., t_max+1, K]`."""
         shape = last_cell.shape
         cell, n = last_cell.reshape(-1), steps_since_detection.reshape(-1)
         features = self.cell(cell) + self.stage(n) + self.cell_and_stage(cell * self.stages + n)
@@ -57,22 +59,37 @@ class RelativeBias(nn.Module):
 
     It is shared by all cells: that sensors far away are of no use is learned once, not once per cell. (The name is that
     of the relative position bias of Shaw et al. 2018.)
+
+    With `grid.window` the K sensors of the window are the displacements, and the table is `[t_max+2, K]`. Without one
+    there are (2 rows - 1)(2 columns - 1) displacements, of which each cell sees M.
     """
 
-    _index: Tensor
+    _code: Tensor | None
+    _index: Tensor | None
 
     def __init__(self, task: Task) -> None:
         super().__init__()
-        # Displacements (row, column) from (1 - rows, 1 - columns) to (rows - 1, columns - 1), row by row; (0, 0) is the
-        # one in the middle.
         side, places = 2 * task.columns - 1, (2 * task.rows - 1) * (2 * task.columns - 1)
-        self.table = nn.Parameter(torch.zeros(task.t_max + 2, places))
-        cell = torch.arange(task.num_cells)
+        self._whole = task.window is None
+        self.table = nn.Parameter(torch.zeros(task.t_max + 2, places if self._whole else task.num_sensors))
+        # Displacements (row, column) from (1 - rows, 1 - columns) to (rows - 1, columns - 1), row by row; (0, 0) is the
+        # one in the middle. On 3 x 3, side 5, from cell 4 (code 6) to cell 5 (code 7): 7 - 6 + 12, right of the middle.
+        cell = torch.arange(task.num_cells if self._whole else 0)
         code = cell // task.columns * side + cell % task.columns
-        self.register_buffer("_index", code - code.unsqueeze(-1) + places // 2, persistent=False)
+        # On a small grid the places of all pairs of cells are kept, so that a state looks up one row of M numbers; on a
+        # large one, where M² is more than a batch has, each state's places are worked out.
+        kept = code - code.unsqueeze(-1) + places // 2 if self._whole and len(code) ** 2 <= _PAIRS else None
+        self.register_buffer("_index", kept, persistent=False)
+        self.register_buffer("_code", code if self._whole and kept is None else None, persistent=False)
 
     def forward(self, last_cell: Tensor, steps_since_detection: Tensor) -> Tensor:
-        """`[..., M]` of a batch of any shape `[...]`."""
-        m = len(self._index)
-        rows = self.table[:, self._index].view(-1, m)
-        return nn.functional.embedding(steps_since_detection * m + last_cell, rows)
+        """`[..., K]` of a batch of any shape `[...]`."""
+        if self._index is not None:
+            m = len(self._index)
+            rows = self.table[:, self._index].view(-1, m)
+            return nn.functional.embedding(steps_since_detection * m + last_cell, rows)
+        if self._code is None:
+            return nn.functional.embedding(steps_since_detection, self.table)
+        places = self.table.shape[1]
+        middle = steps_since_detection * places + places // 2 - self._code[last_cell]
+        return self.table.view(-1)[middle.unsqueeze(-1) + self._code]

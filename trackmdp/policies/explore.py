@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import ClassVar
 
 import numpy as np
+import numpy.typing as npt
 import torch
+from scipy import sparse
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
@@ -23,7 +25,8 @@ class RenewedTable(TensorDictModuleBase):
     """Acts as a deterministic policy that is replaced from time to time.
 
     The table is a buffer of fixed shape, for collectors hand buffers on to their worker processes; so it holds a bit
-    for every entry and not the entries stored, which change in number.
+    for every entry and not the entries stored, which change in number. There are M (t_max+1) K entries, in the local
+    numbers of the window where the task has one.
 
     Args:
         task: what it acts in.
@@ -38,10 +41,10 @@ class RenewedTable(TensorDictModuleBase):
 
     def __init__(self, task: Task, device: torch.device | str = "cpu", *, on: bool = False) -> None:
         super().__init__()
-        self.num_cells, self.num_choices = task.num_cells, task.num_choices
+        self.num_choices = task.num_choices
         self.window = Window.of(task, device)
         # Row x (t_max + 1) + n, as in `PolicyTable`; 8 sensors per byte: 10 x 10 cells take 13 bytes a row.
-        shape = (task.num_cells * task.num_choices, -(-task.num_cells // 8))
+        shape = (task.num_cells * task.num_choices, -(-task.num_sensors // 8))
         self.register_buffer("bits", torch.full(shape, 255 * on, dtype=torch.uint8, device=device))
         # numpy.packbits puts the first of eight entries into the highest bit.
         self.register_buffer("_place", torch.arange(7, -1, -1, device=device), persistent=False)
@@ -50,8 +53,19 @@ class RenewedTable(TensorDictModuleBase):
         """Act as the deterministic `policy` from now on."""
         assert policy.sets is not None
         for begin in range(0, len(self.bits), _ROWS_AT_ONCE):
-            rows = policy.sets[begin : begin + _ROWS_AT_ONCE].toarray()
+            rows = self._local(policy.sets[begin : begin + _ROWS_AT_ONCE], begin)
             self.bits[begin : begin + len(rows)].copy_(torch.as_tensor(np.packbits(rows, axis=1)))
+
+    def _local(self, sets: sparse.csr_array, begin: int) -> npt.NDArray[np.bool_]:
+        """`[R, K]`, what rows `begin` and following of a policy's sets `[R, M]` are from their located cells."""
+        if not self.window.is_local:
+            return sets.toarray()
+        on = np.zeros((sets.shape[0], self.window.width), dtype=bool)
+        row = np.repeat(np.arange(sets.shape[0]), np.diff(sets.indptr))
+        start, cell = torch.as_tensor((begin + row) // self.num_choices), torch.as_tensor(sets.indices).long()
+        # A policy of this task has no sensor outside the window, so that each has a local number below K.
+        on[row, self.window.find(start.to(self.bits.device), cell.to(self.bits.device)).cpu().numpy()] = True
+        return on
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action` `[*B, K]`, local to `last_cell` where the task has a window."""
@@ -59,8 +73,8 @@ class RenewedTable(TensorDictModuleBase):
         # n = t_max + 1 has no row of its own: the safe action replaces whatever is written there.
         packed = self.bits[cell * self.num_choices + n.clamp_max(self.num_choices - 1)]
         # [*B, bytes, 1] >> [8] = [*B, bytes, 8], flattened to bits in the order of the sensors; the padding is cut off.
-        chosen = ((packed.unsqueeze(-1) >> self._place) & 1).flatten(-2)[..., : self.num_cells].bool()
-        return tensordict.set("action", self.window.to_local(cell, chosen))
+        chosen = ((packed.unsqueeze(-1) >> self._place) & 1).flatten(-2)[..., : self.window.width].bool()
+        return tensordict.set("action", chosen)
 
 
 class Exploring(RenewedTable):

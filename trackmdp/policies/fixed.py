@@ -1,7 +1,4 @@
-"""Modules that act while frames are collected or measured: random subsets, and a table that a learner rewrites.
-
-`Policy` stands for a policy that is finished; a learner writes into the tables here after every update.
-"""
+"""Random subsets, which drive the environment in benchmarks; `Policy` stands for a policy that is finished."""
 
 from __future__ import annotations
 
@@ -10,11 +7,8 @@ from typing import ClassVar
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
 
-from trackmdp.world.model import BoolArray
-
-__all__ = ["ChainPolicy", "RandomSubset"]
+__all__ = ["RandomSubset"]
 
 
 class RandomSubset(TensorDictModuleBase):
@@ -36,26 +30,3 @@ class RandomSubset(TensorDictModuleBase):
         words.random_(generator=self.generator)
         bits = (words.unsqueeze(-1) >> self._shifts) & 1
         return tensordict.set("action", bits.flatten(-2)[..., :m].bool())
-
-
-class ChainPolicy(TensorDictModuleBase):
-    """A table on the learner's device, rewritten in place: the sensors on at n misses after locating the target in x.
-
-    Args:
-        chains: `[M, t_max+1, M]` bool.
-        device: where the table lives.
-    """
-
-    in_keys: ClassVar = ["last_cell", "steps_since_detection"]
-    out_keys: ClassVar = ["action"]
-    chains: Tensor
-
-    def __init__(self, chains: BoolArray, device: torch.device | str = "cpu") -> None:
-        super().__init__()
-        self.register_buffer("chains", torch.as_tensor(chains, dtype=torch.bool, device=device))
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write `action` `[B, M]`; where the safe action is forced the last set stands in, unused."""
-        # chains has no slot for n = t_max + 1.
-        n = tensordict["steps_since_detection"].clamp_max(self.chains.shape[1] - 1)
-        return tensordict.set("action", self.chains[tensordict["last_cell"], n])

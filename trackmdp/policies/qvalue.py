@@ -13,6 +13,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from trackmdp.policies.encoder import StateEncoder
 from trackmdp.policies.unroll import STATE_KEYS
 from trackmdp.world.model import Task
+from trackmdp.world.windows import Window
 
 __all__ = ["AdditiveQ", "EpsilonFlip", "joint_value", "make_qvalue"]
 
@@ -33,48 +34,60 @@ class AdditiveQ(nn.Module):
         super().__init__()
         self.t_max = task.t_max
         self.encoder = StateEncoder(task, hidden, scale=1.0, history_scale=0.03)
-        self.base, self.sensor = nn.Linear(hidden, 1), nn.Linear(hidden, task.num_cells)
+        self.base, self.sensor = nn.Linear(hidden, 1), nn.Linear(hidden, task.num_sensors)
         for head, start in ((self.base, 0.0), (self.sensor, _ALL_ON)):
             nn.init.orthogonal_(head.weight, gain=0.01)
             nn.init.constant_(head.bias, start)
         price = torch.as_tensor(task.cost, dtype=torch.float32).clamp_min(0.01 * task.reward)
-        self.register_buffer("unit", scale * price)
+        self.window = Window.of(task) if task.window is not None else None
+        # What lies outside the grid, cell M, has no price: there q_j is 0, and the sensor off.
+        unit = price if self.window is None else nn.functional.pad(price, (0, 1))
+        self.register_buffer("unit", scale * unit)
 
     def forward(
         self, last_cell: Tensor, steps_since_detection: Tensor, action_history: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """V `[..., 1]` and q `[..., M]`, the latter 0 where the safe action is forced."""
+        """V `[..., 1]` and q `[..., K]`, the latter 0 where the safe action is forced and outside the grid."""
         features = self.encoder(last_cell, steps_since_detection, action_history)
         free = (steps_since_detection <= self.t_max).unsqueeze(-1)
-        return self.base(features), self.unit * self.sensor(features) * free
+        unit = self.unit if self.window is None else self.unit[self.window.around(last_cell)]
+        return self.base(features), unit * self.sensor(features) * free
 
 
 def joint_value(values: TensorDictBase, action: Tensor) -> Tensor:
-    """`[...]` Q(s, a) of `action` `[..., M]` from the `base` and `sensor_value` of a network."""
+    """`[...]` Q(s, a) of `action` `[..., K]` from the `base` and `sensor_value` of a network."""
     sensor = values["sensor_value"]
     flipped = action.to(sensor.dtype) - (sensor > 0).to(sensor.dtype)
     return values["base"].squeeze(-1) + (sensor * flipped).sum(-1)
 
 
 class EpsilonFlip(TensorDictModuleBase):
-    """The greedy subset {j : q_j > 0}; while exploring, each sensor is flipped with probability epsilon."""
+    """The greedy subset {j : q_j > 0}; while exploring, each sensor is flipped with probability epsilon.
 
-    in_keys: ClassVar = ["sensor_value"]
+    Args:
+        epsilon: that probability.
+        task: with `grid.window`, sensors of its window that lie outside the grid stay off.
+    """
+
     out_keys: ClassVar = ["action"]
     epsilon: Tensor
 
-    def __init__(self, epsilon: float) -> None:
+    def __init__(self, epsilon: float, task: Task | None = None) -> None:
         super().__init__()
+        self.window = Window.of(task) if task is not None and task.window is not None else None
+        self.in_keys = ["sensor_value"] if self.window is None else ["sensor_value", "last_cell"]
         self.register_buffer("epsilon", torch.tensor(epsilon))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write `action` `[B, M]`."""
+        """Write `action` `[*B, K]`."""
         greedy = tensordict["sensor_value"] > 0
         if exploration_type() is ExplorationType.RANDOM:
             greedy = greedy ^ (torch.rand(greedy.shape, device=greedy.device) < self.epsilon)
+            if self.window is not None:
+                greedy = greedy & self.window.inside(tensordict["last_cell"].reshape(-1)).view(greedy.shape)
         return tensordict.set("action", greedy)
 
 
 def make_qvalue(task: Task, hidden: int, scale: float) -> TensorDictModule:
-    """State -> `base` `[B, 1]`, `sensor_value` `[B, M]`, for rewards multiplied by `scale`."""
+    """State -> `base` `[B, 1]`, `sensor_value` `[B, K]`, for rewards multiplied by `scale`."""
     return TensorDictModule(AdditiveQ(task, hidden, scale), in_keys=list(STATE_KEYS), out_keys=["base", "sensor_value"])
