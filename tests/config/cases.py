@@ -11,6 +11,7 @@ from hydra import compose, initialize_config_dir
 
 from trackmdp.app.compose import register
 from trackmdp.config import GROUPS, ROOTS, Option, conf_dir, from_hydra, options
+from trackmdp.config.options import several
 
 REFUSED = {("evaluate", "log=csv"), ("evaluate", "log=tensorboard")} | {
     (command, "kernel=tracks") for command in ("evaluate", "solve", "verify", "benchmark")
@@ -59,7 +60,7 @@ def _walk(schema: type[Any], choice: str, prefix: str) -> Iterator[tuple[str, st
             yield choice, f"{prefix}{key}", item
         elif key in GROUPS and not prefix:
             for name, member in GROUPS[key].items():
-                yield from _walk(member, f"{key}={name}", f"{key}.")
+                yield from _walk(member, f"{key}={name}", f"{key}.{name}." if several(schema, key) else f"{key}.")
         else:
             yield from _walk(item, choice, f"{prefix}{key}.")
 

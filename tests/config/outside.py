@@ -142,9 +142,9 @@ FILES = {
             word: str = option("the word", choices=("row", "line"))
     """,
     "outside/conf/log/lines.yaml": """
+        # @package log.lines
         defaults: [base_lines]
 
-        every: 1
         word: line
     """,
     # What an installer leaves.

@@ -64,6 +64,6 @@ def test_what_is_not_allowed_is_one_line(overrides: dict[str, Any], message: str
 
 
 def test_what_only_training_reads_is_refused_elsewhere() -> None:
-    with pytest.raises(UserError, match=r"log\.every=2: without effect outside training"):
-        compose("evaluate", {"baseline": "qmdp", "log": "mcap", "log.every": 2})
-    assert compose("evaluate", {"baseline": "qmdp", "log": "mcap", "log.layout": True}).log.layout
+    with pytest.raises(UserError, match=r"log\.mcap\.evaluations=2: without effect outside training"):
+        compose("evaluate", {"baseline": "qmdp", "log": "mcap", "log.mcap.evaluations": 2})
+    assert compose("evaluate", {"baseline": "qmdp", "log": "mcap", "log.mcap.layout": True}).log["mcap"].layout

@@ -13,7 +13,7 @@ import pytest
 from tests.config.outside import FILES, install
 
 ROOT = Path(__file__).parents[2]
-TRAIN = "train algo=lazy kernel=jump log=lines grid.size=3 optimal.enabled=false"
+TRAIN = "train algo=lazy kernel=jump log=[csv,lines] grid.size=3 optimal.enabled=false"
 
 TWICE = FILES["outside/jump_config.py"].replace('"jump"', '"drift"')
 

@@ -211,7 +211,7 @@ def test_bad_input_ends_in_one_clear_line(tmp_path: Path, log: Path, monkeypatch
     cases: list[tuple[Callable[[], Path], str]] = [
         (lambda: tmp_path / "none.mcap", "no such file"),
         (lambda: tmp_path, "a folder, expected an ordinary file"),
-        (lambda: holding(b""), "an empty file, expected a log written with log=mcap"),
+        (lambda: holding(b""), "an empty file, expected a log written with log=[mcap]"),
         (lambda: holding(b"PK\x03\x04 and more"), "not an MCAP file, expected a log"),
         (lambda: holding(log.read_bytes()[:-3]), "cut off before its end; recover=true saves"),
         (lambda: holding(log.read_bytes()[:20]), "damaged (the record at byte 8 reaches beyond"),

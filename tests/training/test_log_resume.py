@@ -10,7 +10,13 @@ from tests.training.runs import at_iteration, train
 from trackmdp.episodes.log import EpisodeLog
 from trackmdp.episodes.reader import EpisodeReader
 
-LOGGED = ("log=mcap", "log.episodes=3", "log.evaluations=1", "evaluation.every=2", "kernel.exit_probability=0.2")
+LOGGED = (
+    "log=[mcap]",
+    "log.mcap.episodes=3",
+    "log.mcap.evaluations=1",
+    "evaluation.every=2",
+    "kernel.exit_probability=0.2",
+)
 
 
 class Killed(BaseException):

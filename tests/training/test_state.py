@@ -14,7 +14,7 @@ from tests.helpers import train_config
 from tests.training.runs import BUDGET, QUICK, SMALL, assert_same_run, at_iteration, rows, train
 from tests.training.test_checkpoint import corrupted
 from trackmdp.app.cli import main
-from trackmdp.config import load_run_config
+from trackmdp.config import load_run_config, to_dict
 from trackmdp.errors import RunError, UserError
 from trackmdp.training import checkpoint
 from trackmdp.training.state import find
@@ -133,11 +133,12 @@ def test_another_credit_is_refused_where_the_algorithm_is_not_typed(
 
 
 def test_budget_logging_and_saving_may_change(half: Path) -> None:
-    words = ["collector.total_frames=2560", "checkpoint.every=512", "evaluation.every=2", "log.every=2"]
+    words = ["collector.total_frames=2560", "checkpoint.every=512", "evaluation.every=2", "log.csv.every=2"]
     assert typed(half, "resume=auto", *words) == 0
     assert [int(row["iteration"]) for row in rows(half)] == [1, 2, 3, 4, 6, 8, 10]
     saved = load_run_config(half)
-    assert (saved.collector.total_frames, saved.checkpoint.every, saved.log.every, saved.seed) == (2560, 512, 2, 0)
+    assert (saved.collector.total_frames, saved.checkpoint.every, saved.seed) == (2560, 512, 0)
+    assert to_dict(saved)["log"] == {"csv": {"every": 2}}
 
 
 def test_a_config_edited_by_hand_is_not_the_run(half: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -174,8 +175,8 @@ def test_events_after_the_checkpoint_are_hidden(tmp_path: Path, monkeypatch: pyt
     with monkeypatch.context() as patch:
         at_iteration(patch, 5, lambda: (_ for _ in ()).throw(OSError(5, "Input/output error")))
         with pytest.raises(RunError):
-            train(tmp_path, "log=tensorboard", "checkpoint.every=512")
-    train(tmp_path, "log=tensorboard", "checkpoint.every=512", "resume=auto")
+            train(tmp_path, "log=[csv,tensorboard]", "checkpoint.every=512")
+    train(tmp_path, "log=[csv,tensorboard]", "checkpoint.every=512", "resume=auto")
     events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
     assert [event.step for event in events.Scalars("iteration")] == list(range(256, 2049, 256))
 

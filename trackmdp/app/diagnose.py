@@ -12,6 +12,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
 from trackmdp.config import GROUPS, ROOTS, SELECTORS, Option, options
+from trackmdp.config.options import listed, several
 from trackmdp.config.refusals import refuse_renamed, unknown_choice, unknown_option
 from trackmdp.errors import UserError
 
@@ -40,6 +41,9 @@ def diagnose(error: Exception, command: str, words: Sequence[str], compose: Comp
     # Hydra says that a sweep "requires --multirun"; nothing is wrong with the value itself.
     sweeps = [override.input_line for override in parsed if override.is_sweep_override()]
     if sweeps and ("multirun" in str(error).lower()):
+        group, _, names = str(sweeps[0]).partition("=")
+        if _many(group, command) and "[" not in names:
+            return UserError(f"{sweeps[0]}: expected {group}=[{names}]")
         return UserError(f"{sweeps[0]}: expected one value; add -m to run once for each")
     groups = [override for override in parsed if _group(override, command)]
     files = [override for override in parsed if _is_choice(override, command)]
@@ -74,7 +78,7 @@ def _parse(word: str) -> Override:
     except (HydraException, ValueError) as error:  # ValueError: an integer of thousands of digits
         raise UserError(f"{word}: expected option=value (a value with blanks or commas needs quotes)") from error
     refuse_renamed(override.key_or_group)
-    for value in _values(override):
+    for value in _names(override):
         refuse_renamed(override.key_or_group, str(value))
     return override
 
@@ -88,11 +92,18 @@ def _group(override: Override, command: str) -> str:
     return key if chosen in GROUPS and chosen in options(ROOTS[command]) else ""
 
 
+def _many(group: str, command: str) -> bool:
+    """Whether any number of choices may be made of the group: ``log=[csv,mcap]``."""
+    return group in GROUPS and group in options(ROOTS[command]) and several(ROOTS[command], group)
+
+
 def _bad_choice(override: Override, group: str, error: Exception) -> UserError | None:
     """The refusal of a choice that Hydra did not find."""
     known = SELECTORS[group].choices if group in SELECTORS else GROUPS[group]
-    for value in _values(override):
-        if not isinstance(value, str) or (value not in known and f"Could not find '{group}/{value}" in str(error)):
+    for value in _names(override):
+        # Hydra says `find` of a single choice and `load` of one in a list.
+        missing = any(f"Could not {verb} '{group}/{value}" in str(error) for verb in ("find", "load"))
+        if not isinstance(value, str) or (value not in known and missing):
             return unknown_choice(group, value)
     return None
 
@@ -121,7 +132,10 @@ def _bad_file(override: Override, error: Exception) -> UserError | None:
 
 def _jobs(groups: Sequence[Override]) -> Iterator[list[str]]:
     """Every combination of the groups' choices, as overrides."""
-    per_group = [[f"{override.key_or_group}={value}" for value in _values(override)] for override in groups]
+    per_group = [
+        [f"{each.key_or_group}={listed(value) if isinstance(value, list) else value}" for value in _values(each)]
+        for each in groups
+    ]
     yield from (list(words) for words in itertools.product(*per_group))
 
 
@@ -140,6 +154,11 @@ def _options_of(node: Any, schema: type[Any], prefix: str) -> Iterator[tuple[str
             continue
         # `node[name]` would resolve interpolations and raise at values that are missing; only the type is asked for.
         child = node._get_node(name)
+        if several(schema, name):
+            for each in child:
+                chosen = child._get_node(each)
+                yield from _options_of(chosen, OmegaConf.get_type(chosen) or item, f"{prefix}{name}.{each}.")
+            continue
         kind = OmegaConf.get_type(child) if isinstance(child, DictConfig) and not child._is_none() else None
         if kind is not None:
             yield from _options_of(child, kind, f"{prefix}{name}.")
@@ -175,6 +194,11 @@ def _values(override: Override) -> list[Any]:
     if override.is_sweep_override() and override.is_discrete_sweep():
         return list(override.sweep_iterator())
     return [override.value()]
+
+
+def _names(override: Override) -> list[Any]:
+    """The choices that a word makes; a list of a group of several is taken apart."""
+    return [name for value in _values(override) for name in (value if isinstance(value, list) else [value])]
 
 
 def _shown(value: Any) -> Any:

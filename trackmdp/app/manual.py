@@ -13,6 +13,7 @@ from omegaconf import OmegaConf
 
 from trackmdp.app.sweep.schema import PLUGINS
 from trackmdp.config import GROUPS, ROOTS, SELECTORS, Option, options
+from trackmdp.config.options import listed, several
 from trackmdp.config.refusals import refuse_renamed, unknown_choice
 from trackmdp.config.registry import conf_dir, conf_file, load_plugins
 from trackmdp.errors import UserError
@@ -69,7 +70,7 @@ def manual(command: str, words: Sequence[str] = ()) -> str:
     if typed:
         chosen = " ".join(f"{group}={name}" for group, name in typed.items())
         blocks += ["Examples", f"  trackmdp {command} {chosen}"]
-        for group, name in typed.items():
+        for group, name in ((group, name) for group, names in typed.items() for name in _names(names)):
             blocks += [
                 *_example(command, chosen, group, name),
                 *_choice(group, name, typed),
@@ -96,7 +97,15 @@ def _all(command: str, values: dict[str, Any]) -> Iterator[str]:
         if key not in GROUPS:
             yield from ("", *_wrapped(f"{key}: {_about(item)}"), *_entries(item, values.get(key), f"{key}."))
             continue
-        yield from ("", *_wrapped(f"{key}={'|'.join(GROUPS[key])} (default: {chosen.get(key) or 'none chosen'})"))
+        default = chosen.get(key) or "none chosen"
+        if several(ROOTS[command], key):
+            default = listed(chosen[key])
+            yield from (
+                "",
+                *_wrapped(f"{key}={listed(GROUPS[key])}: any of them, none by {key}=[] (default: {default})"),
+            )
+        else:
+            yield from ("", *_wrapped(f"{key}={'|'.join(GROUPS[key])} (default: {default})"))
         yield from _selectors(key, chosen)
         for name in GROUPS[key]:
             yield from _choice(key, name, {})
@@ -112,7 +121,7 @@ def _members(group: str) -> dict[str, type[Any]]:
 
 
 def _choices(command: str, words: Sequence[str]) -> dict[str, str]:
-    """Group -> the choice that the words make, a selector's among them."""
+    """Group -> the choice that the words make, as it was typed, a selector's among them."""
     groups = [*(key for key in options(ROOTS[command]) if key in GROUPS), *(f"hydra/{group}" for group in PLUGINS)]
     made: dict[str, str] = {}
     for word in words:
@@ -123,11 +132,27 @@ def _choices(command: str, words: Sequence[str]) -> dict[str, str]:
             known = _members(key)
         else:
             continue
-        refuse_renamed(key, name)
-        if name not in known:
-            raise UserError(f"{word}: expected one of {', '.join(known)}") if "/" in key else unknown_choice(key, name)
+        for each in _names(name) if several(ROOTS[command], key) else [name]:
+            refuse_renamed(key, each)
+            if each not in known:
+                raise (
+                    UserError(f"{word}: expected one of {', '.join(known)}")
+                    if "/" in key
+                    else unknown_choice(key, each)
+                )
         made[key] = name
     return made if made.keys() - SELECTORS.keys() else {}  # a selector alone chooses nothing
+
+
+def _names(typed: str) -> list[str]:
+    """The choices that one word makes: ``[csv,mcap]``, or a single ``mcap``."""
+    return [name for name in typed.strip("[]").split(",") if name]
+
+
+def _prefix(group: str, name: str) -> str:
+    """What stands before the options of a choice: ``algo.``, or ``log.mcap.`` of one of several."""
+    many = any(several(root, group) for root in ROOTS.values() if group in options(root))
+    return f"{group.replace('/', '.')}." + (f"{name}." if many else "")
 
 
 def _choice(group: str, name: str, typed: dict[str, str]) -> Iterator[str]:
@@ -136,7 +161,7 @@ def _choice(group: str, name: str, typed: dict[str, str]) -> Iterator[str]:
         return
     yield from ("", *_wrapped(f"  {group}={name}: {_about(_schema(group, name, typed))}"))
     values = _values(group, name, typed)
-    yield from _entries(_schema(group, name, typed), values, f"{group.replace('/', '.')}.")
+    yield from _entries(_schema(group, name, typed), values, _prefix(group, name))
 
 
 def _schema(group: str, name: str, typed: dict[str, str]) -> type[Any]:
@@ -156,7 +181,7 @@ def _example(command: str, chosen: str, group: str, name: str) -> Iterator[str]:
             # An interpolation is not something to type after a `=`: the shell would take the `$`.
             if "$" not in shown:
                 flag = "-m " if group.startswith("hydra/") else ""
-                yield f"  trackmdp {command} {flag}{chosen} {group.replace('/', '.')}.{key}={shown}"
+                yield f"  trackmdp {command} {flag}{chosen} {_prefix(group, name)}{key}={shown}"
                 return
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from trackmdp.config.options import choice, option, refuse
+from trackmdp.config.options import choice, listed, option, refuse
 from trackmdp.config.schema import ChoiceConfig
 
 __all__ = [
@@ -125,12 +125,12 @@ class OptimalConfig(BaselineConfig):
 class PlaybackConfig(BaselineConfig):
     """The actions of a logged episode again, step by step, whatever is observed; none on after the last."""
 
-    file: str = option("the log", expects="a file written with log=mcap", path=True)
+    file: str = option("the log", expects="a file written with log=[mcap]", path=True)
     episode: int = option("which of its episodes", ge=0)
 
     def check(self, key: str, root: Any) -> None:
         """What is played back is simulated, and not logged a second time."""
-        if root.log is not None:
-            raise refuse("log", root.log.name, "null with baseline=playback, whose episodes are logged already")
+        if root.log:
+            raise refuse("log", listed(root.log), "[] with baseline=playback, whose episodes are logged already")
         if root.episodes == 0:
             raise refuse("episodes", 0, "at least 1 with baseline=playback, which is only simulated")

@@ -19,7 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from trackmdp.config.checks import absolute_paths, validate
 from trackmdp.config.ignored import refuse_ignored
-from trackmdp.config.options import GROUPS, SELECTORS, Option, optional, options, refuse
+from trackmdp.config.options import GROUPS, SELECTORS, Option, optional, options, refuse, several
 from trackmdp.config.refusals import refuse_renamed, unknown_choice, unknown_option
 from trackmdp.config.registry import conf_file
 from trackmdp.config.resolvers import register_resolvers
@@ -50,7 +50,7 @@ def compose(command: str, overrides: Mapping[str, Any] | None = None, *, folder:
     values: dict[str, Any] = {key: value for key, value in root.items() if key in options(schema)}
     for group, name in chosen.items():
         if group in options(schema):
-            values[group] = None if name is None else _choice(group, name, chosen)
+            values[group] = _values_of(group, name, chosen)
     known = dict(_known(schema, values))
     # After all choices are merged, so that `algo.epochs` is looked up among the options of the algorithm that
     # was chosen.
@@ -92,9 +92,9 @@ def given(arguments: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in arguments.items() if not isinstance(value, Default)}
 
 
-def _chosen(root: Mapping[str, Any], schema: type[Any], typed: Mapping[str, Any]) -> dict[str, str | None]:
-    """Group or selector -> its choice: that of the defaults list, unless another is given."""
-    chosen: dict[str, str | None] = {}
+def _chosen(root: Mapping[str, Any], schema: type[Any], typed: Mapping[str, Any]) -> dict[str, Any]:
+    """Group or selector -> its choice, or list of choices: that of the defaults list, unless another is given."""
+    chosen: dict[str, Any] = {}
     # An entry is a text (`base_train`, `_self_`, `hydra/folders`) or one pair (`kernel: random_support`); of
     # the pairs, `experiment: null` and `override hydra/sweeper: ...` are neither a selector nor an option of
     # the schema.
@@ -105,15 +105,29 @@ def _chosen(root: Mapping[str, Any], schema: type[Any], typed: Mapping[str, Any]
         if group not in typed:
             continue
         name = typed[group]
-        refuse_renamed(group, str(name))
+        many = several(schema, group)
+        names = name if many and isinstance(name, list) else [name]
         known = SELECTORS[group].choices if group in SELECTORS else GROUPS[group]
-        if name not in known and not (name is None and optional(schema, group)):
-            raise unknown_choice(group, name)
-        chosen[group] = name
+        for each in names:
+            refuse_renamed(group, str(each))
+            if each not in list(known) and not (each is None and optional(schema, group)):
+                raise unknown_choice(group, each)
+        chosen[group] = names if many else name
     return chosen
 
 
-def _choice(group: str, name: str, chosen: Mapping[str, str | None]) -> dict[str, Any]:
+def _values_of(group: str, name: Any, chosen: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The values of what is chosen from a group: of a list of choices by their names, and null of none."""
+    if isinstance(name, list):
+        return {each: _without_name(_choice(group, each, chosen)) for each in name}
+    return None if name is None else _choice(group, name, chosen)
+
+
+def _without_name(values: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in values.items() if key != "name"}
+
+
+def _choice(group: str, name: str, chosen: Mapping[str, Any]) -> dict[str, Any]:
     """The values of one choice with its `name`, its defaults list followed."""
     # Example: algo=ppo credit=per_sensor. conf/algo/ppo.yaml names /credit@_here_: '${credit}/ppo', hence
     # conf/credit/per_sensor/ppo.yaml, whose own list names /algo/base_ppo_per_sensor@_here_: the choice's name
@@ -140,7 +154,10 @@ def _known(schema: type[Any], values: Any, prefix: str = "") -> Iterator[tuple[s
             continue
         # A group that is null (`baseline: null`) has no options.
         inner = values.get(name) if values else None
-        if inner is not None:
+        if inner is not None and several(schema, name):
+            for each, values_of_each in inner.items():
+                yield from _known(GROUPS[name][each], values_of_each, f"{prefix}{name}.{each}.")
+        elif inner is not None:
             yield from _known(GROUPS[name][inner["name"]] if name in GROUPS else item, inner, f"{prefix}{name}.")
 
 

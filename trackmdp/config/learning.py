@@ -245,32 +245,37 @@ class RayWorkersConfig(WorkersConfig):
 
 @dataclass(kw_only=True)
 class LogConfig(ChoiceConfig):
-    """Base of the group `log`: what is written of each iteration, next to `summary.json`."""
+    """Base of the group `log`: what is written of each iteration, next to `summary.json`; any of them together.
+
+    What a choice makes is called with its config and the run's folder, and returns a callback of the training.
+    """
 
     episodes_only: ClassVar[bool] = False
-    every: int = option("iterations from one row to the next", unit="iterations", ge=1)
 
-    def ignored(self, root: Any) -> dict[str, str]:
-        """An evaluation has no iterations."""
-        return {} if root.learns else {"every": "outside training"}
+
+@dataclass(kw_only=True)
+class RowsConfig(LogConfig):
+    """A row for each iteration that is due."""
+
+    every: int = option("iterations from one row to the next", unit="iterations", ge=1)
 
 
 @choice("log", "csv", makes="trackmdp.training.metrics:CsvLogger")
 @dataclass(kw_only=True)
-class CsvConfig(LogConfig):
-    """`metrics.csv`."""
+class CsvConfig(RowsConfig):
+    """`metrics.csv`, which a training always writes: without this choice a row for every iteration."""
 
 
 @choice("log", "tensorboard", makes="trackmdp.training.metrics:TensorboardLogger")
 @dataclass(kw_only=True)
-class TensorboardConfig(LogConfig):
-    """`metrics.csv` and TensorBoard event files."""
+class TensorboardConfig(RowsConfig):
+    """TensorBoard event files."""
 
 
 @choice("log", "mcap", makes="trackmdp.episodes.logger:EpisodeLogger")
 @dataclass(kw_only=True)
 class McapConfig(LogConfig):
-    """`episodes.mcap`: simulated episodes, step by step, for `replay` and viewers; in training `metrics.csv` too."""
+    """`episodes.mcap`: simulated episodes, step by step, for `replay` and viewers."""
 
     episodes_only: ClassVar[bool] = True
     evaluations: int = option(
@@ -281,7 +286,7 @@ class McapConfig(LogConfig):
 
     def ignored(self, root: Any) -> dict[str, str]:
         """An evaluation logs all the episodes that it simulates."""
-        return {} if root.learns else dict.fromkeys(("every", "evaluations", "episodes"), "outside training")
+        return {} if root.learns else dict.fromkeys(("evaluations", "episodes"), "outside training")
 
 
 def state_bytes(task: Sizes) -> int:

@@ -23,11 +23,13 @@ __all__ = [
     "Selector",
     "choice",
     "leaves",
+    "listed",
     "nodes",
     "option",
     "optional",
     "options",
     "refuse",
+    "several",
 ]
 
 T = TypeVar("T")
@@ -166,12 +168,17 @@ def option(
 
 
 def options(schema: type[Any]) -> dict[str, Option | type[Any]]:
-    """Fields of a schema in order: an `Option` for a value, the dataclass (or group base) for a nested config."""
+    """Fields of a schema in order: an `Option` for a value, the dataclass (or group base) for a nested config.
+
+    A group of which any number of choices may be made is a ``dict[str, Base]`` and found as its ``Base``; `several`
+    tells it from the others.
+    """
     # `from __future__ import annotations` leaves the annotations as text; this evaluates them.
     hints = typing.get_type_hints(schema)
     found: dict[str, Option | type[Any]] = {}
     for field in dataclasses.fields(schema):
         kind, nullable = _strip_none(hints[field.name])
+        kind = _element_of(kind) or kind
         described = field.metadata.get("option")
         if dataclasses.is_dataclass(kind) and isinstance(kind, type):
             found[field.name] = kind
@@ -186,6 +193,11 @@ def options(schema: type[Any]) -> dict[str, Option | type[Any]]:
 def optional(schema: type[Any], name: str) -> bool:
     """Whether the field `name`, a choice or a nested config, may be null."""
     return _strip_none(typing.get_type_hints(schema).get(name))[1]
+
+
+def several(schema: type[Any], name: str) -> bool:
+    """Whether any number of choices may be made of the group `name`: ``log=[csv,mcap]``, none by ``log=[]``."""
+    return _element_of(_strip_none(typing.get_type_hints(schema).get(name))[0]) is not None
 
 
 def choice(group: str, name: str, *, makes: str) -> typing.Callable[[type[T]], type[T]]:
@@ -219,6 +231,10 @@ def nodes(cfg: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
     for name, value in vars(cfg).items():
         if dataclasses.is_dataclass(value):
             yield from nodes(value, f"{prefix}.{name}".lstrip("."))
+        elif isinstance(value, dict):  # a group of several: log.csv, log.mcap
+            for each, node in value.items():
+                if dataclasses.is_dataclass(node):
+                    yield from nodes(node, f"{prefix}.{name}.{each}".lstrip("."))
 
 
 def leaves(cfg: Any, prefix: str = "") -> Iterator[tuple[str, Option, Any]]:
@@ -227,6 +243,9 @@ def leaves(cfg: Any, prefix: str = "") -> Iterator[tuple[str, Option, Any]]:
         key, value = f"{prefix}{name}", vars(cfg)[name]
         if isinstance(described, Option):
             yield key, described, value
+        elif isinstance(value, dict):  # a group of several
+            for each, node in value.items():
+                yield from leaves(node, f"{key}.{each}.")
         elif value is not None:
             yield from leaves(value, f"{key}.")
 
@@ -234,6 +253,19 @@ def leaves(cfg: Any, prefix: str = "") -> Iterator[tuple[str, Option, Any]]:
 def refuse(key: str, value: object, expected: str) -> UserError:
     """The error for a value that is not allowed."""
     return UserError(f"{key}={'null' if value is None else value}: expected {expected}")
+
+
+def listed(names: typing.Iterable[str]) -> str:
+    """Choices as they are typed: ``[csv,mcap]``."""
+    return f"[{','.join(names)}]"
+
+
+def _element_of(kind: Any) -> type[Any] | None:
+    """What each of ``dict[str, Base]`` is: ``Base``; None for any other type."""
+    if typing.get_origin(kind) is not dict:
+        return None
+    element = typing.get_args(kind)[1]
+    return element if isinstance(element, type) and dataclasses.is_dataclass(element) else None
 
 
 def _strip_none(hint: Any) -> tuple[Any, bool]:

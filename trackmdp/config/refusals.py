@@ -17,6 +17,10 @@ RENAMED: dict[str, str] = {
     "algo.lam": "algo.gae_lambda",
     "algo.lr": "algo.learning_rate",
     "kernel.homogeneous": "algo.share_cells",
+    "log.episodes": "log.mcap.episodes",
+    "log.evaluations": "log.mcap.evaluations",
+    "log.every": "log.csv.every",
+    "log.layout": "log.mcap.layout",
     "lr": "algo.learning_rate",
 }
 """Former name of an option (``group.option``) or of a choice (``group=choice``) -> its name."""

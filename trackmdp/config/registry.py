@@ -4,7 +4,8 @@ A kernel, an algorithm, a solver, a baseline, a collector or a logger is three f
 
 * its code, such as ``def levy(size, *, alpha, exit_probability): ...`` in ``trackmdp_levy/flight.py``;
 * its schema, such as ``@choice("kernel", "levy", makes="trackmdp_levy.flight:levy")`` in ``trackmdp_levy/__init__.py``;
-* its values, here ``trackmdp_levy/conf/kernel/levy.yaml``, which begins with ``defaults: [base_levy]``.
+* its values, here ``trackmdp_levy/conf/kernel/levy.yaml``, which begins with ``defaults: [base_levy]``
+  (a logger's with a line ``# @package log.levy`` before it, since any number of them are chosen together).
 
 An outside package says in its ``pyproject.toml`` which module holds the schemas; ``conf/`` is looked for beside it::
 

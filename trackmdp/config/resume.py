@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from trackmdp.config.checks import validate
-from trackmdp.config.options import SELECTORS
+from trackmdp.config.options import SELECTORS, listed
 from trackmdp.config.roots import TrainConfig
 from trackmdp.config.tree import load_run_config, to_yaml
 from trackmdp.errors import UserError
@@ -92,10 +92,8 @@ def continued(cfg: TrainConfig, folder: Path, words: Sequence[str]) -> TrainConf
     if cfg.resume is None or not (folder / "config.yaml").is_file():
         return cfg
     saved = load_run_config(folder)
-    for word in words:
-        # Hydra's grammar: `algo.epochs=3`, `+key=1` adds, `~key` removes, `group@package=name`,
-        # `hydra/launcher=joblib`.
-        key = word.lstrip("+~").split("=", 1)[0].split("@")[0].replace("/", ".")
+    # Choices before their options: log.mcap.episodes=3 log=[mcap] first brings the mcap to set it in.
+    for key, word in sorted(((_key(word), word) for word in words), key=lambda pair: "." in pair[0]):
         if key.split(".")[0] in ("hydra", "resume"):
             continue
         old, new = _look(saved, key), _look(cfg, key)
@@ -104,7 +102,7 @@ def continued(cfg: TrainConfig, folder: Path, words: Sequence[str]) -> TrainConf
             old, new = _look(saved, f"{SELECTORS[key].group}.{key}"), word.partition("=")[2]
         if _same(old, new):
             continue
-        # With the dot, so that `log` allows `log.every` but not an option that merely begins with these
+        # With the dot, so that `log` allows `log.csv.every` but not an option that merely begins with these
         # letters.
         if not any(key == allowed or key.startswith(f"{allowed}.") for allowed in CHANGEABLE):
             raise UserError(f"{key}: the run has {_shown(old)}, typed was {_shown(new)}; it cannot change on resume")
@@ -114,26 +112,45 @@ def continued(cfg: TrainConfig, folder: Path, words: Sequence[str]) -> TrainConf
     return dataclasses.replace(saved, resume=cfg.resume)
 
 
+def _key(word: str) -> str:
+    """The dotted key that an override sets."""
+    # Hydra's grammar: `algo.epochs=3`, `+key=1` adds, `~key` removes, `group@package=name`, `hydra/launcher=joblib`.
+    return word.lstrip("+~").split("=", 1)[0].split("@")[0].replace("/", ".")
+
+
 def _look(cfg: Any, key: str) -> Any:
     """The value at a dotted key; None where the run chose another option of a group, which has no such key."""
     for name in key.split("."):
-        cfg = getattr(cfg, name, None)
+        cfg = cfg.get(name) if isinstance(cfg, dict) else getattr(cfg, name, None)
     return cfg
 
 
 def _put(cfg: Any, key: str, value: Any) -> None:
+    """Set a changed option; of several choices those that the run has keep their values.
+
+    Raises:
+        UserError: it is an option of a choice that the run has not made.
+    """
     *parents, last = key.split(".")
     for name in parents:
-        cfg = getattr(cfg, name)
+        if isinstance(cfg, dict) and name not in cfg:
+            names = listed([*cfg, name])
+            raise UserError(f"{key}: the run has {parents[0]}={listed(cfg)}, expected {parents[0]}={names} beside it")
+        cfg = cfg[name] if isinstance(cfg, dict) else getattr(cfg, name)
+    if isinstance(value, dict):
+        value = {name: getattr(cfg, last).get(name, node) for name, node in value.items()}
     setattr(cfg, last, value)
 
 
 def _same(old: Any, new: Any) -> bool:
     """Equal values, or the same option chosen from a group, whose own values are compared where they were typed."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        return old.keys() == new.keys()
     if dataclasses.is_dataclass(old) and hasattr(old, "name"):
         return type(old) is type(new)
     return bool(old == new)
 
 
 def _shown(value: Any) -> str:
+    value = listed(value) if isinstance(value, dict) else value
     return str(getattr(value, "name", "null" if value is None else value))

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 from trackmdp.config import learned_kernel, per_sensor  # noqa: F401  (more algorithms to choose from)
 from trackmdp.config.baselines import BaselineConfig
 from trackmdp.config.learning import DEVICE, AlgoConfig, CollectorConfig, LogConfig
-from trackmdp.config.options import GROUPS, option, refuse
+from trackmdp.config.options import GROUPS, listed, option, refuse
 from trackmdp.config.schema import NodeConfig
 from trackmdp.config.world import CostConfig, GridConfig, KernelConfig
 from trackmdp.errors import UserError
@@ -88,7 +88,7 @@ class TrainConfig(WorldConfig):
     threads: int = option("torch threads of the learning process", unit="threads", ge=1, le=256)
     algo: AlgoConfig
     collector: CollectorConfig
-    log: LogConfig
+    log: dict[str, LogConfig]
     evaluation: EvaluationConfig
     optimal: OptimalBoundConfig
     checkpoint: CheckpointConfig
@@ -112,7 +112,7 @@ class EvaluateConfig(WorldConfig):
         "folder of a training run; its world is taken from there", expects="the folder of a run", path=True
     )
     baseline: BaselineConfig | None
-    log: LogConfig | None
+    log: dict[str, LogConfig]
     seed: int = option("seed of the simulated episodes", ge=0)
     device: str = option("device of the simulation", expects="cpu, cuda, cuda:N or auto", pattern=DEVICE)
     threads: int = option("torch threads", unit="threads", ge=1, le=256)
@@ -124,8 +124,8 @@ class EvaluateConfig(WorldConfig):
         if (self.run is None) == (self.baseline is None):
             given = "neither" if self.run is None else "both"
             raise UserError(f"expected exactly one of run=FOLDER and baseline=NAME, got {given}")
-        if self.log is not None and not self.log.episodes_only:
-            raise refuse("log", self.log.name, "mcap or null; an evaluation has no iterations")
+        if not all(node.episodes_only for node in self.log.values()):
+            raise refuse("log", listed(self.log), "[mcap] or []; an evaluation has no iterations")
 
 
 @dataclass(kw_only=True)
@@ -172,7 +172,7 @@ class BenchmarkConfig(WorldConfig):
 class ReplayConfig(CommandConfig):
     """Look at logged episodes, prove them, rebuild a damaged log; without more than file=, list what it holds."""
 
-    file: str = option("the log", expects="a file written with log=mcap", path=True)
+    file: str = option("the log", expects="a file written with log=[mcap]", path=True)
     episode: int | None = option("play this episode; for html= and csv= the one that is written", ge=0)
     verify: bool = option("re-simulate every episode and name the first difference")
     recover: bool = option("write every whole episode of a cut or damaged log to a new one beside it")

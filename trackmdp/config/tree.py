@@ -11,8 +11,8 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from trackmdp.config.checks import absolute_paths, validate
-from trackmdp.config.options import GROUPS, Option, options
-from trackmdp.config.refusals import suggestion
+from trackmdp.config.options import GROUPS, Option, options, several
+from trackmdp.config.refusals import suggestion, unknown_choice
 from trackmdp.config.roots import CommandConfig, TrainConfig, WorldConfig
 from trackmdp.config.schema import ChoiceConfig
 from trackmdp.config.untrusted import MAX_BYTES, parse_yaml
@@ -64,17 +64,34 @@ def refuse_unknown(cfg: Any, schema: type[Any], prefix: str = "") -> None:
             raise UserError(f"{prefix}{name}: unknown key{suggestion(name, known)}")
         if dataclasses.is_dataclass(value):
             refuse_unknown(value, type(value), f"{prefix}{name}.")
+        elif several(schema, name):
+            _refuse_not_chosen(name, value, prefix)
+
+
+def _refuse_not_chosen(group: str, chosen: Mapping[str, Any], prefix: str) -> None:
+    """Refuse an entry of a group of several that no file of the group made, such as that of ``+log.mcap.every=2``."""
+    for name, node in chosen.items():
+        if type(node) is not GROUPS[group].get(name):
+            raise UserError(f"{prefix}{group}.{name}: not chosen, expected {group}=[NAME,...] with it among the names")
+        refuse_unknown(node, type(node), f"{prefix}{group}.{name}.")
 
 
 def to_dict(cfg: Any) -> dict[str, Any]:
-    """A plain copy of the config; the option chosen from a group stands under `name`."""
+    """A plain copy of the config; the option chosen from a group stands under `name`, of several each under its own."""
     # A choice's name is an attribute of its class, no field: without it a saved `kernel: {...}` could not be told from
     # another choice with the same options.
     plain: dict[str, Any] = {"name": cfg.name} if hasattr(type(cfg), "name") else {}
     for key in options(type(cfg)):
         value = vars(cfg)[key]
-        plain[key] = to_dict(value) if dataclasses.is_dataclass(value) else value
+        if several(type(cfg), key):  # {"csv": {"every": 1}}: its name is its key
+            plain[key] = {name: _nameless(node) for name, node in value.items()}
+        else:
+            plain[key] = to_dict(value) if dataclasses.is_dataclass(value) else value
     return plain
+
+
+def _nameless(node: ChoiceConfig) -> dict[str, Any]:
+    return {key: value for key, value in to_dict(node).items() if key != "name"}
 
 
 def to_yaml(cfg: Any) -> str:
@@ -155,15 +172,31 @@ def build_config(plain: Mapping[Any, Any], schema: type[Any], prefix: str = "", 
         if key not in values:
             raise UserError(f"{prefix}{key}: missing")
         value = values[key]
-        if not isinstance(described, Option) and value is not None:
+        if not isinstance(described, Option) and (value is not None or several(schema, key)):
             if not isinstance(value, Mapping):
                 raise UserError(f"{prefix}{key}={value}: expected a mapping")
-            values[key] = build_config(value, described, f"{prefix}{key}.", key)
+            if several(schema, key):
+                values[key] = {name: _build_one(each, key, name, f"{prefix}{key}.") for name, each in value.items()}
+            else:
+                values[key] = build_config(value, described, f"{prefix}{key}.", key)
         # `reward: 10` in a file is an int to YAML; `type` leaves True alone, which is an int as well, for `validate`
         # to refuse.
         elif isinstance(described, Option) and described.kind is float and type(value) is int:
             values[key] = float(value)
     return schema(**values)
+
+
+def _build_one(plain: Any, group: str, name: Any, prefix: str) -> Any:
+    """The dataclass of one of several choices of a group.
+
+    Raises:
+        UserError: there is no such choice, or its values are not those of its schema.
+    """
+    if not isinstance(name, str) or name not in GROUPS[group]:
+        raise unknown_choice(group, name)
+    if not isinstance(plain, Mapping):
+        raise UserError(f"{prefix}{name}={plain}: expected a mapping")
+    return build_config(plain, GROUPS[group][name], f"{prefix}{name}.")
 
 
 def _expected(cfg: DictConfig, schema: type[Any], key: str) -> str:

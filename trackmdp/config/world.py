@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from trackmdp.config.options import GROUPS, Option, choice, option, refuse
+from trackmdp.config.options import GROUPS, Option, choice, listed, option, refuse
 from trackmdp.config.schema import ChoiceConfig, NodeConfig
 from trackmdp.errors import UserError
 
@@ -158,9 +158,9 @@ class TracksConfig(KernelConfig):
         """Recorded tracks hold no motion model: nothing that reads one goes with them."""
         if root.needs_motion:
             raise refuse(key, self.name, "a motion model, which train and evaluate do without")
-        if root.log is not None and root.log.episodes_only:
-            expected = "csv or tensorboard with kernel=tracks; episodes are logged with a motion model"
-            raise refuse("log", root.log.name, expected)
+        if any(node.episodes_only for node in root.log.values()):
+            expected = "none but csv and tensorboard with kernel=tracks; episodes are logged with a motion model"
+            raise refuse("log", listed(root.log), expected)
         baseline = getattr(root, "baseline", None)
         if baseline is not None and baseline.reads_motion:
             known = [name for name, schema in GROUPS["baseline"].items() if not schema.reads_motion]

@@ -252,7 +252,7 @@ def opened_log(file: Path) -> BinaryIO:
     if start != MAGIC:
         stream.close()
         what = "an empty file" if not start else "not an MCAP file"
-        raise UserError(f"file={file}: {what}, expected a log written with log=mcap")
+        raise UserError(f"file={file}: {what}, expected a log written with log=[mcap]")
     return stream
 
 

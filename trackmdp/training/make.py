@@ -9,10 +9,9 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import BaseCollector
 
 from trackmdp.algos.common import Algorithm
-from trackmdp.config import TrainConfig
+from trackmdp.config import CsvConfig, TrainConfig
 from trackmdp.config.registry import maker
 from trackmdp.training.callbacks import Callback
-from trackmdp.training.metrics import CsvLogger
 from trackmdp.world.model import Task
 from trackmdp.world.tracks import Problem
 
@@ -38,7 +37,8 @@ def make_collector(
 
 def make_loggers(cfg: TrainConfig, folder: Path) -> list[Callback]:
     """What the run writes of itself while it learns."""
-    csv = CsvLogger(cfg.log, folder)
-    # metrics.csv is written whatever the log is: reports and `Run.metrics` read it. The other logger is imported by
-    # the name in its schema, since the packages it may need (mcap) are not to load without it.
-    return [csv] if cfg.log.name == "csv" else [csv, maker(cfg.log)(cfg.log, folder)]
+    # metrics.csv is written whatever the log is: reports and `Run.metrics` read it. `csv` stays first, with the options
+    # of its own where it is chosen.
+    chosen = {"csv": CsvConfig(every=1)} | cfg.log
+    # Each is imported by the name in its schema, since the packages it may need (mcap) are not to load without it.
+    return [maker(node)(node, folder) for node in chosen.values()]

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from trackmdp.config import LogConfig
+from trackmdp.config.learning import RowsConfig
 from trackmdp.durable import own_folder, reopen
 from trackmdp.training.callbacks import Callback, Row, Training
 from trackmdp.untrusted import decoded, opened
@@ -29,7 +29,7 @@ class CsvLogger(Callback):
 
     name = "csv"
 
-    def __init__(self, cfg: LogConfig, folder: Path) -> None:
+    def __init__(self, cfg: RowsConfig, folder: Path) -> None:
         self._every, self._path, self._position = cfg.every, folder / "metrics.csv", 0
 
     def on_start(self, trainer: Training) -> None:  # noqa: ARG002
@@ -89,7 +89,7 @@ class TensorboardLogger(Callback):
 
     name = "tensorboard"
 
-    def __init__(self, cfg: LogConfig, folder: Path) -> None:
+    def __init__(self, cfg: RowsConfig, folder: Path) -> None:
         self._every, self._folder = cfg.every, folder / "tensorboard"
 
     def on_start(self, trainer: Training) -> None:

@@ -1,4 +1,4 @@
-"""`log=mcap`, `replay` and `baseline=playback` as they are typed."""
+"""`log=[mcap]`, `replay` and `baseline=playback` as they are typed."""
 
 from __future__ import annotations
 
@@ -39,7 +39,16 @@ TRAIN = [*WORLD, "algo=a2c", "collector.total_frames=4096", "collector.frames_pe
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run") / "a"
-    words = ["evaluate", "baseline=qmdp", *WORLD, "log=mcap", "log.layout=true", "episodes=30", "quiet=true", "seed=3"]
+    words = [
+        "evaluate",
+        "baseline=qmdp",
+        *WORLD,
+        "log=[mcap]",
+        "log.mcap.layout=true",
+        "episodes=30",
+        "quiet=true",
+        "seed=3",
+    ]
     assert main([*words, f"hydra.run.dir={folder}"]) == 0
     return folder / "episodes.mcap"
 
@@ -75,7 +84,7 @@ def test_simulated_figures_are_those_of_the_episodes_in_the_log(log: Path) -> No
 
 
 def test_the_same_seed_gives_the_same_file(log: Path, tmp_path: Path) -> None:
-    words = ["evaluate", "baseline=qmdp", *WORLD, "log=mcap", "log.layout=true", "episodes=30", "quiet=true"]
+    words = ["evaluate", "baseline=qmdp", *WORLD, "log=[mcap]", "log.mcap.layout=true", "episodes=30", "quiet=true"]
     assert main([*words, "seed=3", f"hydra.run.dir={tmp_path / 'a'}"]) == 0
     assert (tmp_path / "a/episodes.mcap").read_bytes() == log.read_bytes()
     assert main([*words, "seed=4", f"hydra.run.dir={tmp_path / 'b'}"]) == 0
@@ -84,7 +93,7 @@ def test_the_same_seed_gives_the_same_file(log: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("baseline", ["random_k", "clocked"])
 def test_every_kind_of_policy_verifies(baseline: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["evaluate", f"baseline={baseline}", *WORLD, "grid.max_steps=20", "log=mcap", "episodes=15"]
+    words = ["evaluate", f"baseline={baseline}", *WORLD, "grid.max_steps=20", "log=[mcap]", "episodes=15"]
     assert main([*words, "quiet=true", f"hydra.run.dir={tmp_path}"]) == 0
     status, said, _ = replay(capsys, f"file={tmp_path}/episodes.mcap", "verify=true")
     assert (status, "15 episodes" in said, "the same to the bit" in said) == (0, True, True)
@@ -93,7 +102,15 @@ def test_every_kind_of_policy_verifies(baseline: str, tmp_path: Path, capsys: py
 def test_training_logs_the_first_the_kth_and_the_last_evaluation(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["train", *TRAIN, "evaluation.every=2", "log=mcap", "log.evaluations=3", "log.episodes=4", "quiet=true"]
+    words = [
+        "train",
+        *TRAIN,
+        "evaluation.every=2",
+        "log=[mcap]",
+        "log.mcap.evaluations=3",
+        "log.mcap.episodes=4",
+        "quiet=true",
+    ]
     assert main([*words, f"hydra.run.dir={tmp_path / 'a'}"]) == 0
     with EpisodeReader(tmp_path / "a/episodes.mcap") as reader:
         labels = [policy["label"] for policy in reader.policies]
@@ -105,7 +122,7 @@ def test_training_logs_the_first_the_kth_and_the_last_evaluation(
 
 
 def test_every_option_is_read(log: Path, tmp_path: Path) -> None:
-    words = ("quiet=true", "log=mcap", "evaluation.every=2", "log.evaluations=1", *TRAIN)
+    words = ("quiet=true", "log=[mcap]", "evaluation.every=2", "log.mcap.evaluations=1", *TRAIN)
     cfg = composed("train", *words)
     with record_reads(cfg) as reads:
         importlib.import_module("trackmdp.app.commands.train").run(cfg, tmp_path)
@@ -115,11 +132,11 @@ def test_every_option_is_read(log: Path, tmp_path: Path) -> None:
         importlib.import_module("trackmdp.app.commands.replay").run(cfg, tmp_path)
     assert unread(cfg, reads) == set()
     playback = ("baseline=playback", f"baseline.file={log}", *WORLD, "quiet=true", "episodes=5")
-    for words in (playback, ("baseline=qmdp", "log=mcap", *WORLD, "quiet=true", "episodes=5")):
+    for words in (playback, ("baseline=qmdp", "log=[mcap]", *WORLD, "quiet=true", "episodes=5")):
         cfg = composed("evaluate", *words)
         with record_reads(cfg) as reads:
             importlib.import_module("trackmdp.app.commands.evaluate").run(cfg, tmp_path)
-        of_training = {"log.every", "log.evaluations", "log.episodes"}
+        of_training = {"log.mcap.evaluations", "log.mcap.episodes"}
         assert unread(cfg, reads) - of_training == set()
 
 
@@ -221,7 +238,7 @@ def test_recover_as_typed(log: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
         ("file=none.mcap", "file={here}/none.mcap: no such file"),
         ("file={log} episode=999", "episode=999: {log} holds 30 episodes (0 to 29)"),
         ("file={log} html=no/such/a.html", "html={here}/no/such/a.html: cannot be written (no such file or directory)"),
-        ("", "file: missing, expected a file written with log=mcap"),
+        ("", "file: missing, expected a file written with log=[mcap]"),
     ],
 )
 def test_mistakes_end_in_one_line(
@@ -267,7 +284,15 @@ def test_a_full_disk_stops_the_log_and_is_said_once(
         added(writer, episode)
 
     monkeypatch.setattr(EpisodeWriter, "add", full)
-    words = ["train", *TRAIN, "evaluation.every=2", "log=mcap", "log.evaluations=1", "log.episodes=4", "quiet=true"]
+    words = [
+        "train",
+        *TRAIN,
+        "evaluation.every=2",
+        "log=[mcap]",
+        "log.mcap.evaluations=1",
+        "log.mcap.episodes=4",
+        "quiet=true",
+    ]
     assert main([*words, f"hydra.run.dir={tmp_path / 'a'}"]) == 0
     part = tmp_path / "a/episodes.mcap.part"
     error = capsys.readouterr().err
@@ -284,7 +309,7 @@ def test_an_evaluation_outlives_its_log(
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(EpisodeWriter, "finish", full)
-    words = ["evaluate", "baseline=qmdp", *WORLD, "log=mcap", "episodes=5", f"hydra.run.dir={tmp_path}"]
+    words = ["evaluate", "baseline=qmdp", *WORLD, "log=[mcap]", "episodes=5", f"hydra.run.dir={tmp_path}"]
     assert main(words) == 0
     said = capsys.readouterr()
     assert said.err.endswith("no space left on device; no more episodes are logged\n")

@@ -59,8 +59,8 @@ def run(cfg: EvaluateConfig, folder: Path, problem: Problem | None = None) -> fl
         write_json(folder / "sets.json", policy.as_lists())
     write_text(folder / "picture.txt", draw_picture(episodes, world))
     _show(console, subject, evaluator, score, simulation, folder)
-    if cfg.log is not None:
-        _log_episodes(cfg, world, episodes, subject, folder, console)
+    if isinstance(mcap := cfg.log.get("mcap"), McapConfig):
+        _log_episodes(cfg, mcap, world, episodes, subject, folder, console)
     if estimate is not None:
         shares = (
             f"from Q {estimate.exact:.2%} (printed form {estimate.paper:.2%}), from the belief {estimate.bayes:.2%}"
@@ -71,6 +71,7 @@ def run(cfg: EvaluateConfig, folder: Path, problem: Problem | None = None) -> fl
 
 def _log_episodes(
     cfg: EvaluateConfig,
+    mcap: McapConfig,
     world: World,
     episodes: Episodes,
     subject: str,
@@ -78,9 +79,8 @@ def _log_episodes(
     console: Console,
 ) -> None:
     """Write `episodes.mcap`: the episodes that the simulated figures are those of."""
-    assert isinstance(cfg.log, McapConfig)
     described = to_yaml(load_run_config(cfg.run) if cfg.run else cfg)
-    log = EpisodeLog(folder, world, seed=cfg.seed, config=described, layout=cfg.log.layout, command="evaluate")
+    log = EpisodeLog(folder, world, seed=cfg.seed, config=described, layout=mcap.layout, command="evaluate")
     log.add(episodes, {"label": subject})
     if log.close():
         console.print(f"{log.episodes} episodes in {log.file}", markup=False)
