@@ -349,7 +349,7 @@ EVIL = "{_target_: os.mkdir, path: mark}"
         ("experiment/a", "seed: &a [*a]", "experiment=a", "not a config (alias *a"),
         ("experiment/a", f"seed: {'[' * 3000}{']' * 3000}", "experiment=a", "deeper than 50 levels"),
         ("experiment/a", "- 1", "experiment=a", "expected a mapping"),
-        ("experiment/a", "x: " + "y" * 2**20, "experiment=a", "longer than 1,048,576 bytes"),
+        ("experiment/a", "x: " + "y" * 2**20, "experiment=a", "expected at most 1,048,576"),
         ("algo/a", f"defaults: [hindsight]\nx: {EVIL}", "algo=a", "x._target_: a config is data"),
         ("mine", "defaults: [base_train]\nhydra: {searchpath: ['pkg://os']}", "--config-name mine", "sets hydra.sea"),
         ("hydra/job_logging/a", "root: {level: 1}\nfilters: {x: {(): os.mkdir}}", "hydra/job_logging=a", "x.(): a con"),

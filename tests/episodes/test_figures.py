@@ -72,7 +72,8 @@ def test_a_function_that_draws_is_simulated_with_the_history_it_has_made() -> No
     episodes = simulate(world, drawing, 5_000, seed=1)
     exact = Policy.from_dense(world, np.full((9, 3, 9), 0.25))
     assert_close(world, exact, episodes.figures())
-    assert np.nanmean(seen) == pytest.approx(0.25, abs=0.03)  # a little less: sets that were missed
+    # A set that missed did not hold the target's cell: of nine sensors, eight are on with 1/4.
+    assert np.nanmean(seen) == pytest.approx(0.25 * 8 / 9, abs=0.01)
     assert episodes.policy is None
     assert simulate(world, drawing, 50, seed=1).figures() == simulate(world, drawing, 50, seed=1).figures()
 

@@ -103,7 +103,7 @@ def test_a_run_that_was_changed_is_named_and_the_others_are_read(case: str, swee
     assert "\n" not in anomaly.text
 
 
-@pytest.mark.parametrize("name", ["policy.npz", "kernel.npy"])
+@pytest.mark.parametrize("name", ["policy.npz", "kernel.npz"])
 def test_what_another_run_left_is_not_used(name: str, sweep: Path) -> None:
     content = bytearray((sweep / "a" / name).read_bytes())
     content[-30] ^= 1
@@ -233,6 +233,6 @@ def test_a_cell_of_a_spreadsheet_is_no_formula() -> None:
 
 
 def test_a_summary_names_the_files_of_its_run(tmp_path: Path) -> None:
-    np.save(tmp_path / "kernel.npy", np.eye(2))
+    np.savez(tmp_path / "kernel.npz", kernel=np.eye(2))
     write_summary(tmp_path, {"frames": 3})
-    assert read_summary(tmp_path)["files"].keys() == {"kernel.npy"}
+    assert read_summary(tmp_path)["files"].keys() == {"kernel.npz"}

@@ -140,7 +140,7 @@ def test_the_same_world_gives_the_same_policy() -> None:
 
 def _kernel_with_edges() -> np.ndarray:
     """3x3: a row of one cell, a cell that cannot be reached, a strong asymmetry, exit 1e-6 but from one cell."""
-    kernel = drift(3, direction=0.0, persistence=0.9, exit_probability=1e-6, border="renormalize")
+    kernel = drift(3, direction=0.0, persistence=0.9, exit_probability=1e-6, border="renormalize").toarray()
     kernel[:, 4] = 0.0
     kernel[0] = 0.0
     kernel[0, 1] = 1.0 - 1e-6

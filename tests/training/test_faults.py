@@ -47,7 +47,7 @@ def test_a_disk_that_fills_up_costs_nothing_but_a_call(
     with monkeypatch.context() as patch:
         at_iteration(patch, 5, lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard)))
         try:
-            with pytest.raises(RunError, match="File too large; resume=auto goes on from the last checkpoint"):
+            with pytest.raises(RunError, match="File too large; resume=auto resumes from the last checkpoint"):
                 train(tmp_path)
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

@@ -42,19 +42,24 @@ def typed_config(command: str, cfg: DictConfig, folder: Path) -> CommandConfig:
     Raises:
         UserError: an option is unknown or not allowed.
     """
-    given: dict[str, Any] = {}
-    choices: dict[str, Any] = {}
+    plain = cfg
     if "hydra" in cfg:
-        words = (word.lstrip("+~").partition("=") for word in cfg.hydra.overrides.task)
-        given, choices = {key: value for key, _, value in words}, cfg.hydra.runtime.choices
         # The caller still needs Hydra's part; "struct" would forbid to delete it here, where no schema has it.
-        cfg = cfg.copy()
-        cfg._set_flag("struct", False)
-        del cfg["hydra"]
-    typed = from_hydra(cfg, ROOTS[command], folder)
-    # Only what was typed: a default that nothing reads is no mistake of the user's.
-    refuse_ignored(typed, given, choices)
+        plain = cfg.copy()
+        plain._set_flag("struct", False)
+        del plain["hydra"]
+    typed = from_hydra(plain, ROOTS[command], folder)
+    # A run that is resumed has a config of its own, which says what is read; `prepare` looks once it is known.
+    if not getattr(typed, "resume", None):
+        _refuse_ignored(typed, cfg)
     return typed
+
+
+def _refuse_ignored(typed: CommandConfig, composed: DictConfig) -> None:
+    """Refuse words of the command line that have no effect; a default that nothing reads is no mistake of the user's."""
+    if "hydra" in composed:
+        words = (word.lstrip("+~").partition("=") for word in composed.hydra.overrides.task)
+        refuse_ignored(typed, {key: value for key, _, value in words}, composed.hydra.runtime.choices)
 
 
 @dataclass(frozen=True)
@@ -91,7 +96,10 @@ def prepare(command: str, composed: DictConfig, words: Sequence[str]) -> Prepare
         UserError: an option is not allowed, or what it names is not there or not what is expected.
     """
     cfg = typed_config(command, composed, Path.cwd())
-    return check(command, cfg, folder_of(composed, "hydra.run.dir"), words)
+    prepared = check(command, cfg, folder_of(composed, "hydra.run.dir"), words)
+    if getattr(cfg, "resume", None) and not (prepared.folder / "config.yaml").is_file():
+        _refuse_ignored(cfg, composed)  # there is no run yet: this begins one
+    return prepared
 
 
 def check(command: str, cfg: CommandConfig, folder: Path, words: Sequence[str]) -> Prepared:

@@ -31,9 +31,14 @@ class BaselineConfig(ChoiceConfig):
     """Base of the groups `baseline` and `solver`.
 
     What a choice makes is called with the world and the choice's options, and returns a `Policy` or a `Solution`.
+
+    Attributes:
+        reads_motion: needs the kernel, which recorded tracks have not.
+        whole_episodes: plans for episodes that only the exit ends; `grid.max_steps` then counts in the valuing alone.
     """
 
     reads_motion: ClassVar[bool] = True
+    whole_episodes: ClassVar[bool] = False
 
 
 @choice("baseline", "qmdp", makes="trackmdp.solvers.qmdp:solve")
@@ -115,6 +120,8 @@ class LookaheadConfig(BaselineConfig):
 @dataclass(kw_only=True)
 class OptimalConfig(BaselineConfig):
     """Policy iteration, search and branch and bound: the optimum with a certificate, or an honest bracket."""
+
+    whole_episodes: ClassVar[bool] = True
 
     time_limit: float = option("stop closing the bracket after this long", unit="s", gt=0)
     tolerance: float = option("bracket that counts as closed, relative to the value", ge=0, lt=1)

@@ -54,6 +54,7 @@ def compose(command: str, overrides: Mapping[str, Any] | None = None, *, folder:
     known = dict(_known(schema, values))
     # After all choices are merged, so that `algo.epochs` is looked up among the options of the algorithm that
     # was chosen.
+    typed = _by_option(typed, known)
     for key, value in typed.items():
         if key not in chosen:
             _put(values, key, value, known)
@@ -159,6 +160,15 @@ def _known(schema: type[Any], values: Any, prefix: str = "") -> Iterator[tuple[s
                 yield from _known(GROUPS[name][each], values_of_each, f"{prefix}{name}.{each}.")
         elif inner is not None:
             yield from _known(GROUPS[name][inner["name"]] if name in GROUPS else item, inner, f"{prefix}{name}.")
+
+
+def _by_option(typed: Mapping[str, Any], known: Mapping[str, Option]) -> dict[str, Any]:
+    """What was given by the name of a node as a mapping, `algo.entropy={"start": 0.1}`, by those of its options."""
+    flat: dict[str, Any] = {}
+    for key, value in typed.items():
+        inner = isinstance(value, Mapping) and key not in known
+        flat |= _by_option({f"{key}.{name}": each for name, each in value.items()}, known) if inner else {key: value}
+    return flat
 
 
 def _put(values: dict[str, Any], key: str, value: Any, known: Mapping[str, Option]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from inspect import signature
 from typing import TYPE_CHECKING, Any
 
@@ -76,5 +77,7 @@ def baseline_policy(problem: Problem, choice: BaselineConfig) -> Policy:
 
     if choice.reads_motion and not isinstance(problem, World):
         raise UserError(f"baseline={choice.name}: needs a motion model; recorded tracks have none")
+    if choice.whole_episodes:
+        problem = replace(problem, max_steps=None)
     made = make(choice, problem)
     return made.policy if isinstance(made, Solution) else as_policy(problem, made)
