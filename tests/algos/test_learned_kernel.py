@@ -90,3 +90,15 @@ def test_the_state_is_plain_tensors_and_words(tmp_path) -> None:
     again = algorithm("learned_kernel", small_world(3), "algo.sensing=chosen")
     again.load_state_dict(state)
     assert (again.actor.dense() == learner.actor.dense()).all()
+
+
+def test_plans_within_the_window() -> None:
+    """Where fewer sensors can be chosen than the target can reach, no set holds another."""
+    world = small_world(5)
+    narrow = World(world.kernel, 5, cost=0.05, t_max=1, window=1)
+    learner, _ = learn(narrow, 2)
+    row, cell = learner.actor.sets.nonzero()
+    located = row // 2  # two sets per located cell
+    assert len(row)
+    assert np.abs(located // 5 - cell // 5).max() <= 1
+    assert np.abs(located % 5 - cell % 5).max() <= 1

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trackmdp.algos.paths import CellIndex, stratified_starts
+from trackmdp.algos.paths import CellIndex, cell_dtype, stratified_starts
 
 
 def test_the_places_of_a_cell_are_cut_evenly() -> None:
@@ -34,3 +34,10 @@ def test_starts_are_even_and_first_draws_stratified(count: int, steps: int, cell
         first = draws[0, start == cell]
         within = first * len(first) - torch.arange(len(first))
         assert -1e-4 < within.min() <= within.max() < 1 + 1e-4
+
+
+def test_cells_of_large_grids_fit() -> None:
+    """M itself stands for the exit: 181 x 181 cells take 16 bits, 182 x 182 take more."""
+    for side, dtype in ((181, torch.int16), (182, torch.int32)):
+        assert cell_dtype(side**2) is dtype
+        assert torch.tensor(side**2, dtype=dtype).item() == side**2

@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from trackmdp.algos.paths import CellIndex, sensed_steps, stratified_starts
+from trackmdp.algos.paths import CellIndex, cell_dtype, sensed_steps, stratified_starts
 
 __all__ = ["MoveBuffer", "sensed_moves"]
 
@@ -25,8 +25,8 @@ class MoveBuffer:
 
     def __init__(self, num_cells: int, capacity: int, generator: torch.Generator) -> None:
         self.num_cells, self._capacity, self._generator = num_cells, capacity, generator
-        # Oldest first; 16 bits hold M up to 32,767, a square of 181 x 181 cells.
-        self._moves = torch.empty(2, 0, dtype=torch.int16, device=generator.device)
+        # Oldest first.
+        self._moves = torch.empty(2, 0, dtype=cell_dtype(num_cells), device=generator.device)
         self._index: tuple[Tensor, CellIndex] | None = None
 
     def __len__(self) -> int:

@@ -8,7 +8,12 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-__all__ = ["CellIndex", "sensed_steps", "stratified_starts"]
+__all__ = ["CellIndex", "cell_dtype", "sensed_steps", "stratified_starts"]
+
+
+def cell_dtype(num_cells: int) -> torch.dtype:
+    """The smallest integers that hold all cells and M: 16 bits on grids of up to 181 x 181 cells."""
+    return torch.int16 if num_cells <= torch.iinfo(torch.int16).max else torch.int32
 
 
 class CellIndex(NamedTuple):

@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.functional import pad
 
-from trackmdp.algos.paths import CellIndex, sensed_steps, stratified_starts
+from trackmdp.algos.paths import CellIndex, cell_dtype, sensed_steps, stratified_starts
 
 __all__ = ["SegmentBuffer"]
 
@@ -29,8 +29,8 @@ class SegmentBuffer:
 
     def __init__(self, num_cells: int, steps: int, capacity: int, generator: torch.Generator) -> None:
         self.num_cells, self.steps, self._capacity, self._generator = num_cells, steps, capacity, generator
-        # Oldest first; 16 bits hold M up to 32,767, a square of 181 x 181 cells.
-        self._segments = torch.empty(steps + 1, 0, dtype=torch.int16, device=generator.device)
+        # Oldest first.
+        self._segments = torch.empty(steps + 1, 0, dtype=cell_dtype(num_cells), device=generator.device)
         self._tail: dict[str, Tensor] = {}
         self._index: tuple[Tensor, CellIndex] | None = None
 
@@ -51,7 +51,8 @@ class SegmentBuffer:
         fresh = _segments(frames, self.steps, self.num_cells)
         self._segments = torch.cat([self._segments, fresh], dim=1)[:, -self._capacity :].contiguous()
         # The frames at which a segment may begin that this batch is too short for.
-        self._tail = {key: value[:, value.shape[1] - self.steps + 1 :].clone() for key, value in frames.items()}
+        begin = max(0, frames["start"].shape[1] - self.steps + 1)
+        self._tail = {key: value[:, begin:].clone() for key, value in frames.items()}
         self._index = None
 
     def moves(self) -> tuple[Tensor, Tensor]:
@@ -97,8 +98,8 @@ def _frames(batch: TensorDictBase, num_cells: int) -> dict[str, Tensor]:
     """`[B, time]` of a collected batch: the cells around each step, whether it was sensed, whether it ended."""
     whole, end = sensed_steps(batch, num_cells)
     return {
-        "start": batch["last_cell"].to(torch.int16),
-        "end": end.to(torch.int16),
+        "start": batch["last_cell"].to(cell_dtype(num_cells)),
+        "end": end.to(cell_dtype(num_cells)),
         "whole": whole,
         "done": batch["next", "done"].squeeze(-1),
     }
@@ -115,7 +116,7 @@ def _goes_on(before: dict[str, Tensor], frames: dict[str, Tensor]) -> bool:
 
 
 def _segments(frames: dict[str, Tensor], steps: int, num_cells: int) -> Tensor:
-    """`[steps + 1, K]` int16, the segments that are complete: fully sensed to their end or to the exit."""
+    """`[steps + 1, K]`, the segments that are complete: fully sensed to their end or to the exit."""
     # 5 frames and segments of 3 steps: they may begin at frames 0, 1 and 2.
     count = frames["start"].shape[1] - steps + 1
     if count < 1:

@@ -56,7 +56,7 @@ def typed_config(command: str, cfg: DictConfig, folder: Path) -> CommandConfig:
 
 
 def _refuse_ignored(typed: CommandConfig, composed: DictConfig) -> None:
-    """Refuse words of the command line that have no effect; a default that nothing reads is no mistake of the user's."""
+    """Refuse words of the command line that have no effect; a default that nothing reads is no mistake."""
     if "hydra" in composed:
         words = (word.lstrip("+~").partition("=") for word in composed.hydra.overrides.task)
         refuse_ignored(typed, {key: value for key, _, value in words}, composed.hydra.runtime.choices)

@@ -54,5 +54,6 @@ def _row(n: int, what: str, figure: str, file: str, *words: str) -> dict[str, An
         except subprocess.CalledProcessError:
             return row
         result = json.loads(Path(folder, "run", file).read_text())
-    result = result["rows"][0] if "rows" in result else result
-    return row | {key: usage[key] for key in usage if "rows" not in file} | {figure: result[figure]}
+    if "rows" in result:  # a rate: of the process only its memory is of interest
+        result, usage = result["rows"][0], {"peak_mib": usage["peak_mib"]}
+    return row | usage | {figure: result[figure]}
