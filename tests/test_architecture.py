@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import ast
+import io
+import tokenize
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -193,6 +196,38 @@ def test_nothing_prints_or_unpickles(file: Path) -> None:
             assert arguments.get("allow_pickle") == "False", f"{file}:{node.lineno}"
         if called == "torch.load":
             assert arguments.get("weights_only") == "True", f"{file}:{node.lineno}"
+
+
+def lines_of(source: str) -> tuple[set[int], int]:
+    """Lines of code (no blanks, docstrings, comments), and the number of comments."""
+    texts: set[int] = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+            texts |= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+    layout = (tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER)
+    code, comments = set[int](), 0
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            comments += 1
+        elif token.type not in layout:
+            code |= set(range(token.start[0], token.end[0] + 1))
+    return code - texts, comments
+
+
+def test_lines_are_counted_as_they_are_meant() -> None:
+    source = '"""A module."""\n\nx = [  # why\n    1,\n]\n# why\n\n\ndef f():\n    """Text."""\n    return x\n'
+    assert lines_of(source) == ({3, 4, 5, 9, 11}, 2)
+
+
+def test_every_package_says_why() -> None:
+    """At least 5 comments per 100 lines of code."""
+    code, comments = Counter[str](), Counter[str]()
+    for file in FILES:
+        lines, said = lines_of(file.read_text(encoding="utf-8"))
+        package = file.relative_to(PACKAGE).parts[0] if file.parent != PACKAGE else "."
+        code[package] += len(lines)
+        comments[package] += said
+    assert {name: 100 * comments[name] / code[name] for name in code if comments[name] < 0.05 * code[name]} == {}
 
 
 def test_the_top_level_holds_only_what_belongs_there() -> None:
