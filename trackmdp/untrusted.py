@@ -25,6 +25,7 @@ __all__ = [
     "opened",
     "parse_json",
     "SMALL",
+    "no_formula",
     "printable",
     "read_bytes",
     "read_json",
@@ -191,6 +192,12 @@ _TIMED = re.compile("second|time|per_s$")
 # C1 controls; \u200e... and \u2066... turn the direction of text; surrogates cannot be encoded, so that printing them
 # raises.
 _UNPRINTABLE = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+
+
+def no_formula(text: str) -> str:
+    """The text of a cell that a spreadsheet shows and does not compute, whatever somebody called a folder."""
+    # With an apostrophe before it, a spreadsheet takes it for text.
+    return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text
 
 
 def printable(text: str) -> str:

@@ -263,3 +263,5 @@ def test_a_belief_within_the_tolerance_passes() -> None:
     changed = dataclasses.replace(episode, belief=episode.belief + np.float32(1e-7))
     assert first_difference(changed, episode)
     assert first_difference(changed, episode, belief_tolerance=1e-6) is None
+    changed.belief[0, 0] = np.nan
+    assert (first_difference(changed, episode, belief_tolerance=1e-6) or "").startswith("step 0, belief of cell 0")

@@ -190,7 +190,7 @@ def _differing(logged: Episode, again: Episode, name: str, steps: int, tolerance
     mine, other = getattr(logged, name)[:steps], getattr(again, name)[:steps]
     differs = mine != other
     if name == "belief" and tolerance:
-        differs = np.abs(mine - other) > tolerance
+        differs = ~(np.abs(mine - other) <= tolerance)  # so that a NaN differs from every number
     if not differs.any():
         return None
     where = tuple(int(each) for each in np.argwhere(differs)[0])

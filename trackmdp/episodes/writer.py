@@ -153,7 +153,7 @@ class EpisodeWriter:
             raise ValueError(f"episode {episode.number}: without its belief; log those of `Episodes.complete`")
         # Before the first message of the episode: NaN is no JSON, and a time that does not fit into its field makes
         # the Writer raise within a chunk, which finish() could then no longer write.
-        if not (np.isfinite(episode.reward).all() and 0 <= tick < 2**50):
+        if not (np.isfinite(episode.reward).all() and 0 <= tick < 2**37):
             raise ValueError(f"episode {episode.number}: a reward that is not finite, or a time out of range")
         add, step, grid = self._writer.add_message, self._channels["/step"], self._channels["/grid"]
         steps = messages.step_messages(episode, self._size, self._t_max)

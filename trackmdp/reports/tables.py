@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-from trackmdp.untrusted import printable
+from trackmdp.untrusted import no_formula, printable
 
 __all__ = ["Cell", "Column", "Table"]
 
@@ -141,14 +141,8 @@ def _plain(value: Cell) -> Any:
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return ""
     if isinstance(value, str):
-        return _no_formula(printable(value))
+        return no_formula(printable(value))
     return repr(value) if isinstance(value, float) else value
-
-
-def _no_formula(text: str) -> str:
-    """The text of a cell that a spreadsheet shows and does not compute, whatever somebody called a folder."""
-    # With an apostrophe before it, a spreadsheet takes it for text.
-    return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text
 
 
 def _escape(text: str) -> str:

@@ -21,9 +21,10 @@ from trackmdp.app.cli import main
 from trackmdp.app.sweep.job import stop_signal
 from trackmdp.app.sweep.plan import Job
 from trackmdp.app.sweep.sweep import sweep
+from trackmdp.app.sweep.table import write_table
 from trackmdp.durable import write_sealed
 from trackmdp.errors import Preempted, RunError
-from trackmdp.training.folders import read_plan, run_of, runs_of
+from trackmdp.training.folders import RunState, read_plan, run_of, runs_of
 from trackmdp.training.lock import locked
 
 __all__ = ["here"]
@@ -269,3 +270,12 @@ def test_runs_outlive_their_fork_server(here: Path) -> None:
 
 def _parent(process: Path) -> int:
     return int((process / "stat").read_text().rpartition(")")[2].split()[1])
+
+
+def test_the_table_holds_no_formulas(tmp_path: Path) -> None:
+    """A name that a spreadsheet would compute is kept as text; numbers, negative ones too, stay as they are."""
+    run = RunState(tmp_path / "=1+1", ("kernel.direction=-90", "init_from=@home"), "failed", "+no luck")
+    write_table(tmp_path, [run])
+    (row,) = table(tmp_path)
+    assert (row["folder"], row["reason"]) == ("'=1+1", "'+no luck")
+    assert (row["kernel.direction"], row["init_from"]) == ("-90", "'@home")

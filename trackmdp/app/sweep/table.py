@@ -15,6 +15,7 @@ from trackmdp.durable import write_text
 from trackmdp.errors import FAILED, USER_MISTAKE
 from trackmdp.training.display import table
 from trackmdp.training.folders import FAILED_FILE, RunState, read_run_json
+from trackmdp.untrusted import no_formula
 
 __all__ = ["TABLE", "run_figures", "show_runs", "status_of", "write_table"]
 
@@ -52,9 +53,20 @@ def write_table(sweep: Path, runs: Sequence[RunState]) -> None:
     writer.writerow(["folder", "state", *_FIGURES, "reason", *keys])
     for run, pairs in zip(runs, words, strict=True):
         found = run_figures(run)
-        row = [run.folder.name, run.state, *(found.get(name) for name in _FIGURES), run.reason]
-        writer.writerow([*row, *(pairs.get(key) for key in keys)])
+        row = [_cell(run.folder.name), run.state, *(found.get(name) for name in _FIGURES), _cell(run.reason)]
+        writer.writerow([*row, *(_cell(pairs.get(key)) for key in keys)])
     write_text(sweep / TABLE, stream.getvalue())
+
+
+def _cell(text: str | None) -> str | None:
+    """Numbers as they are, also negative ones; a text that would be a formula is kept from being one."""
+    if text is None:
+        return None
+    try:
+        float(text)
+    except ValueError:
+        return no_formula(text)
+    return text
 
 
 def status_of(runs: Sequence[RunState]) -> int:
