@@ -67,7 +67,8 @@ def test_ours_and_the_peers_take_turns_and_are_timed_alike(tmp_path: Path, capfd
     assert np.diff(good["curve"]["seconds"]).tolist() == pytest.approx([1.0, 1.0])
     assert good["settled_steps"] == 30
     assert good["curve"]["seconds"][2] == pytest.approx(good["wall_seconds"])
-    assert good["curve"]["regret"][0] > good["curve"]["regret"][1] > 0.5
+    # Of 25 sensors at .2 a step all cost 5; with none, the safe action costs as much every other step.
+    assert good["curve"]["regret"][1] > good["curve"]["regret"][0] > 0.5
     assert lost["settled_seconds"] is lost["settled_steps"] is lost["times_ours"] is None
     assert lost["last_regret"] == pytest.approx(good["curve"]["regret"][0])
     out = capfd.readouterr().out

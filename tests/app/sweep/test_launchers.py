@@ -133,7 +133,7 @@ def test_a_preempted_run_saves_is_requeued_and_goes_on(tmp_path: Path, monkeypat
     _, said = process.communicate(timeout=300)
     assert process.returncode == 0, said
     assert (state / "requeued").read_text() == "4711\n"
-    assert "goes on after iteration" in (run.folder / "output.txt").read_text()
+    assert "resumes after iteration" in (run.folder / "output.txt").read_text()
     finish_one = ["train", *TINY, *words, "quiet=true", "hydra.run.dir=alone"]
     assert started(tmp_path, *finish_one).wait(timeout=300) == 0
     assert run_of(tmp_path / "alone").result["policy"] == run_of(run.folder).result["policy"]
