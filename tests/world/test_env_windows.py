@@ -9,10 +9,9 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
-from tests.helpers import small_world, worlds
+from tests.helpers import random_state, small_world, worlds
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.kernels import random_walk
 from trackmdp.world.model import World
@@ -25,23 +24,6 @@ def walk(window: int | None, size: tuple[int, int] = (5, 4), t_max: int = 2) -> 
     kernel = random_walk(size, stay=0.2, diagonal=True, exit_probability=0.1, border="clip")
     cost = torch.linspace(0.1, 0.3, size[0] * size[1]).numpy()
     return World(kernel, size, cost=cost, t_max=t_max, window=window)
-
-
-def local_state(world: World, rows: int, seed: int) -> TensorDict:
-    """States an episode with a window can be in."""
-    rng = torch.Generator().manual_seed(seed)
-    m, k, choices = world.num_cells, world.num_sensors, world.num_choices
-    n = torch.randint(choices + 1, (rows,), generator=rng)
-    history = torch.rand(rows, choices, k, generator=rng) < 0.4
-    history &= (torch.arange(choices) < n.unsqueeze(-1)).unsqueeze(-1)
-    state = {
-        "target": torch.randint(m, (rows,), generator=rng),
-        "last_cell": torch.randint(m, (rows,), generator=rng),
-        "steps_since_detection": n,
-        "action_history": history,
-        "action": torch.rand(rows, k, generator=rng) < 0.5,
-    }
-    return TensorDict(state, [rows])
 
 
 def everywhere(world: World, state: Any) -> dict[str, torch.Tensor]:
@@ -57,7 +39,7 @@ def everywhere(world: World, state: Any) -> dict[str, torch.Tensor]:
 def test_a_step_with_a_window_is_the_one_without(world: World, radius: int, rows: int, seed: int) -> None:
     """The same target, sets within the window: the same reward to the bit, and the same state after it."""
     local = replace(world, window=radius)
-    state = local_state(local, rows, seed)
+    state = random_state(local, rows, seed)
     draws = torch.rand(rows, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
     mine = TrackEnv(local, rows).advance(state, draws)
     theirs = TrackEnv(world, rows).advance(everywhere(local, state), draws)
