@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,7 +13,7 @@ from trackmdp.paper.calibration import chosen
 from trackmdp.paper.openings import load_openings
 from trackmdp.paper.printed import PRINTED_QMDP, pairs
 from trackmdp.reports.grouping import Study, study
-from trackmdp.reports.results import is_stored, load_results
+from trackmdp.reports.results import is_stored, load_results, save_results
 
 KEPT = Path(__file__).parents[1] / "data/paper"
 
@@ -48,6 +50,23 @@ def test_the_default_comes_close_in_every_pair_and_a2c_is_above_qmdp(grouped: St
         assert min(run.figure("aihtr") for run in a2c) > a2c[0].figure("qmdp_aihtr"), world
         assert max(grouped.regrets(world, "hindsight")) <= 0.01, world
         assert max(grouped.regrets(world, "a2c_per_sensor")) < 0.0025, world
+
+
+@pytest.mark.parametrize(("words", "shown"), [([], False), (["paper=true"], True)])
+def test_a_sweep_of_some_of_the_paper_s_worlds_is_not_taken_for_the_paper_s(
+    tmp_path: Path, words: list[str], shown: bool
+) -> None:
+    results = load_results(KEPT)
+    wanted = ("Z=5, c=0.16", "Z=3, c=0.16")
+    grouped = study(results.runs)
+    some = [run for world in grouped.worlds if world in wanted for run in grouped.in_world(world)]
+    assert some
+    part = tmp_path / "part"
+    part.mkdir()
+    save_results(replace(results, runs=some, curves={}), part)
+    shutil.copy(KEPT / "paper.json", part)  # known already, so that nothing is computed
+    assert main(["report", f"sweep={part}", f"hydra.run.dir={tmp_path / 'out'}", "quiet=true", *words]) == 0
+    assert ("Table II" in (tmp_path / "out/report.html").read_text(encoding="utf-8")) is shown
 
 
 @pytest.mark.slow

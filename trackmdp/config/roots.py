@@ -192,7 +192,7 @@ class ReportConfig(CommandConfig):
         "folder of the sweep, or of stored results", expects="the folder of a sweep or an earlier report", path=True
     )
     watch: bool = option("show all runs live until they are done, instead of a report")
-    paper: bool | None = option("add what concerns the paper's settings; null = where the runs are in its worlds")
+    paper: bool | None = option("add what concerns the paper's settings; null = where the runs cover its twelve worlds")
     threshold: float | None = option(
         "count the runs that end at most this far from the bound", unit="reward/step", gt=0
     )

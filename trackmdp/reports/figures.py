@@ -112,7 +112,7 @@ def regret_against_cost(study: Study, panel: Panel, threshold: float | None) -> 
             axes.axhline(threshold, color=INK, linewidth=0.6, linestyle=(0, (1, 2)))
             at, where = (1.01, threshold), ("axes fraction", "data")
             # x in parts of the axes, y in data: right of the frame, at the height of the line.
-            axes.annotate(f"{threshold:g}", at, xycoords=where, va="center", fontsize=7, clip_on=False)
+            axes.annotate(f"{threshold:g}", at, xycoords=where, va="center", clip_on=False)
         axes.set_yscale("log")
         axes.set_ylabel("regret per step")
         axes.set_xlabel("c, price of a sensor for one step")

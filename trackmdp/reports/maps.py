@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -41,9 +42,13 @@ def policy_map(
     possible = _possible(policy, motion, len(shown))
 
     def paint(figure: Canvas) -> None:
+        # A stored plan has a set for every n; where the miss cannot happen it is arbitrary, and never comes about.
+        drawn = [policy.chains[:, n] & possible[n].any(axis=1, keepdims=True) for n in shown]
+        # One size of tile for all, so that they can be compared: that of the farthest cell drawn.
+        reach = max(_farthest(can | on, size[1]) for can, on in zip(possible, drawn, strict=True))
         for axes, n in zip(np.atleast_1d(figure.subplots(len(shown), 1)), shown, strict=True):
-            _tiles(axes, policy.chains[:, n], possible[n], size, reach=n + 1)
-            axes.set_title("just located (n = 0)" if n == 0 else "after one miss (n = 1)", fontsize=8.5)
+            _tiles(axes, drawn[n], possible[n], size, max(reach, 1))
+            axes.set_title("just located (n = 0)" if n == 0 else "after one miss (n = 1)")
 
     rows: list[list[Cell]] = [
         [x, n, int((on := policy.chains[x, n]).sum()), int(possible[n][x].sum()), _cells_text(on, size[1])]
@@ -80,18 +85,21 @@ def value_map(name: str, where: str, policy: StoredPolicy, motion: MotionTable, 
     }
 
     def paint(figure: Canvas) -> None:
-        for place, (axes, (label, values)) in enumerate(zip(figure.subplots(1, 3), layers.items(), strict=True)):
-            # Two scales of colour: values and what is missing are not to be compared by shade. Bright is good in both,
-            # much in viridis and little in magma_r.
-            _shade(figure, axes, values.reshape(size), "viridis" if place == 0 else "magma_r")
-            axes.set_title(label, fontsize=6.8)
+        # Two scales of colour: values and what is missing are not to be compared by shade. Bright is good in both, much
+        # in viridis and little in magma_r. What is missing has one scale for both policies.
+        first, *missing = figure.subplots(1, 3)
+        value, *short = (values.reshape(size) for values in layers.values())
+        _shade(figure, [first], [value], "viridis")
+        _shade(figure, missing, short, "magma_r", low=0.0)
+        for axes, label in zip((first, *missing), ("value V(x)", "below the bound", "Q_MDP's"), strict=True):
+            axes.set_title(label)
 
     columns = [Column("start cell"), Column("row"), Column("column"), *(Column(label, 3) for label in layers)]
     rows = [
         [x, x // size[1] + 1, x % size[1] + 1, *(float(values[x]) for values in layers.values())]
         for x in range(len(policy.value))
     ]
-    title = f"Value of each start cell, {where}"
+    title = f"Value of each start cell, and what is missing of the clocked bound, {where}"
     text = "; ".join(
         f"{label}: mean {values.mean():.2f}, from {values.min():.2f} to {values.max():.2f}"
         for label, values in layers.items()
@@ -99,20 +107,30 @@ def value_map(name: str, where: str, policy: StoredPolicy, motion: MotionTable, 
     return draw_figure(f"value-{name}", title, f"{text}.", Table(f"value-{name}", title, columns, rows), 2.1, paint)
 
 
-def _shade(figure: Canvas, axes: Axes, values: Array, colours: str) -> None:
-    """A square of shaded cells with its scale."""
+def _shade(
+    figure: Canvas, every: Sequence[Axes], layers: Sequence[Array], colours: str, low: float | None = None
+) -> None:
+    """Shaded cells of one or more layers, with the scale they share."""
     from matplotlib import colormaps
     from matplotlib.ticker import MaxNLocator
 
-    # 24 shades: the colour bar is then 24 rectangles in the SVG, and not 256.
-    shade = axes.pcolormesh(values, cmap=colormaps[colours].resampled(LEVELS))
-    # Row 1 on top, as in the numbering of cells.
-    axes.invert_yaxis()
-    axes.set_aspect("equal")
-    axes.set_xticks([])
-    axes.set_yticks([])
-    bar = figure.colorbar(shade, ax=axes, orientation="horizontal", pad=0.03, fraction=0.07)
-    bar.ax.tick_params(labelsize=6.5)
+    # A single outlying cell would leave one shade to all others: the scale ends at the 2nd and the 98th of a hundred.
+    second, high = np.percentile(np.concatenate([values.ravel() for values in layers]), (2, 98))
+    low = second if low is None else low
+    for axes, values in zip(every, layers, strict=True):
+        # 24 shades: the colour bar is then 24 rectangles in the SVG, and not 256.
+        shade = axes.pcolormesh(values, cmap=colormaps[colours].resampled(LEVELS), vmin=low, vmax=high)
+        # Row 1 on top, as in the numbering of cells.
+        axes.invert_yaxis()
+        axes.set_aspect("equal")
+        axes.set_xticks([])
+        axes.set_yticks([])
+    # An arrow at an end of the bar: some cells lie beyond it.
+    beyond = (min(values.min() for values in layers) < low, max(values.max() for values in layers) > high)
+    ends = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}[beyond]
+    bar = figure.colorbar(
+        shade, ax=list(every), orientation="horizontal", pad=0.03, fraction=0.07, aspect=12 * len(every), extend=ends
+    )
     assert bar.solids is not None
     bar.solids.set_rasterized(False)  # a page takes no pictures
     bar.locator = MaxNLocator(3)
@@ -144,13 +162,9 @@ def _tiles(axes: Axes, on: BoolArray, possible: BoolArray, size: tuple[int, int]
         on: `[M, M]`, row x: sensors on with the target located in x.
         possible: `[M, M]`, row x: cells it can be in.
         size: rows and columns of the grid.
-        reach: cells shown on each side of the located one, at least; more where possible cells are farther away.
+        reach: cells shown on each side of the located one.
     """
     rows, columns = size
-    # A stored plan has a set for every n; where the miss cannot happen it is arbitrary.
-    on = on & possible.any(axis=1, keepdims=True)  # elsewhere it never comes to this
-    # After n misses n + 1 moves have been made, each to a neighbour in most worlds.
-    reach = max(reach, _farthest(possible | on, columns))
     # 2 reach + 1 cells and one between tiles.
     side = 2 * reach + 2
     groups: dict[str, list[tuple[float, float]]] = {ON: [], OFF: [], IDLE: []}
@@ -159,13 +173,17 @@ def _tiles(axes: Axes, on: BoolArray, possible: BoolArray, size: tuple[int, int]
         # The tile of x begins at (column, row) * side; its centre, x itself, is at + reach, and j is drawn relative to
         # it. In a grid of 10 columns, x = 23 and j = 34: one down, one right.
         for j in np.flatnonzero(possible[x] | on[x]):
-            down, right = j // columns - row, j % columns - column
+            down, across = j // columns - row, j % columns - column
             colour = IDLE if not possible[x, j] else ON if on[x, j] else OFF
-            groups[colour].append((float(column * side + reach + right), float(row * side + reach + down)))
+            groups[colour].append((float(column * side + reach + across), float(row * side + reach + down)))
     _squares(axes, groups)
     places = (divmod(x, columns) for x in range(rows * columns))
     centres = [(column * side + reach + 0.5, row * side + reach + 0.5) for row, column in places]
     axes.plot(*np.array(centres).T, ".", color=INK, markersize=12 / side)
+    # A frame around each tile: with reach 1 tiles are 4 apart and their cells begin at 0, 4, ..., frames at -0.5, 3.5.
+    right, below = columns * side - 0.5, rows * side - 0.5
+    axes.vlines(np.arange(columns + 1) * side - 0.5, -0.5, below, colors=LINE, linewidths=0.5)
+    axes.hlines(np.arange(rows + 1) * side - 0.5, -0.5, right, colors=LINE, linewidths=0.5)
     axes.set_xlim(-1, columns * side)
     axes.set_ylim(rows * side, -1)
     axes.set_aspect("equal")

@@ -156,14 +156,14 @@ def _against_cost(grouped: Study, threshold: float | None) -> list[Section]:
         return []
     note = (
         "<p>Learned policies: mean over seeds, bars are 95 % intervals (Student's t; none below three seeds). Q_MDP, "
-        "the bounds and the solver's policy are valued exactly. Below, the distance to the proved upper bound tells "
-        "the best apart.</p>"
+        "the bounds and the solver's policy are valued exactly. Above: the distance to the proved upper bound, which "
+        "tells the best apart; below: the reward itself.</p>"
     )
     above = [figures.against_cost(grouped, panel) for panel in found]
     # No regret where a world has no proved bound, as one on recorded tracks.
     bounded = [panel for panel in found if not any(math.isnan(grouped.upper(world)) for world in panel.worlds)]
     below = [figures.regret_against_cost(grouped, panel, threshold) for panel in bounded]
-    return [Section("figures", "Against the price of a sensor", [note, above, below])]
+    return [Section("figures", "Against the price of a sensor", [below, note, above])]
 
 
 def _learning(results: Results, grouped: Study, threshold: float | None) -> list[Section]:

@@ -22,6 +22,7 @@ __all__ = [
     "INK",
     "LINE",
     "PALETTE",
+    "TEXT",
     "Figure",
     "Look",
     "Say",
@@ -37,6 +38,8 @@ Say: TypeAlias = Callable[[str], None]
 
 WIDTH = 4.3
 """Inches; as wide as a phone, so that letters keep their size there."""
+TEXT = 10.5
+"""Points. A figure is 310 points wide and is shown 330 pixels wide on a phone: 11 pixels there, more elsewhere."""
 INK, LINE, PAGE = "#1b1b1c", "#c4c4c5", "#fffffe"
 # `_inline` replaces these very letters in the SVG: a colour that is not among them would stay as it is in the dark
 # scheme.
@@ -197,7 +200,7 @@ def legend(figure: Canvas, axes: Axes, columns: int = 3, first: Sequence[str] = 
         [labels[place] for place in order],
         loc="outside lower center",
         ncols=columns,
-        fontsize=7.5,
+        fontsize=TEXT,
         frameon=False,
         columnspacing=1.2,
     )
@@ -212,10 +215,11 @@ def _settings(name: str) -> Any:
         "svg.fonttype": "none",
         "text.parse_math": False,  # a label is a name, and $x^{$ one that somebody may give
         "font.family": "DejaVu Sans",
-        "font.size": 8.5,
-        "axes.labelsize": 8.5,
-        "xtick.labelsize": 8,
-        "ytick.labelsize": 8,
+        "font.size": TEXT,
+        "axes.titlesize": TEXT,
+        "axes.labelsize": TEXT,
+        "xtick.labelsize": TEXT,
+        "ytick.labelsize": TEXT,
         "text.color": INK,
         "axes.labelcolor": INK,
         "axes.edgecolor": INK,

@@ -10,7 +10,7 @@ from rich.text import Text
 from trackmdp.config import ReportConfig
 from trackmdp.durable import write_bytes, write_text
 from trackmdp.paper.openings import compute, load_openings, save_openings
-from trackmdp.paper.printed import pairs
+from trackmdp.paper.printed import PRINTED_QMDP, pairs
 from trackmdp.paper.sections import sections
 from trackmdp.reports import style, watch
 from trackmdp.reports.gather import gather_runs
@@ -52,7 +52,9 @@ def run(cfg: ReportConfig, folder: Path) -> float:
 def _about_the_paper(cfg: ReportConfig, sweep: Path, found: Results, folder: Path, say: style.Say) -> list[Section]:
     """Where it is asked for, what concerns the paper: made from stored figures, or from such that are computed now."""
     grouped = study(found.runs)
-    if not (bool(pairs(grouped)) if cfg.paper is None else cfg.paper):
+    # A sweep of one's own may touch some of the paper's worlds; all twelve of them are its experiments.
+    asked = len(pairs(grouped)) == len(PRINTED_QMDP) if cfg.paper is None else cfg.paper
+    if not asked:
         return []
     known = (load_openings(sweep) if is_stored(sweep) else None) or compute(say)
     save_openings(known, folder)
