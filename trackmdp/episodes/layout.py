@@ -1,4 +1,4 @@
-"""A layout for viewers that take Lichtblick's form: two maps, plots of the step, the state of the target."""
+"""A layout for viewers that take Lichtblick's form: four maps, plots of the step, the state of the target."""
 
 from __future__ import annotations
 
@@ -11,11 +11,13 @@ from trackmdp.durable import write_text
 __all__ = ["layout", "write_layout"]
 
 
-def layout() -> dict[str, Any]:
-    """The layout as plain values."""
-    panels: dict[str, Any] = {
-        "3D!belief": _map("belief"),
-        "3D!policy": _map("policy"),
+# A panel colours a grid by one of its fields, so that what is on, what is likely and what is true are one map each.
+_MAPS = ("belief", "active", "target", "policy")
+
+
+def layout(size: tuple[int, int]) -> dict[str, Any]:
+    """The layout as plain values, its cameras over a grid of `size` (rows, columns)."""
+    panels: dict[str, Any] = {f"3D!{field}": _map(field, size) for field in _MAPS} | {
         "Plot!misses": _plot("/step.n", "/step.n_active"),
         "Plot!reward": _plot("/step.reward", "/step.ep_return"),
         "StateTransitions!seen": {
@@ -24,13 +26,14 @@ def layout() -> dict[str, Any]:
         },
         "RawMessages!episode": {"topicPath": "/episode"},
     }
-    maps = _split("row", "3D!belief", "3D!policy")
+    belief, active, target, policy = (f"3D!{field}" for field in _MAPS)
+    maps = _split("row", _split("row", belief, active), _split("row", target, policy))
     plots = _split("column", "Plot!misses", _split("column", "Plot!reward", "StateTransitions!seen"))
     arrangement = _split("column", maps, _split("row", plots, "RawMessages!episode"))
     return {"configById": panels, "globalVariables": {}, "userNodes": {}, "layout": arrangement}
 
 
-def _map(colour_field: str) -> dict[str, Any]:
+def _map(colour_field: str, size: tuple[int, int]) -> dict[str, Any]:
     grid = {
         "visible": True,
         "colorField": colour_field,
@@ -39,7 +42,16 @@ def _map(colour_field: str) -> dict[str, Any]:
         "minValue": 0,
         "maxValue": 1,
     }
-    camera = {"perspective": False, "phi": 0, "thetaOffset": 0, "distance": 15, "targetOffset": [5, 5, 0]}
+    rows, columns = size
+    # Cells are squares of side 1 from (0, 0) on, x along the columns; without perspective the distance is the height of
+    # what is seen. A grid of 4 x 6 cells is looked at from above (3, 2), over a height of 9.
+    camera = {
+        "perspective": False,
+        "phi": 0,
+        "thetaOffset": 0,
+        "distance": 1.5 * max(rows, columns),
+        "targetOffset": [columns / 2, rows / 2, 0],
+    }
     return {"foxglovePanelTitle": colour_field, "followTf": "grid", "topics": {"/grid": grid}, "cameraState": camera}
 
 
@@ -52,6 +64,6 @@ def _split(direction: str, first: Any, second: Any) -> dict[str, Any]:
     return {"direction": direction, "first": first, "second": second}
 
 
-def write_layout(file: Path) -> None:
+def write_layout(file: Path, size: tuple[int, int]) -> None:
     """Write the layout as JSON."""
-    write_text(file, json.dumps(layout(), indent=2) + "\n")
+    write_text(file, json.dumps(layout(size), indent=2) + "\n")

@@ -57,7 +57,7 @@ class EpisodeLog:
                 facts = {"seed": str(seed)}
                 self._writer = EpisodeWriter(self.file, world, facts=facts, config=config)
             if layout:
-                write_layout(folder / "episodes.layout.json")
+                write_layout(folder / "episodes.layout.json", world.size)
         except OSError as error:
             self._stop(error)
 

@@ -26,6 +26,7 @@ from trackmdp.config import world_of
 from trackmdp.episodes import schema
 from trackmdp.episodes.episode import Episode, first_difference
 from trackmdp.episodes.frame import frame, sentence
+from trackmdp.episodes.layout import layout as layout_of
 from trackmdp.episodes.log import EpisodeLog
 from trackmdp.episodes.player import Playing
 from trackmdp.episodes.reader import EpisodeReader
@@ -66,8 +67,13 @@ def test_evaluate_logs_as_many_episodes_as_it_simulates(log: Path) -> None:
         assert world_of(reader.attachment("config.yaml").decode()).grid.size == 4
     layout = json.loads((log.parent / "episodes.layout.json").read_text())
     maps = [panel for panel in layout["configById"].values() if "topics" in panel]
-    assert {panel["topics"]["/grid"]["colorField"] for panel in maps} == {"belief", "policy"}
+    assert {panel["topics"]["/grid"]["colorField"] for panel in maps} == {"belief", "active", "target", "policy"}
     assert all(panel["topics"]["/grid"]["visible"] for panel in maps)
+    # WORLD has 4 x 4 cells of side 1: seen from above their middle, over 1.5 times their height
+    assert {(*panel["cameraState"]["targetOffset"], panel["cameraState"]["distance"]) for panel in maps} == {
+        (2, 2, 0, 6)
+    }
+    assert layout_of((4, 6))["configById"]["3D!belief"]["cameraState"]["targetOffset"] == [3, 2, 0]
 
 
 def test_simulated_figures_are_those_of_the_episodes_in_the_log(log: Path) -> None:

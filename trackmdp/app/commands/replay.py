@@ -64,7 +64,7 @@ def _exports(console: Console, cfg: ReplayConfig, reader: EpisodeReader) -> bool
     writers: list[tuple[str, str | None, Callable[[Path], object]]] = [
         ("html", cfg.html, lambda path: write_page(reader, path, cfg.episode)),
         ("csv", cfg.csv, lambda path: write_tables(reader, path, cfg.episode)),
-        ("layout", cfg.layout, write_layout),
+        ("layout", cfg.layout, lambda path: write_layout(path, reader.world().size)),
     ]
     for key, path, write in writers:
         if path is None:
