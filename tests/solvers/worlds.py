@@ -51,8 +51,13 @@ def paper_world(support_size: int, cost: float, t_max: int, size: int = 10) -> W
 
 
 @st.composite
-def tiny_worlds(draw: st.DrawFn, *, size: int = 2, most_t_max: int = 1, support: int | None = None) -> World:
-    """Any kernel with some zeros, per-cell costs, and a safe action cheaper or dearer than all sensors."""
+def tiny_worlds(
+    draw: st.DrawFn, *, size: int = 2, most_t_max: int = 1, support: int | None = None, misses: bool = False
+) -> World:
+    """Any kernel with some zeros, per-cell costs, and a safe action cheaper or dearer than all sensors.
+
+    With `misses` sensors miss, and the safe action may.
+    """
     m = size**2
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     kernel = rng.random((m, m)) ** draw(st.sampled_from([1, 4]))
@@ -63,6 +68,10 @@ def tiny_worlds(draw: st.DrawFn, *, size: int = 2, most_t_max: int = 1, support:
     spread = draw(st.sampled_from([0.0, 1.0]))
     cost = draw(st.sampled_from([0.0, 0.1, 0.25, 0.5, 1.2])) * (1.0 + spread * rng.random(m))
     safe_cost = float(cost.sum()) * draw(st.sampled_from([0.1, 1.0, 3.0]))
+    sensors: dict[str, Any] = {}
+    if misses:
+        sensors["detection"] = 1.0 - draw(st.sampled_from([0.05, 0.6])) * rng.random(m)
+        sensors["safe_detection"] = draw(st.sampled_from([1.0, 0.7]))
     return World(
         kernel,
         size,
@@ -70,6 +79,7 @@ def tiny_worlds(draw: st.DrawFn, *, size: int = 2, most_t_max: int = 1, support:
         safe_cost=safe_cost,
         t_max=draw(st.integers(0, most_t_max)),
         reward=draw(st.sampled_from([1.0, 2.0])),
+        **sensors,
     )
 
 
@@ -88,11 +98,15 @@ def renewal(world: World, x: int, chain: BoolArray) -> tuple[float, Array]:
     mass = np.eye(world.num_cells)[x]
     for sensors in chain:
         mass = mass @ world.kernel
-        earned += world.reward * mass[sensors].sum() - world.cost[sensors].sum() * mass.sum()
-        located[sensors] += mass[sensors]
-        mass = np.where(sensors, 0.0, mass)
-    mass = mass @ world.kernel
-    return earned + (world.reward - world.safe_cost) * mass.sum(), located + mass
+        found = np.where(sensors, mass * world.detection, 0.0)
+        earned += world.reward * found.sum() - world.cost[sensors].sum() * mass.sum()
+        located, mass = located + found, mass - found
+    while mass.sum() > 1e-16:  # once only where the safe action always locates
+        mass = mass @ world.kernel
+        found = mass * world.safe_detection
+        earned += world.reward * found.sum() - world.safe_cost * mass.sum()
+        located, mass = located + found, mass - found
+    return earned, located
 
 
 def best_by_enumeration(world: World, allowed: BoolArray | None = None) -> Array:

@@ -67,16 +67,7 @@ class LearnedKernel:
 
     def _world(self, kernel: sparse.csr_array) -> World:
         """The task with the `[M, M + 1]` kernel believed."""
-        task = self.task
-        return World(
-            kernel[:, :-1],
-            task.size,
-            cost=task.cost,
-            safe_cost=task.safe_cost,
-            t_max=task.t_max,
-            reward=task.reward,
-            window=task.window,
-        )
+        return World.of(self.task, kernel[:, :-1], max_steps=None)
 
     def _diagnostics(self, plan: PolicyTable) -> dict[str, float]:
         """What the plan is believed to be worth, how sure that is, and what learning has cost so far."""

@@ -221,13 +221,17 @@ def corner(world: World) -> World:
     kernel *= 0.99 / np.maximum(kernel.sum(axis=1, keepdims=True), 0.99)
     # D = N^2 c by default, so it shrinks with the number of sensors.
     share = len(cells) / world.num_cells
-    return World(
+    return World.of(
+        world,
         kernel,
-        (len(cells) // columns, columns),
+        size=(len(cells) // columns, columns),
         cost=world.cost[cells],
         safe_cost=world.safe_cost * share,
         t_max=min(world.t_max, 2),
-        reward=world.reward,
+        max_steps=None,
+        window=None,
+        detection=world.detection[cells],
+        safe_detection=world.safe_detection[cells],
     )
 
 
@@ -240,9 +244,8 @@ def dearer(world: World) -> World:
 
 
 def changed(world: World, **changes: Any) -> World:
-    """A whole-episode copy of the world, all sensors allowed, with some of cost, safe_cost, t_max, reward replaced."""
-    own = {name: getattr(world, name) for name in ("cost", "safe_cost", "t_max", "reward")}
-    return World(world.kernel, world.size, **(own | changes))
+    """A whole-episode copy of the world, all sensors allowed, with some arguments of its task replaced."""
+    return World.of(world, world.kernel, **({"max_steps": None, "window": None} | changes))
 
 
 def _estimator(world: World, solution: Solution) -> Iterator[Check]:

@@ -40,6 +40,7 @@ def paper(world: World) -> Array:
     rows, p = row_index(world.kernel), world.kernel.data
     # max{P_xj r - c_j, 0} for each possible move: here c_j is not multiplied by the probability of staying in the grid,
     # which is the difference to `_best_step`.
+    p = p * world.detects(world.kernel.indices)
     gain = np.maximum(p * world.reward - world.cost[world.kernel.indices], 0.0)
     return accumulate(world.kernel, per_row(rows, gain, world.num_cells), world.size)
 
@@ -68,10 +69,11 @@ def _best_step(world: World) -> Array:
     # The reward is 0 on the exit step, costs included (eq. reward_func), so a sensor costs c_j P_in(x).
     cost = world.cost[world.kernel.indices] * world.stay_probability[rows]
     # Sensors add up: each is on where it gains, and a cell that cannot be reached never is.
-    free = per_row(rows, np.maximum(p * world.reward - cost, 0.0), world.num_cells)
+    report = p * world.detects(world.kernel.indices)
+    free = per_row(rows, np.maximum(report * world.reward - cost, 0.0), world.num_cells)
     # D is free to be anything: a safe action cheaper than the sensors it stands for is worth more than any free choice,
     # and would lie above the bound if it were left out.
-    return np.maximum(free, (world.reward - world.safe_cost) * world.stay_probability)
+    return np.maximum(free, world.safe_gain)
 
 
 @lru_cache(maxsize=1)
@@ -79,7 +81,9 @@ def clocked_table(world: World) -> ClockedBound:
     """U(x, n) by policy iteration, each policy valued by one sparse solve.
 
     U(x, t_max + 1) = sum_j P_xj (r - D + U(j, 0)), and
-    U(x, n) = sum_j max{P_xj (r + U(j, 0)) - c_j P_in(x), P_xj U(j, n + 1)}.
+    U(x, n) = sum_j max{P_xj [p_d (r + U(j, 0)) + (1 - p_d) U(j, n + 1)] - c_j P_in(x), P_xj U(j, n + 1)}.
+    Where the safe action may miss, U(x, t_max + 1) = sum_j P_xj [p_s (r + U(j, 0)) + (1 - p_s) U(j, t_max + 1) - D].
+    A bound for any p_d; not tight below 1, since a miss then never tells where the target is.
 
     The greedy policy of a table Û within rho of its own equation gives U <= Û + rho · (longest expected episode): the
     clocked process is left at every step with the target's probability of exit, whatever is chosen.
@@ -104,19 +108,20 @@ def clocked_table(world: World) -> ClockedBound:
 
 
 def _gains(world: World, table: Array) -> tuple[Array, Array]:
-    """`[E]` what sensing a possible move earns, and `[t_max + 1, E]` what leaving it unsensed does."""
+    """`[t_max + 1, E]` what sensing a possible move earns, and what leaving it unsensed does."""
     rows, cells, p = row_index(world.kernel), world.kernel.indices, world.kernel.data
-    sense = p * (world.reward + table[cells, 0]) - world.cost[cells] * world.stay_probability[rows]
-    return sense, p * table[cells, 1:].T
+    detected, missed = world.reward + table[cells, 0], table[cells, 1:].T
+    worth = detected - (1.0 - world.detects(cells)) * (detected - missed)
+    return p * worth - world.cost[cells] * world.stay_probability[rows], p * missed
 
 
 def _improve(world: World, table: Array, sensed: BoolArray) -> BoolArray:
     """`[t_max + 1, E]` the choice for each possible move; a tie leaves the present choice."""
     rows, cells, p = row_index(world.kernel), world.kernel.indices, world.kernel.data
-    # Both sides of the comparison are multiplied by the probability of the move: sense iff p (r + U(j,0)) - c > p
-    # U(j,n+1).
+    # Both sides of the comparison are multiplied by the probability p of the move; what a sensor that is on misses is
+    # worth p (1 - p_d) U(j, n + 1) on both, so that it is on iff p p_d (r + U(j, 0) - U(j, n + 1)) > c p_in.
     cost = world.cost[cells] * world.stay_probability[rows]
-    gain = p * (world.reward + table[cells, 0] - table[cells, 1:].T) - cost
+    gain = p * world.detects(cells) * (world.reward + table[cells, 0] - table[cells, 1:].T) - cost
     # without a margin, rounding could switch a tied choice to and fro for ever
     tie = 1e-12 * (1.0 + np.abs(table).max())
     return np.where(np.abs(gain) <= tie, sensed, gain > 0)
@@ -125,36 +130,47 @@ def _improve(world: World, table: Array, sensed: BoolArray) -> BoolArray:
 def _excess(world: World, table: Array) -> float:
     """The most by which the best choices, one step ahead, exceed `table`."""
     rows, (sense, leave) = row_index(world.kernel), _gains(world, table)
-    best = [per_row(rows, np.maximum(sense, left), world.num_cells) for left in leave]
+    best = [per_row(rows, np.maximum(on, off), world.num_cells) for on, off in zip(sense, leave, strict=True)]
     # The last column has no choice: the safe action is forced.
-    best.append(world.kernel @ (world.reward - world.safe_cost + table[:, 0]))
+    best.append(world.kernel @ _after_safe_action(world, table))
     return max(float((np.stack(best, axis=1) - table).max()), 0.0)
+
+
+def _after_safe_action(world: World, table: Array) -> Array:
+    """`[M]` worth of the target being in each cell when the safe action has been carried out, its price included."""
+    located = world.reward - world.safe_cost + table[:, 0]
+    return located - world.safe_misses * (world.reward + table[:, 0] - table[:, -1])
 
 
 def _value(world: World, sensed: BoolArray) -> tuple[Array, bool]:
     """`[M, t_max + 2]` U of the given choices, and whether it is exact.
 
     U(., n) = earned[n] + reach[n] U(., 0), from the last n backwards: after the safe action reach is P; before it, a
-    move that is sensed reaches a located cell at once, one that is not goes on with reach[n + 1].
+    sensor that is on reaches a located cell with p_d, and what it misses, like what is unsensed, goes on with
+    reach[n + 1]. Where the safe action may miss, U(., t_max + 1) is unknown as well, and reach has 2M columns.
     """
-    moves = world.kernel
+    moves, report = world.kernel, sensed * world.detects(world.kernel.indices)
     rows, cells = row_index(moves), moves.indices
     # With t_max = 1: reach[2] = P, reach[1] = hit_1 + miss_1 P, reach[0] = hit_0 + miss_0 reach[1]. Only the last is
     # solved with; the others give U(., n) by one product each.
-    earned = [(world.reward - world.safe_cost) * world.stay_probability]
-    reach = [moves]
+    earned, reach = [world.safe_gain], [moves]
+    if not world.safe:
+        lost = sparse.csr_array(moves.multiply(world.safe_misses))
+        reach = [sparse.csr_array(sparse.hstack([moves - lost, lost]))]
     # What a sensed move earns at once; the value of being located is in `reach`.
-    gain = moves.data * world.reward - world.cost[cells] * world.stay_probability[rows]
-    for choice in sensed[::-1]:
-        hit, miss = _masked(moves, choice), _masked(moves, ~choice)
+    gain = moves.data * world.detects(cells) * world.reward - world.cost[cells] * world.stay_probability[rows]
+    for choice, share in zip(sensed[::-1], report[::-1], strict=True):
+        hit, miss = _masked(moves, share), _masked(moves, 1.0 - share)
+        hit.resize(reach[0].shape)
         earned.insert(0, per_row(rows, gain * choice, world.num_cells) + miss @ earned[0])
         reach.insert(0, hit + miss @ reach[0])
-    system = RenewalSystem(reach[0], world.size)
-    located = system.solve(earned[0])
+    unknown = slice(1) if world.safe else slice(None, None, world.num_choices)  # U(., 0), and U(., t_max + 1)
+    system = RenewalSystem(sparse.csr_array(sparse.vstack(reach[unknown])), world.size)
+    located = system.solve(np.concatenate(earned[unknown]))
     return np.stack([b + k @ located for b, k in zip(earned, reach, strict=True)], axis=1), system.exact
 
 
-def _masked(moves: sparse.csr_array, keep: BoolArray) -> sparse.csr_array:
+def _masked(moves: sparse.csr_array, keep: Array) -> sparse.csr_array:
     kept = sparse.csr_array((moves.data * keep, moves.indices, moves.indptr), shape=moves.shape, copy=True)
     kept.eliminate_zeros()
     return kept
@@ -175,16 +191,11 @@ def _truncated_clocked(world: World, max_steps: int) -> Array:
     """
     moves, m = world.kernel, world.num_cells
     rows, cells, p = row_index(moves), moves.indices, moves.data
-    cost = world.cost[cells] * world.stay_probability[rows]
     # U_h(x, n) with h steps left, from U_0 = 0: each round adds one step in front.
     table = np.zeros((m, world.num_choices + 1))
     for _ in range(max_steps):
-        located = table[cells, 0]
-        gains = [
-            per_row(rows, np.maximum(p * (world.reward + located) - cost, p * table[cells, n + 1]), m)
-            for n in range(world.num_choices)
-        ]
-        # n = t_max + 1: r - D, and located again, whose clock is 0.
-        forced = per_row(rows, p * (world.reward - world.safe_cost + located), m)
-        table = np.stack([*gains, forced], axis=1)
+        best = [per_row(rows, np.maximum(on, off), m) for on, off in zip(*_gains(world, table), strict=True)]
+        # n = t_max + 1: r - D, and located again, whose clock is 0; or missed, and the safe action again.
+        forced = per_row(rows, p * _after_safe_action(world, table)[cells], m)
+        table = np.stack([*best, forced], axis=1)
     return table[:, 0]

@@ -8,6 +8,10 @@ revealed *once*, after any step. With m = zP and R_h(j) = F_h(e_j), two facts ab
 * leaving the cells N unsensed and sensing all others is worth at most what is sensed plus the lesser of two bounds on
   the mass z_N left: the position revealed at once, R_{h-1} z_N, or revealed after one more set chosen for all of it.
 
+A sensor that is on misses a share 1 - p_d(j) of its mass. Sensing j is then worth p_d m_j (r + V(j)) +
+(1 - p_d) m_j R_{h-1}(j) - c_j sum(m), and what is left of m after the set is the mass missed even with every sensor on,
+(1 - p_d) m, plus p_d m of the cells left unsensed: all said above holds for these two parts together.
+
 The loss against revealing at once is superadditive, so what two cells lose when both are left bounds what any set
 of undecided cells takes away (`Tree._least_loss`).
 
@@ -48,7 +52,9 @@ class _Frontier:
         start: `[B]`, the problem (located cell) they belong to.
         sets_left: sets still to be chosen, the next one included.
         relaxed: `[B]`, earned so far plus the bound on the rest with every cell at its better choice.
-        cells, mass, regret: `[B, K]`; `regret` is what sensing costs against the bound on leaving.
+        cells, mass, regret: `[B, K]`; `mass` is what sensing locates, `regret` what it costs against the bound on
+            leaving.
+        missed: `[B, M]`, mass that all sensors together would miss; None where no sensor misses.
         count: `[B]`, cells that are not padding.
         rest: `[B, K + 1]`, least that the cells from the k-th on take away from `relaxed`.
         origin: the batch these states came from and `[B]` their places in it; none at the start.
@@ -62,6 +68,7 @@ class _Frontier:
     regret: Array
     count: IndexArray
     rest: Array
+    missed: sparse.csr_array | None
     origin: tuple[_Choices, IndexArray] | None
 
 
@@ -265,7 +272,9 @@ class Tree:
         state = choices.state[row]
         cells, mass = choices.frontier.cells[state, place], choices.frontier.mass[state, place]
         pointer = np.concatenate([[0], np.cumsum(left.sum(axis=1))])
-        return sparse.csr_array((mass, cells, pointer), shape=(len(left), self._world.num_cells))
+        unsensed = sparse.csr_array((mass, cells, pointer), shape=(len(left), self._world.num_cells))
+        missed = choices.frontier.missed
+        return unsensed if missed is None else sparse.csr_array(unsensed + missed[choices.state])
 
     def _one_more_set(self, mass: sparse.csr_array, sets_left: int) -> tuple[Array, sparse.csr_array, Array, Array]:
         """Upper bound of F on each row of `mass` `[P, M]`: one more set for all of it, then the position is revealed.
@@ -275,15 +284,14 @@ class Tree:
             and of leaving it.
         """
         # Row q of `mass` [P, M] is a vector of undetected mass, `moved` is q P. Revealed after this set, each cell
-        # counts by itself, m_j (r + V(j)) - c_j |m| or m_j R_{h-1}(j), and the best set takes the larger one cell by
-        # cell.
+        # counts by itself, m_j (p_d (r + V(j)) + (1 - p_d) R_{h-1}(j)) - c_j |m| or m_j R_{h-1}(j), and the best set
+        # takes the larger one cell by cell.
         moved = mass @ self._world.kernel
         rows, cells = row_index(moved), moved.indices
-        sense = (
-            moved.data * self._detected[cells]
-            - self._world.cost[cells] * per_row(rows, moved.data, mass.shape[0])[rows]
-        )
-        leave = moved.data * self._revealed[sets_left - 1][cells]
+        detected, missed = self._detected[cells], self._revealed[sets_left - 1][cells]
+        worth = detected - (1.0 - self._world.detects(cells)) * (detected - missed)
+        sense = moved.data * worth - self._world.cost[cells] * per_row(rows, moved.data, mass.shape[0])[rows]
+        leave = moved.data * missed
         return per_row(rows, np.maximum(sense, leave), mass.shape[0]), moved, sense, leave
 
     def _advance(self, choices: _Choices) -> None:
@@ -307,12 +315,25 @@ class Tree:
             self._record(start, relaxed, moved, leave > sense, origin)
             return
         kept = np.flatnonzero(self._hopeful(start, relaxed))
-        frontier = _frontier(start, sets_left, relaxed, moved, leave - sense, kept, origin)
+        detects = self._world.detects(moved.indices)
+        found = sparse.csr_array((moved.data * detects, moved.indices, moved.indptr), shape=moved.shape)
+        frontier = _frontier(start, sets_left, relaxed, found, leave - sense, kept, origin)
+        if not self._world.perfect:
+            frontier = replace(frontier, missed=sparse.csr_array((moved - found)[kept]))
         frontier = replace(frontier, rest=self._least_loss(frontier))
-        left = np.zeros(frontier.cells.shape, dtype=bool)
-        bound = frontier.relaxed - frontier.rest[:, 0]
-        none = np.zeros(len(kept))
-        self._push(_Choices(frontier, 0, np.arange(len(kept)), left, frontier.relaxed, none, bound))
+        first = _Choices(
+            frontier,
+            0,
+            np.arange(len(kept)),
+            np.zeros(frontier.cells.shape, dtype=bool),
+            frontier.relaxed,
+            np.zeros(len(kept)),
+            frontier.relaxed - frontier.rest[:, 0],
+        )
+        if frontier.missed is not None:  # what the missed mass loses is lost whatever is chosen
+            lost = self._joint_loss(first, first.left)
+            first = replace(first, lost=lost, bound=first.bound - lost)
+        self._push(first)
 
     def _within(self, start: IndexArray, cells: IndexArray, sense: Array) -> Array:
         """`sense` `[E]`, replaced by a large negative number where the sensor lies outside the window.
@@ -380,7 +401,7 @@ def _frontier(
     loss[rows[entry], column] = regret[entry]
     source = None if origin is None else (origin, kept)
     none = np.zeros((len(kept), shape[1] + 1))
-    return _Frontier(start[kept], sets_left, relaxed[kept], cells, mass, loss, count, none, source)
+    return _Frontier(start[kept], sets_left, relaxed[kept], cells, mass, loss, count, none, None, source)
 
 
 def _sets_left_out(choices: _Choices | None, place: int) -> list[IndexArray]:

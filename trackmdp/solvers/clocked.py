@@ -11,15 +11,15 @@ __all__ = ["solve"]
 
 
 def solve(world: World) -> PolicyTable:
-    """The policy that senses j iff m_j (r + U(j, 0) - U(j, n + 1)) > c_j sum(m), m the predicted undetected mass.
+    """The policy that senses j iff p_d m_j (r + U(j, 0) - U(j, n + 1)) > c_j sum(m), m the predicted undetected mass.
 
-    Optimal wherever at most one cell of positive probability is left unsensed: then a miss tells where the target is,
-    as the bound assumes.
+    Optimal, with sensors that never miss, wherever at most one cell of positive probability is left unsensed: then a
+    miss tells where the target is, as the bound assumes.
     """
     table = clocked_table(world).table
 
     def gains(seen: Prediction) -> BoolArray:
         credit = world.reward + table[seen.cells, 0] - table[seen.cells, seen.n + 1]
-        return seen.mass * credit > world.cost[seen.cells] * seen.inside[seen.rows]
+        return seen.mass * world.detects(seen.cells) * credit > world.cost[seen.cells] * seen.inside[seen.rows]
 
     return unroll(world, gains)

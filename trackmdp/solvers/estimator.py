@@ -19,7 +19,7 @@ from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.known import tables
 from trackmdp.solvers.layers import Layer, layer_sets, reachable_layers
 from trackmdp.solvers.prediction import renewal
-from trackmdp.solvers.renewal import IndexArray, accumulate, per_row
+from trackmdp.solvers.renewal import IndexArray, accumulate, forced_worth, per_row
 from trackmdp.world.model import Array, BoolArray, World
 
 __all__ = ["EstimatorAccuracy", "PositionEstimate", "accuracy", "known_positions", "positions"]
@@ -71,7 +71,7 @@ def known_positions(world: World, value: Array) -> list[Array]:
     """W after n + 1 misses, for n = 0 ... t_max, each `[M]`: best play from a known position, V = `value`."""
     # r + V(j) for a detection; after the last free choice, R_0(x) = sum_j P_xj (r - D + V(j)).
     detected = world.reward + value
-    forced = world.kernel @ (detected - world.safe_cost)
+    forced = forced_worth(world, detected)
     known = tables(world, detected, forced, world.t_max, slack=1e-9, go_on=_go_on)
     # `tables` counts sets left (R_0 first), here misses: after n + 1 misses there are t_max - n sets left.
     return known[::-1]
@@ -146,10 +146,12 @@ def _best(rows: IndexArray, score: Array, allowed: BoolArray) -> IndexArray:
 
 def _visits(world: World, policy: PolicyTable) -> Array:
     """`[M]` expected renewals that start in each cell, per episode from a uniform start: s (I - T)^-1."""
-    start = np.full(world.num_cells, 1.0 / world.num_cells)
     # T, the sum over the steps of a renewal; visits w solve w = s + w T, that is (I - T^T) w = s.
-    located = sum((hit for hit, _ in renewal(world, policy)), sparse.csr_array((world.num_cells, world.num_cells)))
-    return accumulate(sparse.csr_array(located.T), start, world.size)
+    hits = [hit for hit, _ in renewal(world, policy)]
+    located = sum(hits, sparse.csr_array(hits[0].shape))
+    start = np.zeros(located.shape[0])
+    start[: world.num_cells] = 1.0 / world.num_cells
+    return accumulate(sparse.csr_array(located.T), start, world.size)[: world.num_cells]
 
 
 def _go_on(tree: Tree) -> bool:

@@ -48,7 +48,8 @@ def evaluate(problem: Problem, policy: PolicyLike | Array | BoolArray) -> Evalua
 
 def _whole_episodes(world: World, policy: PolicyTable) -> Evaluation:
     m = world.num_cells
-    located, gathered = sparse.csr_array((m, m)), np.zeros((m, 6))
+    states = m if world.safe else 2 * m  # see `renewal`
+    located, gathered = sparse.csr_array((states, states)), np.zeros((states, 6))
     for hit, earned in renewal(world, policy):
         located, gathered = located + hit, gathered + earned
     system = RenewalSystem(located, world.size)
@@ -62,7 +63,7 @@ def _whole_episodes(world: World, policy: PolicyTable) -> Evaluation:
         residual = np.abs(system.residual(gathered, totals)).max(axis=0)
         longest = float(totals[:, 5].max()) / (1.0 - float(residual[5]))
         error = longest * float(residual[0])
-    return pooled(totals[:, :5], totals[:, 5], error)
+    return pooled(totals[:m, :5], totals[:m, 5], error)
 
 
 def _table(problem: Problem, policy: PolicyLike | Array | BoolArray) -> PolicyTable:

@@ -18,11 +18,11 @@ __all__ = ["solve"]
 
 
 def solve(world: World, *, in_grid: bool = False) -> PolicyTable:
-    """Sense j at n misses iff (e_x P^(n+1))_j r >= c_j: the prediction takes no notice of the misses.
+    """Sense j at n misses iff p_d(j) (e_x P^(n+1))_j r >= c_j: the prediction takes no notice of the misses.
 
     Args:
         world: the problem.
-        in_grid: charge sensors only while the target is in the grid: p_j r >= c_j p_in.
+        in_grid: charge sensors only while the target is in the grid: p_d p_j r >= c_j p_in.
     """
     moved, sensed = sparse.eye_array(world.num_cells, format="csr"), []
     for n in range(world.num_choices):
@@ -30,7 +30,7 @@ def solve(world: World, *, in_grid: bool = False) -> PolicyTable:
         charged = seen.inside[seen.rows] if in_grid else 1.0
         # seen.mass is e_x P^(n+1) itself: since nothing is taken away at a miss, no probability of misses has to be
         # divided by.
-        on = seen.mass * world.reward >= world.cost[seen.cells] * charged * (1.0 - TIE)
+        on = seen.mass * world.detects(seen.cells) * world.reward >= world.cost[seen.cells] * charged * (1.0 - TIE)
         allowed = within_window(world, seen.rows, seen.cells)
         on = on if allowed is None else on & allowed
         sensed.append((seen.rows[on], seen.cells[on]))

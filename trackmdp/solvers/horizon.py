@@ -23,9 +23,10 @@ def truncated_value(world: World, policy: PolicyTable, max_steps: int) -> Evalua
     b_t is gathered at step t, and L_t says where the target is located at step t. Kept are the last t_max + 2 V_h.
     """
     steps = list(renewal(world, policy))
-    left = [np.zeros((world.num_cells, 6))]  # V_{h-1}, V_{h-2}, ...
+    left = [np.zeros_like(steps[0][1])]  # V_{h-1}, V_{h-2}, ...
     for h in range(1, max_steps + 1):
         # zip stops at the shorter one: with h steps left only the first h steps of a renewal happen.
         now = sum(earned + hit @ later for (hit, earned), later in zip(steps[:h], left, strict=False))
         left = [np.asarray(now), *left[: len(steps) - 1]]
-    return pooled(left[0][:, :5], left[0][:, 5])
+    figures = left[0][: world.num_cells]
+    return pooled(figures[:, :5], figures[:, 5])

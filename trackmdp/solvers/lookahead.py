@@ -43,7 +43,7 @@ def solve(world: World, *, depth: int = 2, tail: Tail = "clocked") -> PolicyTabl
         # column.
         problem = InnerProblem(world, layers[n : n + ahead + 1], world.reward + table[:, 0], table[:, n + ahead])
         sets.append(_first_set(problem, layers, mass))
-        mass = (mass @ layers[n + 1].moves) * ~sets[-1]
+        mass = (mass @ layers[n + 1].moves) * (1.0 - sets[-1] * world.detects(layers[n + 1].cells))
     return policy_table(world, layers, sets)
 
 

@@ -11,14 +11,14 @@ __all__ = ["solve"]
 
 
 def solve(world: World, *, threshold: float | None = None) -> PolicyTable:
-    """Sense j iff its predicted probability, given the misses so far, is at least `threshold`.
+    """Sense j iff the probability that it reports the target, given the misses so far, is at least `threshold`.
 
-    Without one, sense where the sensor earns its price in this very step: p_j r >= c_j p_in.
+    Without one, sense where the sensor earns its price in this very step: p_d(j) p_j r >= c_j p_in.
     """
     if threshold is None:
         return qmdp.solve(world, in_grid=True)
 
     def likely(seen: Prediction) -> BoolArray:
-        return seen.mass >= threshold * seen.before[seen.rows] * (1.0 - qmdp.TIE)
+        return seen.mass * world.detects(seen.cells) >= threshold * seen.before[seen.rows] * (1.0 - qmdp.TIE)
 
     return unroll(world, likely)

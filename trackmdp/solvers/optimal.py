@@ -168,7 +168,7 @@ class _Run:
             mass = mass @ layer.moves
             # a plan of the tree senses every possible cell but those left out
             sets.append(np.where(better[layer.rows], (mass > 0) & ~out.has(layer.rows, layer.cells), on))
-            mass = mass * ~sets[-1]
+            mass = mass * (1.0 - sets[-1] * self.world.detects(layer.cells))
         return self.use(policy_table(self.world, layers, search.improve(self.world, layers, sets)))
 
     def explore(self, tree: Tree, patience: int) -> None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy import sparse
 
 from trackmdp.policies.table import PolicyTable
@@ -35,7 +37,7 @@ class Prediction:
     before: Array
     inside: Array
 
-    def part(self, share: Array | BoolArray) -> sparse.csr_array:
+    def part(self, share: npt.NDArray[np.floating[Any]]) -> sparse.csr_array:
         """`[M, M]` sparse, `share` `[E]` times the mass of each entry; entries without mass are dropped."""
         mass, count = self.mass * share, len(self.before)
         # entries are in order of their rows, so that counting those kept gives the row pointer
@@ -64,29 +66,68 @@ def unroll(world: World, rule: Callable[[Prediction], BoolArray]) -> PolicyTable
         on, allowed = rule(seen), within_window(world, seen.rows, seen.cells)
         on = on if allowed is None else on & allowed
         sensed.append((seen.rows[on], seen.cells[on]))
-        undetected = seen.part(~on)
+        undetected = seen.part(1.0 - on * world.detects(seen.cells))
     return PolicyTable(world, sensed_csr(world, sensed))
 
 
 def renewal(world: World, policy: PolicyTable) -> Iterator[tuple[sparse.csr_array, Array]]:
     """What happens at each step from one detection to the next, for all located cells at once.
 
+    A safe action that may miss is repeated until it locates, so that there is no last step. Then there are S = 2M
+    states: M + j stands for the target in j, missed there by the safe action, and is left after one step, the next safe
+    action. Otherwise S = M.
+
     Yields:
-        t_max + 2 pairs, the last of the forced step: `[M, M]` sparse, the probability of being located in j at this
-        step, and `[M, 6]`, expected reward, step in the grid, detection, sensors on by choice, safe action, step.
+        t_max + 2 pairs, the last of the forced step: `[S, S]` sparse, the probability of being located in j at this
+        step (column M + j: of being missed in j by the safe action), and `[S, 6]`, expected reward, step in the grid,
+        detection, sensors on by choice, safe action, step.
     """
-    m, nothing = world.num_cells, np.zeros(world.num_cells)
-    undetected = sparse.eye_array(m, format="csr")
+    m = world.num_cells
+    start = undetected = sparse.eye_array(m, format="csr")
+    # What the M states of a missed target do: all of it at the first step, nothing at the later ones.
+    nowhere, again = sparse.csr_array((m, m)), np.zeros((m, 6))
+    found = missed = nowhere
+    if not world.safe:
+        found, missed, again = _safe_action(world, predict(world, start, world.num_choices))
     for n in range(world.num_choices):
         seen = predict(world, undetected, n)
-        on = policy.on(n, seen.rows, seen.cells)
-        # sensors are paid while the target is in the grid, whether or not it is where they look
-        hit, undetected = seen.part(on), seen.part(1.0 - on)
-        detected = per_row(seen.rows, seen.mass * on, m)
-        reward = world.reward * detected - policy.spent(n, world.cost) * seen.inside
-        sensors = policy.spent(n, np.ones(m)) * seen.inside
-        yield hit, np.stack([reward, seen.inside, detected, sensors, nothing, seen.before], axis=1)
-    forced = predict(world, undetected, world.num_choices)
-    reward = (world.reward - world.safe_cost) * forced.inside
-    found = forced.part(np.ones(len(forced.mass)))
-    yield found, np.stack([reward, forced.inside, forced.inside, nothing, forced.inside, forced.before], axis=1)
+        hit, undetected, earned = _free_choice(world, policy, seen)
+        if world.safe:
+            yield hit, earned
+        else:
+            yield _blocks(hit, nowhere, found, missed), np.concatenate([earned, again])
+            found, missed, again = nowhere, nowhere, np.zeros((m, 6))
+    hit, lost, earned = _safe_action(world, predict(world, undetected, world.num_choices))
+    if world.safe:
+        yield hit, earned
+    else:
+        yield _blocks(hit, lost, nowhere, nowhere), np.concatenate([earned, again])
+
+
+def _free_choice(
+    world: World, policy: PolicyTable, seen: Prediction
+) -> tuple[sparse.csr_array, sparse.csr_array, Array]:
+    """A step with the sets of `policy`: `[M, M]` where they locate the target, where they miss it, six figures."""
+    m, nothing = world.num_cells, np.zeros(world.num_cells)
+    report = policy.on(seen.n, seen.rows, seen.cells) * world.detects(seen.cells)
+    detected = per_row(seen.rows, seen.mass * report, m)
+    # sensors are paid while the target is in the grid, whether or not it is where they look
+    reward = world.reward * detected - policy.spent(seen.n, world.cost) * seen.inside
+    sensors = policy.spent(seen.n, np.ones(m)) * seen.inside
+    figures = np.stack([reward, seen.inside, detected, sensors, nothing, seen.before], axis=1)
+    return seen.part(report), seen.part(1.0 - report), figures
+
+
+def _safe_action(world: World, seen: Prediction) -> tuple[sparse.csr_array, sparse.csr_array, Array]:
+    """The forced step: `[M, M]` where it locates the target, where it misses it, and six figures."""
+    share, nothing = world.safe_detection[seen.cells], np.zeros(world.num_cells)
+    detected = per_row(seen.rows, seen.mass * share, world.num_cells)
+    reward = (world.reward - world.safe_cost) * seen.inside - world.reward * (seen.inside - detected)
+    figures = np.stack([reward, seen.inside, detected, nothing, seen.inside, seen.before], axis=1)
+    return seen.part(share), seen.part(1.0 - share), figures
+
+
+def _blocks(*parts: sparse.csr_array) -> sparse.csr_array:
+    """`[2M, 2M]` of four `[M, M]`, row by row."""
+    a, b, c, d = parts
+    return sparse.csr_array(sparse.block_array([[a, b], [c, d]], format="csr"))

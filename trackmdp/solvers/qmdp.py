@@ -13,18 +13,20 @@ TIE = 1e-12
 
 
 def solve(world: World, *, in_grid: bool = False) -> PolicyTable:
-    """Q_MDP, eq. qmdp_policy: sense j iff p_j >= c_j / r.
+    """Q_MDP, eq. qmdp_policy: sense j iff p_d(j) p_j >= c_j / r.
 
-    p_j is the predicted probability of cell j given the misses so far, the exit being one of the possibilities.
+    p_j is the predicted probability of cell j given the misses so far, the exit being one of the possibilities; p_d(j)
+    is 1 for a sensor that never misses.
 
     Args:
         world: the problem.
-        in_grid: charge sensors like the reward does, only while the target is in the grid: p_j r >= c_j p_in.
+        in_grid: charge sensors like the reward does, only while the target is in the grid: p_d p_j r >= c_j p_in.
     """
 
     def worth_it(seen: Prediction) -> BoolArray:
         # multiplied by the probability of the misses, which need not be divided by then
         charged = seen.inside if in_grid else seen.before
-        return seen.mass * world.reward >= world.cost[seen.cells] * charged[seen.rows] * (1.0 - TIE)
+        earned = seen.mass * world.detects(seen.cells) * world.reward
+        return earned >= world.cost[seen.cells] * charged[seen.rows] * (1.0 - TIE)
 
     return unroll(world, worth_it)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +25,7 @@ class ReplayedTracks:
 
     Attributes:
         totals: `[K, 5]` reward, steps in the grid, detections, sensors on by choice, safe actions; expected ones where
-            the policy draws.
+            the policy draws or a sensor may miss.
         length: `[K]` steps, the exit step included.
     """
 
@@ -108,21 +109,23 @@ def _renewals(
     m, points = task.num_cells, np.arange(len(cells))
     figures, hits = np.zeros((6, len(cells))), []
     at, undetected = points[cells < m], np.ones(int((cells < m).sum()))
-    for n in range(task.num_choices + 1):
+    for n in itertools.count():  # beyond t_max + 1 only where the safe action may miss
         # at: points whose plan is still running after n misses; `undetected`: with what probability
         going = (at + n + 1 <= last[at]) & (undetected > 0)
         at, undetected = at[going], undetected[going]
+        if not len(at):
+            break
         cell = cells[at + n + 1]
         inside = cell < m
         # the exit is a step as well, and costs nothing; a recording that stops has none (`Tracks.closed`)
         figures[5, at] += undetected
         at, undetected, cell = at[inside], undetected[inside], cell[inside]
         if n < task.num_choices:
-            sensed = policy.on(n, cells[at], cell)
+            sensed = policy.on(n, cells[at], cell) * task.detects(cell)
             sensors, price = (policy.spent(n, each)[cells[at]] for each in (np.ones(task.num_cells), task.cost))
             safe: float | Array = 0.0
         else:
-            sensed, sensors, safe = np.ones(len(at)), np.zeros(len(at)), 1.0
+            sensed, sensors, safe = task.safe_detection[cell], np.zeros(len(at)), 1.0
             price = np.full(len(at), task.safe_cost)
         for row, amount in enumerate((task.reward * sensed - price, 1.0, sensed, sensors, safe)):
             figures[row, at] += undetected * amount

@@ -18,7 +18,16 @@ from scipy.sparse.linalg import SuperLU, splu
 from trackmdp.errors import UserError
 from trackmdp.world.model import Array, World
 
-__all__ = ["DIRECT_CELLS", "IndexArray", "RenewalSystem", "accumulate", "expected_steps", "per_row", "row_index"]
+__all__ = [
+    "DIRECT_CELLS",
+    "IndexArray",
+    "RenewalSystem",
+    "accumulate",
+    "expected_steps",
+    "forced_worth",
+    "per_row",
+    "row_index",
+]
 
 IndexArray: TypeAlias = npt.NDArray[np.integer[Any]]
 
@@ -48,8 +57,8 @@ class RenewalSystem:
     length of the episodes (at N = 256 and p_exit = 5e-5: 127 products instead of 3,434).
 
     Args:
-        transition: `[M, M]` sub-stochastic.
-        size: (rows, columns) of the grid; None where the M states are none, for always direct.
+        transition: `[M, M]` sub-stochastic; or `[KM, KM]` of K states per cell, cell j in its k-th state being kM + j.
+        size: (rows, columns) of the grid; None where the states are no cells, for always direct.
         direct: cells up to which a factorisation is used.
 
     Attributes:
@@ -69,7 +78,9 @@ class RenewalSystem:
             self._factors = _factorise(self._system)
             return
         rows, columns = size
-        self._blocks = _blocks(rows, columns)
+        # States beyond one per cell are that many layers of the grid, each with blocks of its own.
+        layers = transition.shape[0] // (rows * columns)
+        self._blocks = sparse.csr_array(sparse.block_diag([_blocks(rows, columns)] * layers))
         # Galerkin: with B [M, blocks] the indicator of the blocks, B^T (I - T) B is the system seen by vectors that are
         # constant on each block.
         self._coarse = _factorise(sparse.csr_array(self._blocks.T @ self._system @ self._blocks))
@@ -161,6 +172,24 @@ class RenewalSystem:
 def accumulate(transition: sparse.csr_array, gathered: Array, size: tuple[int, int] | None = None) -> Array:
     """Solve ``v = gathered + transition v`` once; see `RenewalSystem`."""
     return RenewalSystem(transition, size).solve(gathered)
+
+
+def forced_worth(world: World, detected: Array) -> Array:
+    """`[M]` worth of the target being in each cell when the safe action is next, repeated until it locates the target.
+
+    L = P [p_s (r + V) + (1 - p_s) L] - D p_in, `detected` `[M]` being r + V: another linear system, of matrix
+    P (1 - p_s), which without misses is empty.
+    """
+    if world.safe:
+        return world.kernel @ (detected - world.safe_cost)
+    located = world.kernel @ (world.safe_detection * detected) - world.safe_cost * world.stay_probability
+    return _safe_system(world).solve(located)
+
+
+@lru_cache(maxsize=1)
+def _safe_system(world: World) -> RenewalSystem:
+    """The moves on which the safe action misses the target."""
+    return RenewalSystem(sparse.csr_array(world.kernel.multiply(1.0 - world.safe_detection)), world.size)
 
 
 @lru_cache(maxsize=1)

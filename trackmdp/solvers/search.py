@@ -2,9 +2,9 @@
 
 With the value V of being located fixed, choosing the sets after each located cell is an optimal search for a moving
 target. The sets before step t give the undetected mass m_t; the sets after it give W_t(j), the value of going on with
-the target in j, undetected; and the best set of step t is {j : m_t(j) (r + V(j) - W_t(j)) > c_j sum(m_t)}. The ascent
-ends where no change of one step's set gains, but sets may have to change together: to leave a cell out pays only if it
-is looked at next. Starting from the optimistic credit of the clocked bound, r + U(j, 0) - U(j, n + 1), and moving
+the target in j, undetected; and the best set of step t is {j : p_d(j) m_t(j) (r + V(j) - W_t(j)) > c_j sum(m_t)}. The
+ascent ends where no change of one step's set gains, but sets may have to change together: to leave a cell out pays only
+if it is looked at next. Starting from the optimistic credit of the clocked bound, r + U(j, 0) - U(j, n + 1), and moving
 gradually to the exact one finds most of those joint optima (theory: continuation).
 """
 
@@ -18,8 +18,9 @@ from scipy import sparse
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import clocked
 from trackmdp.solvers.bounds import clocked_table
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.layers import Layer, layer_sets, policy_table, reachable_layers
-from trackmdp.solvers.renewal import RenewalSystem, per_row
+from trackmdp.solvers.renewal import RenewalSystem, forced_worth, per_row
 from trackmdp.world.model import Array, BoolArray, World
 
 __all__ = ["InnerProblem", "improve", "located_value", "solve"]
@@ -51,7 +52,7 @@ class InnerProblem:
     def of(cls, world: World, layers: list[Layer], value: Array) -> InnerProblem:
         """The problem of one renewal: after the last set comes the safe action. `value`: `[M]`, V."""
         detected = world.reward + value
-        return cls(world, layers, detected, world.kernel @ (detected - world.safe_cost))
+        return cls(world, layers, detected, forced_worth(world, detected))
 
     @property
     def length(self) -> int:
@@ -60,12 +61,14 @@ class InnerProblem:
 
     def undetected(self, sets: list[BoolArray]) -> list[Array]:
         """W_t per entry of each layer: what follows when the target is there, undetected, and `sets` go on."""
-        # W_t(i) = sum_j P_ij [r + V(j) if j is sensed, else W_{t+1}(j)] - c(A_t) P_in(i), from the last set backwards.
+        # W_t(i) = sum_j P_ij [h_j (r + V(j)) + (1 - h_j) W_{t+1}(j)] - c(A_t) P_in(i), from the last set backwards; h_j
+        # is the probability of a report, p_d(j) where j is sensed.
         # A set belongs to a located cell, so its price c(A_t) is that of the entry's row.
         later = [self.missed[self.layers[-1].cells]]
         for before, layer, on in reversed(list(zip(self.layers, self.layers[1:], sets, strict=False))):
             paid = per_row(layer.rows, on * self.world.cost[layer.cells], self.world.num_cells)
-            gross = layer.moves @ np.where(on, self.detected[layer.cells], later[0])
+            report = on * self.world.detects(layer.cells)
+            gross = layer.moves @ (report * self.detected[layer.cells] + (1.0 - report) * later[0])
             later.insert(0, gross - paid[before.rows] * self.world.stay_probability[before.cells])
         return later
 
@@ -103,9 +106,10 @@ class InnerProblem:
                 if credit is not None:
                     gain = optimism * credit[t][layer.cells] + (1.0 - optimism) * gain
                 # strict: an entry without mass is never sensed, not even by a sensor that costs nothing
-                on = now * gain > self.world.cost[layer.cells] * inside[layer.rows]
+                detects = self.world.detects(layer.cells)
+                on = now * detects * gain > self.world.cost[layer.cells] * inside[layer.rows]
                 chosen.append(on & layer.allowed if self.windowed and layer.allowed is not None else on)
-                now = now * ~chosen[-1]
+                now = now * (1.0 - chosen[-1] * detects)
             if all((new == old).all() for new, old in zip(chosen, sets, strict=True)):
                 break
             # All steps are replaced at once, each against the sets before it in this sweep and those after it in the
@@ -168,6 +172,8 @@ def improve(
 
 def located_value(world: World, layers: list[Layer], sets: list[BoolArray], guess: Array | None = None) -> Array:
     """`[M]` V of a policy given as sets on the layers, on large worlds by iteration from `guess` `[M]`."""
+    if not world.safe:
+        return evaluate(world, policy_table(world, layers, sets)).value
     m, mass, earned = world.num_cells, np.ones(world.num_cells), np.zeros(world.num_cells)
     hits = []
     for layer, on in zip(layers[1:], sets, strict=True):
@@ -175,10 +181,11 @@ def located_value(world: World, layers: list[Layer], sets: list[BoolArray], gues
         inside = per_row(layer.rows, now, m)
         # c(A_t(x)); paid as long as the target is undetected and in the grid, so times the mass `inside`.
         paid = per_row(layer.rows[on], world.cost[layer.cells[on]], m)
-        earned += world.reward * per_row(layer.rows[on], now[on], m) - paid * inside
+        found = now[on] * world.detects(layer.cells[on])
+        earned += world.reward * per_row(layer.rows[on], found, m) - paid * inside
         # The entries of T(x, j): mass located in j after a plan made in x.
-        hits.append((now[on], layer.rows[on], layer.cells[on]))
-        mass = now * ~on
+        hits.append((found, layer.rows[on], layer.cells[on]))
+        mass = now * (1.0 - on * world.detects(layer.cells))
     # what is left after the last set moves once more and is located by the safe action
     left = mass > 0
     missed = sparse.csr_array((mass[left], (layers[-1].rows[left], layers[-1].cells[left])), shape=(m, m))

@@ -60,7 +60,7 @@ class HeldOutEvaluator(Evaluator):
         """The policies that a learned one is compared with, by their names in tables."""
         task = self.world
         kernel = estimated_kernel(task.tracks, task.size)
-        world = World(kernel, task.size, cost=task.cost, safe_cost=task.safe_cost, t_max=task.t_max, reward=task.reward)
+        world = World.of(task, kernel, max_steps=None, window=None)
         return {
             "all on": PolicyTable.all_on(task),
             "no sensors": PolicyTable.none(task),

@@ -41,6 +41,10 @@ class Task:
         reward: r, earned when the target is sensed.
         max_steps: episodes are truncated after this many steps; None for never.
         window: W; only the sensors up to W rows and columns from the last located cell can be chosen. None: all can.
+        detection: `[M]`, p_d per cell, in (0, 1]: how likely a sensor that is on reports the target in its cell; the
+            constructor takes one number for all cells.
+        safe_detection: `[M]`, p_s per cell, in (0, 1]: the same of the safe action; below 1 it is repeated, at D each,
+            until it locates the target.
         markov: whether the next move depends on the target's cell alone, so that a learner may put paths together from
             moves seen on different ones.
 
@@ -55,6 +59,8 @@ class Task:
     reward: float
     max_steps: int | None
     window: int | None
+    detection: Array
+    safe_detection: Array
     markov: bool
 
     def __init__(
@@ -67,6 +73,8 @@ class Task:
         reward: float = 1.0,
         max_steps: int | None = None,
         window: int | None = None,
+        detection: npt.ArrayLike = 1.0,
+        safe_detection: npt.ArrayLike = 1.0,
         markov: bool = True,
     ) -> None:
         rows, columns = grid_size(size)
@@ -79,6 +87,8 @@ class Task:
             "reward": _price("reward", reward),
             "max_steps": None if max_steps is None else _at_least(1, "max_steps", max_steps),
             "window": None if window is None else _at_least(0, "window", window),
+            "detection": _probabilities("detection", detection, rows * columns),
+            "safe_detection": _probabilities("safe_detection", safe_detection, rows * columns),
             "markov": markov,
         }
         for name, value in values.items():
@@ -109,13 +119,32 @@ class Task:
         """K, the sensors that can be chosen from one located cell: M, or (2W+1)² with a window."""
         return self.num_cells if self.window is None else (2 * self.window + 1) ** 2
 
+    @cached_property
+    def perfect(self) -> bool:
+        """Whether every sensor that is on reports the target in its cell."""
+        return bool((self.detection == 1.0).all())
+
+    @cached_property
+    def safe(self) -> bool:
+        """Whether the safe action always locates the target."""
+        return bool((self.safe_detection == 1.0).all())
+
+    def detects(self, cells: npt.NDArray[Any]) -> Array | float:
+        """`[E]` p_d of `cells` `[E]`; simply 1.0 where no sensor misses, so that perfect sensors cost no look-up."""
+        return 1.0 if self.perfect else self.detection[cells]
+
+    @property
+    def safe_misses(self) -> Array | float:
+        """`[M]` 1 - p_s; simply 0.0 where the safe action always locates."""
+        return 0.0 if self.safe else 1.0 - self.safe_detection
+
     @property
     def task(self) -> Task:
         """The same task without the motion."""
         return Task(**self._known())
 
     def _known(self) -> dict[str, Any]:
-        """All that a `Task` holds, as arguments of its constructor."""
+        """All that a `Task` holds, as arguments of its constructor and of that of `World`."""
         return {name: getattr(self, name) for name in Task.__dataclass_fields__}
 
 
@@ -147,6 +176,8 @@ class World(Task):
         reward: float = 1.0,
         max_steps: int | None = None,
         window: int | None = None,
+        detection: npt.ArrayLike = 1.0,
+        safe_detection: npt.ArrayLike = 1.0,
         markov: bool = True,
     ) -> None:
         super().__init__(
@@ -157,6 +188,8 @@ class World(Task):
             reward=reward,
             max_steps=max_steps,
             window=window,
+            detection=detection,
+            safe_detection=safe_detection,
             markov=markov,
         )
         # Checked after it is canonical: duplicates are added up and zeros dropped, so that the checks see what solvers
@@ -165,11 +198,22 @@ class World(Task):
         check_kernel(canonical, self.size, truncates=max_steps is not None)
         object.__setattr__(self, "kernel", canonical)
 
+    @classmethod
+    def of(cls, task: Task, kernel: sparse.sparray | npt.NDArray[np.generic], **changes: Any) -> World:
+        """The world of a task with a `kernel` `[M, M]`; `changes` are arguments that differ from the task's."""
+        return cls(kernel, **(Task._known(task) | changes))
+
     @cached_property
     def stay_probability(self) -> Array:
         """`[M]` probability of still being in the grid after one step, 1 - p_exit."""
         # Not kernel.sum(axis=1), which may differ in the last digit from the sums of the same kernel written out.
         return pairwise_row_sums(self.kernel)
+
+    @cached_property
+    def safe_gain(self) -> Array:
+        """`[M]` expected reward of one safe action when the target is in each cell: r sum_j P_xj p_s(j) - D P_in(x)."""
+        gain: Array = (self.reward - self.safe_cost) * self.stay_probability
+        return gain if self.safe else gain - self.reward * (self.kernel @ (1.0 - self.safe_detection))
 
 
 def grid_size(size: Size) -> tuple[int, int]:
@@ -193,6 +237,17 @@ def _prices(cost: npt.ArrayLike, cells: int) -> Array:
         bad = int(np.flatnonzero(~fine)[0])
         raise UserError(f"cost: cell {bad} costs {prices.flat[bad]}, expected a finite number >= 0")
     return np.broadcast_to(prices, (cells,)).copy()
+
+
+def _probabilities(name: str, given: npt.ArrayLike, cells: int) -> Array:
+    """`[M]` probabilities in (0, 1], from one number for all or from one for each."""
+    values = np.asarray(given, dtype=np.float64)
+    if values.shape not in ((), (cells,)):
+        raise UserError(f"{name}: expected one number or {cells} (one per cell), got shape {values.shape}")
+    if not (fine := (values > 0) & (values <= 1)).all():  # a nan is neither
+        bad = int(np.flatnonzero(~fine)[0])
+        raise UserError(f"{name}: cell {bad} has {values.flat[bad]}, expected a probability above 0, at most 1")
+    return np.broadcast_to(values, (cells,)).copy()
 
 
 def _price(name: str, value: float) -> float:

@@ -111,6 +111,8 @@ class Recorded(Task):
         reward: float = 1.0,
         max_steps: int | None = None,
         window: int | None = None,
+        detection: npt.ArrayLike = 1.0,
+        safe_detection: npt.ArrayLike = 1.0,
         markov: bool = True,
         anywhere: bool = False,
     ) -> None:
@@ -122,6 +124,8 @@ class Recorded(Task):
             reward=reward,
             max_steps=max_steps,
             window=window,
+            detection=detection,
+            safe_detection=safe_detection,
             markov=markov,
         )
         for name, value in (("tracks", tracks), ("held_out", held_out), ("anywhere", anywhere)):
