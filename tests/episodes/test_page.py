@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.episodes.browser import CHROMIUM, Browser
@@ -84,7 +85,8 @@ def test_the_page_in_a_browser(reader: EpisodeReader, tmp_path: Path) -> None:
     number = longest(reader)
     episode = reader.read(number)
     write_page(reader, tmp_path / "a.html", number)
-    last = len(episode) - 1
+    last, belief = len(episode) - 1, episode.belief
+    assert belief is not None
     with Browser(tmp_path / "profile") as browser:
         browser.view(360, 740, "dark")
         browser.open(tmp_path / "a.html")
@@ -102,6 +104,15 @@ def test_the_page_in_a_browser(reader: EpisodeReader, tmp_path: Path) -> None:
             assert value("active") == episode.action[t].sum()
             said = browser.ask("document.getElementById('said').textContent")
             assert said.startswith(f"Step {t + 1} of {last + 1}. ")
+            cursors = "['lanes', 'sum'].map((id) => document.querySelector(`#${id} .now`).getBBox().x)"
+            assert browser.ask(cursors) == [t + 0.5, t + 0.5]
+            # WORLD has 4 columns; x and y of the mark are those of the cell it was last located in before the step
+            before = [t for t in range(t) if episode.located[t]]
+            last_cell = int(episode.target[before[-1]]) if before else episode.start
+            mark = browser.ask("[located.x, located.y].map((at) => Math.floor(at.baseVal.value))")
+            assert mark == [last_cell % 4, last_cell // 4]
+            likeliest = int(np.sum(np.rint(1e4 * belief[t]) == np.rint(1e4 * belief[t].max())))
+            assert browser.ask("guess.getAttribute('d').split('M').length - 1") == likeliest
             if episode.target[t] < 16:
                 place = f"row {episode.target[t] // 4 + 1}, column {episode.target[t] % 4 + 1}"
                 assert place in said

@@ -58,6 +58,7 @@ def _content(reader: EpisodeReader, episode: Episode) -> dict[str, Any]:
         "columns": world.columns,
         "about": about,
         "bound": float(bound[episode.start]),
+        "start": int(episode.start),
         "target": target[shown].tolist(),
         "located": episode.located[shown].astype(int).tolist(),
         "forced": episode.forced(world.t_max)[shown].astype(int).tolist(),
