@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from trackmdp.config import GROUPS, EvaluateConfig, TrainConfig, options
@@ -126,6 +126,21 @@ def random_state(world: World, rows: int, seed: int) -> TensorDict:
         "action": torch.rand(rows, k, generator=rng) < 0.4,
     }
     return TensorDict(state, [rows])
+
+
+class Watched(TrackEnv):
+    """Says after each step of `step_and_maybe_reset` where the targets were and came to: under `target`."""
+
+    def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        before = self.target
+        frame, rows = super()._step_and_maybe_reset(tensordict)
+        frame["target"], frame["next", "target"] = before, self.reached
+        return frame, rows
+
+    def _stepped(self, action: torch.Tensor) -> dict[str, torch.Tensor]:
+        following = super()._stepped(action)
+        self.reached = following["target"].reshape(self.batch_size)
+        return following
 
 
 @torch.no_grad()

@@ -21,12 +21,12 @@ def learn(world: World, batches: int, *overrides: str) -> tuple[object, list[dic
 
 
 def test_paths_are_read_from_what_the_tracker_saw() -> None:
-    """Nothing is sensed: the target hops on unseen, is located by the safe action, or exits; `target` is not read."""
+    """Nothing is sensed: the target hops on unseen, is located by the safe action, or exits."""
     world = hop_world(t_max=1)
     learner = algorithm("learned_kernel", world)
     learner.policy = Policy.none(world)
     batch = collect(world, learner.policy, 64, 30)
-    paths = observed_paths(batch.exclude("target", ("next", "target")), world)
+    paths = observed_paths(batch, world)
     located = paths.end < 4
     assert set(paths.misses[located].tolist()) == {2}
     np.testing.assert_array_equal(paths.end[located], (paths.start[located] + 3) % 4)

@@ -94,14 +94,12 @@ def test_a_step_that_was_not_fully_sensed_breaks_a_segment() -> None:
 
 
 def test_nothing_is_read_that_was_not_sensed() -> None:
-    """Where the target and the recording are, rewards, histories, and cells after steps that did not sense all."""
+    """Rewards, histories, and cells after steps that did not sense all."""
     rng = torch.Generator().manual_seed(0)
     batch = collect(SETTING, Policy.all_on(SETTING), 16, 40)
     batch["action"] &= torch.rand(*batch.shape, 1, generator=rng) < 0.8
     poisoned = batch.clone()
     for place in (poisoned, poisoned["next"]):
-        for key in ("target", "point"):
-            place[key] = torch.randint_like(place[key], 9, generator=rng)
         place["action_history"] = torch.rand(place["action_history"].shape, generator=rng) < 0.5
     poisoned["next", "reward"] = torch.randn(16, 40, 1, generator=rng)
     missed = ~batch["action"].all(-1)

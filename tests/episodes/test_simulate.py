@@ -54,17 +54,18 @@ def stepped_alone(world: World, acting: Policy, seed: int) -> TensorDict:
     rng = torch.Generator().manual_seed(seed)
     start, motion = torch.randint(world.num_cells, (1,), generator=rng), Motion(world.kernel)
     env = TrackEnv(world, 1)
-    state = env.reset().set("target", start).set("last_cell", start.clone())
+    hidden, state = {"target": start}, env.reset().set("last_cell", start.clone())
     steps: list[TensorDict] = []
     while True:
         if len(steps) % 256 == 0:
             block = motion.draw(256, rng)
         state = acting(state)
-        following = TensorDict(env.advance(state, block[len(steps) % 256].unsqueeze(0)), [1])
+        following = TensorDict(env.advance({**state, **hidden}, block[len(steps) % 256].unsqueeze(0)), [1])
+        hidden["target"] = following.pop("target")
         steps.append(state.clone().set("next", following))
         if following["done"].item():
             return torch.cat(steps)
-        state = TensorDict({key: following[key] for key in env.state_keys_of_step}, [1])
+        state = following.select(*env.observation_spec)
         state.update({key: torch.zeros(1, 1, dtype=torch.bool) for key in ("done", "terminated", "truncated")})
 
 

@@ -72,7 +72,7 @@ def in_the_environment(setting: Recorded, chains: BoolArray, max_steps: int | No
     env, policy = TrackEnv(limited(setting, max_steps), count), Policy.from_dense(setting, chains)
     state = env.reset()
     totals, running = torch.zeros(6, count), torch.ones(count, dtype=torch.bool)
-    begun = state["point"]
+    begun = env.snapshot()["rows"]["point"]
     while running.any():
         state = policy(state)
         following = env.step(state)["next"]
@@ -83,7 +83,7 @@ def in_the_environment(setting: Recorded, chains: BoolArray, max_steps: int | No
         figures = [following["reward"].squeeze(-1), inside, found, sensors, forced, torch.ones(count)]
         totals += torch.stack(figures) * running
         running &= ~following["done"].squeeze(-1)
-        state = following.select(*env.state_keys_of_step)
+        state = following.select(*env.observation_spec)
     return totals[:, begun.argsort()].T.numpy()  # in the order of the tracks
 
 

@@ -156,7 +156,7 @@ def test_what_another_run_left_is_not_taken(
         {"versions": {"nope": "1"}},
         {"algorithm": [1]},
         {"algorithm": {}},
-        {"collector": {"carrier": {}}},
+        {"collector": {"environment": {"rows": {}, "generators": {}}}},
         {"random": {}},
         {"callbacks": {"csv": {"position": 10**15}}},
         {"callbacks": {"checkpoints": {"best": "x"}}},

@@ -72,8 +72,10 @@ def test_it_says_where_the_environments_targets_are() -> None:
     """200,000 targets from cell 4, two fixed subsets, both missed: the cells they stand in, within five deviations."""
     world, count = small_world(t_max=2, exit_probability=0.2), 200_000
     env = TrackEnv(world, count, seed=1)
-    state = env.reset()
-    state["target"], state["last_cell"] = torch.full((count,), 4), torch.full((count,), 4)
+    env.reset()
+    there = env.snapshot()
+    there["rows"] |= dict.fromkeys(("target", "last_cell"), torch.full((count,), 4))
+    state = env.restore(there)
     belief = BeliefFilter(world.kernel)
     rows = belief.detect(torch.tensor([4]))
     for cells in ([0, 1, 8], [4, 5]):
@@ -82,7 +84,7 @@ def test_it_says_where_the_environments_targets_are() -> None:
         state = env.step(state.set("action", action.expand(count, 9)))["next"]
         rows = belief.miss(belief.predict(rows), action)
     missed = (state["steps_since_detection"] == 2) & ~state["terminated"].squeeze(-1)
-    counts = np.bincount(state["target"][missed], minlength=9)
+    counts = np.bincount(env.target[missed], minlength=9)
     assert counts.sum() > 20_000
     p = rows[0].numpy()
     assert (abs(counts - counts.sum() * p) <= 5 * np.sqrt(counts.sum() * p * (1 - p))).all()

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs.utils import check_env_specs
 
-from tests.helpers import hop_world, limited, small_world
+from tests.helpers import Watched, hop_world, limited, small_world
 from trackmdp.policies.fixed import RandomSubset
 from trackmdp.seeding import generator
 from trackmdp.world.env import TrackEnv
@@ -130,7 +130,7 @@ def rollout(env: TrackEnv, steps: int, seed: int = 0) -> list[TensorDictBase]:
 @pytest.mark.parametrize(("t_max", "max_steps"), [(0, None), (1, 5), (3, None), (2, 1)])
 def test_every_frame_of_a_long_run_lies_in_the_specs(t_max: int, max_steps: int | None) -> None:
     world = small_world(t_max=t_max)
-    env = TrackEnv(limited(world, max_steps), 7, seed=3)
+    env = Watched(limited(world, max_steps), 7, seed=3)
     reset = env.reset()
     assert env.observation_spec.is_in(reset.select(*env.observation_spec.keys()))
     seen, lengths = set(), torch.zeros(7, dtype=torch.int64)
@@ -210,16 +210,17 @@ def test_the_global_generator_is_neither_read_nor_moved() -> None:
 def test_generators_go_on_where_they_were_saved() -> None:
     env = TrackEnv(small_world(exit_probability=0.4), 16, seed=0)
     rollout(env, 5)
-    saved = env.generator_state()
+    saved = env.snapshot()
     later = TrackEnv(small_world(exit_probability=0.4), 16, seed=99)
-    later.set_generator_state(saved)
+    later.restore(saved)
     assert frames_equal(env, later)
 
 
 def test_starts_are_uniform_over_the_cells() -> None:
-    starts = TrackEnv(small_world(), 90_000, seed=0).reset()
+    env = TrackEnv(small_world(), 90_000, seed=0)
+    starts = env.reset()
     counts = torch.bincount(starts["last_cell"], minlength=9)
     assert ((counts - 10_000) ** 2 / 10_000).sum() < 26.1  # chi-square, 8 degrees, 0.1 %
-    assert torch.equal(starts["last_cell"], starts["target"])
+    assert torch.equal(starts["last_cell"], env.target)
     assert not starts["steps_since_detection"].any()
     assert not starts["action_history"].any()

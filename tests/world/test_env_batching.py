@@ -62,10 +62,12 @@ def test_a_partial_reset_leaves_the_other_rows(seed: int, mask: list[bool], max_
     world = small_world(t_max=2)
     env, rows = TrackEnv(limited(world, max_steps), 6, seed=seed), torch.tensor(mask)
     before = _midway(env)
+    was = env.target
     after = env.reset(before.clone().set("_reset", rows.unsqueeze(-1)))
-    for key in env.state_keys_of_step:
+    for key in env.observation_spec:
         assert torch.equal(after[key][~rows], before[key][~rows])
-    assert torch.equal(after["last_cell"][rows], after["target"][rows])
+    assert torch.equal(env.target[~rows], was[~rows])
+    assert torch.equal(after["last_cell"][rows], env.target[rows])
     assert not after["steps_since_detection"][rows].any()
     assert not after["action_history"][rows].any()
     assert not after["done"].any()
@@ -87,9 +89,9 @@ def test_rows_that_end_are_the_only_ones_reset() -> None:
     for _ in range(100):
         frame, rows = env.step_and_maybe_reset(policy(rows))
         done = frame["next", "done"].squeeze(-1)
-        for key in env.state_keys_of_step:
+        for key in env.observation_spec:
             assert torch.equal(rows[key][~done], frame["next", key][~done])
-        assert torch.equal(rows["last_cell"][done], rows["target"][done])
+        assert torch.equal(rows["last_cell"][done], env.target[done])
         assert not rows["steps_since_detection"][done].any()
         assert not rows["done"].any()
         fresh += int(done.sum())

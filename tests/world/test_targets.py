@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
-from tests.helpers import limited, small_world
+from tests.helpers import Watched, limited, small_world
 from tests.tracks import by_hand, drawn, recorded
 from trackmdp.policies.fixed import RandomSubset
 from trackmdp.seeding import generator
@@ -31,7 +31,7 @@ def all_on(rows: TensorDict) -> TensorDict:
     return rows.set("action", torch.ones_like(rows["action_history"][..., 0, :]))
 
 
-def followed(env: TrackEnv, steps: int) -> list[list[tuple[int, ...]]]:
+def followed(env: Watched, steps: int) -> list[list[tuple[int, ...]]]:
     """Per row, the cells of each episode, M for the exit, `()` closing one that was truncated."""
     paths: list[list[tuple[int, ...]]] = [[] for _ in range(env.num_envs)]
     now: list[tuple[int, ...]] = [()] * env.num_envs
@@ -47,7 +47,7 @@ def followed(env: TrackEnv, steps: int) -> list[list[tuple[int, ...]]]:
 
 
 def test_every_track_is_replayed_from_its_first_cell_to_its_end() -> None:
-    env = TrackEnv(recorded(TRACKS), 1, seed=1)
+    env = Watched(recorded(TRACKS), 1, seed=1)
     (paths,) = followed(env, 9 * 20)
     expected = {(0, 1, 2, 9), (3, 4, 9), (5, 6, 7, 8)}
     assert set(paths) == expected
@@ -64,7 +64,7 @@ def test_rows_share_the_tracks_out_among_them() -> None:
 
 def test_starts_anywhere_are_all_points_that_have_a_next() -> None:
     env = TrackEnv(recorded(TRACKS, anywhere=True), 8, seed=0)
-    assert sorted(env.reset()["target"].tolist()) == [0, 1, 2, 3, 4, 5, 6, 7]
+    assert sorted(env.reset()["last_cell"].tolist()) == [0, 1, 2, 3, 4, 5, 6, 7]
 
 
 @pytest.mark.parametrize("max_steps", [None, 2])
@@ -99,10 +99,9 @@ def test_a_reset_of_some_rows_takes_tracks_for_these_alone() -> None:
     env, rows = TrackEnv(setting, 4, seed=0), torch.tensor([True, False, False, True])
     before = env.reset()
     after = env.reset(before.clone().set("_reset", rows.unsqueeze(-1)))
-    for key in env.state_keys_of_step:
-        assert torch.equal(after[key][~rows], before[key][~rows])
+    assert torch.equal(after["last_cell"][~rows], before["last_cell"][~rows])
     rest = env.reset(before.clone().set("_reset", torch.tensor([[True], [True], [True], [False]])))
-    begun = [*before["target"], *after["target"][rows], *rest["target"][:3]]
+    begun = [*before["last_cell"], *after["last_cell"][rows], *rest["last_cell"][:3]]
     assert sorted(map(int, begun)) == list(range(9))
 
 
@@ -110,7 +109,7 @@ def test_the_seed_and_the_stream_decide_the_order() -> None:
     tracks = recorded(drawn(small_world().kernel, 200))
 
     def order(**names: Any) -> list[int]:
-        return [int(cell) for frame in rollout(TrackEnv(tracks, 16, **names), 30) for cell in frame["target"]]
+        return [int(cell) for frame in rollout(Watched(tracks, 16, **names), 30) for cell in frame["target"]]
 
     assert order(seed=0) == order(seed=0)
     assert order(seed=0) != order(seed=1)
@@ -121,8 +120,8 @@ def test_an_environment_goes_on_where_it_was_saved() -> None:
     tracks = recorded(drawn(small_world(exit_probability=0.4).kernel, 30))
     env = TrackEnv(tracks, 16, seed=0)
     rollout(env, 5)
-    saved = {key: value.clone() for key, value in env.generator_state().items()}
+    saved = env.snapshot()
     later = TrackEnv(tracks, 16, seed=0)
-    later.set_generator_state(saved)
+    later.restore(saved)
     for a, b in zip(rollout(env, 40), rollout(later, 40), strict=True):
         assert bool((a == b).all())

@@ -197,8 +197,8 @@ class CollectorConfig(ChoiceConfig):
 
     def memory(self, task: Sizes, root: Any) -> dict[str, int]:
         """Two batches: one is collected while the other is handed over."""
-        index, number = BYTES["int64"], BYTES["float32"]
-        frame = 2 * (state_bytes(task) + index + 3) + task.num_sensors + number * (task.num_sensors + 2)
+        number = BYTES["float32"]
+        frame = 2 * (state_bytes(task) + 3) + task.num_sensors + number * (task.num_sensors + 2)
         return {"collector.frames_per_batch": 2 * self.frames_per_batch * frame}
 
 

@@ -83,6 +83,8 @@ class Episode:
     def to_tensordict(self, task: Task) -> TensorDict:
         """`[T]` steps under the keys of `TrackEnv`, as a rollout has them: the outcome of each step under `next`.
 
+        As in a rollout the true cell is not among them; it is `target`.
+
         Args:
             task: of the world; with a window actions are in its local numbers, as the environment takes them, and with
                 `max_steps` there is a `step_count`.
@@ -95,7 +97,6 @@ class Episode:
         after = np.concatenate([self.misses[1:], [0]])
         after[-1] = 0 if self.located[-1] or self.terminated else self.misses[-1] + 1
         following = {
-            "target": self.target,
             "last_cell": np.where(self.located, self.target, self.last_cell),
             "steps_since_detection": after,
             # h after step t is h before step t + 1, as for n.
@@ -104,7 +105,6 @@ class Episode:
             **_ends(len(self), self.terminated, self.truncated),
         }
         current = {
-            "target": np.concatenate([[self.start], self.target[:-1]]),
             "last_cell": self.last_cell,
             "steps_since_detection": self.misses,
             "action_history": history,

@@ -54,7 +54,7 @@ def module_rule(task: Task, module: TensorDictModuleBase) -> Rule:
     Raises:
         UserError: it reads or writes other keys, or its action has another form.
     """
-    # The true position is in the environment's state too; a module that reads it is no policy of the tracker.
+    # A table has a row for each state of these keys; a module that reads more is no function of its row.
     others = [str(key) for key in module.in_keys if key not in STATE_KEYS]
     if others:
         raise UserError(f"policy: the module reads {', '.join(others)}, expected {', '.join(STATE_KEYS)} at most")

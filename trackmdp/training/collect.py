@@ -7,7 +7,6 @@ from functools import partial
 from typing import Any
 
 import torch
-from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import BaseCollector, Collector, MultiAsyncCollector, MultiSyncCollector
 
@@ -147,23 +146,17 @@ def _remote_env(world: Problem, worker: str, env: dict[str, Any], threads: int) 
 
 
 def collector_state(collector: BaseCollector) -> dict[str, Any] | None:
-    """Where collecting stands between two batches: the rows in mid-episode and the environment's generators.
+    """Where collecting stands between two batches: the targets in mid-episode and the environment's generators.
 
     None for collectors in worker processes, whose environments cannot be asked: they start new episodes on resume.
     """
     if not isinstance(collector, Collector):
         return None
-    return {
-        # Private, but in no state_dict of TorchRL: the observations with which the next batch begins, rows in
-        # mid-episode. A clone, since the collector goes on writing into its own.
-        "carrier": collector._carrier.clone().to_dict(),
-        "environment": collector.env.generator_state(),
-    }
+    return {"environment": collector.env.snapshot()}
 
 
 def load_collector_state(collector: Collector, state: dict[str, Any]) -> None:
     """Resume from a `collector_state`; call before the first batch."""
-    rows = TensorDict.from_dict(state["carrier"], batch_size=collector._carrier.batch_size)
-    # An emptied copy keeps batch size and device, and has only the keys that were saved.
-    collector._carrier = collector._carrier.empty().update(rows)
-    collector.env.set_generator_state(state["environment"])
+    # Private, but in no state_dict of TorchRL: the observations with which the next batch begins, rows in mid-episode.
+    # An episode's end is not among them, for the environment has begun the next one in that row.
+    collector._carrier.update(collector.env.restore(state["environment"]))

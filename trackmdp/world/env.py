@@ -11,12 +11,15 @@ from torch import Tensor
 from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from trackmdp.errors import UserError
 from trackmdp.world.costs import Costs
 from trackmdp.world.targets import make_targets
 from trackmdp.world.tracks import Problem
 from trackmdp.world.windows import Window
 
 __all__ = ["TrackEnv"]
+
+_FLAGS = ("done", "terminated", "truncated")
 
 
 class TrackEnv(EnvBase):
@@ -29,14 +32,17 @@ class TrackEnv(EnvBase):
     On recorded tracks the target goes along one of them; where its recording stops before it exits, the episode is
     truncated.
 
-    The state lies in the tensordict, so the environment itself holds nothing but its generators:
+    What the tracker knows is observed:
 
     - `last_cell` `[*B]` int64, the cell of the last detection, x_{l(k)};
     - `steps_since_detection` `[*B]` int64, n(k), 0 ... t_max + 1;
     - `action_history` `[*B, t_max+1, K]` bool, the actions since then; slots n and later are empty;
-    - `target` `[*B]` int64, the true cell, M once exited: for the step, the log and tests; no policy reads it;
-    - `point` `[*B]` int64, only with recorded tracks: where in the recording it is; no policy reads it;
     - `step_count` `[*B]` int64, only with `max_steps` in the world.
+
+    The true cell is in no spec and no tensordict, so that no encoder or transform can read the answer; `target` shows
+    it to logs and tests. TorchRL carries from one step to the next only what is observed, so the environment holds its
+    state itself and reads nothing but `action`: transforms may scale, join or delete what is observed. The tensors
+    observed are those of the state: whoever writes to them in place moves the target's clock.
 
     An `action` `[*B, K]` bool is a set of sensors. Without `window` in the world K = M and sensor k is that of cell k.
     With it K = (2W + 1)² and actions, those remembered included, are in the local numbers of `Window`, as seen from
@@ -48,6 +54,9 @@ class TrackEnv(EnvBase):
         seed: seed of the run; the generators' names begin with `stream`.
         stream: name that keeps this environment's draws apart from all others.
         device: where the tensors live.
+
+    Raises:
+        UserError: a step was asked for before the first reset.
     """
 
     def __init__(
@@ -63,62 +72,82 @@ class TrackEnv(EnvBase):
         super().__init__(device=torch.device(device), batch_size=shape)
         self.num_envs, self.max_steps = shape.numel(), world.max_steps
         self.num_cells, self.t_max = world.num_cells, world.t_max
-        self._stream = stream
+        self._stream, self._grid = stream, world.size
         self._targets = make_targets(world, self.device)
         self._window = Window.of(world, self.device)
         self._costs = Costs(world, self.device)
         self._rows = torch.arange(self.num_envs, device=self.device)
         # Shared by all steps that truncate nothing; handed out as a clone only.
         self._no = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
+        # By its keys `[num_envs, ...]`; empty before the first reset. Its tensors are replaced, never written to: those
+        # observed are the same ones.
+        self._state: dict[str, Tensor] = {}
         self._make_specs()
         self._set_seed(seed)
 
+    def __repr__(self) -> str:
+        grid = f"{self._grid[0]} x {self._grid[1]} cells, {self._window.width} sensors, t_max={self.t_max}"
+        limit = f", max_steps={self.max_steps}" if self.max_steps else ""
+        return f"{type(self).__name__}({grid}{limit}, batch_size={list(self.batch_size)}, device={self.device})"
+
     @property
-    def state_keys_of_step(self) -> tuple[str, ...]:
-        """The keys a step reads from the one before."""
-        keys = ("target", *self._targets.hidden, "last_cell", "steps_since_detection", "action_history")
-        return (*keys, "step_count") if self.max_steps else keys
+    def target(self) -> Tensor:
+        """`[*B]` int64, the true cell, M once exited; for logs and tests, no policy is shown it."""
+        return self._shaped(self._now, ("target",))["target"]
+
+    @property
+    def _now(self) -> dict[str, Tensor]:
+        if not self._state:
+            raise UserError("TrackEnv: a step before the first reset, expected env.reset()")
+        return self._state
 
     def _make_specs(self) -> None:
         b, m, k, choices = self.batch_size, self.num_cells, self._window.width, self.t_max + 1
         index: dict[str, Any] = {"shape": b, "dtype": torch.int64, "device": self.device}
         observation = Composite(
-            # m + 1 values: cell M is the exit. n takes t_max + 2: 0 ... t_max + 1, the last one with the safe action
-            # forced.
-            target=Categorical(m + 1, **index),
+            # n takes t_max + 2 values: 0 ... t_max + 1, the last one with the safe action forced.
             last_cell=Categorical(m, **index),
             steps_since_detection=Categorical(choices + 1, **index),
             action_history=Binary(k, shape=(*b, choices, k), dtype=torch.bool, device=self.device),
             shape=b,
         )
-        for key, values in self._targets.hidden.items():
-            observation[key] = Categorical(values, **index)
         if self.max_steps:
             observation["step_count"] = Categorical(self.max_steps + 1, **index)
         self.observation_spec = observation
+        self._observed = tuple(observation.keys())
         self.action_spec = Binary(k, shape=(*b, k), dtype=torch.bool, device=self.device)
         self.reward_spec = Unbounded((*b, 1), device=self.device)
         flag = Binary(1, shape=(*b, 1), dtype=torch.bool, device=self.device)
         self.done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=b)
+        self._shown = (*self._observed, "reward", *_FLAGS)
 
     def _set_seed(self, seed: int | None) -> None:
         self._targets.seed(seed or 0, self._stream)
 
-    def generator_state(self) -> dict[str, Tensor]:
-        """State of the environment's generators, for a checkpoint."""
-        return self._targets.state()
+    def snapshot(self) -> dict[str, dict[str, Tensor]]:
+        """The state of all targets `[num_envs, ...]` and of the generators, for a checkpoint."""
+        return {"rows": dict(self._state), "generators": self._targets.state()}
 
-    def set_generator_state(self, state: dict[str, Tensor]) -> None:
-        """Continue the generators where `generator_state` left them."""
-        self._targets.load_state(state)
+    def restore(self, snapshot: Mapping[str, Mapping[str, Tensor]]) -> TensorDict:
+        """Go on where a `snapshot` was taken; returns what is observed there."""
+        self._state = {key: value.to(self.device) for key, value in snapshot["rows"].items()}
+        self._targets.load_state(snapshot["generators"])
+        return self._shaped(self._now, self._observed)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDictBase:
-        """Initial states for the whole batch; TorchRL takes from them the rows whose `_reset` mask is set."""
+        """Begin anew the rows whose `_reset` mask is set, all without one; returns what is observed in every row."""
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        # TorchRL resets only the rows of its mask. The others are made as well, so that shapes stay fixed, and thrown
-        # away.
-        rows = None if mask is None else mask.view(-1).nonzero().squeeze(-1)
-        return self._shaped(self._fresh(rows))
+        if mask is None or not self._state:
+            self._state = self._fresh()
+        else:
+            self._begin(mask.reshape(-1).nonzero().squeeze(-1))
+        return self._shaped(self._state, self._observed)
+
+    def _begin(self, rows: Tensor) -> None:
+        """New episodes in some rows; the others are made as well, so that shapes stay fixed, and thrown away."""
+        if len(rows):
+            fresh = self._fresh(rows)
+            self._state = {key: value.index_copy(0, rows, fresh[key][rows]) for key, value in self._state.items()}
 
     def _fresh(self, rows: Tensor | None = None) -> dict[str, Tensor]:
         """Initial states s_0 = (x_0, 0, ∅), the target located; the caller uses only `rows` of them, None for all."""
@@ -136,24 +165,21 @@ class TrackEnv(EnvBase):
         return state
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return self._shaped(self._stepped(tensordict))
+        return self._shaped(self._stepped(tensordict["action"]), self._shown)
 
-    def _stepped(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
-        """One step of all targets in a row, `[num_envs, ...]`."""
-        state: Mapping[str, Tensor] = tensordict
+    def _stepped(self, action: Tensor) -> dict[str, Tensor]:
+        """One step of all targets in a row, `[num_envs, ...]`, from an action `[*B, K]`."""
+        flat = action.reshape(self.num_envs, self._window.width)
+        following = self.advance(self._now | {"action": flat}, self._targets.draw(self.num_envs))
+        self._state = {key: following[key] for key in self._state}
+        return following
+
+    def _shaped(self, rows: Mapping[str, Tensor], keys: Sequence[str]) -> TensorDict:
+        """The TensorDict `[*B]` of some of what is known of all targets in a row."""
+        chosen = {key: rows[key] for key in keys}
         if len(self.batch_size) != 1:
-            keys = (*self.state_keys_of_step, "action")
-            state = {key: self._flat(tensordict[key]) for key in keys}
-        return self.advance(state, self._targets.draw(self.num_envs))
-
-    def _flat(self, value: Tensor) -> Tensor:
-        return value.reshape((self.num_envs, *value.shape[len(self.batch_size) :]))
-
-    def _shaped(self, rows: dict[str, Tensor]) -> TensorDict:
-        """The TensorDict `[*B]` of what was worked out with all targets in a row."""
-        if len(self.batch_size) != 1:
-            rows = {key: value.reshape((*self.batch_size, *value.shape[1:])) for key, value in rows.items()}
-        return TensorDict(rows, self.batch_size, device=self.device)
+            chosen = {key: value.reshape((*self.batch_size, *value.shape[1:])) for key, value in chosen.items()}
+        return TensorDict(chosen, self.batch_size, device=self.device)
 
     def advance(self, state: Mapping[str, Tensor] | TensorDictBase, draws: Tensor) -> dict[str, Tensor]:
         """The step as a function of state and `action` `[B, ...]` and of the motion's uniform `draws` `[B]`."""
@@ -203,13 +229,9 @@ class TrackEnv(EnvBase):
         """TorchRL's step and auto-reset in one pass; bit-equal to the stock path, twice as fast."""
         # `next` holds the state that was reached, the returned tensordict the one to act on: where an episode ended
         # they differ.
-        following = self._stepped(tensordict)
-        tensordict.set("next", self._shaped(following))
+        following = self._stepped(tensordict["action"])
+        tensordict.set("next", self._shaped(following, self._shown))
         done = following["done"]
-        carry = {key: following[key] for key in self.state_keys_of_step}
-        ended = done.squeeze(-1).nonzero().squeeze(-1)
-        if len(ended):
-            fresh = self._fresh(ended)
-            carry = {key: value.index_copy(0, ended, fresh[key][ended]) for key, value in carry.items()}
-        flags = {key: torch.zeros_like(done) for key in ("done", "terminated", "truncated")}
-        return tensordict, self._shaped(carry | flags)
+        self._begin(done.squeeze(-1).nonzero().squeeze(-1))
+        flags = {key: torch.zeros_like(done) for key in _FLAGS}
+        return tensordict, self._shaped(self._state | flags, (*self._observed, *_FLAGS))

@@ -20,9 +20,6 @@ __all__ = ["RecordedTargets", "SampledTargets", "Targets", "make_targets"]
 class Targets(Protocol):
     """A batch of targets. Their positions are in the environment's state; this object holds only the generators."""
 
-    hidden: Mapping[str, int]
-    """Keys of the state beside `target`, and how many values each may have."""
-
     def seed(self, seed: int, stream: str) -> None:
         """Begin the draws of a seed and a stream."""
         ...
@@ -36,7 +33,7 @@ class Targets(Protocol):
         ...
 
     def start(self, count: int, rows: Tensor | None) -> dict[str, Tensor]:
-        """`target` and the hidden keys `[count]` of fresh targets; only `rows` of them are used, None for all."""
+        """`target`, and what else a move depends on, `[count]` of fresh targets; `rows` of them are used, None: all."""
         ...
 
     def draw(self, count: int) -> Tensor:
@@ -44,7 +41,7 @@ class Targets(Protocol):
         ...
 
     def move(self, state: Mapping[str, Tensor], draws: Tensor) -> dict[str, Tensor]:
-        """`target` and the hidden keys after one move; a target of M has exited."""
+        """The same after one move; a target of M has exited."""
         ...
 
     def cut(self, moved: Mapping[str, Tensor]) -> Tensor | None:
@@ -63,7 +60,6 @@ class SampledTargets:
     """Targets that move as the kernel says; they start uniformly over the cells."""
 
     def __init__(self, world: World, device: torch.device) -> None:
-        self.hidden: Mapping[str, int] = {}
         self._cells, self._device = world.num_cells, device
         self._motion = Motion(world.kernel, device)
 
@@ -106,7 +102,6 @@ class RecordedTargets:
 
     def __init__(self, setting: Recorded, device: torch.device) -> None:
         cells, following, starts, cut = _line(setting.tracks, setting.num_cells, anywhere=setting.anywhere)
-        self.hidden: Mapping[str, int] = {"point": len(cells)}
         self._cells, self._following, self._starts, self._cut = (
             torch.as_tensor(part, device=device) for part in (cells, following, starts, cut)
         )
