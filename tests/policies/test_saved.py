@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from scipy import sparse
 
 from tests.helpers import small_world, train_config
@@ -66,9 +67,16 @@ def test_limits_and_probabilities_are_kept(tmp_path: Path) -> None:
         assert found.on(1, np.arange(6), np.arange(6)) == pytest.approx(policy.on(1, np.arange(6), np.arange(6)))
 
 
-def test_exactly_k_sensors_is_no_table(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="k sensors drawn at random"):
-        Policy.random_k(small_world(), 2).save(tmp_path / "policy.npz")
+@pytest.mark.parametrize("window", [None, 1])
+def test_exactly_k_sensors_come_back_as_exactly_k(window: int | None, tmp_path: Path) -> None:
+    task = Task(4, cost=0.16, t_max=1, window=window)
+    policy, file = Policy.random_k(task, 3), tmp_path / "policy.npz"
+    policy.save(file)
+    found = Policy.load(file)
+    at = torch.tensor([5, 5, 10]), torch.tensor([0, 1, 0])  # inner cells, whose windows are whole
+    draws = torch.rand(3, 16, generator=torch.Generator().manual_seed(0))
+    assert found.act(*at, draws).sum(-1).tolist() == [3, 3, 3]
+    assert torch.equal(found.act(*at, draws), policy.act(*at, draws))
 
 
 def test_a_run_leaves_the_policy_of_its_summary(tmp_path: Path) -> None:
@@ -108,6 +116,7 @@ def test_the_file_made_here_is_a_policy(tmp_path: Path) -> None:
         stored(value=np.array(["a", "b", "c", "d"])),
         stored(data=np.full(16, np.nan)),
         stored(probability=np.array(2.0)),
+        stored(k=np.array(5)),
         stored(task_cost=np.array([{}, {}, {}, {}], dtype=object)),
     ],
 )

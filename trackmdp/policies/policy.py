@@ -73,11 +73,15 @@ class Policy(TensorDictModuleBase, PolicyTable):
         k: int | None = None,
     ) -> None:
         TensorDictModuleBase.__init__(self)
-        PolicyTable.__init__(self, task, sets, probability=probability)
-        self.k = k
+        PolicyTable.__init__(self, task, sets, probability=probability, k=k)
         self.generator: torch.Generator | None = None
         self._lookup: DenseTable | SparseTable | None = None
         self._local: DenseTable | SparseTable | None = None  # of the window's sensors alone
+
+    @classmethod
+    def from_table(cls, table: PolicyTable) -> Policy:
+        """The policy that acts as a table says."""
+        return cls(table.task, table.sets, probability=table.probability, k=table.k)
 
     @classmethod
     def random_k(cls, task: Task, k: int) -> Policy:
@@ -212,13 +216,7 @@ class Policy(TensorDictModuleBase, PolicyTable):
     # Files.
 
     def save(self, file: str | Path, value: Array | None = None) -> None:
-        """Write `policy.npz`; see `trackmdp.policies.saved`.
-
-        Raises:
-            UserError: the policy draws exactly k sensors, which no table says.
-        """
-        if self.k is not None:
-            raise UserError("policy: k sensors drawn at random are no table to save")
+        """Write `policy.npz`; see `trackmdp.policies.saved`."""
         save_policy(Path(file), self, value)
 
     @classmethod
@@ -228,8 +226,7 @@ class Policy(TensorDictModuleBase, PolicyTable):
         Raises:
             UserError: the file is missing or damaged, or holds something else.
         """
-        table, _ = load_policy(Path(file))
-        return cls(table.task, table.sets, probability=table.probability)
+        return cls.from_table(load_policy(Path(file))[0])
 
 
 def as_policy(task: Task, policy: PolicyLike, *, device: torch.device | str | None = None) -> Policy:
@@ -249,7 +246,7 @@ def as_policy(task: Task, policy: PolicyLike, *, device: torch.device | str | No
     policy.check_fits(task)
     if isinstance(policy, Policy):
         return policy
-    return Policy(policy.task, policy.sets, probability=policy.probability)
+    return Policy.from_table(policy)
 
 
 def rule_of(task: Task, policy: TensorDictModuleBase | Callable[..., Any]) -> Rule:

@@ -27,7 +27,7 @@ def save_policy(file: Path, policy: PolicyTable, value: Array | None = None) -> 
 
     Args:
         file: to write.
-        policy: its table or its one probability.
+        policy: its table or its one probability, and how many sensors it draws.
         value: `[M]`, what an episode is worth from each cell.
     """
     content: dict[str, Any] = {f"task_{name}": _number(getattr(policy.task, name)) for name in _TASK}
@@ -38,6 +38,8 @@ def save_policy(file: Path, policy: PolicyTable, value: Array | None = None) -> 
         content |= {"indices": policy.sets.indices.astype(np.int32), "indptr": policy.sets.indptr.astype(np.int64)}
         if not policy.deterministic:  # else every entry stored is a sensor on
             content["data"] = policy.sets.data
+    if policy.k is not None:
+        content["k"] = np.int64(policy.k)
     if value is not None:
         content["value"] = value
     stream = io.BytesIO()
@@ -57,9 +59,10 @@ def load_policy(file: Path) -> tuple[PolicyTable, Array | None]:
         value = content.get("value")
         if value is not None and (value.shape != (task.num_cells,) or value.dtype != np.float64):
             raise ValueError(f"values {value.dtype} {value.shape} for {task.num_cells} cells")
+        k = int(content["k"]) if "k" in content else None
         if "probability" in content:
-            return PolicyTable(task, probability=float(content["probability"])), value
-        return PolicyTable(task, _sets(content, task)), value
+            return PolicyTable(task, probability=float(content["probability"]), k=k), value
+        return PolicyTable(task, _sets(content, task), k=k), value
 
 
 def _number(value: Any) -> npt.NDArray[Any]:

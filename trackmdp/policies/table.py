@@ -28,6 +28,8 @@ class PolicyTable:
             independently of each other and of the history.
         probability: the same for every sensor in every state, instead of `sets`; in a task with a window, for every
             sensor in the window of the located cell, which is then written out as `sets`.
+        k: exactly k sensors are on, each such subset equally likely; `sets` or `probability` then has each sensor's
+            share of them, which is all that exact values depend on.
 
     Attributes:
         deterministic: whether the policy is the same function of the state each time.
@@ -36,7 +38,14 @@ class PolicyTable:
         UserError: the shape is not that of the task's states, or an entry is no probability.
     """
 
-    def __init__(self, task: Task, sets: sparse.csr_array | None = None, *, probability: float | None = None) -> None:
+    def __init__(
+        self,
+        task: Task,
+        sets: sparse.csr_array | None = None,
+        *,
+        probability: float | None = None,
+        k: int | None = None,
+    ) -> None:
         if (sets is None) == (probability is None):
             raise UserError("policy: expected either sets or one probability for all sensors")
         if probability is not None and not 0.0 <= probability <= 1.0:
@@ -44,7 +53,9 @@ class PolicyTable:
         if probability and task.window is not None:
             # Which sensors there are depends on where the target was located: no longer the same everywhere.
             sets, probability = _window_sets(task, probability), None
-        self.task, self.probability = task.task, probability
+        if k is not None and not 0 <= k <= task.num_cells:
+            raise UserError(f"policy: expected k from 0 to {task.num_cells} sensors, got {k}")
+        self.task, self.probability, self.k = task.task, probability, k
         self.sets = None if sets is None else _checked(task, sets)
         self.deterministic = probability in (0.0, 1.0) if self.sets is None else self.sets.dtype == np.bool_
 

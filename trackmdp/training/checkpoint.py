@@ -10,6 +10,7 @@ import os
 import pickle
 import re
 import stat
+import sys
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -115,6 +116,9 @@ def load(file: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
 def _storages(value: Any) -> dict[int, int]:
     """Address -> bytes of each storage; as pages of a file, torch takes the length that a tensor claims for its own."""
     if isinstance(value, torch.Tensor):
+        # Copied into a real weight, its imaginary part would be lost with no more than a warning.
+        if value.is_complex():
+            raise ValueError("complex numbers")
         storage = value.untyped_storage()
         # By address, since tensors may share a storage (views); an empty storage has no address of its own.
         return {storage.data_ptr(): storage.nbytes()} if storage.nbytes() else {}
@@ -193,6 +197,11 @@ def _check_archive(stream: BinaryIO, size: int) -> int:
     """
     with zipfile.ZipFile(stream) as archive:
         members = archive.infolist()
+        # Of a machine with the bytes of a number in the other order torch would turn the numbers round, of any file that
+        # says so. A run goes on where its versions are the same, and none of them is built for such a machine.
+        order = next((each for each in members if each.filename.endswith("/byteorder")), None)
+        if order is None or order.file_size > _SEAL or archive.read(order).decode() != sys.byteorder:
+            raise ValueError("numbers in another order of bytes than this machine's")
     # torch.save stores, so that a deflated member is not its work; unpacked it might fill the memory.
     if any(member.compress_type != zipfile.ZIP_STORED for member in members):
         raise ValueError("a compressed archive")

@@ -112,8 +112,7 @@ def load_run(folder: str | Path) -> Run:
     summary = read_summary(place)
     check_files(place, summary)
     table, value = load_policy(place / "policy.npz")
-    policy = Policy(table.task, table.sets, probability=table.probability)
-    return Run(policy, _evaluation(place, summary, value), read_metrics(place), summary, place)
+    return Run(Policy.from_table(table), _evaluation(place, summary, value), read_metrics(place), summary, place)
 
 
 def _evaluation(folder: Path, summary: Mapping[str, Any], value: Array | None) -> Evaluation:

@@ -24,6 +24,9 @@ from trackmdp.untrusted import decoded
 __all__ = ["Position", "capture", "find", "identity", "load_learned", "restore", "take_weights"]
 
 _EXACT = ("torch", "torchrl", "tensordict", "trackmdp")
+_PARTS = {"format", "iteration", "identity", "versions", "algorithm", "collector", "random", "position", "callbacks"}
+"""Of the state of a run: what `capture` takes, and the two that `checkpoint.save` adds."""
+
 _NOT_WEIGHTS = ("optimizer", "buffer", "generator")
 
 
@@ -179,8 +182,9 @@ def _check(state: Mapping[str, Any], cfg: TrainConfig, file: Path) -> None:
             raise ValueError("a position that is none")
         if not (0 <= at.seconds < math.inf and math.isfinite(at.reward)) or at.iteration != state["iteration"]:
             raise ValueError("a position that is none")
-        if not {"algorithm", "collector", "random", "callbacks"} <= state.keys():
-            raise ValueError("a part is missing")
+        # No part more either: what nothing here reads was not written here.
+        if state.keys() != _PARTS:
+            raise ValueError(f"parts {sorted(map(str, state.keys() ^ _PARTS))} missing or too many")
 
 
 def _weights(state: Mapping[str, Any], prefix: str = "") -> list[tuple[str, torch.Tensor]]:
