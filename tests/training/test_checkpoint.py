@@ -277,6 +277,24 @@ def test_a_name_given_twice_leaves_nothing_behind(tmp_path: Path) -> None:
     assert names(tmp_path) == ["best.pt", "iteration-00000001.pt", "last.pt"]
 
 
+def test_numbers_in_another_order_of_bytes_are_refused(tmp_path: Path) -> None:
+    """torch would turn every number round without a word."""
+    file, packed = checkpoint.save(tmp_path, 1, state(), keep=1), io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(file.read_bytes()[:-128])) as old, zipfile.ZipFile(packed, "w") as new:
+        for member in old.infolist():
+            new.writestr(member.filename, b"big" if member.filename.endswith("byteorder") else old.read(member))
+    file.write_bytes(sealed(packed.getvalue()))
+    with pytest.raises(UserError, match="another order of bytes"):
+        checkpoint.load(file)
+
+
+def test_complex_numbers_are_refused(tmp_path: Path) -> None:
+    """Copied into weights they would lose half of themselves."""
+    file = checkpoint.save(tmp_path, 1, {"weights": torch.ones(3, dtype=torch.complex64)}, keep=1)
+    with pytest.raises(UserError, match="complex numbers"):
+        checkpoint.load(file)
+
+
 def test_a_tensor_that_reaches_beyond_what_is_stored_is_refused(tmp_path: Path) -> None:
     file, packed = checkpoint.save(tmp_path, 1, state(), keep=1), io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(file.read_bytes()[:-128])) as old, zipfile.ZipFile(packed, "w") as new:

@@ -148,6 +148,16 @@ def test_a_config_edited_by_hand_is_not_the_run(half: Path, capsys: pytest.Captu
     assert "belongs to a run with another config" in capsys.readouterr().err
 
 
+def test_a_part_that_nothing_reads_is_refused(half: Path) -> None:
+    cfg = train_config(*SMALL["ppo"], *QUICK, *BUDGET, "checkpoint.keep=3", f"resume={checkpoint.newest(half)}")
+    state = checkpoint.load(checkpoint.newest(half))
+    iteration = state.pop("iteration")
+    state.pop("format")
+    checkpoint.save(half / "checkpoints", iteration, {**state, "metrics": -5}, keep=3)
+    with pytest.raises(UserError, match=r"parts \['metrics'\] missing or too many"):
+        find(cfg, half, CPU)
+
+
 def test_another_version_is_refused(half: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cfg = train_config(*SMALL["ppo"], *QUICK, *BUDGET, "checkpoint.keep=3", "resume=auto")
     monkeypatch.setattr("trackmdp.training.state.version", lambda name: "0.0")

@@ -11,6 +11,7 @@ from trackmdp.config.schema import ChoiceConfig, NodeConfig
 from trackmdp.errors import UserError
 
 __all__ = [
+    "LARGEST",
     "CostConfig",
     "DriftConfig",
     "GridConfig",
@@ -20,6 +21,9 @@ __all__ = [
     "TableConfig",
     "TracksConfig",
 ]
+
+LARGEST = 1e15
+"""Of a price or a reward: sums of them over cells and steps, and squares of those in a loss, stay far from overflow."""
 
 BORDERS = ("renormalize", "inside", "clip", "exit")
 
@@ -181,28 +185,30 @@ class CostConfig(ChoiceConfig):
 class PaperCostConfig(CostConfig):
     """The paper's rewards: r for a detection, c per sensor switched on, D for the safe action."""
 
-    reward: float = option("r, earned by a detection", unit="reward", gt=0)
+    reward: float = option("r, earned by a detection", unit="reward", ge=1 / LARGEST, le=LARGEST)
     sensor: Any = option(
         "c, price of one sensor switched on for one step, for all cells or for each",
         unit="reward per sensor-step",
-        expects="a number >= 0, a list of one per cell, or a path to a .npy or .csv file of one per cell",
+        expects="a number from 0 to 1e15, a list of one per cell, or a path to a .npy or .csv file of one per cell",
         path=True,
     )
     safe: float | None = option(
-        "D, price of the safe action; null = the sum of all sensors' prices", unit="reward", ge=0
+        "D, price of the safe action; null = the sum of all sensors' prices", unit="reward", ge=0, le=LARGEST
     )
 
     def check(self, key: str, root: Any) -> None:
         """One price for all sensors, or one for each; a file is read later."""
         cells, price = root.grid.num_cells, self.sensor
-        expected = f"a number >= 0, a list of {cells} of them (one per cell), or a path to a .npy or .csv file"
+        expected = (
+            f"a number from 0 to 1e15, a list of {cells} of them (one per cell), or a path to a .npy or .csv file"
+        )
         if isinstance(price, str):
             if Path(price).suffix not in (".npy", ".csv"):
                 raise refuse(f"{key}.sensor", price, expected)
             return
         # `sensor` is declared Any, since OmegaConf has no union of number, list and text; so its values are checked
         # here.
-        number = Option("", ge=0, kind=float)
+        number = Option("", ge=0, le=LARGEST, kind=float)
         if not isinstance(price, list):
             if price is None or not number.allows(price):
                 raise refuse(f"{key}.sensor", price, expected)
@@ -211,4 +217,4 @@ class PaperCostConfig(CostConfig):
             raise UserError(f"{key}.sensor: {len(price)} values, expected one number or {cells} (one per cell)")
         for index, value in enumerate(price):
             if value is None or not number.allows(value):
-                raise refuse(f"{key}.sensor[{index}]", value, "a finite number >= 0")
+                raise refuse(f"{key}.sensor[{index}]", value, "a number from 0 to 1e15")

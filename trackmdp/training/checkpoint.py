@@ -197,8 +197,8 @@ def _check_archive(stream: BinaryIO, size: int) -> int:
     """
     with zipfile.ZipFile(stream) as archive:
         members = archive.infolist()
-        # Of a machine with the bytes of a number in the other order torch would turn the numbers round, of any file that
-        # says so. A run goes on where its versions are the same, and none of them is built for such a machine.
+        # Where a file says that the bytes of its numbers are in another order, torch turns every number round. None of
+        # ours says so: the machines that this program runs on have one order.
         order = next((each for each in members if each.filename.endswith("/byteorder")), None)
         if order is None or order.file_size > _SEAL or archive.read(order).decode() != sys.byteorder:
             raise ValueError("numbers in another order of bytes than this machine's")

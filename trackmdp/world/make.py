@@ -12,6 +12,7 @@ import numpy.typing as npt
 from trackmdp.config import WorldConfig
 from trackmdp.config.compose import compose, default, given
 from trackmdp.config.registry import make
+from trackmdp.config.world import LARGEST
 from trackmdp.errors import UserError
 from trackmdp.world.checks import canonical_kernel, check_kernel
 from trackmdp.world.files import read_numbers
@@ -176,7 +177,7 @@ def _price_per_cell(sensor: float | list[float] | str, cells: int) -> Array:
     price = read_numbers("cost.sensor", sensor, name="cost").ravel()
     if price.size != cells:
         raise UserError(f"cost.sensor={sensor}: {price.size} values, expected {cells} (one per cell)")
-    if not (np.isfinite(price) & (price >= 0)).all():
-        bad = int(np.flatnonzero(~(np.isfinite(price) & (price >= 0)))[0])
-        raise UserError(f"cost.sensor={sensor}: cell {bad} costs {price[bad]}, expected a finite number >= 0")
+    if not (fine := (price >= 0) & (price <= LARGEST)).all():
+        bad = int(np.flatnonzero(~fine)[0])
+        raise UserError(f"cost.sensor={sensor}: cell {bad} costs {price[bad]}, expected a number from 0 to 1e15")
     return price

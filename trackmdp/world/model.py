@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from trackmdp.config.world import LARGEST
 from trackmdp.errors import UserError
 from trackmdp.world.checks import canonical_kernel, check_kernel
 from trackmdp.world.rows import pairwise_row_sums
@@ -83,7 +83,7 @@ class Task:
             "size": (rows, columns),
             "cost": prices,
             "t_max": _at_least(0, "t_max", t_max),
-            "safe_cost": float(prices.sum()) if safe_cost is None else _price("safe_cost", safe_cost),
+            "safe_cost": _price("safe_cost", prices.sum() if safe_cost is None else safe_cost, LARGEST * prices.size),
             "reward": _price("reward", reward),
             "max_steps": None if max_steps is None else _at_least(1, "max_steps", max_steps),
             "window": None if window is None else _at_least(0, "window", window),
@@ -233,9 +233,9 @@ def _prices(cost: npt.ArrayLike, cells: int) -> Array:
     prices = np.asarray(cost, dtype=np.float64)
     if prices.shape not in ((), (cells,)):
         raise UserError(f"cost: expected one number or {cells} (one per cell), got shape {prices.shape}")
-    if not (fine := np.isfinite(prices) & (prices >= 0)).all():
+    if not (fine := (prices >= 0) & (prices <= LARGEST)).all():
         bad = int(np.flatnonzero(~fine)[0])
-        raise UserError(f"cost: cell {bad} costs {prices.flat[bad]}, expected a finite number >= 0")
+        raise UserError(f"cost: cell {bad} costs {prices.flat[bad]}, expected a number from 0 to 1e15")
     return np.broadcast_to(prices, (cells,)).copy()
 
 
@@ -250,9 +250,9 @@ def _probabilities(name: str, given: npt.ArrayLike, cells: int) -> Array:
     return np.broadcast_to(values, (cells,)).copy()
 
 
-def _price(name: str, value: float) -> float:
-    if not (math.isfinite(value) and value >= 0):
-        raise UserError(f"{name}={value}: expected a finite number >= 0")
+def _price(name: str, value: float, most: float = LARGEST) -> float:
+    if not 0 <= value <= most:
+        raise UserError(f"{name}={value}: expected a number from 0 to {most:g}")
     return float(value)
 
 
