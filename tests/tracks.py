@@ -33,10 +33,19 @@ def drawn(kernel: sparse.csr_array, count: int, seed: int = 0) -> Tracks:
     return Tracks(cells[cells < m], np.concatenate([[0], np.cumsum(lengths)]), np.ones(count, bool), np.arange(count))
 
 
-def recorded(tracks: Tracks, held_out: Tracks | None = None, *, size: int = 3, t_max: int = 1, **more: Any) -> Recorded:
-    """A task on tracks; r = 1, c = 0.2, D = 0.2 M; what is held out are the same tracks unless given."""
-    m = size**2
-    return Recorded(tracks, size, held_out=held_out or tracks, cost=0.2, safe_cost=0.2 * m, t_max=t_max, **more)
+def recorded(
+    tracks: Tracks,
+    held_out: Tracks | None = None,
+    *,
+    validation: Tracks | None = None,
+    size: int = 3,
+    t_max: int = 1,
+    **more: Any,
+) -> Recorded:
+    """A task on tracks; r = 1, c = 0.2, D = 0.2 M; the other parts are the same tracks unless given."""
+    of_task = {"cost": 0.2, "safe_cost": 0.2 * size**2, "t_max": t_max}
+    parts = {"validation": validation or tracks, "held_out": held_out or tracks}
+    return Recorded(tracks, size, **parts, **of_task, **more)
 
 
 def write(file: Path, tracks: Tracks, *, size: int | None = None, step: bool = True) -> Path:

@@ -18,10 +18,12 @@ from tests.tracks import by_hand, drawn, recorded, write
 from tests.training.runs import SMALL, tensors
 from tests.training.runs import rows as metrics
 from tests.training.runs import train as train_run
+from trackmdp.app.sweep.table import run_scores
 from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.solvers import qmdp
 from trackmdp.training import checkpoint
 from trackmdp.training.evaluator import ExactEvaluator
+from trackmdp.training.folders import run_of
 from trackmdp.training.held_out import ESTIMATED, HeldOutEvaluator, estimated_kernel, make_evaluator
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Tracks, read_tracks, split
@@ -35,14 +37,18 @@ def test_the_setting_decides_who_evaluates() -> None:
 
 def test_only_the_held_out_tracks_count() -> None:
     """All on: r - 9 c a step in the grid, nothing on the exit step."""
-    evaluator = HeldOutEvaluator(recorded(by_hand([0, 1, 2], [3, 3]), by_hand([4, 5], [4, 5, 6, 7], [8, 8])))
-    score = evaluator.score(Policy.all_on(evaluator.world))
-    assert score.evaluation.aihtr == pytest.approx((1 + 3 + 1) / 3 * (1 - 1.8))
-    assert score.evaluation.expected_length == pytest.approx((2 + 4 + 2) / 3)
-    assert (score.evaluation.accuracy, score.evaluation.sensors_per_step) == (1.0, 9.0)
-    assert math.isnan(score.regret_per_step)
+    others = by_hand([0, 1, 2], [3, 3])
+    setting = recorded(others, by_hand([4, 5], [4, 5, 6, 7], [8, 8]), validation=by_hand([4, 5, 5, 5, 5]))
+    evaluator = HeldOutEvaluator(setting)
+    evaluation = evaluator.evaluate(Policy.all_on(setting))
+    assert evaluation.aihtr == pytest.approx((1 + 3 + 1) / 3 * (1 - 1.8))
+    assert evaluation.expected_length == pytest.approx((2 + 4 + 2) / 3)
+    assert (evaluation.accuracy, evaluation.sensors_per_step) == (1.0, 9.0)
     assert math.isnan(evaluator.upper)
-    value = score.evaluation.value
+    score = evaluator.score(Policy.all_on(setting))
+    assert score.evaluation.aihtr == pytest.approx(4 * -0.8)
+    assert math.isnan(score.regret_per_step)
+    value = evaluation.value
     assert value[[4, 8]] == pytest.approx([2 * -0.8, -0.8])
     assert np.isnan(np.delete(value, [4, 8])).all()
 
@@ -107,36 +113,65 @@ def test_a_run_says_nothing_that_takes_a_kernel(file: Path, tmp_path: Path) -> N
     assert (summary["qmdp"], summary["optimal"], summary["regret_per_step"]) == (None, None, None)
     assert set(summary["bounds"].values()) == {None}
     assert summary["held_out"]["tracks"] == 12
-    assert summary["held_out"]["learned_from"] == 48
+    assert summary["held_out"]["validation"] == 6
+    assert summary["held_out"]["learned_from"] == 42
     figures = summary["held_out"]["figures"]["policy"]
     assert figures["aihtr"]["mean"] == pytest.approx(summary["policy"]["aihtr"])
     evaluated = [row for row in metrics(tmp_path / "run") if row["aihtr"]]
     assert {row["regret_per_step"] for row in metrics(tmp_path / "run")} == {""}
-    assert float(evaluated[-1]["aihtr"]) == summary["policy"]["aihtr"]
+    assert float(evaluated[-1]["aihtr"]) == summary["validation"]["aihtr"] != summary["policy"]["aihtr"]
     assert not (tmp_path / "run" / "kernel.npz").exists()
     described = json.loads((tmp_path / "run" / "tracks.json").read_text())
-    assert (described["learned_from"]["tracks"], described["held_out"]["tracks"]) == (48, 12)
+    assert {name: part["tracks"] for name, part in described.items()} == {
+        "learned_from": 42,
+        "validation": 6,
+        "held_out": 12,
+    }
 
 
 @pytest.mark.parametrize("algo", SMALL)
-def test_held_out_tracks_are_never_learned_from(algo: str, file: Path, tmp_path: Path) -> None:
-    """Other cells in the held-out tracks, and the run learns the same; in the others, and it does not."""
+def test_only_its_own_part_is_learned_from(algo: str, file: Path, tmp_path: Path) -> None:
+    """Other cells in the held-out or the validation tracks, and the run learns the same; in the others, it does not."""
     run(tmp_path / "clean", file, algo=algo)
     _, first = checkpoints(tmp_path / "clean")
-    names = held_out_names(file)
-    held = np.repeat(np.isin(FILE.names, names), FILE.lengths)
-    for name, poisoned in (("held_out", held), ("learned", ~held)):
-        cells = np.where(poisoned, 8 - FILE.cells, FILE.cells)
-        other = write(tmp_path / f"{name}.csv", replace(FILE, cells=cells))
-        run(tmp_path / name, other, algo=algo)
+    for name, part in zip(("learned", "validation", "held_out"), parts(file), strict=True):
+        run(tmp_path / name, poisoned(tmp_path / f"{name}.csv", part), algo=algo)
         keys, second = checkpoints(tmp_path / name)
-        assert all(same(first[key], second[key]) for key in keys) == (name == "held_out")
+        assert all(same(first[key], second[key]) for key in keys) == (name != "learned")
     learned = [strip(row) for row in metrics(tmp_path / "clean")]
-    assert learned == [strip(row) for row in metrics(tmp_path / "held_out")]
+    assert learned == [strip(row) for row in metrics(tmp_path / "validation")]
 
 
-def held_out_names(file: Path) -> Any:
-    return split(read_tracks(file, 3, exits=True), 0.2, 0)[1].names
+def test_choices_are_made_on_the_validation_tracks_alone(file: Path, tmp_path: Path) -> None:
+    """What is looked at while learning, best.pt and Optuna's figure: as they are, whatever the held-out tracks hold."""
+    others = {name: poisoned(tmp_path / f"{name}.csv", part) for name, part in zip(PARTS, parts(file), strict=True)}
+    summaries = {name: run(tmp_path / name, each) for name, each in {"clean": file, **others}.items()}
+    assert metrics(tmp_path / "held_out") == metrics(tmp_path / "clean")
+    assert metrics(tmp_path / "validation") != metrics(tmp_path / "clean")
+    for key, changed in (("validation", "validation"), ("policy", "held_out")):
+        assert [name for name in ("validation", "held_out") if summaries[name][key] != summaries["clean"][key]] == [
+            changed
+        ]
+    # best.pt is the first checkpoint of those with the largest figure on the validation tracks
+    shown = {int(row["iteration"]): float(row["aihtr"]) for row in metrics(tmp_path / "clean") if row["aihtr"]}
+    best = checkpoint.load(tmp_path / "clean/checkpoints" / checkpoint.BEST)
+    assert best["callbacks"]["checkpoints"]["best"] >= max(shown.values())
+    assert shown.get(best["iteration"], math.inf) >= max(shown.values())
+    value = run_scores(run_of(tmp_path / "clean"))["aihtr"]
+    assert value == summaries["clean"]["validation"]["aihtr"] != summaries["clean"]["policy"]["aihtr"]
+
+
+PARTS = ("learned", "validation", "held_out")
+
+
+def parts(file: Path) -> tuple[Tracks, Tracks, Tracks]:
+    return split(read_tracks(file, 3, exits=True), 0.2, 0.1, 0)
+
+
+def poisoned(file: Path, part: Tracks) -> Path:
+    """The tracks, those of `part` with other cells."""
+    mine = np.repeat(np.isin(FILE.names, part.names), FILE.lengths)
+    return write(file, replace(FILE, cells=np.where(mine, 8 - FILE.cells, FILE.cells)))
 
 
 def checkpoints(folder: Path) -> tuple[list[str], dict[str, Any]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -120,27 +121,41 @@ def test_short_tracks_are_refused() -> None:
         check_tracks(tracks, 4, "x")
 
 
-@given(st.integers(2, 50), st.floats(0.05, 0.95), st.integers(0, 2**31))
-def test_a_split_deals_out_every_track_once(count: int, share: float, seed: int) -> None:
+@given(st.integers(2, 50), st.floats(0.05, 0.95), st.floats(0.05, 0.95), st.integers(0, 2**31))
+def test_a_split_deals_out_every_track_once(count: int, share: float, middle: float, seed: int) -> None:
     tracks = by_hand(*[[i % 9, (i + 1) % 9, 3][: 1 + i % 3] for i in range(count)])
-    if not 0 < round(share * count) < count:
-        with pytest.raises(UserError, match=r"^kernel\.held_out=.*: leaves, of \d+ tracks, none to (judge|learn)"):
-            split(tracks, share, seed)
+    last, chosen_by = round(share * count), round(middle * count)
+    if not (last and chosen_by and last + chosen_by < count):
+        words = r"^kernel\.held_out=.*: leave, of \d+ tracks, none to (judge on|choose by|learn from); expected"
+        with pytest.raises(UserError, match=words):
+            split(tracks, share, middle, seed)
         return
-    mine, held_out = split(tracks, share, seed)
-    assert len(held_out) == round(share * count)
-    assert sorted([*mine.names, *held_out.names]) == list(range(count))
-    for part in (mine, held_out):
+    mine, validation, held_out = split(tracks, share, middle, seed)
+    assert (len(held_out), len(validation)) == (last, chosen_by)
+    assert sorted([*mine.names, *validation.names, *held_out.names]) == list(range(count))
+    for part in (mine, validation, held_out):
         for place, name in enumerate(part.names):
             cells = part.cells[part.first[place] : part.first[place + 1]]
             assert cells.tolist() == tracks.cells[tracks.first[name] : tracks.first[name + 1]].tolist()
-    assert same(split(tracks, share, seed)[1], held_out)
+    assert all(map(same, split(tracks, share, middle, seed), (mine, validation, held_out)))
+    # how many are validated on does not change which ones are held out
+    assert same(split(tracks, share, 1 / count, seed)[2], held_out)
+
+
+@given(st.integers(0, 2**31))
+def test_tracks_of_one_name_stay_together(seed: int) -> None:
+    """The pieces of a target's path, cut where it was not seen, are in one part."""
+    tracks = replace(by_hand(*[[i % 9, 3] for i in range(30)]), names=np.arange(30) // 3)
+    parts = split(tracks, 0.2, 0.1, seed)
+    assert [len(part) for part in parts] == [21, 3, 6]
+    assert sorted(name for part in parts for name in set(part.names.tolist())) == list(range(10))
 
 
 def test_the_seed_decides_which_tracks_are_held_out() -> None:
     tracks = by_hand(*[[0, 1]] * 100)
-    names = [split(tracks, 0.2, seed)[1].names.tolist() for seed in range(3)]
-    assert len({tuple(each) for each in names}) == 3
+    for part in range(3):
+        names = [split(tracks, 0.2, 0.1, seed)[part].names.tolist() for seed in range(3)]
+        assert len({tuple(each) for each in names}) == 3
 
 
 def test_closed_and_limited_by_hand() -> None:

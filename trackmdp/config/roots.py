@@ -207,7 +207,11 @@ class ExportConfig(CommandConfig):
     format: str = option(
         "torch_export: policy.pt2, onnx: policy.onnx, sets: sets.json", choices=("torch_export", "onnx", "sets")
     )
-    checkpoint: str = option("which of the run's checkpoints", choices=("newest", "best"))
+    checkpoint: str = option(
+        "which of the run's checkpoints; best = of the largest AIHTR: the oracle's choice, made with the motion no "
+        "learner knows, and with kernel=tracks the validation tracks'",
+        choices=("newest", "best"),
+    )
 
 
 ROOTS: dict[str, type[CommandConfig]] = {

@@ -135,7 +135,7 @@ class TableConfig(KernelConfig):
 @choice("kernel", "tracks", makes="trackmdp.world.make:recorded")
 @dataclass(kw_only=True)
 class TracksConfig(KernelConfig):
-    """No motion model but recorded tracks: learn from most of them, and judge on those held out."""
+    """No motion model but recorded tracks: learn from most of them, choose by some, and judge on those held out."""
 
     is_motion: ClassVar[bool] = False
     path: str = option(
@@ -151,8 +151,13 @@ class TracksConfig(KernelConfig):
         "where episodes begin while learning: first = where a track does, anywhere = at any recorded point",
         choices=("first", "anywhere"),
     )
-    held_out: float = option("share of the tracks to judge on, which no learner sees", gt=0, lt=1)
-    seed: int = option("seed of the draw of the held-out tracks", ge=0)
+    held_out: float = option(
+        "share of the tracks for the last figures, which no learner and no choice sees", gt=0, lt=1
+    )
+    validation: float = option(
+        "share of the tracks for figures while learning, best.pt and Optuna; nothing learns from them", gt=0, lt=1
+    )
+    seed: int = option("seed of the draw of these two", ge=0)
     min_length: int | None = option(
         "fewest cells of a track; null = grid.t_max + 3, a whole path of a policy", unit="cells", ge=1
     )

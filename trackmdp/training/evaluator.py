@@ -45,7 +45,7 @@ class Evaluator(ABC):
         """Figures of a policy."""
 
     def score(self, policy: PolicyTable) -> Score:
-        """Figures and the regret per step of a policy."""
+        """Figures and the regret per step, by which a policy may be chosen: while learning, for best.pt."""
         evaluation = self.evaluate(policy)
         return Score(evaluation, regret_per_step(self.upper, evaluation))
 

@@ -16,7 +16,7 @@ from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.kernel_estimate import KernelEstimate
 from trackmdp.solvers.recorded import replay
 from trackmdp.statistics import MeanInterval
-from trackmdp.training.evaluator import Evaluator, ExactEvaluator
+from trackmdp.training.evaluator import Evaluator, ExactEvaluator, Score
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Problem, Recorded, Tracks
 
@@ -32,9 +32,11 @@ def make_evaluator(problem: Problem) -> Evaluator:
 
 
 class HeldOutEvaluator(Evaluator):
-    """Evaluates on every held-out track, from its first cell to its end.
+    """Evaluates on every held-out track, from its first cell to its end; scores are those of the validation tracks.
 
-    Without a motion model there are no bounds, no Q_MDP and no regret: `upper` and the scores' regrets are nan.
+    Whatever is looked at while learning, or to choose between policies, is a score: the best of many policies on the
+    held-out tracks would be the luckiest there. Without a motion model there are no bounds, no Q_MDP and no regret:
+    `upper` and the scores' regrets are nan.
 
     Args:
         world: the task and its recorded tracks, each truncated after `max_steps` steps.
@@ -51,6 +53,10 @@ class HeldOutEvaluator(Evaluator):
     def evaluate(self, policy: PolicyTable) -> Evaluation:
         """Figures of a policy on the held-out tracks."""
         return evaluate(self.world, policy)
+
+    def score(self, policy: PolicyTable) -> Score:
+        """Figures of a policy on the validation tracks."""
+        return Score(evaluate(self.world.selection, policy), math.nan)
 
     def intervals(self, policy: PolicyTable) -> dict[str, MeanInterval]:
         """Figure -> its mean over the held-out tracks with a 95 % confidence interval."""
@@ -74,7 +80,8 @@ class HeldOutEvaluator(Evaluator):
             name: {figure: asdict(interval) for figure, interval in self.intervals(each).items()}
             for name, each in policies.items()
         }
-        return {"tracks": len(self.tracks), "learned_from": len(self.world.tracks), "figures": figures}
+        counts = {"learned_from": self.world.tracks, "validation": self.world.validation, "tracks": self.tracks}
+        return {name: len(part) for name, part in counts.items()} | {"figures": figures}
 
 
 def estimated_kernel(tracks: Tracks, size: tuple[int, int]) -> sparse.csr_array:

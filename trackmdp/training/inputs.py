@@ -61,7 +61,7 @@ def _content(problem: Problem) -> bytes:
 
 def _described(problem: Recorded) -> bytes:
     """How many tracks and points of which content, as JSON."""
-    parts = {"learned_from": problem.tracks, "held_out": problem.held_out}
+    parts = {"learned_from": problem.tracks, "validation": problem.validation, "held_out": problem.held_out}
     content = {
         name: {"tracks": len(part), "cells": len(part.cells), "sha256": part.digest()} for name, part in parts.items()
     }

@@ -8,6 +8,7 @@ from typing import Any
 
 from trackmdp import __version__
 from trackmdp.config.resume import config_digest
+from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.solution import Solution
 from trackmdp.training.callbacks import Training
 from trackmdp.training.evaluator import Score, figures, while_collecting
@@ -18,12 +19,16 @@ __all__ = ["summarize"]
 _PACKAGES = ("torch", "torchrl", "tensordict", "hydra-core", "numpy", "scipy")
 
 
-def summarize(trainer: Training, score: Score, solution: Solution | None, times: dict[str, float]) -> dict[str, Any]:
-    """The figures of a run that has ended; on held-out tracks there are no bounds, no Q_MDP and no regret.
+def summarize(
+    trainer: Training, final: Evaluation, score: Score, solution: Solution | None, times: dict[str, float]
+) -> dict[str, Any]:
+    """The figures of a run that has ended; on recorded tracks there are no bounds, no Q_MDP and no regret.
 
     Args:
         trainer: of the run.
-        score: of the last policy, its regret to the best bound known by now.
+        final: figures of the last policy.
+        score: of the last policy, its regret to the best bound known by now; on recorded tracks it is of others than
+            `final`, and stands under `validation`.
         solution: the optimum or a bracket of it, where it was solved for.
         times: seconds spent, by their names in the summary.
     """
@@ -34,14 +39,15 @@ def summarize(trainer: Training, score: Score, solution: Solution | None, times:
         "seed": config.seed,
         "frames": end.frames,
         **times,
-        "policy": figures(score.evaluation),
+        "policy": figures(final),
+        "validation": None if final is score.evaluation else figures(score.evaluation),
         "qmdp": figures(evaluator.qmdp) if evaluator.qmdp else None,
         "bounds": evaluator.bounds,
         "optimal": {"lower": solution.lower, "upper": solution.upper, "certified": solution.certified}
         if solution
         else None,
         "regret_per_step": score.regret_per_step,
-        "while_collecting": while_collecting(evaluator.upper, score.evaluation, end.reward, end.frames),
+        "while_collecting": while_collecting(evaluator.upper, final, end.reward, end.frames),
         "held_out": evaluator.report(trainer.policy()),
         "versions": {"trackmdp": __version__, "python": platform.python_version()}
         | {name: version(name) for name in _PACKAGES},

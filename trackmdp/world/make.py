@@ -74,7 +74,7 @@ def load_tracks(
     window: int | None = default("grid.window"),
     **track_options: Any,
 ) -> Recorded:
-    """Recorded tracks in place of a motion model: most of them to learn from, the others held out to evaluate on.
+    """Recorded tracks in place of a motion model: most to learn from, some to choose by, some held out to evaluate on.
 
     Args:
         path: a .csv or .npz file with columns track, cell (or row, column) and, if wanted, step.
@@ -85,7 +85,8 @@ def load_tracks(
         reward: r.
         max_steps: tracks are cut after so many steps; None: never.
         window: W.
-        **track_options: those of ``kernel=tracks``: `ends`, `starts`, `held_out`, `seed`, `min_length`, `markov`.
+        **track_options: those of ``kernel=tracks``: `ends`, `starts`, `held_out`, `validation`, `seed`,
+            `min_length`, `markov`.
 
     Raises:
         UserError: the file is not of that form, a track is too short, or an option is wrong.
@@ -129,23 +130,26 @@ def recorded(
     ends: str,
     starts: str,
     held_out: float,
+    validation: float,
     seed: int,
     min_length: int | None,
     markov: bool,
     **of_task: Any,
 ) -> Recorded:
-    """The recorded tracks in a file, those held out set apart; see `TracksConfig` for the options.
+    """The recorded tracks in a file, in their three parts; see `TracksConfig` for the options.
 
     Raises:
-        UserError: the file is missing or malformed, a track is too short, or one of the two parts would be empty.
+        UserError: the file is missing or malformed, a track is too short, or one of the three parts would be empty.
     """
     tracks = read_tracks(path, size, exits=ends == "exit")
     # A located cell, t_max + 1 free choices and the forced step: t_max + 3 cells, the segment that hindsight learns
     # from.
     shortest = max(min_length or of_task["t_max"] + 3, 1 if ends == "exit" else 2)  # a cut track of one has no step
     check_tracks(tracks, shortest, f"kernel.path={path}")
-    mine, apart = split(tracks, held_out, seed)
-    return Recorded(mine, size, held_out=apart, markov=markov, anywhere=starts == "anywhere", **of_task)
+    mine, chosen, judged = split(tracks, held_out, validation, seed)
+    return Recorded(
+        mine, size, validation=chosen, held_out=judged, markov=markov, anywhere=starts == "anywhere", **of_task
+    )
 
 
 def paper_cost(size: Size, *, reward: float, sensor: float | list[float] | str, safe: float | None) -> dict[str, Any]:

@@ -91,11 +91,13 @@ class Recorded(Task):
 
     Attributes:
         tracks: those to learn from.
-        held_out: those to evaluate on; no learner sees them.
+        validation: those to choose between policies by (best.pt, Optuna's trials); nothing learns from them.
+        held_out: those to evaluate on at the end; no learner and no choice sees them.
         anywhere: episodes begin at any recorded point, not only with a track.
     """
 
     tracks: Tracks
+    validation: Tracks
     held_out: Tracks
     anywhere: bool
 
@@ -104,6 +106,7 @@ class Recorded(Task):
         tracks: Tracks,
         size: Size,
         *,
+        validation: Tracks,
         held_out: Tracks,
         cost: npt.ArrayLike,
         t_max: int,
@@ -128,13 +131,14 @@ class Recorded(Task):
             safe_detection=safe_detection,
             markov=markov,
         )
-        for name, value in (("tracks", tracks), ("held_out", held_out), ("anywhere", anywhere)):
+        parts = {"tracks": tracks, "validation": validation, "held_out": held_out, "anywhere": anywhere}
+        for name, value in parts.items():
             object.__setattr__(self, name, value)  # the dataclass is frozen
 
     @property
-    def judged(self) -> Recorded:
-        """The same task on the held-out tracks, each from its first cell."""
-        return replace(self, tracks=self.held_out, anywhere=False)
+    def selection(self) -> Recorded:
+        """The same task, evaluated on the validation tracks in place of the held-out ones."""
+        return replace(self, held_out=self.validation)
 
 
 Problem: TypeAlias = World | Recorded
@@ -196,19 +200,36 @@ def check_tracks(tracks: Tracks, shortest: int, source: str) -> Tracks:
     return tracks
 
 
-def split(tracks: Tracks, share: float, seed: int) -> tuple[Tracks, Tracks]:
-    """Whole tracks to learn from, and about `share` of them, drawn at random, held out.
+def split(tracks: Tracks, held_out: float, validation: float, seed: int) -> tuple[Tracks, Tracks, Tracks]:
+    """Three parts drawn at random: to learn from, to choose between policies by, and held out for the last figures.
+
+    Tracks of one name stay together: the pieces of one target's path are alike, and a part that has one of them would
+    tell of the others.
+
+    Args:
+        tracks: all of them.
+        held_out: about this share of the names is held out; which ones does not depend on `validation`.
+        validation: share of the names to choose by.
+        seed: of the draw.
 
     Raises:
-        UserError: one of the two parts is empty.
+        UserError: one of the three parts is empty.
     """
-    count = round(share * len(tracks))
-    if not 0 < count < len(tracks):
-        left = "none to judge on" if count == 0 else "none to learn from"
-        raise UserError(f"kernel.held_out={share}: leaves, of {len(tracks)} tracks, {left}; expected both")
-    held_out = np.zeros(len(tracks), dtype=bool)
-    held_out[np.random.default_rng(derive(seed, "held_out")).permutation(len(tracks))[:count]] = True
-    return tracks.select(~held_out), tracks.select(held_out)
+    names, of_name = np.unique(tracks.names, return_inverse=True)
+    last, middle = round(held_out * len(names)), round(validation * len(names))
+    counts = {"judge on": last, "choose by": middle, "learn from": len(names) - last - middle}
+    for words, count in counts.items():
+        if count < 1:
+            raise UserError(
+                f"kernel.held_out={held_out}, kernel.validation={validation}: leave, of {len(names)} tracks, none to "
+                f"{words}; expected at least one for each"
+            )
+    # Example: of 10 names, shares .2 and .1, the permutation 7 2 9 0 ... holds 7 and 2 out, and 9 is the validation.
+    part = np.zeros(len(names), dtype=np.int64)
+    order = np.random.default_rng(derive(seed, "held_out")).permutation(len(names))
+    part[order[:last]], part[order[last : last + middle]] = 2, 1
+    learned, chosen, judged = (tracks.select(part[of_name] == each) for each in range(3))
+    return learned, chosen, judged
 
 
 def _ends(lengths: Indices) -> Indices:

@@ -72,7 +72,7 @@ def test_the_picture_follows_a_held_out_track(folder: Path) -> None:
         for row in range(3)
         if "●" in frame[row]
     ]
-    held_out = split(read_tracks(folder.parent / "tracks.csv", 3, exits=True), 0.2, 0)[1]
+    held_out = split(read_tracks(folder.parent / "tracks.csv", 3, exits=True), 0.2, 0.1, 0)[2]
     paths = [held_out.cells[a:b].tolist() for a, b in zip(held_out.first[:-1], held_out.first[1:], strict=True)]
     assert any(path[1:7] == drawn_cells for path in paths)
 
@@ -114,8 +114,22 @@ NEEDS_THE_MODEL = sorted(set(GROUPS["baseline"]) - {"all_on", "none", "random_k"
             "baseline=all_on log=mcap",
             "log=[mcap]: expected none but csv and tensorboard with kernel=tracks",
         ),
-        ("train", "kernel.held_out=0.001", "kernel.held_out=0.001: leaves, of 60 tracks, none to judge on"),
-        ("train", "kernel.held_out=0.999", "kernel.held_out=0.999: leaves, of 60 tracks, none to learn from"),
+        (
+            "train",
+            "kernel.held_out=0.001",
+            "kernel.held_out=0.001, kernel.validation=0.1: leave, of 60 tracks, none to judge on; expected at least",
+        ),
+        (
+            "train",
+            "kernel.validation=0.001",
+            "kernel.held_out=0.2, kernel.validation=0.001: leave, of 60 tracks, none to choose by",
+        ),
+        (
+            "train",
+            "kernel.held_out=0.9",
+            "kernel.held_out=0.9, kernel.validation=0.1: leave, of 60 tracks, none to learn from",
+        ),
+        ("train", "kernel.validation=1", "kernel.validation=1.0: expected a number > 0 and < 1"),
         ("train", "kernel.held_out=0", "kernel.held_out=0.0: expected a number > 0 and < 1"),
         ("train", "kernel.path=no.csv", "kernel.path="),
         ("train", "grid.size=4 kernel.min_length=null", "kernel.path="),
@@ -192,7 +206,7 @@ def test_ends_and_starts_are_options(ends: str, starts: str, folder: Path) -> No
     assert train("a", f"kernel.ends={ends}", f"kernel.starts={starts}", "algo.updates=2") == 0
     summary = json.loads((folder / "a/summary.json").read_text())
     length = summary["policy"]["expected_length"]
-    held_out = split(read_tracks(folder.parent / "tracks.csv", 3, exits=True), 0.2, 0)[1]
+    held_out = split(read_tracks(folder.parent / "tracks.csv", 3, exits=True), 0.2, 0.1, 0)[2]
     assert length == pytest.approx(held_out.lengths.mean() - (ends == "cut"))
 
 

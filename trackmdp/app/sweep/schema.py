@@ -83,7 +83,9 @@ class OptunaConfig(SweeperConfig):
 
     n_trials: int = option("runs of the whole study, those of earlier calls among them", unit="runs", ge=1)
     objective: str = option(
-        "what is searched for: the largest AIHTR, the least regret", choices=("aihtr", "regret_per_step")
+        "what is searched for: the largest AIHTR, the least regret: the oracle's choice, made with the motion, and "
+        "with kernel=tracks the validation tracks'",
+        choices=("aihtr", "regret_per_step"),
     )
     sampler: str = option("how the next run is chosen", choices=("tpe", "random"))
     seed: int = option("every choice derives from it", ge=0)

@@ -17,7 +17,7 @@ from trackmdp.training.display import table
 from trackmdp.training.folders import FAILED_FILE, RunState, read_run_json
 from trackmdp.untrusted import no_formula
 
-__all__ = ["TABLE", "run_figures", "show_runs", "status_of", "write_table"]
+__all__ = ["TABLE", "run_figures", "run_scores", "show_runs", "status_of", "write_table"]
 
 TABLE = "runs.csv"
 
@@ -81,6 +81,11 @@ def status_of(runs: Sequence[RunState]) -> int:
 
 def _state(run: RunState, skipped: Collection[Path]) -> str:
     return "skipped" if run.folder in skipped and run.state == "done" else run.state
+
+
+def run_scores(run: RunState) -> dict[str, Any]:
+    """The figures to choose between runs by: of recorded tracks those on the validation tracks, else all there are."""
+    return {**run_figures(run), **(run.result.get("validation") or {})}
 
 
 def run_figures(run: RunState) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from hydra.core.override_parser.types import IntervalSweep, Override, RangeSweep
 
 from trackmdp.app.sweep.plan import Job
 from trackmdp.app.sweep.schema import OptunaConfig
-from trackmdp.app.sweep.table import run_figures
+from trackmdp.app.sweep.table import run_scores
 from trackmdp.errors import UserError, require
 from trackmdp.seeding import derive
 from trackmdp.training.folders import run_of
@@ -119,7 +119,7 @@ def _tell(cfg: OptunaConfig, study: Any, trial: Any, job: Job) -> int:
     An interrupted one stays open, and is enqueued again by the next call.
     """
     run = run_of(job.folder)
-    value = run_figures(run).get(cfg.objective) if run.state == "done" else None
+    value = run_scores(run).get(cfg.objective) if run.state == "done" else None
     if value is not None:
         study.tell(trial, value)
         return 0
