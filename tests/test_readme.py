@@ -26,7 +26,7 @@ SHORT = {
         "collector.total_frames=8192",
         "collector.frames_per_batch=4096",
         "collector.envs=64",
-        "optimal.time_limit=1",
+        "optimal.nodes=100000",
     ],
     "evaluate": ["episodes=20"],
 }

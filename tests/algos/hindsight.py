@@ -49,7 +49,7 @@ def policy(learner: Any, world: World) -> Any:
 def assert_it_learns(name: str, words: tuple[str, ...], t_max: int) -> None:
     world = small_world(t_max=t_max, exit_probability=0.02)
     learner = learn(world, batches(world, 32), *SOLVES, "algo.total_frames=8192", *words, name=name)
-    best = optimal.solve(world, time_limit=5.0)
+    best = optimal.solve(world, nodes=1_000_000)
     assert regret_per_step(best.upper, evaluate(world, policy(learner, world))) < 0.01
 
 

@@ -50,7 +50,7 @@ def test_mixed_reaches_the_optimum_of_a_small_world() -> None:
         frames = collect(world, learner.policy, 32, 8, seed=number) if number < 32 else None
         earned += [] if frames is None else [frames["next", "reward"].mean().item()]
         learner.step(frames)
-    best = optimal.solve(world, time_limit=5.0)
+    best = optimal.solve(world, nodes=1_000_000)
     assert regret_per_step(best.upper, evaluate(world, policy(learner, world))) < 0.01
     assert np.mean(earned[-8:]) > np.mean(earned[:8]) + 0.5
 

@@ -20,7 +20,7 @@ from trackmdp.world.model import BoolArray, World
 
 
 def checks(world: World, solution: Solution | None = None) -> dict[tuple[str, str], Check]:
-    solved = optimal.solve(world, tolerance=1e-9, time_limit=20) if solution is None else solution
+    solved = optimal.solve(world, tolerance=1e-9, nodes=4_000_000) if solution is None else solution
     return {(row.name, row.statement): row for row in theorems.check_theorems(world, solved, 1e-8)}
 
 

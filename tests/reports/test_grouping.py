@@ -12,6 +12,7 @@ from trackmdp.config import to_dict
 from trackmdp.reports.finished import flatten
 from trackmdp.reports.grouping import study, world_key
 from trackmdp.reports.results import FIGURES, FinishedRun
+from trackmdp.reports.summaries import methods_table, runs_table
 
 
 @functools.cache
@@ -74,10 +75,26 @@ def test_regret_is_to_the_best_upper_bound_that_any_run_of_the_world_has_proved(
         run("b", options={"seed": 1}, aihtr=99.0, expected_length=200.0, bound_clocked=101.0, optimal_upper=99.5),
     ]
     runs[0].figures["optimal_lower"], runs[1].figures["optimal_lower"] = 99.0, 99.2  # type: ignore[index]
+    for each in runs:
+        each.figures.update(dict.fromkeys(("frames", "wall_seconds", "cpu_seconds", "accuracy"), 1.0))  # type: ignore[attr-defined]
     found = study(runs)
     (world,) = found.worlds
     assert (found.upper(world), found.lower(world)) == (99.5, 99.2)
     assert found.regrets(world, "hindsight") == pytest.approx([9.5 / 200, 0.5 / 200])
+    assert found.bracket(world) == pytest.approx(0.3 / 200)  # 99.2 is attained, 99.5 may be
+    table = runs_table(found)
+    at = [column.label for column in table.columns].index("regret per step to the best known")
+    assert [row[at : at + 2] for row in table.rows] == [
+        pytest.approx([9.2 / 200, 9.5 / 200]),
+        pytest.approx([0.2 / 200, 0.5 / 200]),
+    ]
+    assert f"not certified: {world} by 0.0015" in methods_table(found, None).caption
+
+
+def test_a_learned_policy_above_the_solvers_is_the_best_known() -> None:
+    found = study([run("a", aihtr=99.4, expected_length=200.0, optimal_lower=99.0, optimal_upper=100.0)])
+    (world,) = found.worlds
+    assert found.best(world) == 99.4
 
 
 def test_without_a_bound_there_is_no_regret() -> None:

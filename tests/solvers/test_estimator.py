@@ -18,7 +18,7 @@ from trackmdp.world.model import BoolArray, World
 @settings(max_examples=40)
 @given(tiny_worlds(most_t_max=2))
 def test_the_exact_form_is_the_belief(world: World) -> None:
-    solution = optimal.solve(world, tolerance=1e-9, time_limit=20)
+    solution = optimal.solve(world, tolerance=1e-9)
     for estimate in estimator.positions(world, solution.table, solution.value):
         np.testing.assert_allclose(estimate.exact, estimate.belief, rtol=0, atol=1e-8)
 

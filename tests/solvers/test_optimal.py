@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -14,6 +16,7 @@ from tests.solvers.worlds import (
     reference_world,
     tiny_worlds,
 )
+from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import bounds, optimal, search
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.layers import layer_sets, policy_table, reachable_layers
@@ -24,7 +27,7 @@ from trackmdp.world.model import World
 
 
 def assert_optimal(world: World, best: np.ndarray, tolerance: float = 1e-9) -> None:
-    solution = optimal.solve(world, tolerance=tolerance, time_limit=60)
+    solution = optimal.solve(world, tolerance=tolerance)
     scale = 1.0 + np.abs(best).max()
     assert solution.certified
     np.testing.assert_allclose(solution.value, best, rtol=0, atol=2 * tolerance * scale)
@@ -47,7 +50,7 @@ def test_reference_values(reference: dict) -> None:
 )
 def test_the_papers_worlds_are_certified(row: dict) -> None:
     world = paper_world(row["support_size"], row["cost"], row["t_max"])
-    solution = optimal.solve(world, time_limit=60)
+    solution = optimal.solve(world)
     assert solution.certified
     assert solution.upper - solution.lower <= 1e-6 * max(1.0, abs(solution.lower))
     assert solution.lower == pytest.approx(row["best_known"], abs=1e-7)
@@ -99,10 +102,10 @@ def test_the_homotopy_finds_sets_that_have_to_change_together() -> None:
 def test_an_open_bracket_holds_the_optimum() -> None:
     """Stopped at once, the bracket is wide but holds the value that is certified with more time."""
     world = paper_world(5, 0.22, 3)
-    stopped = optimal.solve(world, time_limit=1e-9)
+    stopped = optimal.solve(world, nodes=1)
     assert not stopped.certified
     assert not stopped.interrupted
-    certified = optimal.solve(world, time_limit=60)
+    certified = optimal.solve(world)
     assert (stopped.value <= certified.bound + 1e-9).all()
     assert (certified.value <= stopped.bound + 1e-9).all()
     assert stopped.lower <= certified.lower <= certified.upper <= stopped.upper
@@ -165,17 +168,67 @@ def test_numeric_edges(name: str, shape: str) -> None:
     walk = random_walk(3, stay=0.2, diagonal=False, exit_probability=0.01, border="clip")
     kernel = _kernel_with_edges() if shape == "edges" else walk
     world = World(kernel, 3, cost=cost, safe_cost=float(cost.sum()) if safe is None else safe, t_max=t_max)
-    solution = optimal.solve(world, time_limit=20)
+    solution = optimal.solve(world)
     scale = 1.0 + np.abs(solution.bound).max()
     assert np.isfinite(solution.value).all()
     assert np.isfinite(solution.bound).all()
     assert solution.certified
     assert (solution.value <= bounds.clocked(world) + 1e-8 * scale).all()
     assert (bounds.clocked(world) <= bounds.valid(world) + 1e-8 * scale).all()
-    np.testing.assert_array_equal(solution.table.dense(), optimal.solve(world, time_limit=20).table.dense())
+    np.testing.assert_array_equal(solution.table.dense(), optimal.solve(world).table.dense())
 
 
 def test_a_larger_grid_is_certified() -> None:
-    solution = optimal.solve(paper_world(5, 0.22, 1, size=20), time_limit=60)
+    solution = optimal.solve(paper_world(5, 0.22, 1, size=20))
     assert solution.certified
     assert solution.lower == pytest.approx(25.459964, abs=1e-5)
+
+
+class FastClock:
+    """Another machine's clock: each look at it finds an hour gone."""
+
+    def __init__(self) -> None:
+        self.hours = itertools.count()
+
+    def __call__(self) -> float:
+        return 3600.0 * next(self.hours)
+
+
+def open_world() -> World:
+    """25 cells of a drift that turns often, two free misses: some 200,000 nodes to close."""
+    kernel = drift(5, direction=0.0, persistence=0.5, exit_probability=0.01, border="renormalize")
+    return World(kernel, 5, cost=0.3, t_max=2)
+
+
+def test_the_bracket_is_the_same_at_any_speed_of_the_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    world, nodes = open_world(), 20_000
+    first = optimal.solve(world, nodes=nodes)
+    assert not first.certified
+    assert not first.timed_out
+    assert first.nodes < 2 * nodes
+    monkeypatch.setattr("time.monotonic", FastClock())
+    again = optimal.solve(world, nodes=nodes)
+    assert np.array_equal(first.value, again.value)
+    assert np.array_equal(first.bound, again.bound)
+    assert first.nodes == again.nodes
+    assert "another machine" not in again.ended
+
+
+def test_a_time_limit_is_said_where_it_ends_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("time.monotonic", FastClock())
+    solution = optimal.solve(open_world(), time_limit=1.0)
+    assert solution.timed_out
+    assert solution.ended == "not closed, stopped by the time limit (another machine may end elsewhere)"
+    # nothing was left to stop
+    assert not optimal.solve(paper_world(3, 0.16, 3), time_limit=1.0).timed_out
+
+
+def test_the_solution_is_no_worse_than_the_policy_it_was_handed() -> None:
+    world = open_world()
+    best, alone = optimal.solve(world), optimal.solve(world, nodes=1)
+    handed = optimal.solve(world, nodes=1, start=best.table)
+    assert handed.lower == best.lower
+    # A poor one changes nothing, bit for bit.
+    poor = optimal.solve(world, nodes=1, start=PolicyTable.none(world))
+    assert np.array_equal(poor.value, alone.value)
+    assert np.array_equal(poor.bound, alone.bound)

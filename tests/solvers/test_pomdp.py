@@ -15,7 +15,7 @@ from trackmdp.world.model import World
 @settings(max_examples=15)
 @given(tiny_worlds(most_t_max=2))
 def test_the_same_optimum_as_on_chains(world: World) -> None:
-    chains = optimal.solve(world, tolerance=1e-9, time_limit=20)
+    chains = optimal.solve(world, tolerance=1e-9)
     scale = 1.0 + np.abs(chains.value).max()
     np.testing.assert_allclose(pomdp.solve(world).value, chains.value, rtol=0, atol=1e-8 * scale)
 

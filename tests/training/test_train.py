@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 import sys
 from pathlib import Path
@@ -22,6 +23,8 @@ from trackmdp.training.callbacks import Callback, Row, Training
 from trackmdp.training.evaluator import Score
 from trackmdp.training.run import load_run
 from trackmdp.training.train import train
+from trackmdp.world.kernels import drift
+from trackmdp.world.model import World
 
 QUICK: dict[str, Any] = {
     "total_frames": 2048,
@@ -162,3 +165,22 @@ train(World(kernel, 3, cost=0.2, t_max=1), "ppo", total_frames=512, frames_per_b
 assert not [name for name in sys.modules if name.split(".")[0] == "hydra"]
 """
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_regret_is_the_same_on_a_busy_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the optimum stays open, the bound is that of a budget of work: bit for bit, however the clock runs."""
+    kernel = drift(5, direction=0.0, persistence=0.5, exit_probability=0.01, border="renormalize")
+    world = World(kernel, 5, cost=0.3, t_max=2)
+    words = QUICK | {"optimal": {"enabled": True, "nodes": 20_000}}
+    idle = train(world, "a2c", seed=0, **words)
+    ticks = itertools.count()
+    monkeypatch.setattr("time.monotonic", lambda: 3600.0 * next(ticks))
+    busy = train(world, "a2c", seed=0, **words)
+    assert busy.summary["regret_per_step"] == idle.summary["regret_per_step"]
+    assert busy.summary["optimal"] == idle.summary["optimal"]
+    assert not idle.summary["optimal"]["certified"]
+    low, high = idle.summary["regret_per_step_lower"], idle.summary["regret_per_step"]
+    assert 0.0 <= low < high
+    assert idle.solution is not None
+    length = idle.evaluation.expected_length
+    assert low == pytest.approx((idle.solution.lower - idle.evaluation.aihtr) / length, abs=1e-12)

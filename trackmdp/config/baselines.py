@@ -123,7 +123,10 @@ class OptimalConfig(BaselineConfig):
 
     whole_episodes: ClassVar[bool] = True
 
-    time_limit: float = option("stop closing the bracket after this long", unit="s", gt=0)
+    nodes: int = option("choices of branch and bound after which the bracket is left as it is", unit="nodes", ge=1)
+    time_limit: float | None = option(
+        "stop after this long even so, where the machine is slow; said where it happens; null = never", unit="s", gt=0
+    )
     tolerance: float = option("bracket that counts as closed, relative to the value", ge=0, lt=1)
 
 

@@ -61,7 +61,10 @@ class OptimalBoundConfig(NodeConfig):
     """The certified optimum beside the policy's figures."""
 
     enabled: bool = option("solve for the optimum at the end")
-    time_limit: float = option("stop solving after this long", unit="s", gt=0)
+    nodes: int = option("choices of branch and bound after which solving stops", unit="nodes", ge=1)
+    time_limit: float | None = option(
+        "stop after this long even so; regrets then depend on the machine, and say so; null = never", unit="s", gt=0
+    )
 
 
 @dataclass(kw_only=True)

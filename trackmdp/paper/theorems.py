@@ -202,7 +202,7 @@ def _as_pomdp(world: World) -> Iterator[Check]:
         except UserError:
             small = corner(small)
             beliefs = pomdp.solve(small)
-        best = optimum.solve(small, tolerance=SLACK, time_limit=20.0)
+        best = optimum.solve(small, tolerance=SLACK, nodes=MOST_NODES)
         where = "the world itself" if small.num_cells == world.num_cells else f"its {CORNER}x{CORNER} corner"
         note = f"on {where}, {prices}, t_max {small.t_max}, {beliefs.beliefs} belief states"
         # Theorem thm:optimalaspomdp: V_TMDP((b, 0, {})) = V_POMDP((e_b, 0)) for every cell b.

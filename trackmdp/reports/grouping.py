@@ -58,11 +58,23 @@ class Study:
         found = [run.figures["optimal_lower"] for run in self.in_world(world)]
         return max((value for value in found if value is not None), default=None)
 
+    def best(self, world: str) -> float:
+        """The AIHTR of the best policy known in a world, the solver's or a run's; nan where no bound is known."""
+        keys = ("optimal_lower", "qmdp_aihtr", "aihtr")
+        found = [run.figures[key] for run in self.in_world(world) for key in keys]
+        known = not math.isnan(self.upper(world))
+        return max((value for value in found if value is not None), default=math.nan) if known else math.nan
+
     def regret(self, run: FinishedRun, world: str, aihtr: float | None = None) -> float:
         """Distance per step to the best proved upper bound, of the run's policy or of one that earns `aihtr`."""
         earned = run.figure("aihtr") if aihtr is None else aihtr
         # Per step, so that worlds whose targets stay for a different time can be averaged.
         return (self.upper(world) - earned) / run.figure("expected_length")
+
+    def bracket(self, world: str) -> float:
+        """Per step, how far the regrets in a world may be too large: from the best policy known to the bound."""
+        run = self.in_world(world)[0]
+        return self.regret(run, world, self.best(world))
 
     def regrets(self, world: str, method: str) -> list[float]:
         """Regret per step of each run; none where no bound is known."""

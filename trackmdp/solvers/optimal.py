@@ -35,6 +35,8 @@ ROUNDING = 1e-10
 FIRST_NODES = 100_000
 """Nodes before the first round's improvements are used; twice as many in each later round. Not seconds, so that the
 same world gives the same policy on any machine."""
+NODES_BETWEEN_REPORTS = 200_000
+"""Nodes after which the bracket is brought up to date while a tree is searched: about a second's."""
 WORTH_A_RESTART = 0.02
 """Share of the bracket that improvements have to close for the search to start anew with them."""
 
@@ -42,18 +44,30 @@ WORTH_A_RESTART = 0.02
 def solve(
     world: World,
     *,
-    time_limit: float = 60.0,
+    nodes: int = 10_000_000,
+    time_limit: float | None = None,
     tolerance: float = 1e-6,
+    start: PolicyTable | None = None,
     on_progress: Callable[[SearchProgress], None] | None = None,
 ) -> Solution:
-    """Search until the bracket is closed to `tolerance` of the value, or `time_limit` seconds are over.
+    """Search until the bracket is closed to `tolerance` of the value, or `nodes` are looked at.
 
-    Where the clocked policy attains the clocked bound, as it does wherever at most one possible cell is ever left
-    unsensed, nothing is searched. Ctrl-C ends a search like the time limit does: the bracket so far is returned.
+    The budget is work, so that a world has the same bracket on a busy and on an idle machine. Where the clocked policy
+    attains the clocked bound, as it does wherever at most one possible cell is ever left unsensed, nothing is
+    searched. Ctrl-C ends a search like the budget does: the bracket so far is returned.
+
+    Args:
+        world: the problem with its motion model.
+        nodes: choices of branch and bound, all trees together; some 200,000 a second.
+        time_limit: seconds after which to stop before; what is returned then depends on the machine, and says so
+            (`Solution.timed_out`). None: no limit.
+        tolerance: bracket that counts as closed, relative to the value.
+        start: a deterministic policy that is known, such as a learned one: what is returned is no worse.
+        on_progress: told how far the search has come.
     """
     if world.max_steps is not None:
         raise UserError(f"grid.max_steps={world.max_steps}: only whole episodes are solved, expected null")
-    run = _Run(world, time_limit, tolerance, on_progress)
+    run = _Run(world, _Budget(nodes, time_limit), tolerance, start, on_progress)
     interrupted = False
     try:
         run.search()
@@ -77,22 +91,49 @@ class _Ground:
         self.longest = float(expected_steps(self.world).max())
 
 
+class _Budget:
+    """Work that may be done, in nodes, and that was; the clock is only read where a time limit is set."""
+
+    def __init__(self, nodes: int, time_limit: float | None) -> None:
+        self.nodes, self.spent, self.timed_out = nodes, 0, False
+        self.started = time.monotonic()
+        self._ends = None if time_limit is None else self.started + time_limit
+
+    def left(self) -> bool:
+        """Whether there is work left to do."""
+        # A limit that has passed stays passed: the rounds after it end one by one.
+        self.timed_out = self.timed_out or (self._ends is not None and time.monotonic() >= self._ends)
+        return self.spent < self.nodes and not self.timed_out
+
+    def run(self, tree: Tree, go_on: Callable[[Tree], bool]) -> None:
+        """Run `tree` while there is work left and `go_on` holds."""
+        before, spent = tree.nodes, self.spent
+
+        def within(tree: Tree) -> bool:
+            self.spent = spent + tree.nodes - before
+            return self.left() and go_on(tree)
+
+        try:
+            tree.run(within)
+        finally:
+            self.spent = spent + tree.nodes - before
+
+
 class _Run:
     """One search: the policy and the bracket so far."""
 
     def __init__(
         self,
         world: World,
-        time_limit: float,
+        budget: _Budget,
         tolerance: float,
+        start: PolicyTable | None,
         on_progress: Callable[[SearchProgress], None] | None,
     ) -> None:
-        self.world, self.tolerance, self.on_progress = world, tolerance, on_progress
-        self.started = time.monotonic()
-        self.ends = self.started + time_limit
+        self.world, self.tolerance, self.on_progress, self.budget = world, tolerance, on_progress, budget
+        self.start = start
         # U(x, 0) >= V*(x) before anything is searched; `tighten` only lowers it.
         self.bound = clocked_table(world).value
-        self.nodes = 0
         self.policy = clocked.solve(world)
         self.evaluation: Evaluation = evaluate(world, self.policy)
 
@@ -104,7 +145,8 @@ class _Run:
     def use(self, policy: PolicyTable) -> bool:
         """Take `policy` as the one at hand if it is better."""
         evaluation = evaluate(self.world, policy)
-        better = bool(evaluation.value.sum() > self.value.sum())
+        # By more than rounding, so that another way to write the same policy changes nothing.
+        better = bool(evaluation.value.sum() > self.value.sum() + 1e-13 * np.abs(self.value).sum())
         if better:
             self.policy, self.evaluation = policy, evaluation
         return better
@@ -119,8 +161,8 @@ class _Run:
 
     def report(self) -> None:
         if self.on_progress is not None:
-            seconds = time.monotonic() - self.started
-            self.on_progress(SearchProgress(float(self.value.mean()), float(self.bound.mean()), seconds, self.nodes))
+            seconds, nodes = time.monotonic() - self.budget.started, self.budget.spent
+            self.on_progress(SearchProgress(float(self.value.mean()), float(self.bound.mean()), seconds, nodes))
 
     def search(self) -> None:
         if self.certified:  # the clocked policy attains its bound
@@ -130,12 +172,15 @@ class _Run:
         layers = self.ground.layers
         # first the policy, then the proof: branch and bound is the faster the better its start
         self.use(policy_table(self.world, layers, follow_credit(self.world, layers, layer_sets(layers, self.policy))))
+        # Last: what the search finds by itself is the same whatever is handed to it.
+        if self.start is not None:
+            self.use(self.start)
         self.report()
         patience = FIRST_NODES
-        while not self.certified and time.monotonic() < self.ends:
+        while not self.certified and self.budget.left():
             improved = self.round(patience)
             self.report()
-            # No better plan: the tree was searched to its end, or time is over.
+            # No better plan: the tree was searched to its end, or the budget is spent.
             if not improved:
                 return
             patience *= 2
@@ -172,19 +217,19 @@ class _Run:
         return self.use(policy_table(self.world, layers, search.improve(self.world, layers, sets)))
 
     def explore(self, tree: Tree, patience: int) -> None:
-        """Run the tree until it is closed or the time limit is reached.
+        """Run the tree until it is closed or the budget is spent.
 
         Every `patience` nodes it also ends if the improvements found close a good part of the bracket: the next round
         starts from a better policy, but most of what this tree has ruled out has to be ruled out again.
         """
-        reported, next_look = time.monotonic(), patience
+        # Nodes, not seconds, also between two reports: `tighten` takes the least of what it is shown.
+        step = max(NODES_BETWEEN_REPORTS, 10 * self.world.num_cells)
+        next_report, next_look = step, patience
 
         def go_on(tree: Tree) -> bool:
-            nonlocal reported, next_look
-            now = time.monotonic()
-            # the clock decides what is shown and when the search ends, never which plan is looked at next
-            if now - reported > 1.0:
-                reported = now
+            nonlocal next_report, next_look
+            if tree.nodes >= next_report:
+                next_report = tree.nodes + step
                 self.tighten(tree)
                 self.report()
             if tree.nodes >= next_look:
@@ -193,11 +238,9 @@ class _Run:
                 gained = self.ground.paths.solve(tree.best - self.value).mean()
                 if gained > WORTH_A_RESTART * float((self.bound - self.value).mean()):
                     return False
-            return now < self.ends
+            return True
 
-        before = tree.nodes
-        tree.run(go_on)
-        self.nodes += tree.nodes - before
+        self.budget.run(tree, go_on)
 
     def tighten(self, tree: Tree) -> None:
         """Use what the tree has proved so far: V* <= V + (I - P)^-1 (T V - V), for any V, also one off by its error."""
@@ -211,11 +254,12 @@ class _Run:
         """`[M]` upper bound of what `length` more sets can earn with the target known to be in each cell."""
         inner = InnerProblem(self.world, self.ground.layers[: length + 1], problem.detected, problem.missed)
         tree = next_table(inner, known, slack)
-        tree.run(lambda tree: tree.nodes < patience and time.monotonic() < self.ends)
-        self.nodes += tree.nodes
+        self.budget.run(tree, lambda tree: tree.nodes < patience)
         return tree.upper()
 
     def solution(self, interrupted: bool) -> Solution:
-        seconds = time.monotonic() - self.started
-        bound = np.maximum(self.bound, self.value)
-        return Solution(self.policy, self.evaluation, bound, self.certified, seconds, self.nodes, interrupted)
+        bound, certified = np.maximum(self.bound, self.value), self.certified
+        seconds, timed_out = time.monotonic() - self.budget.started, self.budget.timed_out and not certified
+        return Solution(
+            self.policy, self.evaluation, bound, certified, seconds, self.budget.spent, interrupted, timed_out
+        )

@@ -32,6 +32,7 @@ class Solution:
         seconds: time spent.
         nodes: branch-and-bound choices looked at.
         interrupted: whether the user stopped the search (Ctrl-C).
+        timed_out: whether a time limit did, so that the bracket depends on the machine.
     """
 
     table: PolicyTable
@@ -41,6 +42,7 @@ class Solution:
     seconds: float
     nodes: int
     interrupted: bool
+    timed_out: bool = False
 
     @cached_property
     def policy(self) -> Policy:
@@ -58,6 +60,15 @@ class Solution:
     def lower(self) -> float:
         """The policy's AIHTR."""
         return self.evaluation.aihtr
+
+    @property
+    def ended(self) -> str:
+        """How the search ended, in words."""
+        if self.certified:
+            return "certified"
+        if self.timed_out:
+            return "not closed, stopped by the time limit (another machine may end elsewhere)"
+        return "interrupted" if self.interrupted else "not closed"
 
     @property
     def upper(self) -> float:

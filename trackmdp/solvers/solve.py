@@ -26,7 +26,8 @@ def solve(
     world: World,
     solver: str = default("solver", "solve"),
     *,
-    time_limit: float = default("solver.time_limit", "solve"),
+    nodes: int = default("solver.nodes", "solve"),
+    time_limit: float | None = default("solver.time_limit", "solve"),
     on_progress: Callable[[SearchProgress], None] | None = None,
     **options: Any,
 ) -> Solution:
@@ -37,7 +38,8 @@ def solve(
     Args:
         world: the problem with its motion model.
         solver: ``optimal``, ``clocked``, ``qmdp``, ``fcr``, ``lookahead``, or one of an installed plugin.
-        time_limit: seconds after which `optimal` stops closing the bracket; not an option of the others.
+        nodes: work after which `optimal` stops closing the bracket, the same on every machine.
+        time_limit: seconds after which it stops even so; None: never. Neither is an option of the others.
         on_progress: told how far a search has come, about once a second.
         **options: the solver's own, such as ``depth=3`` (``trackmdp solve --help`` lists them).
 
@@ -51,7 +53,7 @@ def solve(
         True
     """
     own = {f"solver.{name}": value for name, value in options.items()}
-    named = given({"solver": solver, "solver.time_limit": time_limit})
+    named = given({"solver": solver, "solver.nodes": nodes, "solver.time_limit": time_limit})
     return run_solver(world, compose("solve", named | own).solver, on_progress)
 
 

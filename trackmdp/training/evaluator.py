@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -19,10 +20,28 @@ _PER_CELL = ("value", "steps", "detections", "sensors", "safe_actions")
 
 @dataclass(frozen=True)
 class Score:
-    """A policy's figures and its regret per step to the best upper bound known, nan where there is none."""
+    """A policy's figures and its regret per step, nan where no bound is known.
+
+    The regret to the optimum lies between the two regrets; where the optimum is certified, they are one.
+
+    Attributes:
+        evaluation: the figures.
+        regret_per_step: regret to the best upper bound known.
+        regret_per_step_lower: regret to the best policy known, which may be this one: never below 0.
+    """
 
     evaluation: Evaluation
     regret_per_step: float
+    regret_per_step_lower: float
+
+    @property
+    def regret(self) -> str:
+        """The regret as it is printed: one number, or the range where its ends differ in four digits."""
+        # Adding 0.0 turns the -0.0 that rounding leaves into 0.0.
+        low, high = (f"{round(end, 4) + 0.0:.4f}" for end in (self.regret_per_step_lower, self.regret_per_step))
+        if high <= low or math.isnan(self.regret_per_step):
+            return f"regret per step {high} to the upper bound"
+        return f"regret per step {low} to the best policy known, {high} to the upper bound"
 
 
 class Evaluator(ABC):
@@ -31,12 +50,14 @@ class Evaluator(ABC):
     Attributes:
         world: where policies are evaluated.
         upper: the best upper bound known on the AIHTR; nan where there is none.
+        lower: the AIHTR of the best policy known; nan where there is no bound.
         bounds: the upper bounds by name, None where the setting has no such bound.
         qmdp: figures of the Q_MDP policy; None where there is no motion model to plan with.
     """
 
     world: Task
     upper: float
+    lower: float
     bounds: dict[str, float | None]
     qmdp: Evaluation | None
 
@@ -46,17 +67,20 @@ class Evaluator(ABC):
 
     def score(self, policy: PolicyTable) -> Score:
         """Figures and the regret per step, by which a policy may be chosen: while learning, for best.pt."""
-        evaluation = self.evaluate(policy)
-        return Score(evaluation, regret_per_step(self.upper, evaluation))
+        return self._score(self.evaluate(policy))
+
+    def _score(self, evaluation: Evaluation) -> Score:
+        best = max(self.lower, evaluation.aihtr) if not math.isnan(self.lower) else math.nan
+        return Score(evaluation, regret_per_step(self.upper, evaluation), regret_per_step(best, evaluation))
 
     def report(self, policy: PolicyTable) -> dict[str, Any] | None:  # noqa: ARG002
         """Figures with confidence intervals beside those of the references; None where all figures are exact."""
         return None
 
-    def tighten(self, upper: float, score: Score) -> Score:
-        """Take a proved upper bound into account, from now on and in `score`."""
-        self.upper = min(self.upper, upper)
-        return Score(score.evaluation, regret_per_step(self.upper, score.evaluation))
+    def tighten(self, lower: float, upper: float, score: Score) -> Score:
+        """Take the AIHTR of another policy and a proved bound into account, from now on and in `score`."""
+        self.lower, self.upper = max(self.lower, lower), min(self.upper, upper)
+        return self._score(score.evaluation)
 
 
 class ExactEvaluator(Evaluator):
@@ -75,6 +99,7 @@ class ExactEvaluator(Evaluator):
         self.upper = float(bounds.clocked(world).mean())
         self.bounds = {"paper": paper, "valid": float(bounds.valid(world).mean()), "clocked": self.upper}
         self.qmdp = evaluate(world, qmdp.solve(world))
+        self.lower = self.qmdp.aihtr
 
     def evaluate(self, policy: PolicyTable) -> Evaluation:
         """Exact figures of a policy."""

@@ -47,7 +47,7 @@ class HeldOutEvaluator(Evaluator):
     def __init__(self, world: Recorded) -> None:
         self.world = world
         self.tracks = world.held_out.limited(world.max_steps)
-        self.upper, self.qmdp = math.nan, None
+        self.upper, self.lower, self.qmdp = math.nan, math.nan, None
         self.bounds = dict.fromkeys(("paper", "valid", "clocked"))
 
     def evaluate(self, policy: PolicyTable) -> Evaluation:

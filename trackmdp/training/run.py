@@ -74,12 +74,13 @@ def complete(trainer: Trainer) -> Run:
     table = Table()
     trainer.callbacks.append(table)
     score = trainer.run()
-    policy, solution = trainer.policy(), _solve(trainer)
+    policy = trainer.policy()
+    solution = _solve(trainer, policy)
     # Exact figures are those that were scored; on recorded tracks the held-out ones are looked at here for the first
     # time.
     final = score.evaluation if isinstance(trainer.problem, World) else trainer.evaluator.evaluate(policy)
     if solution is not None:
-        score = trainer.evaluator.tighten(solution.upper, score)  # keeps the evaluation that it is of
+        score = trainer.evaluator.tighten(solution.lower, solution.upper, score)  # keeps the evaluation that it is of
     times = {
         "wall_seconds": time.monotonic() - began + trainer.start.seconds,
         "cpu_seconds": time.process_time() - used,
@@ -94,13 +95,17 @@ def complete(trainer: Trainer) -> Run:
     return Run(policy, final, metrics or table.columns, summary, trainer.folder, solution)
 
 
-def _solve(trainer: Trainer) -> Solution | None:
-    """The certified optimum, where it is asked for; there is none for episodes truncated by `grid.max_steps`."""
-    cfg, problem = trainer.config, trainer.problem
-    if not cfg.optimal.enabled or problem.max_steps is not None or not isinstance(problem, World):
+def _solve(trainer: Trainer, learned: Policy) -> Solution | None:
+    """The certified optimum, where it is asked for; there is none for episodes truncated by `grid.max_steps`.
+
+    The search also starts from what was learned: a policy that learning has found is known, and counts as such.
+    """
+    cfg, problem = trainer.config.optimal, trainer.problem
+    if not cfg.enabled or problem.max_steps is not None or not isinstance(problem, World):
         return None
-    with trainer.console.status(f"solving for the optimum, at most {cfg.optimal.time_limit:g} s"):
-        return optimal.solve(problem, time_limit=cfg.optimal.time_limit)
+    start = learned if learned.deterministic else None
+    with trainer.console.status(f"solving for the optimum, at most {cfg.nodes:,} nodes"):
+        return optimal.solve(problem, nodes=cfg.nodes, time_limit=cfg.time_limit, start=start)
 
 
 def load_run(folder: str | Path) -> Run:

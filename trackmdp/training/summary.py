@@ -43,10 +43,11 @@ def summarize(
         "validation": None if final is score.evaluation else figures(score.evaluation),
         "qmdp": figures(evaluator.qmdp) if evaluator.qmdp else None,
         "bounds": evaluator.bounds,
-        "optimal": {"lower": solution.lower, "upper": solution.upper, "certified": solution.certified}
+        "optimal": {key: getattr(solution, key) for key in ("lower", "upper", "certified", "timed_out")}
         if solution
         else None,
         "regret_per_step": score.regret_per_step,
+        "regret_per_step_lower": score.regret_per_step_lower,
         "while_collecting": while_collecting(evaluator.upper, final, end.reward, end.frames),
         "held_out": evaluator.report(trainer.policy()),
         "versions": {"trackmdp": __version__, "python": platform.python_version()}

@@ -35,7 +35,7 @@ def never_read(command: str, words: str, folder: Path) -> set[str]:
 
 @pytest.mark.parametrize("algo", GROUPS["algo"])
 def test_train_reads_every_option(algo: str, tmp_path: Path) -> None:
-    words = f"algo={algo} {SHORT} optimal.time_limit=1"
+    words = f"algo={algo} {SHORT} optimal.nodes=100000"
     words += (
         MIXED
         if issubclass(GROUPS["algo"][algo], PerSensorConfig)

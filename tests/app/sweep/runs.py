@@ -23,7 +23,7 @@ TINY = (
     "collector.envs=64",
     "algo.updates=4",
     "algo.hidden=8",
-    "optimal.time_limit=1",
+    "optimal.nodes=100000",
 )
 
 

@@ -107,6 +107,7 @@ def _report(subject: str, evaluator: ExactEvaluator, score: Score, simulation: S
         "qmdp": figures(evaluator.qmdp),
         "bounds": evaluator.bounds,
         "regret_per_step": score.regret_per_step,
+        "regret_per_step_lower": score.regret_per_step_lower,
     }
 
 
@@ -128,5 +129,4 @@ def _show(
         rows.append([label, f"{exact[key]:,.4f}", simulated, f"{qmdp[key]:,.4f}"])
     title = f"simulated, {simulation.episodes} episodes ± s.e." if simulation else "simulated"
     console.print(table(subject, ["figure", "exact", title, "Q_MDP exact"], rows))
-    regret = round(score.regret_per_step, 4) + 0.0
-    console.print(f"upper bound (clocked) {evaluator.upper:,.4f}; regret per step {regret:.4f}; results in {folder}")
+    console.print(f"upper bound (clocked) {evaluator.upper:,.4f}; {score.regret}; results in {folder}")

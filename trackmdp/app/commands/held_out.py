@@ -30,7 +30,8 @@ def run(
     evaluator = HeldOutEvaluator(world)
     report = evaluator.report(policy)
     value = evaluator.evaluate(policy).value
-    content = {"policy": subject, "value": value.tolist(), "held_out": report, "regret_per_step": None}
+    content = {"policy": subject, "value": value.tolist(), "held_out": report}
+    content |= dict.fromkeys(("regret_per_step", "regret_per_step_lower"))
     write_json(folder / "evaluation.json", content)
     if policy.deterministic:
         write_json(folder / "sets.json", policy.as_lists())

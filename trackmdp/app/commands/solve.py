@@ -62,6 +62,7 @@ def _report(cfg: SolveConfig, solution: Solution, bound: dict[str, float]) -> di
         "upper": solution.upper,
         "certified": solution.certified,
         "interrupted": solution.interrupted,
+        "timed_out": solution.timed_out,
         "seconds": solution.seconds,
         "nodes": solution.nodes,
         "regret_per_step": regret_per_step(solution.upper, solution.evaluation),
@@ -84,10 +85,9 @@ def _show(
     rows += [[f"{name} bound", f"{value:,.6f}", "", "", ""] for name, value in bound.items()]
     columns = ["policy", "AIHTR", "accuracy", "sensors per step", "safe actions per episode"]
     console.print(table("exact values", columns, rows))
-    state = "certified" if solution.certified else "interrupted" if solution.interrupted else "not closed"
     regret = max(regret_per_step(solution.upper, solution.evaluation), 0.0)
     console.print(
-        f"{state}: bracket {solution.lower:,.6f} ... {solution.upper:,.6f}, {regret:.2g} per step, after "
+        f"{solution.ended}: bracket {solution.lower:,.6f} ... {solution.upper:,.6f}, {regret:.2g} per step, after "
         f"{solution.seconds:.1f} s and {solution.nodes:,} nodes; results in {folder}"
     )
 

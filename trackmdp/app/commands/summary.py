@@ -27,5 +27,6 @@ def show_summary(console: Console, trainer: Trainer, run: Run) -> None:
     ]
     rows.append(["upper bound", f"{evaluator.upper:,.3f}", "", ""])
     console.print(table("exact values", ["policy", "AIHTR", "accuracy", "sensors per step"], rows))
-    regret = round(run.summary["regret_per_step"], 4) + 0.0
-    console.print(f"regret per step {regret:.4f} to the upper bound")
+    console.print(trainer.evaluator.score(run.policy).regret)
+    if solution is not None and solution.timed_out:
+        console.print(f"optimum: {solution.ended}")
