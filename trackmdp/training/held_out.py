@@ -56,7 +56,7 @@ class HeldOutEvaluator(Evaluator):
 
     def score(self, policy: PolicyTable) -> Score:
         """Figures of a policy on the validation tracks."""
-        return Score(evaluate(self.world.selection, policy), math.nan)
+        return Score(evaluate(self.world.selection, policy), math.nan, math.nan)
 
     def intervals(self, policy: PolicyTable) -> dict[str, MeanInterval]:
         """Figure -> its mean over the held-out tracks with a 95 % confidence interval."""
