@@ -39,6 +39,7 @@ class Training(Protocol):
     callbacks: list[Callback]
     start: Position
     position: Position
+    collecting: float
     score: Score
     error: BaseException | None
 

@@ -143,7 +143,7 @@ class Trainer:
         opened.callback(self.collector.shutdown)
         self.evaluator = make_evaluator(problem)
         self.start = self._restore(state)
-        self.position = self.start
+        self.position, self.collecting = self.start, 0.0
         if folder is not None:
             write_inputs(config, problem, folder, resumed=state is not None)
             plan = {"iterations": self.iterations, "upper_bound": self.evaluator.upper}
@@ -184,8 +184,10 @@ class Trainer:
         """The next batch, None once all frames are in."""
         try:
             with _named(iteration), self._watch.waiting():
+                began = time.monotonic()
                 # None after the last batch: learners that replay have more iterations than batches.
                 batch = next(self._batches, None)
+                self.collecting += time.monotonic() - began
         except RunError:
             if not self._signals.heard():
                 raise

@@ -1,0 +1,44 @@
+"""What is shown while a run goes on."""
+
+from __future__ import annotations
+
+import io
+import re
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from trackmdp.training.display import Display
+from trackmdp.training.state import Position
+
+
+def shown(width: int, *, terminal: bool) -> list[str]:
+    """The lines that are printed for a run of 1,000,000 frames, collected in 4 s."""
+    out = io.StringIO()
+    console = Console(width=width, file=out, force_terminal=terminal, color_system=None, soft_wrap=not terminal)
+    trainer: Any = SimpleNamespace(
+        position=Position(), iterations=10, evaluator=SimpleNamespace(upper=117.25), collecting=0.0
+    )
+    display = Display(console, "hindsight seed 12")
+    display.on_start(trainer)
+    trainer.score = SimpleNamespace(evaluation=SimpleNamespace(aihtr=-2985.0))
+    trainer.position, trainer.collecting = Position(iteration=10, frames=1_000_000, seconds=50.0), 4.0
+    display.on_update(trainer, {})
+    display.on_end(trainer)
+    return re.split(r"\r?\n|\r|\x1b\[2K|\x1b\[1A", out.getvalue())
+
+
+def test_at_80_columns_the_progress_takes_one_line() -> None:
+    lines = shown(80, terminal=True)
+    last = next(line for line in reversed(lines) if line.startswith("hindsight"))
+    # cut or wrapped it would lack one of these
+    assert "1,000,000 frames AIHTR -2,985.00 gap 3,102.25 left 0:00:00" in last
+    assert len(last) <= 80
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_frames_per_second_are_those_of_collecting(terminal: bool) -> None:
+    # 1,000,000 frames in 4 s of collecting, whatever the 50 s of the run were spent on
+    assert any("1,000,000 frames 250,000/s AIHTR -2,985.00" in line for line in shown(160, terminal=terminal))
