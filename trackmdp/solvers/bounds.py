@@ -97,7 +97,7 @@ def clocked_table(world: World) -> ClockedBound:
         improved = _improve(world, table, sensed)
         if (improved == sensed).all():
             break
-        candidate, exact = _value(world, improved)
+        candidate, exact = _value(world, improved, table)
         if candidate.sum() <= table.sum():  # only rounding is left to gain
             break
         sensed, table = improved, candidate
@@ -142,15 +142,14 @@ def _after_safe_action(world: World, table: Array) -> Array:
     return located - world.safe_misses * (world.reward + table[:, 0] - table[:, -1])
 
 
-def _value(world: World, sensed: BoolArray) -> tuple[Array, bool]:
-    """`[M, t_max + 2]` U of the given choices, and whether it is exact.
+def _value(world: World, sensed: BoolArray, guess: Array | None = None) -> tuple[Array, bool]:
+    """`[M, t_max + 2]` U of the given choices, and whether it is exact; `guess` is a table near to it.
 
     U(., n) = earned[n] + reach[n] U(., 0), from the last n backwards: after the safe action reach is P; before it, a
     sensor that is on reaches a located cell with p_d, and what it misses, like what is unsensed, goes on with
     reach[n + 1]. Where the safe action may miss, U(., t_max + 1) is unknown as well, and reach has 2M columns.
     """
-    moves, report = world.kernel, sensed * world.detects(world.kernel.indices)
-    rows, cells = row_index(moves), moves.indices
+    moves, rows, cells = world.kernel, row_index(world.kernel), world.kernel.indices
     # With t_max = 1: reach[2] = P, reach[1] = hit_1 + miss_1 P, reach[0] = hit_0 + miss_0 reach[1]. Only the last is
     # solved with; the others give U(., n) by one product each.
     earned, reach = [world.safe_gain], [moves]
@@ -158,15 +157,17 @@ def _value(world: World, sensed: BoolArray) -> tuple[Array, bool]:
         lost = sparse.csr_array(moves.multiply(world.safe_misses))
         reach = [sparse.csr_array(sparse.hstack([moves - lost, lost]))]
     # What a sensed move earns at once; the value of being located is in `reach`.
-    gain = moves.data * world.detects(cells) * world.reward - world.cost[cells] * world.stay_probability[rows]
-    for choice, share in zip(sensed[::-1], report[::-1], strict=True):
-        hit, miss = _masked(moves, share), _masked(moves, 1.0 - share)
+    reports = world.detects(cells)
+    gain = moves.data * reports * world.reward - world.cost[cells] * world.stay_probability[rows]
+    for choice in sensed[::-1]:
+        hit, miss = _masked(moves, choice * reports), _masked(moves, 1.0 - choice * reports)
         hit.resize(reach[0].shape)
         earned.insert(0, per_row(rows, gain * choice, world.num_cells) + miss @ earned[0])
         reach.insert(0, hit + miss @ reach[0])
     unknown = slice(1) if world.safe else slice(None, None, world.num_choices)  # U(., 0), and U(., t_max + 1)
     system = RenewalSystem(sparse.csr_array(sparse.vstack(reach[unknown])), world.size)
-    located = system.solve(np.concatenate(earned[unknown]))
+    start = None if guess is None else guess.T[unknown].ravel()
+    located = system.solve(np.concatenate(earned[unknown]), start)
     return np.stack([b + k @ located for b, k in zip(earned, reach, strict=True)], axis=1), system.exact
 
 

@@ -13,11 +13,11 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers.evaluation import Evaluation, pooled
+from trackmdp.solvers.evaluation import Evaluation, pooled, summed_up
 from trackmdp.solvers.horizon import truncated_value
 from trackmdp.solvers.prediction import renewal
 from trackmdp.solvers.recorded import evaluate_recorded
-from trackmdp.solvers.renewal import RenewalSystem, check_length
+from trackmdp.solvers.renewal import RenewalSystem, check_length, expected_steps
 from trackmdp.world.model import Array, BoolArray, World
 from trackmdp.world.tracks import Problem
 
@@ -27,13 +27,14 @@ if TYPE_CHECKING:  # torch is loaded where something that acts is asked for its 
 __all__ = ["evaluate"]
 
 
-def evaluate(problem: Problem, policy: PolicyLike | Array | BoolArray) -> Evaluation:
+def evaluate(problem: Problem, policy: PolicyLike | Array | BoolArray, *, guess: Array | None = None) -> Evaluation:
     """What `policy` earns: exactly on a `World`, as replayed on the held-out tracks of a `Recorded`.
 
     Args:
         problem: a `World`, whose episodes end by the target's exit or after `max_steps`; or `Recorded` tracks.
         policy: a `Policy` or its table, or the same dense, `[M, t_max + 1, M]`; a TensorDict module or a function
             that does not draw (`Policy.from_function`).
+        guess: `[M]`, where the solve begins on a grid too large to factorise, such as the clocked bound.
 
     Raises:
         UserError: the policy draws at random and is not one whose probabilities are known, or is for another grid.
@@ -43,27 +44,40 @@ def evaluate(problem: Problem, policy: PolicyLike | Array | BoolArray) -> Evalua
         return evaluate_recorded(problem, table)
     if problem.max_steps is not None:
         return truncated_value(problem, table, problem.max_steps)
-    return _whole_episodes(problem, table)
+    return _whole_episodes(problem, table, guess)
 
 
-def _whole_episodes(world: World, policy: PolicyTable) -> Evaluation:
+def _whole_episodes(world: World, policy: PolicyTable, guess: Array | None) -> Evaluation:
     m = world.num_cells
     states = m if world.safe else 2 * m  # see `renewal`
     located, gathered = sparse.csr_array((states, states)), np.zeros((states, 6))
     for hit, earned in renewal(world, policy):
         located, gathered = located + hit, gathered + earned
     system = RenewalSystem(located, world.size)
+    if not system.exact:
+        return _by_iteration(world, system, located, gathered, guess)
     # All six totals by one factorisation: reward, steps in the grid, detections, sensors, safe actions, steps [M, 6].
     totals = system.solve(gathered)
     check_length(totals[:, 5])
-    error = 0.0
-    if not system.exact:
-        # |V - V̂| <= max (I - T)^-1 1 · max |residual|, and an episode has no more renewals than steps: those of the
-        # sixth column, itself off by at most the same factor times its own residual (theory-extensions: section 0).
-        residual = np.abs(system.residual(gathered, totals)).max(axis=0)
-        longest = float(totals[:, 5].max()) / (1.0 - float(residual[5]))
-        error = longest * float(residual[0])
-    return pooled(totals[:m, :5], totals[:m, 5], error)
+    return pooled(totals[:m, :5], totals[:m, 5])
+
+
+def _by_iteration(
+    world: World, system: RenewalSystem, located: sparse.csr_array, gathered: Array, guess: Array | None
+) -> Evaluation:
+    """The value and the pooled figures by two solves in place of six."""
+    length, (m, states) = expected_steps(world), (world.num_cells, len(gathered))
+    # what a missed target is worth is near to what a located one in its cell is
+    value = system.solve(gathered[:, 0], None if guess is None else np.tile(guess, states // m))
+    # |V - V̂| <= max (I - T)^-1 1 · max |residual|, and an episode has no more renewals than steps (theory-extensions:
+    # section 0); the steps are those of I - P, themselves iterated.
+    error = float(length.max()) * float(np.abs(system.residual(gathered[:, 0], value)).max())
+    # Detections and the like are wanted for a uniform start s alone, s (I - T)^-1 b: with the visits v = s (I - T)^-1,
+    # that is v = s + v T, each is a scalar product v b.
+    start = np.concatenate([np.full(m, 1 / m), np.zeros(states - m)])
+    visits = RenewalSystem(sparse.csr_array(located.T), world.size).solve(start)
+    # Sensing does not move the target, and each episode has one exit step: the steps in the grid are all but that one.
+    return summed_up(value[:m], length - 1.0, length, list(visits @ gathered[:, 2:5]), error)
 
 
 def _table(problem: Problem, policy: PolicyLike | Array | BoolArray) -> PolicyTable:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from trackmdp.world.model import Array
 
-__all__ = ["Evaluation", "pooled", "regret_per_step"]
+__all__ = ["Evaluation", "pooled", "regret_per_step", "summed_up"]
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,8 @@ class Evaluation:
         sensors_per_step: sensors switched on by free choice per step in the grid; the safe action counts as none.
         safe_per_episode: forced safe actions per episode.
         expected_length: steps per episode, the exit step included.
-        steps, detections, sensors, safe_actions: `[M]`, per episode from each start cell; `steps` in the grid.
+        steps: `[M]`, steps in the grid per episode from each start cell.
+        detections, sensors, safe_actions: `[M]`, the same of these; None where the system was too large to factorise.
         error: no entry of `value` is farther from the exact one; 0 where the system was factorised.
     """
 
@@ -31,9 +33,9 @@ class Evaluation:
     safe_per_episode: float
     expected_length: float
     steps: Array
-    detections: Array
-    sensors: Array
-    safe_actions: Array
+    detections: Array | None
+    sensors: Array | None
+    safe_actions: Array | None
     error: float = 0.0
 
 
@@ -48,18 +50,33 @@ def pooled(totals: Array, length: Array, error: float = 0.0) -> Evaluation:
     `length` `[M]` is the expected number of steps of an episode, the exit step included.
     """
     value, steps, detections, sensors, safe = totals.T
+    means = [float(each.mean()) for each in (detections, sensors, safe)]
+    return summed_up(value, steps, length, means, error, parts=(detections, sensors, safe))
+
+
+def summed_up(
+    value: Array,
+    steps: Array,
+    length: Array,
+    means: Sequence[float],
+    error: float,
+    *,
+    parts: tuple[Array | None, Array | None, Array | None] = (None, None, None),
+) -> Evaluation:
+    """An evaluation from what is known of each start cell and the `means` of detections, sensors and safe actions."""
     # Ratios of means, not means of ratios: pooled over a uniform start, a long episode counts for all of its steps.
     in_grid = float(steps.mean())
+    detections, sensors, safe = means
     return Evaluation(
         aihtr=float(value.mean()),
         value=value,
-        accuracy=float(detections.mean()) / in_grid if in_grid else 1.0,
-        sensors_per_step=float(sensors.mean()) / in_grid if in_grid else 0.0,
-        safe_per_episode=float(safe.mean()),
+        accuracy=detections / in_grid if in_grid else 1.0,
+        sensors_per_step=sensors / in_grid if in_grid else 0.0,
+        safe_per_episode=safe,
         expected_length=float(length.mean()),
         steps=steps,
-        detections=detections,
-        sensors=sensors,
-        safe_actions=safe,
+        detections=parts[0],
+        sensors=parts[1],
+        safe_actions=parts[2],
         error=error,
     )

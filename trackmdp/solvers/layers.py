@@ -21,6 +21,7 @@ from scipy import sparse
 
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.renewal import IndexArray, row_index
+from trackmdp.world.checks import short_indices
 from trackmdp.world.model import BoolArray, Task, World
 
 __all__ = ["Layer", "layer_sets", "policy_table", "reachable", "reachable_layers", "sensed_csr", "within_window"]
@@ -98,7 +99,7 @@ def sensed_csr(task: Task, parts: Sequence[tuple[IndexArray, IndexArray]]) -> sp
     cells = np.concatenate([part[1] for part in parts])
     table = sparse.csr_array((np.ones(len(rows), dtype=bool), (rows, cells)), shape=(m * choices, m))
     table.sort_indices()
-    return table
+    return short_indices(table)
 
 
 def policy_table(task: Task, layers: Sequence[Layer], sets: Sequence[BoolArray]) -> PolicyTable:

@@ -135,7 +135,7 @@ class _Run:
         # U(x, 0) >= V*(x) before anything is searched; `tighten` only lowers it.
         self.bound = clocked_table(world).value
         self.policy = clocked.solve(world)
-        self.evaluation: Evaluation = evaluate(world, self.policy)
+        self.evaluation: Evaluation = evaluate(world, self.policy, guess=self.bound)
 
     @property
     def value(self) -> Array:
@@ -144,7 +144,7 @@ class _Run:
 
     def use(self, policy: PolicyTable) -> bool:
         """Take `policy` as the one at hand if it is better."""
-        evaluation = evaluate(self.world, policy)
+        evaluation = evaluate(self.world, policy, guess=self.value)
         # By more than rounding, so that another way to write the same policy changes nothing.
         better = bool(evaluation.value.sum() > self.value.sum() + 1e-13 * np.abs(self.value).sum())
         if better:

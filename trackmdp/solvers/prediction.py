@@ -42,7 +42,8 @@ class Prediction:
         mass, count = self.mass * share, len(self.before)
         # entries are in order of their rows, so that counting those kept gives the row pointer
         kept = mass > 0
-        pointer = np.concatenate([[0], np.cumsum(np.bincount(self.rows[kept], minlength=count))])
+        pointer = np.zeros(count + 1, dtype=self.cells.dtype)  # int32 where that is enough: SciPy takes the widest
+        np.cumsum(np.bincount(self.rows[kept], minlength=count), out=pointer[1:])
         return sparse.csr_array((mass[kept], self.cells[kept], pointer), shape=(count, count))
 
 

@@ -13,9 +13,11 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
+from scipy.linalg.blas import daxpy
 from scipy.sparse.linalg import SuperLU, splu
 
 from trackmdp.errors import UserError
+from trackmdp.world.checks import short_indices
 from trackmdp.world.model import Array, World
 
 __all__ = [
@@ -35,9 +37,10 @@ DIRECT_CELLS = 20_000
 """Cells up to which systems are factorised. The factors of a grid fill about M^1.4 entries: 75 a cell at M = 16,384."""
 
 # Side of the square blocks of the coarse level, doubled while there would be more than _MOST_BLOCKS of them: the coarse
-# system is factorised, and has to stay small beside the fine one.
-_BLOCK = 8
-_MOST_BLOCKS = 4096
+# system is factorised, and has to stay small beside the fine one. At N = 1000 blocks of 8 x 8 take 75 products where
+# blocks of 16 x 16 take 114.
+_BLOCK = 4
+_MOST_BLOCKS = DIRECT_CELLS
 # Residual aimed at, relative to the size of right-hand side and solution: some 50 units of rounding of float64.
 _TOLERANCE = 1e-14
 _MOST_PRODUCTS = 20_000
@@ -72,7 +75,7 @@ class RenewalSystem:
         self, transition: sparse.csr_array, size: tuple[int, int] | None = None, *, direct: int = DIRECT_CELLS
     ) -> None:
         # I - T is an M-matrix with a dominant diagonal: its inverse is non-negative, and no pivoting is needed.
-        self._system = sparse.csr_array(sparse.eye_array(transition.shape[0], format="csr") - transition)
+        self._system = short_indices(sparse.csr_array(sparse.eye_array(transition.shape[0], format="csr") - transition))
         self.exact = size is None or transition.shape[0] <= direct
         if self.exact or size is None:
             self._factors = _factorise(self._system)
@@ -84,8 +87,8 @@ class RenewalSystem:
         # Galerkin: with B [M, blocks] the indicator of the blocks, B^T (I - T) B is the system seen by vectors that are
         # constant on each block.
         self._coarse = _factorise(sparse.csr_array(self._blocks.T @ self._system @ self._blocks))
-        # [M, 1], to multiply all right-hand sides [M, K] at once; 0.8 is the usual damping of Jacobi as a smoother.
-        self._damping = 0.8 / self._system.diagonal()[:, None]
+        # 0.8 is the usual damping of Jacobi as a smoother.
+        self._damping = 0.8 / self._system.diagonal()
 
     def solve(self, gathered: Array, guess: Array | None = None) -> Array:
         """`[M]` or `[M, K]`, as `gathered` is; `guess`, of the same shape, is where an iteration starts.
@@ -97,10 +100,11 @@ class RenewalSystem:
         if self.exact:
             total: Array = self._factors.solve(wanted)
         else:
-            # [M] becomes [M, 1]: the iteration treats all right-hand sides as columns.
-            columns = wanted.reshape(len(wanted), -1)
-            start = np.zeros_like(columns) if guess is None else guess.reshape(columns.shape)
-            total = self._iterate(columns, start).reshape(wanted.shape)
+            # One right-hand side after the other: together they would share nothing but the reading of the matrix, and
+            # need K times the memory.
+            starts = np.zeros_like(wanted) if guess is None else guess
+            pairs = zip(wanted.reshape(len(wanted), -1).T, starts.reshape(len(wanted), -1).T, strict=True)
+            total = np.stack([self._iterate(*pair) for pair in pairs], axis=-1).reshape(wanted.shape)
         # A singular system may be factorised all the same, and then gives inf or nan in place of an error.
         if not np.isfinite(total).all():
             raise UserError(_ENDLESS)
@@ -121,12 +125,12 @@ class RenewalSystem:
 
     def _iterate(self, gathered: Array, start: Array) -> Array:
         """BiCGSTAB, started anew while that makes the true residual (the recursive one drifts off) much smaller."""
-        best, products = start, 0
+        gathered, best, products = np.ascontiguousarray(gathered), np.array(start), 0
         residual = self.residual(gathered, best)
         # Rounding alone leaves a residual of about 1e-16 times the solution; nothing is gained below the target.
         while True:
-            target = _TOLERANCE * (np.abs(gathered).max(axis=0) + np.abs(best).max(axis=0))
-            if (np.abs(residual).max(axis=0) <= target).all() or products > _MOST_PRODUCTS:
+            target = _TOLERANCE * float(np.abs(gathered).max() + np.abs(best).max())
+            if np.abs(residual).max() <= target or products > _MOST_PRODUCTS:
                 return best
             candidate, spent = self._bicgstab(best, residual, target)
             products += spent
@@ -135,38 +139,48 @@ class RenewalSystem:
                 return best if np.abs(residual).max() < np.abs(after).max() else candidate
             best, residual = candidate, after
 
-    def _bicgstab(self, solution: Array, residual: Array, target: Array) -> tuple[Array, int]:
-        """Van der Vorst's method, right-preconditioned, on all columns at once, each with scalars of its own."""
-        # The names of van der Vorst (1992): shadow r^, direction p, image A M^-1 p, half s, moved t = A M^-1 s.
-        shadow, products = residual, 0
-        direction = image = np.zeros_like(residual)
-        rho = alpha = omega = np.ones(residual.shape[1])
-        while products < _MOST_PRODUCTS:
-            active = np.abs(residual).max(axis=0) > target
-            # a column that has arrived, or broken down, stays as it is: its alpha and omega are zero from then on
-            correlation = (shadow * residual).sum(axis=0)
-            if not (active & (correlation != 0)).any():
+    def _bicgstab(self, start: Array, residual: Array, target: float) -> tuple[Array, int]:
+        """Van der Vorst's method, right-preconditioned; `[M]` vectors, changed in place to spare memory."""
+        # The names of van der Vorst (1992): shadow r^, direction p, image A M^-1 p, moved t = A M^-1 s.
+        shadow, residual, solution, products = residual, residual.copy(), start.copy(), 0
+        direction, image, spare = (np.zeros_like(residual) for _ in range(3))
+        rho = alpha = omega = 1.0
+
+        def dot(one: Array, other: Array) -> float:
+            # numpy's pairwise sum, the same bits whatever the number of BLAS threads
+            return float(np.multiply(one, other, out=spare).sum())
+
+        while products < _MOST_PRODUCTS and np.abs(residual, out=spare).max() > target:
+            correlation = dot(shadow, residual)
+            if correlation == 0 or omega == 0:  # broken down: the caller starts anew from here
                 break
-            direction = residual + _ratio(correlation * alpha, rho * omega) * (direction - omega * image)
+            # daxpy(x, y, a): y += a x in place. direction = residual + beta (direction - omega image)
+            daxpy(image, direction, a=-omega)
+            direction *= correlation * alpha / (rho * omega)
+            direction += residual
             ahead = self._precondition(direction)
             image = self._system @ ahead
-            rho, alpha = correlation, _ratio(correlation, (shadow * image).sum(axis=0)) * active
-            half = residual - alpha * image
-            correction = self._precondition(half)
+            rho, alpha = correlation, _ratio(correlation, dot(shadow, image))
+            daxpy(image, residual, a=-alpha)
+            correction = self._precondition(residual)
             moved = self._system @ correction
-            omega = _ratio((moved * half).sum(axis=0), (moved * moved).sum(axis=0)) * active
-            solution = solution + alpha * ahead + omega * correction
-            residual = np.where(active, half - omega * moved, residual)
+            omega = _ratio(dot(moved, residual), dot(moved, moved))
+            daxpy(ahead, solution, a=alpha)
+            daxpy(correction, solution, a=omega)
+            daxpy(moved, residual, a=-omega)
             products += 2
         return solution, products
 
     def _precondition(self, residual: Array) -> Array:
         """A damped Jacobi sweep, the correction on the blocks, and a sweep again."""
         # 0.8 / diagonal takes out what differs from cell to cell; what is smooth over a block is left to the blocks
-        guess = self._damping * residual
+        guess: Array = self._damping * residual
         left = residual - self._system @ guess
-        guess = guess + self._blocks @ self._coarse.solve(self._blocks.T @ left)
-        return guess + self._damping * (residual - self._system @ guess)
+        guess += self._blocks @ self._coarse.solve(self._blocks.T @ left)
+        left = residual - self._system @ guess
+        left *= self._damping
+        guess += left
+        return guess
 
 
 def accumulate(transition: sparse.csr_array, gathered: Array, size: tuple[int, int] | None = None) -> Array:
@@ -218,7 +232,7 @@ def per_row(rows: IndexArray, values: Array, count: int) -> Array:
 
 def row_index(matrix: sparse.csr_array) -> IndexArray:
     """`[nnz]` the row of each stored entry."""
-    # indptr = (0, 2, 2, 5) has rows of 2, 0 and 3 entries: 0 0 2 2 2.
+    # indptr = (0, 2, 2, 5) has rows of 2, 0 and 3 entries: 0 0 2 2 2. int64, so that row · M + cell never overflows.
     return np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
 
 
@@ -250,5 +264,5 @@ def _blocks(rows: int, columns: int) -> sparse.csr_array:
     return sparse.csr_array((np.ones(len(block)), (np.arange(len(block)), block)))
 
 
-def _ratio(part: Array, whole: Array) -> Array:
-    return np.divide(part, whole, out=np.zeros_like(part), where=whole != 0)
+def _ratio(part: float, whole: float) -> float:
+    return part / whole if whole else 0.0

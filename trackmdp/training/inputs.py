@@ -6,6 +6,7 @@ import io
 import json
 from pathlib import Path
 
+import numpy as np
 from scipy import sparse
 
 from trackmdp.arrays import LARGE
@@ -55,7 +56,10 @@ def _content(problem: Problem) -> bytes:
     if not isinstance(problem, World):
         return _described(problem)
     buffer = io.BytesIO()
-    sparse.save_npz(buffer, problem.kernel)
+    # Indices of one width, whatever the size of the kernel, and whatever is fastest to work with.
+    kernel = problem.kernel
+    wide = (kernel.data, kernel.indices.astype(np.int64), kernel.indptr.astype(np.int64))
+    sparse.save_npz(buffer, sparse.csr_array(wide, shape=kernel.shape))
     return buffer.getvalue()
 
 

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import breadth_first_order
 from trackmdp.errors import UserError
 from trackmdp.world.rows import pairwise_row_sums
 
-__all__ = ["canonical_kernel", "check_kernel"]
+__all__ = ["canonical_kernel", "check_kernel", "short_indices"]
 
 
 def canonical_kernel(kernel: Any, source: str = "kernel") -> sparse.csr_array:
@@ -30,7 +30,18 @@ def canonical_kernel(kernel: Any, source: str = "kernel") -> sparse.csr_array:
     canonical = sparse.csr_array(table, dtype=np.float64, copy=True)
     canonical.sum_duplicates()
     canonical.eliminate_zeros()
-    return canonical
+    return short_indices(canonical)
+
+
+def short_indices(matrix: sparse.csr_array) -> sparse.csr_array:
+    """The same matrix with int32 indices, where they are enough: half the memory, and products read half as much.
+
+    SciPy takes the widest integer among what a matrix is made of, so that one array of int64 spreads to all.
+    """
+    if max(*matrix.shape, matrix.nnz) > np.iinfo(np.int32).max:
+        return matrix
+    pointers = (matrix.indices.astype(np.int32, copy=False), matrix.indptr.astype(np.int32, copy=False))
+    return sparse.csr_array((matrix.data, *pointers), shape=matrix.shape)
 
 
 def check_kernel(kernel: sparse.csr_array, size: tuple[int, int], *, truncates: bool, source: str = "kernel") -> None:
