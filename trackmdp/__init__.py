@@ -22,6 +22,7 @@ __version__ = "0.1.0"
 __all__ = [
     "Episodes",
     "Evaluation",
+    "ObservationVector",
     "Policy",
     "Recorded",
     "Run",
@@ -40,6 +41,7 @@ __all__ = [
 _HOMES = {
     "Episodes": "trackmdp.episodes.batch",
     "Evaluation": "trackmdp.solvers.evaluation",
+    "ObservationVector": "trackmdp.world.observation",
     "Policy": "trackmdp.policies.policy",
     "Recorded": "trackmdp.world.tracks",
     "Run": "trackmdp.training.run",
@@ -69,6 +71,7 @@ if TYPE_CHECKING:  # the same once more, for type checkers and editors, which do
     from trackmdp.world.env import TrackEnv
     from trackmdp.world.make import load_tracks, make_world
     from trackmdp.world.model import World
+    from trackmdp.world.observation import ObservationVector
     from trackmdp.world.tracks import Recorded
 
 

@@ -8,8 +8,9 @@ from trackmdp.episodes.batch import Episodes
 from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.simulate import simulate
 from trackmdp.policies.policy import Policy
-from trackmdp.reports.picture import PICTURE_LEGEND, draw_picture
+from trackmdp.reports.picture import draw_picture
 from trackmdp.world.model import World
+from trackmdp.world.render import PICTURE_LEGEND
 
 
 def right_mover() -> World:

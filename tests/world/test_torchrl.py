@@ -2,15 +2,39 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
+import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
+from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
+from torchrl.envs.transforms import (
+    CatFrames,
+    CatTensors,
+    Compose,
+    DTypeCastTransform,
+    ExcludeTransform,
+    FlattenObservation,
+    InitTracker,
+    ObservationNorm,
+    RenameTransform,
+    RewardScaling,
+    RewardSum,
+    StepCounter,
+    Transform,
+    VecNormV2,
+)
+from torchrl.envs.utils import check_env_specs
 
 from tests.helpers import limited, small_world
 from tests.tracks import by_hand, recorded
 from trackmdp.errors import UserError
 from trackmdp.world.env import TrackEnv
+from trackmdp.world.model import World
+from trackmdp.world.observation import ObservationVector
 
 OBSERVED = {"last_cell", "steps_since_detection", "action_history"}
 
@@ -48,3 +72,112 @@ def test_a_step_before_the_first_reset_is_one_line() -> None:
     env = TrackEnv(small_world(), 2)
     with pytest.raises(UserError, match=r"before the first reset, expected env\.reset\(\)"):
         env.step(env.fake_tensordict())
+
+
+def vector(*more: Callable[[], Transform]) -> Callable[[EnvBase], EnvBase]:
+    return lambda env: TransformedEnv(env, Compose(ObservationVector(), *(make() for make in more)))
+
+
+def several(kind: type[ParallelEnv | SerialEnv]) -> Callable[[EnvBase], EnvBase]:
+    return lambda env: kind(2, partial(TrackEnv, small_world(), env.batch_size))
+
+
+TABLE: dict[str, Callable[[EnvBase], EnvBase]] = {
+    "bare": lambda env: env,
+    "StepCounter": lambda env: TransformedEnv(env, StepCounter(max_steps=4)),
+    "RewardSum": lambda env: TransformedEnv(env, RewardSum()),
+    "InitTracker": lambda env: TransformedEnv(env, InitTracker()),
+    "RewardScaling": lambda env: TransformedEnv(env, RewardScaling(0.5, 2.0)),
+    "VecNorm of the reward": vector(lambda: VecNormV2(in_keys=["reward"], reduce_batch_dims=True)),
+    "RenameTransform": lambda env: TransformedEnv(env, RenameTransform(["last_cell"], ["cell"])),
+    "ExcludeTransform": lambda env: TransformedEnv(env, ExcludeTransform("action_history")),
+    "ObservationVector": vector(),
+    "ObservationNorm": vector(lambda: ObservationNorm(loc=0.5, scale=2.0, in_keys=["observation"])),
+    "VecNorm": vector(lambda: VecNormV2(in_keys=["observation"], reduce_batch_dims=True)),
+    "CatTensors": vector(
+        lambda: FlattenObservation(-2, -1, in_keys=["action_history"]),
+        lambda: DTypeCastTransform(torch.bool, torch.float32, in_keys=["action_history"]),
+        lambda: CatTensors(in_keys=["observation", "action_history"], out_key="all"),
+    ),
+    "CatFrames": vector(lambda: CatFrames(N=3, dim=-1, in_keys=["observation"])),
+    "all of them": vector(StepCounter, RewardSum, InitTracker, lambda: ExcludeTransform("last_cell", "action_history")),
+    "SerialEnv": several(SerialEnv),
+    "ParallelEnv": several(ParallelEnv),
+}
+
+
+@pytest.mark.filterwarnings("ignore:Support of VecNormV2 for containers with non-empty batch-size")
+@pytest.mark.parametrize("shape", [(), (3,), (2, 2)])
+@pytest.mark.parametrize("name", TABLE)
+def test_it_works_with(name: str, shape: tuple[int, ...]) -> None:
+    """Specs as TorchRL checks them; and 30 steps of the same episodes as without the transform."""
+    if name == "ParallelEnv" and shape != (3,):
+        pytest.skip("worker processes take seconds to start")
+    if name == "CatFrames" and len(shape) > 1:
+        pytest.skip("TorchRL's CatFrames resets no part of a batch of two dimensions, of any environment")
+    bare = TrackEnv(small_world(), shape, seed=3)
+    env = TABLE[name](TrackEnv(small_world(), shape, seed=3))
+    try:
+        check_env_specs(env, break_when_any_done="both")
+        if "Env" not in name and name != "StepCounter":
+            bare.restore(env.base_env.snapshot() if isinstance(env, TransformedEnv) else env.snapshot())
+            actions = torch.rand(30, *shape, 9, generator=torch.Generator().manual_seed(1)) < 0.4
+            mine, theirs = (stepped(each, actions) for each in (env, bare))
+            assert torch.equal(mine, theirs)
+    finally:
+        env.close()
+
+
+def stepped(env: EnvBase, actions: torch.Tensor) -> torch.Tensor:
+    """The ends of episodes under given actions."""
+    rows, ends = env.reset(), []
+    for action in actions:
+        frame, rows = env.step_and_maybe_reset(rows.set("action", action))
+        ends.append(frame["next", "done"])
+    return torch.stack(ends)
+
+
+def test_the_vector_is_the_state_in_bits() -> None:
+    """Cell 4 of nine; one miss of two allowed; the sensors 0 and 8 were on."""
+    env = TransformedEnv(TrackEnv(replace(small_world(), t_max=1), ()), ObservationVector())
+    env.reset()
+    history = torch.zeros(2, 9, dtype=torch.bool)
+    history[0, [0, 8]] = True
+    state = {"last_cell": torch.tensor(4), "steps_since_detection": torch.tensor(1), "action_history": history}
+    made = env.transform(TensorDict(state, []))["observation"]
+    assert made.nonzero().squeeze(-1).tolist() == [4, 9 + 1, 12 + 0, 12 + 8]
+    assert made.shape == env.observation_spec["observation"].shape == (9 + 3 + 18,)
+
+
+def test_its_picture() -> None:
+    """A target that stays in cell 1 of 2 x 2: at the start, seen by its sensor, missed, seen by the safe action."""
+    world = World(np.eye(4), 2, cost=0.1, t_max=0, max_steps=4)
+    env = TrackEnv(world, 2)
+    env.reset()
+    there = env.snapshot()
+    there["rows"] |= dict.fromkeys(("target", "last_cell"), torch.tensor([3, 1]))
+    rows = env.restore(there)
+    pictures = [env.render("text", 1).splitlines()]
+    for cells in ([0, 1], [2], [0], [1]):
+        action = torch.isin(torch.arange(4), torch.tensor(cells)).expand(2, 4)
+        _, rows = env.step_and_maybe_reset(rows.set("action", action))
+        pictures.append(env.render("text", 1).splitlines())
+    assert [each[:2] for each in pictures[:4]] == [["· ●", "· ·"], ["▪ ●", "· ·"], ["· ○", "▪ ·"], ["▪ ●", "▪ ▪"]]
+    assert sorted("".join(pictures[4][:2]).replace(" ", "")) == ["·", "·", "·", "●"]  # a new episode
+
+
+def test_a_picture_in_pixels() -> None:
+    env = TrackEnv(small_world(), 1)
+    env.reset()
+    picture = env.render()
+    assert (picture.shape, picture.dtype) == ((48, 48, 3), np.uint8)
+    row, column = divmod(int(env.target), 3)
+    blue = (picture == (0, 90, 181)).all(-1)
+    assert blue[16 * row : 16 * row + 16, 16 * column : 16 * column + 16].sum() == blue.sum() == 14 * 14
+    with pytest.raises(UserError, match=r"expected rgb_array or text, a row of 0 \.\.\. 0"):
+        env.render("human")
+
+
+def test_it_says_what_it_is() -> None:
+    env = TrackEnv(limited(small_world(t_max=2), 7), [4, 2])
+    assert repr(env) == "TrackEnv(3 x 3 cells, 9 sensors, t_max=2, max_steps=7, batch_size=[4, 2], device=cpu)"

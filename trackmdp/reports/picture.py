@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-import numpy as np
-
 from trackmdp.episodes.episode import Episode
 from trackmdp.world.model import BoolArray, Task
+from trackmdp.world.render import PICTURE_LEGEND, text_rows
 
-__all__ = ["PICTURE_LEGEND", "draw_picture"]
+__all__ = ["draw_picture"]
 
-FOUND, MISSED, ON, OFF = "●", "○", "▪", "·"
-PICTURE_LEGEND = f"{FOUND} target, detected   {MISSED} target, missed   {ON} sensor on   {OFF} sensor off"
 MARGIN = "   "
 
 
@@ -26,7 +23,7 @@ def draw_picture(episodes: Sequence[Episode], task: Task, *, steps: int = 6) -> 
     """
     # Longer than `steps`: the picture is then full, and does not end with the exit.
     episode = next((each for each in episodes if len(each) > steps), None) or max(episodes, key=len)
-    frames = [_frame(task, cell, on) for cell, on in _steps(episode, task, steps)]
+    frames = [text_rows(task.size, cell, on, found=bool(on[cell])) for cell, on in _steps(episode, task, steps)]
     columns = [[f"step {k}", *frame] for k, frame in enumerate(frames, start=1)]
     wide = [[row.ljust(max(map(len, column))) for row in column] for column in columns]
     lines = [MARGIN.join(rows) for rows in zip(*wide, strict=True)]
@@ -40,9 +37,3 @@ def _steps(episode: Episode, task: Task, steps: int) -> Iterator[tuple[int, Bool
         # The cell numbered M stands for having left the grid.
         if cell < task.num_cells:
             yield cell, episode.action[t] | forced[t]
-
-
-def _frame(task: Task, cell: int, on: BoolArray) -> list[str]:
-    marks = np.where(on, ON, OFF)
-    marks[cell] = FOUND if on[cell] else MISSED
-    return [" ".join(row) for row in marks.reshape(task.size)]

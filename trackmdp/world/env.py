@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -13,6 +15,7 @@ from torchrl.envs import EnvBase
 
 from trackmdp.errors import UserError
 from trackmdp.world.costs import Costs
+from trackmdp.world.render import PICTURE_LEGEND, pixels, text_rows
 from trackmdp.world.targets import make_targets
 from trackmdp.world.tracks import Problem
 from trackmdp.world.windows import Window
@@ -82,6 +85,10 @@ class TrackEnv(EnvBase):
         # By its keys `[num_envs, ...]`; empty before the first reset. Its tensors are replaced, never written to: those
         # observed are the same ones.
         self._state: dict[str, Tensor] = {}
+        # For `render`: the last action, from which cells and after how many misses it was chosen, and the rows begun
+        # anew since.
+        self._acted: tuple[Tensor, Tensor, Tensor] | None = None
+        self._begun: list[Tensor] = []
         self._make_specs()
         self._set_seed(seed)
 
@@ -100,6 +107,27 @@ class TrackEnv(EnvBase):
         if not self._state:
             raise UserError("TrackEnv: a step before the first reset, expected env.reset()")
         return self._state
+
+    def render(self, mode: str = "rgb_array", row: int = 0) -> npt.NDArray[np.uint8] | str:
+        """The grid after the last step: the target, and the sensors that were on, none if an episode has just begun.
+
+        Args:
+            mode: "rgb_array" for `[16 rows, 16 columns, 3]` uint8, or "text".
+            row: which target of the batch, as if all were in a row.
+
+        Raises:
+            UserError: another mode, or a row that is not there.
+        """
+        if mode not in ("rgb_array", "text") or not 0 <= row < self.num_envs:
+            raise UserError(f"render({mode!r}, {row}): expected rgb_array or text, a row of 0 ... {self.num_envs - 1}")
+        cell, n = (int(self._now[key][row]) for key in ("target", "steps_since_detection"))
+        on = np.zeros(self.num_cells, dtype=bool)
+        if self._acted is not None and not any((rows == row).any() for rows in self._begun):
+            action, last, misses = (each[row : row + 1] for each in self._acted)
+            on |= (self._window.to_global(last, action)[0] | (misses > self.t_max)).cpu().numpy()
+        draw = pixels if mode == "rgb_array" else text_rows
+        picture = draw(self._grid, cell, on, found=n == 0)
+        return picture if isinstance(picture, np.ndarray) else "\n".join([*picture, PICTURE_LEGEND])
 
     def _make_specs(self) -> None:
         b, m, k, choices = self.batch_size, self.num_cells, self._window.width, self.t_max + 1
@@ -138,7 +166,7 @@ class TrackEnv(EnvBase):
         """Begin anew the rows whose `_reset` mask is set, all without one; returns what is observed in every row."""
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None or not self._state:
-            self._state = self._fresh()
+            self._state, self._acted = self._fresh(), None
         else:
             self._begin(mask.reshape(-1).nonzero().squeeze(-1))
         return self._shaped(self._state, self._observed)
@@ -146,6 +174,7 @@ class TrackEnv(EnvBase):
     def _begin(self, rows: Tensor) -> None:
         """New episodes in some rows; the others are made as well, so that shapes stay fixed, and thrown away."""
         if len(rows):
+            self._begun.append(rows)
             fresh = self._fresh(rows)
             self._state = {key: value.index_copy(0, rows, fresh[key][rows]) for key, value in self._state.items()}
 
@@ -170,7 +199,9 @@ class TrackEnv(EnvBase):
     def _stepped(self, action: Tensor) -> dict[str, Tensor]:
         """One step of all targets in a row, `[num_envs, ...]`, from an action `[*B, K]`."""
         flat = action.reshape(self.num_envs, self._window.width)
-        following = self.advance(self._now | {"action": flat}, self._targets.draw(self.num_envs))
+        now = self._now
+        self._acted, self._begun = (flat, now["last_cell"], now["steps_since_detection"]), []
+        following = self.advance(now | {"action": flat}, self._targets.draw(self.num_envs))
         self._state = {key: following[key] for key in self._state}
         return following
 

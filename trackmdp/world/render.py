@@ -1,0 +1,53 @@
+"""A grid, the sensors that are on and the target, as text or as pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from trackmdp.world.model import BoolArray
+
+__all__ = ["PICTURE_LEGEND", "pixels", "text_rows"]
+
+FOUND, MISSED, ON, OFF = "●", "○", "▪", "·"
+PICTURE_LEGEND = f"{FOUND} target, detected   {MISSED} target, missed   {ON} sensor on   {OFF} sensor off"
+
+# Red, green, blue; told apart in grey as well, and by those who see no red.
+_COLOURS = {FOUND: (0, 90, 181), MISSED: (220, 50, 32), ON: (255, 194, 10), OFF: (238, 238, 238)}
+_SIDE, _GAP = 16, 1  # pixels of a cell, and of the white line around it
+
+
+def _marks(size: Sequence[int], cell: int, on: BoolArray, found: bool) -> npt.NDArray[np.str_]:
+    """`[rows, columns]` symbols; the target's cell M, where it has exited, is on no grid."""
+    marks = np.where(on, ON, OFF)
+    if cell < len(marks):
+        marks[cell] = FOUND if found else MISSED
+    return marks.reshape(tuple(size))
+
+
+def text_rows(size: Sequence[int], cell: int, on: BoolArray, *, found: bool) -> list[str]:
+    """A line of symbols for each row of the grid; see `PICTURE_LEGEND`.
+
+    Args:
+        size: rows and columns.
+        cell: the target's, M where it has exited.
+        on: `[M]` sensors that are on.
+        found: whether the target is detected.
+    """
+    return [" ".join(row) for row in _marks(size, cell, on, found)]
+
+
+def pixels(size: Sequence[int], cell: int, on: BoolArray, *, found: bool) -> npt.NDArray[np.uint8]:
+    """`[16 rows, 16 columns, 3]` red, green and blue; arguments as for `text_rows`."""
+    marks = _marks(size, cell, on, found)
+    picture = np.full((*marks.shape, _SIDE, _SIDE, 3), 255, dtype=np.uint8)
+    for symbol, colour in _COLOURS.items():
+        # A boolean index picks whole tiles, [hits, side, side, 3], whose inner part gets the colour.
+        tiles = picture[marks == symbol]
+        tiles[:, _GAP:-_GAP, _GAP:-_GAP] = colour
+        picture[marks == symbol] = tiles
+    # [rows, columns, y, x, 3] to [rows, y, columns, x, 3]: neighbouring tiles' lines of pixels side by side.
+    rows, columns = marks.shape
+    return picture.transpose(0, 2, 1, 3, 4).reshape(rows * _SIDE, columns * _SIDE, 3)
