@@ -14,7 +14,18 @@ from tests.config.cases import COMBINATIONS, composed, files_of
 from tests.helpers import configured
 from tests.reads import record_reads, unread
 from trackmdp.app.sweep.schema import PLUGINS
-from trackmdp.config import GROUPS, ROOTS, SELECTORS, Option, TrainConfig, conf_dir, load_config, options, to_yaml
+from trackmdp.config import (
+    GROUPS,
+    ROOTS,
+    SELECTORS,
+    Option,
+    TrainConfig,
+    conf_dir,
+    load_config,
+    options,
+    to_yaml,
+    world_of,
+)
 from trackmdp.errors import UserError
 
 CONF = Path(conf_dir())
@@ -214,3 +225,8 @@ def test_the_budget_grows_with_the_number_of_cells(choice: str, size: int, frame
     assert cfg.algo.total_frames == cfg.collector.total_frames == cfg.algo.buffer_size == frames
     typed = configured("train", *choice.split(), f"grid.size={size}", "algo.total_frames=20000")
     assert typed.collector.total_frames == typed.algo.buffer_size == 20_000
+
+
+def test_bytes_that_are_no_text_are_no_config() -> None:
+    with pytest.raises(UserError, match=r"^config.yaml: not a config \('utf-8' codec"):
+        world_of(b"\xff\xfe\xfa")

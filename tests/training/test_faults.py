@@ -7,6 +7,8 @@ import os
 import resource
 import shutil
 import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -190,3 +192,23 @@ def test_a_worker_that_is_killed_is_named(
     train(tmp_path, f"collector={collector}", "resume=auto")
     assert saved(tmp_path)[0] == 8
     assert [int(row["iteration"]) for row in rows(tmp_path)] == list(range(1, 9))
+
+
+def test_a_worker_ends_with_the_learner_that_was_killed() -> None:
+    code = """
+import multiprocessing, threading
+from trackmdp.training.collect import _end_with_learner
+def work():
+    threading.Thread(target=_end_with_learner, daemon=True).start()
+    print("ready", flush=True)
+    threading.Event().wait()
+worker = multiprocessing.get_context("fork").Process(target=work)
+worker.start()
+worker.join()
+"""
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as learner:
+        assert learner.stdout is not None
+        assert learner.stdout.readline() == "ready\n"
+        learner.kill()
+        # The worker holds the other end of the pipe, which is closed once it has ended too.
+        assert learner.communicate(timeout=60)[0] == ""

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from tests.training.runs import at_iteration, train
 from trackmdp.episodes.log import EpisodeLog
 from trackmdp.episodes.reader import EpisodeReader
+from trackmdp.episodes.writer import EpisodeWriter
+from trackmdp.errors import RunError
+from trackmdp.training import checkpoint
 
 LOGGED = (
     "log=[mcap]",
@@ -66,3 +72,22 @@ def test_a_log_that_lost_episodes_is_left_alone(
     assert "not whole; a new log is begun beside it" in capsys.readouterr().err
     assert part.read_bytes() == short
     assert count(tmp_path / "cut" / "episodes-2.mcap") == 6
+
+
+def test_on_a_full_disk_one_line_says_why_and_the_run_goes_on_as_if_it_never_had_been(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The log is over at iteration 2, the checkpoint after iteration 6 fails, and the same words go on later."""
+
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    train(tmp_path / "whole", *LOGGED)
+    with monkeypatch.context() as patch, pytest.raises(RunError, match="No space left"):
+        at_iteration(patch, 2, lambda: patch.setattr(EpisodeWriter, "add", full))
+        at_iteration(patch, 6, full)
+        train(tmp_path / "cut", *LOGGED)
+    assert capsys.readouterr().err == ""
+    train(tmp_path / "cut", *LOGGED, "resume=auto")
+    mine, whole = (checkpoint.load(checkpoint.newest(tmp_path / run))["callbacks"] for run in ("cut", "whole"))
+    assert mine["episodes"] == whole["episodes"] == {"policies": 5}

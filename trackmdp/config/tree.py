@@ -119,7 +119,7 @@ def load_config(file: Path, root: type[C]) -> C:
     return typed
 
 
-def world_of(text: str) -> WorldConfig:
+def world_of(text: str | bytes) -> WorldConfig:
     """The world that the text of a `config.yaml` describes, whatever command it was written by.
 
     Raises:

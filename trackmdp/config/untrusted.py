@@ -20,13 +20,14 @@ _CODE = ("_target_", "()")
 """Keys by which Hydra and Python's logging name what is called."""
 
 
-def parse_yaml(text: str, source: str) -> DictConfig | ListConfig:
-    """The content of YAML text; `source` is what messages call it.
+def parse_yaml(text: str | bytes, source: str) -> DictConfig | ListConfig:
+    """The content of YAML text, in UTF-8 where it is bytes; `source` is what messages call it.
 
     Raises:
         UserError: it is not YAML, unfolds to too much, or names code to call.
     """
     try:
+        text = text.decode() if isinstance(text, bytes) else text
         _check_size(text)
         if not isinstance(yaml.safe_load(text), (dict, list, type(None))):  # OmegaConf asserts it
             raise ValueError("expected a mapping")

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,7 +31,7 @@ class EpisodeLog:
         layout: write a viewer's layout next to the log.
         policies: resume the log of an earlier process after so many of its policies, and drop what it wrote later; None
             to begin a new log.
-        command: named where it is said, on standard error, that logging is over.
+        tell: called with one line where logging is over, or goes on in another file.
     """
 
     def __init__(
@@ -43,10 +42,10 @@ class EpisodeLog:
         seed: int,
         config: str,
         layout: bool,
-        command: str,
+        tell: Callable[[str], None],
         policies: int | None = None,
     ) -> None:
-        self._world, self._seed, self._command = world, seed, command
+        self._world, self._seed, self._tell = world, seed, tell
         self._writer: EpisodeWriter | None = None
         try:
             self.file, self.episodes = folder / "episodes.mcap", 0
@@ -61,11 +60,6 @@ class EpisodeLog:
         except OSError as error:
             self._stop(error)
 
-    @property
-    def policies(self) -> int:
-        """How many policies have been recorded."""
-        return 0 if self._writer is None else self._writer.policies
-
     def _take_over(self, policies: int) -> None:
         """Resume the log of an earlier process, which was killed (`.part`) or ended in order."""
         part = self.file.with_name(f"{self.file.name}.part")
@@ -79,7 +73,7 @@ class EpisodeLog:
         taken = taken_over(earlier, self.file, policies)
         if taken is None:
             earlier.replace(written)
-            sys.stderr.write(f"trackmdp {self._command}: {written}: not whole; a new log is begun beside it\n")
+            self._tell(f"{written}: not whole; a new log is begun beside it")
             return
         self._writer, self.episodes = taken
         earlier.unlink()
@@ -117,7 +111,7 @@ class EpisodeLog:
     def _stop(self, error: OSError) -> None:
         part = self.file.with_name(f"{self.file.name}.part")
         reason = (error.strerror or "cannot be written").lower()
-        sys.stderr.write(f"trackmdp {self._command}: {part}: {reason}; no more episodes are logged\n")
+        self._tell(f"{part}: {reason}; no more episodes are logged")
         if self._writer is not None:
             self._writer.abandon()
             self._writer = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -29,19 +30,24 @@ class EpisodeLogger(Callback):
 
     def __init__(self, cfg: McapConfig, folder: Path) -> None:
         self._cfg, self._folder = cfg, folder
-        self._policies: int | None = None
+        self._policies, self._lost = 0, ""
 
     def on_start(self, trainer: Training) -> None:
         """Open the log; what an earlier process recorded after its last checkpoint is cut off."""
         assert isinstance(trainer.problem, World)
+
+        def tell(line: str) -> None:
+            self._lost = line
+            trainer.console.print(line, markup=False)
+
         self._log = EpisodeLog(
             self._folder,
             trainer.problem,
             seed=trainer.config.seed,
             config=config_text(trainer.config),
             layout=self._cfg.layout,
-            policies=self._policies,
-            command="train",
+            policies=self._policies or None,
+            tell=tell,
         )
 
     def on_evaluation(self, trainer: Training, policy: Policy, score: Score) -> None:  # noqa: ARG002
@@ -50,14 +56,18 @@ class EpisodeLogger(Callback):
         if iteration == 1 or trainer.due(every):
             facts = {"label": f"iteration {iteration}"}
             self._log.record(policy, facts, self._cfg.episodes, iteration)
+            # Also where logging is over: what a checkpoint holds must not depend on how full the disk was.
+            self._policies += 1
 
-    def on_end(self, trainer: Training) -> None:  # noqa: ARG002
-        """Finish the file."""
+    def on_end(self, trainer: Training) -> None:
+        """Finish the file, and say what was lost of it; where the run itself broke down, its own line says why."""
         self._log.close()
+        if self._lost and trainer.error is None:
+            sys.stderr.write(f"trackmdp train: {self._lost}\n")
 
     def state_dict(self) -> dict[str, Any]:
-        """How many policies were recorded."""
-        return {"policies": self._log.policies}
+        """How many policies were handed to the log."""
+        return {"policies": self._policies}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Resume the log after the policies it held when the state was taken."""

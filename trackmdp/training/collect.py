@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import os
 import signal
+import threading
 from functools import partial
 from typing import Any
 
@@ -135,8 +138,17 @@ def _worker_env(world: Problem, worker: str, env: dict[str, Any]) -> TrackEnv:
     # for an answer of theirs while it should save. It tells them to end, and kills those that do not.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
+    threading.Thread(target=_end_with_learner, daemon=True).start()
     torch.manual_seed(derive(env["seed"], "torch", worker))
     return TrackEnv(world, stream=f"world-{worker}", **env)
+
+
+def _end_with_learner() -> None:
+    """Wait for the end of the process that learns, and end this one: killed, it cannot tell its workers to end."""
+    learner = multiprocessing.parent_process()
+    if learner is not None:
+        learner.join()
+        os._exit(1)  # not sys.exit, which would end this thread alone
 
 
 def _remote_env(world: Problem, worker: str, env: dict[str, Any], threads: int) -> TrackEnv:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -80,7 +81,11 @@ def _log_episodes(
 ) -> None:
     """Write `episodes.mcap`: the episodes that the simulated figures are those of."""
     described = to_yaml(load_run_config(cfg.run) if cfg.run else cfg)
-    log = EpisodeLog(folder, world, seed=cfg.seed, config=described, layout=mcap.layout, command="evaluate")
+
+    def tell(line: str) -> None:
+        sys.stderr.write(f"trackmdp evaluate: {line}\n")
+
+    log = EpisodeLog(folder, world, seed=cfg.seed, config=described, layout=mcap.layout, tell=tell)
     log.add(episodes, {"label": subject})
     if log.close():
         console.print(f"{log.episodes} episodes in {log.file}", markup=False)
