@@ -14,6 +14,7 @@ from scipy import sparse
 from tests.helpers import small_world, train_config
 from trackmdp.app.commands import train
 from trackmdp.errors import UserError
+from trackmdp.policies import saved
 from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.policies.saved import load_policy, save_policy
 from trackmdp.solvers import qmdp
@@ -138,3 +139,37 @@ def test_saving_replaces_the_file_whole(tmp_path: Path, monkeypatch: pytest.Monk
     with pytest.raises(OSError, match="No space"):
         save_policy(tmp_path / "policy.npz", Policy.none(small_world()))
     assert Policy.load(tmp_path / "policy.npz").probability == 1.0
+
+
+@pytest.mark.parametrize("listed", [20_000, 8])
+def test_sets_are_read_back_from_a_list_and_from_an_array_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, listed: int
+) -> None:
+    world = small_world(3, t_max=1)
+    policy, value = qmdp.solve(world), np.arange(9.0)
+    monkeypatch.setattr(saved, "LISTED_CELLS", listed)
+    named = saved.write_sets(tmp_path, policy, value=value)
+    assert [file.name for file in tmp_path.iterdir()] == [saved.sets_name(world)]
+    assert named["value"] == (value.tolist() if listed > 9 else "sets.npz")
+    found = saved.read_sets(world, tmp_path / saved.sets_name(world))
+    assert np.array_equal(found.dense(), policy.dense())
+    with pytest.raises(UserError, match="; expected 4"):
+        saved.read_sets(small_world(2, t_max=1), tmp_path / saved.sets_name(world))
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ('{"t_max": 0, "sets": {"0": [[4]], "1": [[]], "2": [[]], "3": [[]]}}', "not sets"),
+        ('{"t_max": 0, "sets": {"0": [[1]]}}', "not sets"),
+        ('{"t_max": 0, "sets": {"0": [["x"]], "1": [[]], "2": [[]], "3": [[]]}}', "not sets"),
+        ("[]", "expected a JSON object"),
+    ],
+)
+def test_a_file_of_no_sets_is_refused_in_one_line(tmp_path: Path, content: str, said: str) -> None:
+    (tmp_path / "sets.json").write_text(content, encoding="utf-8")
+    with pytest.raises(UserError, match=said) as caught:
+        saved.read_sets(small_world(2, t_max=0), tmp_path / "sets.json")
+    assert "\n" not in str(caught.value)
+    with pytest.raises(UserError, match="expected a sets"):
+        saved.read_sets(small_world(2, t_max=0), tmp_path / "sets.txt")

@@ -23,6 +23,7 @@ __all__ = [
     "PlaybackConfig",
     "QmdpConfig",
     "RandomKConfig",
+    "SetsConfig",
 ]
 
 
@@ -128,6 +129,15 @@ class OptimalConfig(BaselineConfig):
         "stop after this long even so, where the machine is slow; said where it happens; null = never", unit="s", gt=0
     )
     tolerance: float = option("bracket that counts as closed, relative to the value", ge=0, lt=1)
+
+
+@choice("baseline", "sets", makes="trackmdp.policies.saved:read_sets")
+@dataclass(kw_only=True)
+class SetsConfig(BaselineConfig):
+    """The sets in a file that evaluate, solve, export or a run has written."""
+
+    reads_motion: ClassVar[bool] = False
+    file: str = option("the sets", expects="a sets.json, or a sets.npz or policy.npz", path=True)
 
 
 @choice("baseline", "playback", makes="trackmdp.policies.playback:Playback")

@@ -1,4 +1,8 @@
-"""A policy in a file, `policy.npz`: its sparse table, its task, and if wanted its values; nothing is unpickled."""
+"""A policy in a file: its sparse table, its task, and if wanted its values; nothing is unpickled.
+
+`policy.npz` and `sets.npz` are that. `sets.json` is the sets alone, for a reader of another language, on grids small
+enough to be worth writing out: a million cells would be 260 MB.
+"""
 
 from __future__ import annotations
 
@@ -11,24 +15,28 @@ import numpy.typing as npt
 from scipy import sparse
 
 from trackmdp.arrays import LARGE, load_npz
-from trackmdp.durable import write_bytes
+from trackmdp.durable import write_bytes, write_json
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
-from trackmdp.untrusted import decoded, opened
+from trackmdp.untrusted import decoded, opened, read_object
 from trackmdp.world.model import Array, Task
 
-__all__ = ["load_policy", "save_policy"]
+__all__ = ["LISTED_CELLS", "load_policy", "read_sets", "save_policy", "sets_name", "write_sets"]
+
+LISTED_CELLS = 20_000
+"""Cells up to which sets and values are written as JSON."""
 
 _TASK = ("size", "cost", "t_max", "safe_cost", "reward", "max_steps", "window", "markov")
 
 
-def save_policy(file: Path, policy: PolicyTable, value: Array | None = None) -> None:
+def save_policy(file: Path, policy: PolicyTable, value: Array | None = None, **more: Array) -> None:
     """Write a policy, whole or not at all; the same policy, the same bytes.
 
     Args:
         file: to write.
         policy: its table or its one probability, and how many sensors it draws.
         value: `[M]`, what an episode is worth from each cell.
+        **more: further `[M]` arrays that go with it.
     """
     content: dict[str, Any] = {f"task_{name}": _number(getattr(policy.task, name)) for name in _TASK}
     if policy.sets is None:
@@ -42,6 +50,7 @@ def save_policy(file: Path, policy: PolicyTable, value: Array | None = None) -> 
         content["k"] = np.int64(policy.k)
     if value is not None:
         content["value"] = value
+    content |= more
     stream = io.BytesIO()
     np.savez_compressed(stream, **content)
     write_bytes(file, stream.getvalue())
@@ -63,6 +72,55 @@ def load_policy(file: Path) -> tuple[PolicyTable, Array | None]:
         if "probability" in content:
             return PolicyTable(task, probability=float(content["probability"]), k=k), value
         return PolicyTable(task, _sets(content, task), k=k), value
+
+
+def sets_name(task: Task) -> str:
+    """`sets.json`, or on a grid too large for that `sets.npz`."""
+    return "sets.json" if task.num_cells <= LISTED_CELLS else "sets.npz"
+
+
+def write_sets(folder: Path, policy: PolicyTable, **arrays: Array) -> dict[str, Any]:
+    """Write the sets of a policy, and return `arrays` as a report in JSON has them.
+
+    Up to `LISTED_CELLS` cells the sets go to `sets.json`, unless they are drawn at random, and the arrays are returned
+    as lists. Above, both go to `sets.npz`, as `load_policy` reads it, and in place of each array its file is named.
+    """
+    file = folder / sets_name(policy.task)
+    if file.suffix == ".npz":
+        save_policy(file, policy, **arrays)
+        return dict.fromkeys(arrays, file.name)
+    if policy.deterministic:
+        write_json(file, policy.as_lists())
+    return {name: array.tolist() for name, array in arrays.items()}
+
+
+def read_sets(task: Task, file: str | Path) -> PolicyTable:
+    """The policy in a `sets.json`, or in a `sets.npz` or `policy.npz`, for `task`.
+
+    Raises:
+        UserError: the file is missing or damaged, holds something else, or is for another grid or t_max.
+    """
+    file = Path(file)
+    if file.suffix == ".npz":
+        table = load_policy(file)[0]
+        table.check_fits(task)
+        return PolicyTable(task, table.sets, probability=table.probability, k=table.k)
+    if file.suffix != ".json":
+        raise UserError(f"{file}: expected a sets.json, or a sets.npz or policy.npz")
+    content = read_object(file, most=LARGE)
+    with decoded(str(file), "sets"):
+        return PolicyTable(task, _listed(task, content))
+
+
+def _listed(task: Task, content: dict[str, Any]) -> sparse.csr_array:
+    """`[M (t_max + 1), M]` bool of what `PolicyTable.as_lists` wrote."""
+    cells, expected = content["sets"], {str(cell) for cell in range(task.num_cells)}
+    if content["t_max"] != task.t_max or set(cells) != expected:
+        raise ValueError(f"{len(cells)} cells, t_max {content['t_max']}; expected {len(expected)}, {task.t_max}")
+    rows = [each for cell in range(task.num_cells) for each in cells[str(cell)]]
+    pointer = np.cumsum([0, *map(len, rows)])
+    indices = np.array([each for row in rows for each in row], dtype=np.int64)
+    return _sets({"indices": indices, "indptr": pointer}, task)
 
 
 def _number(value: Any) -> npt.NDArray[Any]:

@@ -54,28 +54,23 @@ def _whole_episodes(world: World, policy: PolicyTable, guess: Array | None) -> E
     for hit, earned in renewal(world, policy):
         located, gathered = located + hit, gathered + earned
     system = RenewalSystem(located, world.size)
-    if not system.exact:
-        return _by_iteration(world, system, located, gathered, guess)
-    # All six totals by one factorisation: reward, steps in the grid, detections, sensors, safe actions, steps [M, 6].
-    totals = system.solve(gathered)
-    check_length(totals[:, 5])
-    return pooled(totals[:m, :5], totals[:m, 5])
-
-
-def _by_iteration(
-    world: World, system: RenewalSystem, located: sparse.csr_array, gathered: Array, guess: Array | None
-) -> Evaluation:
-    """The value and the pooled figures by two solves in place of six."""
-    length, (m, states) = expected_steps(world), (world.num_cells, len(gathered))
+    if system.exact:
+        # All six totals by one factorisation: reward, steps in the grid, detections, sensors, safe actions, steps.
+        totals = system.solve(gathered)
+        check_length(totals[:, 5])
+        return pooled(totals[:m, :5], totals[:m, 5])
+    # By iteration, the value and the pooled figures by two solves in place of six.
+    length = expected_steps(world)
     # what a missed target is worth is near to what a located one in its cell is
     value = system.solve(gathered[:, 0], None if guess is None else np.tile(guess, states // m))
     # |V - V̂| <= max (I - T)^-1 1 · max |residual|, and an episode has no more renewals than steps (theory-extensions:
     # section 0); the steps are those of I - P, themselves iterated.
     error = float(length.max()) * float(np.abs(system.residual(gathered[:, 0], value)).max())
     # Detections and the like are wanted for a uniform start s alone, s (I - T)^-1 b: with the visits v = s (I - T)^-1,
-    # that is v = s + v T, each is a scalar product v b.
-    start = np.concatenate([np.full(m, 1 / m), np.zeros(states - m)])
-    visits = RenewalSystem(sparse.csr_array(located.T), world.size).solve(start)
+    # that is v = s + v T, each is a scalar product v b. One system goes before the next comes: both are large.
+    del system
+    system = RenewalSystem(sparse.csr_array(located.T), world.size)
+    visits = system.solve(np.concatenate([np.full(m, 1 / m), np.zeros(states - m)]))
     # Sensing does not move the target, and each episode has one exit step: the steps in the grid are all but that one.
     return summed_up(value[:m], length - 1.0, length, list(visits @ gathered[:, 2:5]), error)
 

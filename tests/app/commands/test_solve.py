@@ -14,6 +14,7 @@ import pytest
 
 from tests.solvers.worlds import paper_world
 from trackmdp.app.cli import main
+from trackmdp.policies import saved
 from trackmdp.solvers import bounds
 from trackmdp.solvers.evaluate import evaluate
 
@@ -39,7 +40,7 @@ def test_solution_json_holds_the_certified_optimum(tmp_path: Path, capsys: pytes
     assert solution["lower"] == pytest.approx(90.48447403756, abs=1e-8)
     assert solution["lower"] <= solution["upper"] <= solution["lower"] + 1e-4
     np.testing.assert_allclose(np.mean(solution["value"]), solution["lower"])
-    policy = evaluate(world, chains_of(solution["policy"], 100))
+    policy = evaluate(world, chains_of(read(tmp_path / "a", "sets.json"), 100))
     np.testing.assert_allclose(policy.value, solution["value"], atol=1e-9)
     assert solution["bounds"]["clocked"] == pytest.approx(bounds.clocked(world).mean())
     assert solution["seconds"] > 0
@@ -107,3 +108,18 @@ def test_ctrl_c_prints_and_saves_the_bracket(tmp_path: Path) -> None:
     assert solution["interrupted"] is True
     assert solution["certified"] is False
     assert solution["lower"] < solution["upper"]
+
+
+@pytest.mark.parametrize("listed", [20_000, 8])
+def test_the_sets_of_a_solution_are_valued_again_by_evaluate(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, listed: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(saved, "LISTED_CELLS", listed)
+    world = ["grid.size=4", "cost.sensor=0.2"]
+    assert main(["solve", *world, f"hydra.run.dir={tmp_path / 'a'}"]) == 0
+    name = "sets.json" if listed > 16 else "sets.npz"
+    assert f"sets in {name}" in " ".join(capsys.readouterr().out.split())
+    words = ["baseline=sets", f"baseline.file={tmp_path / 'a' / name}", f"hydra.run.dir={tmp_path / 'b'}"]
+    assert main(["evaluate", *world, *words, "episodes=20", "log=[mcap]"]) == 0
+    assert read(tmp_path / "b", "evaluation.json")["exact"]["aihtr"] == read(tmp_path / "a", "solution.json")["lower"]
+    assert (tmp_path / "b" / name).is_file()

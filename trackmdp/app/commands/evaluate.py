@@ -19,6 +19,7 @@ from trackmdp.episodes.figures import Simulation
 from trackmdp.episodes.log import EpisodeLog
 from trackmdp.episodes.simulate import simulate
 from trackmdp.policies.policy import Policy
+from trackmdp.policies.saved import sets_name, write_sets
 from trackmdp.reports.picture import draw_picture
 from trackmdp.solvers import estimator
 from trackmdp.solvers.solve import baseline_policy
@@ -55,9 +56,7 @@ def run(cfg: EvaluateConfig, folder: Path, problem: Problem | None = None) -> fl
     # Theorem thm:estimator is about Q of whole episodes and of a policy that is a table.
     estimate = estimator.accuracy(world, policy) if policy.deterministic and world.max_steps is None else None
     report = _report(subject, evaluator, score, simulation) | {"estimator": asdict(estimate) if estimate else None}
-    write_json(folder / "evaluation.json", report)
-    if policy.deterministic:
-        write_json(folder / "sets.json", policy.as_lists())
+    write_json(folder / "evaluation.json", report | write_sets(folder, policy, value=score.evaluation.value))
     write_text(folder / "picture.txt", draw_picture(episodes, world))
     _show(console, subject, evaluator, score, simulation, folder)
     if isinstance(mcap := cfg.log.get("mcap"), McapConfig):
@@ -107,7 +106,6 @@ def _report(subject: str, evaluator: ExactEvaluator, score: Score, simulation: S
     return {
         "policy": subject,
         "exact": figures(score.evaluation),
-        "value": score.evaluation.value.tolist(),
         "simulated": asdict(simulation) if simulation else None,
         "qmdp": figures(evaluator.qmdp),
         "bounds": evaluator.bounds,
@@ -134,4 +132,5 @@ def _show(
         rows.append([label, f"{exact[key]:,.4f}", simulated, f"{qmdp[key]:,.4f}"])
     title = f"simulated, {simulation.episodes} episodes ± s.e." if simulation else "simulated"
     console.print(table(subject, ["figure", "exact", title, "Q_MDP exact"], rows))
-    console.print(f"upper bound (clocked) {evaluator.upper:,.4f}; {score.regret}; results in {folder}")
+    where = f"results in {folder}, sets in {sets_name(evaluator.world)}"
+    console.print(f"upper bound (clocked) {evaluator.upper:,.4f}; {score.regret}; {where}")

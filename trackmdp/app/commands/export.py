@@ -17,9 +17,10 @@ from torch import Tensor, nn
 from trackmdp import __version__
 from trackmdp.app.commands.trained import trained
 from trackmdp.config import ExportConfig
-from trackmdp.durable import write_bytes, write_json
+from trackmdp.durable import write_bytes
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
+from trackmdp.policies.saved import sets_name, write_sets
 from trackmdp.training.display import make_console
 from trackmdp.world.model import BoolArray
 
@@ -47,7 +48,8 @@ def run(cfg: ExportConfig, folder: Path) -> None:
         "t_max": str(task.t_max),
     }
     if cfg.format == "sets":
-        write_json(file, found.policy.as_lists())
+        file = folder / sets_name(task)
+        write_sets(folder, found.policy)
     else:
         forms: dict[str, Callable[[Policy, dict[str, str]], bytes]] = {"torch_export": to_torch, "onnx": to_onnx}
         write_bytes(file, forms[cfg.format](found.policy, about))

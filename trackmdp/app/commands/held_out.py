@@ -10,6 +10,7 @@ from rich.console import Console
 from trackmdp.durable import write_json, write_text
 from trackmdp.episodes.simulate import simulate
 from trackmdp.policies.policy import Policy
+from trackmdp.policies.saved import write_sets
 from trackmdp.reports.picture import draw_picture
 from trackmdp.training.display import table
 from trackmdp.training.held_out import HeldOutEvaluator
@@ -30,11 +31,9 @@ def run(
     evaluator = HeldOutEvaluator(world)
     report = evaluator.report(policy)
     value = evaluator.evaluate(policy).value
-    content = {"policy": subject, "value": value.tolist(), "held_out": report}
+    content = {"policy": subject, "held_out": report} | write_sets(folder, policy, value=value)
     content |= dict.fromkeys(("regret_per_step", "regret_per_step_lower"))
     write_json(folder / "evaluation.json", content)
-    if policy.deterministic:
-        write_json(folder / "sets.json", policy.as_lists())
     write_text(folder / "picture.txt", draw_picture(simulate(world, policy, 16, seed=seed), world))
     show_held_out(console, subject, report)
     console.print(f"results in {folder}")

@@ -11,6 +11,7 @@ from rich.console import Console
 from trackmdp.config import SolveConfig
 from trackmdp.durable import write_json
 from trackmdp.errors import UserError
+from trackmdp.policies.saved import sets_name, write_sets
 from trackmdp.solvers import bounds, qmdp
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import regret_per_step
@@ -42,7 +43,8 @@ def run(cfg: SolveConfig, folder: Path, problem: Problem | None = None) -> float
     with _SearchDisplay(console, f"solve {cfg.solver.name}") as display:
         solution = run_solver(world, cfg.solver, display.update)
     bound = {name: float(each(world).mean()) for name, each in _BOUNDS.items()}
-    write_json(folder / "solution.json", _report(cfg, solution, bound))
+    arrays = write_sets(folder, solution.table, value=solution.value, upper_value=solution.bound)
+    write_json(folder / "solution.json", _report(cfg, solution, bound) | arrays)
     _show(console, cfg, world, solution, bound, folder)
     # After the results are written: the command still ends with the status of an interruption.
     if solution.interrupted:
@@ -68,9 +70,6 @@ def _report(cfg: SolveConfig, solution: Solution, bound: dict[str, float]) -> di
         "regret_per_step": regret_per_step(solution.upper, solution.evaluation),
         "figures": figures(solution.evaluation),
         "bounds": bound,
-        "value": solution.value.tolist(),
-        "upper_value": solution.bound.tolist(),
-        "policy": solution.table.as_lists(),
     }
 
 
@@ -88,7 +87,7 @@ def _show(
     regret = max(regret_per_step(solution.upper, solution.evaluation), 0.0)
     console.print(
         f"{solution.ended}: bracket {solution.lower:,.6f} ... {solution.upper:,.6f}, {regret:.2g} per step, after "
-        f"{solution.seconds:.1f} s and {solution.nodes:,} nodes; results in {folder}"
+        f"{solution.seconds:.1f} s and {solution.nodes:,} nodes; results in {folder}, sets in {sets_name(world)}"
     )
 
 
