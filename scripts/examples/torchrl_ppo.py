@@ -52,7 +52,8 @@ def main(frames: int = FRAMES) -> None:
             optimizer.zero_grad()
             (parts["loss_objective"] + parts["loss_critic"] + parts["loss_entropy"]).backward()
             optimizer.step()
-    print(f"PPO {tm.evaluate(world, actor).aihtr:.3f}, optimum {tm.solve(world).upper:.3f}")
+    drawing, mode = tm.evaluate(world, actor), tm.evaluate(world, tm.Policy.from_module(world, actor))
+    print(f"PPO as it draws {drawing.aihtr:.3f}, its mode {mode.aihtr:.3f}, optimum {tm.solve(world).upper:.3f}")
 
 
 if __name__ == "__main__":

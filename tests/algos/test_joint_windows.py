@@ -12,7 +12,7 @@ from torch.utils._pytree import tree_leaves
 
 import trackmdp
 from tests.helpers import algorithm, collect, random_state, small_world
-from trackmdp.policies.policy import as_policy
+from trackmdp.policies.policy import Policy
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import regret_per_step
 from trackmdp.world.kernels import random_walk
@@ -66,7 +66,7 @@ def test_sensors_outside_the_grid_are_never_on(name: str) -> None:
         assert rows["action"][inside].float().mean() > (0.3 if name == "dqn" else 0.6)
     learner.step(batch)
     assert all(torch.isfinite(part).all() for part in learner.parameters)
-    sets = as_policy(world, learner.actor).sets  # refuses sensors that cannot be chosen
+    sets = Policy.from_module(world, learner.actor).sets  # refuses sensors that cannot be chosen
     assert sets is not None
     assert sets.shape == (32, 16)
 

@@ -16,7 +16,7 @@ import torch
 from tests.helpers import ALGORITHMS, algorithm, collect, small_world, train_config
 from trackmdp.app.commands.train import run
 from trackmdp.config import GROUPS, PerSensorConfig
-from trackmdp.policies.policy import as_policy
+from trackmdp.policies.policy import Policy
 from trackmdp.solvers import optimal
 from trackmdp.training import checkpoint
 from trackmdp.world.make import build_world
@@ -112,7 +112,7 @@ def test_it_goes_on_from_its_state_as_if_nothing_had_happened(variant: str) -> N
         later_says = later.step(batch.clone())
     assert later_says == straight_says
     assert different(straight.state_dict(), later.state_dict()) == []
-    assert (as_policy(world, straight.actor).dense() == as_policy(world, later.actor).dense()).all()
+    assert (Policy.from_module(world, straight.actor).dense() == Policy.from_module(world, later.actor).dense()).all()
 
 
 def tiny(name: str) -> list[str]:

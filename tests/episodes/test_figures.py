@@ -12,7 +12,7 @@ import torch
 from tests.helpers import BASELINES, algorithm, evaluate_config, hop_world, limited, small_world
 from trackmdp.episodes.figures import Simulation
 from trackmdp.episodes.simulate import simulate
-from trackmdp.policies.policy import Policy, as_policy
+from trackmdp.policies.policy import Policy
 from trackmdp.solvers.solve import baseline_policy
 from trackmdp.training.evaluator import ExactEvaluator
 from trackmdp.world.make import build_world
@@ -46,10 +46,11 @@ def test_exact_and_simulated_figures_agree_for_a_learned_actor() -> None:
     actor = algorithm("ppo", world).actor
     with torch.no_grad():
         actor.module[0].module.network.head.weight.normal_(std=0.3)
-    simulation = simulate(world, actor, 10_000).figures()
+    mode = Policy.from_module(world, actor)
+    simulation = simulate(world, mode, 10_000).figures()
     assert simulation.safe_per_episode.mean > 0.05
     assert 0.2 < simulation.accuracy.mean < 0.9
-    assert_close(world, as_policy(world, actor), simulation)
+    assert_close(world, mode, simulation)
 
 
 def test_prices_per_cell_and_a_cheap_safe_action() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,11 +12,16 @@ from scipy import sparse
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import ProbabilisticActor
 
 from tests.helpers import ALGORITHMS, algorithm, random_kernel, random_state, small_world
+from trackmdp.episodes.simulate import simulate
 from trackmdp.errors import UserError
 from trackmdp.policies import lookup, policy
+from trackmdp.policies.actor_critic import SubsetDistribution
 from trackmdp.policies.policy import Policy, as_policy
+from trackmdp.policies.unroll import STATE_KEYS
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.world.model import World
 
 WORLD = small_world(t_max=2)
@@ -156,7 +162,7 @@ def test_a_function_may_write_to_what_it_is_given() -> None:
 def test_a_learner_s_actor_becomes_the_table_of_its_modes(name: str) -> None:
     actor = algorithm(name, WORLD).actor
     before = torch.get_rng_state()
-    read = as_policy(WORLD, actor)
+    read = Policy.from_module(WORLD, actor)
     assert torch.equal(torch.get_rng_state(), before)
     first = {
         "last_cell": torch.arange(M),
@@ -167,6 +173,66 @@ def test_a_learner_s_actor_becomes_the_table_of_its_modes(name: str) -> None:
         assert torch.equal(read(TensorDict(first, [M]))["action"], actor(TensorDict(first, [M]))["action"])
 
 
+def stochastic(reads_history: bool, width: int = M) -> ProbabilisticActor:
+    """Sensor j is on with probability σ((x + n + j) / 4 - 2), and one more where the history holds it."""
+
+    def logits(x: torch.Tensor, n: torch.Tensor, h: torch.Tensor) -> torch.Tensor:
+        base = (x[..., None] + n[..., None] + torch.arange(width)) / 4 - 2
+        return base + (h.any(-2) if reads_history else 0)
+
+    return ProbabilisticActor(
+        TensorDictModule(logits, in_keys=list(STATE_KEYS), out_keys=["logits"]),
+        in_keys=["logits"],
+        distribution_class=SubsetDistribution,
+    )
+
+
+def test_a_stochastic_actor_is_valued_as_the_mixture_it_is() -> None:
+    """By its probabilities exactly, in agreement with 20,000 episodes of its draws; by its mode where that is asked."""
+    actor = stochastic(reads_history=False)
+    x, n, j = np.ogrid[:M, :CHOICES, :M]
+    exact = evaluate(WORLD, Policy.from_dense(WORLD, 1 / (1 + np.exp(2 - (x + n + j) / 4))))
+    assert evaluate(WORLD, actor).aihtr == pytest.approx(exact.aihtr, rel=1e-6)
+    simulated = simulate(WORLD, actor, 20_000).figures().aihtr
+    assert abs(simulated.mean - exact.aihtr) < 4 * simulated.standard_error
+    mode = evaluate(WORLD, Policy.from_module(WORLD, actor)).aihtr
+    assert mode == pytest.approx(evaluate(WORLD, (x + n + j) / 4 > 2).aihtr)
+    assert abs(mode - exact.aihtr) > 0.1
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        assert evaluate(WORLD, actor).aihtr == mode
+
+
+def test_draws_that_depend_on_draws_before_are_refused_and_can_be_simulated() -> None:
+    actor = stochastic(reads_history=True)
+    with pytest.raises(UserError, match="depend on the sets that it drew before, so no exact value; simulate it") as no:
+        evaluate(WORLD, actor)
+    assert "\n" not in str(no.value)
+    drawn, free = (simulate(WORLD, stochastic(each), 20_000).figures() for each in (True, False))
+    assert drawn.sensors_per_step.mean > free.sensors_per_step.mean + 0.05
+    assert Policy.from_module(WORLD, actor).deterministic
+    once = replace(WORLD, t_max=0)
+    assert evaluate(once, actor).aihtr == evaluate(once, stochastic(reads_history=False)).aihtr
+
+
+def test_in_a_window_a_mixture_is_over_its_sensors() -> None:
+    world = windowed()
+    made = as_policy(world, stochastic(reads_history=False, width=9))
+    state = {"last_cell": torch.tensor([0]), "steps_since_detection": torch.tensor([1])}
+    # Around cell 0 the local sensors 4, 5, 7 and 8 are the cells 0, 1, 4 and 5; the others lie outside the grid.
+    expected = torch.zeros(12)
+    expected[[0, 1, 4, 5]] = torch.sigmoid((1 + torch.tensor([4.0, 5, 7, 8])) / 4 - 2)
+    assert torch.allclose(made.probabilities(**state)[0], expected)
+
+
+class Signs(torch.distributions.HalfNormal):
+    """Draws subsets, and does not say how likely each is."""
+
+    has_rsample = False
+
+    def sample(self, sample_shape: Any = ()) -> torch.Tensor:
+        return super().sample(sample_shape) > 1
+
+
 SHARED = torch.Generator().manual_seed(0)
 DRAWING: dict[str, Any] = {
     "torch": lambda x, n, h: torch.rand(len(x), M) < 0.5,
@@ -174,6 +240,11 @@ DRAWING: dict[str, Any] = {
     "its own generator": lambda x, n, h: torch.rand(len(x), M, generator=SHARED) < 0.5,
     "numpy": lambda x, n, h: np.random.random((len(x), M)) < 0.5,  # noqa: NPY002
     "module": TensorDictModule(lambda x: torch.rand(*x.shape, M) < 0.5, in_keys=["last_cell"], out_keys=["action"]),
+    "an actor of another form": ProbabilisticActor(
+        TensorDictModule(lambda x: torch.ones(len(x), M), in_keys=["last_cell"], out_keys=["scale"]),
+        in_keys=["scale"],
+        distribution_class=Signs,
+    ),
     "dropout": TensorDictModule(
         lambda x: torch.nn.functional.dropout(torch.ones(*x.shape, M)) > 0, in_keys=["last_cell"], out_keys=["action"]
     ),

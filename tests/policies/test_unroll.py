@@ -14,7 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from tests.helpers import ALGORITHMS, algorithm, collect, small_world
 from trackmdp.episodes.simulate import simulate
-from trackmdp.policies.policy import as_policy
+from trackmdp.policies.policy import Policy, as_policy
 
 STATE = ["last_cell", "steps_since_detection", "action_history"]
 
@@ -56,7 +56,7 @@ def test_a_table_holds_what_the_actor_does_in_the_environment(name: str) -> None
         with torch.no_grad():
             for parameter in actor.parameters():
                 parameter.normal_(std=0.5)
-    chains = torch.as_tensor(as_policy(world, actor).dense())
+    chains = torch.as_tensor(Policy.from_module(world, actor).dense())
     batch = collect(world, _evaluated(actor), 100, 40)
     free = batch["steps_since_detection"] <= 2
     followed = chains[batch["last_cell"][free], batch["steps_since_detection"][free]]
@@ -83,7 +83,7 @@ def test_evaluating_does_not_disturb_training(name: str) -> None:
         for seed in range(3):
             learner.step(collect(world, learner.policy, 32, 8, seed=seed))
             if evaluated:
-                as_policy(world, learner.actor)
+                Policy.from_module(world, learner.actor)
                 simulate(world, learner.actor, 20)
                 simulate(world, learner.policy, 20)
         states.append(TensorDict.from_dict(_tensors(learner.state_dict())))

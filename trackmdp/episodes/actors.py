@@ -14,11 +14,10 @@ from typing import ClassVar, Protocol
 import numpy as np
 import torch
 from torch import Tensor
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from trackmdp.policies.playback import Playback
 from trackmdp.policies.policy import DrawsError, Policy, PolicyLike, as_policy, rule_of
-from trackmdp.policies.unroll import Rule
+from trackmdp.policies.unroll import Rule, acting
 from trackmdp.world.costs import Costs
 from trackmdp.world.model import Task
 from trackmdp.world.windows import Window
@@ -212,7 +211,7 @@ class Asking:
         # Slot s holds the action at s misses; what stands in slot n and later is left from an earlier row of misses.
         filled = self._slots < states.misses.unsqueeze(1)
         history = self._history[states.row] & filled.unsqueeze(-1)
-        with set_exploration_type(ExplorationType.DETERMINISTIC):
+        with acting():
             action = self._rule(states.last_cell, states.misses, history)
         self._history[states.row, states.misses.clamp_max(len(self._slots) - 1)] = action
         return _Written(self._window.to_global(states.last_cell, action), self._costs)

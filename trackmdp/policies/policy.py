@@ -18,12 +18,24 @@ from scipy import sparse
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from trackmdp.errors import UserError
 from trackmdp.policies.lookup import DenseTable, SparseTable
 from trackmdp.policies.saved import load_policy, save_policy
 from trackmdp.policies.table import PolicyTable
-from trackmdp.policies.unroll import STATE_KEYS, Rule, draws, function_rule, module_rule, unrolled
+from trackmdp.policies.unroll import (
+    STATE_KEYS,
+    TAKE_ITS_MODE,
+    DrawsError,
+    Rule,
+    acting,
+    draws,
+    function_rule,
+    mixture,
+    module_rule,
+    unrolled,
+)
 from trackmdp.world.model import Array, Task
 from trackmdp.world.windows import Window
 
@@ -33,10 +45,6 @@ PolicyLike: TypeAlias = "PolicyTable | TensorDictModuleBase | Callable[..., Any]
 """A policy or its table, a TensorDict module, or a function as `Policy.from_function` takes it."""
 
 _DENSE = 2**24  # entries; a table of no more is looked up dense, the faster of the two ways to act
-
-
-class DrawsError(UserError):
-    """An exact value was asked of something that draws at random."""
 
 
 class Policy(TensorDictModuleBase, PolicyTable):
@@ -116,7 +124,8 @@ class Policy(TensorDictModuleBase, PolicyTable):
         Raises:
             UserError: it draws, or it returns something else.
         """
-        return cls._unrolled(task, function_rule(task, function), device, check=check)
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            return cls._unrolled(task, function_rule(task, function), device, check=check)
 
     @classmethod
     def from_module(
@@ -126,13 +135,14 @@ class Policy(TensorDictModuleBase, PolicyTable):
 
         The module is run with TorchRL's exploration type DETERMINISTIC: a stochastic actor is taken at its mode.
         """
-        return cls._unrolled(task, module_rule(task, module), device, check=check)
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            return cls._unrolled(task, module_rule(task, module), device, check=check)
 
     @classmethod
     def _unrolled(cls, task: Task, rule: Rule, device: torch.device | str, *, check: bool) -> Policy:
         sets = unrolled(task, rule, torch.device(device))
         if check and draws(task, rule, torch.device(device), sets):
-            raise DrawsError("policy: draws at random, so that it has no exact value; simulate it, or take its mode")
+            raise DrawsError(f"policy: draws at random, so that it has no exact value; {TAKE_ITS_MODE}")
         return cls(task, sets)
 
     # Acting.
@@ -232,17 +242,25 @@ class Policy(TensorDictModuleBase, PolicyTable):
 def as_policy(task: Task, policy: PolicyLike, *, device: torch.device | str | None = None) -> Policy:
     """Anything that acts as a `Policy`.
 
+    A stochastic actor of TorchRL is the mixture that it draws from, unless `set_exploration_type` says otherwise.
+
     Args:
         task: what it acts in.
         policy: a `Policy`, a TensorDict module, or a function.
         device: where to ask a module or function; None for where the module's first weight is, or the CPU.
 
     Raises:
-        DrawsError: a module or function draws at random; `Policy.random_k` and tables of probabilities may.
+        DrawsError: a module or function draws at random with probabilities that are not known, or depend on what it
+            drew before; `Policy.random_k` and tables of probabilities may draw.
         UserError: it belongs to another grid, or is not of these forms.
     """
     if not isinstance(policy, PolicyTable):
-        return Policy._unrolled(task, rule_of(task, policy), device or _device_of(policy), check=True)
+        where = torch.device(device or _device_of(policy))
+        with acting():
+            chances = mixture(task, policy, where) if isinstance(policy, TensorDictModuleBase) else None
+            if chances is not None:
+                return Policy(task, chances)
+            return Policy._unrolled(task, rule_of(task, policy), where, check=True)
     policy.check_fits(task)
     if isinstance(policy, Policy):
         return policy

@@ -10,19 +10,20 @@ from collections.abc import Callable
 from typing import Any, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from scipy import sparse
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from torch import Tensor, distributions
+from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
 from trackmdp.errors import UserError
 from trackmdp.seeding import preserved_global_rng
-from trackmdp.world.model import BoolArray, Task
+from trackmdp.world.model import Task
 from trackmdp.world.windows import Window
 
-__all__ = ["Rule", "STATE_KEYS", "draws", "function_rule", "module_rule", "unrolled"]
+__all__ = ["DrawsError", "Rule", "STATE_KEYS", "acting", "draws", "function_rule", "mixture", "module_rule", "unrolled"]
 
 STATE_KEYS = ("last_cell", "steps_since_detection", "action_history")
 
@@ -30,6 +31,21 @@ Rule: TypeAlias = Callable[[Tensor, Tensor, Tensor], Tensor]
 """`last_cell` `[B]`, `steps_since_detection` `[B]`, `action_history` `[B, t_max+1, K]` -> bool `[B, K]`.
 
 K = M, or with a window the sensors around `last_cell`, in the local numbers of `Window`."""
+
+TAKE_ITS_MODE = "simulate it, or take its mode by Policy.from_module"
+
+
+class DrawsError(UserError):
+    """An exact value was asked of something that draws at random."""
+
+
+def acting() -> set_exploration_type:
+    """What the caller chose by `set_exploration_type`; where nothing is chosen a policy acts as it explores, RANDOM.
+
+    A TorchRL actor would otherwise be valued at its mode without a word, although it draws while collecting.
+    """
+    return set_exploration_type(exploration_type() or ExplorationType.RANDOM)
+
 
 _HISTORY_AT_ONCE = 2**22  # entries of the action history in one block; a net's activations follow from it
 
@@ -54,7 +70,7 @@ def module_rule(task: Task, module: TensorDictModuleBase) -> Rule:
     Raises:
         UserError: it reads or writes other keys, or its action has another form.
     """
-    # A table has a row for each state of these keys; a module that reads more is no function of its row.
+    # A table has a row for each state of these keys; one that reads more, its own past say, is no function of them.
     others = [str(key) for key in module.in_keys if key not in STATE_KEYS]
     if others:
         raise UserError(f"policy: the module reads {', '.join(others)}, expected {', '.join(STATE_KEYS)} at most")
@@ -78,7 +94,7 @@ def _checked(action: Tensor, shape: tuple[int, int], what: str) -> Tensor:
 def unrolled(task: Task, rule: Rule, device: torch.device) -> sparse.csr_array:
     """`[M * (t_max + 1), M]` bool, the sets of a rule; row x * (t_max + 1) + n as in `Policy.sets`.
 
-    A stochastic actor of TorchRL is taken at its mode. Torch's global generators are left as they were.
+    Torch's global generators are left as they were.
     """
     with preserved_global_rng():
         return _table(task, rule, device)
@@ -99,42 +115,105 @@ def draws(task: Task, rule: Rule, device: torch.device, sets: sparse.csr_array) 
     return moved or not same
 
 
+def mixture(task: Task, module: TensorDictModuleBase, device: torch.device) -> sparse.csr_array | None:
+    """`[M * (t_max + 1), M]` float64, with what probability a stochastic actor switches each sensor on.
+
+    Exact values need no more than these where they do not depend on the history: the next state then depends on the
+    sensor at the target's cell alone, and the price is a sum over the sensors.
+
+    Args:
+        task: what it acts in.
+        module: a module of TorchRL; its distribution must be a Bernoulli per sensor.
+        device: where to ask it.
+
+    Returns:
+        None where the module has no such distribution, or is asked for its mode.
+
+    Raises:
+        DrawsError: the probabilities depend on the history, that is on what was drawn before.
+        UserError: it reads or writes other keys.
+    """
+    stochastic = isinstance(module, ProbabilisticTensorDictSequential)
+    if not stochastic or exploration_type() != ExplorationType.RANDOM:
+        return None
+    module_rule(task, module)  # refuses keys that are not its business
+
+    def probabilities(filled: bool) -> Rule:
+        def rule(*state: Tensor) -> Tensor:
+            known = torch.full_like(state[2], filled) & _taken(state[1], state[2])
+            batch = TensorDict(dict(zip(STATE_KEYS, (*state[:2], known), strict=True)), state[0].shape)
+            chances = _bernoulli(module.get_dist(batch.to(device)))
+            if chances is None or chances.shape != (len(state[0]), task.num_sensors):
+                raise _NoProbabilitiesError
+            return chances
+
+        return rule
+
+    try:
+        with preserved_global_rng():
+            # Two histories as far apart as can be: a network that reads them at all answers otherwise.
+            none, full = (_table(task, probabilities(filled), device, torch.float64) for filled in (False, True))
+    except _NoProbabilitiesError:
+        return None
+    if (none != full).nnz:
+        raise DrawsError(
+            f"policy: its probabilities depend on the sets that it drew before, so no exact value; {TAKE_ITS_MODE}"
+        )
+    return none
+
+
+class _NoProbabilitiesError(Exception):
+    """A distribution that is not a Bernoulli per sensor."""
+
+
+def _taken(misses: Tensor, history: Tensor) -> Tensor:
+    """`[B, t_max+1, 1]` bool, the slots of a history that hold an action after `misses` `[B]`."""
+    return (torch.arange(history.shape[1], device=misses.device) < misses.unsqueeze(1)).unsqueeze(-1)
+
+
+def _bernoulli(found: distributions.Distribution) -> Tensor | None:
+    """`[B, K]` probabilities of a Bernoulli, however often it is wrapped in `Independent`."""
+    while isinstance(found, distributions.Independent):
+        found = found.base_dist
+    return found.probs.double() if isinstance(found, distributions.Bernoulli) else None
+
+
 @torch.no_grad()
-def _table(task: Task, rule: Rule, device: torch.device) -> sparse.csr_array:
+def _table(task: Task, rule: Rule, device: torch.device, dtype: torch.dtype = torch.bool) -> sparse.csr_array:
+    """A rule's answers of any dtype as rows of a table; where they are bool, each is remembered as the set chosen."""
     m, k, choices = task.num_cells, task.num_sensors, task.num_choices
     # One located cell takes a history of (t_max + 1) K bools; blocks keep M of them from being there at once.
     at_once = max(1, _HISTORY_AT_ONCE // (choices * k))
     window = Window.of(task, device)
-    columns, lengths = [], []
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        for begin in range(0, m, at_once):
-            cells = torch.arange(begin, min(begin + at_once, m), device=device)
-            # The history [B, t_max+1, K] in row-major order is B * (t_max+1) rows of the table, in the table's order.
-            on = _followed(rule, cells, choices, k).reshape(-1, k)
-            # Row-major order: flat place p of [rows, K] is column p mod K. Without a window K = M and columns are
-            # cells.
-            chosen = np.flatnonzero(on) % k
-            if window.is_local:
-                # A window's local numbers go through it row by row, as the cells do: columns stay in order.
-                inside = window.inside(cells).repeat_interleave(choices, dim=0).cpu().numpy()
-                on &= inside
-                row, local = np.nonzero(on)
-                chosen = window.around(cells).cpu().numpy()[row // choices, local]
-            columns.append(chosen)
-            # Sensors on per row, whose running sum is the CSR row pointer.
-            lengths.append(np.count_nonzero(on, axis=1))
+    columns, values, lengths = [], [], []
+    for begin in range(0, m, at_once):
+        cells = torch.arange(begin, min(begin + at_once, m), device=device)
+        # [B, t_max+1, K] in row-major order is B * (t_max+1) rows of the table, in the table's order.
+        on = _followed(rule, cells, choices, k, dtype).reshape(-1, k)
+        if window.is_local:
+            on *= window.inside(cells).repeat_interleave(choices, dim=0).cpu().numpy()
+        # Row-major order: flat place p of [rows, K] is column p mod K. Without a window K = M and columns are cells.
+        place = np.flatnonzero(on)
+        chosen = place % k
+        if window.is_local:
+            # A window's local numbers go through it row by row, as the cells do: columns stay in order.
+            chosen = window.around(cells).cpu().numpy()[place // (k * choices), chosen]
+        columns.append(chosen)
+        values.append(on.reshape(-1)[place])
+        # Sensors on per row, whose running sum is the CSR row pointer.
+        lengths.append(np.count_nonzero(on, axis=1))
     indptr = np.concatenate([[0], np.cumsum(np.concatenate(lengths))])
-    indices = np.concatenate(columns)
-    return sparse.csr_array((np.ones(len(indices), dtype=bool), indices, indptr), shape=(m * choices, m))
+    found = np.concatenate(values), np.concatenate(columns), indptr
+    return sparse.csr_array(found, shape=(m * choices, m))
 
 
-def _followed(rule: Rule, cells: Tensor, choices: int, sensors: int) -> BoolArray:
-    """`[B, t_max+1, K]` the sets chosen at n = 0, 1, ... misses from located `cells` `[B]`."""
+def _followed(rule: Rule, cells: Tensor, choices: int, sensors: int, dtype: torch.dtype) -> npt.NDArray[Any]:
+    """`[B, t_max+1, K]` the answers at n = 0, 1, ... misses from located `cells` `[B]`."""
     # Slot n is written after the call for n: at n misses the rule sees slots 0 ... n - 1, as in the environment.
-    history = torch.zeros(len(cells), choices, sensors, dtype=torch.bool, device=cells.device)
+    history = torch.zeros(len(cells), choices, sensors, dtype=dtype, device=cells.device)
     for n in range(choices):
         # Copies, for a rule may keep what it is given, or write to it.
-        history[:, n] = rule(cells.clone(), torch.full_like(cells, n), history.clone())
+        history[:, n] = rule(cells.clone(), torch.full_like(cells, n), history.to(torch.bool, copy=True))
     return history.cpu().numpy()
 
 
