@@ -156,6 +156,12 @@ RULES = [
     ("train", "cost.sensor=[1,2,3]", "cost.sensor: 3 values, expected one number or 100"),
     ("train", "cost.sensor=-0.1", "cost.sensor=-0.1: expected a number from 0 to 1e15"),
     ("train", "cost.sensor=true", "cost.sensor=True: expected a number from 0 to 1e15"),
+    ("train", "collector.total_frames=1000000000000000000", "collector.total_frames=1000000000000000000: expected an"),
+    (
+        "train",
+        "kernel=tracks kernel.path=t.csv grid.max_steps=2",
+        "grid.max_steps=2: expected at least grid.t_max + 2 = 3",
+    ),
     ("train", "cost.sensor=1e16", "cost.sensor=1e+16: expected a number from 0 to 1e15"),
     ("train", "cost.reward=5e-324", "cost.reward=5e-324: expected a number from 1e-15 to 1e+15"),
     ("train", "cost.safe=1e308", "cost.safe=1e+308: expected a number from 0 to 1e+15"),

@@ -61,6 +61,13 @@ def test_a_buffer_that_cannot_fit_is_refused_before_anything_is_written(
     assert not folder.exists()
 
 
+def test_a_batch_of_paths_that_cannot_fit_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", "algo.batch_size=999999999999", f"hydra.run.dir={tmp_path / 'run'}"]) == 2
+    # 4 cells of a path with t_max 1, six numbers of 8 bytes for each: 192 bytes a path.
+    assert "algo.batch_size=999999999999: needs about 178,813" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
 def test_batches_that_cannot_fit_are_named() -> None:
     cfg = train_config("algo=ppo", "collector.frames_per_batch=2560000000", "collector.total_frames=2560000000")
     with pytest.raises(UserError, match=r"^collector.frames_per_batch=2560000000: needs about [\d,.]+ GiB, "):
@@ -72,7 +79,7 @@ def test_a_run_says_what_it_takes(tmp_path: Path, capsys: pytest.CaptureFixture[
     budget = ["algo.updates=1", "optimal.enabled=false"]
     assert main(["train", *words, *budget, f"hydra.run.dir={tmp_path}"]) == 0
     (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("memory: "))
-    assert "algo.buffer_size 0.00 GiB, algo.hidden 0.00 GiB, collector.frames_per_batch 0.00 GiB" in line
+    assert "algo.buffer_size 0.00 GiB, algo.batch_size 0.00 GiB, algo.hidden 0.00 GiB" in line
 
 
 @pytest.mark.parametrize(

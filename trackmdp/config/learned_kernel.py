@@ -21,9 +21,9 @@ class LearnedKernelConfig(AlgoConfig):
     warm_up: int = option("with chosen sets: env steps with all sensors on before them", unit="frames", ge=0)
     prior: float = option("the pooled motion counts as much as this many moves out of each cell", unit="moves", gt=0)
     exit_prior: float = option("the pooled exit probability counts as much as this many moves", unit="moves", gt=0)
-    rounds: int = option("EM rounds after each batch", ge=1)
-    rounds_at_end: int = option("EM rounds after the last batch", ge=1)
-    samples: int = option("kernels drawn for the uncertainty reported", ge=2)
+    rounds: int = option("EM rounds after each batch", ge=1, le=10**6)
+    rounds_at_end: int = option("EM rounds after the last batch", ge=1, le=10**6)
+    samples: int = option("kernels drawn for the uncertainty reported", ge=2, le=10**4)
 
     def ignored(self, root: Any) -> dict[str, str]:
         """With all sensors on throughout, nothing comes before chosen sets."""

@@ -26,10 +26,14 @@ __all__ = [
     "SingleConfig",
     "TensorboardConfig",
     "WorkersConfig",
+    "MOST_FRAMES",
     "DEVICE",
     "networks",
     "state_bytes",
 ]
+
+MOST_FRAMES = 10**12
+"""Of a run: eleven days at a million frames per second. What asks for more would not end, and is a slip."""
 
 DEVICE = r"auto|cpu|cuda(:\d+)?"
 """Names of devices."""
@@ -69,7 +73,7 @@ class AlgoConfig(ChoiceConfig):
     """
 
     credit: ClassVar[str | None] = "joint"
-    total_frames: int = option("env steps the algorithm needs", unit="frames", ge=1)
+    total_frames: int = option("env steps the algorithm needs", unit="frames", ge=1, le=MOST_FRAMES)
     frames_per_batch: int = option("env steps per collected batch", unit="frames", ge=1)
     envs: int = option("environments stepped together", ge=1)
 
@@ -141,7 +145,7 @@ class DqnConfig(AlgoConfig):
     n_step: int = option("rewards summed before bootstrapping", unit="steps", ge=1, le=64)
     buffer_size: int = option("transitions kept for replay", unit="frames", ge=1)
     batch_size: int = option("transitions per update", unit="frames", ge=1)
-    updates: int = option("updates per collected batch", ge=1)
+    updates: int = option("updates per collected batch", ge=1, le=10**6)
     target_tau: float = option("share of the target network replaced at each update", gt=0, le=1)
     max_grad_norm: float = option("gradients are clipped to this norm", gt=0)
     hidden: int = option("units of the hidden layer", unit="units", ge=1, le=4096)
@@ -171,7 +175,7 @@ class DqnConfig(AlgoConfig):
 class CollectorConfig(ChoiceConfig):
     """Base of the group `collector`: where the frames come from. One frame is one env step of one environment."""
 
-    total_frames: int = option("env steps of the whole run", unit="frames", ge=1)
+    total_frames: int = option("env steps of the whole run", unit="frames", ge=1, le=MOST_FRAMES)
     frames_per_batch: int = option(
         "env steps per collected batch, a multiple of the number of environments", unit="frames", ge=1
     )
@@ -281,7 +285,7 @@ class McapConfig(LogConfig):
     evaluations: int = option(
         "training: from one recorded evaluation to the next; the last is recorded too", unit="evaluations", ge=1
     )
-    episodes: int = option("training: episodes recorded of each such evaluation", unit="episodes", ge=1)
+    episodes: int = option("training: episodes recorded of each such evaluation", unit="episodes", ge=1, le=10**6)
     layout: bool = option("write a viewer's layout next to the log")
 
     def ignored(self, root: Any) -> dict[str, str]:

@@ -48,7 +48,7 @@ class PerSensorConfig(AlgoConfig):
     blend: ScheduleConfig
     ema_decay: float = option("decay of the exponential moving average of the actor, which is evaluated", ge=0, lt=1)
     batch_size: int = option("path segments per update", unit="segments", ge=1)
-    updates: int | None = option("updates of the whole run; null: by the size of the problem", ge=1)
+    updates: int | None = option("updates of the whole run; null: by the size of the problem", ge=1, le=10**9)
     updates_per_iteration: int = option("updates from one evaluation, log row or checkpoint to the next at most", ge=1)
     hidden: int | None = option(
         "units of each net's hidden layer; null: by the size of the problem", unit="units", ge=1, le=4096
@@ -65,17 +65,22 @@ class PerSensorConfig(AlgoConfig):
     )
 
     def check(self, key: str, root: Any) -> None:
-        """`explore` is a probability."""
+        """`explore` is a probability; where whole paths are learned from, episodes have room for one."""
         for end in ("start", "end"):
             if (probability := getattr(self.explore, end)) > 1:
                 raise refuse(f"{key}.explore.{end}", probability, "a number from 0 to 1, a probability")
+        # Tracks of t_max + 3 cells or more, which is what null asks for, are all cut off by a smaller limit.
+        kernel, limit, path = root.kernel, root.grid.max_steps, root.grid.t_max + 2
+        if not (getattr(kernel, "markov", True) or kernel.min_length) and limit is not None and limit < path:
+            expected = f"at least grid.t_max + 2 = {path} with kernel.markov=false, a whole path of a policy"
+            raise refuse("grid.max_steps", limit, expected)
 
     def ignored(self, root: Any) -> dict[str, str]:
         """All sensors on leave nothing to explore."""
         return {} if self.collect == "mixed" else {"explore": "with algo.collect=all_on"}
 
     def memory(self, task: Sizes, root: Any) -> dict[str, int]:
-        """The moves kept, with what sorting them takes; the networks.
+        """The moves kept, with what sorting them takes; the paths of one update; the networks.
 
         A move is two cells of 16 bits. Where moves of different paths do not combine (`markov`), whole paths of
         t_max + 3 cells are kept a second time, sorted.
@@ -84,6 +89,8 @@ class PerSensorConfig(AlgoConfig):
         cells = 2 if task.markov else 2 * (task.t_max + 3)
         return {
             "algo.buffer_size": moves * (cells * BYTES["int16"] + 5 * BYTES["int64"]),
+            # Each of the t_max + 3 cells of a path, and about five numbers that are gathered for it.
+            "algo.batch_size": self.batch_size * (task.t_max + 3) * 6 * BYTES["int64"],
             "algo.hidden": networks(task, self.hidden),
         }
 
