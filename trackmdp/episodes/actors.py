@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from trackmdp.policies.playback import Playback
-from trackmdp.policies.policy import DrawsError, Policy, PolicyLike, as_policy, rule_of
-from trackmdp.policies.unroll import Rule, acting
+from trackmdp.policies.policy import Policy, PolicyLike, as_policy, rule_of
+from trackmdp.policies.unroll import DrawsError, Rule, acting
 from trackmdp.world.costs import Costs
 from trackmdp.world.model import Task
 from trackmdp.world.windows import Window

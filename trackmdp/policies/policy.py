@@ -39,7 +39,7 @@ from trackmdp.policies.unroll import (
 from trackmdp.world.model import Array, Task
 from trackmdp.world.windows import Window
 
-__all__ = ["DrawsError", "Policy", "PolicyLike", "as_policy", "rule_of"]
+__all__ = ["Policy", "PolicyLike", "as_policy", "rule_of"]
 
 PolicyLike: TypeAlias = "PolicyTable | TensorDictModuleBase | Callable[..., Any]"
 """A policy or its table, a TensorDict module, or a function as `Policy.from_function` takes it."""
