@@ -19,7 +19,7 @@ from trackmdp.policies.explore import RenewedTable
 from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
-from trackmdp.solvers import search
+from trackmdp.solvers import exchange
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.kernel_estimate import KernelEstimate, ObservedPaths
 from trackmdp.world.model import Task, World
@@ -57,12 +57,12 @@ class LearnedKernel:
             self._estimate.add(observed_paths(batch, self.task))
             self._spent += [batch.numel(), _sensors_on(batch)]
         self._estimate.fit(self.cfg.rounds_at_end if self._iteration == self.iterations else self.cfg.rounds)
-        plan = search.solve(self._world(self._estimate.mean()))
+        plan = exchange.solve(self._world(self._estimate.mean()))
         self.actor = as_policy(self.task, plan)
         # Acting on a draw, not on the mean: where the estimate is unsure the draws differ, and so moves get sensed that
         # the mean may leave out for good.
         if isinstance(self.policy, RenewedTable) and self._spent[0] >= self._warm_up:
-            self.policy.renew(search.solve(self._world(self._estimate.sample(self._rng))))
+            self.policy.renew(exchange.solve(self._world(self._estimate.sample(self._rng))))
         return self._diagnostics(plan)
 
     def _world(self, kernel: sparse.csr_array) -> World:

@@ -10,6 +10,7 @@ from scipy import sparse
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.bounds import clocked_table, valid
 from trackmdp.solvers.branch import Tree
+from trackmdp.solvers.exchange import exchange
 from trackmdp.solvers.known import first_guess, tables
 from trackmdp.solvers.layers import Layer, policy_table, reachable_layers
 from trackmdp.solvers.search import InnerProblem
@@ -57,7 +58,7 @@ def _tail_table(world: World, tail: Tail) -> Array:
 def _first_set(problem: InnerProblem, layers: list[Layer], mass: Array) -> BoolArray:
     """`[E]` the first set of the best plan from each located cell, on the second layer of `problem`."""
     world, known = problem.world, _known(problem, layers)
-    sets = first_guess(problem, known, mass)
+    sets = exchange(problem, first_guess(problem, known, mass), mass)
     origin, after = problem.layers[:2]
     # one problem per located cell: its undetected mass after the sets carried out so far
     here = sparse.csr_array((mass, (origin.rows, origin.cells)), shape=(world.num_cells, world.num_cells))

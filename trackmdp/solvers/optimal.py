@@ -16,17 +16,18 @@ import numpy as np
 
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers import clocked, search
+from trackmdp.solvers import clocked
 from trackmdp.solvers.bounds import clocked_table
 from trackmdp.solvers.branch import Tree
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import Evaluation
+from trackmdp.solvers.exchange import exchanged
 from trackmdp.solvers.known import next_table
 from trackmdp.solvers.layers import Layer, layer_sets, policy_table, reachable_layers
 from trackmdp.solvers.renewal import RenewalSystem, expected_steps
 from trackmdp.solvers.search import InnerProblem, follow_credit
 from trackmdp.solvers.solution import SearchProgress, Solution
-from trackmdp.world.model import Array, World
+from trackmdp.world.model import Array, BoolArray, World
 
 __all__ = ["solve"]
 
@@ -172,6 +173,7 @@ class _Run:
         layers = self.ground.layers
         # first the policy, then the proof: branch and bound is the faster the better its start
         self.use(policy_table(self.world, layers, follow_credit(self.world, layers, layer_sets(layers, self.policy))))
+        self.use(self.exchanged(layer_sets(layers, self.policy)))
         # Last: what the search finds by itself is the same whatever is handed to it.
         if self.start is not None:
             self.use(self.start)
@@ -214,7 +216,12 @@ class _Run:
             # a plan of the tree senses every possible cell but those left out
             sets.append(np.where(better[layer.rows], (mass > 0) & ~out.has(layer.rows, layer.cells), on))
             mass = mass * (1.0 - sets[-1] * self.world.detects(layer.cells))
-        return self.use(policy_table(self.world, layers, search.improve(self.world, layers, sets)))
+        return self.use(self.exchanged(sets))
+
+    def exchanged(self, sets: list[BoolArray]) -> PolicyTable:
+        """The policy that exchange makes of `sets`."""
+        layers = self.ground.layers
+        return policy_table(self.world, layers, exchanged(self.world, layers, sets, go_on=self.budget.left))
 
     def explore(self, tree: Tree, patience: int) -> None:
         """Run the tree until it is closed or the budget is spent.
