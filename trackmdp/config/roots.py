@@ -9,6 +9,7 @@ from trackmdp.config import learned_kernel, per_sensor  # noqa: F401  (more algo
 from trackmdp.config.baselines import BaselineConfig
 from trackmdp.config.learning import DEVICE, AlgoConfig, CollectorConfig, LogConfig
 from trackmdp.config.options import GROUPS, listed, option, refuse
+from trackmdp.config.partition import PartitionConfig
 from trackmdp.config.schema import NodeConfig
 from trackmdp.config.world import CostConfig, GridConfig, KernelConfig
 from trackmdp.errors import UserError
@@ -136,6 +137,7 @@ class SolveConfig(WorldConfig):
     """Solve the world with its motion model."""
 
     solver: BaselineConfig
+    partition: PartitionConfig
     verify: bool = option("check the paper's theorems on this world as well")
 
 

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from inspect import signature
 from typing import TYPE_CHECKING, Any
 
 from trackmdp.config.baselines import BaselineConfig
 from trackmdp.config.compose import compose, default, given
+from trackmdp.config.partition import PartitionConfig
 from trackmdp.config.registry import make, maker
 from trackmdp.errors import UserError
+from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers.partition import narrow_halo, plan_by_blocks
 from trackmdp.solvers.solution import SearchProgress, Solution, bracketed
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Problem
@@ -29,6 +33,9 @@ def solve(
     nodes: int = default("solver.nodes", "solve"),
     time_limit: float | None = default("solver.time_limit", "solve"),
     on_progress: Callable[[SearchProgress], None] | None = None,
+    block: int | None = default("partition.block", "solve"),
+    halo: int | None = default("partition.halo", "solve"),
+    workers: int = default("partition.workers", "solve"),
     **options: Any,
 ) -> Solution:
     """The policy that a solver finds for `world`, what it earns, and an upper bound on what any policy earns.
@@ -41,6 +48,9 @@ def solve(
         nodes: work after which `optimal` stops closing the bracket, the same on every machine.
         time_limit: seconds after which it stops even so; None: never. Neither is an option of the others.
         on_progress: told how far a search has come, about once a second.
+        block: side of the blocks that plan for themselves (`trackmdp.solvers.partition`); None: the whole grid at once.
+        halo: cells around its own that a block knows of; None: as many as lose nothing.
+        workers: processes that plan blocks; the result does not depend on it.
         **options: the solver's own, such as ``depth=3`` (``trackmdp solve --help`` lists them).
 
     Raises:
@@ -54,19 +64,40 @@ def solve(
     """
     own = {f"solver.{name}": value for name, value in options.items()}
     named = given({"solver": solver, "solver.nodes": nodes, "solver.time_limit": time_limit})
-    return run_solver(world, compose("solve", named | own).solver, on_progress)
+    blocks = given({"partition.block": block, "partition.halo": halo, "partition.workers": workers})
+    cfg = compose("solve", named | own | blocks)
+    solution = run_solver(world, cfg.solver, on_progress, cfg.partition)
+    if said := narrow_halo(world, cfg.partition, solution):
+        warnings.warn(said, stacklevel=2)
+    return solution
 
 
 def run_solver(
-    world: World, choice: BaselineConfig, on_progress: Callable[[SearchProgress], None] | None = None
+    world: World,
+    choice: BaselineConfig,
+    on_progress: Callable[[SearchProgress], None] | None = None,
+    partition: PartitionConfig | None = None,
 ) -> Solution:
     """What the solver of a config finds; a policy without a proof is bracketed by the clocked bound."""
     if not isinstance(world, World):
         raise UserError(f"solver={choice.name}: needs a motion model; recorded tracks have none")
-    watched = {"on_progress": on_progress} if "on_progress" in signature(maker(choice)).parameters else {}
     started = time.monotonic()
+    if partition is not None and partition.block is not None:
+        table = plan_by_blocks(world, _Planner(choice), partition)
+        return bracketed(world, table, time.monotonic() - started)
+    watched = {"on_progress": on_progress} if "on_progress" in signature(maker(choice)).parameters else {}
     made = make(choice, world, **watched)
     return made if isinstance(made, Solution) else bracketed(world, made, time.monotonic() - started)
+
+
+@dataclass(frozen=True)
+class _Planner:
+    """The policy that a solver of the config finds for a block; picklable, to be sent to workers."""
+
+    choice: BaselineConfig
+
+    def __call__(self, world: World) -> PolicyTable:
+        return run_solver(world, self.choice).table
 
 
 def baseline_policy(problem: Problem, choice: BaselineConfig) -> Policy:

@@ -15,6 +15,7 @@ from trackmdp.policies.saved import sets_name, write_sets
 from trackmdp.solvers import bounds, qmdp
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import regret_per_step
+from trackmdp.solvers.partition import narrow_halo
 from trackmdp.solvers.solution import SearchProgress, Solution
 from trackmdp.solvers.solve import run_solver
 from trackmdp.training.display import make_console, table
@@ -41,11 +42,13 @@ def run(cfg: SolveConfig, folder: Path, problem: Problem | None = None) -> float
     world = build_world(cfg) if problem is None else problem
     assert isinstance(world, World)  # recorded tracks are refused: there is no kernel to solve with
     with _SearchDisplay(console, f"solve {cfg.solver.name}") as display:
-        solution = run_solver(world, cfg.solver, display.update)
+        solution = run_solver(world, cfg.solver, display.update, cfg.partition)
     bound = {name: float(each(world).mean()) for name, each in _BOUNDS.items()}
     arrays = write_sets(folder, solution.table, value=solution.value, upper_value=solution.bound)
     write_json(folder / "solution.json", _report(cfg, solution, bound) | arrays)
     _show(console, cfg, world, solution, bound, folder)
+    if said := narrow_halo(world, cfg.partition, solution):
+        console.print(f"warning: {said}")
     # After the results are written: the command still ends with the status of an interruption.
     if solution.interrupted:
         raise KeyboardInterrupt

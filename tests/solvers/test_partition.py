@@ -1,0 +1,144 @@
+"""Blocks with a halo: what they see, what they own, and what the policy put together from their plans is worth."""
+
+from __future__ import annotations
+
+import os
+import signal
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import sparse
+
+import trackmdp as tm
+from trackmdp.app.cli import main
+from trackmdp.config.compose import compose
+from trackmdp.errors import UserError
+from trackmdp.solvers.partition import Block, blocks, default_halo, plan_by_blocks, reach, sub_world
+from trackmdp.solvers.solve import run_solver
+from trackmdp.solvers.workers import run_jobs
+from trackmdp.world.model import World
+
+
+def line(cells: int) -> World:
+    """A line of cells; the target moves one to the right with .5, two with .4."""
+    kernel = np.diag(np.full(cells - 1, 0.5), 1) + np.diag(np.full(cells - 2, 0.4), 2)
+    return World(kernel, (1, cells), cost=np.arange(1, cells + 1) / 100, t_max=1)
+
+
+def test_blocks_own_every_cell_once_and_see_their_halo() -> None:
+    parts = blocks((10, 10), 4, 2)
+    assert len(parts) == 9
+    assert parts[1] == Block(own=(range(4), range(4, 8)), seen=(range(6), range(2, 10)))
+    owned = np.zeros((10, 10), dtype=int)
+    for part in parts:
+        owned[np.ix_(*part.own)] += 1
+    assert (owned == 1).all()
+
+
+def test_what_leaves_a_rectangle_has_exited() -> None:
+    part = sub_world(line(6), (range(1), range(2, 5)))
+    assert part.size == (1, 3)
+    np.testing.assert_allclose(part.kernel.toarray(), [[0, 0.5, 0.4], [0, 0, 0.5], [0, 0, 0]])
+    np.testing.assert_allclose(part.cost, [0.03, 0.04, 0.05])
+    assert part.safe_cost == line(6).safe_cost
+
+
+def test_a_rectangle_has_the_moves_of_the_whole_grid() -> None:
+    world = tm.make_world("random_support", size=[7, 9], support_size=4)
+    cells = (np.arange(2, 6)[:, None] * 9 + np.arange(3, 8)).ravel()
+    part = sub_world(world, (range(2, 6), range(3, 8)))
+    assert np.array_equal(part.kernel.toarray(), world.kernel.toarray()[np.ix_(cells, cells)])
+
+
+def test_the_reach_is_that_of_the_longest_move() -> None:
+    assert reach(line(6)) == 2
+    assert default_halo(line(6)) == 6
+    kernel = sparse.csr_array(([0.5], ([1], [9])), shape=(16, 16))  # two rows down
+    assert reach(World(kernel, 4, cost=0.1, t_max=0)) == 2
+
+
+@pytest.mark.parametrize(("cost", "t_max"), [(0.16, 1), (0.22, 2)])
+def test_with_the_default_halo_blocks_lose_nothing_and_without_one_they_do(cost: float, t_max: int) -> None:
+    world = tm.make_world("random_support", size=14, support_size=5, radius=1, cost=cost, t_max=t_max, safe_cost=8)
+    whole = tm.solve(world)
+    wide = tm.solve(world, block=5)
+    assert whole.lower - wide.lower <= 1e-4 * whole.evaluation.expected_length
+    with pytest.warns(UserWarning, match="partition.halo=0: below") as said:
+        none = tm.solve(world, block=5, halo=0)
+    lost = (whole.lower - none.lower) / none.evaluation.expected_length
+    assert lost > 0.05
+    stated = float(str(said[0].message).split("at most ")[1].split()[0])
+    assert lost <= stated + 5e-5
+
+
+def test_the_policy_of_blocks_is_bounded_on_the_whole_grid() -> None:
+    world = tm.make_world("random_support", size=12, support_size=5, cost=0.16, safe_cost=16)
+    found, whole = tm.solve(world, block=6), tm.solve(world)
+    assert found.certified
+    assert found.lower == pytest.approx(whole.lower, abs=1e-9)
+    assert np.array_equal(found.table.sets.indices, whole.table.sets.indices)  # type: ignore[union-attr]
+
+
+def test_two_workers_find_the_same_bytes_as_one() -> None:
+    cfg = compose("solve", {"partition.block": 4, "grid.size": 8})
+    world = tm.make_world("random_support", size=8, support_size=5, cost=0.22)
+    alone = run_solver(world, cfg.solver, None, cfg.partition).table.sets
+    cfg.partition.workers = 2
+    together = run_solver(world, cfg.solver, None, cfg.partition).table.sets
+    assert alone is not None
+    assert together is not None
+    assert alone.indices.tobytes() == together.indices.tobytes()
+    assert alone.indptr.tobytes() == together.indptr.tobytes()
+
+
+@dataclass(frozen=True)
+class Dies:
+    """Squares a number; the first process that gets 2 is killed, as for lack of memory, and any that gets 3."""
+
+    folder: Path
+    always: bool = False
+
+    def __call__(self, number: int) -> int:
+        mark = self.folder / "killed"
+        if number == 2 and (self.always or not mark.exists()):
+            mark.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        if number == 9:
+            raise UserError("nine")
+        return number * number
+
+
+@pytest.mark.parametrize("cluster", [None, pytest.param("local", marks=pytest.mark.slow)])
+def test_what_a_killed_worker_had_is_done_again(tmp_path: Path, cluster: str | None) -> None:
+    if cluster:
+        pytest.importorskip("ray")
+    assert run_jobs(Dies(tmp_path), range(5), workers=2, cluster=cluster) == [0, 1, 4, 9, 16]
+    assert (tmp_path / "killed").exists()
+    with pytest.raises(UserError, match="nine"):
+        run_jobs(Dies(tmp_path), [9], workers=2, cluster=cluster)
+
+
+def test_a_job_that_kills_every_worker_ends_in_one_line(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="workers died 3 times"):
+        run_jobs(Dies(tmp_path, always=True), [2], workers=2)
+
+
+def test_a_policy_that_draws_cannot_be_put_together() -> None:
+    def half(world: World) -> tm.Policy:
+        return tm.Policy(world, probability=0.5)
+
+    cfg = compose("solve", {"partition.block": 4, "grid.size": 8}).partition
+    with pytest.raises(UserError, match="does not draw"):
+        plan_by_blocks(tm.make_world(size=8), half, cfg)
+
+
+def test_blocks_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["solve", "grid.size=8", f"hydra.run.dir={tmp_path / 'a'}"]
+    assert main([*words, "partition.block=4", "partition.halo=1"]) == 0
+    assert "warning: partition.halo=1: below 3 = R (T_max + 2)" in " ".join(capsys.readouterr().out.split())
+    assert main([*words, "partition.halo=1"]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "partition.halo=1: without effect without partition.block" in error

@@ -1,0 +1,189 @@
+"""Sub-grids with a hand-off: square blocks of a large grid plan for themselves, and the whole is valued at the end.
+
+Each block sees its own cells and a halo of some cells around them; what lies farther away is the exit. It owns the
+plans of its own cells alone: whoever owns the cell the target was last located in decides, also about sensors beyond
+its border. That is all the hand-off there is.
+
+From a located cell the target comes at most R (t_max + 2) cells far before it is located again, R being the reach of a
+move, so that with a halo as wide a block knows all that its plans depend on but the worth of the places where the
+target is located next. An error of that worth that is the same in all of them changes no decision: only where two
+places are off by different amounts do plans differ, and that difference fades with each renewal (theory-extensions:
+section 1). What is left is not guessed but proved: policy and bound are those of the whole grid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise, product
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from trackmdp.config.partition import PartitionConfig
+from trackmdp.errors import UserError
+from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers.layers import sensed_csr
+from trackmdp.solvers.renewal import IndexArray, row_index
+from trackmdp.solvers.solution import Solution
+from trackmdp.solvers.workers import run_jobs
+from trackmdp.world.model import World
+
+__all__ = ["Block", "blocks", "default_halo", "narrow_halo", "plan_by_blocks", "reach", "sub_world"]
+
+Planner: TypeAlias = "Callable[[World], PolicyTable]"
+Rectangle: TypeAlias = tuple[range, range]
+"""Rows and columns of the grid."""
+
+_JOBS = 64
+"""Jobs that the blocks of a grid are put into: a worker that dies loses one, and each costs a message."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """A block's `own` cells, and all that it sees: those and its halo, cut off at the border of the grid."""
+
+    own: Rectangle
+    seen: Rectangle
+
+
+def reach(world: World) -> int:
+    """R, the most rows or columns that a move can lead away."""
+    row, column = np.divmod(row_index(world.kernel), world.columns)
+    to_row, to_column = np.divmod(world.kernel.indices, world.columns)
+    return int(np.maximum(np.abs(row - to_row), np.abs(column - to_column)).max(initial=0))
+
+
+def default_halo(world: World) -> int:
+    """R (t_max + 2), how far away the target can be located next: t_max + 1 free choices and the safe action."""
+    return reach(world) * (world.t_max + 2)
+
+
+def blocks(size: tuple[int, int], side: int, halo: int) -> list[Block]:
+    """The blocks of a grid, row by row; those at its end may be smaller.
+
+    Of 10 x 10 cells with side 4 and halo 2, the second block owns columns 4 to 7 of rows 0 to 3 and sees columns 2 to 9
+    of rows 0 to 5.
+    """
+    cuts = [[*range(0, length, side), length] for length in size]
+
+    def widened(begin: int, end: int, length: int) -> range:
+        return range(max(begin - halo, 0), min(end + halo, length))
+
+    return [
+        Block((range(*rows), range(*columns)), (widened(*rows, size[0]), widened(*columns, size[1])))
+        for rows, columns in product(pairwise(cuts[0]), pairwise(cuts[1]))
+    ]
+
+
+def sub_world(world: World, seen: Rectangle) -> World:
+    """The world inside a rectangle of the grid; whoever leaves it has exited."""
+    rows, columns = seen
+    cells = _cells(world, seen)
+    moves = world.kernel[cells]
+    # Not by kernel[cells][:, cells], which takes M steps for each block. With 10 columns, cell 57 is (5, 7): in the
+    # rectangle of rows 4 to 8 and columns 6 to 8 it is (1, 1), number 1 * 3 + 1 = 4.
+    row, column = np.divmod(moves.indices, world.columns)
+    row, column = row - rows.start, column - columns.start
+    inside = (row >= 0) & (row < len(rows)) & (column >= 0) & (column < len(columns))
+    start = row_index(moves)[inside]
+    place = (start, (row * len(columns) + column)[inside])
+    kernel = type(moves)((moves.data[inside], place), shape=(len(cells), len(cells)))
+    own = {name: getattr(world, name)[cells] for name in ("cost", "detection", "safe_detection")}
+    return World.of(world, kernel, size=(len(rows), len(columns)), **own)
+
+
+def plan_by_blocks(world: World, plan: Planner, partition: PartitionConfig) -> PolicyTable:
+    """The policy put together from the plans of all blocks; the same bits however many workers there are.
+
+    Args:
+        world: the whole grid.
+        plan: gives the deterministic policy of a block, and must not depend on a clock.
+        partition: side of the blocks, halo, workers.
+
+    Raises:
+        UserError: a policy that draws was planned, or Ray is asked for and not there.
+    """
+    assert partition.block is not None
+    halo = default_halo(world) if partition.halo is None else partition.halo
+    parts = blocks(world.size, partition.block, halo)
+    jobs = _Jobs(world, parts)
+    done = run_jobs(_PlanJob(plan, world.columns), jobs, workers=partition.workers, cluster=partition.cluster)
+    sensed = [_joined([job[n] for job in done]) for n in range(world.num_choices)]
+    return PolicyTable(world, sensed_csr(world, sensed))
+
+
+def narrow_halo(world: World, partition: PartitionConfig, solution: Solution) -> str | None:
+    """What to say of a halo that may lose something: the most it can have lost; None of one that is wide enough."""
+    wide = default_halo(world)
+    if partition.block is None or partition.halo is None or partition.halo >= wide:
+        return None
+    lost = max(solution.upper - solution.lower + solution.evaluation.error, 0.0) / solution.evaluation.expected_length
+    return (
+        f"partition.halo={partition.halo}: below {wide} = R (T_max + 2), so blocks do not see all that they decide on; "
+        f"at most {lost:.4f} per step is lost"
+    )
+
+
+class _Jobs(Sequence[list[tuple[World, Block]]]):
+    """Some blocks in a row each, with their worlds, made when asked for: no worker needs the rest of the grid."""
+
+    def __init__(self, world: World, parts: Sequence[Block]) -> None:
+        self._world, self._parts = world, parts
+        self._ends = np.linspace(0, len(parts), min(_JOBS, len(parts)) + 1).astype(int)
+
+    def __len__(self) -> int:
+        return len(self._ends) - 1
+
+    def __getitem__(self, number: Any) -> Any:
+        if not 0 <= number < len(self):
+            raise IndexError(number)
+        parts = self._parts[self._ends[number] : self._ends[number + 1]]
+        return [(sub_world(self._world, each.seen), each) for each in parts]
+
+
+@dataclass(frozen=True)
+class _PlanJob:
+    """Plans some blocks: for each n the sensed (located cells, sensors) of the whole grid, of their own cells alone."""
+
+    plan: Planner
+    columns: int
+
+    def __call__(self, job: Sequence[tuple[World, Block]]) -> list[tuple[IndexArray, IndexArray]]:
+        found = [self._block(*each) for each in job]
+        return [_joined([part[n] for part in found]) for n in range(len(found[0]))]
+
+    def _block(self, world: World, block: Block) -> list[tuple[IndexArray, IndexArray]]:
+        table = self.plan(world)
+        if not table.deterministic:
+            raise UserError("partition.block: expected a solver whose policy does not draw")
+        # A single probability of 0 or 1 for all sensors says nothing about the world beyond the halo.
+        sets = table.sets if table.sets is not None else PolicyTable.from_dense(world, table.dense()).sets
+        assert sets is not None
+        rows, columns = block.seen
+        everywhere = (np.array(rows)[:, None] * self.columns + np.array(columns)).ravel()
+        own = np.zeros((len(rows), len(columns)), dtype=bool)
+        own[_within(block.own[0], rows), _within(block.own[1], columns)] = True
+        state, sensor = row_index(sets), sets.indices
+        # Row 7 of a table with two choices is cell 3 after one miss.
+        cell, n = np.divmod(state, world.num_choices)
+        kept = own.ravel()[cell]
+        return [
+            (everywhere[cell[kept & (n == each)]], everywhere[sensor[kept & (n == each)]])
+            for each in range(world.num_choices)
+        ]
+
+
+def _joined(parts: Sequence[tuple[IndexArray, IndexArray]]) -> tuple[IndexArray, IndexArray]:
+    """Located cells and sensors of several parts end to end."""
+    return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
+
+
+def _cells(world: World, part: Rectangle) -> IndexArray:
+    """Numbers of the cells of a rectangle, row by row."""
+    rows, columns = part
+    return (np.array(rows)[:, None] * world.columns + np.array(columns)).ravel()
+
+
+def _within(inner: range, outer: range) -> slice:
+    return slice(inner.start - outer.start, inner.stop - outer.start)
