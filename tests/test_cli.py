@@ -140,7 +140,7 @@ def test_price_files_are_checked_before_a_folder_is_made(tmp_path: Path, capsys:
     (tmp_path / "broken.csv").write_text("a,b\n")
     for name, message in (
         ("short.csv", "3 values, expected 9"),
-        ("negative.csv", "cell 4 costs -2.0"),
+        ("negative.csv", "cell 4 has -2.0"),
         ("broken.csv", "not a table of numbers"),
     ):
         assert message in refused(capsys, "train", "grid.size=3", f"cost.sensor=../{name}")

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Prepared", "announce", "check", "prepare", "say", "shown", "typed_config"]
 
-WORLD_KEYS = ("grid", "kernel", "cost")
+WORLD_KEYS = ("grid", "kernel", "cost", "sensor")
 
 
 def typed_config(command: str, cfg: DictConfig, folder: Path) -> CommandConfig:
@@ -165,7 +165,8 @@ def _reads_files(cfg: WorldConfig) -> bool:
     """Whether building the world can still fail: it is read from files, or its target may never exit."""
     # Where the target never exits, the undiscounted value is infinite, which only building the world finds out.
     exits = getattr(cfg.kernel, "exit_probability", 0.0) > 1e-9
-    return not exits or isinstance(getattr(cfg.cost, "sensor", None), str)
+    tables = [getattr(cfg.cost, "sensor", None), *vars(cfg.sensor).values()]
+    return not exits or any(isinstance(table, str) for table in tables)
 
 
 def _check_files(cfg: CommandConfig, words: Sequence[str]) -> None:

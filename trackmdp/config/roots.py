@@ -11,7 +11,7 @@ from trackmdp.config.learning import DEVICE, AlgoConfig, CollectorConfig, LogCon
 from trackmdp.config.options import GROUPS, listed, option, refuse
 from trackmdp.config.partition import PartitionConfig
 from trackmdp.config.schema import NodeConfig
-from trackmdp.config.world import CostConfig, GridConfig, KernelConfig
+from trackmdp.config.world import CostConfig, GridConfig, KernelConfig, SensorConfig
 from trackmdp.errors import UserError
 
 __all__ = [
@@ -48,6 +48,7 @@ class WorldConfig(CommandConfig):
     grid: GridConfig
     kernel: KernelConfig
     cost: CostConfig
+    sensor: SensorConfig
 
 
 @dataclass(kw_only=True)
@@ -171,6 +172,11 @@ class BenchmarkConfig(WorldConfig):
         path=True,
     )
     peers_seconds: float = option("`peers`: how long a peer learns", unit="s", gt=0)
+
+    def check(self, key: str, root: Any) -> None:
+        """What the peers are made for."""
+        if self.part == "peers" and self.sensor.name != "perfect":
+            raise refuse("sensor", self.sensor.name, "perfect with part=peers, whose scripts know no other")
 
 
 @dataclass(kw_only=True)

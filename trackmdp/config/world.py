@@ -16,8 +16,11 @@ __all__ = [
     "DriftConfig",
     "GridConfig",
     "KernelConfig",
+    "MissConfig",
+    "PerfectSensorConfig",
     "RandomSupportConfig",
     "RandomWalkConfig",
+    "SensorConfig",
     "TableConfig",
     "TracksConfig",
 ]
@@ -203,23 +206,64 @@ class PaperCostConfig(CostConfig):
 
     def check(self, key: str, root: Any) -> None:
         """One price for all sensors, or one for each; a file is read later."""
-        cells, price = root.grid.num_cells, self.sensor
-        expected = (
-            f"a number from 0 to 1e15, a list of {cells} of them (one per cell), or a path to a .npy or .csv file"
-        )
-        if isinstance(price, str):
-            if Path(price).suffix not in (".npy", ".csv"):
-                raise refuse(f"{key}.sensor", price, expected)
-            return
-        # `sensor` is declared Any, since OmegaConf has no union of number, list and text; so its values are checked
-        # here.
-        number = Option("", ge=0, le=LARGEST, kind=float)
-        if not isinstance(price, list):
-            if price is None or not number.allows(price):
-                raise refuse(f"{key}.sensor", price, expected)
-            return
-        if len(price) != cells:
-            raise UserError(f"{key}.sensor: {len(price)} values, expected one number or {cells} (one per cell)")
-        for index, value in enumerate(price):
-            if value is None or not number.allows(value):
-                raise refuse(f"{key}.sensor[{index}]", value, "a number from 0 to 1e15")
+        price = Option("", ge=0, le=LARGEST, kind=float)
+        _check_per_cell(f"{key}.sensor", self.sensor, root, price, "number from 0 to 1e15")
+
+
+@dataclass(kw_only=True)
+class SensorConfig(ChoiceConfig):
+    """Base of the group `sensor`: what a sensor that is on sees of the target in its cell.
+
+    What a choice makes is called with the grid's size and the choice's options, and returns arguments of `Task`.
+    """
+
+
+@choice("sensor", "perfect", makes="trackmdp.world.sensors:perfect")
+@dataclass(kw_only=True)
+class PerfectSensorConfig(SensorConfig):
+    """The paper's sensors: one that is on always locates the target in its cell."""
+
+
+@choice("sensor", "miss", makes="trackmdp.world.sensors:miss")
+@dataclass(kw_only=True)
+class MissConfig(SensorConfig):
+    """Sensors that miss: one that is on reports the target in its cell with probability p_d, and never another cell."""
+
+    p_d: Any = option(
+        "p_d, probability that a sensor that is on reports the target in its cell, for all cells or for each",
+        expects="a number above 0, at most 1, a list of one per cell, or a path to a .npy or .csv file of one per cell",
+        path=True,
+    )
+    p_s: Any = option(
+        "p_s, the same of the safe action; below 1 it is repeated, at its full price, until it locates the target",
+        expects="a number above 0, at most 1, a list of one per cell, or a path to a .npy or .csv file of one per cell",
+        path=True,
+    )
+
+    def check(self, key: str, root: Any) -> None:
+        """One probability for all cells, or one for each; a file is read later."""
+        for name in ("p_d", "p_s"):
+            number = Option("", gt=0, le=1, kind=float)
+            _check_per_cell(f"{key}.{name}", getattr(self, name), root, number, "number above 0, at most 1")
+
+
+def _check_per_cell(key: str, value: Any, root: Any, number: Option, allowed: str) -> None:
+    """Refuse what is neither one number for all cells, nor a list of one for each, nor the name of a table.
+
+    Such options are declared Any, since OmegaConf has no union of number, list and text; so values are checked here.
+
+    Raises:
+        UserError: it is something else.
+    """
+    cells = root.grid.num_cells
+    if isinstance(value, list):
+        if len(value) != cells:
+            raise UserError(f"{key}: {len(value)} values, expected one number or {cells} (one per cell)")
+        for index, each in enumerate(value):
+            if each is None or not number.allows(each):
+                raise refuse(f"{key}[{index}]", each, f"a {allowed}")
+        return
+    fine = Path(value).suffix in (".npy", ".csv") if isinstance(value, str) else number.allows(value)
+    if value is None or not fine:
+        expected = f"a {allowed}, a list of {cells} of them (one per cell), or a path to a .npy or .csv file"
+        raise refuse(key, value, expected)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from scipy import sparse
 from torch import Tensor
@@ -24,7 +26,7 @@ def beliefs(world: World, episodes: Sequence[Episode]) -> list[Floats]:
     exact, into = BeliefFilter(world.kernel), world.kernel.T.tocsr()
     lengths = torch.tensor([len(episode) for episode in episodes])
     first = lengths.cumsum(0) - lengths
-    action = torch.as_tensor(np.concatenate([episode.action for episode in episodes]))
+    action = torch.as_tensor(np.concatenate([_reported(world, episode) for episode in episodes]))
     target = torch.as_tensor(np.concatenate([episode.target for episode in episodes]))
     located = torch.as_tensor(np.concatenate([episode.located for episode in episodes]))
     found = torch.zeros(len(target), world.num_cells)
@@ -41,6 +43,14 @@ def beliefs(world: World, episodes: Sequence[Episode]) -> list[Floats]:
         seen = exact.detect(target[step] * located[step])
         belief = torch.where(located[step, None], seen, exact.miss(predicted, action[step]))
     return [part.numpy() for part in found.split(lengths.tolist())]
+
+
+def _reported(world: World, episode: Episode) -> npt.NDArray[Any]:
+    """`[T, M]` probability that a step reports a target in each cell; the action itself where reports are certain."""
+    if world.perfect and world.safe:
+        return episode.action
+    forced = episode.misses > world.t_max
+    return np.where(forced[:, None], world.safe_detection, episode.action * world.detection)
 
 
 def _predict(into: sparse.csr_array, belief: Tensor) -> Tensor:

@@ -91,11 +91,11 @@ class Episode:
         """
         t_max, max_steps = task.t_max, task.max_steps
         action = Window.of(task).to_local(torch.from_numpy(self.last_cell), torch.from_numpy(self.action)).numpy()
-        history = _history(action, self.misses, t_max)
+        history = _history(action, self.misses, self.located, t_max)
         # n after step t is n before step t + 1; behind the last step there is none to look it up in, so it follows
         # from the outcome.
         after = np.concatenate([self.misses[1:], [0]])
-        after[-1] = 0 if self.located[-1] or self.terminated else self.misses[-1] + 1
+        after[-1] = 0 if self.located[-1] or self.terminated else min(self.misses[-1] + 1, t_max + 1)
         following = {
             "last_cell": np.where(self.located, self.target, self.last_cell),
             "steps_since_detection": after,
@@ -123,19 +123,22 @@ class Episode:
         if self.located[-1] or self.terminated:
             return np.zeros_like(history)
         kept = history.copy()
-        kept[min(int(self.misses[-1]), t_max)] = action
+        if self.misses[-1] <= t_max:  # an action that the safe one replaced is none
+            kept[self.misses[-1]] = action
         return kept
 
 
-def _history(action: BoolArray, misses: Integers, t_max: int) -> BoolArray:
+def _history(action: BoolArray, misses: Integers, located: BoolArray, t_max: int) -> BoolArray:
     """`[T, t_max+1, K]` h before each step: slot s holds the action at s misses, empty from slot n on.
 
-    Step t with n misses before it has in slot s the action of step t - n + s.
+    That is the action of the s-th step after the last detection, from 0 on; the safe action, however often it is
+    repeated, comes behind all slots.
     """
     # Example: misses 0 1 2 0 (located by the third step), t_max = 2. Before step 2, n = 2: slot 0 is the action of
     # step 0, slot 1 that of step 1, slot 2 is empty.
     slots = np.arange(t_max + 1)
-    steps = np.arange(len(misses))[:, None] - misses[:, None] + slots
+    found = np.where(located, np.arange(len(misses)) + 1, 0)
+    steps = np.concatenate([[0], np.maximum.accumulate(found)[:-1]])[:, None] + slots
     filled = slots < misses[:, None]
     # Empty slots point at steps that are not theirs: they read step 0 instead, and the mask clears what they read.
     return action[np.where(filled, steps, 0)] & filled[..., None]

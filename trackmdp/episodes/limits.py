@@ -13,7 +13,7 @@ from typing import Any
 
 from trackmdp.episodes import schema
 
-__all__ = ["check_policy", "check_row", "check_run", "check_steps", "size_of_grid"]
+__all__ = ["check_policy", "check_row", "check_run", "check_steps", "size_of_grid", "tables_of"]
 
 _MOST = 10**9
 """Steps, episodes, T_max: beyond any log, and small enough to be multiplied without overflow."""
@@ -46,6 +46,12 @@ def check_run(run: Mapping[str, str]) -> None:
 def size_of_grid(run: Mapping[str, str]) -> tuple[int, int]:
     """(rows, columns) of a log's grid; `columns` is said of rectangles alone."""
     return int(run["size"]), int(run.get("columns") or run["size"])
+
+
+def tables_of(run: Mapping[str, str]) -> tuple[str, ...]:
+    """The attachments that a log's world and config are read from; `sensors.npy` only where sensors may miss."""
+    every = ("config.yaml", "kernel.npy", "cost.npy")
+    return (*every, "sensors.npy") if "sensors.npy.sha256" in run else every
 
 
 def check_policy(facts: Mapping[str, str], cells: int) -> None:

@@ -204,7 +204,9 @@ class EpisodeReader:
 
     def _world(self) -> World:
         run = self.run
-        kernel, cost = (_load(self.attachment(name)) for name in ("kernel.npy", "cost.npy"))
+        # Kernel and prices, and where sensors may miss `[2, M]`, p_d and p_s.
+        kernel, cost, *sensors = (_load(self.attachment(name)) for name in limits.tables_of(run)[1:])
+        may_miss = dict(zip(("detection", "safe_detection"), sensors[0], strict=True)) if sensors else {}
         return World(
             kernel,
             limits.size_of_grid(run),
@@ -214,12 +216,13 @@ class EpisodeReader:
             reward=float(run["reward"]),
             max_steps=self.max_steps,
             window=int(run["window"]) if run.get("window") else None,
+            **may_miss,
         )
 
     def check_all(self) -> None:
         """Check every byte of the file, those without meaning to this reader included."""
         self._checked(self._container.check_data)
-        for name in ("config.yaml", "kernel.npy", "cost.npy"):
+        for name in limits.tables_of(self.run):
             self.attachment(name)
         for number in range(len(self.policies)):
             self.policy_table(number)

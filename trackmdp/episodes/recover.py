@@ -13,7 +13,7 @@ from typing import Any
 
 from trackmdp.episodes import container, schema
 from trackmdp.episodes.container import Damaged
-from trackmdp.episodes.limits import check_policy, check_row, size_of_grid
+from trackmdp.episodes.limits import check_policy, check_row, size_of_grid, tables_of
 from trackmdp.episodes.messages import decode
 from trackmdp.episodes.reader import checked_run
 from trackmdp.episodes.writer import EpisodeWriter
@@ -24,8 +24,6 @@ __all__ = ["Recovered", "recover", "recovered_name", "taken_over"]
 
 _MOST_HELD = 2**28
 """Bytes of one episode's messages."""
-
-_TABLES = ("config.yaml", "kernel.npy", "cost.npy")
 
 
 @dataclass(frozen=True)
@@ -179,7 +177,7 @@ def _begin(file: Path, target: Path, found: _Found) -> EpisodeWriter | None:
     if schema.RUN not in found.metadata:
         return None
     run = checked_run(file, found.metadata[schema.RUN])
-    tables = {name: found.attachments.get(name, b"") for name in _TABLES}
+    tables = {name: found.attachments.get(name, b"") for name in tables_of(run)}
     # Without the kernel and the prices that it names, the log could not be simulated again; a copy would look whole.
     if any(schema.digest(content) != run.get(f"{name}.sha256") for name, content in tables.items()):
         return None

@@ -18,6 +18,7 @@ from trackmdp.policies.playback import Playback
 from trackmdp.policies.policy import PolicyLike
 from trackmdp.seeding import derive, preserved_global_rng
 from trackmdp.world.costs import Costs
+from trackmdp.world.reports import Reports
 from trackmdp.world.tracks import Problem
 
 __all__ = ["episode_seeds", "resimulate", "simulate"]
@@ -54,20 +55,20 @@ def episode_seeds(seed: int, episodes: int, *names: str | int) -> list[int]:
 @torch.no_grad()
 def resimulate(problem: Problem, policy: PolicyLike | Playback, seeds: Sequence[int]) -> Episodes:
     """One episode for each of `seeds`, in their order; each the same whatever the others are. See `simulate`."""
-    costs, source = Costs(problem), source_of(problem)
+    costs, reports, source = Costs(problem), Reports(problem), source_of(problem)
     actor = actor_of(problem.task, policy, costs)
     at_once = [seeds[begin : begin + actor.most_rows] for begin in range(0, len(seeds), actor.most_rows)]
     with preserved_global_rng():
         # What a function or module draws from torch's global generator is then the same in every call.
         torch.manual_seed(derive(seeds[0] if seeds else 0, "policy"))
-        parts = [_Batch(problem, source, actor, costs, some).run() for some in at_once]
+        parts = [_Batch(problem, source, actor, (costs, reports), some).run() for some in at_once]
     return Episodes.of(problem, actor.policy, seeds, parts)
 
 
 class _Draws:
-    """Uniform draws of many episodes, each from two generators of its own: one for the moves, one for the choices."""
+    """Uniform draws of many episodes, each from generators of its own: for the moves, the choices and the reports."""
 
-    def __init__(self, source: Source, seeds: Sequence[int], per_choice: int) -> None:
+    def __init__(self, source: Source, seeds: Sequence[int], per_choice: int, *, certain: bool) -> None:
         self._source, self._per_choice = source, per_choice
         # A generator for each episode, not one for the batch: what an episode draws must not depend on how many others
         # run beside it, nor on when they end. Moves and choices apart, so that two policies with one seed meet the
@@ -77,13 +78,17 @@ class _Draws:
         if per_choice:
             self._of_choices = [torch.Generator().manual_seed(derive(seed, "policy")) for seed in seeds]
         self._choices = torch.zeros(len(seeds), _BLOCK, per_choice)
+        self._seen: Tensor | None = None
+        if not certain:
+            self._of_reports = [torch.Generator().manual_seed(derive(seed, "report")) for seed in seeds]
+            self._seen = torch.zeros(len(seeds), _BLOCK, dtype=torch.float64)
 
     def starts(self) -> Tensor:
         """`[B]` places; taken before any move."""
         return self._source.start(self._of_moves)
 
-    def at(self, step: int, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Draws of the moves `[R]` and of the choices `[R, per_choice]` of the episodes `rows` `[R]` at a step."""
+    def at(self, step: int, rows: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Draws of moves `[R]`, choices `[R, per_choice]` and reports `[R]` of the episodes `rows` `[R]` at a step."""
         place = step % _BLOCK
         # At steps 0, 256, 512, ...: all running episodes are at the same step, and refill together; ended ones draw no
         # more.
@@ -92,7 +97,10 @@ class _Draws:
                 self._moves[row] = self._source.draw(_BLOCK, self._of_moves[row])
                 if self._per_choice:
                     self._choices[row] = torch.rand(_BLOCK, self._per_choice, generator=self._of_choices[row])
-        return self._moves[rows, place], self._choices[rows, place]
+                if self._seen is not None:
+                    self._seen[row] = torch.rand(_BLOCK, dtype=torch.float64, generator=self._of_reports[row])
+        seen = None if self._seen is None else self._seen[rows, place]
+        return self._moves[rows, place], self._choices[rows, place], seen
 
 
 @dataclass(frozen=True)
@@ -112,9 +120,12 @@ class _At:
 class _Batch:
     """Episodes stepped together; each leaves the batch with its end."""
 
-    def __init__(self, problem: Problem, source: Source, actor: Actor, costs: Costs, seeds: Sequence[int]) -> None:
-        self._task, self._source, self._actor, self._costs = problem, source, actor, costs
-        self._draws = _Draws(source, seeds, actor.num_draws)
+    def __init__(
+        self, problem: Problem, source: Source, actor: Actor, rules: tuple[Costs, Reports], seeds: Sequence[int]
+    ) -> None:
+        self._task, self._source, self._actor = problem, source, actor
+        self._costs, self._reports = rules
+        self._draws = _Draws(source, seeds, actor.num_draws, certain=self._reports.certain)
         self._steps = Steps(len(seeds))
 
     def run(self) -> Steps:
@@ -131,7 +142,7 @@ class _Batch:
 
     def _step(self, at: _At, step: int) -> _At:
         """One step of `TrackEnv`, of the episodes still running; the same order of events, the same arithmetic."""
-        moves, choices = self._draws.at(step, at.row)
+        moves, choices, seen = self._draws.at(step, at.row)
         choice = self._actor.decide(States(at.row, at.last_cell, at.misses, step), choices)
         place = self._source.move(at.place, moves)
         target = self._source.cell(place)
@@ -140,8 +151,8 @@ class _Batch:
         # answer.
         sensed = choice.sensed(target.clamp_max(self._task.num_cells - 1)) & in_grid
         forced = at.misses > self._task.t_max
-        located = (sensed | forced) & in_grid
-        reward = self._costs.reward_of(choice.spent, sensed, forced, in_grid)
+        located = (sensed | forced) & in_grid & self._reports.seen(target, forced, seen)
+        reward = self._costs.reward_of(choice.spent, located, forced, in_grid)
         # An exit on the last step allowed is an exit (terminated), not a truncation.
         truncated = self._truncated(place, step) & in_grid
         self._steps.add(
@@ -151,7 +162,8 @@ class _Batch:
         # episodes end.
         going_on = (in_grid & ~truncated).nonzero().squeeze(-1)
         last_cell = torch.where(located, target, at.last_cell)
-        misses = torch.where(located, 0, at.misses + 1)
+        # The clock stands still while the safe action is repeated.
+        misses = torch.where(located, 0, (at.misses + 1).clamp_max(self._task.t_max + 1))
         return _At(at.row, place, last_cell, misses).kept(going_on)
 
     def _truncated(self, place: Tensor, step: int) -> Tensor:

@@ -46,6 +46,8 @@ class EpisodeWriter:
             "kernel.npy": _npy(world.kernel.toarray()),
             "cost.npy": _npy(world.cost),
         }
+        if not (world.perfect and world.safe):
+            tables["sensors.npy"] = _npy(np.stack([world.detection, world.safe_detection]))
         run = {
             **schema.versions(),
             **facts,

@@ -27,6 +27,8 @@ LISTED_CELLS = 20_000
 """Cells up to which sets and values are written as JSON."""
 
 _TASK = ("size", "cost", "t_max", "safe_cost", "reward", "max_steps", "window", "markov")
+_SENSORS = ("detection", "safe_detection")
+"""Written where a sensor or the safe action may miss."""
 
 
 def save_policy(file: Path, policy: PolicyTable, value: Array | None = None, **more: Array) -> None:
@@ -38,7 +40,8 @@ def save_policy(file: Path, policy: PolicyTable, value: Array | None = None, **m
         value: `[M]`, what an episode is worth from each cell.
         **more: further `[M]` arrays that go with it.
     """
-    content: dict[str, Any] = {f"task_{name}": _number(getattr(policy.task, name)) for name in _TASK}
+    names = _TASK if policy.task.perfect and policy.task.safe else (*_TASK, *_SENSORS)
+    content: dict[str, Any] = {f"task_{name}": _number(getattr(policy.task, name)) for name in names}
     if policy.sets is None:
         content["probability"] = np.float64(policy.probability)
     else:
@@ -140,6 +143,7 @@ def _task(content: dict[str, npt.NDArray[Any]]) -> Task:
         max_steps=None if np.isnan(given["max_steps"]) else int(given["max_steps"]),
         window=None if np.isnan(given["window"]) else int(given["window"]),
         markov=bool(given["markov"]),
+        **{name: content[f"task_{name}"] for name in _SENSORS if f"task_{name}" in content},
     )
 
 

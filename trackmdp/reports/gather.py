@@ -212,7 +212,7 @@ def _world_config(place: Path) -> WorldConfig:
     # The motion as it was stored, not drawn anew: another version of NumPy may draw another kernel from the same seed.
     kernel: dict[str, Any] = {field.name: False for field in dataclasses.fields(TableConfig)}
     kernel |= {"name": "table", "path": str(place / "kernel.npz")}
-    parts = {key: plain.get(key) for key in ("grid", "cost")}
+    parts = {key: plain.get(key) for key in ("grid", "cost", "sensor")}
     return world_of(OmegaConf.to_yaml(OmegaConf.create({"quiet": True, "kernel": kernel, **parts})))
 
 

@@ -18,7 +18,8 @@ from trackmdp.training.display import make_console
 from trackmdp.training.lock import locked
 from trackmdp.training.run import Run, complete
 from trackmdp.training.trainer import Trainer
-from trackmdp.world.model import World
+from trackmdp.world.make import sensor_words
+from trackmdp.world.model import Array, World
 from trackmdp.world.tracks import Problem
 
 __all__ = ["train"]
@@ -79,21 +80,26 @@ def _flat(given: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any
             yield key, value
 
 
+def _short(values: Array) -> float | list[float]:
+    """One number where all cells have the same, else one for each."""
+    return float(values[0]) if (values == values[0]).all() else values.tolist()
+
+
 def _described(problem: Problem, folder: Path | None) -> dict[str, Any]:
     """The options that a problem made in Python is described by: what is in memory counts, and is saved as a table."""
     price = problem.cost
-    uniform = bool((price == price[0]).all())
     given: dict[str, Any] = {
         "grid.size": problem.rows if problem.rows == problem.columns else list(problem.size),
         "grid.t_max": problem.t_max,
         "grid.max_steps": problem.max_steps,
         "grid.window": problem.window,
         "cost.reward": problem.reward,
-        "cost.sensor": float(price[0]) if uniform else price.tolist(),
+        "cost.sensor": _short(price),
         # null means the sum of all prices: that is what most problems have, up to the rounding of a sum in another
         # order.
         "cost.safe": None if np.isclose(problem.safe_cost, price.sum(), rtol=1e-15) else problem.safe_cost,
     }
+    given |= sensor_words(_short(problem.detection), _short(problem.safe_detection))
     if isinstance(problem, World):
         where = (folder or Path()).absolute() / "kernel.npz"
         return given | {"kernel": "table", "kernel.path": str(where)}

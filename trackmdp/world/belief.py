@@ -36,11 +36,12 @@ class BeliefFilter:
     def miss(self, predicted: Tensor, action: Tensor) -> Tensor:
         """Condition `predicted` `[B, M]` on no detection under `action` `[B, M]` and no exit.
 
+        `action` is bool, or the probability of a report from each cell: p_d where a sensor is on that may miss.
         Where that event has probability zero the prediction itself is returned, normalised over the grid: the
         observation cannot have happened, and the belief stays finite.
         """
         # Bayes with a perfect sensor: a miss has likelihood 0 where a sensor is on and 1 elsewhere.
-        unseen = predicted * ~action
+        unseen = predicted * (~action if action.dtype == torch.bool else 1.0 - action)
         mass = unseen.sum(-1, keepdim=True)
         grid = predicted / predicted.sum(-1, keepdim=True).clamp_min(torch.finfo(predicted.dtype).tiny)
         # `where` evaluates both sides; the clamps keep 0 / 0 out of the one that is not taken.

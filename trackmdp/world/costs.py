@@ -24,7 +24,7 @@ class Costs:
     def __init__(self, task: Task, device: torch.device | str = "cpu") -> None:
         self.reward, self.safe_cost = float(task.reward), float(task.safe_cost)
         self.sensor = torch.as_tensor(task.cost, dtype=torch.float32, device=device)
-        self._window = Window.of(task, device)
+        self._window, self._safe = Window.of(task, device), task.safe
         self._uniform = bool((self.sensor == self.sensor[0]).all())
         # What lies outside the grid, cell M, costs nothing.
         self._steps = torch.as_tensor(np.append(_whole_steps(task.cost), 0.0), device=device)
@@ -48,12 +48,12 @@ class Costs:
     def pseudo_reward(
         self, action: Tensor, last_cell: Tensor, sensed: Tensor, forced: Tensor, in_grid: Tensor
     ) -> Tensor:
-        """`[B]` reward of one step: r·1[sensed] - c·|a|, or r - D when the safe action is forced; 0 on the exit step.
+        """`[B]` reward of one step: r·1[sensed] - c·|a|, where forced r·1[sensed] - D; 0 on the exit step.
 
         Args:
             action: `[B, K]` sensors on.
             last_cell: `[B]` where the target was located last; a window's sensors are around it.
-            sensed: `[B]` the target stands on a cell whose sensor is on.
+            sensed: `[B]` the target is reported, by its cell's sensor or, where forced, by the safe action.
             forced: `[B]` the safe action replaces `action`.
             in_grid: `[B]` the target is still in the grid after its move.
         """
@@ -71,7 +71,10 @@ class Costs:
         """`pseudo_reward` where the price `spent` `[B]` of the sensors on is known."""
         # Costs are zeroed on the exit step together with the reward (eq. reward_func multiplies all of it).
         chosen = self.reward * sensed - spent
-        return torch.where(forced, self.reward - self.safe_cost, chosen) * in_grid
+        safe: Tensor | float = self.reward - self.safe_cost
+        if not self._safe:
+            safe = torch.where(sensed, safe, -self.safe_cost)
+        return torch.where(forced, safe, chosen) * in_grid
 
 
 def _whole_steps(cost: Array) -> Array:

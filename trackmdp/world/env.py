@@ -16,6 +16,7 @@ from torchrl.envs import EnvBase
 from trackmdp.errors import UserError
 from trackmdp.world.costs import Costs
 from trackmdp.world.render import PICTURE_LEGEND, pixels, text_rows
+from trackmdp.world.reports import Reports
 from trackmdp.world.targets import make_targets
 from trackmdp.world.tracks import Problem
 from trackmdp.world.windows import Window
@@ -30,7 +31,8 @@ class TrackEnv(EnvBase):
 
     One step, in this order: the policy has chosen `action`; the target moves; if it exits, the episode terminates with
     reward 0; else if it has been missed t_max + 1 times in a row the safe action replaces `action` and locates it;
-    else it is located exactly where its cell's sensor is on.
+    else it is located exactly where its cell's sensor is on. Sensors that miss (`detection` in the world) locate it
+    with their probability; a safe action that misses is repeated, while the clock stands still, until it locates it.
 
     On recorded tracks the target goes along one of them; where its recording stops before it exits, the episode is
     truncated.
@@ -78,7 +80,7 @@ class TrackEnv(EnvBase):
         self._stream, self._grid = stream, world.size
         self._targets = make_targets(world, self.device)
         self._window = Window.of(world, self.device)
-        self._costs = Costs(world, self.device)
+        self._costs, self._reports, self._safe = Costs(world, self.device), Reports(world, self.device), world.safe
         self._rows = torch.arange(self.num_envs, device=self.device)
         # Shared by all steps that truncate nothing; handed out as a clone only.
         self._no = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
@@ -151,15 +153,17 @@ class TrackEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         self._targets.seed(seed or 0, self._stream)
+        self._reports.seed(seed or 0, self._stream)
 
     def snapshot(self) -> dict[str, dict[str, Tensor]]:
         """The state of all targets `[num_envs, ...]` and of the generators, for a checkpoint."""
-        return {"rows": dict(self._state), "generators": self._targets.state()}
+        return {"rows": dict(self._state), "generators": self._targets.state() | self._reports.state()}
 
     def restore(self, snapshot: Mapping[str, Mapping[str, Tensor]]) -> TensorDict:
         """Go on where a `snapshot` was taken; returns what is observed there."""
         self._state = {key: value.to(self.device) for key, value in snapshot["rows"].items()}
         self._targets.load_state(snapshot["generators"])
+        self._reports.load_state(snapshot["generators"])
         return self._shaped(self._now, self._observed)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDictBase:
@@ -201,7 +205,8 @@ class TrackEnv(EnvBase):
         flat = action.reshape(self.num_envs, self._window.width)
         now = self._now
         self._acted, self._begun = (flat, now["last_cell"], now["steps_since_detection"]), []
-        following = self.advance(now | {"action": flat}, self._targets.draw(self.num_envs))
+        draws, reports = self._targets.draw(self.num_envs), self._reports.draw(self.num_envs)
+        following = self.advance(now | {"action": flat}, draws, reports)
         self._state = {key: following[key] for key in self._state}
         return following
 
@@ -212,8 +217,10 @@ class TrackEnv(EnvBase):
             chosen = {key: value.reshape((*self.batch_size, *value.shape[1:])) for key, value in chosen.items()}
         return TensorDict(chosen, self.batch_size, device=self.device)
 
-    def advance(self, state: Mapping[str, Tensor] | TensorDictBase, draws: Tensor) -> dict[str, Tensor]:
-        """The step as a function of state and `action` `[B, ...]` and of the motion's uniform `draws` `[B]`."""
+    def advance(
+        self, state: Mapping[str, Tensor] | TensorDictBase, draws: Tensor, reports: Tensor | None = None
+    ) -> dict[str, Tensor]:
+        """The step as a function of state and `action` `[B, ...]` and of uniform draws `[B]` of motion and reports."""
         action, last, n = state["action"], state["last_cell"], state["steps_since_detection"]
         moved = self._targets.move(state, draws)
         target = moved["target"]
@@ -225,15 +232,15 @@ class TrackEnv(EnvBase):
         sensed = action[self._rows, sensor.clamp_max(self._window.width - 1)] & (sensor < self._window.width)
         # n = t_max + 1: the policy's action does not count any more.
         forced = n > self.t_max
-        located = (sensed | forced) & in_grid
+        located = (sensed | forced) & in_grid & self._reports.seen(target, forced, reports)
         missed = in_grid & ~located
         following = moved | {
             # On the exit step `last` stays: the spec has no cell M for it, and done ends the row anyway.
             "last_cell": torch.where(located, target, last),
-            # n + 1 on a miss, 0 on a detection and on the exit step.
-            "steps_since_detection": (n + 1) * missed,
+            # n + 1 on a miss, 0 on a detection and on the exit step; the clock stands still if the safe action misses.
+            "steps_since_detection": (n + 1 if self._safe else (n + 1).clamp_max(self.t_max + 1)) * missed,
             "action_history": self._remember(state["action_history"], action, n, missed),
-            "reward": self._costs.pseudo_reward(action, last, sensed, forced, in_grid).unsqueeze(-1),
+            "reward": self._costs.pseudo_reward(action, last, located, forced, in_grid).unsqueeze(-1),
         }
         terminated = ~in_grid.unsqueeze(-1)
         cut = self._targets.cut(moved)
@@ -248,11 +255,12 @@ class TrackEnv(EnvBase):
 
     def _remember(self, history: Tensor, action: Tensor, n: Tensor, missed: Tensor) -> Tensor:
         """h_{k+1}: `action` in slot n where the target was missed, empty elsewhere; misses are few."""
-        # With t_max = 1: missed at n = 0 gives slots (a, -), missed again at n = 1 gives (a, b); n = 2 is forced and
-        # never missed.
+        # With t_max = 1: missed at n = 0 gives slots (a, -), missed again at n = 1 gives (a, b); n = 2 is forced.
         kept = torch.zeros_like(history)
         rows = missed.nonzero().squeeze(-1)
         kept[rows] = history[rows]
+        if not self._safe:  # an action that the safe one replaced is none
+            rows = rows[n[rows] <= self.t_max]
         kept[rows, n[rows]] = action[rows]
         return kept
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import io
+import math
 import os
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -16,9 +17,9 @@ from scipy import sparse
 from trackmdp.arrays import LARGE, load_npy, load_npz, size_of
 from trackmdp.errors import UserError
 from trackmdp.untrusted import decoded, opened
-from trackmdp.world.model import Array
+from trackmdp.world.model import Array, BoolArray, Size, grid_size
 
-__all__ = ["csr_of", "read_columns", "read_matrix", "read_numbers"]
+__all__ = ["csr_of", "per_cell", "read_columns", "read_matrix", "read_numbers"]
 
 _LONGEST_TEXT, _LONGEST_HEAD = 2**30, 2**16
 """Bytes of the longest .csv file, a recording of some eighty million steps, and of its first line."""
@@ -38,6 +39,33 @@ def read_numbers(key: str, path: str | Path, *, name: str) -> Array:
     if not isinstance(table, np.ndarray) or table.dtype.kind not in "biuf":
         raise UserError(f"{key}={path}: not a table of numbers (but of {getattr(table, 'dtype', type(table))})")
     return table.astype(np.float64)
+
+
+def per_cell(
+    key: str, given: float | list[float] | str, size: Size, allowed: Callable[[Array], BoolArray], expected: str
+) -> Array:
+    """`[M]` one number per cell: one for all, a list, or what is in a file.
+
+    Args:
+        key: the option, for messages.
+        given: a number, a list, or a path as in `read_numbers`.
+        size: of the grid.
+        allowed: which of the numbers in a file are in range.
+        expected: the range in words.
+
+    Raises:
+        UserError: a file is missing or malformed, or holds another number of numbers, or one out of range.
+    """
+    cells = math.prod(grid_size(size))
+    if not isinstance(given, str):
+        return np.broadcast_to(np.asarray(given, dtype=np.float64), (cells,)).copy()
+    values = read_numbers(key, given, name=key.rpartition(".")[2]).ravel()
+    if values.size != cells:
+        raise UserError(f"{key}={given}: {values.size} values, expected {cells} (one per cell)")
+    if not (fine := allowed(values)).all():
+        bad = int(np.flatnonzero(~fine)[0])
+        raise UserError(f"{key}={given}: cell {bad} has {values[bad]}, expected {expected}")
+    return values
 
 
 def read_matrix(key: str, path: str | Path, *, name: str) -> sparse.csr_array | Array:

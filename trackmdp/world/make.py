@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +12,9 @@ from trackmdp.config import WorldConfig
 from trackmdp.config.compose import compose, default, given
 from trackmdp.config.registry import make
 from trackmdp.config.world import LARGEST
-from trackmdp.errors import UserError
 from trackmdp.world.checks import canonical_kernel, check_kernel
-from trackmdp.world.files import read_numbers
-from trackmdp.world.model import Array, Size, World, grid_size
+from trackmdp.world.files import per_cell
+from trackmdp.world.model import Size, World
 from trackmdp.world.tracks import Problem, Recorded, check_tracks, read_tracks, split
 
 __all__ = ["build_world", "load_tracks", "make_problem", "make_world", "paper_cost", "recorded"]
@@ -32,6 +30,8 @@ def make_world(
     reward: float = default("cost.reward"),
     max_steps: int | None = default("grid.max_steps"),
     window: int | None = default("grid.window"),
+    detection: npt.ArrayLike | str = 1.0,
+    safe_detection: npt.ArrayLike | str = 1.0,
     **kernel_options: Any,
 ) -> World:
     """A world with one of the motion kernels; for a table of your own take `World` itself.
@@ -48,6 +48,8 @@ def make_world(
         reward: r, earned by a detection.
         max_steps: episodes are truncated after so many steps; None: never.
         window: W; only sensors up to W rows and columns from the last located cell can be chosen. None: all can.
+        detection: p_d, how likely a sensor that is on reports the target in its cell; as `cost`, in (0, 1].
+        safe_detection: p_s, the same of the safe action, which is repeated until it locates; as `detection`.
         **kernel_options: the kernel's own, such as ``support_size=5`` (``trackmdp solve --help`` lists them).
 
     Raises:
@@ -57,7 +59,7 @@ def make_world(
         >>> make_world("drift", size=5, direction=90).num_cells
         25
     """
-    of_task = _task_words(size, t_max, cost, safe_cost, reward, max_steps, window)
+    of_task = _task_words(size, t_max, cost, safe_cost, reward, max_steps, window, detection, safe_detection)
     own = {f"kernel.{name}": value for name, value in kernel_options.items()}
     return build_world(compose("solve", given({"kernel": kernel}) | of_task | own))
 
@@ -72,6 +74,8 @@ def load_tracks(
     reward: float = default("cost.reward"),
     max_steps: int | None = default("grid.max_steps"),
     window: int | None = default("grid.window"),
+    detection: npt.ArrayLike | str = 1.0,
+    safe_detection: npt.ArrayLike | str = 1.0,
     **track_options: Any,
 ) -> Recorded:
     """Recorded tracks in place of a motion model: most to learn from, some to choose by, some held out to evaluate on.
@@ -85,13 +89,15 @@ def load_tracks(
         reward: r.
         max_steps: tracks are cut after so many steps; None: never.
         window: W.
+        detection: p_d.
+        safe_detection: p_s.
         **track_options: those of ``kernel=tracks``: `ends`, `starts`, `held_out`, `validation`, `seed`,
             `min_length`, `markov`.
 
     Raises:
         UserError: the file is not of that form, a track is too short, or an option is wrong.
     """
-    of_task = _task_words(size, t_max, cost, safe_cost, reward, max_steps, window)
+    of_task = _task_words(size, t_max, cost, safe_cost, reward, max_steps, window, detection, safe_detection)
     own = {f"kernel.{name}": value for name, value in track_options.items()}
     made = make_problem(compose("train", {"kernel": "tracks", "kernel.path": path} | of_task | own))
     assert isinstance(made, Recorded)
@@ -158,30 +164,37 @@ def paper_cost(size: Size, *, reward: float, sensor: float | list[float] | str, 
     Raises:
         UserError: a file of prices is missing or malformed, or does not have one price per cell.
     """
-    return {"reward": reward, "cost": _price_per_cell(sensor, math.prod(grid_size(size))), "safe_cost": safe}
+    price = per_cell("cost.sensor", sensor, size, lambda c: (c >= 0) & (c <= LARGEST), "a number from 0 to 1e15")
+    return {"reward": reward, "cost": price, "safe_cost": safe}
 
 
 def _task_words(
-    size: Any, t_max: Any, cost: Any, safe_cost: Any, reward: Any, max_steps: Any, window: Any
+    size: Any,
+    t_max: Any,
+    cost: Any,
+    safe_cost: Any,
+    reward: Any,
+    max_steps: Any,
+    window: Any,
+    detection: Any,
+    safe_detection: Any,
 ) -> dict[str, Any]:
     """What was given of a task, by the names of the command line."""
     grid = {"grid.size": size, "grid.t_max": t_max, "grid.max_steps": max_steps, "grid.window": window}
-    return given(grid | {"cost.sensor": cost, "cost.safe": safe_cost, "cost.reward": reward})
+    costs = {"cost.sensor": cost, "cost.safe": safe_cost, "cost.reward": reward}
+    return given(grid | costs | sensor_words(detection, safe_detection))
+
+
+def sensor_words(detection: Any, safe_detection: Any) -> dict[str, Any]:
+    """p_d and p_s by the names of the command line; nothing where all are 1, so that no sensor misses."""
+    if all(not isinstance(p, (str, Path)) and np.all(np.asarray(p) == 1.0) for p in (detection, safe_detection)):
+        return {}
+    return {"sensor": "miss", "sensor.p_d": detection, "sensor.p_s": safe_detection}
 
 
 def _of_task(cfg: WorldConfig) -> dict[str, Any]:
     """Costs and limits of a world config, as arguments of `Task`."""
     costs: dict[str, Any] = make(cfg.cost, cfg.grid.size)
-    return costs | {"t_max": cfg.grid.t_max, "max_steps": cfg.grid.max_steps, "window": cfg.grid.window}
-
-
-def _price_per_cell(sensor: float | list[float] | str, cells: int) -> Array:
-    if not isinstance(sensor, str):
-        return np.broadcast_to(np.asarray(sensor, dtype=np.float64), (cells,)).copy()
-    price = read_numbers("cost.sensor", sensor, name="cost").ravel()
-    if price.size != cells:
-        raise UserError(f"cost.sensor={sensor}: {price.size} values, expected {cells} (one per cell)")
-    if not (fine := (price >= 0) & (price <= LARGEST)).all():
-        bad = int(np.flatnonzero(~fine)[0])
-        raise UserError(f"cost.sensor={sensor}: cell {bad} costs {price[bad]}, expected a number from 0 to 1e15")
-    return price
+    sensors: dict[str, Any] = make(cfg.sensor, cfg.grid.size)
+    limits = {"t_max": cfg.grid.t_max, "max_steps": cfg.grid.max_steps, "window": cfg.grid.window}
+    return costs | sensors | limits

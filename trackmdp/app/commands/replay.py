@@ -95,7 +95,8 @@ def _verify(console: Console, cfg: ReplayConfig, reader: EpisodeReader) -> None:
 def _kernel_difference(reader: EpisodeReader) -> str | None:
     """Where the kernel of the log is not the one its config describes; a table of the user's own is taken as it is."""
     cfg = world_of(reader.attachment("config.yaml"))
-    if isinstance(cfg.kernel, TableConfig) or isinstance(getattr(cfg.cost, "sensor", None), str):
+    tables = [getattr(cfg.cost, "sensor", None), *vars(cfg.sensor).values()]
+    if isinstance(cfg.kernel, TableConfig) or any(isinstance(table, str) for table in tables):
         return None
     described, logged = build_world(cfg).kernel, reader.world().kernel
     if described.shape != logged.shape:
