@@ -50,10 +50,11 @@ def chain_returns(
     """Return of a chain of sets from each of its steps on, along paths, the target undetected until then.
 
     Backwards from the safe action: G_{T+1} = r - D + γV(y), G_n = r + γV(y) - c(A_n) if y is in A_n, else
-    γG_{n+1} - c(A_n), where y is the cell the target moves to at that step; 0 once the target has left.
+    γG_{n+1} - c(A_n), where y is the cell the target moves to at that step; 0 once the target has left. A sensor that
+    may miss gives the mean of the two: no report is drawn, and none adds noise.
 
     Args:
-        hits: bool `[T+1, B]`, whether A_n contains y.
+        hits: `[T+1, B]`, whether A_n contains y, or with what probability the sensor there reports.
         inside: bool `[T+2, B]`, whether the target is in the grid after the move.
         set_cost: `[T+1, B]`, c(A_n), the cost of the sensors on.
         value: `[T+2, B]`, V(y).
@@ -69,6 +70,6 @@ def chain_returns(
     # plan that misses until the exit has paid for its sets in the grid alone.
     returns = [(found[-1] - safe_cost) * inside[-1]]
     for n in reversed(range(len(hits))):
-        outcome = torch.where(hits[n], found[n], discount * returns[-1]) - set_cost[n]
+        outcome = torch.lerp(discount * returns[-1], found[n], hits[n].to(found.dtype)) - set_cost[n]
         returns.append(outcome * inside[n])
     return torch.stack(returns[::-1])

@@ -21,6 +21,7 @@ from trackmdp.algos.actor_loss import ActorLoss, Decision
 from trackmdp.algos.common import Averages, set_learning_rate
 from trackmdp.algos.hindsight_loss import HindsightLoss
 from trackmdp.algos.moves import MoveBuffer
+from trackmdp.algos.paths import report_weights
 from trackmdp.algos.segments import SegmentBuffer
 from trackmdp.config.per_sensor import PerSensorConfig
 from trackmdp.errors import UserError
@@ -71,6 +72,10 @@ class Hindsight:
         # Cells that share weights share decisions, which with different prices are not the same.
         if cfg.share_cells and (task.cost != task.cost[0]).any():
             raise UserError("algo.share_cells=true: sensors of different prices, expected one price for all")
+        if cfg.share_cells and (task.detection != task.detection[0]).any():
+            raise UserError("algo.share_cells=true: sensors of different p_d, expected one for all")
+        if not task.safe:  # what follows a safe action that missed is on no path that was seen
+            raise UserError(f"sensor.p_s={task.safe_detection.min():g}: expected 1, for this algo learns no other")
         self.actor = Policy.none(task)
         self.policy = Exploring(task, device) if self._mixed else Policy.all_on(task)
 
@@ -163,9 +168,10 @@ class Hindsight:
 
 def _buffer(task: Task, capacity: int, rng: torch.Generator) -> MoveBuffer | SegmentBuffer:
     """Paths put together from moves where the next one depends on the cell alone, else only those that were sensed."""
+    weights = report_weights(task, rng.device)
     if task.markov:
-        return MoveBuffer(task.num_cells, capacity, rng)
-    return SegmentBuffer(task.num_cells, task.t_max + 2, capacity, rng)
+        return MoveBuffer(task.num_cells, capacity, rng, weights)
+    return SegmentBuffer(task.num_cells, task.t_max + 2, capacity, rng, weights)
 
 
 def _distance(start: Tensor, end: Tensor, task: Task) -> Tensor:

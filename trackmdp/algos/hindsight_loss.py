@@ -32,8 +32,8 @@ class _Replayed:
     Attributes:
         row: `[T+1, B]`, the place in `[M, T+1]` of the path's first cell.
         entry: `[T+1, B]`, the place in `[M, T+1, K]` of the sensor the target moved to.
-        alive: bool `[T+1, B]`, whether the target is in the grid and was not yet located.
-        gain: `[T+1, B]`, what having that sensor on gains, 0 where not alive.
+        alive: `[T+1, B]`, probability that the target was not yet located where it is in the grid, else 0.
+        gain: `[T+1, B]`, what having that sensor on gains, times p_d and `alive`.
         target: `[M]`, mean return of the paths from each cell, the critic's target.
     """
 
@@ -116,6 +116,9 @@ class HindsightLoss(nn.Module):
         cost = torch.as_tensor(task.cost / task.reward, dtype=torch.float32, device=device)
         # [M + 1]: cell M, outside the grid, costs nothing, so that windows cut off by the border need no mask here.
         self.register_buffer("cost", pad(cost, (0, 1)))
+        # p_d, known to the learner like the prices; 0 outside, and no state: it is the task's, not the training's.
+        detection = torch.as_tensor(task.detection, dtype=torch.float32, device=device)
+        self._perfect, self._detection = task.perfect, pad(detection, (0, 1))
         self.register_buffer("clocks", torch.arange(choices, device=device).unsqueeze(-1))
         # Row 0 for the clocked actor, row 1 for the actor.
         self.register_buffer("gain_scale", torch.ones(2, choices, device=device))
@@ -182,8 +185,9 @@ class HindsightLoss(nn.Module):
         """How many paths stay in the grid for a move, and the sum of what sensing gains there, `[T+1]`."""
         # The gain depends on the end y and the clock alone, so moves are counted by y: [T + 1, M] @ [M].
         arrived = torch.bincount(end, minlength=advantage.shape[1])[:-1].float()
+        seen = arrived * self._detection[:-1]
         gain = sensing_gain(advantage[:, :-1], reward=1.0, discount=self.discount)
-        return arrived.sum(), gain.abs() @ arrived
+        return arrived.sum(), gain.abs() @ seen
 
     def _clocked(self, moves: Tensor, rows: slice, advantage: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
         """From the moves `[2, B]` out of the cells `rows`, at every clock: the position is revealed after every action.
@@ -203,8 +207,10 @@ class HindsightLoss(nn.Module):
         # moved [x, 1, K] counts moves by their end; stays [x, 1] those that stay in the grid, visits [x, 1] all. Their
         # quotients are the empirical kernel: moved / visits for P_xj, stays / visits for P_in(x).
         stays, visits = moved.sum(-1), torch.bincount(start - first, minlength=count).unsqueeze(-1)
-        # advantage[:, nearby] is [T + 1, x, K]: transposed to the layout [x, T + 1, K] of the logits.
-        gain = moved * sensing_gain(advantage[:, nearby].transpose(0, 1), reward=1.0, discount=self.discount)
+        # advantage[:, nearby] is [T + 1, x, K]: transposed to the layout [x, T + 1, K] of the logits. A sensor that is
+        # on reports p_d of the moves to its cell; what it misses goes on like what is not sensed.
+        seen = moved if self._perfect else moved * self._detection[nearby].unsqueeze(1)
+        gain = seen * sensing_gain(advantage[:, nearby].transpose(0, 1), reward=1.0, discount=self.discount)
         chosen, cost = logits.detach() > 0, self.cost[nearby].unsqueeze(1)
         if self._window is not None and self._window < self.reach:
             # Sensors outside the window cannot be chosen: they neither gain nor cost, nor are they learned about.
@@ -234,24 +240,28 @@ class HindsightLoss(nn.Module):
         entry = row * k + self.view.index(start, end)
         # Where the target has left the grid or the view, `entry` is that of some other sensor.
         seen = end < m if self._window is None else self.view.contains(start.expand_as(end), end)
-        hits, inside = gather(on, entry) & seen, moves < m
+        # [T + 1, B], the probability of a report; 0 or 1 with sensors that never miss.
+        reports, inside = (gather(on, entry) & seen).float(), moves < m
+        detects = None if self._perfect else gather(self._detection, end)
+        reports = reports if detects is None else reports * detects
         located = gather(pad(value, (0, 1)), moves)
         # Set costs are computed once per (x, n) and looked up by the paths, however many there are.
         spent = gather(torch.cat([self._set_cost(on[rows], rows) for rows in self.slices()]), row)
         discount, safe_cost = self.discount, 1.0 - self.safe
-        returns = chain_returns(hits, inside, spent, located, reward=1.0, safe_cost=safe_cost, discount=discount)
+        returns = chain_returns(reports, inside, spent, located, reward=1.0, safe_cost=safe_cost, discount=discount)
         # advantage is [T + 1, M + 1]: entry (n, y) is n (M + 1) + y.
         clocked = gather(advantage, self.clocks * (m + 1) + end)
         # V(y) - G_{n+1}: located at y now, against the plan's return on the rest of this very path. The target's true
         # cell is known because it was sensed, not because the simulator tells it.
         gain = sensing_gain(clocked, located[:-1] - returns[1:], reward=1.0, discount=discount, blend=blend)
-        # Clock n is reached if no earlier set of the plan hit; other rows are not states of this policy. The move has
-        # to stay in the grid, too: an exit step earns and costs nothing.
-        alive = inside[:-1].clone()
+        # Clock n is reached if no earlier set of the plan reported; other rows are not states of this policy. The move
+        # has to stay in the grid, too: an exit step earns and costs nothing.
+        alive = inside[:-1].float()
         for n in range(1, choices):
-            alive[n] &= alive[n - 1] & ~hits[n - 1]
+            alive[n] *= alive[n - 1] * (1.0 - reports[n - 1])
         visits = torch.bincount(start, minlength=m)
-        gain = gain * (alive if self._window is None else alive & seen)
+        gain = gain * (alive if self._window is None else alive * seen)
+        gain = gain if detects is None else gain * detects
         # Cells without a path get the target 0, and with `visits` 0 no weight in the critic's loss.
         return _Replayed(row, entry, alive, gain, scatter_add(returns[0], start, m) / visits.clamp(min=1))
 
@@ -273,7 +283,7 @@ class HindsightLoss(nn.Module):
         first = (rows.start or 0) * choices
         row, entry, alive, gain = replayed.of(chosen, first, first * k)
         # Paths that reach each (x, n); every sensor on costs c on each of them, the one the target moves to included.
-        arrivals = scatter_add(alive.float(), row, count * choices).view(count, choices)
+        arrivals = scatter_add(alive, row, count * choices).view(count, choices)
         price = arrivals.unsqueeze(-1) * self.cost[self.view.cells[rows]].unsqueeze(1)
         credit = SensorCredit(entry, gain, arrivals, price, rows)
         return self.actor_loss(logits, credit).sum((0, 2))

@@ -15,6 +15,7 @@ from scipy import sparse
 from tensordict import TensorDictBase
 
 from trackmdp.config.learned_kernel import LearnedKernelConfig
+from trackmdp.errors import UserError
 from trackmdp.policies.explore import RenewedTable
 from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.policies.table import PolicyTable
@@ -43,7 +44,11 @@ class LearnedKernel:
         self, task: Task, cfg: LearnedKernelConfig, *, iterations: int, seed: int, device: torch.device
     ) -> None:
         self.task, self.cfg, self.iterations, self.device = task, cfg, iterations, device
-        self._estimate = KernelEstimate(task.size, weight=cfg.prior, exit_weight=cfg.exit_prior)
+        if not task.safe:  # how often a safe action was repeated is not in what was observed
+            raise UserError(f"sensor.p_s={task.safe_detection.min():g}: expected 1, for this algo learns no other")
+        detection = None if task.perfect else task.detection
+        weights = {"weight": cfg.prior, "exit_weight": cfg.exit_prior}
+        self._estimate = KernelEstimate(task.size, **weights, detection=detection)
         self._rng = np.random.default_rng(derive(seed, "learned_kernel"))
         self._chooses, self._warm_up = cfg.sensing == "chosen", cfg.warm_up
         self._iteration, self._spent = 0, np.zeros(2)

@@ -21,10 +21,13 @@ class MoveBuffer:
         num_cells: M.
         capacity: moves kept; the oldest go first.
         generator: draws the paths; the buffer lives on its device.
+        weights: `[M + 1]`, how much a move to each cell counts; None: all alike. See `report_weights`.
     """
 
-    def __init__(self, num_cells: int, capacity: int, generator: torch.Generator) -> None:
-        self.num_cells, self._capacity, self._generator = num_cells, capacity, generator
+    def __init__(
+        self, num_cells: int, capacity: int, generator: torch.Generator, weights: Tensor | None = None
+    ) -> None:
+        self.num_cells, self._capacity, self._generator, self._weights = num_cells, capacity, generator, weights
         # Oldest first.
         self._moves = torch.empty(2, 0, dtype=cell_dtype(num_cells), device=generator.device)
         self._index: tuple[Tensor, CellIndex] | None = None
@@ -65,8 +68,9 @@ class MoveBuffer:
         start, end = self.moves()
         # With M = 4, the move 2 -> 3 has the key 2 * 5 + 3 = 13, and 13 mod 5 = 3 gives its end back. One sort orders
         # the moves by start; that the ends of a start are sorted too makes stratified draws cover them in proportion.
-        ends = torch.cat([(start * (m + 1) + end).sort().values % (m + 1), end.new_tensor([m])])
-        return ends, CellIndex.of(start, m)
+        ends = (start * (m + 1) + end).sort().values % (m + 1)
+        weights = None if self._weights is None else self._weights[ends]
+        return torch.cat([ends, end.new_tensor([m])]), CellIndex.of(start, m, weights)
 
     def state_dict(self) -> dict[str, Tensor]:
         """The moves; the generator is its owner's to save."""

@@ -7,8 +7,11 @@ from typing import NamedTuple
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.nn.functional import pad
 
-__all__ = ["CellIndex", "cell_dtype", "sensed_steps", "stratified_starts"]
+from trackmdp.world.model import Task
+
+__all__ = ["CellIndex", "cell_dtype", "report_weights", "sensed_steps", "stratified_starts"]
 
 
 def cell_dtype(num_cells: int) -> torch.dtype:
@@ -22,24 +25,45 @@ class CellIndex(NamedTuple):
     Attributes:
         first: `[M + 1]` int64, place of the first entry of each cell; for a cell without entries, the place after all.
         share: `[M + 1]` float, number of entries of each cell, at least one, and slightly reduced (see `of`).
+        sums: `[K + 1]` float64, running sums of the entries' weights, from 0 on; None where all weigh the same.
     """
 
     first: Tensor
     share: Tensor
+    sums: Tensor | None = None
 
     @classmethod
-    def of(cls, start: Tensor, num_cells: int) -> CellIndex:
-        """Index entries `[K]` by the cells they start in, in whatever order they come."""
+    def of(cls, start: Tensor, num_cells: int, weights: Tensor | None = None) -> CellIndex:
+        """Index entries `[K]` by the cells they start in; their `weights` `[K]` come in the order of the cells."""
         seen = torch.bincount(start, minlength=num_cells + 1)
         # Starts 0 0 2 on 3 cells: seen 2 0 1 0, first 0 3 2 3, the last one for M. A cell without entries leads to
         # place 3, where the buffers keep an exit.
         first = torch.where(seen > 0, seen.cumsum(0) - seen, len(start))
         # Half a float's spacing below the count, so that a draw close to 1 does not round up to the next cell's.
-        return cls(first, seen.clamp(min=1).float() * (1.0 - 2.0**-24))
+        share = seen.clamp(min=1).float() * (1.0 - 2.0**-24)
+        return cls(first, share, None if weights is None else pad(weights.double().cumsum(0), (1, 0)))
 
     def pick(self, cells: Tensor, draws: Tensor) -> Tensor:
-        """Places of entries of `cells`, one for each draw from [0, 1)."""
+        """Places of entries of `cells`, one for each draw from [0, 1), in proportion to their weights."""
+        if self.sums is not None:
+            first = self.first.index_select(0, cells)
+            # `ceil` undoes the reduction. A cell without entries has one place behind all of them, and keeps it.
+            last = (first + self.share.index_select(0, cells).ceil().long()).clamp_max(len(self.sums) - 1)
+            begin, end = self.sums[first], self.sums[last]
+            place = torch.searchsorted(self.sums, begin + draws * (end - begin), right=True) - 1
+            return torch.where(first < last, place.clamp(first, last - 1), first)
         return (draws * self.share.index_select(0, cells)).long() + self.first.index_select(0, cells)
+
+
+def report_weights(task: Task, device: torch.device) -> Tensor | None:
+    """`[M + 1]` 1 / p_d of a path's step to each cell, 1 for the exit; None where no sensor misses.
+
+    A path is known only where it was reported at every step, with probability Π p_d(x_k): weighted by the inverse of
+    that, those known stand for all (Horvitz and Thompson 1952).
+    """
+    if task.perfect:
+        return None
+    return pad(1.0 / torch.as_tensor(task.detection, device=device), (0, 1), value=1.0)
 
 
 def stratified_starts(count: int, steps: int, num_cells: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from trackmdp.algos.actor_loss import ActorLoss, Poisson, PolicyGradient, Surrogate
 from trackmdp.algos.hindsight import Hindsight
 from trackmdp.config.per_sensor import A2cPerSensorConfig, PpoPerSensorConfig
+from trackmdp.errors import UserError
+from trackmdp.world.model import Task
 
 __all__ = ["PerSensorA2C", "PerSensorDQN", "PerSensorPPO"]
 
@@ -22,6 +26,11 @@ class PerSensorPPO(Hindsight):
     """The clipped surrogate of every sensor, over both actions or over sets drawn from the old policy."""
 
     cfg: PpoPerSensorConfig
+
+    def __init__(self, task: Task, cfg: PpoPerSensorConfig, **run: Any) -> None:
+        if cfg.surrogate == "sampled" and not task.perfect:  # it counts paths, which then have weights
+            raise UserError("algo.surrogate=sampled: expected all_action where sensors miss")
+        super().__init__(task, cfg, **run)
 
     def _actor_loss(self) -> ActorLoss:
         cfg = self.cfg

@@ -25,10 +25,15 @@ class SegmentBuffer:
         steps: steps of a segment.
         capacity: segments kept; the oldest go first.
         generator: draws the paths; the buffer lives on its device.
+        weights: `[M + 1]`, by which each step to a cell multiplies what a segment counts; None: all count alike. See
+            `report_weights`.
     """
 
-    def __init__(self, num_cells: int, steps: int, capacity: int, generator: torch.Generator) -> None:
+    def __init__(
+        self, num_cells: int, steps: int, capacity: int, generator: torch.Generator, weights: Tensor | None = None
+    ) -> None:
         self.num_cells, self.steps, self._capacity, self._generator = num_cells, steps, capacity, generator
+        self._weights = weights
         # Oldest first.
         self._segments = torch.empty(steps + 1, 0, dtype=cell_dtype(num_cells), device=generator.device)
         self._tail: dict[str, Tensor] = {}
@@ -81,7 +86,9 @@ class SegmentBuffer:
         start, end = self._segments[:2].long()
         # Sorted by (start, end): with M = 4, the move 2 -> 3 has the key 2 * 5 + 3 = 13, and an exit from 2 the key 14.
         order = (start * (m + 1) + end).argsort(stable=True)
-        return pad(self._segments.index_select(1, order), (0, 1), value=m), CellIndex.of(start, m)
+        segments = self._segments.index_select(1, order)
+        weights = None if self._weights is None else self._weights[segments[1:].long()].prod(0)
+        return pad(segments, (0, 1), value=m), CellIndex.of(start, m, weights)
 
     def state_dict(self) -> dict[str, Any]:
         """The segments, and the end of the last batch; the generator is its owner's to save."""

@@ -1,8 +1,8 @@
 """The target's kernel estimated from what a tracker sees: detections, exits, and misses, which are censored moves.
 
-A miss says that the target is in one of the cells not sensed, and nothing else. Expectation-maximisation (Baum-Welch: a
-forward and a backward pass) replaces each path with misses by the expected number of moves i -> j on it, so that
-estimates stay consistent when the sets were chosen rather than all sensors on.
+A miss says that the target is in one of the cells not sensed, or was missed by its sensor, and nothing else.
+Expectation-maximisation (Baum-Welch: a forward and a backward pass) replaces each path with misses by the expected
+number of moves i -> j on it, so that estimates stay consistent when the sets were chosen rather than all sensors on.
 
 Counts and kernels are sparse, `[M, M + 1]` with the exit in the last column: their memory follows the moves that were
 seen, and those that the prior adds, which puts the displacements seen anywhere down at every cell.
@@ -65,13 +65,17 @@ class KernelEstimate:
         size: (rows, columns), or one number for a square.
         weight: the prior counts as much as this many moves.
         exit_weight: the pooled exit probability counts as much as this many moves.
+        detection: `[M]`, p_d of each cell's sensor; None where no sensor misses.
 
     Attributes:
         direct: `[M, M + 1]`, moves seen at once.
         counts: `[M, M + 1]`, moves seen, and those of censored paths at their expectation.
     """
 
-    def __init__(self, size: int | tuple[int, int], *, weight: float, exit_weight: float) -> None:
+    def __init__(
+        self, size: int | tuple[int, int], *, weight: float, exit_weight: float, detection: Array | None = None
+    ) -> None:
+        self._detection = detection
         self.rows, self.columns = grid_size(size)
         self.weight, self.exit_weight = weight, exit_weight
         self.num_cells = self.rows * self.columns
@@ -129,7 +133,7 @@ class KernelEstimate:
         paths, copies = _merged(_joined(self._censored))
         for first in [True, *[False] * (rounds - 1)]:
             kernel = (1.0 - OPEN) * self.mean() + OPEN * self._open_moves(paths) if first else self.mean()
-            self.counts = self.direct + _expected_moves(kernel, paths, copies)
+            self.counts = self.direct + _expected_moves(kernel, paths, copies, self._detection)
         counts = self.counts.copy()
         counts.data[counts.data < NEGLIGIBLE] = 0.0
         counts.eliminate_zeros()
@@ -270,8 +274,10 @@ def _merged(paths: ObservedPaths) -> tuple[ObservedPaths, Array]:
     return paths.pick(first), copies.astype(np.float64)
 
 
-def _expected_moves(kernel: sparse.csr_array, paths: ObservedPaths, copies: Array) -> sparse.csr_array:
-    """`[M, M + 1]` expected moves on the censored paths, given the kernel.
+def _expected_moves(
+    kernel: sparse.csr_array, paths: ObservedPaths, copies: Array, detection: Array | None
+) -> sparse.csr_array:
+    """`[M, M + 1]` expected moves on the censored paths, given the kernel and p_d.
 
     With f_t the mass that goes on undetected and l_t the likelihood of what is seen later, the move i -> j at step t of
     a path is made with probability f_t(i) P_ij l_{t+1}(j) / (likelihood of the path); P_ij is multiplied in at the end.
@@ -284,6 +290,8 @@ def _expected_moves(kernel: sparse.csr_array, paths: ObservedPaths, copies: Arra
         some, each = paths.pick(part), np.arange(len(part))
         # Rows t, t + (t_max + 1), ...: the set of miss t of every path, [paths, M].
         sensed = [some.sensed[t :: some.choices].astype(np.float64) for t in range(n)]
+        if detection is not None:  # a miss is as likely in a sensed cell as its sensor misses
+            sensed = [sparse.csr_array(each_set.multiply(detection)) for each_set in sensed]
         forward = [_counted(each, some.start, np.ones(len(part)), (len(part), m))]
         for t in range(n):
             forward.append(_hidden(forward[t] @ moves, sensed[t]))
@@ -302,7 +310,7 @@ def _expected_moves(kernel: sparse.csr_array, paths: ObservedPaths, copies: Arra
 
 
 def _hidden(mass: sparse.csr_array, sensed: sparse.csr_array) -> sparse.csr_array:
-    """`mass` with the sensed cells set to zero."""
+    """`mass` less what the sensors report of it: `sensed` holds their p_d."""
     left = sparse.csr_array(mass - mass.multiply(sensed))
     left.eliminate_zeros()
     return left

@@ -87,6 +87,7 @@ def _first_best(worth: Array, best: Array, state: np.ndarray, first: np.ndarray)
 
 def _enumerate(world: World, most_beliefs: int) -> tuple[FiniteMdp, int]:
     kernel = world.kernel.toarray()  # a few cells: every set of sensors is tried in every belief
+    forced, price = _safe_action(world, kernel)
     beliefs = [(belief, 0) for belief in np.eye(world.num_cells)]
     index = {_key(belief, n): i for i, (belief, n) in enumerate(beliefs)}
     problem = FiniteMdp()
@@ -94,19 +95,21 @@ def _enumerate(world: World, most_beliefs: int) -> tuple[FiniteMdp, int]:
         predicted = belief @ kernel
         # After t_max + 1 misses the safe action is forced: one action, and every position is located.
         if n == world.num_choices:
-            problem.add(i, (world.reward - world.safe_cost) * float(predicted.sum()), *_sparse(predicted))
+            located = belief @ forced
+            problem.add(i, world.reward * float(located.sum()) - float(belief @ price), *_sparse(located))
             continue
         for action in _subsets(predicted > 0):
-            after, missed = _miss(predicted, action)
-            targets, probability = _sparse(np.where(action, predicted, 0.0))
+            found = np.where(action, predicted * world.detection, 0.0)
+            after, missed = _miss(predicted - found)
+            targets, probability = _sparse(found)
             if missed > 0:
                 key = _key(after, n + 1)
                 if key not in index:
                     index[key] = len(beliefs)
                     beliefs.append((after, n + 1))
                 targets, probability = [*targets, index[key]], [*probability, missed]
-            price = float(world.cost[action].sum() * predicted.sum())
-            problem.add(i, world.reward * float(predicted[action].sum()) - price, targets, probability)
+            paid = float(world.cost[action].sum() * predicted.sum())
+            problem.add(i, world.reward * float(found.sum()) - paid, targets, probability)
         if len(beliefs) > most_beliefs:
             raise UserError(f"grid.size={world.rows}: more than {most_beliefs} belief states, expected a smaller world")
     return problem, len(beliefs)
@@ -120,9 +123,18 @@ def _subsets(possible: BoolArray) -> BoolArray:
     return sets
 
 
-def _miss(predicted: Array, action: BoolArray) -> tuple[Array, float]:
-    """Eq. belief_up given no detection and no exit, and the probability of that."""
-    left = np.where(action, 0.0, predicted)
+def _safe_action(world: World, kernel: Array) -> tuple[Array, Array]:
+    """`[M, M]` where the safe action locates the target in the end, by the cell it is in, and `[M]` what that costs.
+
+    Repeated until it locates: with L = P (1 - p_s), the sum of all L^k is (I - L)^-1.
+    """
+    repeated = np.linalg.inv(np.eye(world.num_cells) - kernel * (1.0 - world.safe_detection))
+    price: Array = world.safe_cost * (repeated @ kernel.sum(axis=1))
+    return repeated @ (kernel * world.safe_detection), price
+
+
+def _miss(left: Array) -> tuple[Array, float]:
+    """Eq. belief_up given no detection and no exit, from what the sensors leave `[M]`, and the probability of that."""
     missed = float(left.sum())
     return (left / missed if missed else left), missed
 

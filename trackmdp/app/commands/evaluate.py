@@ -54,7 +54,8 @@ def run(cfg: EvaluateConfig, folder: Path, problem: Problem | None = None) -> fl
     episodes = simulate(world, policy, cfg.episodes or _FOR_THE_PICTURE, seed=cfg.seed)
     simulation = episodes.figures() if cfg.episodes else None
     # Theorem thm:estimator is about Q of whole episodes and of a policy that is a table.
-    estimate = estimator.accuracy(world, policy) if policy.deterministic and world.max_steps is None else None
+    told = policy.deterministic and world.max_steps is None and world.perfect
+    estimate = estimator.accuracy(world, policy) if told else None
     report = _report(subject, evaluator, score, simulation) | {"estimator": asdict(estimate) if estimate else None}
     write_json(folder / "evaluation.json", report | write_sets(folder, policy, value=score.evaluation.value))
     write_text(folder / "picture.txt", draw_picture(episodes, world))
