@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
-from tests.solvers.worlds import paper_world
-from trackmdp.solvers import optimal, search
+from tests.solvers.worlds import all_plans, best_of_all, paper_world, random_tiny_world
+from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers import bounds, optimal, search
 from trackmdp.solvers.branch import Tree
 from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers.joint import Joint
 from trackmdp.solvers.known import tables
 from trackmdp.solvers.layers import reachable_layers
+from trackmdp.solvers.optimal import payment
 from trackmdp.solvers.search import InnerProblem
 from trackmdp.solvers.solution import SearchProgress
+from trackmdp.world.model import World
 
 
 def _tree() -> tuple[Tree, np.ndarray, np.ndarray]:
@@ -74,3 +80,66 @@ def test_a_search_cut_short_keeps_a_bracket_around_the_optimum() -> None:
         solution = optimal.solve(world, on_progress=stop)
         assert solution.lower <= best + 1e-9
         assert solution.upper >= best - 1e-9
+
+
+def test_every_bound_is_above_the_best_of_all_plans() -> None:
+    """300 worlds, the search stopped after 1, 30, 300 nodes or at its end: no policy exceeds what it claims."""
+    rng, closed = np.random.default_rng(7), 0
+    for nodes in np.tile([1, 30, 300, 100_000], 75):
+        world = random_tiny_world(rng)
+        best, solution = best_of_all(world), optimal.solve(world, nodes=int(nodes), tolerance=1e-9)
+        scale = 1.0 + np.abs(best).max()
+        assert (solution.bound >= best - 1e-9 * scale).all()
+        assert (solution.value <= best + 1e-9 * scale).all()
+        assert (bounds.clocked(world) >= best - 1e-9 * scale).all()
+        if nodes == 100_000:
+            assert solution.certified
+            np.testing.assert_allclose(solution.value, best, atol=1e-7 * scale)
+        closed += solution.certified and solution.nodes > 0
+    assert closed > 40
+
+
+def test_what_is_paid_on_the_way_covers_what_any_plan_gains() -> None:
+    """Over a policy that senses nothing, the tree stopped anywhere: every plan, with the mass it leaves undetected."""
+    rng, less = np.random.default_rng(1), 0.0
+    for nodes in np.tile([0, 4, 16, 64], 25):
+        world = random_tiny_world(rng)
+        value = evaluate(world, PolicyTable.none(world)).value
+        problem = InnerProblem.of(world, reachable_layers(world, world.num_choices), value)
+        known = tables(world, problem.detected, problem.missed, world.t_max, slack=1e-9, go_on=lambda _: True)
+        tree = Tree(world, problem.detected, known, value, 1e-9)
+        tree.run(lambda tree, most=nodes: tree.nodes < most)
+        paid = payment(tree, value)
+        less = max(less, float((np.maximum(tree.upper() - value, 0.0) - paid).max()))
+        for x in range(world.num_cells):
+            earned, located, waited = all_plans(world, x)
+            gained = earned + located @ value - value[x]
+            assert (paid[x] + waited @ paid >= gained - 1e-9 * (1.0 + np.abs(value).max())).all()
+    assert less > 0.1
+
+
+def test_joint_losses_hold_for_all_sets_of_undecided_cells() -> None:
+    """A state of six cells, the first three decided: one more set for what is left, worth by definition, all ways."""
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        kernel = rng.random((6, 6)) ** 3 * (rng.random((6, 6)) < 0.6)
+        kernel *= 0.95 / np.maximum(kernel.sum(axis=1, keepdims=True), 1e-9)
+        world = World(kernel, (2, 3), cost=rng.uniform(0.0, 0.5, 6), t_max=1)
+        detected, ends, known = rng.normal(2.0, 1.0, 6), rng.normal(0.0, 1.0, 6), rng.normal(2.0, 1.0, 6)
+        cells, mass = np.arange(6)[None], rng.random((1, 6))
+        joint = Joint(world, detected, [ends, known])
+        after = joint.next(cells, np.ones((1, 6), dtype=bool))
+        assert after is not None
+
+        def lost(left: np.ndarray) -> float:
+            moved = (mass[0] * left) @ kernel  # noqa: B023
+            sensed = moved * detected - world.cost * moved.sum()  # noqa: B023
+            return float((mass[0] * left) @ known - np.maximum(sensed, moved * ends).sum())  # noqa: B023
+
+        for decided in (2, 3, 6):
+            left = np.arange(6) < decided - (decided == 3)
+            own, added = joint.losses(after, cells, mass, 1, np.zeros(1, dtype=int), left[None], decided)
+            np.testing.assert_allclose(own[0], lost(left))
+            for others in itertools.product([False, True], repeat=6 - decided):
+                chosen = left | np.array([False] * decided + list(others))
+                assert lost(chosen) >= own[0] + added[0] @ np.array(others, dtype=float) - 1e-12

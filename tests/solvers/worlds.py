@@ -143,3 +143,50 @@ def all_chains(world: World, x: int, allowed: BoolArray | None = None) -> Iterat
 
 def _subsets(cells: np.ndarray) -> Iterator[tuple[int, ...]]:
     return itertools.chain.from_iterable(itertools.combinations(cells, k) for k in range(len(cells) + 1))
+
+
+def random_tiny_world(rng: np.random.Generator) -> World:
+    """Three or four cells, T_max 0 to 4: prices per cell, some of them 0, and D from nothing to very dear."""
+    t_max = int(rng.integers(5))
+    size = (1, 3) if t_max >= 3 else (2, 2)
+    m = size[0] * size[1]
+    kernel = rng.random((m, m)) ** rng.choice([1.0, 4.0]) * (rng.random((m, m)) < rng.choice([0.5, 0.8, 1.0]))
+    kernel *= (1.0 - rng.choice([0.02, 0.2])) / np.maximum(kernel.sum(axis=1, keepdims=True), 1e-300)
+    cost = rng.choice([0.1, 0.25, 0.5]) * (1.0 + rng.random(m)) * (rng.random(m) < 0.8)
+    safe_cost = float(cost.sum() * rng.choice([0.0, 0.3, 1.0, 30.0]))
+    return World(kernel, size, cost=cost, safe_cost=safe_cost, t_max=t_max)
+
+
+def best_of_all(world: World) -> Array:
+    """`[M]` V* as in `best_by_enumeration`, all plans of a cell at once: 4,096 of them with four cells and T_max 2."""
+    m = world.num_cells
+    tried = [all_plans(world, x) for x in range(m)]
+    value = value_of(world, np.zeros((m, world.num_choices, m), dtype=bool))
+    while True:
+        picks = [int(np.argmax(earned + located @ value)) for earned, located, _ in tried]
+        located = np.stack([options[1][pick] for options, pick in zip(tried, picks, strict=True)])
+        earned = np.array([options[0][pick] for options, pick in zip(tried, picks, strict=True)])
+        better = np.linalg.solve(np.eye(m) - located, earned)
+        if better.sum() <= value.sum() + 1e-11:
+            return value
+        value = better
+
+
+def all_plans(world: World, x: int) -> tuple[Array, Array, Array]:
+    """Every plan from x: `[C]` its reward, `[C, M]` where the target is located, and the sum of z_t undetected."""
+    m, mass, earned = world.num_cells, np.eye(world.num_cells)[[x]], np.zeros(1)
+    subsets = (np.arange(2**m)[:, None] >> np.arange(m)) % 2 > 0
+    price, located, waited = subsets @ world.cost, np.zeros((1, m)), np.zeros((1, m))
+    for _ in range(world.num_choices):
+        mass = mass @ world.kernel
+        # [plans so far, sets, M], then one row per plan
+        found = mass[:, None, :] * subsets
+        paid = mass.sum(axis=1)[:, None] * price
+        earned = (earned[:, None] + world.reward * found.sum(axis=2) - paid).ravel()
+        mass = mass[:, None, :] - found
+        located, waited = (
+            (total[:, None, :] + now).reshape(-1, m) for total, now in ((located, found), (waited, mass))
+        )
+        mass = mass.reshape(-1, m)
+    mass = mass @ world.kernel
+    return earned + (world.reward - world.safe_cost) * mass.sum(axis=1), located + mass, waited

@@ -29,6 +29,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import sparse
 
+from trackmdp.solvers.joint import Joint, Next
 from trackmdp.solvers.layers import within_window
 from trackmdp.solvers.renewal import IndexArray, per_row, row_index
 from trackmdp.world.model import Array, BoolArray, World
@@ -57,6 +58,7 @@ class _Frontier:
         missed: `[B, M]`, mass that all sensors together would miss; None where no sensor misses.
         count: `[B]`, cells that are not padding.
         rest: `[B, K + 1]`, least that the cells from the k-th on take away from `relaxed`.
+        after: where the target goes on to from `cells`; None where that is not looked at.
         origin: the batch these states came from and `[B]` their places in it; none at the start.
     """
 
@@ -69,6 +71,7 @@ class _Frontier:
     count: IndexArray
     rest: Array
     missed: sparse.csr_array | None
+    after: Next | None
     origin: tuple[_Choices, IndexArray] | None
 
 
@@ -155,6 +158,7 @@ class Tree:
         """
         self._windowed = windowed
         self._world, self._detected, self._revealed, self._slack = world, detected, revealed, slack
+        self._joint = Joint(world, detected, revealed)
         self.best = lower.copy()
         self.nodes = 0
         # Problem -> cells left unsensed at each step, for the problems with a better plan than `lower`.
@@ -178,6 +182,31 @@ class Tree:
         for _, _, choices in self._heap:
             np.maximum.at(bound, choices.start, choices.bound)
         return bound
+
+    def rate(self, value: Array, paid: Array) -> Array:
+        """`[B]` the least e with e(x) >= bound - value(x) - sum_t z_t · paid for each plan of x not ruled out.
+
+        z_t is the undetected mass after the t-th set of a plan, as far as it is decided, and `paid` `[M]` what is paid
+        for each step that the target is not located; see `optimal`.
+        """
+        rate = self.best + self._slack - value
+        known: dict[int, Array] = {}
+        for _, _, choices in self._heap:
+            np.maximum.at(rate, choices.start, choices.bound - value[choices.start] - self._paid(choices, paid, known))
+        return rate
+
+    def _paid(self, choices: _Choices, paid: Array, known: dict[int, Array]) -> Array:
+        """`[P]` sum_t z_t · paid; `known`: that of the states of each frontier, by its id."""
+        frontier = choices.frontier
+        before = known.get(id(frontier))
+        if before is None:
+            origin = frontier.origin
+            before = np.zeros(len(frontier.start)) if origin is None else self._paid(origin[0], paid, known)[origin[1]]
+            if frontier.missed is not None:
+                before = before + frontier.missed @ paid
+            known[id(frontier)] = before
+        on_left = frontier.mass * paid[frontier.cells]
+        return before[choices.state] + (choices.left * on_left[choices.state]).sum(axis=1)
 
     def run(self, go_on: Callable[[Tree], bool]) -> None:
         """Expand open choices, best first, while there are any and `go_on(self)` holds."""
@@ -204,17 +233,38 @@ class Tree:
         if not len(split.state):
             return
         self.nodes += 2 * len(split.state)
-        sensed = split.relaxed - frontier.regret[split.state, k]
+        raw, added = self._losses(split)
+        regret = frontier.regret[split.state, k]
+        # Each undecided cell costs its regret or what it adds; `together` has them all decided for the better.
+        least = np.minimum(frontier.regret[split.state, k:], added)
+        together = split.relaxed - raw - least.sum(axis=1)
         left = split.left.copy()
         left[:, k] = True
         # Two children each: cell k sensed, which costs its regret; or left, which costs what it loses together with
         # the cells left before it. A child's bound never exceeds its parent's, nor does it pay for the same loss twice.
-        for cells, relaxed, lost in (
-            (split.left, sensed, split.lost),
-            (left, split.relaxed, self._joint_loss(split, left)),
+        for cells, relaxed, lost, paid in (
+            (split.left, split.relaxed - regret, split.lost, regret),
+            (left, split.relaxed, np.maximum(split.lost, raw + added[:, 0]), added[:, 0]),
         ):
-            bound = np.minimum(split.bound, relaxed - lost - frontier.rest[split.state, k + 1])
+            apart = relaxed - lost - frontier.rest[split.state, k + 1]
+            bound = np.minimum(split.bound, np.minimum(apart, together - (paid - least[:, 0])))
             self._push(_Choices(frontier, k + 1, split.state, cells, relaxed, lost, bound))
+
+    def _losses(self, choices: _Choices) -> tuple[Array, Array]:
+        """`[P]` what the cells left lose together, `[P, K - k]` what each undecided one adds if it is left as well."""
+        frontier, k = choices.frontier, choices.decided
+        lost, added = choices.lost.copy(), np.zeros((len(choices.state), frontier.cells.shape[1] - k))
+        some = np.flatnonzero(choices.left.any(axis=1))
+        if not len(some):
+            return lost, added
+        if frontier.after is None:
+            picked = choices.pick(some)
+            lost[some] = self._joint_loss(picked, picked.left)
+            return lost, added
+        at = choices.state[some], choices.left[some]
+        of = frontier.after, frontier.cells, frontier.mass, frontier.sets_left - 1
+        lost[some], added[some] = self._joint.losses(*of, *at, k)
+        return lost, added
 
     def _joint_loss(self, choices: _Choices, left: BoolArray) -> Array:
         """`[P]` lower bound on what leaving the cells `left` unsensed loses against revealing the position at once."""
@@ -315,12 +365,16 @@ class Tree:
             self._record(start, relaxed, moved, leave > sense, origin)
             return
         kept = np.flatnonzero(self._hopeful(start, relaxed))
+        if not len(kept):
+            return
         detects = self._world.detects(moved.indices)
         found = sparse.csr_array((moved.data * detects, moved.indices, moved.indptr), shape=moved.shape)
         frontier = _frontier(start, sets_left, relaxed, found, leave - sense, kept, origin)
         if not self._world.perfect:
             frontier = replace(frontier, missed=sparse.csr_array((moved - found)[kept]))
-        frontier = replace(frontier, rest=self._least_loss(frontier))
+        present = np.arange(frontier.cells.shape[1]) < frontier.count[:, None]
+        after = self._joint.next(frontier.cells, present) if self._world.perfect else None
+        frontier = replace(frontier, rest=self._least_loss(frontier), after=after)
         first = _Choices(
             frontier,
             0,
@@ -401,7 +455,7 @@ def _frontier(
     loss[rows[entry], column] = regret[entry]
     source = None if origin is None else (origin, kept)
     none = np.zeros((len(kept), shape[1] + 1))
-    return _Frontier(start[kept], sets_left, relaxed[kept], cells, mass, loss, count, none, None, source)
+    return _Frontier(start[kept], sets_left, relaxed[kept], cells, mass, loss, count, none, None, None, source)
 
 
 def _sets_left_out(choices: _Choices | None, place: int) -> list[IndexArray]:

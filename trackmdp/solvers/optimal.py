@@ -1,9 +1,11 @@
 """The optimal policy, with a proof: policy iteration over located cells, the inner search by branch and bound.
 
-With V the value of the policy at hand and T the Bellman operator over renewals, the residual eps = T V - V >= 0
-bounds the optimum: V* <= V + (I - P)^-1 eps. For T V <= V + eps gives V* - V <= K* (V* - V) + eps, K* the moves from
-one detection to the next under the optimal policy, so V* - V <= (I - K*)^-1 eps; and since sensing does not move the
-target, the located cells of any policy are some of the cells on its path, each counted by (I - P)^-1.
+With V the value of the policy at hand, a plan nu from x is worth at most V(x) + eps_nu and leads to the next located
+cell by K_nu: V* - V <= max_nu eps_nu + K_nu (V* - V). Let the target pay e(X_s) >= 0 at every step s, located or not:
+phi = (I - P)^-1 e is what a path pays, whatever is sensed, and phi = e(x) + sum_t z_t e + K_nu phi, z_t the undetected
+mass after the t-th set of nu. If e(x) + sum_t z_t e >= eps_nu for every plan that is not ruled out, then phi >= max_nu
+eps_nu + K_nu phi, hence V* <= V + phi. With e = max_nu eps_nu the inequality holds; what is paid between two detections
+lets e be less.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ from trackmdp.solvers.search import InnerProblem, follow_credit
 from trackmdp.solvers.solution import SearchProgress, Solution
 from trackmdp.world.model import Array, BoolArray, World
 
-__all__ = ["solve"]
+__all__ = ["payment", "solve"]
 
 ROUNDING = 1e-10
 """Relative gap that is not told from rounding, whatever the tolerance."""
@@ -250,11 +252,10 @@ class _Run:
         self.budget.run(tree, go_on)
 
     def tighten(self, tree: Tree) -> None:
-        """Use what the tree has proved so far: V* <= V + (I - P)^-1 (T V - V), for any V, also one off by its error."""
-        # The tree bounds T V from above, cell by cell, also where it was stopped early. The clocked bound and all that
-        # earlier rounds proved hold as well: the least of them is kept, cell by cell.
-        residual = np.maximum(tree.upper() - self.value, 0.0)
-        met = self.ground.paths.upper(residual, self.ground.longest)
+        """Use what the tree has proved so far, for any V, also one off by its error."""
+        paid = payment(tree, self.value)
+        # The clocked bound and all that earlier rounds proved hold as well: the least of them is kept, cell by cell.
+        met = self.ground.paths.upper(paid, self.ground.longest)
         self.bound = np.minimum(self.bound, self.value + met)
 
     def revealed(self, problem: InnerProblem, known: list[Array], length: int, patience: int, slack: float) -> Array:
@@ -270,3 +271,14 @@ class _Run:
         return Solution(
             self.policy, self.evaluation, bound, certified, seconds, self.budget.spent, interrupted, timed_out
         )
+
+
+def payment(tree: Tree, value: Array) -> Array:
+    """`[M]` e >= 0 with e(x) + sum_t z_t e >= eps_nu for each plan nu of x, whatever part of the tree was searched."""
+    # `rate` falls where e rises. rate(0) will do, and with e also rate(rate(e)) <= e: from e >= rate(e) follows
+    # rate(e) <= rate(rate(e)), and from that rate(rate(rate(e))) <= rate(rate(e)).
+    paid = np.maximum(tree.rate(value, np.zeros_like(value)), 0.0)
+    for _ in range(2):
+        least = np.maximum(tree.rate(value, paid), 0.0)
+        paid = np.maximum(tree.rate(value, least), 0.0)
+    return paid
