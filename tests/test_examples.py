@@ -62,6 +62,15 @@ def test_torchrl_ppo() -> None:
 
 
 @pytest.mark.slow
+def test_gymnasium_sb3() -> None:
+    """Stable-Baselines3's PPO and A2C get most of the way from sensing nothing to the optimum."""
+    pytest.importorskip("stable_baselines3")
+    _, *lines = example("gymnasium_sb3")
+    for learned, none, optimum in map(numbers, lines):
+        assert none + 0.6 * (optimum - none) < learned <= optimum + 1e-9
+
+
+@pytest.mark.slow
 def test_recorded_tracks() -> None:
     learned, all_on, none, _ = (numbers(line.split("step")[1])[0] for line in example("recorded_tracks"))
     assert learned > max(all_on, none)

@@ -15,6 +15,7 @@ Every name below is imported from its module when it is first used: ``import tra
 from __future__ import annotations
 
 import importlib
+import sys
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
@@ -73,6 +74,10 @@ if TYPE_CHECKING:  # the same once more, for type checkers and editors, which do
     from trackmdp.world.model import World
     from trackmdp.world.observation import ObservationVector
     from trackmdp.world.tracks import Recorded
+
+
+if "gymnasium" in sys.modules:
+    import trackmdp.gym  # noqa: F401
 
 
 def __getattr__(name: str) -> Any:
