@@ -16,8 +16,9 @@ from tensordict import TensorDictBase
 from tests.helpers import small_world, train_config
 from tests.tracks import drawn, recorded
 from tests.training.runs import rows
+from trackmdp.app.cli import main
 from trackmdp.app.commands import train as command
-from trackmdp.errors import UserError
+from trackmdp.errors import RunError, UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.training.callbacks import Callback, Row, Training
 from trackmdp.training.evaluator import Score
@@ -152,6 +153,28 @@ def test_recorded_tracks_are_learned_from() -> None:
     run = train(setting, "ppo", **QUICK)
     assert run.summary["held_out"]["tracks"] == 40
     assert np.isfinite(run.evaluation.aihtr)
+
+
+def test_recorded_tracks_in_a_folder_are_resumed_and_evaluated(tmp_path: Path) -> None:
+    world = small_world(exit_probability=0.05)
+    setting = recorded(drawn(world.kernel, 120), drawn(world.kernel, 40, seed=1), markov=False, anywhere=True)
+    whole = train(setting, "ppo", folder=tmp_path / "whole", **QUICK)
+
+    class Stop(Callback):
+        def on_checkpoint(self, trainer: Training, file: Path) -> None:
+            raise RunError("stop")
+
+    options = QUICK | {"checkpoint.every": 1}
+    with pytest.raises(RunError, match="stop"):
+        train(setting, "ppo", folder=tmp_path / "cut", callbacks=[Stop()], **options)
+    # Typed, by somebody who has nothing but the folder.
+    words = [f"hydra.run.dir={tmp_path / 'cut'}", "quiet=true"]
+    assert main(["train", "resume=auto", *words]) == 0
+    assert load_run(tmp_path / "cut").summary["policy"] == whole.summary["policy"]
+    assert main(["evaluate", f"run={tmp_path / 'cut'}", "quiet=true", f"hydra.run.dir={tmp_path / 'e'}"]) == 0
+    other = recorded(drawn(world.kernel, 120, seed=5), markov=False, anywhere=True)
+    with pytest.raises(UserError, match="the run's recording is not the one"):
+        train(other, "ppo", folder=tmp_path / "cut", resume="auto", **{**options, "collector.total_frames": 4096})
 
 
 def test_no_hydra_is_loaded() -> None:

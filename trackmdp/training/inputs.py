@@ -1,4 +1,4 @@
-"""The inputs of a run, as its folder keeps them: `config.yaml`, and `kernel.npz` or `tracks.json`."""
+"""The inputs of a run, as its folder keeps them: `config.yaml`, `kernel.npz` or `tracks.json`, and tracks of no file."""
 
 from __future__ import annotations
 
@@ -16,13 +16,17 @@ from trackmdp.durable import write_bytes, write_text
 from trackmdp.errors import UserError
 from trackmdp.untrusted import read_bytes
 from trackmdp.world.model import World
+from trackmdp.world.recording import recording_bytes
 from trackmdp.world.tracks import Problem, Recorded
 
-__all__ = ["check_inputs", "write_inputs"]
+__all__ = ["RECORDING", "check_inputs", "write_inputs"]
+
+RECORDING = "recording.npz"
+"""The tracks of a run that was begun in Python, which may have been read from any file, or from none."""
 
 
 def write_inputs(config: TrainConfig, problem: Problem, folder: Path, *, resumed: bool) -> None:
-    """Write the config, and the kernel or which tracks these are.
+    """Write the kernel, or which tracks these are, and the config; tracks that are in no file, too.
 
     Raises:
         UserError: the run that is resumed was begun with another kernel, or with other tracks.
@@ -31,8 +35,12 @@ def write_inputs(config: TrainConfig, problem: Problem, folder: Path, *, resumed
     # Before anything is written: a run that is refused must keep the inputs that its results belong to.
     if resumed:
         check_inputs(problem, folder)
-    write_text(folder / "config.yaml", config_text(config))
+    # The config last: with it the folder is that of a run, and all that it names must be there.
     write_bytes(file, content)
+    own = folder.absolute() / RECORDING
+    if isinstance(problem, Recorded) and getattr(config.kernel, "path", None) == str(own) and not resumed:
+        write_bytes(own, recording_bytes(problem))
+    write_text(folder / "config.yaml", config_text(config))
 
 
 def check_inputs(problem: Problem, folder: Path) -> None:

@@ -15,6 +15,7 @@ from trackmdp.errors import UserError
 from trackmdp.seeding import preserved_global_rng
 from trackmdp.training.callbacks import Callback
 from trackmdp.training.display import make_console
+from trackmdp.training.inputs import RECORDING
 from trackmdp.training.lock import locked
 from trackmdp.training.run import Run, complete
 from trackmdp.training.trainer import Trainer
@@ -86,7 +87,7 @@ def _short(values: Array) -> float | list[float]:
 
 
 def _described(problem: Problem, folder: Path | None) -> dict[str, Any]:
-    """The options that a problem made in Python is described by: what is in memory counts, and is saved as a table."""
+    """The options that a problem made in Python is described by: what is in memory counts, and the folder keeps it."""
     price = problem.cost
     given: dict[str, Any] = {
         "grid.size": problem.rows if problem.rows == problem.columns else list(problem.size),
@@ -103,10 +104,12 @@ def _described(problem: Problem, folder: Path | None) -> dict[str, Any]:
     if isinstance(problem, World):
         where = (folder or Path()).absolute() / "kernel.npz"
         return given | {"kernel": "table", "kernel.path": str(where)}
-    if folder is not None:
-        raise UserError(
-            "folder: recorded tracks that were loaded in Python have no file to resume from; use trackmdp train "
-            "kernel=tracks kernel.path=..., or folder=None"
-        )
-    # A path must be given, and nothing reads it: the tracks are in memory, and no folder keeps this config.
-    return given | {"kernel": "tracks", "kernel.path": "tracks.csv", "kernel.markov": problem.markov}
+    # Without a folder a path must be given all the same, and nothing reads it: the tracks are in memory.
+    tracks = {
+        "kernel": "tracks",
+        "kernel.path": str((folder or Path()).absolute() / RECORDING),
+        "kernel.markov": problem.markov,
+        "kernel.starts": "anywhere" if problem.anywhere else "first",
+        "kernel.min_length": 1,  # however short they are, they were taken
+    }
+    return given | tracks

@@ -14,7 +14,8 @@ from trackmdp.config.registry import make
 from trackmdp.config.world import LARGEST
 from trackmdp.world.checks import canonical_kernel, check_kernel
 from trackmdp.world.files import per_cell
-from trackmdp.world.model import Size, World
+from trackmdp.world.model import Size, World, grid_size
+from trackmdp.world.recording import read_recording
 from trackmdp.world.tracks import Problem, Recorded, check_tracks, read_tracks, split
 
 __all__ = ["build_world", "load_tracks", "make_problem", "make_world", "paper_cost", "recorded"]
@@ -144,18 +145,21 @@ def recorded(
 ) -> Recorded:
     """The recorded tracks in a file, in their three parts; see `TracksConfig` for the options.
 
+    A `recording.npz`, which a run keeps of tracks that were in memory, has the parts and the ends of its own.
+
     Raises:
         UserError: the file is missing or malformed, a track is too short, or one of the three parts would be empty.
     """
+    of_task |= {"markov": markov, "anywhere": starts == "anywhere"}
+    if (kept := read_recording(path, math.prod(grid_size(size)))) is not None:
+        return Recorded(kept[0], size, validation=kept[1], held_out=kept[2], **of_task)
     tracks = read_tracks(path, size, exits=ends == "exit")
     # A located cell, t_max + 1 free choices and the forced step: t_max + 3 cells, the segment that hindsight learns
     # from.
     shortest = max(min_length or of_task["t_max"] + 3, 1 if ends == "exit" else 2)  # a cut track of one has no step
     check_tracks(tracks, shortest, f"kernel.path={path}")
     mine, chosen, judged = split(tracks, held_out, validation, seed)
-    return Recorded(
-        mine, size, validation=chosen, held_out=judged, markov=markov, anywhere=starts == "anywhere", **of_task
-    )
+    return Recorded(mine, size, validation=chosen, held_out=judged, **of_task)
 
 
 def paper_cost(size: Size, *, reward: float, sensor: float | list[float] | str, safe: float | None) -> dict[str, Any]:
