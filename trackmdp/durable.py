@@ -15,8 +15,9 @@ import stat
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from io import BufferedWriter
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, Any, BinaryIO
 
 from trackmdp.errors import UserError
 from trackmdp.untrusted import printable, sealed
@@ -65,7 +66,7 @@ def whole_file(file: Path) -> Iterator[BinaryIO]:
         raise
 
 
-def create(file: Path) -> BinaryIO:
+def create(file: Path) -> BufferedWriter:
     """A new file, open for writing; whatever had its name, a link included, is removed first, not followed."""
     file.unlink(missing_ok=True)
     # O_EXCL: if somebody puts a link under this name after the unlink, the call fails instead of writing where it
@@ -130,7 +131,7 @@ def second_name(file: Path, name: Path) -> None:
     part.unlink(missing_ok=True)  # rename does nothing where both are names of one file already
 
 
-def sync(stream: BinaryIO, file: Path) -> None:
+def sync(stream: IO[Any], file: Path) -> None:
     """Put the bytes written to `file` on the disk."""
     stream.flush()
     _fsync(stream.fileno(), file.parent)

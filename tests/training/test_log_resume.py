@@ -91,3 +91,24 @@ def test_on_a_full_disk_one_line_says_why_and_the_run_goes_on_as_if_it_never_had
     train(tmp_path / "cut", *LOGGED, "resume=auto")
     mine, whole = (checkpoint.load(checkpoint.newest(tmp_path / run))["callbacks"] for run in ("cut", "whole"))
     assert mine["episodes"] == whole["episodes"] == {"policies": 5}
+
+
+def test_what_a_checkpoint_counts_on_is_on_the_disk_before_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a power failure the bytes are gone that no fsync has put on the disk."""
+    synced: dict[int, int] = {}
+    fsync, point = os.fsync, checkpoint.point
+
+    def noted(descriptor: int) -> None:
+        fsync(descriptor)
+        synced[os.fstat(descriptor).st_ino] = os.fstat(descriptor).st_size
+
+    def checked(file: Path, *, best: bool) -> None:
+        state = checkpoint.load(file)["callbacks"]
+        metrics, log = (tmp_path / name for name in ("metrics.csv", "episodes.mcap.part"))
+        assert synced[metrics.stat().st_ino] >= state["csv"]["position"] > 0
+        assert synced[log.stat().st_ino] == log.stat().st_size
+        point(file, best=best)
+
+    monkeypatch.setattr(os, "fsync", noted)
+    monkeypatch.setattr(checkpoint, "point", checked)
+    train(tmp_path, *LOGGED)

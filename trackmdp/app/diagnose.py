@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
+from hydra.core.override_parser.types import Glob, Override
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
@@ -191,9 +191,11 @@ def _unknown(override: Override, known: dict[str, Option]) -> UserError:
 
 def _values(override: Override) -> list[Any]:
     """The value, or those of a sweep."""
-    if override.is_sweep_override() and override.is_discrete_sweep():
+    value = override.value()
+    # What glob(*) stands for only Hydra's loader of configs knows.
+    if override.is_sweep_override() and override.is_discrete_sweep() and not isinstance(value, Glob):
         return list(override.sweep_iterator())
-    return [override.value()]
+    return [value]
 
 
 def _names(override: Override) -> list[Any]:

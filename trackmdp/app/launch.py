@@ -108,11 +108,13 @@ class _NoCallbacks:
 
 def _sweep(compose: Composer) -> int:
     from trackmdp.app.sweep.launchers import make_launcher
-    from trackmdp.app.sweep.plan import sweep_name
+    from trackmdp.app.sweep.plan import parsed, sweep_name
     from trackmdp.app.sweep.sweep import sweep
     from trackmdp.training.display import make_console
 
     command, words = compose.command, run_words(compose.words)
+    for word in words:
+        parsed(word)  # refused here, where the message names the word; later `hydra.sweep.dir` would be named
     # Hydra refuses words with several values outside its own multirun; what concerns the sweep as a whole has one
     # value.
     cfg = compose([word for word in compose.words if not _has_values(word)])

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from trackmdp.app.outputs import folder_of
 from trackmdp.config import (
@@ -58,7 +58,9 @@ def typed_config(command: str, cfg: DictConfig, folder: Path) -> CommandConfig:
 def _refuse_ignored(typed: CommandConfig, composed: DictConfig) -> None:
     """Refuse words of the command line that have no effect; a default that nothing reads is no mistake."""
     if "hydra" in composed:
-        words = (word.lstrip("+~").partition("=") for word in composed.hydra.overrides.task)
+        # As typed: an interpolation in a word that a later one replaces may be of no resolver there is.
+        as_typed: Any = OmegaConf.to_container(composed.hydra.overrides.task, resolve=False)
+        words = (word.lstrip("+~").partition("=") for word in as_typed)
         refuse_ignored(typed, {key: value for key, _, value in words}, composed.hydra.runtime.choices)
 
 

@@ -96,6 +96,15 @@ class EpisodeLog:
         except OSError as error:
             self._stop(error)
 
+    def sync(self) -> None:
+        """Put what has been recorded on the disk."""
+        if self._writer is None:
+            return
+        try:
+            self._writer.sync()
+        except OSError as error:
+            self._stop(error)
+
     def close(self) -> bool:
         """Finish the file, unless logging is over already; returns whether the file is whole."""
         if self._writer is None:

@@ -66,7 +66,8 @@ class EpisodeLogger(Callback):
             sys.stderr.write(f"trackmdp train: {self._lost}\n")
 
     def state_dict(self) -> dict[str, Any]:
-        """How many policies were handed to the log."""
+        """How many policies were handed to the log, whose episodes are on the disk from then on."""
+        self._log.sync()
         return {"policies": self._policies}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from mcap.writer import Writer
 
-from trackmdp.durable import sync_folder
+from trackmdp.durable import create, sync, sync_folder
 from trackmdp.episodes import messages, schema
 from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.limits import size_of_grid
@@ -81,7 +81,7 @@ class EpisodeWriter:
         self._policies = self._unflushed = self._tick = 0
         # Opened here and not by the Writer, which closes a file of its own in finish(), before it could be synced.
         # CRCs over the data section are off by default; `Container.check_data` needs them.
-        self._stream = self.part.open("wb")
+        self._stream = create(self.part)
         self._writer = Writer(self._stream, enable_data_crcs=True)
         self._writer.start(library=f"trackmdp {run['trackmdp']}")
         # Once, and the numbers kept: registering a topic a second time would make a second channel of the same name.
@@ -173,6 +173,12 @@ class EpisodeWriter:
         with self._lock:
             self._flush()
 
+    def sync(self) -> None:
+        """Close the chunk and put it on the disk: it then survives a power failure as well."""
+        with self._lock:
+            self._flush()
+            sync(self._stream, self.part)
+
     def finish(self) -> Path:
         """Complete the file and give it its name; returns it."""
         with self._lock:
@@ -186,8 +192,7 @@ class EpisodeWriter:
             # whoever sees the final name sees all bytes. A kill before the rename leaves a `.part` that can be
             # recovered.
             self._writer.finish()
-            self._stream.flush()
-            os.fsync(self._stream.fileno())
+            sync(self._stream, self.part)
             self._stream.close()
         self.part.replace(self.file)
         sync_folder(self.file.parent)

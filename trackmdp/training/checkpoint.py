@@ -151,7 +151,8 @@ class _Hashed:
         try:
             torch.save(state, cast("IO[bytes]", self))
         except RuntimeError as error:  # what torch says when a write failed, whatever the reason
-            raise self._failure or error from None
+            cause = error.__context__ if isinstance(error.__context__, OSError) else error
+            raise self._failure or cause from None
 
     def write(self, piece: bytes) -> int:
         self.digest.update(piece)

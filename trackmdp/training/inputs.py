@@ -1,4 +1,4 @@
-"""The inputs of a run, as its folder keeps them: `config.yaml`, `kernel.npz` or `tracks.json`, and tracks of no file."""
+"""Inputs of a run in its folder: `config.yaml`, `kernel.npz` or `tracks.json`, and recorded tracks of no other file."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from trackmdp.config.learning import RowsConfig
-from trackmdp.durable import own_folder, reopen
+from trackmdp.durable import own_folder, reopen, sync
 from trackmdp.training.callbacks import Callback, Row, Training
 from trackmdp.untrusted import decoded, opened
 
@@ -71,7 +71,11 @@ class CsvLogger(Callback):
         self._file.close()
 
     def state_dict(self) -> dict[str, Any]:
-        """Bytes of the file so far."""
+        """Bytes of the file so far, which are on the disk from then on.
+
+        The checkpoint that holds this number is: after a power failure it must not find fewer bytes.
+        """
+        sync(self._file, self._path)
         return {"position": self._file.tell()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
+from hydra.core.override_parser.types import Glob, Override
 from hydra.errors import HydraException
 from omegaconf import DictConfig
 
@@ -22,7 +22,7 @@ from trackmdp.config import CommandConfig, TrainConfig, to_dict
 from trackmdp.config.resume import CHANGEABLE
 from trackmdp.errors import UserError
 
-__all__ = ["Job", "combinations", "plan", "sweep_name"]
+__all__ = ["Job", "combinations", "parsed", "plan", "sweep_name"]
 
 _UNNAMED = ("experiment", "quiet", "resume")
 """Keys that are left out of a folder's readable name: they do not change a result, or stand for other words."""
@@ -73,7 +73,7 @@ def combinations(blocks: Sequence[str], typed: Sequence[str]) -> list[list[str]]
         axes: dict[str, list[str]] = {}
         # `posix=False` keeps quotes: they are for Hydra's parser, which reads the word next.
         for word in [*shlex.split(block, posix=False), *typed]:
-            override = _parse(word)
+            override = parsed(word)
             if override.key_or_group == "experiment" and override.is_sweep_override():
                 raise UserError(f"{word}: expected one experiment; each is a sweep of its own")
             # By key: what is typed comes last, and replaces the word of the block. `algo=a2c,ppo seed=0,1` makes the
@@ -134,7 +134,7 @@ def sweep_name(command: str, words: Sequence[str], blocks: Sequence[str]) -> str
     told = _distinguishing(words)
     experiments = [word.partition("=")[2] for word in told if _key(word) == "experiment"]
     # Stable sort: False comes first, so that words with several values lead and survive the cut at 80 letters.
-    text = _slug(sorted(told, key=lambda word: not _parse(word).is_sweep_override()), experiments or [command])
+    text = _slug(sorted(told, key=lambda word: not parsed(word).is_sweep_override()), experiments or [command])
     return f"{text}-{_digest(command, told, list(blocks))}"
 
 
@@ -203,11 +203,19 @@ def _resumable(cfg: CommandConfig) -> CommandConfig:
     return replace(cfg, resume="auto")
 
 
-def _parse(word: str) -> Override:
+def parsed(word: str) -> Override:
+    """A word as Hydra reads it.
+
+    Raises:
+        UserError: it cannot be read, or names its values by `glob`, which would find the schemas beside the choices.
+    """
     try:
-        return OverridesParser.create().parse_override(word)
-    except HydraException as error:
+        override = OverridesParser.create().parse_override(word)
+    except (HydraException, ValueError) as error:  # ValueError: an integer of thousands of digits
         raise UserError(f"{word}: expected option=value (a value with blanks or commas needs quotes)") from error
+    if not override.is_delete() and isinstance(override.value(), Glob):
+        raise UserError(f"{word}: expected the values themselves, separated by commas")
+    return override
 
 
 def _values(override: Override) -> list[str]:

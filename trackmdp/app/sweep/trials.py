@@ -8,10 +8,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import IntervalSweep, Override, RangeSweep
 
-from trackmdp.app.sweep.plan import Job
+from trackmdp.app.sweep.plan import Job, parsed
 from trackmdp.app.sweep.schema import OptunaConfig
 from trackmdp.app.sweep.table import run_scores
 from trackmdp.errors import UserError, require
@@ -42,9 +41,9 @@ def trials(
         UserError: Optuna is not installed, there is nothing to search, or the study is one of another search.
     """
     require("optuna", "optuna", "hydra/sweeper=optuna")
-    parsed = [OverridesParser.create().parse_override(word) for word in words]
-    searched = {each.get_key_element(): each for each in parsed if each.is_sweep_override()}
-    fixed = [word for word, each in zip(words, parsed, strict=True) if not each.is_sweep_override()]
+    read = [parsed(word) for word in words]
+    searched = {each.get_key_element(): each for each in read if each.is_sweep_override()}
+    fixed = [word for word, each in zip(words, read, strict=True) if not each.is_sweep_override()]
     if not searched:
         raise UserError("hydra/sweeper=optuna: expected a word to search, such as algo.gamma=interval(0.9,0.99)")
     with _study(cfg, folder) as study:
