@@ -74,7 +74,7 @@ FILES = {
                 if self.naps > root.collector.envs:
                     raise refuse(f"{key}.naps", self.naps, f"at most collector.envs={root.collector.envs}")
 
-            def memory(self, task, root):
+            def needs(self, task, root):
                 return {"algo.bed": self.bed}
     """,
     "outside/conf/algo/lazy.yaml": """

@@ -26,7 +26,7 @@ from trackmdp.solvers.kernel_estimate import KernelEstimate, ObservedPaths
 from trackmdp.world.model import Task, World
 from trackmdp.world.windows import Window
 
-__all__ = ["LearnedKernel", "observed_paths"]
+__all__ = ["LearnedKernel", "observed_paths", "policy_tensors", "tensors_policy"]
 
 
 class LearnedKernel:
@@ -94,7 +94,7 @@ class LearnedKernel:
             "rng": _rng_state(self._rng),
             "estimate": {name: torch.as_tensor(part) for name, part in self._estimate.state().items()},
             "policy": self.policy.state_dict(),
-            "actor": _packed(self.actor),
+            "actor": policy_tensors(self.actor),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -103,7 +103,7 @@ class LearnedKernel:
         self._rng.bit_generator.state = _unpacked(state["rng"])
         self._estimate.load_state({name: part.cpu().numpy() for name, part in state["estimate"].items()})
         self.policy.load_state_dict(state["policy"])
-        self.actor = Policy.all_on(self.task) if state["actor"] is None else _policy(self.task, state["actor"])
+        self.actor = Policy.all_on(self.task) if state["actor"] is None else tensors_policy(self.task, state["actor"])
 
 
 def observed_paths(batch: TensorDictBase, task: Task) -> ObservedPaths:
@@ -147,14 +147,15 @@ def _unpacked(state: dict[str, Any]) -> dict[str, Any]:
     return {**state, "state": {name: int(value) for name, value in state["state"].items()}}
 
 
-def _packed(policy: PolicyTable) -> dict[str, torch.Tensor] | None:
+def policy_tensors(policy: PolicyTable) -> dict[str, torch.Tensor] | None:
     """The table's sparse matrix as tensors; None for all sensors on, before the first plan."""
     if policy.sets is None:
         return None
     return {"indices": torch.as_tensor(policy.sets.indices), "indptr": torch.as_tensor(policy.sets.indptr)}
 
 
-def _policy(task: Task, packed: dict[str, torch.Tensor]) -> Policy:
-    indices, indptr = packed["indices"].cpu().numpy().copy(), packed["indptr"].cpu().numpy().copy()
-    shape = (task.num_cells * task.num_choices, task.num_cells)
+def tensors_policy(task: Task, tensors: dict[str, torch.Tensor]) -> Policy:
+    """The policy of `policy_tensors`."""
+    indices, indptr = (tensors[name].cpu().numpy().copy() for name in ("indices", "indptr"))
+    shape = (task.num_keys * task.num_choices, task.num_cells)
     return Policy(task, sparse.csr_array((np.ones(len(indices), dtype=bool), indices, indptr), shape=shape))

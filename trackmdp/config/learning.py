@@ -73,6 +73,8 @@ class AlgoConfig(ChoiceConfig):
     """
 
     credit: ClassVar[str | None] = "joint"
+    remembers: ClassVar[bool] = False
+    """Whether it learns policies that remember more than the cell (`task.memory`)."""
     total_frames: int = option("env steps the algorithm needs", unit="frames", ge=1, le=MOST_FRAMES)
     frames_per_batch: int = option("env steps per collected batch", unit="frames", ge=1)
     envs: int = option("environments stepped together", ge=1)
@@ -92,7 +94,7 @@ class ActorCriticConfig(AlgoConfig):
     initial_logit: float = option("actor's output bias at the start", unit="logits", ge=-20, le=20)
     reward_scale: float = option("factor on rewards while learning", gt=0)
 
-    def memory(self, task: Sizes, root: Any) -> dict[str, int]:
+    def needs(self, task: Sizes, root: Any) -> dict[str, int]:
         """The two networks and their optimiser."""
         return {"algo.hidden": networks(task, self.hidden)}
 
@@ -159,7 +161,7 @@ class DqnConfig(AlgoConfig):
             expected = f"at least collector.frames_per_batch={frames} and {key}.batch_size={self.batch_size}"
             raise refuse(f"{key}.buffer_size", self.buffer_size, expected)
 
-    def memory(self, task: Sizes, root: Any) -> dict[str, int]:
+    def needs(self, task: Sizes, root: Any) -> dict[str, int]:
         """The replay buffer, whose transitions hold two states; the networks."""
         # State and next state, the action's K bits as bools, two float32 and one flag (reward, discount,
         # terminated), an index.
@@ -199,7 +201,7 @@ class CollectorConfig(ChoiceConfig):
             expected = f"at least {key}.frames_per_batch={self.frames_per_batch}"
             raise refuse(f"{key}.total_frames", self.total_frames, expected)
 
-    def memory(self, task: Sizes, root: Any) -> dict[str, int]:
+    def needs(self, task: Sizes, root: Any) -> dict[str, int]:
         """Two batches: one is collected while the other is handed over."""
         number = BYTES["float32"]
         frame = 2 * (state_bytes(task) + 3) + task.num_sensors + number * (task.num_sensors + 2)

@@ -79,7 +79,7 @@ class PerSensorConfig(AlgoConfig):
         """All sensors on leave nothing to explore."""
         return {} if self.collect == "mixed" else {"explore": "with algo.collect=all_on"}
 
-    def memory(self, task: Sizes, root: Any) -> dict[str, int]:
+    def needs(self, task: Sizes, root: Any) -> dict[str, int]:
         """The moves kept, with what sorting them takes; the paths of one update; the networks.
 
         A move is two cells of 16 bits. Where moves of different paths do not combine (`markov`), whole paths of

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from trackmdp.config import learned_kernel, per_sensor  # noqa: F401  (more algorithms to choose from)
+from trackmdp.config import learned_kernel, path_counts, per_sensor  # noqa: F401  (more algorithms to choose from)
 from trackmdp.config.baselines import BaselineConfig
 from trackmdp.config.learning import DEVICE, AlgoConfig, CollectorConfig, LogConfig
 from trackmdp.config.options import GROUPS, listed, option, refuse
 from trackmdp.config.partition import PartitionConfig
 from trackmdp.config.schema import NodeConfig
-from trackmdp.config.world import CostConfig, GridConfig, KernelConfig, SensorConfig
+from trackmdp.config.world import CostConfig, GridConfig, KernelConfig, SensorConfig, TaskConfig
 from trackmdp.errors import UserError
 
 __all__ = [
@@ -49,6 +49,11 @@ class WorldConfig(CommandConfig):
     kernel: KernelConfig
     cost: CostConfig
     sensor: SensorConfig
+
+    @property
+    def remembered(self) -> dict[str, Any]:
+        """What policies remember, as arguments of `Task`: the cell, where the command has no options of it."""
+        return {}
 
 
 @dataclass(kw_only=True)
@@ -91,6 +96,7 @@ class TrainConfig(WorldConfig):
     seed: int = option("every random draw of the run derives from it", ge=0)
     device: str = option("device the networks live on", expects="cpu, cuda, cuda:N or auto", pattern=DEVICE)
     threads: int = option("torch threads of the learning process", unit="threads", ge=1, le=256)
+    task: TaskConfig
     algo: AlgoConfig
     collector: CollectorConfig
     log: dict[str, LogConfig]
@@ -106,6 +112,11 @@ class TrainConfig(WorldConfig):
     init_from: str | None = option(
         "start from the weights of another run, where shapes fit", expects="the folder of a run", path=True
     )
+
+    @property
+    def remembered(self) -> dict[str, Any]:
+        """The options of `task`."""
+        return {"memory": self.task.memory, "clip": self.task.clip}
 
 
 @dataclass(kw_only=True)

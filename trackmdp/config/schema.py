@@ -31,6 +31,10 @@ class Sizes(Protocol):
         """T_max."""
 
     @property
+    def order(self) -> int:
+        """Detections before the last one that are remembered."""
+
+    @property
     def markov(self) -> bool:
         """Whether moves of different paths combine."""
 
@@ -57,7 +61,7 @@ class NodeConfig:
         """
         return {}
 
-    def memory(self, task: Sizes, root: Any) -> dict[str, int]:
+    def needs(self, task: Sizes, root: Any) -> dict[str, int]:
         """Bytes that a run needs for what this node asks for, by the dotted option that they grow with."""
         return {}
 

@@ -22,13 +22,16 @@ __all__ = [
     "RandomWalkConfig",
     "SensorConfig",
     "TableConfig",
+    "TaskConfig",
     "TracksConfig",
+    "MEMORIES",
 ]
 
 LARGEST = 1e15
 """Of a price or a reward: sums of them over cells and steps, and squares of those in a loss, stay far from overflow."""
 
 BORDERS = ("renormalize", "inside", "clip", "exit")
+MEMORIES = ("cell", "displacement", "displacement_gap", "two_displacements")
 
 
 @dataclass(kw_only=True)
@@ -60,6 +63,36 @@ class GridConfig(NodeConfig):
         """(rows, columns)."""
         rows, columns = (self.size, self.size) if isinstance(self.size, int) else self.size
         return rows, columns
+
+
+@dataclass(kw_only=True)
+class TaskConfig(NodeConfig):
+    """What the policy may know."""
+
+    memory: str = option(
+        "what a policy remembers at a detection: the cell; with it the displacement since the detection before, with "
+        "or without the misses between; or the last displacement and the direction of the one before",
+        choices=MEMORIES,
+    )
+    clip: int = option(
+        "rows and columns up to which displacements are told apart; larger ones count as that", unit="cells", ge=1, le=8
+    )
+
+    def check(self, key: str, root: Any) -> None:
+        """More than the cell is remembered where there is a learner of it, and paths to learn from."""
+        if self.memory == "cell":
+            return
+        readers = [name for name, schema in GROUPS["algo"].items() if schema.remembers]
+        if not root.algo.remembers:
+            expected = f"cell with algo={root.algo.name}, or algo={' or '.join(readers)}"
+            raise refuse(f"{key}.memory", self.memory, expected)
+        if root.kernel.is_motion:
+            expected = f"cell with kernel={root.kernel.name}, whose next move depends on the cell alone"
+            raise refuse(f"{key}.memory", self.memory, expected)
+
+    def ignored(self, root: Any) -> dict[str, str]:
+        """Where the cell alone is remembered there is no displacement."""
+        return {"clip": "with task.memory=cell"} if self.memory == "cell" else {}
 
 
 @dataclass(kw_only=True)

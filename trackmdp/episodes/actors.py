@@ -36,12 +36,14 @@ class States:
     Attributes:
         row: `[B]` which episodes of the batch these are.
         last_cell: `[B]` cell of the last detection.
+        key: `[B]` what the policy remembered there; the cell, where that is all.
         misses: `[B]` n since then.
         step: steps done so far.
     """
 
     row: Tensor
     last_cell: Tensor
+    key: Tensor
     misses: Tensor
     step: int
 
@@ -146,7 +148,7 @@ class Following:
 
     def decide(self, states: States, draws: Tensor) -> Choice:  # noqa: ARG002
         """See `Actor`."""
-        row = self.policy.row(states.last_cell, states.misses)
+        row = self.policy.row(states.key, states.misses)
         return _Rows(self._table.entry, row, self._count[row], self._spent[row])
 
 
@@ -176,7 +178,7 @@ class Drawing:
 
     def decide(self, states: States, draws: Tensor) -> Choice:
         """See `Actor`."""
-        return _Written(self.policy.act(states.last_cell, states.misses, draws), self._costs)
+        return _Written(self.policy.act(states.key, states.misses, draws), self._costs)
 
 
 class Issuing:

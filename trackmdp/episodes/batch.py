@@ -84,6 +84,7 @@ class Episodes(Sequence[Episode]):
         truncated: `[S]`, whether the step was the last one allowed.
         sensors: `[S]`, how many were on.
         bits: `[S, ceil(M/8)]`, the actions, eight sensors to a byte; None where they follow from the policy.
+        key: `[S]`, what the policy remembered before each step; None where that is the last cell alone.
     """
 
     problem: Problem
@@ -98,6 +99,7 @@ class Episodes(Sequence[Episode]):
     truncated: BoolArray
     sensors: npt.NDArray[np.int32]
     bits: npt.NDArray[np.uint8] | None
+    key: npt.NDArray[np.int32] | None = None
 
     @classmethod
     def of(cls, problem: Problem, policy: Policy | None, seeds: Sequence[int], batches: Sequence[Steps]) -> Episodes:
@@ -137,7 +139,7 @@ class Episodes(Sequence[Episode]):
             policy=0,
             start=start,
             misses=misses,
-            action=self._action(steps, last_cells(start, target, located), misses),
+            action=self._action(steps, self._keys(steps, last_cells(start, target, located)), misses),
             target=target,
             located=located,
             reward=self.reward[steps],
@@ -146,14 +148,18 @@ class Episodes(Sequence[Episode]):
             truncated=bool(self.truncated[steps][-1]),
         )
 
-    def _action(self, steps: slice, last_cell: Integers, misses: Integers) -> BoolArray:
+    def _keys(self, steps: slice, last_cell: Integers) -> Integers:
+        """`[T]`, what the policy remembered before each step."""
+        return last_cell if self.key is None else self.key[steps].astype(np.int64)
+
+    def _action(self, steps: slice, key: Integers, misses: Integers) -> BoolArray:
         """`[T, M]`."""
-        # A policy with a table needs no bits: its action follows from (last cell, misses), and S rows of M bits are
-        # not kept.
+        # A policy with a table needs no bits: its action follows from (key, misses), and S rows of M bits are not
+        # kept.
         if self.bits is not None:
             return np.unpackbits(self.bits[steps], axis=-1, count=self.problem.num_cells).astype(np.bool_)
         assert self.policy is not None
-        return self.policy.act(torch.from_numpy(last_cell), torch.from_numpy(misses)).numpy()
+        return self.policy.act(torch.from_numpy(key), torch.from_numpy(misses)).numpy()
 
     def figures(self) -> Simulation:
         """What the episodes say of the policy, with standard errors."""
@@ -186,5 +192,7 @@ class Episodes(Sequence[Episode]):
     def _probability(self, episode: Episode) -> Floats:
         if self.policy is None:
             return episode.action.astype(np.float32)
-        state = torch.from_numpy(episode.last_cell), torch.from_numpy(episode.misses)
+        steps = slice(int(self.first[episode.number]), int(self.first[episode.number + 1]))
+        key = self._keys(steps, episode.last_cell)
+        state = torch.from_numpy(key), torch.from_numpy(episode.misses)
         return self.policy.probabilities(*state).float().numpy()

@@ -110,11 +110,12 @@ class _At:
     row: Tensor
     place: Tensor
     last_cell: Tensor
+    key: Tensor
     misses: Tensor
 
     def kept(self, rows: Tensor) -> _At:
         """Those of the positions `rows`."""
-        return _At(self.row[rows], self.place[rows], self.last_cell[rows], self.misses[rows])
+        return _At(*(part[rows] for part in (self.row, self.place, self.last_cell, self.key, self.misses)))
 
 
 class _Batch:
@@ -125,6 +126,8 @@ class _Batch:
     ) -> None:
         self._task, self._source, self._actor = problem, source, actor
         self._costs, self._reports = rules
+        # What a policy remembers is its own; whatever else acts knows the cell.
+        self._keys = (actor.policy.task if actor.policy else problem.forgetful).keys
         self._draws = _Draws(source, seeds, actor.num_draws, certain=self._reports.certain)
         self._steps = Steps(len(seeds))
 
@@ -133,7 +136,7 @@ class _Batch:
         place = self._draws.starts()
         start = self._source.cell(place)
         self._steps.begin(start)
-        at = _At(torch.arange(len(start)), place, start, torch.zeros_like(start))
+        at = _At(torch.arange(len(start)), place, start, self._keys.start(start), torch.zeros_like(start))
         step = 0
         while len(at.row):
             at = self._step(at, step)
@@ -143,7 +146,7 @@ class _Batch:
     def _step(self, at: _At, step: int) -> _At:
         """One step of `TrackEnv`, of the episodes still running; the same order of events, the same arithmetic."""
         moves, choices, seen = self._draws.at(step, at.row)
-        choice = self._actor.decide(States(at.row, at.last_cell, at.misses, step), choices)
+        choice = self._actor.decide(States(at.row, at.last_cell, at.key, at.misses, step), choices)
         place = self._source.move(at.place, moves)
         target = self._source.cell(place)
         in_grid = target < self._task.num_cells
@@ -155,16 +158,18 @@ class _Batch:
         reward = self._costs.reward_of(choice.spent, located, forced, in_grid)
         # An exit on the last step allowed is an exit (terminated), not a truncation.
         truncated = self._truncated(place, step) & in_grid
-        self._steps.add(
-            at.row, choice, misses=at.misses, target=target, located=located, reward=reward, truncated=truncated
-        )
+        columns = {"key": at.key} if self._keys.order else {}
+        columns |= {"misses": at.misses, "target": target, "located": located, "reward": reward}
+        self._steps.add(at.row, choice, truncated=truncated, **columns)
         # `[R']`, the positions of those still running: only they are carried over, so that a step's cost falls as
         # episodes end.
         going_on = (in_grid & ~truncated).nonzero().squeeze(-1)
         last_cell = torch.where(located, target, at.last_cell)
+        known = self._keys.next(at.key, at.misses, target.clamp_max(self._task.num_cells - 1))
+        key = torch.where(located, known, at.key)
         # The clock stands still while the safe action is repeated.
         misses = torch.where(located, 0, (at.misses + 1).clamp_max(self._task.t_max + 1))
-        return _At(at.row, place, last_cell, misses).kept(going_on)
+        return _At(at.row, place, last_cell, key, misses).kept(going_on)
 
     def _truncated(self, place: Tensor, step: int) -> Tensor:
         """`[R]` whether this step is the last one allowed, or the last one recorded."""

@@ -39,7 +39,7 @@ from trackmdp.policies.unroll import (
 from trackmdp.world.model import Array, Task
 from trackmdp.world.windows import Window
 
-__all__ = ["Policy", "PolicyLike", "as_policy", "rule_of"]
+__all__ = ["Policy", "PolicyLike", "actor_table", "as_policy", "rule_of"]
 
 PolicyLike: TypeAlias = "PolicyTable | TensorDictModuleBase | Callable[..., Any]"
 """A policy or its table, a TensorDict module, or a function as `Policy.from_function` takes it."""
@@ -55,9 +55,10 @@ class Policy(TensorDictModuleBase, PolicyTable):
 
     Args:
         task: grid, costs and limits.
-        sets: `[M * (t_max + 1), M]` sparse; row `x * (t_max + 1) + n` is the set at n misses after locating the target
-            in x. Bool entries are sensors on; entries in (0, 1] are the probabilities of switching them on,
-            independently of each other and of the history.
+        sets: `[keys * (t_max + 1), M]` sparse; row `key * (t_max + 1) + n` is the set at n misses after the detection
+            that left `key`: the located cell, or more where the task's memory holds more. Bool entries are sensors on;
+            entries in (0, 1] are the probabilities of switching them on, independently of each other and of the
+            history.
         probability: the same for every sensor in every state, instead of `sets`.
         k: exactly k sensors are on, each such subset equally likely; `probability` is then k / M.
 
@@ -69,7 +70,7 @@ class Policy(TensorDictModuleBase, PolicyTable):
         UserError: the shape is not that of the task's states, or an entry is no probability.
     """
 
-    in_keys: ClassVar = list(STATE_KEYS)
+    in_keys: list[str] = list(STATE_KEYS)  # noqa: RUF012 (each policy may have its own)
     out_keys: ClassVar = ["action"]
 
     def __init__(
@@ -82,6 +83,8 @@ class Policy(TensorDictModuleBase, PolicyTable):
     ) -> None:
         TensorDictModuleBase.__init__(self)
         PolicyTable.__init__(self, task, sets, probability=probability, k=k)
+        if task.order:
+            self.in_keys = ["last_cell", "key", "steps_since_detection"]
         self.generator: torch.Generator | None = None
         self._lookup: DenseTable | SparseTable | None = None
         self._local: DenseTable | SparseTable | None = None  # of the window's sensors alone
@@ -140,6 +143,7 @@ class Policy(TensorDictModuleBase, PolicyTable):
 
     @classmethod
     def _unrolled(cls, task: Task, rule: Rule, device: torch.device | str, *, check: bool) -> Policy:
+        task = task.forgetful  # a rule is asked what it does knowing the cell
         sets = unrolled(task, rule, torch.device(device))
         if check and draws(task, rule, torch.device(device), sets):
             raise DrawsError(f"policy: draws at random, so that it has no exact value; {TAKE_ITS_MODE}")
@@ -152,15 +156,15 @@ class Policy(TensorDictModuleBase, PolicyTable):
         """Uniform draws that one decision takes: none, or one per sensor."""
         return 0 if self.deterministic else self.task.num_cells
 
-    def act(self, last_cell: Tensor, steps_since_detection: Tensor, draws: Tensor | None = None) -> Tensor:
+    def act(self, key: Tensor, steps_since_detection: Tensor, draws: Tensor | None = None) -> Tensor:
         """`[*B, M]` bool, the sensors on, as a function of state and draws.
 
         Args:
-            last_cell: `[*B]` int64.
+            key: `[*B]` int64, what was remembered at the last detection; the cell, where that is all.
             steps_since_detection: `[*B]` int64; where the safe action is forced the last set stands in, unused.
             draws: `[*B, num_draws]` uniform in [0, 1), where the policy is not deterministic.
         """
-        probability = self.probabilities(last_cell, steps_since_detection)
+        probability = self.probabilities(key, steps_since_detection)
         if self.deterministic:
             return probability
         assert draws is not None
@@ -172,18 +176,18 @@ class Policy(TensorDictModuleBase, PolicyTable):
         on = torch.zeros_like(draws, dtype=torch.bool)
         return on.scatter_(-1, largest, value=True) & (probability > 0)
 
-    def probabilities(self, last_cell: Tensor, steps_since_detection: Tensor) -> Tensor:
+    def probabilities(self, key: Tensor, steps_since_detection: Tensor) -> Tensor:
         """`[*B, M]` with which each sensor is switched on: bool for a deterministic policy, else float32."""
-        device, shape = last_cell.device, (*last_cell.shape, self.task.num_cells)
+        device, shape = key.device, (*key.shape, self.task.num_cells)
         if self.sets is None:
             assert self.probability is not None
             dtype = torch.bool if self.deterministic else torch.float32
             return torch.full(shape, self.probability, dtype=dtype, device=device)
-        return self.lookup(device)(self.row(last_cell, steps_since_detection))
+        return self.lookup(device)(self.row(key, steps_since_detection))
 
-    def row(self, last_cell: Tensor, steps_since_detection: Tensor) -> Tensor:
+    def row(self, key: Tensor, steps_since_detection: Tensor) -> Tensor:
         """`[*B]`, the row of `sets` for a state; where the safe action is forced, that of the last free choice."""
-        return last_cell * self.task.num_choices + steps_since_detection.clamp_max(self.task.t_max)
+        return key * self.task.num_choices + steps_since_detection.clamp_max(self.task.t_max)
 
     def lookup(self, device: torch.device) -> DenseTable | SparseTable:
         """The rows of `sets` on a device."""
@@ -195,33 +199,34 @@ class Policy(TensorDictModuleBase, PolicyTable):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action` `[*B, K]`: over all cells, or in the local numbers of the window around `last_cell`."""
         last_cell, n = tensordict["last_cell"], tensordict["steps_since_detection"]
+        key = tensordict["key"] if self.task.order else last_cell
         if self.deterministic:
-            return tensordict.set("action", self._near(last_cell, n))
+            return tensordict.set("action", self._near(key, n))
         # A generator draws on its own device only.
         device = last_cell.device if self.generator is None else self.generator.device
         draws = torch.rand((*last_cell.shape, self.num_draws), generator=self.generator, device=device)
-        action = self.act(last_cell, n, draws)
+        action = self.act(key, n, draws)
         if self.task.window is not None:
             action = Window.of(self.task, last_cell.device).to_local(last_cell, action)
         return tensordict.set("action", action)
 
-    def _near(self, last_cell: Tensor, steps_since_detection: Tensor) -> Tensor:
+    def _near(self, key: Tensor, steps_since_detection: Tensor) -> Tensor:
         """`[*B, K]` bool, the action of a deterministic policy as the environment takes it."""
         if self.task.window is None:
-            return self.act(last_cell, steps_since_detection)
+            return self.act(key, steps_since_detection)
         if self.sets is None:
-            shape = (*last_cell.shape, self.task.num_sensors)
-            return torch.zeros(shape, dtype=torch.bool, device=last_cell.device)
-        if self._local is None or self._local.device != last_cell.device:
+            shape = (*key.shape, self.task.num_sensors)
+            return torch.zeros(shape, dtype=torch.bool, device=key.device)
+        if self._local is None or self._local.device != key.device:
             row = np.repeat(np.arange(self.sets.shape[0]), np.diff(self.sets.indptr))
-            start = torch.as_tensor(row // self.task.num_choices)
+            start = torch.as_tensor(self.task.keys.cell(row // self.task.num_choices))
             cells = torch.as_tensor(self.sets.indices, dtype=torch.int64)
             # Local numbers are in the order of the cells they stand for, so that the columns of a row stay in order.
             local = Window.of(self.task).find(start, cells).numpy()
             shape = (self.sets.shape[0], self.task.num_sensors)
             table = sparse.csr_array((self.sets.data, local, self.sets.indptr), shape=shape)
-            self._local = _made(table, last_cell.device)
-        return self._local(self.row(last_cell, steps_since_detection))
+            self._local = _made(table, key.device)
+        return self._local(self.row(key, steps_since_detection))
 
     # Files.
 
@@ -265,6 +270,13 @@ def as_policy(task: Task, policy: PolicyLike, *, device: torch.device | str | No
     if isinstance(policy, Policy):
         return policy
     return Policy.from_table(policy)
+
+
+def actor_table(task: Task, actor: TensorDictModuleBase, *, device: torch.device, check: bool = True) -> Policy:
+    """The table of a learner's actor; one that has a table already, or remembers more than the cell, is it."""
+    if isinstance(actor, Policy) and (actor.sets is not None or actor.task.order):
+        return actor
+    return Policy.from_module(task, actor, device=device, check=check)
 
 
 def rule_of(task: Task, policy: TensorDictModuleBase | Callable[..., Any]) -> Rule:

@@ -42,6 +42,8 @@ def save_policy(file: Path, policy: PolicyTable, value: Array | None = None, **m
     """
     names = _TASK if policy.task.perfect and policy.task.safe else (*_TASK, *_SENSORS)
     content: dict[str, Any] = {f"task_{name}": _number(getattr(policy.task, name)) for name in names}
+    if policy.task.memory != "cell":  # what is not there is the paper's
+        content |= {"task_memory": np.str_(policy.task.memory), "task_clip": np.int64(policy.task.clip)}
     if policy.sets is None:
         content["probability"] = np.float64(policy.probability)
     else:
@@ -144,13 +146,15 @@ def _task(content: dict[str, npt.NDArray[Any]]) -> Task:
         window=None if np.isnan(given["window"]) else int(given["window"]),
         markov=bool(given["markov"]),
         **{name: content[f"task_{name}"] for name in _SENSORS if f"task_{name}" in content},
+        memory=str(content.get("task_memory", "cell")),
+        clip=int(content.get("task_clip", 2)),
     )
 
 
 def _sets(content: dict[str, npt.NDArray[Any]], task: Task) -> sparse.csr_array:
     indices, indptr = content["indices"], content["indptr"]
     data = content.get("data", np.ones(len(indices), dtype=bool))
-    shape = (task.num_cells * task.num_choices, task.num_cells)
+    shape = (task.num_keys * task.num_choices, task.num_cells)
     sets = sparse.csr_array((data, indices, indptr), shape=shape)
     sets.check_format(full_check=True)  # indices of somebody else's file may lead anywhere
     if not np.isfinite(sets.data).all():

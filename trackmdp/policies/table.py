@@ -19,12 +19,15 @@ __all__ = ["PolicyTable"]
 
 
 class PolicyTable:
-    """Which sensors are on n misses after the target was located in x: the open-loop plan of every located cell.
+    """Which sensors are on n misses after the target was located: one open-loop plan for each key (`world/memory.py`).
+
+    With `task.memory` "cell" the key is the located cell x. What a policy remembers is its own: a policy of one memory
+    may be valued in a task of another.
 
     Args:
-        task: grid, costs and limits.
-        sets: `[M * (t_max + 1), M]` sparse; row `x * (t_max + 1) + n` is the set at n misses after locating the target
-            in x. Bool entries are sensors on; entries in (0, 1] are the probabilities of switching them on,
+        task: grid, costs, limits and memory.
+        sets: `[keys * (t_max + 1), M]` sparse; row `key * (t_max + 1) + n` is the set at n misses after the detection
+            that left `key`. Bool entries are sensors on; entries in (0, 1] are the probabilities of switching them on,
             independently of each other and of the history.
         probability: the same for every sensor in every state, instead of `sets`; in a task with a window, for every
             sensor in the window of the located cell, which is then written out as `sets`.
@@ -71,16 +74,16 @@ class PolicyTable:
 
     @classmethod
     def from_dense(cls, task: Task, table: npt.NDArray[np.generic]) -> Self:
-        """A policy from `[M, t_max + 1, M]`, bool or probabilities."""
-        expected = (task.num_cells, task.num_choices, task.num_cells)
+        """A policy from `[keys, t_max + 1, M]`, bool or probabilities."""
+        expected = (task.num_keys, task.num_choices, task.num_cells)
         if table.shape != expected:
-            raise UserError(f"policy: expected shape {expected} (M, t_max + 1, M), got {table.shape}")
+            raise UserError(f"policy: expected shape {expected} (keys, t_max + 1, M), got {table.shape}")
         return cls(task, sparse.csr_array(np.ascontiguousarray(table).reshape(-1, task.num_cells)))
 
     # What exact evaluation reads, for arrays of any E.
 
     def on(self, n: int, rows: npt.NDArray[Any], cells: npt.NDArray[Any]) -> Array:
-        """`[E]` probability that sensor `cells` `[E]` is on, n misses after the target was located in `rows` `[E]`."""
+        """`[E]` probability that sensor `cells` `[E]` is on, n misses after the detection of key `rows` `[E]`."""
         if self.sets is None:
             assert self.probability is not None
             return np.full(len(rows), self.probability)
@@ -94,11 +97,11 @@ class PolicyTable:
         return np.where(found, np.append(self.sets.data, 0.0)[place], 0.0)
 
     def spent(self, n: int, price: Array) -> Array:
-        """`[M]` expected price of the sensors on, n misses after each located cell; `price` `[M]` is per sensor."""
+        """`[keys]` expected price of the sensors on, n misses after each key; `price` `[M]` is per sensor."""
         if self.sets is None:
             assert self.probability is not None
-            return np.full(self.task.num_cells, self.probability * price.sum())
-        # Rows n, n + (t_max + 1), ...: those of (0, n), (1, n), ..., one per located cell.
+            return np.full(self.task.num_keys, self.probability * price.sum())
+        # Rows n, n + (t_max + 1), ...: those of (0, n), (1, n), ..., one per key.
         rows = self.sets[n :: self.task.num_choices]
         return rows.astype(np.float64) @ price
 
@@ -120,27 +123,33 @@ class PolicyTable:
             raise UserError(f"policy: made for {theirs}; expected {ours}")
 
     def dense(self) -> BoolArray:
-        """`[M, t_max + 1, M]`, the sets of a deterministic policy; M² (t_max + 1) bytes, so for small worlds alone.
+        """`[keys, t_max + 1, M]`, the sets of a deterministic policy, a byte each, so for small worlds alone.
 
         Raises:
             UserError: the policy draws its sets.
         """
         if not self.deterministic:
             raise UserError("policy: draws its sets at random, so that there is no table of them")
-        shape = (self.task.num_cells, self.task.num_choices, self.task.num_cells)
+        shape = (self.task.num_keys, self.task.num_choices, self.task.num_cells)
         if self.sets is None:
             return np.full(shape, self.probability == 1.0)
         return self.sets.toarray().reshape(shape)
 
     def as_lists(self) -> dict[str, Any]:
-        """Plain lists, as `sets.json` has them: for each located cell the sensed cells at n = 0 ... t_max."""
+        """Plain lists, as `sets.json` has them: for each key the sensed cells at n = 0 ... t_max.
+
+        With `task.memory` "cell" the keys are the located cells; else `memory` says how they are numbered.
+        """
         m, choices = self.task.num_cells, self.task.num_choices
         if self.sets is None:
             each = list(range(m)) if self.probability == 1.0 else []
             return {"t_max": self.task.t_max, "sets": {str(cell): [each] * choices for cell in range(m)}}
         lists = [part.tolist() for part in np.split(self.sets.indices, self.sets.indptr[1:-1])]
-        sets = {str(cell): lists[cell * choices : (cell + 1) * choices] for cell in range(m)}
-        return {"t_max": self.task.t_max, "sets": sets}
+        sets = {str(key): lists[key * choices : (key + 1) * choices] for key in range(self.task.num_keys)}
+        if self.task.memory == "cell":
+            return {"t_max": self.task.t_max, "sets": sets}
+        memory = {"kind": self.task.memory, "clip": self.task.clip, "classes": self.task.keys.num_classes}
+        return {"t_max": self.task.t_max, "memory": memory, "sets": sets}
 
 
 def _checked(task: Task, sets: sparse.csr_array) -> sparse.csr_array:
@@ -149,9 +158,9 @@ def _checked(task: Task, sets: sparse.csr_array) -> sparse.csr_array:
     Raises:
         UserError: another shape, or entries that are no probabilities.
     """
-    expected = (task.num_cells * task.num_choices, task.num_cells)
+    expected = (task.num_keys * task.num_choices, task.num_cells)
     if sets.shape != expected:
-        raise UserError(f"policy: expected sets of shape {expected} (M (t_max + 1), M), got {sets.shape}")
+        raise UserError(f"policy: expected sets of shape {expected} (keys (t_max + 1), M), got {sets.shape}")
     sets = sparse.csr_array(sets, copy=True)
     if sets.dtype != np.bool_:
         if not ((sets.data >= 0) & (sets.data <= 1)).all():
@@ -161,7 +170,7 @@ def _checked(task: Task, sets: sparse.csr_array) -> sparse.csr_array:
     sets.sum_duplicates()  # sorts the columns of each row as well
     sets.eliminate_zeros()
     if task.window is not None:
-        start = np.repeat(np.arange(sets.shape[0]), np.diff(sets.indptr)) // task.num_choices
+        start = task.keys.cell(np.repeat(np.arange(sets.shape[0]), np.diff(sets.indptr)) // task.num_choices)
         far = _distance(task, start, sets.indices) > task.window
         if far.any():
             x, cell = int(start[far][0]), int(sets.indices[far][0])
@@ -177,7 +186,7 @@ def _distance(task: Task, start: npt.NDArray[Any], cell: npt.NDArray[Any]) -> np
 
 
 def _window_sets(task: Task, probability: float) -> sparse.csr_array:
-    """`[M (t_max + 1), M]`, every sensor of the window around each located cell, with one probability."""
+    """`[keys (t_max + 1), M]`, every sensor of the window around each located cell, with one probability."""
     assert task.window is not None
     m, reach = task.num_cells, np.arange(-task.window, task.window + 1)
     row, column = np.divmod(np.arange(m), task.columns)
@@ -188,4 +197,4 @@ def _window_sets(task: Task, probability: float) -> sparse.csr_array:
     cells, count = (rows * task.columns + columns)[inside], inside.sum(axis=(1, 2))
     begin = np.concatenate([[0], np.cumsum(count)])
     near = sparse.csr_array((np.full(len(cells), probability), cells, begin), shape=(m, m))
-    return near[np.repeat(np.arange(m), task.num_choices)]
+    return near[np.repeat(np.arange(m), task.keys.num_classes * task.num_choices)]

@@ -13,10 +13,81 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.evaluation import Evaluation, pooled
 from trackmdp.solvers.renewal import IndexArray
 from trackmdp.statistics import MeanInterval, ratio
-from trackmdp.world.model import Array, Task
+from trackmdp.world.memory import KeySpace
+from trackmdp.world.model import Array, BoolArray, Task
 from trackmdp.world.tracks import Recorded, Tracks
 
-__all__ = ["ReplayedTracks", "evaluate_recorded", "replay"]
+__all__ = ["Events", "ReplayedTracks", "evaluate_recorded", "replay"]
+
+
+@dataclass(frozen=True)
+class Events:
+    """All that a policy may know when it locates the target at a point of K tracks: S states of (point, key).
+
+    A key follows from where the target was at the last detections: at this point, g points earlier, and, where two
+    displacements are remembered, g' points before that. With G = t_max + 3 values of a gap, 0 for a detection that
+    there was not, state p · G² + g · G + g' is that of point p; with one displacement p · G + g, and where the cell
+    alone is remembered the states are the points.
+
+    Attributes:
+        line: the tracks, each closed by the exit.
+        keys: of the policies that are replayed.
+        point: `[S]`.
+        key: `[S]`, only where `possible`.
+        possible: `[S]` whether the target is in the grid, and the gaps lead to no point before the track's first.
+        last: `[S]`, the last point of the state's track.
+    """
+
+    line: Tracks
+    keys: KeySpace
+    point: IndexArray
+    key: IndexArray
+    possible: BoolArray
+    last: IndexArray
+
+    @classmethod
+    def of(cls, tracks: Tracks, keys: KeySpace) -> Events:
+        """The states of all points of `tracks`."""
+        cells = keys.size[0] * keys.size[1]
+        line = tracks.closed(cells)
+        track = np.repeat(np.arange(len(line)), np.diff(line.first))
+        gaps, order = keys.t_max + 3, keys.order
+        point = np.repeat(np.arange(len(line.cells)), gaps**order)
+        begin, last = line.first[:-1][track][point], line.first[1:][track][point] - 1
+        possible = line.cells[point] < cells
+        # Going back from the last detection: the gap before it, then the one before that.
+        code, at, back = np.tile(np.arange(gaps**order), len(line.cells)), point, []
+        for digit in range(order - 1, -1, -1):
+            gap = code // gaps**digit % gaps
+            # No detection before this one: it is the track's first point. Else its gap leads to an earlier one.
+            possible &= np.where(gap == 0, at == begin, at - gap >= begin)
+            back.append((at, gap))
+            at = np.maximum(at - gap, begin)
+        # Forward again, as the policy does.
+        key = keys.start(line.cells[at])
+        for after, gap in reversed(back):
+            key = np.where(gap > 0, keys.next(key, gap - 1, line.cells[after]), key)
+        return cls(line, keys, point, key, possible, last)
+
+    @property
+    def first(self) -> IndexArray:
+        """`[K]`, the states in which the tracks begin."""
+        return self.line.first[:-1] * self._gaps
+
+    @property
+    def _gaps(self) -> int:
+        return (self.keys.t_max + 3) ** self.keys.order
+
+    def follow(self, states: IndexArray, misses: int) -> IndexArray:
+        """The states after `misses` and a detection."""
+        gap, codes = misses + 1, self._gaps
+        at = (self.point[states] + gap) * codes
+        if self.keys.order == 0:
+            return at
+        # Of (g, g') the gap g becomes the earlier one: with G = 4 and 1 miss, code 2 · 4 + 3 becomes 2 · 4 + 2.
+        oldest = self.keys.t_max + 3
+        following: IndexArray = at + gap * (codes // oldest) + states % codes // oldest
+        return following
 
 
 @dataclass(frozen=True)
@@ -77,52 +148,53 @@ def evaluate_recorded(problem: Recorded, policy: PolicyTable) -> Evaluation:
 def replay(task: Task, tracks: Tracks, policy: PolicyTable) -> ReplayedTracks:
     """Follow `policy` along every track, from its first cell.
 
-    Every point of the recording is taken as one where the target may be located; what follows up to the next detection
-    is known from the recording, so that one triangular system tells which points are reached.
+    Every point of the recording is taken as one where the target may be located, knowing all that the policy may know
+    there (`Events`); what follows up to the next detection is known from the recording, so that one triangular system
+    tells which points are reached.
     """
-    m = task.num_cells
-    line = tracks.closed(m)
-    points = len(line.cells)
-    track = np.repeat(np.arange(len(line)), np.diff(line.first))
-    last = line.first[1:][track] - 1
-    figures, hits = _renewals(task, line.cells, last, policy)
-    reached = np.zeros(points)
-    reached[line.first[:-1]] = 1.0
-    # Point p of the recording is reached with probability reached[p]; located there, the plan is missed up to the next
-    # detection at a later point of the same track. So reached = first points + onward^T reached, which is triangular.
+    events = Events.of(tracks, policy.task.keys)
+    states = len(events.point)
+    figures, hits = _renewals(task, events, policy)
+    reached = np.zeros(states)
+    reached[events.first] = 1.0
+    # State s of the recording is reached with probability reached[s]; located there, the plan is missed up to the next
+    # detection at a later point of the same track. So reached = first states + onward^T reached, which is triangular.
     start, end, weight = hits
-    onward = sparse.csr_array((weight, (end, start)), shape=(points, points))
-    reached = spsolve_triangular(sparse.eye_array(points, format="csr") - onward, reached, unit_diagonal=True)
-    sums = np.stack([np.bincount(track, reached * figure, len(line)) for figure in figures], axis=1)
+    onward = sparse.csr_array((weight, (end, start)), shape=(states, states))
+    reached = spsolve_triangular(sparse.eye_array(states, format="csr") - onward, reached, unit_diagonal=True)
+    track = np.searchsorted(events.line.first, events.point, side="right") - 1
+    sums = np.stack([np.bincount(track, reached * figure, len(tracks)) for figure in figures], axis=1)
     return ReplayedTracks(sums[:, :5].astype(np.float64), sums[:, 5].astype(np.float64))
 
 
 def _renewals(
-    task: Task, cells: IndexArray, last: IndexArray, policy: PolicyTable
+    task: Task, events: Events, policy: PolicyTable
 ) -> tuple[list[Array], tuple[IndexArray, IndexArray, Array]]:
-    """From every point, located there, to the next detection or the end of the track.
+    """From every state, located there, to the next detection or the end of the track.
 
     Returns:
-        Six `[P]`, the columns of `ReplayedTracks.totals` and the steps; and the detections as a sparse matrix: from
-        which point, at which one, with what probability.
+        Six `[S]`, the columns of `ReplayedTracks.totals` and the steps; and the detections as a sparse matrix: from
+        which state, to which one, with what probability.
     """
-    m, points = task.num_cells, np.arange(len(cells))
-    figures, hits = np.zeros((6, len(cells))), []
-    at, undetected = points[cells < m], np.ones(int((cells < m).sum()))
+    m, cells, point = task.num_cells, events.line.cells, events.point
+    figures, hits = np.zeros((6, len(point))), []
+    at = np.flatnonzero(events.possible)
+    undetected = np.ones(len(at))
     for n in itertools.count():  # beyond t_max + 1 only where the safe action may miss
-        # at: points whose plan is still running after n misses; `undetected`: with what probability
-        going = (at + n + 1 <= last[at]) & (undetected > 0)
+        # at: states whose plan is still running after n misses; `undetected`: with what probability
+        going = (point[at] + n + 1 <= events.last[at]) & (undetected > 0)
         at, undetected = at[going], undetected[going]
         if not len(at):
             break
-        cell = cells[at + n + 1]
+        cell = cells[point[at] + n + 1]
         inside = cell < m
         # the exit is a step as well, and costs nothing; a recording that stops has none (`Tracks.closed`)
         figures[5, at] += undetected
         at, undetected, cell = at[inside], undetected[inside], cell[inside]
         if n < task.num_choices:
-            sensed = policy.on(n, cells[at], cell) * task.detects(cell)
-            sensors, price = (policy.spent(n, each)[cells[at]] for each in (np.ones(task.num_cells), task.cost))
+            key = events.key[at]
+            sensed = policy.on(n, key, cell) * task.detects(cell)
+            sensors, price = (policy.spent(n, each)[key] for each in (np.ones(task.num_cells), task.cost))
             safe: float | Array = 0.0
         else:
             sensed, sensors, safe = task.safe_detection[cell], np.zeros(len(at)), 1.0
@@ -130,7 +202,7 @@ def _renewals(
         for row, amount in enumerate((task.reward * sensed - price, 1.0, sensed, sensors, safe)):
             figures[row, at] += undetected * amount
         found = sensed > 0
-        hits.append((at[found], (at + n + 1)[found], (undetected * sensed)[found]))
+        hits.append((at[found], events.follow(at[found], n), (undetected * sensed)[found]))
         undetected = undetected * (1.0 - sensed)
     start, end, weight = (np.concatenate(part) for part in zip(*hits, strict=True))
     return list(figures), (start, end, weight)

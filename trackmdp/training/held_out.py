@@ -66,7 +66,7 @@ class HeldOutEvaluator(Evaluator):
         """The policies that a learned one is compared with, by their names in tables."""
         task = self.world
         kernel = estimated_kernel(task.tracks, task.size)
-        world = World.of(task, kernel, max_steps=None, window=None)
+        world = World.of(task, kernel, max_steps=None, window=None, memory="cell")
         return {
             "all on": PolicyTable.all_on(task),
             "no sensors": PolicyTable.none(task),

@@ -40,7 +40,7 @@ def needs(cfg: TrainConfig, task: Task) -> dict[str, int]:
     """Bytes of the replay buffer, of collected batches and of networks, by the option that they grow with."""
     parts: dict[str, int] = {}
     for _, node in nodes(cfg):
-        parts |= node.memory(task, cfg)
+        parts |= node.needs(task, cfg)
     return parts
 
 

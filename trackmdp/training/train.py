@@ -94,6 +94,7 @@ def _described(problem: Problem, folder: Path | None) -> dict[str, Any]:
         "grid.t_max": problem.t_max,
         "grid.max_steps": problem.max_steps,
         "grid.window": problem.window,
+        "task.memory": problem.memory,
         "cost.reward": problem.reward,
         "cost.sensor": _short(price),
         # null means the sum of all prices: that is what most problems have, up to the rounding of a sum in another
@@ -101,6 +102,8 @@ def _described(problem: Problem, folder: Path | None) -> dict[str, Any]:
         "cost.safe": None if np.isclose(problem.safe_cost, price.sum(), rtol=1e-15) else problem.safe_cost,
     }
     given |= sensor_words(_short(problem.detection), _short(problem.safe_detection))
+    if problem.memory != "cell":
+        given["task.clip"] = problem.clip
     if isinstance(problem, World):
         where = (folder or Path()).absolute() / "kernel.npz"
         return given | {"kernel": "table", "kernel.path": str(where)}

@@ -16,7 +16,7 @@ from tensordict import TensorDictBase
 from trackmdp.config import TrainConfig
 from trackmdp.durable import write_json
 from trackmdp.errors import Preempted, RunError
-from trackmdp.policies.policy import Policy
+from trackmdp.policies.policy import Policy, actor_table
 from trackmdp.seeding import seed_global
 from trackmdp.training import memory
 from trackmdp.training.callbacks import Callback, Row
@@ -93,7 +93,7 @@ class Trainer:
     def policy(self) -> Policy:
         """The policy as it is now; asking for it does not disturb the run."""
         # Learners evaluate a deterministic actor, so that there is no need to ask twice whether it draws.
-        return Policy.from_module(self.problem.task, self.algorithm.actor, device=self.device, check=False)
+        return actor_table(self.problem.task, self.algorithm.actor, device=self.device, check=False)
 
     def run(self) -> Score:
         """Train to the end; returns the score of the last policy.

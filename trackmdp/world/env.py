@@ -42,6 +42,7 @@ class TrackEnv(EnvBase):
     - `last_cell` `[*B]` int64, the cell of the last detection, x_{l(k)};
     - `steps_since_detection` `[*B]` int64, n(k), 0 ... t_max + 1;
     - `action_history` `[*B, t_max+1, K]` bool, the actions since then; slots n and later are empty;
+    - `key` `[*B]` int64, only where `task.memory` is more than the cell: what was remembered at the last detection;
     - `step_count` `[*B]` int64, only with `max_steps` in the world.
 
     The true cell is in no spec and no tensordict, so that no encoder or transform can read the answer; `target` shows
@@ -81,6 +82,7 @@ class TrackEnv(EnvBase):
         self._targets = make_targets(world, self.device)
         self._window = Window.of(world, self.device)
         self._costs, self._reports, self._safe = Costs(world, self.device), Reports(world, self.device), world.safe
+        self._keys = world.keys if world.order else None
         self._rows = torch.arange(self.num_envs, device=self.device)
         # Shared by all steps that truncate nothing; handed out as a clone only.
         self._no = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
@@ -141,6 +143,8 @@ class TrackEnv(EnvBase):
             action_history=Binary(k, shape=(*b, choices, k), dtype=torch.bool, device=self.device),
             shape=b,
         )
+        if self._keys:
+            observation["key"] = Categorical(self._keys.num_keys, **index)
         if self.max_steps:
             observation["step_count"] = Categorical(self.max_steps + 1, **index)
         self.observation_spec = observation
@@ -193,6 +197,8 @@ class TrackEnv(EnvBase):
                 *start.shape, self.t_max + 1, self._window.width, dtype=torch.bool, device=self.device
             ),
         }
+        if self._keys:
+            state["key"] = self._keys.start(start)
         if self.max_steps:
             state["step_count"] = torch.zeros_like(start)
         return state
@@ -242,6 +248,10 @@ class TrackEnv(EnvBase):
             "action_history": self._remember(state["action_history"], action, n, missed),
             "reward": self._costs.pseudo_reward(action, last, located, forced, in_grid).unsqueeze(-1),
         }
+        if self._keys:
+            # As with `last_cell`, what is worked out for a target that has exited is thrown away.
+            key = self._keys.next(state["key"], n, target.clamp_max(self.num_cells - 1))
+            following["key"] = torch.where(located, key, state["key"])
         terminated = ~in_grid.unsqueeze(-1)
         cut = self._targets.cut(moved)
         truncated = self._no if cut is None else cut.unsqueeze(-1)

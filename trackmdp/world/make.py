@@ -78,6 +78,8 @@ def load_tracks(
     window: int | None = default("grid.window"),
     detection: npt.ArrayLike | str = 1.0,
     safe_detection: npt.ArrayLike | str = 1.0,
+    memory: str = default("task.memory"),
+    clip: int = default("task.clip"),
     **track_options: Any,
 ) -> Recorded:
     """Recorded tracks in place of a motion model: most to learn from, some to choose by, some held out to evaluate on.
@@ -93,6 +95,9 @@ def load_tracks(
         window: W.
         detection: p_d.
         safe_detection: p_s.
+        memory: what a policy remembers at a detection: ``cell``, ``displacement``, ``displacement_gap`` or
+            ``two_displacements``.
+        clip: rows and columns up to which displacements are told apart.
         **track_options: those of ``kernel=tracks``: `ends`, `starts`, `held_out`, `validation`, `seed`,
             `min_length`, `markov`.
 
@@ -100,8 +105,11 @@ def load_tracks(
         UserError: the file is not of that form, a track is too short, or an option is wrong.
     """
     of_task = _task_words(size, t_max, cost, safe_cost, reward, max_steps, window, detection, safe_detection)
+    known = given({"task.memory": memory, "task.clip": clip})
     own = {f"kernel.{name}": value for name, value in track_options.items()}
-    made = make_problem(compose("train", {"kernel": "tracks", "kernel.path": path} | of_task | own))
+    # Of the options of `train` only those of the problem matter; the algorithm is one that may remember anything.
+    words = {"kernel": "tracks", "kernel.path": path, "algo": "path_counts"} | of_task | known | own
+    made = make_problem(compose("train", words))
     assert isinstance(made, Recorded)
     return made
 
@@ -202,4 +210,4 @@ def _of_task(cfg: WorldConfig) -> dict[str, Any]:
     costs: dict[str, Any] = make(cfg.cost, cfg.grid.size)
     sensors: dict[str, Any] = make(cfg.sensor, cfg.grid.size)
     limits = {"t_max": cfg.grid.t_max, "max_steps": cfg.grid.max_steps, "window": cfg.grid.window}
-    return costs | sensors | limits
+    return costs | sensors | limits | cfg.remembered

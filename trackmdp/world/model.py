@@ -11,9 +11,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from trackmdp.config.world import LARGEST
+from trackmdp.config.world import LARGEST, MEMORIES
 from trackmdp.errors import UserError
 from trackmdp.world.checks import canonical_kernel, check_kernel
+from trackmdp.world.memory import KeySpace
 from trackmdp.world.rows import pairwise_row_sums
 
 __all__ = ["Array", "BoolArray", "Size", "Task", "World", "grid_size"]
@@ -47,6 +48,8 @@ class Task:
             until it locates the target.
         markov: whether the next move depends on the target's cell alone, so that a learner may put paths together from
             moves seen on different ones.
+        memory: what a policy remembers at a detection, one of `trackmdp.config.world.MEMORIES`; see `KeySpace`.
+        clip: rows and columns up to which remembered displacements are told apart.
 
     Raises:
         UserError: a number is out of its range, or `cost` does not have one price per cell.
@@ -62,6 +65,8 @@ class Task:
     detection: Array
     safe_detection: Array
     markov: bool
+    memory: str
+    clip: int
 
     def __init__(
         self,
@@ -76,7 +81,11 @@ class Task:
         detection: npt.ArrayLike = 1.0,
         safe_detection: npt.ArrayLike = 1.0,
         markov: bool = True,
+        memory: str = "cell",
+        clip: int = 2,
     ) -> None:
+        if memory not in MEMORIES:
+            raise UserError(f"memory={memory}: expected one of {', '.join(MEMORIES)}")
         rows, columns = grid_size(size)
         prices = _prices(cost, rows * columns)
         values = {
@@ -90,9 +99,14 @@ class Task:
             "detection": _probabilities("detection", detection, rows * columns),
             "safe_detection": _probabilities("safe_detection", safe_detection, rows * columns),
             "markov": markov,
+            "memory": memory,
+            "clip": _at_least(1, "clip", clip),
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)  # the dataclass is frozen
+        # Keys are counted up to t_max + 1 misses, and a safe action that misses is repeated.
+        if memory != "cell" and not self.safe:
+            raise UserError(f"memory={memory}: with a safe action that may miss, expected cell")
 
     @property
     def rows(self) -> int:
@@ -138,6 +152,26 @@ class Task:
         """`[M]` 1 - p_s; simply 0.0 where the safe action always locates."""
         return 0.0 if self.safe else 1.0 - self.safe_detection
 
+    @cached_property
+    def keys(self) -> KeySpace:
+        """What a policy may remember at a detection; with `memory` "cell" the keys are the cells."""
+        return KeySpace(self.size, self.t_max, self.memory, self.clip)
+
+    @property
+    def forgetful(self) -> Task:
+        """The same task, in which a policy remembers the cell alone."""
+        return Task(**self._known() | {"memory": "cell"}) if self.order else self.task
+
+    @property
+    def order(self) -> int:
+        """Detections before the last one that a policy may remember something of."""
+        return self.keys.order
+
+    @property
+    def num_keys(self) -> int:
+        """Plans of a policy, one for each key."""
+        return self.keys.num_keys
+
     @property
     def task(self) -> Task:
         """The same task without the motion."""
@@ -179,6 +213,8 @@ class World(Task):
         detection: npt.ArrayLike = 1.0,
         safe_detection: npt.ArrayLike = 1.0,
         markov: bool = True,
+        memory: str = "cell",
+        clip: int = 2,
     ) -> None:
         super().__init__(
             size,
@@ -191,6 +227,8 @@ class World(Task):
             detection=detection,
             safe_detection=safe_detection,
             markov=markov,
+            memory=memory,
+            clip=clip,
         )
         # Checked after it is canonical: duplicates are added up and zeros dropped, so that the checks see what solvers
         # will.

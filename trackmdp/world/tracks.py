@@ -118,6 +118,8 @@ class Recorded(Task):
         safe_detection: npt.ArrayLike = 1.0,
         markov: bool = True,
         anywhere: bool = False,
+        memory: str = "cell",
+        clip: int = 2,
     ) -> None:
         super().__init__(
             size,
@@ -130,6 +132,8 @@ class Recorded(Task):
             detection=detection,
             safe_detection=safe_detection,
             markov=markov,
+            memory=memory,
+            clip=clip,
         )
         parts = {"tracks": tracks, "validation": validation, "held_out": held_out, "anywhere": anywhere}
         for name, value in parts.items():

@@ -28,13 +28,15 @@ __all__ = ["run", "to_onnx", "to_torch"]
 
 FILES = {"torch_export": "policy.pt2", "onnx": "policy.onnx", "sets": "sets.json"}
 _INPUTS = ("last_cell", "steps_since_detection")
+_LARGEST = 2**31  # entries, a byte each
 
 
 def run(cfg: ExportConfig, folder: Path) -> None:
     """Write `policy.pt2`, `policy.onnx` or `sets.json` to `folder`.
 
     The first two take int64 `last_cell` `[B]` and `steps_since_detection` `[B]` and give bool `action` `[B, M]`: the
-    sensors to switch on, all of them once the target has been missed more than t_max times.
+    sensors to switch on, all of them once the target has been missed more than t_max times. Where the policy remembers
+    more than the cell, its key (`trackmdp.world.memory`) stands in place of `last_cell`.
 
     Raises:
         UserError: there is no such run, or a package that `cfg.format` needs is missing.
@@ -47,6 +49,8 @@ def run(cfg: ExportConfig, folder: Path) -> None:
         "grid_size": str(task.rows),
         "t_max": str(task.t_max),
     }
+    if task.order:
+        about |= {"memory": task.memory, "clip": str(task.clip), "classes": str(task.keys.num_classes)}
     if cfg.format == "sets":
         file = folder / sets_name(task)
         write_sets(folder, found.policy)
@@ -119,7 +123,14 @@ class _Table(nn.Module):
 
 
 def _table(policy: Policy) -> BoolArray:
-    """`[M, t_max+2, M]`, the sets and after them the forced safe action."""
+    """`[keys, t_max+2, M]`, the sets and after them the forced safe action.
+
+    Raises:
+        UserError: it is too large to be written out.
+    """
+    task = policy.task
+    if (size := task.num_keys * (task.num_choices + 1) * task.num_cells) > _LARGEST:
+        raise UserError(f"format: a table of {size:,} entries, expected at most {_LARGEST:,}; format=sets takes less")
     sets = policy.dense()
     # Row t_max + 1 is all sensors on: the file's reader then needs no rule for the forced action.
     return np.concatenate([sets, np.ones_like(sets[:, :1])], axis=1)

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from trackmdp.config import load_run_config
-from trackmdp.policies.policy import Policy
+from trackmdp.policies.policy import Policy, actor_table
 from trackmdp.training import checkpoint
 from trackmdp.training.inputs import check_inputs
 from trackmdp.training.make import make_algorithm
@@ -40,5 +40,5 @@ def trained(run: str, device: torch.device, *, best: bool = False) -> Trained:
     file = folder / "checkpoints" / checkpoint.BEST if best else checkpoint.newest(folder)
     load_learned(algorithm, cfg, file, device)
     check_inputs(world, folder)
-    policy = Policy.from_module(world.task, algorithm.actor, device=device)
+    policy = actor_table(world.task, algorithm.actor, device=device)
     return Trained(world, policy, f"{cfg.algo.name}, {file.name}")
