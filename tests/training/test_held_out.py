@@ -19,7 +19,7 @@ from tests.training.runs import SMALL, tensors
 from tests.training.runs import rows as metrics
 from tests.training.runs import train as train_run
 from trackmdp.app.sweep.table import run_scores
-from trackmdp.policies.policy import Policy, as_policy
+from trackmdp.policies.policy import Policy
 from trackmdp.solvers import qmdp
 from trackmdp.training import checkpoint
 from trackmdp.training.evaluator import ExactEvaluator
@@ -195,5 +195,5 @@ def test_every_algorithm_learns_from_tracks(name: str) -> None:
         learner.step(batch)
     for _ in range(learner.iterations - 4 if name == "hindsight" else 0):
         learner.step(None)
-    policy = as_policy(setting.task, learner.actor)
+    policy = Policy.from_module(setting.task, learner.actor)
     assert np.isfinite(HeldOutEvaluator(setting).score(policy).evaluation.aihtr)

@@ -175,9 +175,31 @@ class TracksConfig(KernelConfig):
 
     is_motion: ClassVar[bool] = False
     path: str = option(
-        "file with columns track, cell (or row, column) and, if wanted, step",
-        expects="a path to a .csv or .npz file",
+        "file of cells (columns track, cell, or row and column, and, if wanted, step), or of positions",
+        expects="a path to a .csv, .npz, .parquet, .geojson, .gpx, .txt (MOT-Challenge) or .xml (SUMO) file",
         path=True,
+    )
+    format: str | None = option(
+        "what the file holds; null = as its ending and columns say. points = a table of id, time and x, y or lat, lon, "
+        "as of AIS and ADS-B; sumo = fcd-output",
+        choices=("cells", "points", "geojson", "gpx", "mot", "sumo"),
+    )
+    step: float | None = option("positions: time from one cell of a track to the next", unit="s; mot: frames", gt=0)
+    cell: float | None = option("positions: side of a cell", unit="m; mot: pixels", gt=0)
+    max_gap: float | None = option(
+        "positions: longest time between two reports that a straight line bridges; longer ones cut the track; null = 3 "
+        "steps",
+        unit="s; mot: frames",
+        gt=0,
+    )
+    origin: list[float] | None = option(
+        "positions: corner of the grid with the least coordinates, [x, y] or [lon, lat]; null = the middles of grid "
+        "and positions agree",
+    )
+    crs: str | None = option(
+        "positions as lat, lon: projection to metres; null = the UTM zone where they lie",
+        expects="a code such as EPSG:2056",
+        pattern="[A-Za-z]+:[0-9]{1,9}",
     )
     ends: str = option(
         "what the end of a track is: exit = the target left the grid, cut = the recording stopped",
@@ -201,6 +223,8 @@ class TracksConfig(KernelConfig):
 
     def check(self, key: str, root: Any) -> None:
         """Recorded tracks hold no motion model: nothing that reads one goes with them."""
+        if self.origin is not None and len(self.origin) != 2:
+            raise refuse(f"{key}.origin", self.origin, "[x, y], or [lon, lat], or null")
         if root.needs_motion:
             raise refuse(key, self.name, "a motion model, which train and evaluate do without")
         if any(node.episodes_only for node in root.log.values()):

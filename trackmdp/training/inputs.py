@@ -77,4 +77,5 @@ def _described(problem: Recorded) -> bytes:
     content = {
         name: {"tracks": len(part), "cells": len(part.cells), "sha256": part.digest()} for name, part in parts.items()
     }
+    content |= {"loaded": dict(problem.loaded)} if problem.loaded else {}
     return (json.dumps(content, indent=2) + "\n").encode()

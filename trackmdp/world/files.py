@@ -19,7 +19,7 @@ from trackmdp.errors import UserError
 from trackmdp.untrusted import decoded, opened
 from trackmdp.world.model import Array, BoolArray, Size, grid_size
 
-__all__ = ["csr_of", "per_cell", "read_columns", "read_matrix", "read_numbers"]
+__all__ = ["column_names", "csr_of", "first_line", "per_cell", "read_columns", "read_matrix", "read_numbers"]
 
 _LONGEST_TEXT, _LONGEST_HEAD = 2**30, 2**16
 """Bytes of the longest .csv file, a recording of some eighty million steps, and of its first line."""
@@ -124,6 +124,16 @@ def read_columns(key: str, path: str | Path) -> dict[str, Array]:
     return {name: column.astype(np.float64) for name, column in columns.items()}
 
 
+def column_names(key: str, path: str | Path) -> list[str]:
+    """The names in the first line of a .csv file.
+
+    Raises:
+        UserError: there is no such file, or its first line is not text.
+    """
+    with _opened(f"{key}={path}", Path(path)) as stream:
+        return first_line(stream)
+
+
 @contextmanager
 def _opened(source: str, file: Path) -> Iterator[BinaryIO]:
     """The file, open; what goes wrong with it ends in one line that begins with `source`."""
@@ -138,7 +148,7 @@ def _opened(source: str, file: Path) -> Iterator[BinaryIO]:
 
 
 def _csv_columns(stream: BinaryIO) -> dict[str, np.ndarray]:
-    names = [name.strip() for name in _first_line(stream).decode("utf-8-sig").split(",")]
+    names = first_line(stream)
     if len(set(names)) < len(names):
         raise ValueError(f"two columns of one name in {','.join(names)[:80]}")
     if not stream.read(1):
@@ -150,11 +160,12 @@ def _csv_columns(stream: BinaryIO) -> dict[str, np.ndarray]:
     return dict(zip(names, table.T, strict=True))
 
 
-def _first_line(stream: BinaryIO) -> bytes:
+def first_line(stream: BinaryIO) -> list[str]:
+    """The names in the first line of a .csv file, which is read."""
     line = stream.readline(_LONGEST_HEAD)
     if len(line) == _LONGEST_HEAD:
         raise ValueError(f"a first line of more than {_LONGEST_HEAD:,} bytes")
-    return line
+    return [name.strip().strip('"') for name in line.decode("utf-8-sig").split(",")]
 
 
 def _csv(stream: BinaryIO, comments: str | None = "#") -> Array:

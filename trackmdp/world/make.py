@@ -17,7 +17,8 @@ from trackmdp.world.checks import canonical_kernel, check_kernel
 from trackmdp.world.files import per_cell
 from trackmdp.world.model import Size, World, grid_size
 from trackmdp.world.recording import read_recording
-from trackmdp.world.tracks import Problem, Recorded, check_tracks, read_tracks, split
+from trackmdp.world.track_files import read_track_file
+from trackmdp.world.tracks import Problem, Recorded, split
 
 __all__ = ["build_world", "load_tracks", "make_problem", "make_world", "paper_cost", "recorded"]
 
@@ -85,7 +86,10 @@ def load_tracks(
     """Recorded tracks in place of a motion model: most to learn from, some to choose by, some held out to evaluate on.
 
     Args:
-        path: a .csv or .npz file with columns track, cell (or row, column) and, if wanted, step.
+        path: a file of cells (.csv or .npz with columns track, cell, or row and column, and, if wanted, step), or one
+            of positions: a table (.csv, .parquet) of id, time and x, y or lat, lon, as of AIS and ADS-B; GeoJSON; GPX;
+            MOT-Challenge text; SUMO's fcd-output. Positions need `step` and `cell`; see `Recorded.loaded` for what
+            was left out.
         size: N of an N x N grid, or (rows, columns).
         t_max: see `make_world`, as for the following.
         cost: c.
@@ -98,11 +102,14 @@ def load_tracks(
         memory: what a policy remembers at a detection: ``cell``, ``displacement``, ``displacement_gap`` or
             ``two_displacements``.
         clip: rows and columns up to which displacements are told apart.
-        **track_options: those of ``kernel=tracks``: `ends`, `starts`, `held_out`, `validation`, `seed`,
-            `min_length`, `markov`.
+        **track_options: those of ``kernel=tracks`` (``trackmdp train kernel=tracks --help``): `format`, `step`, `cell`,
+            `max_gap`, `origin`, `crs`, `ends`, `starts`, `held_out`, `validation`, `seed`, `min_length`, `markov`.
 
     Raises:
         UserError: the file is not of that form, a track is too short, or an option is wrong.
+
+    Example:
+        ``load_tracks("ais.csv", (40, 60), cell=500, step=60, max_gap=600, ends="cut")``
     """
     of_task = _task_words(size, t_max, cost, safe_cost, reward, max_steps, window, detection, safe_detection)
     known = given({"task.memory": memory, "task.clip": clip})
@@ -143,6 +150,12 @@ def recorded(
     size: Size,
     *,
     path: str,
+    format: str | None,
+    step: float | None,
+    cell: float | None,
+    max_gap: float | None,
+    origin: list[float] | None,
+    crs: str | None,
     ends: str,
     starts: str,
     held_out: float,
@@ -162,13 +175,19 @@ def recorded(
     of_task |= {"markov": markov, "anywhere": starts == "anywhere"}
     if (kept := read_recording(path, math.prod(grid_size(size)))) is not None:
         return Recorded(kept[0], size, validation=kept[1], held_out=kept[2], **of_task)
-    tracks = read_tracks(path, size, exits=ends == "exit")
     # A located cell, t_max + 1 free choices and the forced step: t_max + 3 cells, the segment that hindsight learns
     # from.
     shortest = max(min_length or of_task["t_max"] + 3, 1 if ends == "exit" else 2)  # a cut track of one has no step
-    check_tracks(tracks, shortest, f"kernel.path={path}")
+    tracks, loaded = read_track_file(
+        path,
+        grid_size(size),
+        exits=ends == "exit",
+        shortest=shortest,
+        format=format,
+        gridding={"step": step, "cell": cell, "max_gap": max_gap, "origin": origin, "crs": crs},
+    )
     mine, chosen, judged = split(tracks, held_out, validation, seed)
-    return Recorded(mine, size, validation=chosen, held_out=judged, **of_task)
+    return Recorded(mine, size, validation=chosen, held_out=judged, loaded=loaded, **of_task)
 
 
 def paper_cost(size: Size, *, reward: float, sensor: float | list[float] | str, safe: float | None) -> dict[str, Any]:

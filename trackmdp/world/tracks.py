@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -16,7 +17,7 @@ from trackmdp.seeding import derive
 from trackmdp.world.files import read_columns
 from trackmdp.world.model import Array, BoolArray, Size, Task, World, grid_size
 
-__all__ = ["Indices", "Problem", "Recorded", "Tracks", "check_tracks", "read_tracks", "split"]
+__all__ = ["Indices", "Problem", "Recorded", "Tracks", "check_tracks", "ends_of", "read_tracks", "split"]
 
 Indices: TypeAlias = npt.NDArray[np.int64]
 
@@ -57,7 +58,7 @@ class Tracks:
         """The tracks for which `chosen` `[K]` holds."""
         lengths = self.lengths
         cells = self.cells[np.repeat(chosen, lengths)]
-        return Tracks(cells, _ends(lengths[chosen]), self.exits[chosen], self.names[chosen])
+        return Tracks(cells, ends_of(lengths[chosen]), self.exits[chosen], self.names[chosen])
 
     def limited(self, max_steps: int | None) -> Tracks:
         """The tracks, cut off after `max_steps` steps; None for never."""
@@ -69,13 +70,13 @@ class Tracks:
         # max_steps moves have max_steps + 1 cells. A track cut short has no exit any more; one of max_steps + 1 cells
         # leaves on a step too many.
         kept = np.minimum(lengths, max_steps + 1)
-        return Tracks(self.cells[step <= max_steps], _ends(kept), self.exits & (lengths <= max_steps), self.names)
+        return Tracks(self.cells[step <= max_steps], ends_of(kept), self.exits & (lengths <= max_steps), self.names)
 
     def closed(self, num_cells: int) -> Tracks:
         """The tracks with the exit, a cell called M, as the last one where the target left."""
         # np.insert takes places in the old array: M goes before the first cell of the next track.
         cells = np.insert(self.cells, self.first[1:][self.exits], num_cells)
-        return Tracks(cells, _ends(self.lengths + self.exits), self.exits, self.names)
+        return Tracks(cells, ends_of(self.lengths + self.exits), self.exits, self.names)
 
     def digest(self) -> str:
         """SHA-256 of all that was recorded."""
@@ -94,12 +95,14 @@ class Recorded(Task):
         validation: those to choose between policies by (best.pt, Optuna's trials); nothing learns from them.
         held_out: those to evaluate on at the end; no learner and no choice sees them.
         anywhere: episodes begin at any recorded point, not only with a track.
+        loaded: how many of what was read, cut and dropped where positions were brought onto the grid.
     """
 
     tracks: Tracks
     validation: Tracks
     held_out: Tracks
     anywhere: bool
+    loaded: Mapping[str, int]
 
     def __init__(
         self,
@@ -120,6 +123,7 @@ class Recorded(Task):
         anywhere: bool = False,
         memory: str = "cell",
         clip: int = 2,
+        loaded: Mapping[str, int] | None = None,
     ) -> None:
         super().__init__(
             size,
@@ -135,8 +139,9 @@ class Recorded(Task):
             memory=memory,
             clip=clip,
         )
-        parts = {"tracks": tracks, "validation": validation, "held_out": held_out, "anywhere": anywhere}
-        for name, value in parts.items():
+        parts = {"tracks": tracks, "validation": validation, "held_out": held_out}
+        own: dict[str, object] = {**parts, "anywhere": anywhere, "loaded": loaded or {}}
+        for name, value in own.items():
             object.__setattr__(self, name, value)  # the dataclass is frozen
 
     @property
@@ -184,7 +189,7 @@ def _load(path: str | Path, size: tuple[int, int], exits: bool, stamp: tuple[int
     if "step" in numbers:
         _check_steps(source, track, numbers["step"][order])
     names, lengths = np.unique(track, return_counts=True)
-    return Tracks(cell, _ends(lengths), np.full(len(names), exits), names)
+    return Tracks(cell, ends_of(lengths), np.full(len(names), exits), names)
 
 
 def check_tracks(tracks: Tracks, shortest: int, source: str) -> Tracks:
@@ -236,7 +241,8 @@ def split(tracks: Tracks, held_out: float, validation: float, seed: int) -> tupl
     return learned, chosen, judged
 
 
-def _ends(lengths: Indices) -> Indices:
+def ends_of(lengths: Indices) -> Indices:
+    """`[K + 1]` where each of K tracks of these lengths begins, end to end, and where the last one ends."""
     return np.concatenate([[0], np.cumsum(lengths)])
 
 

@@ -19,6 +19,7 @@ from tests.typed import refused
 from trackmdp.app.cli import main
 from trackmdp.app.commands.train import run
 from trackmdp.config import GROUPS
+from trackmdp.world.make import load_tracks
 from trackmdp.world.tracks import read_tracks, split
 
 TRACKS = drawn(small_world(exit_probability=0.05).kernel, 60)
@@ -31,6 +32,7 @@ SMALL = [
     "checkpoint.every=256",
     "checkpoint.seconds=null",
 ]
+CITY = Path(__file__).parents[2] / "data" / "city.csv"
 LEARN = ["algo.hidden=16", "algo.batch_size=64", "algo.updates=8", "algo.updates_per_iteration=2"]
 
 
@@ -99,7 +101,7 @@ def test_the_table_shows_what_can_be_judged(capsys: pytest.CaptureFixture[str]) 
     assert "optimum" not in shown
 
 
-NEEDS_THE_MODEL = sorted(set(GROUPS["baseline"]) - {"all_on", "none", "random_k"})
+NEEDS_THE_MODEL = sorted(set(GROUPS["baseline"]) - {"all_on", "none", "random_k", "sets"})
 
 
 @pytest.mark.parametrize(
@@ -132,9 +134,19 @@ NEEDS_THE_MODEL = sorted(set(GROUPS["baseline"]) - {"all_on", "none", "random_k"
         ("train", "kernel.validation=1", "kernel.validation=1.0: expected a number > 0 and < 1"),
         ("train", "kernel.held_out=0", "kernel.held_out=0.0: expected a number > 0 and < 1"),
         ("train", "kernel.path=no.csv", "kernel.path="),
+        (
+            "train",
+            f"kernel.path={CITY}",
+            "kernel.step: missing, expected seconds from one cell to the next; kernel.path=",
+        ),
+        ("train", "kernel.step=5", "kernel.step=5.0: only for positions; kernel.path="),
         ("train", "grid.size=4 kernel.min_length=null", "kernel.path="),
         *(
-            ("evaluate", f"baseline={name}", f"baseline={name}: expected all_on, none or random_k with kernel=tracks")
+            (
+                "evaluate",
+                f"baseline={name}",
+                f"baseline={name}: expected all_on, none, random_k or sets with kernel=tracks",
+            )
             for name in NEEDS_THE_MODEL
             if name != "playback"
         ),
@@ -172,7 +184,7 @@ def test_a_pickled_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture
     objects: Any = np.array([{}], dtype=object)
     np.savez(tmp_path / "bad.npz", track=objects, cell=objects, allow_pickle=True)
     line = refused(capsys, "train", "kernel=tracks", "kernel.path=../bad.npz", "grid.size=3")
-    assert "not a table of numbers" in line
+    assert "not recorded tracks" in line
 
 
 @pytest.mark.parametrize("algo", ["hindsight", "ppo"])
@@ -215,6 +227,32 @@ def test_ends_and_starts_are_options(ends: str, starts: str, folder: Path) -> No
 def test_workers_replay_tracks_too(collector: str, folder: Path) -> None:
     assert train("a", f"collector={collector}", "collector.workers=2") == 0
     assert json.loads((folder / "a/summary.json").read_text())["frames"] == 2048
+
+
+POSITIONS = {"kernel.step": 5, "kernel.cell": 60, "kernel.max_gap": 10, "kernel.origin": [0, 0], "kernel.ends": "cut"}
+
+
+def test_positions_are_the_same_from_the_command_line_and_from_python(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same names, the same tracks; what was left out is said, and kept beside the run."""
+    words = [f"{key}={str(value).replace(' ', '')}" for key, value in POSITIONS.items()]
+    world = ["grid.size=[15,12]", "grid.t_max=1", "cost.sensor=0.1", f"kernel.path={CITY}", "kernel=tracks"]
+    assert main(["train", *world, *words, *SMALL, *LEARN, "hydra.run.dir=a"]) == 0
+    own = {key.removeprefix("kernel."): value for key, value in POSITIONS.items()}
+    tracks = load_tracks(CITY, (15, 12), t_max=1, cost=0.1, **own)
+    written = json.loads((folder / "a/tracks.json").read_text())
+    parts = {"learned_from": tracks.tracks, "validation": tracks.validation, "held_out": tracks.held_out}
+    for name, part in parts.items():
+        assert written[name]["sha256"] == part.digest()
+    assert written["loaded"] == tracks.loaded
+    outside = tracks.loaded["steps outside of the grid"]
+    assert outside > 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"loaded: 17,970 reports read, 719 targets, 17,970 steps, {outside:,} steps outside of the grid" in said
+    assert main(["evaluate", "run=a", "quiet=true"]) == 0
+    evaluation = json.loads((folder / "a/evaluation.json").read_text())
+    assert evaluation["held_out"] == json.loads((folder / "a/summary.json").read_text())["held_out"]
 
 
 def test_every_option_of_the_tracks_is_read(folder: Path) -> None:

@@ -14,9 +14,10 @@ from trackmdp.policies.saved import write_sets
 from trackmdp.reports.picture import draw_picture
 from trackmdp.training.display import table
 from trackmdp.training.held_out import HeldOutEvaluator
-from trackmdp.world.tracks import Recorded
+from trackmdp.world.gridding import said
+from trackmdp.world.tracks import Problem, Recorded
 
-__all__ = ["run", "show_held_out"]
+__all__ = ["run", "show_held_out", "show_loaded"]
 
 
 def run(
@@ -28,6 +29,7 @@ def run(
     seed: int,
 ) -> float:
     """Write `evaluation.json`, `sets.json` and `picture.txt` to `folder`; returns the mean reward of a track."""
+    show_loaded(console, world)
     evaluator = HeldOutEvaluator(world)
     report = evaluator.report(policy)
     value = evaluator.evaluate(policy).value
@@ -38,6 +40,12 @@ def run(
     show_held_out(console, subject, report)
     console.print(f"results in {folder}")
     return float(report["figures"]["policy"]["aihtr"]["mean"])
+
+
+def show_loaded(console: Console, problem: Problem) -> None:
+    """What became of the positions in a file; nothing of a world, and of a file of cells."""
+    if isinstance(problem, Recorded) and problem.loaded:
+        console.print(f"loaded: {said(problem.loaded)}")
 
 
 def show_held_out(console: Console, subject: str, report: dict[str, Any]) -> None:

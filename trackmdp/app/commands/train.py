@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from trackmdp.app.commands.held_out import show_held_out
+from trackmdp.app.commands.held_out import show_held_out, show_loaded
 from trackmdp.app.commands.summary import show_summary
 from trackmdp.config import TrainConfig
 from trackmdp.config.resume import finished
@@ -50,7 +50,9 @@ def _run(cfg: TrainConfig, folder: Path, problem: Problem | None) -> float:
     if reached is not None:
         console.print(f"finished before; results in {folder}")
         return reached
-    trainer = Trainer(problem or make_problem(cfg), cfg, folder=folder, console=console)
+    problem = problem or make_problem(cfg)
+    show_loaded(console, problem)
+    trainer = Trainer(problem, cfg, folder=folder, console=console)
     done = complete(trainer)
     if done.summary["held_out"] is None:
         show_summary(console, trainer, done)

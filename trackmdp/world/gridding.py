@@ -1,0 +1,220 @@
+"""From recorded positions to tracks of cells: projected, sampled at a fixed step, cut at gaps and where they leave."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from trackmdp.errors import UserError, require
+from trackmdp.untrusted import reason
+from trackmdp.world.model import Array
+from trackmdp.world.positions import Positions
+from trackmdp.world.tracks import Tracks, ends_of
+
+__all__ = ["Gridding", "said", "to_tracks"]
+
+_WIDEST = 12.0
+"""Degrees of longitude that one UTM zone, six degrees wide, is stretched over at most."""
+
+
+_MOST = 2**27
+"""Steps of all tracks together; times in milliseconds and a step in seconds would make thousands for each report."""
+
+
+@dataclass(frozen=True)
+class Gridding:
+    """How positions become cells.
+
+    Attributes:
+        size: rows and columns of the grid; row 0 is the upper one, in the north.
+        cell: side of a cell, metres (of videos pixels).
+        step: time from one cell of a track to the next, seconds (of videos frames).
+        max_gap: longest time between two reports that is bridged, by a straight line; seconds.
+        origin: the corner of the grid with the smallest coordinates, in those of the file; None: the grid's middle is
+            that of the positions.
+        crs: projected coordinate system for degrees, such as ``EPSG:2056``; None: the UTM zone of the median.
+        shortest: fewest cells of a track.
+        exits: whether a target has left the grid at its last report.
+    """
+
+    size: tuple[int, int]
+    cell: float
+    step: float
+    max_gap: float
+    origin: tuple[float, float] | None
+    crs: str | None
+    shortest: int
+    exits: bool
+
+
+def to_tracks(positions: Positions, grid: Gridding, source: str) -> tuple[Tracks, dict[str, int]]:
+    """The tracks, and how many of what was read, cut or dropped.
+
+    A path is cut where no report came for longer than `max_gap`, and where it is outside of the grid. Its pieces are
+    tracks of the same name; one that ends by leaving the grid has an exit.
+
+    Args:
+        positions: of all targets.
+        grid: what to make of them.
+        source: what a message begins with.
+
+    Raises:
+        UserError: the projection does not fit the positions, or no track is left.
+    """
+    x, y, origin = _projected(positions, grid, source)
+    flat = replace(positions, x=x, y=y)
+    place, x, y, last = _sampled(flat, grid)
+    cells = _cells(x, y, _corner(flat, grid, origin), grid, downwards=positions.downwards)
+    tracks, counts = _cut(cells, place, last, flat.track, grid)
+    gaps = int(_breaks(flat, grid).sum()) - len(np.unique(flat.track))
+    report = {
+        "reports read": positions.read,
+        "targets": len(np.unique(flat.track)),
+        **positions.dropped,
+        f"cuts where no report came for {grid.max_gap:g} or the file has a break": gaps,
+        "steps": len(cells),
+        **counts,
+    }
+    if not len(tracks):
+        raise UserError(f"{source}: no track of at least {grid.shortest} cells; {said(report)}")
+    return tracks, report
+
+
+def said(report: Mapping[str, int]) -> str:
+    """The report in one line, without what did not happen."""
+    return ", ".join(f"{count:,} {what}" for what, count in report.items() if count)
+
+
+def _projected(positions: Positions, grid: Gridding, source: str) -> tuple[Array, Array, tuple[float, float] | None]:
+    """x, y and the origin in metres."""
+    if not positions.geographic:
+        if grid.crs is not None:
+            raise UserError(f"{source}: has x and y, which are not projected; kernel.crs={grid.crs} is for lat and lon")
+        return positions.x, positions.y, grid.origin
+    require("pyproj", "tracks", source)
+    from pyproj import CRS, Transformer
+    from pyproj.exceptions import ProjError
+
+    code = grid.crs or _utm(positions, source)
+    try:
+        crs = CRS.from_user_input(code)
+        units = {axis.unit_name for axis in crs.axis_info}
+        if not crs.is_projected or units != {"metre"}:
+            raise UserError(f"kernel.crs={code}: {crs.name}, expected a projected coordinate system in metres")
+        forward = Transformer.from_crs("EPSG:4326", crs, always_xy=True)
+    except ProjError as error:
+        raise UserError(f"kernel.crs={code}: no known coordinate system ({reason(error)})") from None
+    x, y = forward.transform(positions.x, positions.y)
+    corner = None if grid.origin is None else tuple(map(float, forward.transform(*grid.origin)))
+    if corner is not None and not np.isfinite(corner).all():
+        raise UserError(f"kernel.origin={list(grid.origin or ())}: outside of {code}, expected lon, lat within it")
+    return np.asarray(x), np.asarray(y), corner  # type: ignore[return-value]  # inf where the projection does not reach
+
+
+def _utm(positions: Positions, source: str) -> str:
+    """The code of the UTM zone in which the median position lies."""
+    low, high = np.percentile(positions.x, (1, 99))
+    latitude = float(np.median(positions.y))
+    if high - low > _WIDEST or abs(latitude) > 84:
+        raise UserError(
+            f"{source}: from {low:.1f} to {high:.1f} degrees of longitude, at latitude {latitude:.1f}, is no part of "
+            "one UTM zone; expected kernel.crs, a projection in metres such as EPSG:6933 (world) or EPSG:3035 (Europe)"
+        )
+    # Zones of 6 degrees from 180 W on: 8.5 E is in 1 + floor(188.5 / 6) = 32. The code of the north serves the south
+    # too, where y is then negative: only differences count here.
+    zone = min(60, 1 + int((float(np.median(positions.x)) + 180.0) // 6.0))
+
+    return f"EPSG:326{zone:02d}"
+
+
+def _breaks(positions: Positions, grid: Gridding) -> np.ndarray:
+    """`[P]` whether a report is the first of an uninterrupted path."""
+    first = np.ones(len(positions.time), dtype=bool)
+    # 1e-9: times since 1970 have errors of 1e-7 s, and a gap of exactly `max_gap` is bridged.
+    gap = np.diff(positions.time) > grid.max_gap * (1 + 1e-9) + 1e-6
+    first[1:] = (np.diff(positions.piece) != 0) | gap
+    return first
+
+
+def _sampled(positions: Positions, grid: Gridding) -> tuple[np.ndarray, Array, Array, np.ndarray]:
+    """Every path at its first report and each `step` after it, on the straight lines between reports.
+
+    Returns:
+        place: `[S]` for each sample the index of the first report of its path.
+        x, y: `[S]`.
+        last: `[S]` whether the path of the sample ends with the target's last report.
+    """
+    start = np.flatnonzero(_breaks(positions, grid))
+    end = np.concatenate([start[1:], [len(positions.time)]]) - 1
+    length = positions.time[end] - positions.time[start]
+    whole = np.floor(length / grid.step + 1e-6) + 1
+    if whole.sum() > _MOST:
+        raise UserError(f"kernel.step={grid.step:g}: makes {whole.sum():.3g} steps of it, expected at most {_MOST:,}")
+    count = whole.astype(np.int64)
+    # All paths one after the other on one axis of time, for one call of interp. Example: reports at 7 9 | 3 5 8 with a
+    # pause of 1 between the paths stand at 0 2 | 3 5 8, and with a step of 2 are sampled at 0 2 | 3 5 7.
+    pause = np.concatenate([[0.0], np.cumsum(length + 1.0)[:-1]])
+    path = np.repeat(np.arange(len(start)), end - start + 1)
+    axis = positions.time - positions.time[start][path] + pause[path]
+    of = np.repeat(np.arange(len(start)), count)
+    number = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count)
+    # Rounding must not carry the last sample into the pause, where the line leads to another target.
+    wanted = np.minimum(number * grid.step, length[of]) + pause[of]
+    x, y = (np.interp(wanted, axis, column) for column in (positions.x, positions.y))
+    track = positions.track
+    final = np.append(track[1:] != track[:-1], True)[end]
+    return start[of], x, y, final[of]
+
+
+def _corner(positions: Positions, grid: Gridding, origin: tuple[float, float] | None) -> tuple[float, float]:
+    """The least x and y of the grid, in metres."""
+    if origin is not None:
+        return origin
+    # Half way between the 1st and the 99th percentile: a few reports from nowhere do not move the grid.
+    sides = (grid.size[1], grid.size[0])
+    known = [column[np.isfinite(column)] for column in (positions.x, positions.y)]
+    middle = [float(np.percentile(column, (1, 99)).mean()) if len(column) else math.nan for column in known]
+    return middle[0] - sides[0] * grid.cell / 2, middle[1] - sides[1] * grid.cell / 2
+
+
+def _cells(x: Array, y: Array, corner: Sequence[float], grid: Gridding, *, downwards: bool) -> np.ndarray:
+    """`[S]` the cell of each sample, -1 outside of the grid.
+
+    Example: with corner (0, 0), cells of 10 and a 2 x 3 grid, (25, 5) is in column 2 and, y upwards, in the lower row:
+    cell 1 · 3 + 2 = 5. (30, 5) is outside: a cell has its left and lower edges, not the others.
+    """
+    rows, columns = grid.size
+    with np.errstate(invalid="ignore"):  # inf, where the projection does not reach
+        column, up = (np.floor((each - low) / grid.cell) for each, low in zip((x, y), corner, strict=True))
+        inside = (column >= 0) & (column < columns) & (up >= 0) & (up < rows)
+        row = up if downwards else rows - 1 - up
+        return np.where(inside, row * columns + column, -1.0).astype(np.int64)
+
+
+def _cut(
+    cells: np.ndarray, place: np.ndarray, last: np.ndarray, track: np.ndarray, grid: Gridding
+) -> tuple[Tracks, dict[str, int]]:
+    """The runs of cells inside the grid, those that are long enough."""
+    inside = cells >= 0
+    same = np.diff(place) == 0
+    # A run begins where the one before is of another path or outside, and ends likewise.
+    begins = np.flatnonzero(inside & ~np.concatenate([[False], same & inside[:-1]]))
+    ends = np.flatnonzero(inside & ~np.concatenate([same & inside[1:], [False]]))
+    # Left the grid: a further sample of the same path follows. Else it ends with the path: with an exit only where that
+    # is the last of the target and the recording does not just stop.
+    left = np.concatenate([same, [False]])[ends]
+    lengths = ends - begins + 1
+    kept = lengths >= grid.shortest
+    exits = (left | (last[ends] & grid.exits))[kept]
+    chosen = np.repeat(kept, lengths)
+    made = Tracks(cells[inside][chosen], ends_of(lengths[kept]), exits, track[place[begins]][kept])
+    counts = {
+        "steps outside of the grid": int((~inside).sum()),
+        f"steps in {int((~kept).sum()):,} tracks of fewer than {grid.shortest} cells": int(lengths[~kept].sum()),
+        "steps kept": len(made.cells),
+        "tracks kept": len(made),
+    }
+    return made, counts

@@ -1,0 +1,123 @@
+"""Readers of positions that are no tables with a header: GeoJSON, GPX, MOT-Challenge text, SUMO's fcd-output.
+
+Whatever a reader raises over a damaged file ends in one line (`positions.read_positions`). XML is refused where it
+declares a document type: no entity is ever expanded, and nothing is fetched.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, BinaryIO
+
+from trackmdp.errors import UserError
+from trackmdp.untrusted import parse_json
+from trackmdp.world.positions import ALIASES, IGNORED, NO_IDENTITY, Positions, table_of
+
+__all__ = ["geojson", "gpx", "mot", "sumo"]
+
+_PER_POINT = ("times", "coordTimes", "timestamps")
+"""Properties of a line that hold one time for each of its points, as converters of GPX write them."""
+
+
+def geojson(stream: BinaryIO) -> Positions:
+    """Features of GeoJSON (RFC 7946: degrees, longitude first) with times.
+
+    A point has an id and a time among its properties; a line has a list of times there, one for each point, and is a
+    target of its own where it has no id.
+    """
+    try:
+        content = parse_json(stream.read(), "its content")
+    except UserError as error:
+        raise ValueError(str(error)) from error  # so that the message begins with the file
+    features = content["features"] if content["type"] == "FeatureCollection" else [content]
+    rows = [row for number, feature in enumerate(features) for row in _feature(feature, number)]
+    return table_of(*_columns(rows, 5), geographic=True)
+
+
+def _feature(feature: Mapping[str, Any], number: int) -> Iterator[tuple[Any, ...]]:
+    """Rows id, time, longitude, latitude, piece."""
+    # A feature without a geometry is allowed, and is nowhere.
+    geometry, properties = feature["geometry"] or {}, feature.get("properties") or {}
+    named = {name.lower(): value for name, value in properties.items()}
+    own = next((named[name] for name in ALIASES["id"] if named.get(name) is not None), feature.get("id"))
+    kind = geometry.get("type")
+    if kind == "Point":
+        time = next((named[name] for name in ALIASES["time"] if name in named), None)
+        yield own, time, *geometry["coordinates"][:2], 0
+        return
+    if kind not in ("LineString", "MultiLineString"):
+        return
+    single = kind == "LineString"
+    lines = [geometry["coordinates"]] if single else geometry["coordinates"]
+    per_point = {**properties, **properties.get("coordinateProperties", {})}
+    times = next((per_point[name] for name in _PER_POINT if name in per_point), None)
+    if times is None:
+        raise ValueError(f"feature {number + 1}: expected a time for each point, as {' or '.join(_PER_POINT)}")
+    # Lines without an id must not become one target: two with the id 3 are two pieces of one path, two without are two.
+    name = f"line {number}" if own is None else own
+    for place, (line, stamps) in enumerate(zip(lines, [times] if single else times, strict=True)):
+        for point, stamp in zip(line, stamps, strict=True):
+            yield name, stamp, *point[:2], len(lines) * number + place
+
+
+def gpx(stream: BinaryIO) -> Positions:
+    """The tracks of a GPX file, each a target; their segments, between which the receiver was off, stay apart."""
+    import gpxpy
+    from defusedxml.ElementTree import fromstring
+
+    content = stream.read()
+    fromstring(content, forbid_dtd=True)  # gpxpy's own parser would expand entities
+    rows = [
+        (number, point.time, point.longitude, point.latitude, piece)
+        for number, track in enumerate(gpxpy.parse(content.decode("utf-8-sig")).tracks)
+        for piece, segment in enumerate(track.segments)
+        for point in segment.points
+    ]
+    return table_of(*_columns(rows, 5), geographic=True)
+
+
+def mot(stream: BinaryIO) -> Positions:
+    """Boxes of a tracker: frame, id, left, top, width, height, and perhaps confidence and more (MOT-Challenge).
+
+    A target stands where the lower edge of its box has its middle. The unit of time is a frame, of length a pixel.
+    """
+    import pandas as pd
+
+    table = pd.read_csv(stream, header=None, dtype="float64", encoding="utf-8-sig")
+    if table.shape[1] < 6:
+        raise ValueError(f"{table.shape[1]} columns, expected frame, id, left, top, width, height")
+    frame, own, left, top, width, height = (table[place] for place in range(6))
+    # In ground truth a confidence of 0 marks what is not to be counted; detections that no tracker has seen have the
+    # id -1.
+    ignored = (table[6] == 0) if table.shape[1] > 6 else frame != frame
+    nobody = (own < 0) & ~ignored
+    kept = ~ignored & ~nobody
+    dropped = {IGNORED: int(ignored.sum()), NO_IDENTITY: int(nobody.sum())}
+    columns = (own, frame, left + width / 2, top + height)
+    return table_of(*(column[kept] for column in columns), downwards=True, dropped=dropped)
+
+
+def sumo(stream: BinaryIO) -> Positions:
+    """What SUMO's ``--fcd-output`` writes: each time step with the vehicles and persons there, in metres."""
+    from defusedxml.ElementTree import iterparse
+
+    rows: list[tuple[Any, ...]] = []
+    time, root = None, None
+    for event, element in iterparse(stream, events=("start", "end"), forbid_dtd=True):
+        if root is None:
+            root = element
+            if element.tag != "fcd-export":
+                raise ValueError(f"<{element.tag}>, expected <fcd-export>")
+        if event == "start":
+            time = element.attrib["time"] if element.tag == "timestep" else time
+        elif element.tag in ("vehicle", "person"):
+            rows.append((element.attrib["id"], time, element.attrib["x"], element.attrib["y"]))
+        elif element.tag == "timestep":
+            root.clear()  # what has been read is let go: files of gigabytes are usual
+    own, times, x, y = _columns(rows, 4)
+    return table_of(own, [float(each) for each in times], x, y)
+
+
+def _columns(rows: Sequence[tuple[Any, ...]], count: int) -> list[list[Any]]:
+    """The columns of rows; empty ones where there are no rows."""
+    return [list(column) for column in zip(*rows, strict=True)] if rows else [[] for _ in range(count)]

@@ -1,0 +1,134 @@
+"""Recorded tracks from a file of any format: cells as they stand, or positions that are brought onto the grid."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, BinaryIO, TypeAlias
+
+from trackmdp.errors import UserError, require
+from trackmdp.untrusted import decoded, opened
+from trackmdp.world.files import column_names
+from trackmdp.world.gridding import Gridding, to_tracks
+from trackmdp.world.position_files import geojson, gpx, mot, sumo
+from trackmdp.world.position_tables import position_table
+from trackmdp.world.positions import ALIASES, LONGEST, Positions
+from trackmdp.world.tracks import Tracks, check_tracks, read_tracks
+
+__all__ = ["read_positions", "read_track_file"]
+
+_FORMATS = {
+    ".npz": "cells",
+    ".parquet": "points",
+    ".geojson": "geojson",
+    ".json": "geojson",
+    ".gpx": "gpx",
+    ".txt": "mot",
+    ".xml": "sumo",
+}
+_GAP = 3
+"""Steps that are bridged where no `kernel.max_gap` is given."""
+
+Reader: TypeAlias = Callable[[BinaryIO], Positions]
+
+
+def read_positions(path: str | Path, kind: str) -> Positions:
+    """The positions in a file.
+
+    Args:
+        path: the file; it may be a link, since the user named it.
+        kind: one of the choices of `kernel.format` but `cells`.
+
+    Raises:
+        UserError: there is no such file, it is too large, not of that form, or without reports.
+    """
+    source = f"kernel.path={path}"
+    words, needed, reader = _readers()[kind]
+    for module in needed:
+        require(module, "tracks", source)
+    with opened(Path(path), most=LONGEST, source=source, links=True) as stream, decoded(source, words):
+        found = reader(stream)
+    if not len(found.time):
+        raise UserError(f"{source}: no positions, expected {words} ({found.read} reports read)")
+    return found
+
+
+def _readers() -> dict[str, tuple[str, Sequence[str], Reader]]:
+    """Format -> what a message calls it, the modules it takes, and what reads it."""
+    return {
+        "points": ("a table of positions", ("pandas", "pyarrow"), position_table),
+        "geojson": ("GeoJSON with the times of its points", ("pandas",), geojson),
+        "gpx": ("a GPX track log", ("gpxpy", "defusedxml", "pandas"), gpx),
+        "mot": ("MOT-Challenge text", ("pandas",), mot),
+        "sumo": ("SUMO's fcd-output", ("defusedxml", "pandas"), sumo),
+    }
+
+
+def read_track_file(
+    path: str | Path,
+    size: tuple[int, int],
+    *,
+    exits: bool,
+    shortest: int,
+    format: str | None,
+    gridding: Mapping[str, Any],
+) -> tuple[Tracks, Mapping[str, int]]:
+    """The tracks in a file, and how many of what was read, cut and dropped; of cells nothing is dropped.
+
+    Args:
+        path: the file.
+        size: rows and columns of the grid.
+        exits: whether the target left the grid at the end of each track.
+        shortest: fewest cells of a track.
+        format: one of the choices of `kernel.format`; None: by the ending of the name and the columns.
+        gridding: `step`, `cell`, `max_gap`, `origin` and `crs`, None where not given (`Gridding`).
+
+    Raises:
+        UserError: the file is not of that form, an option is missing or does not go with it, or no track is left.
+    """
+    kind, source = format or _format_of(path), f"kernel.path={path}"
+    given = {name: value for name, value in gridding.items() if value is not None}
+    if kind == "cells":
+        if given:
+            name, value = next(iter(given.items()))
+            raise UserError(f"kernel.{name}={value}: only for positions; {source} holds cells")
+        return check_tracks(read_tracks(path, size, exits=exits), shortest, source), {}
+    for name, what in (("step", "seconds from one cell to the next"), ("cell", "the side of a cell in metres")):
+        if name not in given:
+            raise UserError(f"kernel.{name}: missing, expected {what}; {source} holds positions")
+    made = Gridding(
+        size=size,
+        cell=given["cell"],
+        step=given["step"],
+        max_gap=given.get("max_gap", _GAP * given["step"]),
+        origin=None if "origin" not in given else (float(given["origin"][0]), float(given["origin"][1])),
+        crs=given.get("crs"),
+        shortest=shortest,
+        exits=exits,
+    )
+    file = Path(path)
+    stamp = (file.stat().st_mtime_ns, file.stat().st_size, file.stat().st_ino) if file.is_file() else None
+    return _load(path, kind, made, stamp)
+
+
+@lru_cache(maxsize=1)  # a run is checked before its folder is made, and asks again after
+def _load(path: str | Path, kind: str, grid: Gridding, stamp: Any) -> tuple[Tracks, Mapping[str, int]]:  # noqa: ARG001
+    """See `read_track_file`; `stamp` tells the file from what it was before."""
+    return to_tracks(read_positions(path, kind), grid, f"kernel.path={path}")
+
+
+def _format_of(path: str | Path) -> str:
+    """The format that the file's name stands for; of a .csv the columns tell.
+
+    Raises:
+        UserError: the ending stands for none.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix == ".csv":
+        positions = {name for own in ("x", "y", "lat", "lon") for name in ALIASES[own]}
+        return "points" if positions & {name.lower() for name in column_names("kernel.path", path)} else "cells"
+    if suffix not in _FORMATS:
+        known = ", ".join([".csv", *_FORMATS])
+        raise UserError(f"kernel.path={path}: expected a file that ends with one of {known}, or kernel.format")
+    return _FORMATS[suffix]
