@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import re
+from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -158,10 +159,14 @@ def test_a_part_that_nothing_reads_is_refused(half: Path) -> None:
         find(cfg, half, CPU)
 
 
-def test_another_version_is_refused(half: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("package", ["torch", "torchrl", "tensordict", "numpy", "scipy", "trackmdp"])
+def test_another_version_is_refused(package: str, half: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All of them draw or add up what a run learns from."""
     cfg = train_config(*SMALL["ppo"], *QUICK, *BUDGET, "checkpoint.keep=3", "resume=auto")
-    monkeypatch.setattr("trackmdp.training.state.version", lambda name: "0.0")
-    with pytest.raises(UserError, match=r"written with torch [\d.]+\S*, this is 0.0; expected the same"):
+    monkeypatch.setattr(
+        "trackmdp.training.state.version", lambda name: "0.0" if name == package else metadata.version(name)
+    )
+    with pytest.raises(UserError, match=rf"written with {package} [\d.]+\S*, this is 0.0; expected the same"):
         find(cfg, half, CPU)
 
 
