@@ -36,11 +36,9 @@ IndexArray: TypeAlias = npt.NDArray[np.integer[Any]]
 DIRECT_CELLS = 20_000
 """Cells up to which systems are factorised. The factors of a grid fill about M^1.4 entries: 75 a cell at M = 16,384."""
 
-# Side of the square blocks of the coarse level, doubled while there would be more than _MOST_BLOCKS of them: the coarse
-# system is factorised, and has to stay small beside the fine one. At N = 1000 blocks of 8 x 8 take 75 products where
-# blocks of 16 x 16 take 114.
+# Side of the square blocks that are one cell of the next coarser level, and cells at which a level is factorised.
 _BLOCK = 4
-_MOST_BLOCKS = DIRECT_CELLS
+_COARSEST = 4_096
 # Residual aimed at, relative to the size of right-hand side and solution: some 50 units of rounding of float64.
 _TOLERANCE = 1e-14
 _MOST_PRODUCTS = 20_000
@@ -55,9 +53,9 @@ _ENDLESS = (
 class RenewalSystem:
     """Solves ``v = gathered + transition v`` for any number of `gathered`.
 
-    Up to `direct` cells by a sparse LU factorisation, above by BiCGSTAB with two levels: damped Jacobi sweeps, and a
-    correction that is constant on square blocks of the grid, without which the number of products grows with the
-    length of the episodes (at N = 256 and p_exit = 5e-5: 127 products instead of 3,434).
+    Up to `direct` cells by a sparse LU factorisation, above by BiCGSTAB preconditioned on coarser and coarser grids
+    (`_Level`), without which the number of products grows with the length of the episodes: at N = 256 and p_exit = 5e-5
+    to 3,434. So it is some 65 at any N, and some 95 at N = 512 where only the border lets the target out.
 
     Args:
         transition: `[M, M]` sub-stochastic; or `[KM, KM]` of K states per cell, cell j in its k-th state being kM + j.
@@ -80,15 +78,7 @@ class RenewalSystem:
         if self.exact or size is None:
             self._factors = _factorise(self._system)
             return
-        rows, columns = size
-        # States beyond one per cell are that many layers of the grid, each with blocks of its own.
-        layers = transition.shape[0] // (rows * columns)
-        self._blocks = sparse.csr_array(sparse.block_diag([_blocks(rows, columns)] * layers))
-        # Galerkin: with B [M, blocks] the indicator of the blocks, B^T (I - T) B is the system seen by vectors that are
-        # constant on each block.
-        self._coarse = _factorise(sparse.csr_array(self._blocks.T @ self._system @ self._blocks))
-        # 0.8 is the usual damping of Jacobi as a smoother.
-        self._damping = 0.8 / self._system.diagonal()
+        self._precondition = _Level(self._system, size)
 
     def solve(self, gathered: Array, guess: Array | None = None) -> Array:
         """`[M]` or `[M, K]`, as `gathered` is; `guess`, of the same shape, is where an iteration starts.
@@ -171,16 +161,51 @@ class RenewalSystem:
             products += 2
         return solution, products
 
-    def _precondition(self, residual: Array) -> Array:
-        """A damped Jacobi sweep, the correction on the blocks, and a sweep again."""
-        # 0.8 / diagonal takes out what differs from cell to cell; what is smooth over a block is left to the blocks
+
+class _Level:
+    """An approximate inverse of a system on a grid: what differs from cell to cell here, what is smooth one level down.
+
+    Two damped Jacobi sweeps take out what differs from cell to cell; between them comes a correction that is constant
+    on blocks of 4 x 4 cells, the next level's approximate solution. That level costs a sixteenth, so that it is asked
+    twice, and the number of products hardly grows with the grid: with its exact solution it is the same.
+
+    Args:
+        system: `[KM, KM]`, K states a cell; cell j in its k-th state is kM + j.
+        size: (rows, columns) of the grid.
+    """
+
+    def __init__(self, system: sparse.csr_array, size: tuple[int, int]) -> None:
+        self._system = system
+        # 0.8 is the usual damping of Jacobi as a smoother.
+        self._damping = 0.8 / system.diagonal()
+        # States beyond one per cell are that many layers of the grid, each with blocks of its own.
+        layers = system.shape[0] // (size[0] * size[1])
+        self._blocks = sparse.csr_array(sparse.block_diag([_blocks(*size)] * layers))
+        # Galerkin: with B [M, blocks] the indicator of the blocks, B^T A B is the system seen by vectors that are
+        # constant on each block.
+        coarse = short_indices(sparse.csr_array(self._blocks.T @ system @ self._blocks))
+        small = coarse.shape[0] <= _COARSEST
+        self._below = None if small else _Level(coarse, (-(-size[0] // _BLOCK), -(-size[1] // _BLOCK)))
+        self._factors = _factorise(coarse) if small else None
+
+    def __call__(self, residual: Array) -> Array:
+        """`[KM]`, about the solution of system x = `residual`."""
         guess: Array = self._damping * residual
         left = residual - self._system @ guess
-        guess += self._blocks @ self._coarse.solve(self._blocks.T @ left)
+        guess += self._blocks @ self._corrected(self._blocks.T @ left)
         left = residual - self._system @ guess
         left *= self._damping
         guess += left
         return guess
+
+    def _corrected(self, residual: Array) -> Array:
+        """The solution on the blocks."""
+        if self._below is None:
+            assert self._factors is not None
+            solved: Array = self._factors.solve(residual)
+            return solved
+        guess = self._below(residual)
+        return guess + self._below(residual - self._below._system @ guess)
 
 
 def accumulate(transition: sparse.csr_array, gathered: Array, size: tuple[int, int] | None = None) -> Array:
@@ -252,15 +277,12 @@ def _factorise(system: sparse.csr_array) -> SuperLU:
 def _blocks(rows: int, columns: int) -> sparse.csr_array:
     """`[M, blocks]` which block of the grid each cell lies in.
 
-    With blocks of 8 x 8, the cell in row 9 and column 20 of a grid of 256 columns (32 blocks a row of blocks) lies in
-    block 1 · 32 + 2 = 34.
+    With blocks of 4 x 4, the cell in row 9 and column 20 of a grid of 256 columns (64 blocks a row of blocks) lies in
+    block 2 · 64 + 5 = 133.
     """
-    side = _BLOCK
-    while -(-rows // side) * -(-columns // side) > _MOST_BLOCKS:
-        side *= 2
     # -(-a // b) is a / b rounded up: the last blocks of a row or column may be cut off by the border.
     row, column = np.divmod(np.arange(rows * columns), columns)
-    block = row // side * -(-columns // side) + column // side
+    block = row // _BLOCK * -(-columns // _BLOCK) + column // _BLOCK
     return sparse.csr_array((np.ones(len(block)), (np.arange(len(block)), block)))
 
 
