@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from scipy import sparse
 
 from tests.helpers import algorithm, collect, hop_world, small_world
 from trackmdp.algos.learned_kernel import observed_paths
@@ -102,3 +103,27 @@ def test_plans_within_the_window() -> None:
     assert len(row)
     assert np.abs(located // 5 - cell // 5).max() <= 1
     assert np.abs(located % 5 - cell % 5).max() <= 1
+
+
+def test_plans_can_wait_for_the_last_batch() -> None:
+    world = small_world(3)
+    always, rows = learn(world, 4, "algo.samples=2")
+    late, waited = learn(world, 4, "algo.plan_every=10", "algo.samples=2")
+    assert np.array_equal(late.actor.dense(), always.actor.dense())  # type: ignore[attr-defined]
+    assert np.isnan([row["believed_aihtr"] for row in waited[:3]]).all()
+    assert waited[-1]["believed_aihtr"] == pytest.approx(rows[-1]["believed_aihtr"])
+    assert [row["least_visits"] for row in waited] == [row["least_visits"] for row in rows]
+
+
+def test_negligible_moves_are_planned_without_and_leave_the_exit_as_it_is() -> None:
+    world = small_world(3)
+    learner = algorithm("learned_kernel", world, "algo.negligible=0.3")
+    kernel = sparse.lil_array((9, 10))
+    kernel[0, [1, 3, 4, 9]] = 0.5, 0.3, 0.1, 0.1  # .1 goes, and the others share it 5 to 3
+    kernel[1, [0, 2, 3, 4, 9]] = 0.2, 0.2, 0.2, 0.2, 0.2  # all would go, and all stay
+    for row in range(2, 9):
+        kernel[row, [row, 9]] = 0.5, 0.5
+    believed = learner._world(sparse.csr_array(kernel)).kernel.toarray()
+    np.testing.assert_allclose(believed[0, [1, 3, 4]], [0.5625, 0.3375, 0.0])
+    np.testing.assert_allclose(believed[1, [0, 2, 3, 4]], 0.2)
+    np.testing.assert_allclose(believed.sum(axis=1), [0.9, 0.8, *[0.5] * 7])

@@ -7,6 +7,7 @@ costs far less and leaves moves to be inferred from misses.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from trackmdp.seeding import derive
 from trackmdp.solvers import exchange
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.kernel_estimate import KernelEstimate, ObservedPaths
+from trackmdp.solvers.renewal import per_row, row_index
 from trackmdp.world.model import Task, World
 from trackmdp.world.windows import Window
 
@@ -52,6 +54,7 @@ class LearnedKernel:
         self._rng = np.random.default_rng(derive(seed, "learned_kernel"))
         self._chooses, self._warm_up = cfg.sensing == "chosen", cfg.warm_up
         self._iteration, self._spent = 0, np.zeros(2)
+        self._believed = dict.fromkeys(("believed_aihtr", "believed_deviation"), math.nan)
         self.actor = Policy.all_on(task)
         self.policy = RenewedTable(task, device, on=True) if self._chooses else Policy.all_on(task)
 
@@ -61,36 +64,52 @@ class LearnedKernel:
         if batch is not None:
             self._estimate.add(observed_paths(batch, self.task))
             self._spent += [batch.numel(), _sensors_on(batch)]
-        self._estimate.fit(self.cfg.rounds_at_end if self._iteration == self.iterations else self.cfg.rounds)
+        last = self._iteration == self.iterations
+        # With all sensors on nothing that is collected depends on a plan: it can wait, on a large grid at length.
+        if not (last or self._chooses or self._iteration % self.cfg.plan_every == 0):
+            return self._diagnostics()
+        self._estimate.fit(self.cfg.rounds_at_end if last else self.cfg.rounds)
         plan = exchange.solve(self._world(self._estimate.mean()))
         self.actor = as_policy(self.task, plan)
         # Acting on a draw, not on the mean: where the estimate is unsure the draws differ, and so moves get sensed that
         # the mean may leave out for good.
         if isinstance(self.policy, RenewedTable) and self._spent[0] >= self._warm_up:
             self.policy.renew(exchange.solve(self._world(self._estimate.sample(self._rng))))
-        return self._diagnostics(plan)
+        self._believed = self._beliefs(plan)
+        return self._diagnostics()
 
     def _world(self, kernel: sparse.csr_array) -> World:
-        """The task with the `[M, M + 1]` kernel believed."""
-        return World.of(self.task, kernel[:, :-1], max_steps=None)
+        """The task with the `[M, M + 1]` kernel believed, but for what is negligible."""
+        moves = sparse.csr_array(kernel[:, :-1])
+        if self.cfg.negligible > 0:
+            # The prior puts every displacement seen anywhere down at each cell: 25 moves where 5 are made, and plans
+            # on several moves grow with a power of that. A row keeps its sum, and with it the exit its probability.
+            rows, kept = row_index(moves), moves.data >= self.cfg.negligible
+            before = per_row(rows, moves.data, moves.shape[0])
+            after = per_row(rows, moves.data * kept, moves.shape[0])
+            kept |= (after == 0)[rows]  # a row of nothing else stays as it is
+            share = np.divide(before, after, out=np.ones_like(before), where=after > 0)
+            moves.data = moves.data * kept * share[rows]
+        return World.of(self.task, moves, max_steps=None)
 
-    def _diagnostics(self, plan: PolicyTable) -> dict[str, float]:
-        """What the plan is believed to be worth, how sure that is, and what learning has cost so far."""
+    def _diagnostics(self) -> dict[str, float]:
+        """What the last plan is believed to be worth, how sure that is, and what learning has cost so far."""
+        frames, sensors = self._spent
+        seen = {"least_visits": float(self._estimate.visits.min()), "sensors_per_frame": sensors / max(frames, 1.0)}
+        return self._believed | seen
+
+    def _beliefs(self, plan: PolicyTable) -> dict[str, float]:
         drawn = [self._world(self._estimate.sample(self._rng)) for _ in range(self.cfg.samples)]
         believed = np.array([evaluate(world, plan).aihtr for world in drawn])
-        frames, sensors = self._spent
-        return {
-            "believed_aihtr": evaluate(self._world(self._estimate.mean()), plan).aihtr,
-            "believed_deviation": float(believed.std()),
-            "least_visits": float(self._estimate.visits.min()),
-            "sensors_per_frame": sensors / max(frames, 1.0),
-        }
+        believes = evaluate(self._world(self._estimate.mean()), plan).aihtr
+        return {"believed_aihtr": believes, "believed_deviation": float(believed.std())}
 
     def state_dict(self) -> dict[str, Any]:
         """The observations, the estimate, the draws to come and the two tables."""
         return {
             "iteration": self._iteration,
             "spent": torch.as_tensor(self._spent),
+            "believed": dict(self._believed),
             "rng": _rng_state(self._rng),
             "estimate": {name: torch.as_tensor(part) for name, part in self._estimate.state().items()},
             "policy": self.policy.state_dict(),
@@ -100,6 +119,7 @@ class LearnedKernel:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`."""
         self._iteration, self._spent = state["iteration"], state["spent"].cpu().numpy().copy()
+        self._believed = dict(state["believed"])
         self._rng.bit_generator.state = _unpacked(state["rng"])
         self._estimate.load_state({name: part.cpu().numpy() for name, part in state["estimate"].items()})
         self.policy.load_state_dict(state["policy"])
@@ -119,6 +139,10 @@ def observed_paths(batch: TensorDictBase, task: Task) -> ObservedPaths:
     start, misses, history = (batch[key][ended] for key in ("last_cell", "steps_since_detection", "action_history"))
     end = torch.where(exited, task.num_cells, after["last_cell"])[ended]
     # Sensors are numbered within the window of the located cell; those outside the grid sense nothing.
+    if not misses.any():  # all sensors on, to which no history matters: the sets are as many as steps, so not read
+        rows = np.zeros(len(start) * history.shape[1] + 1, dtype=np.int64)
+        sensed = sparse.csr_array((rows[:0] > 0, rows[:0], rows), shape=(len(rows) - 1, task.num_cells))
+        return ObservedPaths(start.cpu().numpy(), misses.cpu().numpy(), sensed, end.cpu().numpy())
     path, miss, sensor = history.nonzero(as_tuple=True)
     cell = sensor if task.window is None else Window.of(task, history.device).around(start)[path, sensor]
     row, inside = path * history.shape[1] + miss, cell < task.num_cells

@@ -21,10 +21,17 @@ class LearnedKernelConfig(AlgoConfig):
     warm_up: int = option("with chosen sets: env steps with all sensors on before them", unit="frames", ge=0)
     prior: float = option("the pooled motion counts as much as this many moves out of each cell", unit="moves", gt=0)
     exit_prior: float = option("the pooled exit probability counts as much as this many moves", unit="moves", gt=0)
+    plan_every: int = option(
+        "with all sensors on: batches from one plan to the next; after the last one is planned in any case", ge=1
+    )
+    negligible: float = option(
+        "moves that are believed less likely are planned without; 0 = none are", unit="per step", ge=0, lt=1
+    )
     rounds: int = option("EM rounds after each batch", ge=1, le=10**6)
     rounds_at_end: int = option("EM rounds after the last batch", ge=1, le=10**6)
     samples: int = option("kernels drawn for the uncertainty reported", ge=2, le=10**4)
 
     def ignored(self, root: Any) -> dict[str, str]:
         """With all sensors on throughout, nothing comes before chosen sets."""
-        return {} if self.sensing == "chosen" else {"warm_up": "with algo.sensing=all"}
+        all_on = self.sensing != "chosen"
+        return {"warm_up": "with algo.sensing=all"} if all_on else {"plan_every": "with algo.sensing=chosen"}

@@ -166,7 +166,7 @@ class BenchmarkConfig(WorldConfig):
 
     part: str = option(
         "what is measured",
-        choices=("env", "collector", "train", "size", "memory", "peers", "log"),
+        choices=("env", "collector", "train", "size", "handoff", "memory", "peers", "log"),
     )
     seed: int = option("every random draw derives from it", ge=0)
     device: str = option("device of environments and networks", expects="cpu, cuda, cuda:N or auto", pattern=DEVICE)
@@ -174,6 +174,9 @@ class BenchmarkConfig(WorldConfig):
     seconds: float = option("least time spent on each figure of speed", unit="s", gt=0)
     batch_sizes: list[int] = option("`env`: environments stepped together", unit="environments", ge=1)
     sizes: list[int] = option("`size`: sides of the grid", unit="cells", ge=3)
+    work: list[str] = option("`size`: kinds of work", choices=("solve", "train", "env"))
+    blocks: list[int] = option("`handoff`: sides of the blocks", unit="cells", ge=1)
+    halos: list[int] = option("`handoff`: cells around a block, besides the default", unit="cells", ge=0)
     # Evaluated while this module is imported, before plugins are: only this package's own algorithms.
     algos: list[str] = option("`memory`: algorithms that train", choices=tuple(GROUPS["algo"]))
     seeds: list[int] = option("`peers`: seeds that all train with", ge=0)

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from trackmdp.app.bench import memory, size
+from trackmdp.app.bench import handoff, memory, size
 from trackmdp.app.bench.process import Usage, measured
 from trackmdp.app.cli import main
 
@@ -73,3 +73,34 @@ def test_memory_beside_what_was_expected(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(memory, "FRAMES", 20_000)
     (row,) = bench(tmp_path / "memory", "part=memory", "algos=[dqn]")
     assert 0 < row["expected_mib"] < row["peak_mib"]
+
+
+def test_exponents_are_of_growth_with_the_number_of_cells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stand_in(*words: str) -> Usage:
+        folder = Path(words[-1].partition("=")[2])
+        folder.mkdir()
+        (folder / "solution.json").write_text('{"regret_per_step": 0}')
+        n = next(int(word.partition("=")[2]) for word in words if word.startswith("grid.size"))
+        return Usage(1.0, float(n**2), float(n))
+
+    monkeypatch.setattr(size, "measured", stand_in)
+    first, _, second, _ = bench(tmp_path / "size", "part=size", "sizes=[10,20]", "work=[solve]")
+    assert first["cpu_exponent"] is first["memory_exponent"] is None
+    assert second["cpu_exponent"] == pytest.approx(1.0)
+    assert second["memory_exponent"] == pytest.approx(0.5)
+
+
+def test_what_blocks_lose_by_the_width_of_their_halo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(handoff, "COSTS", (0.16,))
+    rows = bench(tmp_path / "handoff", "part=handoff", "grid.size=8", "blocks=[4]", "halos=[0]", "cost.safe=10")
+    # The reach of the default kernel is 1: R (T_max + 2) is 3 for T_max 1 and 4 for T_max 2.
+    assert [(row["T_max"], row["halo"], row["default"]) for row in rows] == [
+        (1, 0, False),
+        (1, 3, True),
+        (2, 0, False),
+        (2, 4, True),
+    ]
+    for without, wide in zip(rows[::2], rows[1::2], strict=True):
+        assert without["loss_per_step"] > 0.1
+        assert abs(wide["loss_per_step"]) < 5e-4
+        assert wide["gap_per_step"] >= wide["loss_per_step"]

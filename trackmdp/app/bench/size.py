@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 import tempfile
 from collections.abc import Iterator
@@ -27,21 +28,43 @@ def size(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator[d
     """One row per size and kind of work: seconds and peak memory of the whole process, the start of Python included.
 
     Rows of the environment time its steps alone, so they have steps per second and the memory. A run that is refused,
-    as where it asks for more memory than there is, leaves its row without figures.
+    as where it asks for more memory than there is, leaves its row without figures. Exponents say how CPU time and
+    memory have grown with M since the size before.
     """
+    previous: dict[str, dict[str, Any]] = {}
+    for row in _rows(cfg, device):
+        yield row | _growth(previous.get(row["what"]), row)
+        previous[row["what"]] = row
+
+
+def _rows(cfg: BenchmarkConfig, device: torch.device) -> Iterator[dict[str, Any]]:
     own = [f"threads={cfg.threads}", f"device={device}", f"seed={cfg.seed}"]
     for n in cfg.sizes:
-        at = [*typed("kernel", "grid.t_max"), f"grid.size={n}"]
-        for cost in COSTS:
+        at = [*typed("kernel", "grid.t_max", "cost.safe"), f"grid.size={n}"]
+        for cost in COSTS if "solve" in cfg.work else ():
             yield _row(
                 n, f"solve, c = {cost:g}", "regret_per_step", "solution.json", "solve", *at, f"cost.sensor={cost}"
             )
-        yield _row(n, "train hindsight", "regret_per_step", "summary.json", "train", *at, *own)
+        if "train" in cfg.work:
+            yield _row(n, "train hindsight", "regret_per_step", "summary.json", "train", *at, *own)
+        if "env" not in cfg.work:
+            continue
         # A benchmark within the benchmark, so that each size has a process, and a peak memory, of its own.
         steps = ["benchmark", "part=env", f"batch_sizes=[{ENVS}]", f"seconds={cfg.seconds}", *at, *own]
         yield _row(n, f"env, B = {ENVS}", "per_second", "benchmark.json", *steps)
         window = f"env, B = {ENVS}, window {WINDOW}"
         yield _row(n, window, "per_second", "benchmark.json", *steps, f"grid.window={WINDOW}")
+
+
+def _growth(before: dict[str, Any] | None, row: dict[str, Any]) -> dict[str, float | None]:
+    """Exponents of CPU time and memory in M = N², from the row of the size before."""
+    found: dict[str, float | None] = {}
+    for name, key in (("cpu_exponent", "cpu_seconds"), ("memory_exponent", "peak_mib")):
+        found[name] = None
+        if before and before[key] and row[key] and before["N"] != row["N"]:
+            # 16 s at N = 512 and 61 s at N = 1000: log(61 / 16) / log(1000² / 512²) = 1.0
+            found[name] = math.log(row[key] / before[key]) / (2 * math.log(row["N"] / before["N"]))
+    return found
 
 
 def _row(n: int, what: str, figure: str, file: str, *words: str) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from trackmdp.app.bench import log, memory, peers, size, speed
+from trackmdp.app.bench import handoff, log, memory, peers, size, speed
 from trackmdp.config import BenchmarkConfig
 from trackmdp.durable import write_json
 from trackmdp.training.devices import make_device
@@ -25,6 +25,7 @@ PARTS: dict[str, Callable[[BenchmarkConfig, World, torch.device], Iterable[dict[
     "collector": speed.collector_speed,
     "train": speed.train_speed,
     "size": size.size,
+    "handoff": handoff.handoff,
     "memory": memory.memory,
     "peers": peers.peers,
     "log": log.log_speed,
