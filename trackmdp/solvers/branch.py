@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import heapq
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -39,6 +39,8 @@ __all__ = ["LeftOut", "Tree"]
 # Choices under one heap entry: enough of them for array arithmetic to pay, and not so many that poor ones are expanded
 # along with the best one, which gives the batch its place in the heap.
 LARGEST_BATCH = 4096
+# Complete choices that go on to the next step together.
+ENOUGH = 1024
 # Finite on purpose: regrets are summed and their maximum is taken out again (`_least_loss`), and inf - inf is nan.
 FORBIDDEN = 1e30
 MOST_PAIRED = 10
@@ -59,7 +61,7 @@ class _Frontier:
         count: `[B]`, cells that are not padding.
         rest: `[B, K + 1]`, least that the cells from the k-th on take away from `relaxed`.
         after: where the target goes on to from `cells`; None where that is not looked at.
-        origin: the batch these states came from and `[B]` their places in it; none at the start.
+        origin: the choices these states came from; none at the start.
     """
 
     start: IndexArray
@@ -72,7 +74,7 @@ class _Frontier:
     rest: Array
     missed: sparse.csr_array | None
     after: Next | None
-    origin: tuple[_Choices, IndexArray] | None
+    origin: _Origin | None
 
 
 @dataclass(frozen=True)
@@ -97,6 +99,24 @@ class _Choices:
     @property
     def start(self) -> IndexArray:
         return self.frontier.start[self.state]
+
+
+@dataclass(frozen=True)
+class _Origin:
+    """The complete choices that B states came from: state s is row `place[s]` of `batches[batch[s]]`."""
+
+    batches: list[_Choices]
+    batch: IndexArray
+    place: IndexArray
+
+    @classmethod
+    def of(cls, batches: list[_Choices]) -> _Origin:
+        """One state per choice, in order: batches of 2 and 3 rows have batch 0 0 1 1 1 and place 0 1 0 1 2."""
+        sizes = [len(each.state) for each in batches]
+        return cls(batches, np.repeat(np.arange(len(sizes)), sizes), np.concatenate([np.arange(n) for n in sizes]))
+
+    def pick(self, kept: IndexArray) -> _Origin:
+        return _Origin(self.batches, self.batch[kept], self.place[kept])
 
 
 @dataclass(frozen=True)
@@ -164,6 +184,8 @@ class Tree:
         # Problem -> cells left unsensed at each step, for the problems with a better plan than `lower`.
         self._leaves: dict[int, list[IndexArray]] = {}
         self._heap: list[tuple[float, int, _Choices]] = []
+        # Sets left -> complete choices that wait until there are enough of them: arrays of a few rows are slow.
+        self._complete: dict[int, list[_Choices]] = {}
         self._ticket = itertools.count()
         # Nothing is earned yet, all H sets are to be chosen, and no batch came before.
         start = sparse.eye_array(world.num_cells, format="csr") if mass is None else mass
@@ -172,14 +194,20 @@ class Tree:
     @property
     def closed(self) -> bool:
         """Whether no choice is open."""
-        return not self._heap
+        return not self._heap and not self._complete
+
+    def _open_choices(self) -> Iterator[_Choices]:
+        for _, _, choices in self._heap:
+            yield choices
+        for batches in self._complete.values():
+            yield from batches
 
     def upper(self) -> Array:
         """`[B]` proved upper bound of F_H."""
         # What was discarded was worth at most best + slack at the time, and best only grows; what is open still has its
         # own bound. So this holds whenever it is asked, also of a search that was stopped early.
         bound = self.best + self._slack
-        for _, _, choices in self._heap:
+        for choices in self._open_choices():
             np.maximum.at(bound, choices.start, choices.bound)
         return bound
 
@@ -191,7 +219,7 @@ class Tree:
         """
         rate = self.best + self._slack - value
         known: dict[int, Array] = {}
-        for _, _, choices in self._heap:
+        for choices in self._open_choices():
             np.maximum.at(rate, choices.start, choices.bound - value[choices.start] - self._paid(choices, paid, known))
         return rate
 
@@ -201,7 +229,11 @@ class Tree:
         before = known.get(id(frontier))
         if before is None:
             origin = frontier.origin
-            before = np.zeros(len(frontier.start)) if origin is None else self._paid(origin[0], paid, known)[origin[1]]
+            before = np.zeros(len(frontier.start))
+            for number, batch in enumerate(origin.batches if origin is not None else ()):
+                assert origin is not None
+                mine = origin.batch == number
+                before[mine] = self._paid(batch, paid, known)[origin.place[mine]]
             if frontier.missed is not None:
                 before = before + frontier.missed @ paid
             known[id(frontier)] = before
@@ -210,8 +242,13 @@ class Tree:
 
     def run(self, go_on: Callable[[Tree], bool]) -> None:
         """Expand open choices, best first, while there are any and `go_on(self)` holds."""
-        while self._heap and go_on(self):
-            self._decide(heapq.heappop(self._heap)[2])
+        while not self.closed and go_on(self):
+            if self._heap:
+                self._decide(heapq.heappop(self._heap)[2])
+            for sets_left, batches in list(self._complete.items()):
+                if not self._heap or sum(len(each.state) for each in batches) >= ENOUGH:
+                    del self._complete[sets_left]
+                    self._advance(batches)
 
     def improvements(self) -> tuple[BoolArray, list[LeftOut]]:
         """`[B]` which problems have a better plan than they started from, and what it leaves unsensed at each step."""
@@ -228,7 +265,7 @@ class Tree:
         # States of one batch have different numbers of cells to decide; those with k or fewer are complete.
         done = frontier.count[choices.state] <= k
         if done.any():
-            self._advance(choices.pick(done))
+            self._complete.setdefault(frontier.sets_left, []).append(choices.pick(done))
         split = choices.pick(~done)
         if not len(split.state):
             return
@@ -344,16 +381,20 @@ class Tree:
         leave = moved.data * missed
         return per_row(rows, np.maximum(sense, leave), mass.shape[0]), moved, sense, leave
 
-    def _advance(self, choices: _Choices) -> None:
-        """The sets of `choices` are complete: go on to the next step, or value the chain if there is none."""
-        sets_left = choices.frontier.sets_left - 1
-        mass = self._left_mass(choices, choices.left)
-        earned = choices.relaxed - mass @ self._revealed[sets_left]
+    def _advance(self, batches: list[_Choices]) -> None:
+        """The sets of these choices are complete: go on to the next step, or value the chain if there is none."""
+        batches = [each.pick(self._hopeful(each.start, each.bound)) for each in batches]
+        if not any(len(each.state) for each in batches):
+            return
+        sets_left = batches[0].frontier.sets_left - 1
+        mass = sparse.csr_array(sparse.vstack([self._left_mass(each, each.left) for each in batches], format="csr"))
+        earned = np.concatenate([each.relaxed for each in batches]) - mass @ self._revealed[sets_left]
         # `relaxed` counted the cells left at their revealed worth; that is taken out and the rest searched for anew
-        self._open(choices.start, earned, mass, sets_left, choices)
+        start = np.concatenate([each.start for each in batches])
+        self._open(start, earned, mass, sets_left, _Origin.of(batches))
 
     def _open(
-        self, start: IndexArray, earned: Array, mass: sparse.csr_array, sets_left: int, origin: _Choices | None
+        self, start: IndexArray, earned: Array, mass: sparse.csr_array, sets_left: int, origin: _Origin | None
     ) -> None:
         """Put the info states with undetected `mass` on the heap, or close them where one set is left."""
         _, moved, sense, leave = self._one_more_set(mass, sets_left)
@@ -398,7 +439,7 @@ class Tree:
         return sense if allowed is None else np.where(allowed, sense, -FORBIDDEN)
 
     def _record(
-        self, start: IndexArray, worth: Array, moved: sparse.csr_array, left: BoolArray, origin: _Choices | None
+        self, start: IndexArray, worth: Array, moved: sparse.csr_array, left: BoolArray, origin: _Origin | None
     ) -> None:
         # best first, so that of many plans for one problem all but the first are passed over
         order = np.argsort(-worth, kind="stable")
@@ -434,7 +475,7 @@ def _frontier(
     moved: sparse.csr_array,
     regret: Array,
     kept: IndexArray,
-    origin: _Choices | None,
+    origin: _Origin | None,
 ) -> _Frontier:
     """The states `kept`, with the entries of `moved` whose `regret` is positive, the likeliest first."""
     # The entries of `moved` are a ragged table: row s has count[s] of them. They are set into rectangles [B, K]; the
@@ -453,20 +494,17 @@ def _frontier(
     cells[rows[entry], column] = moved.indices[entry]
     mass[rows[entry], column] = moved.data[entry]
     loss[rows[entry], column] = regret[entry]
-    source = None if origin is None else (origin, kept)
+    source = None if origin is None else origin.pick(kept)
     none = np.zeros((len(kept), shape[1] + 1))
     return _Frontier(start[kept], sets_left, relaxed[kept], cells, mass, loss, count, none, None, None, source)
 
 
-def _sets_left_out(choices: _Choices | None, place: int) -> list[IndexArray]:
+def _sets_left_out(origin: _Origin | None, state: int) -> list[IndexArray]:
     """The cells left unsensed at each step so far, found by going back from batch to batch."""
     steps: list[IndexArray] = []
-    while choices is not None:
-        frontier, state = choices.frontier, choices.state[place]
-        steps.insert(0, frontier.cells[state][choices.left[place]])
-        # origin = (choices, kept): the state's place among those kept leads to its place among the choices it came
-        # from.
-        if frontier.origin is None:
-            break
-        choices, place = frontier.origin[0], int(frontier.origin[1][state])
+    while origin is not None:
+        choices, row = origin.batches[origin.batch[state]], origin.place[state]
+        frontier, state = choices.frontier, int(choices.state[row])
+        steps.insert(0, frontier.cells[state][choices.left[row]])
+        origin = frontier.origin
     return steps

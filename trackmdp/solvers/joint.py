@@ -31,8 +31,8 @@ from trackmdp.world.model import Array, BoolArray, World
 
 __all__ = ["Joint", "Next"]
 
-MOST_ENTRIES = 1 << 21
-"""Entries b_ji handled at once: what is a few megabytes stays in the cache."""
+MOST_ENTRIES = 1 << 15
+"""Entries b_ji handled at once: what is a quarter of a megabyte stays in the cache."""
 WIDEST = 1 << 13
 """Pairs (cell, next cell) of one state above which it is not looked at: the sums would take longer than they save."""
 

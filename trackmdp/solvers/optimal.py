@@ -38,7 +38,7 @@ ROUNDING = 1e-10
 FIRST_NODES = 100_000
 """Nodes before the first round's improvements are used; twice as many in each later round. Not seconds, so that the
 same world gives the same policy on any machine."""
-NODES_BETWEEN_REPORTS = 200_000
+NODES_BETWEEN_REPORTS = 100_000
 """Nodes after which the bracket is brought up to date while a tree is searched: about a second's."""
 WORTH_A_RESTART = 0.02
 """Share of the bracket that improvements have to close for the search to start anew with them."""
@@ -47,7 +47,7 @@ WORTH_A_RESTART = 0.02
 def solve(
     world: World,
     *,
-    nodes: int = 10_000_000,
+    nodes: int = 5_000_000,
     time_limit: float | None = None,
     tolerance: float = 1e-6,
     start: PolicyTable | None = None,
@@ -61,7 +61,7 @@ def solve(
 
     Args:
         world: the problem with its motion model.
-        nodes: choices of branch and bound, all trees together; some 200,000 a second.
+        nodes: choices of branch and bound, all trees together; some 100,000 a second.
         time_limit: seconds after which to stop before; what is returned then depends on the machine, and says so
             (`Solution.timed_out`). None: no limit.
         tolerance: bracket that counts as closed, relative to the value.

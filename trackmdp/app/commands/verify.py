@@ -22,7 +22,7 @@ from trackmdp.world.tracks import Problem
 
 __all__ = ["run", "show_checks", "write_checks"]
 
-NODES = 20_000_000
+NODES = 10_000_000
 """Work for the optimum the theorems are about: two minutes or so."""
 
 
