@@ -14,7 +14,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from tests.episodes.logs import CONFIG, WORLD, policy, recorded, rewritten, write
 from tests.episodes.test_simulate import WINDOWED
-from trackmdp.episodes import schema
+from trackmdp.episodes import schema, writer
 from trackmdp.episodes.episode import first_difference
 from trackmdp.episodes.page import page
 from trackmdp.episodes.reader import EpisodeReader
@@ -169,3 +169,22 @@ def test_a_log_of_a_rectangle_comes_back(tmp_path: Path) -> None:
         assert all(first_difference(a, b) is None for a, b in zip(episodes, reader.episodes(), strict=True))
         assert verify(reader).difference is None
         assert '"columns":5' in page(reader, reader.read(0))
+
+
+@pytest.mark.parametrize("acting", [policy(), Policy.all_on(WORLD), Policy.none(WORLD)])
+def test_a_large_grid_is_logged_sparse_and_read_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, acting: Policy
+) -> None:
+    episodes = recorded(10, acting=acting)
+    dense = write(tmp_path / "dense.mcap", episodes, acting=acting)
+    monkeypatch.setattr(writer, "DENSE_CELLS", 15)
+    file = write(tmp_path / "a.mcap", episodes, acting=acting)
+    with EpisodeReader(file) as reader, EpisodeReader(dense) as other:
+        reader.check_all()
+        assert np.array_equal(reader.world().kernel.toarray(), other.world().kernel.toarray())
+        assert set(reader._container.attachments).isdisjoint({"kernel.npy", "policy-0.npy"})
+        if acting.sets is not None:
+            assert np.array_equal(reader.policy(0).dense(), other.policy(0).dense())
+        assert verify(reader).difference is None
+        assert all(first_difference(a, b) is None for a, b in zip(episodes, reader.episodes(), strict=True))
+    assert recover(file).file.read_bytes() == file.read_bytes()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy import sparse
 
 from trackmdp.episodes.batch import Episodes
 from trackmdp.episodes.episode import Episode
@@ -56,3 +57,17 @@ def test_drawn_is_the_first_that_lasts_or_the_longest() -> None:
     short = [episode for episode in episodes if len(episode) <= 6]
     assert draw_picture(short, world) == draw_picture([max(short, key=len)], world)
     assert draw_picture(short[:1], world) != draw_picture([lasting], world)
+
+
+def test_of_a_large_grid_the_part_around_the_target_is_drawn() -> None:
+    world = World(sparse.eye_array(40 * 50) * 0.9, (40, 50), cost=0.1, t_max=0)
+    episode = simulate(world, Policy.all_on(world), 1, seed=3)[0]
+    row, column = divmod(int(episode.target[0]), 50)
+    *frames, empty, where, legend, _ = draw_picture([episode], world, steps=1).split("\n")
+    assert (empty, legend) == ("", PICTURE_LEGEND)
+    top, left = min(max(row - 10, 0), 19), min(max(column - 10, 0), 29)
+    assert where == f"rows {top} to {top + 20} of 40, columns {left} to {left + 20} of 50"
+    assert frames[0] == "step 1"
+    assert [len(line.split()) for line in frames[1:]] == [21] * 21
+    assert frames[1 + row - top].split()[column - left] == "●"
+    assert sum(line.count("●") for line in frames) == 1

@@ -13,7 +13,7 @@ from typing import Any
 
 from trackmdp.episodes import schema
 
-__all__ = ["check_policy", "check_row", "check_run", "check_steps", "size_of_grid", "tables_of"]
+__all__ = ["check_policy", "check_row", "check_run", "check_steps", "size_of_grid", "tables_of", "policy_file"]
 
 _MOST = 10**9
 """Steps, episodes, T_max: beyond any log, and small enough to be multiplied without overflow."""
@@ -50,8 +50,13 @@ def size_of_grid(run: Mapping[str, str]) -> tuple[int, int]:
 
 def tables_of(run: Mapping[str, str]) -> tuple[str, ...]:
     """The attachments that a log's world and config are read from; `sensors.npy` only where sensors may miss."""
-    every = ("config.yaml", "kernel.npy", "cost.npy")
+    every = ("config.yaml", "kernel.npz" if "kernel.npz.sha256" in run else "kernel.npy", "cost.npy")
     return (*every, "sensors.npy") if "sensors.npy.sha256" in run else every
+
+
+def policy_file(number: int, run: Mapping[str, str]) -> str:
+    """The attachment with the table of a policy: a CSR matrix where the kernel is one."""
+    return f"policy-{number}.{'npz' if 'kernel.npz.sha256' in run else 'npy'}"
 
 
 def check_policy(facts: Mapping[str, str], cells: int) -> None:

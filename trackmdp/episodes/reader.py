@@ -13,9 +13,10 @@ from types import TracebackType
 from typing import Any, TypeVar
 
 import numpy as np
+from scipy import sparse
 from tensordict import TensorDict
 
-from trackmdp.arrays import load_npy
+from trackmdp.arrays import load_npy, load_npz
 from trackmdp.episodes import limits, schema
 from trackmdp.episodes.container import Container, Damaged, Message
 from trackmdp.episodes.episode import Episode
@@ -24,6 +25,7 @@ from trackmdp.episodes.messages import decode
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.untrusted import decoded, reason
+from trackmdp.world.files import csr_of
 from trackmdp.world.model import Array, BoolArray, World
 
 __all__ = ["EpisodeReader", "checked_run"]
@@ -173,7 +175,7 @@ class EpisodeReader:
     def policy_table(self, number: int) -> bytes | None:
         """The file of policy `number`; None if it has no table."""
         sha256 = self.policies[number]["table.sha256"]
-        return self.attachment(f"policy-{number}.npy", sha256) if sha256 else None
+        return self.attachment(limits.policy_file(number, self.run), sha256) if sha256 else None
 
     def policy(self, number: int) -> Policy:
         """Policy `number`, as it acted.
@@ -186,6 +188,8 @@ class EpisodeReader:
             return Policy.random_k(task, int(facts["k"]))
         if facts["kind"] != "chains" or table is None:
             raise UserError(f"file={self.file}: policy {number} is a {facts['kind']!r}, expected chains or random_k")
+        if limits.policy_file(number, self.run).endswith(".npz"):
+            return Policy(task, self._checked(_matrix, table))
         return Policy.from_dense(task, self._checked(self._unpacked, table))
 
     def _unpacked(self, table: bytes) -> BoolArray:
@@ -205,7 +209,7 @@ class EpisodeReader:
     def _world(self) -> World:
         run = self.run
         # Kernel and prices, and where sensors may miss `[2, M]`, p_d and p_s.
-        kernel, cost, *sensors = (_load(self.attachment(name)) for name in limits.tables_of(run)[1:])
+        kernel, cost, *sensors = (_loaded(name, self.attachment(name)) for name in limits.tables_of(run)[1:])
         may_miss = dict(zip(("detection", "safe_detection"), sensors[0], strict=True)) if sensors else {}
         return World(
             kernel,
@@ -259,6 +263,15 @@ def checked_run(file: Path, run: dict[str, str]) -> dict[str, str]:
     with decoded(f"file={file}", "a log of trackmdp"):
         limits.check_run(run)
     return run
+
+
+def _loaded(name: str, content: bytes) -> Any:
+    return _matrix(content) if name.endswith(".npz") else _load(content)
+
+
+def _matrix(content: bytes) -> sparse.csr_array:
+    """A CSR matrix as SciPy saves it."""
+    return csr_of(load_npz(io.BytesIO(content)))
 
 
 def _load(content: bytes) -> Array:

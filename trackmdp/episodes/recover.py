@@ -13,7 +13,7 @@ from typing import Any
 
 from trackmdp.episodes import container, schema
 from trackmdp.episodes.container import Damaged
-from trackmdp.episodes.limits import check_policy, check_row, size_of_grid, tables_of
+from trackmdp.episodes.limits import check_policy, check_row, policy_file, size_of_grid, tables_of
 from trackmdp.episodes.messages import decode
 from trackmdp.episodes.reader import checked_run
 from trackmdp.episodes.writer import EpisodeWriter
@@ -194,7 +194,8 @@ def _policies_up_to(number: int, writer: EpisodeWriter, found: _Found, done: set
             raise Damaged(f"policy {each} is lost")
         writer.flush()  # as when it was recorded, so that a copy has the same bytes
         check_policy(facts, math.prod(size_of_grid(found.metadata[schema.RUN])))
-        sha256, table = facts.pop("table.sha256"), found.attachments.get(f"policy-{each}.npy")
+        run = found.metadata[schema.RUN]
+        sha256, table = facts.pop("table.sha256"), found.attachments.get(policy_file(each, run))
         if sha256 and (table is None or schema.digest(table) != sha256):
             raise Damaged(f"policy {each} is lost")
         writer.copy_policy(facts, table if sha256 else None)

@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from mcap.writer import Writer
+from scipy import sparse
 
 from trackmdp.durable import create, sync, sync_folder
 from trackmdp.episodes import messages, schema
 from trackmdp.episodes.episode import Episode
-from trackmdp.episodes.limits import size_of_grid
+from trackmdp.episodes.limits import policy_file, size_of_grid
 from trackmdp.episodes.schema import time_of
 from trackmdp.policies.policy import Policy
 from trackmdp.world.model import World
@@ -27,7 +28,11 @@ __all__ = ["EpisodeWriter"]
 FLUSH_STEPS = 100
 """An episode's end closes the chunk once so many steps are in it, and hands it to the operating system."""
 
-_MEDIA = {".yaml": "application/yaml", ".json": "application/json", ".npy": "application/octet-stream"}
+DENSE_CELLS = 64 * 64
+"""Cells up to which kernel and policies are written dense: 134 MB of kernel at that size."""
+
+_BYTES = "application/octet-stream"
+_MEDIA = {".yaml": "application/yaml", ".json": "application/json", ".npy": _BYTES, ".npz": _BYTES}
 
 
 class EpisodeWriter:
@@ -43,7 +48,7 @@ class EpisodeWriter:
     def __init__(self, file: Path, world: World, *, facts: Mapping[str, str], config: str) -> None:
         tables = {
             "config.yaml": config.encode(),
-            "kernel.npy": _npy(world.kernel.toarray()),
+            **_kernel(world),
             "cost.npy": _npy(world.cost),
         }
         if not (world.perfect and world.safe):
@@ -63,14 +68,14 @@ class EpisodeWriter:
             "tick_ns": str(schema.TICK_NS),
             **{f"{name}.sha256": schema.digest(content) for name, content in tables.items()},
         }
-        self._size, self._t_max = world.size, world.t_max
+        self._size, self._t_max, self._run = world.size, world.t_max, run
         self._open(file, run, tables)
 
     @classmethod
     def copy(cls, file: Path, run: Mapping[str, str], tables: Mapping[str, bytes]) -> EpisodeWriter:
         """A log that starts with the metadata `trackmdp.run` and the attachments of another."""
         writer = cls.__new__(cls)
-        writer._size, writer._t_max = size_of_grid(run), int(run["t_max"])
+        writer._size, writer._t_max, writer._run = size_of_grid(run), int(run["t_max"]), dict(run)
         writer._open(file, dict(run), dict(tables))
         return writer
 
@@ -124,7 +129,7 @@ class EpisodeWriter:
         facts |= {"table.sha256": schema.digest(table) if table is not None else ""}
         self._tell(f"{schema.POLICY}.{number}", facts)
         if table is not None:
-            self._attach(f"policy-{number}.npy", table)
+            self._attach(policy_file(number, self._run), table)
         self._flush()
         self._policies += 1
         return number
@@ -222,14 +227,34 @@ class EpisodeWriter:
 
 
 def _described(policy: Policy | None) -> tuple[dict[str, str], bytes | None]:
-    """What a log says of how a policy acts, and its table `[M, t_max+1, ceil(M/8)]`, eight sensors to a byte."""
+    """What a log says of how a policy acts, and its table.
+
+    `[M, t_max+1, ceil(M/8)]`, eight sensors to a byte; on a large grid the CSR matrix of its sets, as SciPy saves it.
+    """
     if policy is None:
         return {"kind": "unknown"}, None
     if policy.k is not None:
         return {"kind": "random_k", "k": str(policy.k)}, None
     if not policy.deterministic:
         return {"kind": "probabilities"}, None
+    if policy.task.num_cells > DENSE_CELLS:
+        if policy.sets is None:  # all on or none: as many as there are drawn, or not one, which needs no table
+            return {"kind": "random_k", "k": str(round((policy.probability or 0.0) * policy.task.num_cells))}, None
+        return {"kind": "chains"}, _npz(policy.sets)
     return {"kind": "chains"}, _npy(np.packbits(policy.dense(), axis=-1))
+
+
+def _kernel(world: World) -> dict[str, bytes]:
+    """The attachment that holds the kernel: dense, for any reader, or on a large grid as SciPy saves a CSR matrix."""
+    if world.num_cells > DENSE_CELLS:
+        return {"kernel.npz": _npz(world.kernel)}
+    return {"kernel.npy": _npy(world.kernel.toarray())}
+
+
+def _npz(matrix: sparse.csr_array) -> bytes:
+    buffer = io.BytesIO()
+    sparse.save_npz(buffer, matrix)
+    return buffer.getvalue()
 
 
 def _npy(table: npt.NDArray[Any]) -> bytes:

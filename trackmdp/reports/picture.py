@@ -4,17 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+import numpy as np
+
 from trackmdp.episodes.episode import Episode
+from trackmdp.solvers.renewal import IndexArray
 from trackmdp.world.model import BoolArray, Task
 from trackmdp.world.render import PICTURE_LEGEND, text_rows
 
 __all__ = ["draw_picture"]
 
 MARGIN = "   "
+WIDE = 21
+"""Rows and columns of a grid that are drawn at most."""
 
 
 def draw_picture(episodes: Sequence[Episode], task: Task, *, steps: int = 6) -> str:
     """The first `steps` steps of an episode, side by side, under the legend.
+
+    Of a grid larger than `WIDE` only the part around the target.
 
     Args:
         episodes: drawn is the first of them with so many steps in the grid, or the longest.
@@ -23,11 +30,35 @@ def draw_picture(episodes: Sequence[Episode], task: Task, *, steps: int = 6) -> 
     """
     # Longer than `steps`: the picture is then full, and does not end with the exit.
     episode = next((each for each in episodes if len(each) > steps), None) or max(episodes, key=len)
-    frames = [text_rows(task.size, cell, on, found=bool(on[cell])) for cell, on in _steps(episode, task, steps)]
-    columns = [[f"step {k}", *frame] for k, frame in enumerate(frames, start=1)]
-    wide = [[row.ljust(max(map(len, column))) for row in column] for column in columns]
-    lines = [MARGIN.join(rows) for rows in zip(*wide, strict=True)]
-    return "\n".join([*(line.rstrip() for line in lines), "", PICTURE_LEGEND, ""])
+    shown = list(_steps(episode, task, steps))
+    way = np.divmod(np.array([cell for cell, _ in shown], dtype=np.int64), task.columns)
+    rows, columns = (_around(each, length) for each, length in zip(way, task.size, strict=True))
+    frames = [_frame(task, rows, columns, cell, on) for cell, on in shown]
+    pieces = [[f"step {k}", *frame] for k, frame in enumerate(frames, start=1)]
+    wide = [[row.ljust(max(map(len, column))) for row in column] for column in pieces]
+    lines = [MARGIN.join(parts) for parts in zip(*wide, strict=True)]
+    whole = (len(rows), len(columns)) == task.size
+    where = f"rows {rows[0]} to {rows[-1]} of {task.rows}, columns {columns[0]} to {columns[-1]} of {task.columns}"
+    return "\n".join([*(line.rstrip() for line in lines), "", *([] if whole else [where]), PICTURE_LEGEND, ""])
+
+
+def _around(places: IndexArray, length: int) -> range:
+    """The rows, or columns, that are drawn of a large grid: those around where the target is, `WIDE` of them."""
+    if length <= WIDE or not len(places):
+        return range(min(length, WIDE))
+    # Around the middle of its way, as far as the border leaves room: places 3 to 5 of 40 give 0 to 20.
+    middle = (int(places.min()) + int(places.max())) // 2
+    begin = min(max(middle - WIDE // 2, 0), length - WIDE)
+    return range(begin, begin + WIDE)
+
+
+def _frame(task: Task, rows: range, columns: range, cell: int, on: BoolArray) -> list[str]:
+    """The text of some rows and columns; a target beyond them is not drawn."""
+    row, column = divmod(cell, task.columns)
+    inside = row in rows and column in columns
+    here = (row - rows.start) * len(columns) + column - columns.start if inside else len(rows) * len(columns)
+    cut = on.reshape(task.size)[rows.start : rows.stop, columns.start : columns.stop].ravel()
+    return text_rows((len(rows), len(columns)), here, cut, found=bool(on[cell]))
 
 
 def _steps(episode: Episode, task: Task, steps: int) -> Iterator[tuple[int, BoolArray]]:
