@@ -194,7 +194,7 @@ def test_what_depends_on_more_than_the_cell_is_learned_from_whole_paths_only() -
         while learner.step(None)["updates"] < 300:
             pass
         policy = as_policy(setting, learner.actor)
-        earned[markov] = replay(setting, tracks, policy).intervals()["reward_per_step"].mean
+        earned[markov] = replay(setting, tracks, policy).intervals(tracks.names)["reward_per_step"].mean
         if not markov:
             assert policy.dense()[[3, 5]].nonzero()[1].tolist() == [1, 1]
     assert earned[False] > 0.19

@@ -121,7 +121,7 @@ def test_intervals_cover_the_exact_value_19_times_of_20() -> None:
     tracks = drawn(world.kernel, 60 * trials)
     for trial in range(trials):
         mine = np.arange(len(tracks)) // 60 == trial
-        for name, interval in replayed(world, tracks.select(mine), chains).intervals().items():
+        for name, interval in replayed(world, part := tracks.select(mine), chains).intervals(part.names).items():
             truth = exact.aihtr / exact.expected_length if name == "reward_per_step" else getattr(exact, name)
             assert interval.low is not None
             assert interval.high is not None
@@ -131,9 +131,31 @@ def test_intervals_cover_the_exact_value_19_times_of_20() -> None:
 
 
 def test_a_single_track_has_no_interval() -> None:
-    alone = replayed(recorded(by_hand([0, 1])), by_hand([0, 1]), CHAINS).intervals()
+    alone = replayed(recorded(by_hand([0, 1])), by_hand([0, 1]), CHAINS).intervals(np.zeros(1))
     assert alone["aihtr"].mean == pytest.approx(0.8)
     assert (alone["aihtr"].low, alone["aihtr"].high) == (None, None)
+
+
+def test_pieces_of_one_path_count_as_one_target() -> None:
+    """Every track twice: under names of their own the interval is narrower by √2, under one name it stays."""
+    world = small_world(exit_probability=0.05)
+    tracks = drawn(world.kernel, 400)
+    twice = by_hand(*[tracks.cells[a:b].tolist() for a, b in zip(tracks.first[:-1], tracks.first[1:], strict=True)] * 2)
+    once, doubled = (replayed(world, each, CHAINS) for each in (tracks, twice))
+    width: dict[str, float] = {}
+    for name, found in (
+        ("once", once.intervals(tracks.names)),
+        ("one name", doubled.intervals(np.tile(tracks.names, 2))),
+        ("own names", doubled.intervals(twice.names)),
+    ):
+        interval = found["reward_per_step"]
+        assert interval.low is not None
+        assert interval.high is not None
+        assert interval.mean == pytest.approx(once.intervals(tracks.names)["reward_per_step"].mean)
+        width[name] = interval.high - interval.low
+        assert found["aihtr"].mean == pytest.approx(once.totals[:, 0].mean())
+    assert width["one name"] == pytest.approx(width["once"])
+    assert width["own names"] == pytest.approx(width["once"] / 2**0.5, rel=0.1)
 
 
 def test_probabilities_give_the_mean_over_draws() -> None:

@@ -60,7 +60,7 @@ class HeldOutEvaluator(Evaluator):
 
     def intervals(self, policy: PolicyTable) -> dict[str, MeanInterval]:
         """Figure -> its mean over the held-out tracks with a 95 % confidence interval."""
-        return replay(self.world, self.tracks, policy).intervals()
+        return replay(self.world, self.tracks, policy).intervals(self.tracks.names)
 
     def references(self) -> dict[str, PolicyTable]:
         """The policies that a learned one is compared with, by their names in tables."""
