@@ -87,7 +87,8 @@ def test_the_first_frames_of_a_mixture_decide_how_far_the_nets_see() -> None:
         leaves[number]["next", "last_cell"] = near
         for batch, exits in ((jumps[number], torch.zeros_like(far)), (leaves[number], far)):
             batch["next", "terminated"] = exits.unsqueeze(-1)
-    words = (*SHORT, *MIXED, "algo.hidden=8")
+    # Without the exchange, which counts moves of any length.
+    words = (*SHORT, *MIXED, "algo.hidden=8", "algo.exchange=false")
     one, other = learn(world, jumps, *words), learn(world, leaves, *words)
     assert [learner._reach() for learner in (one, other)] == [4, 1]
     assert np.array_equal(policy(one, world).dense(), policy(other, world).dense())

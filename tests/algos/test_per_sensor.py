@@ -67,8 +67,9 @@ def test_reads_nothing_that_was_not_sensed(name: str) -> None:
             place["action_history"] = torch.rand(place["action_history"].shape, generator=rng) < 0.5
         batch["next", "reward"] = torch.randn(batch["next", "reward"].shape, generator=rng)
         batch["next", "last_cell"][missed] = torch.randint(9, (int(missed.sum()),), generator=rng)
-    clean, other = (learn(world, each, *SHORT, name=name) for each in (data, poisoned))
+    clean, other = (learn(world, each, *SHORT, "algo.exchange=true", name=name) for each in (data, poisoned))
     assert_same(clean.state_dict(), other.state_dict())
+    assert np.array_equal(policy(clean, world).dense(), policy(other, world).dense())
 
 
 RESUMED = [*(("hindsight", (), saved_at) for saved_at in (3, 16, 17)), *((*variant, 17) for variant in VARIANTS)]

@@ -2,7 +2,9 @@
 
 Sensing never moves the target. With all sensors on, every path shows what any policy would have found and missed
 on it. Nothing else is read: neither the kernel nor a position that was not sensed. The clocked actor
-and critic only lend credit: they say what a detection is worth while the actor's own chains are still poor.
+and critic only lend credit: they say what a detection is worth while the actor's own chains are still poor. At the end
+the learned sets are exchanged on the counted moves (`algos/exchanged.py`), which gets past what no change of one set
+improves.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ from torch import Tensor
 
 from trackmdp.algos.actor_loss import ActorLoss, Decision
 from trackmdp.algos.common import Averages, set_learning_rate
+from trackmdp.algos.exchanged import exchanged_sets
 from trackmdp.algos.hindsight_loss import HindsightLoss
 from trackmdp.algos.moves import MoveBuffer
 from trackmdp.algos.paths import report_weights
@@ -132,10 +135,22 @@ class Hindsight:
 
     def _renew_policy(self, learner: _Learner) -> None:
         """Rebuild the evaluated policy, and with `collect=mixed` the collecting one, from the averaged actor."""
-        self.actor = Policy(self.task, learner.sets(self.task))
+        sets = learner.sets(self.task)
+        if self._exchanges():
+            moves, last = self._buffer.moves(), self._update == self.updates
+            sets = exchanged_sets(self.task, *moves, sets, share_cells=self.cfg.share_cells, anew=last)
+        self.actor = Policy(self.task, sets)
         if isinstance(self.policy, Exploring):
             self.policy.renew(self.actor)
             self.policy.explore.fill_(self.cfg.explore.at(self._iteration / self._collecting))
+
+    def _exchanges(self) -> bool:
+        """Whether the policy of this iteration is the learned one after exchange: the last, and those that collect.
+
+        Moves out of a cell are counted whatever came before, which only says how the target moves if that is Markov.
+        """
+        acts = self._mixed and self._iteration < self._collecting
+        return self.cfg.exchange and self.task.markov and (acts or self._update == self.updates)
 
     def _make_learner(self, reach: int) -> _Learner:
         loss = HindsightLoss(

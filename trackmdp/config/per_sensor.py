@@ -58,6 +58,10 @@ class PerSensorConfig(AlgoConfig):
         "assume that the target moves alike from all cells away from the border, and learn one policy for them all; "
         "with one price for all sensors"
     )
+    exchange: bool = option(
+        "at the end, change learned sets jointly where the sensed moves, counted, say that it pays (with collect=mixed "
+        "in the policy that collects, too); not with kernel.markov=false"
+    )
     max_entries: int = option(
         "entries (located cell, misses, sensor) of the losses' tables at once; larger ones are gone through in parts",
         unit="entries",

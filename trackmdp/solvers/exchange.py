@@ -28,7 +28,7 @@ from trackmdp.solvers.renewal import IndexArray, per_row, row_index
 from trackmdp.solvers.search import InnerProblem, located_value
 from trackmdp.world.model import Array, BoolArray, World
 
-__all__ = ["exchange", "exchanged", "solve"]
+__all__ = ["exchange", "exchanged", "improve", "solve"]
 
 MOST_NUMBERS = 2**17
 """Numbers in one array of a part, 1 MB: larger parts leave the caches, and took twice the time."""
@@ -53,8 +53,13 @@ FLIPPED = _candidates()
 
 def solve(world: World) -> PolicyTable:
     """The policy of `search`, improved by exchange."""
+    return improve(world, search.solve(world))
+
+
+def improve(world: World, policy: PolicyTable) -> PolicyTable:
+    """What exchange makes of a deterministic `policy`; no cell's value is lower."""
     layers = reachable_layers(world, world.num_choices)
-    return policy_table(world, layers, exchanged(world, layers, layer_sets(layers, search.solve(world))))
+    return policy_table(world, layers, exchanged(world, layers, layer_sets(layers, policy)))
 
 
 def exchanged(

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
+from trackmdp.solvers.alike import AlikeCells
 from trackmdp.solvers.renewal import IndexArray, row_index
 from trackmdp.world.model import Array, grid_size
 
@@ -66,6 +67,8 @@ class KernelEstimate:
         weight: the prior counts as much as this many moves.
         exit_weight: the pooled exit probability counts as much as this many moves.
         detection: `[M]`, p_d of each cell's sensor; None where no sensor misses.
+        share_cells: whether the target moves alike from all cells away from the border, so that what is seen in one of
+            them counts for all; None for where the moves seen do not say otherwise.
 
     Attributes:
         direct: `[M, M + 1]`, moves seen at once.
@@ -73,11 +76,17 @@ class KernelEstimate:
     """
 
     def __init__(
-        self, size: int | tuple[int, int], *, weight: float, exit_weight: float, detection: Array | None = None
+        self,
+        size: int | tuple[int, int],
+        *,
+        weight: float,
+        exit_weight: float,
+        detection: Array | None = None,
+        share_cells: bool | None = False,
     ) -> None:
         self._detection = detection
         self.rows, self.columns = grid_size(size)
-        self.weight, self.exit_weight = weight, exit_weight
+        self.weight, self.exit_weight, self.share_cells = weight, exit_weight, share_cells
         self.num_cells = self.rows * self.columns
         self.direct = sparse.csr_array((self.num_cells, self.num_cells + 1))
         self.counts = self.direct
@@ -149,7 +158,13 @@ class KernelEstimate:
         moves, exits = self._parameters()
         # A Dirichlet draw is a row of gamma draws, scaled to 1; 1e-300 keeps a row of tiny parameters from 0 / 0.
         moves.data = rng.standard_gamma(moves.data) + 1e-300
-        return self._kernel(moves, rng.beta(exits[:, 0], exits[:, 1]))
+        drawn = self._kernel(moves, rng.beta(exits[:, 0], exits[:, 1]))
+        # Cells that move alike are drawn once: the draws of many would average out.
+        return drawn if self.share_cells is False else self._alike().spread(drawn)
+
+    def _alike(self) -> AlikeCells:
+        judged = self.counts if self.share_cells is None else None
+        return AlikeCells((self.rows, self.columns), self._farthest(self.counts[:, :-1]), judged)
 
     @property
     def visits(self) -> Array:
@@ -166,9 +181,10 @@ class KernelEstimate:
 
     def _parameters(self) -> tuple[sparse.csr_array, Array]:
         """Dirichlet parameters `[M, M]` of the moves and Beta parameters `[M, 2]` of the exit."""
-        moved, left = self.counts[:, :-1], self.counts[:, [-1]].toarray()[:, 0]
+        counts = self.counts if self.share_cells is False else self._alike().pooled(self.counts)
+        moved, left = counts[:, :-1], counts[:, [-1]].toarray()[:, 0]
         # half an exit in one more move keeps the pooled probability between 0 and 1 before any exit is seen
-        pooled = (left.sum() + 0.5) / (self.counts.sum() + 1.0)
+        pooled = (left.sum() + 0.5) / (counts.sum() + 1.0)
         # Beta(exits + w p, moves + w (1 - p)), with p the pooled exit probability and w the weight of the prior.
         exits = np.stack([left + self.exit_weight * pooled, moved.sum(axis=1) + self.exit_weight * (1 - pooled)], 1)
         moves = sparse.csr_array(moved + self.weight * self._typical_moves(sparse.csr_array(moved)))

@@ -1,0 +1,106 @@
+"""Exchange at the end of hindsight: on what was counted, and on nothing else."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+import torch
+
+from tests.algos.hindsight import SHORT, assert_same, batches, learn, policy
+from tests.helpers import algorithm, small_world
+from trackmdp.algos import exchanged
+from trackmdp.algos.exchanged import counted_world, exchanged_sets
+from trackmdp.policies.policy import Policy
+from trackmdp.solvers import optimal
+from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers.evaluation import regret_per_step
+from trackmdp.training.train import train
+from trackmdp.world.make import make_world
+from trackmdp.world.model import World
+
+
+def spreading_world(size: int = 5, t_max: int = 1) -> World:
+    """A drift that turns often, at a price at which sets are left out jointly."""
+    return make_world("drift", size=size, persistence=0.5, cost=0.3, t_max=t_max, exit_probability=0.02)
+
+
+def test_the_counted_world_is_the_share_of_each_move() -> None:
+    """On 3 x 3 cells, from 0 twice to 1, once to 3 and once out; cell 8 was never left."""
+    start, end = torch.tensor([0, 0, 0, 0, 1, 3]), torch.tensor([1, 1, 3, 9, 0, 9])
+    kernel = counted_world(small_world(3).task, start, end, share_cells=False).kernel.toarray()
+    leave = (1 + 2.5 / 7) / 5  # the exit probability of all cells, 2.5 in 7, counts as one move
+    np.testing.assert_allclose(kernel[0], [0, (1 - leave) * 2 / 3, 0, (1 - leave) / 3, 0, 0, 0, 0, 0], atol=1e-8)
+    np.testing.assert_allclose(np.flatnonzero(kernel[1]), [0])
+    assert kernel[8].sum() == pytest.approx(1 - 2.5 / 7)
+
+
+def test_the_nets_are_what_they_are_without_it() -> None:
+    world = spreading_world()
+    data = batches(world)
+    on, off = (learn(world, data, *SHORT, f"algo.exchange={on}") for on in (True, False))
+    assert_same(on.state_dict(), off.state_dict())
+    learned = Policy(world, off._learner.sets(world))
+    assert np.array_equal(policy(off, world).dense(), learned.dense())
+    counts = counted_world(world.task, *on._buffer.moves(), share_cells=False)
+    values = [evaluate(counts, policy(each, world)).value for each in (off, on)]
+    assert (values[1] >= values[0] - 1e-9).all()
+    assert values[1].mean() > values[0].mean() + 1.0
+
+
+@pytest.mark.parametrize("collects", ["all_on", "mixed"])
+def test_a_loaded_learner_has_the_exchanged_policy(collects: str) -> None:
+    world = spreading_world()
+    words = (*SHORT, f"algo.collect={collects}")
+    learner = learn(world, batches(world), *words)
+    file = io.BytesIO()
+    torch.save(learner.state_dict(), file)
+    file.seek(0)
+    loaded = algorithm("hindsight", world, *words, "seed=5")
+    loaded.load_state_dict(torch.load(file, weights_only=True))
+    assert np.array_equal(policy(learner, world).dense(), policy(loaded, world).dense())
+    assert not np.array_equal(policy(loaded, world).dense(), Policy(world, loaded._learner.sets(world)).dense())
+
+
+def test_a_mixture_collects_with_the_exchanged_policy() -> None:
+    world = spreading_world()
+    learner = algorithm("hindsight", world, *SHORT, "algo.collect=mixed", "algo.explore.until=0.5", "algo.updates=500")
+    for batch in batches(world)[:8]:
+        learner.step(batch)
+    learned = Policy(world, learner._learner.sets(world))
+    expected = exchanged_sets(world.task, *learner._buffer.moves(), learned.sets, share_cells=False, anew=False)
+    assert np.array_equal(policy(learner, world).dense(), Policy(world, expected).dense())
+    assert (expected != learned.sets).nnz > 0
+    assert learner.policy.bits.sum() == torch.as_tensor(np.packbits(Policy(world, expected).dense(), axis=-1)).sum()
+
+
+def test_motion_with_memory_is_not_counted() -> None:
+    world = World.of(spreading_world(), spreading_world().kernel, markov=False)
+    learner = learn(world, batches(world), *SHORT)
+    assert np.array_equal(policy(learner, world).dense(), Policy(world, learner._learner.sets(world)).dense())
+
+
+def test_plans_too_large_to_be_exchanged_are_left_as_learned(monkeypatch: pytest.MonkeyPatch) -> None:
+    """25 cells, at most 5 successors: 25 · 5 · (1 + 5) = 750 moves of plans of two sets."""
+    world = spreading_world()
+    start = torch.arange(25)
+    end = [torch.where((start + step >= 0) & (start + step < 25), start + step, 25) for step in (-5, -1, 1, 5, 6)]
+    moves = start.repeat(5), torch.cat(end)
+    sets = Policy.from_dense(world, np.zeros((25, 2, 25), dtype=bool)).sets
+    for limit, left in ((750, False), (749, True)):
+        monkeypatch.setattr(exchanged, "MOST_MOVES", limit)
+        found = exchanged_sets(world.task, *moves, sets, share_cells=False)
+        assert (found is sets) == left
+
+
+@pytest.mark.slow
+def test_a_drift_is_learned_to_its_certified_optimum() -> None:
+    world = spreading_world()
+    best = optimal.solve(world)
+    assert best.certified
+    regrets = []
+    for on in (False, True):
+        run = train(world, "hindsight", exchange=on, updates=200, optimal={"enabled": False}, seed=0)
+        regrets.append(regret_per_step(best.upper, evaluate(world, run.policy)))
+    assert regrets[1] < 0.001 < 0.01 < regrets[0]

@@ -1,0 +1,79 @@
+"""The last step of hindsight: exchange on the moves that were sensed, counted.
+
+The counts are the exact expectation of the paths that hindsight puts together from sensed moves, so that what is chosen
+on them uses nothing more than the paths do.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import sparse
+from torch import Tensor
+
+from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers import exchange
+from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers.kernel_estimate import KernelEstimate
+from trackmdp.world.model import Task, World
+
+__all__ = ["counted_world", "exchanged_sets"]
+
+UNSEEN = 1e-9
+"""Weight in moves of what was not seen: it counts where a cell was never left, and nowhere else."""
+EXIT_WEIGHT = 1.0
+"""The exit probability of all cells counts as one move in each, so that no episode is endless on the counts."""
+MOST_MOVES = 20_000_000
+"""Moves of all plans together (some 40 bytes each) up to which sets are exchanged."""
+
+
+def counted_world(task: Task, start: Tensor, end: Tensor, *, share_cells: bool) -> World:
+    """The task with the motion that was counted.
+
+    Args:
+        task: grid, rewards and costs.
+        start: `[K]`, the cell before each sensed move.
+        end: `[K]`, the cell after it, M for outside.
+        share_cells: the target moves alike from all cells away from the border; False: judge by the counts whether it
+            does, cells at the same distance from the borders together.
+    """
+    estimate = KernelEstimate(task.size, weight=UNSEEN, exit_weight=EXIT_WEIGHT, share_cells=share_cells or None)
+    estimate.add_moves(start.cpu().numpy(), end.cpu().numpy())
+    if not task.perfect:
+        # Of the moves to a cell the share p_d is known (`report_weights`): each counts for 1 / p_d.
+        counts = estimate.counts
+        counts.data /= np.append(task.detection, 1.0)[counts.indices]
+    kernel = estimate.mean()[:, :-1]
+    # In rows that were seen the prior stands for moves that were not: sets and work would grow with every one of them.
+    kernel.data[kernel.data < 10 * UNSEEN] = 0.0
+    return World.of(task, kernel, max_steps=None)
+
+
+def exchanged_sets(
+    task: Task, start: Tensor, end: Tensor, sets: sparse.csr_array, *, share_cells: bool, anew: bool = True
+) -> sparse.csr_array:
+    """`[M (t_max + 1), M]`, what exchange on the counts makes of learned `sets`.
+
+    Args:
+        task: grid, rewards and costs.
+        start: `[K]`, the cell before each sensed move.
+        end: `[K]`, the cell after it, M for outside.
+        sets: `[M (t_max + 1), M]`.
+        share_cells: see `counted_world`.
+        anew: whether to start from `search` as well: from one start alone, regrets of .003 were left.
+    """
+    world = counted_world(task, start, end, share_cells=share_cells)
+    if _moves_of_plans(world) > MOST_MOVES:
+        return sets
+    found = [exchange.improve(world, PolicyTable(task, sets)), *([exchange.solve(world)] if anew else [])]
+    worth = [evaluate(world, policy).aihtr for policy in found]
+    best = found[int(np.argmax(worth))].sets
+    assert best is not None
+    return best
+
+
+def _moves_of_plans(world: World) -> float:
+    """No fewer than the moves out of all positions that plans of t_max + 1 sets pass through."""
+    successors = int(np.diff(world.kernel.indptr).max())
+    # After t moves from one cell the target is in one of at most Z^t cells, or of M.
+    positions = sum(min(successors**t, world.num_cells) for t in range(world.num_choices))
+    return world.num_cells * successors * positions

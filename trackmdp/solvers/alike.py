@@ -1,0 +1,84 @@
+"""Cells from which the target moves alike: their moves are pooled, displacement by displacement."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import sparse
+
+from trackmdp.solvers.renewal import per_row, row_index
+from trackmdp.world.model import BoolArray
+
+__all__ = ["AlikeCells"]
+
+DEVIATIONS = 4.0
+"""Standard deviations by which a test of homogeneity has to be exceeded for a group of cells to be split up."""
+
+
+class AlikeCells:
+    """Groups of cells that are equally far from each border, or farther than the target moves.
+
+    Args:
+        size: (rows, columns) of the grid.
+        reach: rows or columns that the target moves in one step, at most.
+        counts: `[M, M + 1]`, moves seen out of each cell: groups whose cells they tell apart are split up.
+
+    Attributes:
+        groups: `[M]`, the group of each cell.
+        first: `[G]`, the first cell of each group.
+    """
+
+    def __init__(self, size: tuple[int, int], reach: int, counts: sparse.csr_array | None = None) -> None:
+        self.rows, self.columns = size
+        row, column = np.divmod(np.arange(self.rows * self.columns), self.columns)
+        # Distances to the four borders, up to the reach. On 5 x 5 cells with reach 1, the 9 inner cells are of one
+        # group, the 3 cells between two corners of another one for each border, and each corner is alone.
+        margins = np.stack([row, self.rows - 1 - row, column, self.columns - 1 - column], axis=1)
+        _, first, groups = np.unique(np.minimum(margins, reach), axis=0, return_index=True, return_inverse=True)
+        self.first, self.groups = first, groups.ravel()
+        if counts is not None:
+            apart = self._told_apart(counts)[self.groups]
+            # Cells of a group that is split up get numbers behind those of all groups.
+            labels = np.where(apart, len(first) + np.arange(len(row)), self.groups)
+            _, self.first, self.groups = np.unique(labels, return_index=True, return_inverse=True)
+
+    def _told_apart(self, counts: sparse.csr_array) -> BoolArray:
+        """`[G]` whether the moves seen out of the cells of a group differ by more than chance, in Pearson's test."""
+        expected = self.pooled(counts)
+        out, together = counts.sum(axis=1), expected.sum(axis=1)
+        # E = n_x (the group's share of the move). The sum of (O - E)² / E over entries is that of O² / E less that of
+        # O, and entries of the group that were not seen out of a cell take part with O = 0.
+        rows = row_index(expected)
+        share = (out / np.maximum(together, 1e-300))[rows]
+        expected = sparse.csr_array((expected.data * share, expected.indices, expected.indptr), shape=counts.shape)
+        seen = expected.data > 0
+        inverse = sparse.csr_array(
+            (1.0 / expected.data[seen], (rows[seen], expected.indices[seen])), shape=counts.shape
+        )
+        statistic = per_row(self.groups, (counts.multiply(counts).multiply(inverse)).sum(axis=1) - out, len(self.first))
+        # Its mean is (cells - 1) (moves - 1), its variance twice that and the sum of all 1 / E, where few are expected.
+        cells = per_row(self.groups, (out > 0).astype(float), len(self.first))
+        moves = np.diff(expected.indptr)[self.first]
+        freedom = np.maximum(cells - 1, 0) * np.maximum(moves - 1, 0)
+        variance = 2.0 * freedom + per_row(self.groups, inverse.sum(axis=1), len(self.first))
+        return statistic > freedom + DEVIATIONS * np.sqrt(variance)
+
+    def pooled(self, counts: sparse.csr_array) -> sparse.csr_array:
+        """`[M, M + 1]` counts of moves, each cell's being those of its whole group; the last column is the exit."""
+        m, (start, end) = len(self.groups), (row_index(counts), counts.indices)
+        # On 10 columns, 2 rows down and 1 column to the left is the shift 2 · 20 - 1 = 39, read back as row
+        # (39 + 10) // 20 = 2 and column 39 - 40 = -1. The exit has a number of its own, beyond all of these.
+        wide, exit_shift = 2 * self.columns, 4 * m + 1
+        shift = (end // self.columns - start // self.columns) * wide + end % self.columns - start % self.columns
+        shifts, place = np.unique(np.where(end == m, exit_shift, shift), return_inverse=True)
+        shape = (len(self.first), len(shifts))
+        each = sparse.csr_array((counts.data, (self.groups[start], place)), shape=shape)[self.groups]
+        start, shift = row_index(each), shifts[each.indices]
+        down = (shift + self.columns) // wide
+        end = start + down * self.columns + (shift - down * wide)
+        return sparse.csr_array((each.data, (start, np.where(shift == exit_shift, m, end))), shape=counts.shape)
+
+    def spread(self, kernel: sparse.csr_array) -> sparse.csr_array:
+        """`[M, M + 1]` with the row of the first cell of each group, moved to all the others'."""
+        kept = np.zeros(len(self.groups))
+        kept[self.first] = 1.0
+        return self.pooled(sparse.csr_array(sparse.diags_array(kept) @ kernel))
