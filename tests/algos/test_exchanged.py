@@ -94,6 +94,16 @@ def test_plans_too_large_to_be_exchanged_are_left_as_learned(monkeypatch: pytest
         assert (found is sets) == left
 
 
+def test_reports_that_are_missed_more_often_count_for_more() -> None:
+    """From 0 to 1 twice, reported in half of all cases, and to 3 four times, always reported: as many of both."""
+    world = small_world(3)
+    task = World.of(world, world.kernel, detection=np.where(np.arange(9) == 1, 0.5, 1.0)).task
+    start, end = torch.tensor([0] * 6), torch.tensor([1] * 2 + [3] * 4)
+    kernel = counted_world(task, start, end, share_cells=False).kernel.toarray()
+    assert kernel[0, 1] == pytest.approx(kernel[0, 3])
+    assert kernel[0, 1] > 0.4
+
+
 @pytest.mark.slow
 def test_a_drift_is_learned_to_its_certified_optimum() -> None:
     world = spreading_world()

@@ -49,8 +49,13 @@ class LearnedKernel:
         if not task.safe:  # how often a safe action was repeated is not in what was observed
             raise UserError(f"sensor.p_s={task.safe_detection.min():g}: expected 1, for this algo learns no other")
         detection = None if task.perfect else task.detection
-        weights = {"weight": cfg.prior, "exit_weight": cfg.exit_prior}
-        self._estimate = KernelEstimate(task.size, **weights, detection=detection)
+        self._estimate = KernelEstimate(
+            task.size,
+            weight=cfg.prior,
+            exit_weight=cfg.exit_prior,
+            detection=detection,
+            share_cells=cfg.share_cells,
+        )
         self._rng = np.random.default_rng(derive(seed, "learned_kernel"))
         self._chooses, self._warm_up = cfg.sensing == "chosen", cfg.warm_up
         self._iteration, self._spent = 0, np.zeros(2)

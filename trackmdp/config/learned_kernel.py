@@ -27,6 +27,9 @@ class LearnedKernelConfig(AlgoConfig):
     negligible: float = option(
         "moves that are believed less likely are planned without; 0 = none are", unit="per step", ge=0, lt=1
     )
+    share_cells: bool | None = option(
+        "count moves of all cells as far from each border together; null: where the moves seen do not tell them apart"
+    )
     rounds: int = option("EM rounds after each batch", ge=1, le=10**6)
     rounds_at_end: int = option("EM rounds after the last batch", ge=1, le=10**6)
     samples: int = option("kernels drawn for the uncertainty reported", ge=2, le=10**4)
