@@ -58,6 +58,18 @@ def test_the_best_does_not_depend_on_where_a_run_was_cut(
     assert_same_best(tmp_path, whole)
 
 
+def test_a_checkpoint_that_a_signal_asked_for_is_not_the_best(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Saved at iterations 3, 6 and 8 of 8; the run that is stopped after each of the first seven, at all of them."""
+    words = ("checkpoint.every=768", "evaluation.every=1")
+    train(tmp_path / "whole", *words)
+    for stop in range(1, 8):
+        with monkeypatch.context() as patch, pytest.raises(Preempted):
+            at_iteration(patch, stop, lambda: signal.raise_signal(signal.SIGTERM))
+            train(tmp_path / "cut", *words, "resume=auto")
+    train(tmp_path / "cut", *words, "resume=auto")
+    assert_same_best(tmp_path / "cut", tmp_path / "whole")
+
+
 def test_the_best_is_the_policy_that_it_was_called_the_best_for(whole: Path) -> None:
     figures = [
         checkpoint.load(file)["callbacks"]["checkpoints"]

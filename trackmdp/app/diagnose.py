@@ -75,10 +75,11 @@ def _parse(word: str) -> Override:
     """
     try:
         override = OverridesParser.create().parse_override(word)
-    except (HydraException, ValueError) as error:  # ValueError: an integer of thousands of digits
+        names = _names(override)
+    except (HydraException, ValueError) as error:  # ValueError: an integer of thousands of digits, range(0,1,0)
         raise UserError(f"{word}: expected option=value (a value with blanks or commas needs quotes)") from error
     refuse_renamed(override.key_or_group)
-    for value in _names(override):
+    for value in names:
         refuse_renamed(override.key_or_group, str(value))
     return override
 

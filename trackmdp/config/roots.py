@@ -78,7 +78,11 @@ class OptimalBoundConfig(NodeConfig):
 class CheckpointConfig(NodeConfig):
     """When the state of the run is saved."""
 
-    every: int = option("frames from one checkpoint to the next; 0 = not counted in frames", unit="frames", ge=0)
+    every: int = option(
+        "frames from one checkpoint to the next, the best of which is best.pt; 0 = not counted in frames",
+        unit="frames",
+        ge=0,
+    )
     seconds: float | None = option(
         "time from one checkpoint to the next, longer where saving would take over 2 %; null = not by time",
         unit="s",

@@ -53,7 +53,7 @@ class Checkpoints(Callback):
 
     def on_update(self, trainer: Training, row: Row) -> None:  # noqa: ARG002
         """Save after the last iteration, and where it is due."""
-        if trainer.position.iteration == trainer.iterations or self.due(trainer.position):
+        if self._is_planned(trainer) or self.due(trainer.position):
             self.save(trainer)
 
     def on_end(self, trainer: Training) -> None:
@@ -66,16 +66,27 @@ class Checkpoints(Callback):
 
         By time not before training took 50 times as long as the last saving, which would else take too much of it.
         """
-        every, saved = self._cfg.every, self._saved
+        seconds = self._cfg.seconds is not None and at.seconds - self._saved.seconds >= max(
+            self._cfg.seconds, self._rest
+        )
+        return self._passes_multiple(at) or seconds
+
+    def _passes_multiple(self, at: Position) -> bool:
         # Multiples that were passed, since batches seldom end on one: every=30,000 with batches of 20,000 saves at
         # 40,000, 60,000 and 100,000.
-        frames = every and at.frames // every > saved.frames // every
-        seconds = self._cfg.seconds is not None and at.seconds - saved.seconds >= max(self._cfg.seconds, self._rest)
-        return bool(frames or seconds)
+        every = self._cfg.every
+        return every > 0 and at.frames // every > self._saved.frames // every
+
+    def _is_planned(self, trainer: Training) -> bool:
+        """Whether this iteration is saved in every run of this config, cut or not."""
+        return trainer.position.iteration == trainer.iterations or self._passes_multiple(trainer.position)
 
     def save(self, trainer: Training) -> None:
         """Save the run as it is, and tell the callbacks."""
-        begin, aihtr = time.monotonic(), self._attained(trainer)
+        begin = time.monotonic()
+        # Where checkpoints are counted in frames, one that a signal or the clock asked for is none of the candidates:
+        # else which one is the best would depend on where the run was cut.
+        aihtr = self._attained(trainer) if not self._cfg.every or self._is_planned(trainer) else -math.inf
         self._is_best, self._best = aihtr > self._best, max(self._best, aihtr)
         # `_best` and `_is_best` are part of the state, so they are set before it is taken. The logs are called before
         # this callback: the lengths of files in their states include this iteration's row and episodes.
@@ -100,7 +111,7 @@ class Checkpoints(Callback):
         return trainer.evaluator.score(trainer.policy()).evaluation.aihtr
 
     def state_dict(self) -> dict[str, Any]:
-        """The highest AIHTR of any checkpoint, and whether it is this one's."""
+        """The highest AIHTR of the checkpoints that count, and whether it is this one's."""
         return {"best": self._best, "is_best": self._is_best}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:

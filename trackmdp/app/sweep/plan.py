@@ -226,7 +226,10 @@ def _values(override: Override) -> list[str]:
         ]
     if not override.is_discrete_sweep():
         raise UserError(f"{override.input_line}: expected values that can be counted; hydra/sweeper=optuna searches")
-    return [f"{key}={value}" for value in override.sweep_string_iterator()]
+    try:
+        return [f"{key}={value}" for value in override.sweep_string_iterator()]
+    except ValueError as error:  # range(0,1,0)
+        raise UserError(f"{override.input_line}: {error}") from error
 
 
 def _key(word: str) -> str:
