@@ -16,6 +16,7 @@ from trackmdp.config.options import several
 REFUSED = {("evaluate", "log=csv"), ("evaluate", "log=tensorboard")} | {
     (command, "kernel=tracks") for command in ("evaluate", "solve", "verify", "benchmark")
 }
+REFUSED |= {(command, "sensor=false_alarm") for command in ("train", "solve", "verify", "benchmark")}
 """Choices that a command's group offers and its rules refuse."""
 
 COMBINATIONS = [

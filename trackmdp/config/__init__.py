@@ -63,6 +63,7 @@ from trackmdp.config.tree import from_hydra, load_config, load_run_config, to_di
 from trackmdp.config.world import (
     CostConfig,
     DriftConfig,
+    FalseAlarmConfig,
     GridConfig,
     KernelConfig,
     MissConfig,
@@ -98,6 +99,7 @@ __all__ = [
     "EvaluateConfig",
     "EvaluationConfig",
     "ExportConfig",
+    "FalseAlarmConfig",
     "FcrConfig",
     "GridConfig",
     "HindsightConfig",

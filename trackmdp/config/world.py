@@ -14,6 +14,7 @@ __all__ = [
     "LARGEST",
     "CostConfig",
     "DriftConfig",
+    "FalseAlarmConfig",
     "GridConfig",
     "KernelConfig",
     "MissConfig",
@@ -302,6 +303,31 @@ class MissConfig(SensorConfig):
         for name in ("p_d", "p_s"):
             number = Option("", gt=0, le=1, kind=float)
             _check_per_cell(f"{key}.{name}", getattr(self, name), root, number, "number above 0, at most 1")
+
+
+@choice("sensor", "false_alarm", makes="trackmdp.world.sensors:false_alarm")
+@dataclass(kw_only=True)
+class FalseAlarmConfig(SensorConfig):
+    """For evaluate alone: sensors that also report targets that are not there; a policy believes each report."""
+
+    p_d: Any = option(
+        "p_d, probability that a sensor that is on reports the target in its cell, for all cells or for each",
+        expects="a number above 0, at most 1, a list of one per cell, or a path to a .npy or .csv file of one per cell",
+        path=True,
+    )
+    p_f: float = option(
+        "p_f, probability that a sensor that is on reports in a step in which the target is not there", ge=0, lt=1
+    )
+
+    def check(self, key: str, root: Any) -> None:
+        """Robustness of a policy made without them, and nothing else."""
+        if not hasattr(root, "baseline"):
+            raise refuse(
+                key, self.name, "perfect or miss; policies are evaluated with false alarms, never made for them"
+            )
+        if root.log:
+            raise refuse("log", listed(root.log), f"[] with {key}={self.name}, where nothing is simulated")
+        _check_per_cell(f"{key}.p_d", self.p_d, root, Option("", gt=0, le=1, kind=float), "number above 0, at most 1")
 
 
 def _check_per_cell(key: str, value: Any, root: Any, number: Option, allowed: str) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers.alarms import believed
 from trackmdp.solvers.evaluation import Evaluation, pooled, summed_up
 from trackmdp.solvers.horizon import truncated_value
 from trackmdp.solvers.prediction import renewal
@@ -27,19 +28,29 @@ if TYPE_CHECKING:  # torch is loaded where something that acts is asked for its 
 __all__ = ["evaluate"]
 
 
-def evaluate(problem: Problem, policy: PolicyLike | Array | BoolArray, *, guess: Array | None = None) -> Evaluation:
+def evaluate(
+    problem: Problem,
+    policy: PolicyLike | Array | BoolArray,
+    *,
+    guess: Array | None = None,
+    false_alarm: float = 0.0,
+) -> Evaluation:
     """What `policy` earns: exactly on a `World`, as replayed on the held-out tracks of a `Recorded`.
 
     Args:
         problem: a `World`, whose episodes end by the target's exit or after `max_steps`; or `Recorded` tracks.
         policy: a `Policy` or its table, or the same dense, `[M, t_max + 1, M]`; a TensorDict module or a function
             that does not draw (`Policy.from_function`).
+        false_alarm: p_f, with which a sensor that is on reports the target in a step in which it is not there; the
+            policy takes each report for the truth (`trackmdp.solvers.alarms`).
         guess: `[M]`, where the solve begins on a grid too large to factorise, such as the clocked bound.
 
     Raises:
         UserError: the policy draws at random and is not one whose probabilities are known, or is for another grid.
     """
     table = _table(problem, policy)
+    if false_alarm:
+        return believed(problem, table, false_alarm)
     if not isinstance(problem, World):
         return evaluate_recorded(problem, table)
     if problem.max_steps is not None:

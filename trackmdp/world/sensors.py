@@ -9,7 +9,7 @@ import numpy as np
 from trackmdp.world.files import per_cell
 from trackmdp.world.model import Array, Size
 
-__all__ = ["miss", "perfect"]
+__all__ = ["false_alarm", "miss", "perfect"]
 
 
 def perfect(size: Size) -> dict[str, Any]:  # noqa: ARG001
@@ -27,6 +27,15 @@ def miss(size: Size, *, p_d: float | list[float] | str, p_s: float | list[float]
         "detection": _probabilities("sensor.p_d", p_d, size),
         "safe_detection": _probabilities("sensor.p_s", p_s, size),
     }
+
+
+def false_alarm(size: Size, *, p_d: float | list[float] | str, p_f: float) -> dict[str, Any]:  # noqa: ARG001
+    """p_d of the sensors; p_f is no matter of the task, which policies are made for, but of their evaluation.
+
+    Raises:
+        UserError: as `miss`.
+    """
+    return {"detection": _probabilities("sensor.p_d", p_d, size)}
 
 
 def _probabilities(key: str, given: float | list[float] | str, size: Size) -> Array:

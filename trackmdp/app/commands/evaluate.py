@@ -10,9 +10,9 @@ from typing import Any
 import torch
 from rich.console import Console
 
-from trackmdp.app.commands import held_out, playback
+from trackmdp.app.commands import alarms, held_out, playback
 from trackmdp.app.commands.trained import trained
-from trackmdp.config import EvaluateConfig, McapConfig, PlaybackConfig, load_run_config, to_yaml
+from trackmdp.config import EvaluateConfig, FalseAlarmConfig, McapConfig, PlaybackConfig, load_run_config, to_yaml
 from trackmdp.durable import write_json, write_text
 from trackmdp.episodes.batch import Episodes
 from trackmdp.episodes.figures import Simulation
@@ -36,16 +36,18 @@ _FOR_THE_PICTURE = 16  # episodes simulated where none are asked for
 
 
 def run(cfg: EvaluateConfig, folder: Path, problem: Problem | None = None) -> float:
-    """Write `evaluation.json`, `sets.json` and `picture.txt` to `folder`; returns the exact AIHTR.
+    """Write `evaluation.json`, and without false alarms `sets.json` and `picture.txt`; returns the exact AIHTR.
 
     `problem` is the world of `cfg`, where it is built already.
     """
     console = make_console(cfg.quiet)
     torch.set_num_threads(cfg.threads)
     device = make_device(cfg.device)
-    if cfg.run is None and isinstance(cfg.baseline, PlaybackConfig):
+    if cfg.run is None and isinstance(cfg.baseline, PlaybackConfig) and not isinstance(cfg.sensor, FalseAlarmConfig):
         return playback.run(cfg, folder, console, problem)
     world, policy, subject = _trained(cfg, device) if cfg.run else _baseline(cfg, problem)
+    if isinstance(cfg.sensor, FalseAlarmConfig):
+        return alarms.run(world, cfg.sensor, policy, subject, folder, console)
     # Recorded tracks have no kernel, hence no exact value and no bound: figures come from the held-out tracks.
     if isinstance(world, Recorded):
         return held_out.run(world, policy, subject, folder, console, cfg.seed)

@@ -1,0 +1,61 @@
+"""Evaluation of a policy where sensors report targets that are not there: its file and its table at the terminal."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.console import Console
+
+from trackmdp.config.world import FalseAlarmConfig
+from trackmdp.durable import write_json
+from trackmdp.errors import UserError
+from trackmdp.policies.policy import Policy
+from trackmdp.solvers import bounds
+from trackmdp.solvers.evaluate import evaluate
+from trackmdp.training.display import table
+from trackmdp.training.evaluator import figures
+from trackmdp.world.model import World
+from trackmdp.world.sensors import false_alarm
+from trackmdp.world.tracks import Problem
+
+__all__ = ["run"]
+
+
+def run(
+    problem: Problem, sensor: FalseAlarmConfig, policy: Policy, subject: str, folder: Path, console: Console
+) -> float:
+    """Write `evaluation.json` to `folder`; returns the exact AIHTR with the false alarms.
+
+    Raises:
+        UserError: tracks instead of a world, or what `trackmdp.solvers.alarms.believed` refuses.
+    """
+    if not isinstance(problem, World):
+        raise UserError("sensor=false_alarm: needs a motion model; recorded tracks have none")
+    # A trained policy's world is that of its run, with the sensors asked for.
+    world = World.of(
+        problem, problem.kernel, safe_detection=1.0, **false_alarm(problem.size, p_d=sensor.p_d, p_f=sensor.p_f)
+    )
+    silent, alarmed = evaluate(world, policy), evaluate(world, policy, false_alarm=sensor.p_f)
+    # Not the clocked bound: a report that is wrong sets the clock back, and D is paid later.
+    bound = float(bounds.valid(world).mean())
+    loss = (silent.aihtr - alarmed.aihtr) / alarmed.expected_length
+    write_json(
+        folder / "evaluation.json",
+        {
+            "policy": subject,
+            "p_f": sensor.p_f,
+            "exact": figures(alarmed),
+            "without_false_alarms": figures(silent),
+            "bounds": {"valid": bound},
+            "loss_per_step": loss,
+        },
+    )
+    names = {"aihtr": "AIHTR", "accuracy": "accuracy", "sensors_per_step": "sensors per step"}
+    told, plain = figures(alarmed), figures(silent)
+    rows = [[label, f"{told[key]:,.4f}", f"{plain[key]:,.4f}"] for key, label in names.items()]
+    title = f"{subject}, each report taken for the truth"
+    console.print(table(title, ["figure", f"p_f = {sensor.p_f:g}, exact", "p_f = 0"], rows))
+    console.print(
+        f"upper bound (valid, of p_f = 0) {bound:,.4f}; {loss:.4f} a step lost to false alarms; results in {folder}"
+    )
+    return alarmed.aihtr
