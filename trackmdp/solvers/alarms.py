@@ -18,9 +18,9 @@ from trackmdp.solvers.renewal import IndexArray, RenewalSystem, per_row, row_ind
 from trackmdp.world.model import Array, World
 from trackmdp.world.tracks import Problem
 
-__all__ = ["MOST_CELLS", "believed"]
+__all__ = ["believed"]
 
-MOST_CELLS = 144
+_MOST_CELLS = 144
 """Of a grid with false alarms: M² pairs are unknown."""
 _DIRECT = 2_000  # pairs; those of four coordinates fill the factors of a larger system (N = 12: 90 s in place of 5)
 
@@ -72,8 +72,8 @@ def _checked(world: Problem, policy: PolicyTable, false_alarm: float) -> World:
         raise UserError(f"false_alarm={false_alarm}: needs a motion model; recorded tracks have none")
     if not 0.0 <= false_alarm < 1.0:
         raise UserError(f"false_alarm={false_alarm}: expected a probability below 1")
-    if world.num_cells > MOST_CELLS:
-        raise UserError(f"false_alarm={false_alarm}: {world.num_cells} cells, expected at most {MOST_CELLS}")
+    if world.num_cells > _MOST_CELLS:
+        raise UserError(f"false_alarm={false_alarm}: {world.num_cells} cells, expected at most {_MOST_CELLS}")
     if world.max_steps is not None or not world.safe:
         raise UserError(f"false_alarm={false_alarm}: expected whole episodes, and a safe action that always locates")
     if not policy.deterministic:
