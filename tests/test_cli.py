@@ -76,6 +76,8 @@ def test_unknown_credit_is_refused(algo: str, bad: str, capsys: pytest.CaptureFi
         ("train size", "size: expected option=value"),
         ("train grid.size=[", "grid.size=[: expected option=value"),
         ("train seed=0,1", "seed=0,1: expected one value; add -m"),
+        ("train -m seed=range(10000000)", "seed=range(10000000): expected at most 100,000 values"),
+        ("train -m seed=range(1000) kernel.seed=range(1000)", "a sweep of 1,000,000 runs: expected at most 100,000"),
         ("train -m seed=range(0,1,0)", "seed=range(0,1,0): range() arg 3 must not be zero"),
         ("train seed=range(0,1,0)", "seed=range(0,1,0): expected option=value"),
         ("train seed=glob(*)", "seed=glob(*): expected one value; add -m"),

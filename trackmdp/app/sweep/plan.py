@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
+import math
 import re
 import shlex
 from collections.abc import Callable, Collection, Iterable, Sequence
@@ -23,6 +24,9 @@ from trackmdp.config.resume import CHANGEABLE
 from trackmdp.errors import UserError
 
 __all__ = ["Job", "combinations", "parsed", "plan", "sweep_name"]
+
+_MOST = 100_000
+"""Runs of a sweep; range(10000000) is a slip."""
 
 _UNNAMED = ("experiment", "quiet", "resume")
 """Keys that are left out of a folder's readable name: they do not change a result, or stand for other words."""
@@ -79,6 +83,9 @@ def combinations(blocks: Sequence[str], typed: Sequence[str]) -> list[list[str]]
             # By key: what is typed comes last, and replaces the word of the block. `algo=a2c,ppo seed=0,1` makes the
             # axes {algo: [algo=a2c, algo=ppo], seed: [seed=0, seed=1]}.
             axes[override.key_or_group] = _values(override)
+        # Counted before they are listed: the list might fill the memory.
+        if (runs := math.prod(map(len, axes.values()))) > _MOST:
+            raise UserError(f"a sweep of {runs:,} runs: expected at most {_MOST:,}")
         # A dict, as a set that keeps its order: blocks may overlap, and a run that is in two of them is one run.
         found |= dict.fromkeys(itertools.product(*axes.values()))
     return [list(words) for words in found]
@@ -227,9 +234,12 @@ def _values(override: Override) -> list[str]:
     if not override.is_discrete_sweep():
         raise UserError(f"{override.input_line}: expected values that can be counted; hydra/sweeper=optuna searches")
     try:
-        return [f"{key}={value}" for value in override.sweep_string_iterator()]
+        values = [f"{key}={value}" for value in itertools.islice(override.sweep_string_iterator(), _MOST + 1)]
     except ValueError as error:  # range(0,1,0)
         raise UserError(f"{override.input_line}: {error}") from error
+    if len(values) > _MOST:
+        raise UserError(f"{override.input_line}: expected at most {_MOST:,} values")
+    return values
 
 
 def _key(word: str) -> str:
