@@ -14,7 +14,7 @@ from trackmdp.config import TrainConfig
 from trackmdp.config.resume import config_text
 from trackmdp.durable import write_bytes, write_text
 from trackmdp.errors import UserError
-from trackmdp.untrusted import read_bytes
+from trackmdp.untrusted import parse_json, read_bytes
 from trackmdp.world.model import World
 from trackmdp.world.recording import recording_bytes
 from trackmdp.world.tracks import Problem, Recorded
@@ -35,8 +35,10 @@ def write_inputs(config: TrainConfig, problem: Problem, folder: Path, *, resumed
     # Before anything is written: a run that is refused must keep the inputs that its results belong to.
     if resumed:
         check_inputs(problem, folder)
-    # The config last: with it the folder is that of a run, and all that it names must be there.
-    write_bytes(file, content)
+    # The config last: with it the folder is that of a run, and all that it names must be there. What was checked stays:
+    # only the process that read the positions can say what it left out of them.
+    if not resumed:
+        write_bytes(file, content)
     own = folder.absolute() / RECORDING
     if isinstance(problem, Recorded) and getattr(config.kernel, "path", None) == str(own) and not resumed:
         write_bytes(own, recording_bytes(problem))
@@ -50,9 +52,21 @@ def check_inputs(problem: Problem, folder: Path) -> None:
         UserError: its kernel, or which tracks it names, is missing, damaged or another than that of `problem`.
     """
     file = folder / _name(problem)
-    if read_bytes(file, most=LARGE) != _content(problem):
+    if not _is_content(problem, read_bytes(file, most=LARGE)):
         what = "kernel" if isinstance(problem, World) else "recording"
         raise UserError(f"{file}: the run's {what} is not the one that its config describes now; it cannot change")
+
+
+def _is_content(problem: Problem, stored: bytes) -> bool:
+    """Whether `stored` describes the problem; what was left out of a file of positions does not count."""
+    if isinstance(problem, World):
+        return stored == _content(problem)
+    try:
+        found = parse_json(stored, "tracks.json")
+    except UserError:
+        return False
+    own = json.loads(_content(problem))
+    return isinstance(found, dict) and {**found, "loaded": None} == {**own, "loaded": None}
 
 
 def _name(problem: Problem) -> str:

@@ -19,6 +19,7 @@ from tests.typed import refused
 from trackmdp.app.cli import main
 from trackmdp.app.commands.train import run
 from trackmdp.config import GROUPS
+from trackmdp.training.train import train as train_in_python
 from trackmdp.world.make import load_tracks
 from trackmdp.world.tracks import read_tracks, split
 
@@ -253,6 +254,16 @@ def test_positions_are_the_same_from_the_command_line_and_from_python(
     assert main(["evaluate", "run=a", "quiet=true"]) == 0
     evaluation = json.loads((folder / "a/evaluation.json").read_text())
     assert evaluation["held_out"] == json.loads((folder / "a/summary.json").read_text())["held_out"]
+
+
+def test_positions_loaded_in_python_are_evaluated_from_the_command_line(folder: Path) -> None:
+    """The run keeps the tracks, and what was left out of the file that they were read from."""
+    tracks = load_tracks(CITY, (15, 12), t_max=1, cost=0.1, step=5, cell=60)
+    words: dict[str, Any] = {"total_frames": 2048, "updates": 4, "hidden": 16, "collector.frames_per_batch": 256}
+    done = train_in_python(tracks, "hindsight", folder="a", **words, **{"collector.envs": 32})
+    assert json.loads((folder / "a/tracks.json").read_text())["loaded"] == tracks.loaded != {}
+    assert main(["evaluate", "run=a", "quiet=true"]) == 0
+    assert json.loads((folder / "a/evaluation.json").read_text())["held_out"] == done.summary["held_out"]
 
 
 def test_every_option_of_the_tracks_is_read(folder: Path) -> None:
