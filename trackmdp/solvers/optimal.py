@@ -12,12 +12,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
+from trackmdp.seeding import derive
 from trackmdp.solvers import clocked
 from trackmdp.solvers.bounds import clocked_table
 from trackmdp.solvers.branch import Tree
@@ -26,7 +27,7 @@ from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.exchange import exchanged
 from trackmdp.solvers.known import next_table
 from trackmdp.solvers.layers import Layer, layer_sets, policy_table, reachable_layers
-from trackmdp.solvers.renewal import RenewalSystem, expected_steps
+from trackmdp.solvers.renewal import RenewalSystem, expected_steps, row_index
 from trackmdp.solvers.search import InnerProblem, follow_credit
 from trackmdp.solvers.solution import SearchProgress, Solution
 from trackmdp.world.model import Array, BoolArray, World
@@ -40,6 +41,9 @@ FIRST_NODES = 100_000
 same world gives the same policy on any machine."""
 NODES_BETWEEN_REPORTS = 100_000
 """Nodes after which the bracket is brought up to date while a tree is searched: about a second's."""
+RESTARTS, SPREAD, MOST_RESTARTED = 4, 0.05, 1_000
+"""Searches led by another kernel where the first tree leaves the bracket open, how far its entries are off (standard
+deviation of their logarithms), and the cells above which the time is better spent on the tree."""
 WORTH_A_RESTART = 0.02
 """Share of the bracket that improvements have to close for the search to start anew with them."""
 
@@ -135,6 +139,8 @@ class _Run:
     ) -> None:
         self.world, self.tolerance, self.on_progress, self.budget = world, tolerance, on_progress, budget
         self.start = start
+        self.restarted = False
+        self.found: PolicyTable | None = None
         # U(x, 0) >= V*(x) before anything is searched; `tighten` only lowers it.
         self.bound = clocked_table(world).value
         self.policy = clocked.solve(world)
@@ -189,6 +195,26 @@ class _Run:
                 return
             patience *= 2
 
+    def restart(self) -> bool:
+        """Search once more, led by kernels that are a little off; whether that gave a better policy, to be used next.
+
+        The homotopy is led by the bound of a kernel whose entries are off by 5 %, and so goes another way; what it
+        finds is exchanged and valued with the true one.
+        """
+        rng, best = np.random.default_rng(derive(0, "optimal", "restarts")), float(self.value.sum())
+        for _ in range(RESTARTS if self.world.num_cells <= MOST_RESTARTED else 0):
+            kernel = self.world.kernel.copy()
+            kernel.data *= np.exp(SPREAD * rng.standard_normal(kernel.nnz))
+            # rows keep their sums: what is off is where the target goes, not when it exits
+            kernel.data *= (self.world.stay_probability / kernel.sum(axis=1))[row_index(kernel)]
+            other = replace(self.world, kernel=kernel)
+            layers = reachable_layers(other, other.num_choices)
+            policy = self.exchanged(follow_credit(other, layers, layer_sets(layers, clocked.solve(other))))
+            value = float(evaluate(self.world, policy, guess=self.value).value.sum())
+            if value > best:
+                self.found, best = policy, value
+        return self.found is not None
+
     def round(self, patience: int) -> bool:
         """Search the renewals of the policy at hand; whether a better policy was found."""
         # Improvements of one renewal below the slack cannot add up to more than half of the gap allowed: a path of
@@ -205,6 +231,10 @@ class _Run:
         finally:  # what was found and proved is kept when the user interrupts as well
             self.tighten(tree)
             improved = self.adopt(tree)
+            # only here: until then the tree's bounds are those over the policy it was grown from
+            if self.found is not None:
+                improved = self.use(self.found) or improved
+                self.found = None
         return improved
 
     def adopt(self, tree: Tree) -> bool:
@@ -245,6 +275,10 @@ class _Run:
                 next_look += patience
                 self.tighten(tree)
                 gained = self.ground.paths.solve(tree.best - self.value).mean()
+                if not self.restarted:
+                    self.restarted = True
+                    if self.restart():
+                        return False
                 if gained > WORTH_A_RESTART * float((self.bound - self.value).mean()):
                     return False
             return True
