@@ -129,9 +129,8 @@ def test_a_policy_that_draws_cannot_be_put_together() -> None:
     def half(world: World) -> tm.Policy:
         return tm.Policy(world, probability=0.5)
 
-    cfg = compose("solve", {"partition.block": 4, "grid.size": 8}).partition
     with pytest.raises(UserError, match="does not draw"):
-        plan_by_blocks(tm.make_world(size=8), half, cfg)
+        plan_by_blocks(tm.make_world(size=8), half, 4)
 
 
 def test_blocks_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

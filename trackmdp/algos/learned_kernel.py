@@ -24,6 +24,7 @@ from trackmdp.seeding import derive
 from trackmdp.solvers import exchange
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.kernel_estimate import KernelEstimate, ObservedPaths
+from trackmdp.solvers.partition import plan_by_blocks
 from trackmdp.solvers.renewal import per_row, row_index
 from trackmdp.world.model import Task, World
 from trackmdp.world.windows import Window
@@ -74,14 +75,21 @@ class LearnedKernel:
         if not (last or self._chooses or self._iteration % self.cfg.plan_every == 0):
             return self._diagnostics()
         self._estimate.fit(self.cfg.rounds_at_end if last else self.cfg.rounds)
-        plan = exchange.solve(self._world(self._estimate.mean()))
+        plan = self._plan(self._estimate.mean())
         self.actor = as_policy(self.task, plan)
         # Acting on a draw, not on the mean: where the estimate is unsure the draws differ, and so moves get sensed that
         # the mean may leave out for good.
         if isinstance(self.policy, RenewedTable) and self._spent[0] >= self._warm_up:
-            self.policy.renew(exchange.solve(self._world(self._estimate.sample(self._rng))))
+            self.policy.renew(self._plan(self._estimate.sample(self._rng)))
         self._believed = self._beliefs(plan)
         return self._diagnostics()
+
+    def _plan(self, kernel: sparse.csr_array) -> PolicyTable:
+        """The plan for the `[M, M + 1]` kernel believed; by blocks, the halo is that of the reach believed."""
+        world = self._world(kernel)
+        if self.cfg.block is None:
+            return exchange.solve(world)
+        return plan_by_blocks(world, exchange.solve, self.cfg.block)
 
     def _world(self, kernel: sparse.csr_array) -> World:
         """The task with the `[M, M + 1]` kernel believed, but for what is negligible."""
@@ -139,15 +147,16 @@ def observed_paths(batch: TensorDictBase, task: Task) -> ObservedPaths:
     after = batch["next"]
     exited = after["terminated"].squeeze(-1)
     ended = exited | (after["steps_since_detection"] == 0)
-    # Of the step that ended the path: its history holds the sets of all misses since the detection, wherever the batch
-    # began.
-    start, misses, history = (batch[key][ended] for key in ("last_cell", "steps_since_detection", "action_history"))
+    start, misses = (batch[key][ended] for key in ("last_cell", "steps_since_detection"))
     end = torch.where(exited, task.num_cells, after["last_cell"])[ended]
-    # Sensors are numbered within the window of the located cell; those outside the grid sense nothing.
-    if not misses.any():  # all sensors on, to which no history matters: the sets are as many as steps, so not read
-        rows = np.zeros(len(start) * history.shape[1] + 1, dtype=np.int64)
+    if not misses.any():  # as with all sensors on: no set is read, so that the histories, most of a batch, stay unread
+        rows = np.zeros(len(start) * task.num_choices + 1, dtype=np.int64)
         sensed = sparse.csr_array((rows[:0] > 0, rows[:0], rows), shape=(len(rows) - 1, task.num_cells))
         return ObservedPaths(start.cpu().numpy(), misses.cpu().numpy(), sensed, end.cpu().numpy())
+    # Of the step that ended the path: its history holds the sets of all misses since the detection, wherever the batch
+    # began.
+    history = batch["action_history"][ended]
+    # Sensors are numbered within the window of the located cell; those outside the grid sense nothing.
     path, miss, sensor = history.nonzero(as_tuple=True)
     cell = sensor if task.window is None else Window.of(task, history.device).around(start)[path, sensor]
     row, inside = path * history.shape[1] + miss, cell < task.num_cells
@@ -161,6 +170,8 @@ def _sensors_on(batch: TensorDictBase) -> float:
     """Sensors switched on by choice in a batch."""
     # At n = t_max + 1 the safe action replaces the policy's, whose sensors are not switched on.
     free = batch["steps_since_detection"] < batch["action_history"].shape[-2]
+    if free.all():
+        return float(batch["action"].count_nonzero())
     return (batch["action"].sum(-1) * free).sum().item()
 
 

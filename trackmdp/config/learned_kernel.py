@@ -30,6 +30,11 @@ class LearnedKernelConfig(AlgoConfig):
     share_cells: bool | None = option(
         "count moves of all cells as far from each border together; null: where the moves seen do not tell them apart"
     )
+    block: int | None = option(
+        "side of blocks that plan for themselves, for grids too large to be planned at once; null = none",
+        unit="cells",
+        ge=1,
+    )
     rounds: int = option("EM rounds after each batch", ge=1, le=10**6)
     rounds_at_end: int = option("EM rounds after the last batch", ge=1, le=10**6)
     samples: int = option("kernels drawn for the uncertainty reported", ge=2, le=10**4)

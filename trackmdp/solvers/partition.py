@@ -93,22 +93,31 @@ def sub_world(world: World, seen: Rectangle) -> World:
     return World.of(world, kernel, size=(len(rows), len(columns)), **own)
 
 
-def plan_by_blocks(world: World, plan: Planner, partition: PartitionConfig) -> PolicyTable:
+def plan_by_blocks(
+    world: World,
+    plan: Planner,
+    block: int,
+    halo: int | None = None,
+    *,
+    workers: int = 1,
+    cluster: str | None = None,
+) -> PolicyTable:
     """The policy put together from the plans of all blocks; the same bits however many workers there are.
 
     Args:
         world: the whole grid.
         plan: gives the deterministic policy of a block, and must not depend on a clock.
-        partition: side of the blocks, halo, workers.
+        block: side of the blocks.
+        halo: cells around its own that a block knows of; None: `default_halo`.
+        workers: processes that plan; see `run_jobs`.
+        cluster: Ray cluster that plans.
 
     Raises:
         UserError: a policy that draws was planned, or Ray is asked for and not there.
     """
-    assert partition.block is not None
-    halo = default_halo(world) if partition.halo is None else partition.halo
-    parts = blocks(world.size, partition.block, halo)
+    parts = blocks(world.size, block, default_halo(world) if halo is None else halo)
     jobs = _Jobs(world, parts)
-    done = run_jobs(_PlanJob(plan, world.columns), jobs, workers=partition.workers, cluster=partition.cluster)
+    done = run_jobs(_PlanJob(plan, world.columns), jobs, workers=workers, cluster=cluster)
     sensed = [_joined([job[n] for job in done]) for n in range(world.num_choices)]
     return PolicyTable(world, sensed_csr(world, sensed))
 
