@@ -13,7 +13,7 @@ from trackmdp.app.compose import register
 from trackmdp.config import GROUPS, ROOTS, Option, conf_dir, from_hydra, options
 from trackmdp.config.options import several
 
-REFUSED = {("evaluate", "log=csv"), ("evaluate", "log=tensorboard")} | {
+REFUSED = {("evaluate", f"log={name}") for name in ("csv", "tensorboard", "wandb", "mlflow")} | {
     (command, "kernel=tracks") for command in ("evaluate", "solve", "verify", "benchmark")
 }
 REFUSED |= {(command, "sensor=false_alarm") for command in ("train", "solve", "verify", "benchmark")}

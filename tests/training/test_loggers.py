@@ -97,14 +97,14 @@ def test_an_option_of_a_logger_that_the_run_does_not_have(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("log=[csv,nope]", "log=nope: expected one of csv, tensorboard, mcap"),
-        ("log=nope", "log=nope: expected one of csv, tensorboard, mcap"),
-        ("log=null", "log=null: expected one of csv, tensorboard, mcap"),
+        ("log=[csv,nope]", "log=nope: expected one of csv, tensorboard, wandb, mlflow, mcap"),
+        ("log=nope", "log=nope: expected one of csv, tensorboard, wandb, mlflow, mcap"),
+        ("log=null", "log=null: expected one of csv, tensorboard, wandb, mlflow, mcap"),
         ("log=csv,mcap", "log=csv,mcap: expected log=[csv,mcap]"),
         ("log.every=2", "log.every: renamed, expected log.csv.every"),
-        ("log=[csv,mcap] log.mcap.episodes=0", "log.mcap.episodes=0: expected an integer >= 1 (episodes)"),
+        ("log=[csv,mcap] log.mcap.episodes=0", "log.mcap.episodes=0: expected an integer from 1 to 1e+06 (episodes)"),
         ("log=[mcap] +log.csv={every:2}", "log.csv"),
-        ("-m log=[csv],[nope]", "log=nope: expected one of csv, tensorboard, mcap"),
+        ("-m log=[csv],[nope]", "log=nope: expected one of csv, tensorboard, wandb, mlflow, mcap"),
     ],
 )
 def test_what_is_wrong_is_one_line(words: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -118,14 +118,16 @@ def test_a_config_file_with_an_unknown_logger_is_one_line(tmp_path: Path) -> Non
     text = to_yaml(compose("train"))
     assert "csv:" in text
     (tmp_path / "config.yaml").write_text(text.replace("csv:", "nope:"), encoding="utf-8")
-    with pytest.raises(UserError, match="log=nope: expected one of csv, tensorboard, mcap"):
+    with pytest.raises(UserError, match="log=nope: expected one of csv, tensorboard, wandb, mlflow, mcap"):
         load_run_config(tmp_path)
 
 
 def test_help_lists_them(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["train", "--help"]) == 0
     text = capsys.readouterr().out
-    assert "log=[csv,tensorboard,mcap]: any of them, none by log=[] (default: [csv])" in " ".join(text.split())
+    assert "log=[csv,tensorboard,wandb,mlflow,mcap]: any of them, none by log=[] (default: [csv])" in " ".join(
+        text.split()
+    )
     assert main(["train", "log=[csv,mcap]", "--help"]) == 0
     text = capsys.readouterr().out
     assert "  log.csv.every=1 " in text

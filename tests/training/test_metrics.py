@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from trackmdp.config import CsvConfig, TensorboardConfig
+from trackmdp.config.compose import compose
 from trackmdp.durable import write_json, write_text
 from trackmdp.training.metrics import CsvLogger, TensorboardLogger
 from trackmdp.training.state import Position
@@ -22,7 +23,8 @@ ROW = {"iteration": 1, "frames": 256, "aihtr": 0.1 + 0.2, "loss": 1e-300, "gap":
 
 def trainer(frames: int) -> Any:
     """What a log asks of a trainer."""
-    return SimpleNamespace(position=Position(frames=frames), due=lambda every: every == 1)
+    known = {"config": compose("train"), "error": KeyboardInterrupt()}  # cut: there are no final figures
+    return SimpleNamespace(position=Position(frames=frames), due=lambda every: every == 1, **known)
 
 
 TRAINER = trainer(0)

@@ -26,6 +26,7 @@ from trackmdp.config import (
     load_run_config,
 )
 from trackmdp.config.ignored import refuse_ignored
+from trackmdp.config.loggers import require_packages
 from trackmdp.config.resume import continued, run_folder
 from trackmdp.errors import UserError
 
@@ -122,6 +123,7 @@ def check(command: str, cfg: CommandConfig, folder: Path, words: Sequence[str]) 
             # A resumed run goes on under its saved config, so that everything after this line looks at that one.
             folder = run_folder(cfg, folder)
             cfg = continued(cfg, folder, words)
+            require_packages(cfg.log)
         _check_files(cfg, words)
         # A world from options alone cannot fail once they are in range; one from files can, and is refused before a
         # folder is made.

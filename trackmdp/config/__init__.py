@@ -19,10 +19,7 @@ from trackmdp.config.learning import (
     A2cConfig,
     AlgoConfig,
     CollectorConfig,
-    CsvConfig,
     DqnConfig,
-    LogConfig,
-    McapConfig,
     MultiAsyncConfig,
     MultiSyncConfig,
     PpoConfig,
@@ -30,8 +27,8 @@ from trackmdp.config.learning import (
     RayWorkersConfig,
     ScheduleConfig,
     SingleConfig,
-    TensorboardConfig,
 )
+from trackmdp.config.loggers import CsvConfig, LogConfig, McapConfig, MlflowConfig, TensorboardConfig, WandbConfig
 from trackmdp.config.options import GROUPS, SELECTORS, Option, choice, option, options, refuse
 from trackmdp.config.per_sensor import (
     A2cPerSensorConfig,
@@ -108,6 +105,7 @@ __all__ = [
     "LogConfig",
     "LookaheadConfig",
     "McapConfig",
+    "MlflowConfig",
     "MissConfig",
     "MultiAsyncConfig",
     "MultiSyncConfig",
@@ -141,6 +139,7 @@ __all__ = [
     "TracksConfig",
     "TrainConfig",
     "VerifyConfig",
+    "WandbConfig",
     "WorldConfig",
     "choice",
     "conf_dir",

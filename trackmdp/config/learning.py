@@ -1,4 +1,4 @@
-"""Schema of learning: schedules, algorithms, collectors, logs."""
+"""Schema of learning: schedules, algorithms, collectors."""
 
 from __future__ import annotations
 
@@ -13,10 +13,7 @@ __all__ = [
     "ActorCriticConfig",
     "AlgoConfig",
     "CollectorConfig",
-    "CsvConfig",
     "DqnConfig",
-    "LogConfig",
-    "McapConfig",
     "MultiAsyncConfig",
     "MultiSyncConfig",
     "PpoConfig",
@@ -24,7 +21,6 @@ __all__ = [
     "RayWorkersConfig",
     "ScheduleConfig",
     "SingleConfig",
-    "TensorboardConfig",
     "WorkersConfig",
     "MOST_FRAMES",
     "DEVICE",
@@ -247,52 +243,6 @@ class RayWorkersConfig(WorkersConfig):
     address: str | None = option("cluster to join; null = start one on this machine", expects="auto, or host:port")
     cpus_per_worker: float = option("cores of each worker", unit="cores", gt=0)
     gpus_per_worker: float = option("GPUs of each worker", unit="GPUs", ge=0)
-
-
-@dataclass(kw_only=True)
-class LogConfig(ChoiceConfig):
-    """Base of the group `log`: what is written of each iteration, next to `summary.json`; any of them together.
-
-    What a choice makes is called with its config and the run's folder, and returns a callback of the training.
-    """
-
-    episodes_only: ClassVar[bool] = False
-
-
-@dataclass(kw_only=True)
-class RowsConfig(LogConfig):
-    """A row for each iteration that is due."""
-
-    every: int = option("iterations from one row to the next", unit="iterations", ge=1)
-
-
-@choice("log", "csv", makes="trackmdp.training.metrics:CsvLogger")
-@dataclass(kw_only=True)
-class CsvConfig(RowsConfig):
-    """`metrics.csv`, which a training always writes: without this choice a row for every iteration."""
-
-
-@choice("log", "tensorboard", makes="trackmdp.training.metrics:TensorboardLogger")
-@dataclass(kw_only=True)
-class TensorboardConfig(RowsConfig):
-    """TensorBoard event files."""
-
-
-@choice("log", "mcap", makes="trackmdp.episodes.logger:EpisodeLogger")
-@dataclass(kw_only=True)
-class McapConfig(LogConfig):
-    """`episodes.mcap`: simulated episodes, step by step, for `replay` and viewers."""
-
-    episodes_only: ClassVar[bool] = True
-    evaluations: int = option(
-        "training: from one recorded evaluation to the next; the last is recorded too", unit="evaluations", ge=1
-    )
-    episodes: int = option("training: episodes recorded of each such evaluation", unit="episodes", ge=1, le=10**6)
-    layout: bool = option("write a viewer's layout next to the log")
-
-    def ignored(self, root: Any) -> dict[str, str]:
-        """An evaluation logs all the episodes that it simulates."""
-        return {} if root.learns else dict.fromkeys(("evaluations", "episodes"), "outside training")
 
 
 def state_bytes(task: Sizes) -> int:

@@ -7,7 +7,8 @@ from typing import Any, ClassVar
 
 from trackmdp.config import learned_kernel, path_counts, per_sensor  # noqa: F401  (more algorithms to choose from)
 from trackmdp.config.baselines import BaselineConfig
-from trackmdp.config.learning import DEVICE, AlgoConfig, CollectorConfig, LogConfig
+from trackmdp.config.learning import DEVICE, AlgoConfig, CollectorConfig
+from trackmdp.config.loggers import LogConfig
 from trackmdp.config.options import GROUPS, listed, option, refuse
 from trackmdp.config.partition import PartitionConfig
 from trackmdp.config.schema import NodeConfig

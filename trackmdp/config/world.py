@@ -229,7 +229,8 @@ class TracksConfig(KernelConfig):
         if root.needs_motion:
             raise refuse(key, self.name, "a motion model, which train and evaluate do without")
         if any(node.episodes_only for node in root.log.values()):
-            expected = "none but csv and tensorboard with kernel=tracks; episodes are logged with a motion model"
+            *some, last = (name for name, schema in GROUPS["log"].items() if not schema.episodes_only)
+            expected = f"none but {', '.join(some)} and {last} with kernel=tracks, without a motion model"
             raise refuse("log", listed(root.log), expected)
         baseline = getattr(root, "baseline", None)
         if baseline is not None and baseline.reads_motion:

@@ -9,12 +9,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from trackmdp.config.learning import RowsConfig
+from trackmdp.config import to_yaml
+from trackmdp.config.loggers import RowsConfig
 from trackmdp.durable import own_folder, reopen, sync
 from trackmdp.training.callbacks import Callback, Row, Training
+from trackmdp.training.evaluator import figures
 from trackmdp.untrusted import decoded, opened
 
-__all__ = ["CsvLogger", "TensorboardLogger"]
+__all__ = ["CsvLogger", "TensorboardLogger", "final_figures", "known"]
 
 
 class CsvLogger(Callback):
@@ -61,7 +63,7 @@ class CsvLogger(Callback):
         if self._writer is None:
             self._writer = csv.DictWriter(self._file, fieldnames=list(row))
             self._writer.writeheader()
-        self._writer.writerow(_known(row))
+        self._writer.writerow(known(row))
         # Flushed to the operating system, not synced: after a kill the rows are there, and others can watch
         # them grow; fsync for each row would cost more than some iterations.
         self._file.flush()
@@ -105,19 +107,32 @@ class TensorboardLogger(Callback):
         # TensorBoard reads all event files of a folder together and cannot be told to drop a part of one; a
         # new file with purge_step hides the events of that step and later ones.
         self._events = SummaryWriter(self._folder, purge_step=frames + 1 if frames else None)
+        self._events.add_text("config", f"```yaml\n{to_yaml(trainer.config)}\n```", frames)
 
     def on_update(self, trainer: Training, row: Row) -> None:
         """Write the row where it is due."""
         if trainer.due(self._every):
-            for key, value in _known(row).items():
+            for key, value in known(row).items():
                 self._events.add_scalar(key, value, trainer.position.frames)
 
-    def on_end(self, trainer: Training) -> None:  # noqa: ARG002
-        """Close the file."""
+    def on_end(self, trainer: Training) -> None:
+        """Write the final figures, and close the file."""
+        for key, value in final_figures(trainer).items():
+            self._events.add_scalar(key, value, trainer.position.frames)
         self._events.close()
 
 
-def _known(row: Row) -> dict[str, float | int]:
+def final_figures(trainer: Training) -> dict[str, float]:
+    """`final/...`: the figures of the last policy and its regret, once all iterations are done; none before."""
+    if trainer.error is not None:
+        return {}
+    score = trainer.score
+    found = figures(score.evaluation) | {"regret_per_step": score.regret_per_step}
+    return {f"final/{key}": value for key, value in known(found).items()}
+
+
+def known(row: Row) -> dict[str, float | int]:
+    """What was measured, and is a finite number."""
     return {key: value for key, value in row.items() if value is not None and math.isfinite(value)}
 
 

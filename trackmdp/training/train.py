@@ -11,6 +11,7 @@ import numpy as np
 
 from trackmdp.config import GROUPS, SELECTORS, TrainConfig, options
 from trackmdp.config.compose import compose
+from trackmdp.config.loggers import require_packages
 from trackmdp.errors import UserError
 from trackmdp.seeding import preserved_global_rng
 from trackmdp.training.callbacks import Callback
@@ -62,6 +63,7 @@ def train(
     given = dict(_flat(options)) | {"algo": algo, "seed": seed, "quiet": not progress}
     config: TrainConfig = compose("train", given | _described(problem, place))
     if place is not None:
+        require_packages(config.log)
         place.mkdir(parents=True, exist_ok=True)
         if config.resume is None and (place / "config.yaml").is_file():
             raise UserError(f"folder={folder}: holds a run already; resume it by resume='auto', or choose another one")

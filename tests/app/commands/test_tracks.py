@@ -111,11 +111,11 @@ NEEDS_THE_MODEL = sorted(set(GROUPS["baseline"]) - {"all_on", "none", "random_k"
         ("solve", "", "kernel=tracks: expected a motion model"),
         ("verify", "", "kernel=tracks: expected a motion model"),
         ("benchmark", "", "kernel=tracks: expected a motion model"),
-        ("train", "log=mcap", "log=[mcap]: expected none but csv and tensorboard with kernel=tracks"),
+        ("train", "log=mcap", "log=[mcap]: expected none but csv, tensorboard, wandb and mlflow with kernel=tracks"),
         (
             "evaluate",
             "baseline=all_on log=mcap",
-            "log=[mcap]: expected none but csv and tensorboard with kernel=tracks",
+            "log=[mcap]: expected none but csv, tensorboard, wandb and mlflow with kernel=tracks",
         ),
         (
             "train",

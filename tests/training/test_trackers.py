@@ -1,0 +1,151 @@
+"""Runs logged with the real wandb and mlflow, offline: read back with their own messages and client."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.training.runs import at_iteration, rows, train
+from tests.training.test_log_resume import Killed, killed
+from trackmdp.app.cli import main
+from trackmdp.config import load_run_config, to_dict
+from trackmdp.errors import UserError
+from trackmdp.training.run import load_run
+from trackmdp.training.train import train as train_in_python
+from trackmdp.world.make import make_world
+
+BLOCK = 32768
+
+
+def records(file: Path) -> Iterator[Any]:
+    """The messages of a `.wandb` file: a header of 7 bytes, then LevelDB's log format."""
+    from wandb.proto.wandb_internal_pb2 import Record
+
+    data, place, whole = file.read_bytes(), 7, b""
+    while place + 7 <= len(data):
+        # A block's last bytes, too few for a record's own header (CRC, length, kind), are padding.
+        if BLOCK - place % BLOCK < 7:
+            place += BLOCK - place % BLOCK
+            continue
+        _, length, kind = struct.unpack("<IHB", data[place : place + 7])
+        whole += data[place + 7 : place + 7 + length]
+        place += 7 + length
+        if kind in (1, 4):  # a whole record, or the last part of one
+            record = Record()
+            record.ParseFromString(whole)
+            whole = b""
+            yield record
+
+
+def offline(folder: Path) -> list[dict[str, Any]]:
+    """The processes of a run as wandb kept them: id, config, rows, and the last summary."""
+    found = []
+    for file in sorted((folder / "wandb").glob("offline-run-*/*.wandb")):
+        run: dict[str, Any] = {"rows": [], "summary": {}, "config": {}}
+        for record in records(file):
+            kind = record.WhichOneof("record_type")
+            if kind == "run":
+                run |= {"id": record.run.run_id, "project": record.run.project}
+                run["config"] |= {each.key: json.loads(each.value_json) for each in record.run.config.update}
+            elif kind == "history":
+                run["rows"].append(read(record.history.item))
+            elif kind == "summary":
+                run["summary"] |= read(record.summary.update)
+        found.append(run)
+    return found
+
+
+def read(items: Any) -> dict[str, Any]:
+    return {item.key or "/".join(item.nested_key): json.loads(item.value_json) for item in items}
+
+
+def test_wandb_offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Config, every row and the final figures; resumed, under the same id."""
+    pytest.importorskip("wandb")
+    words = ("log=[wandb]", "log.wandb.project=ours")
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        at_iteration(patch, 6, killed)
+        train(tmp_path, *words)
+    train(tmp_path, *words, "resume=auto")
+    first, second = offline(tmp_path)
+    assert first["id"] == second["id"]
+    assert first["project"] == "ours"
+    assert {key: first["config"][key] for key in ("seed", "log")} == {
+        key: to_dict(load_run_config(tmp_path))[key] for key in ("seed", "log")
+    }
+    begun = [row["_step"] for row in first["rows"]]
+    assert begun == [256 * k for k in range(1, 6)]
+    table = {int(row["frames"]): row for row in rows(tmp_path)}
+    for row in second["rows"]:
+        assert row["aihtr"] == float(table[row["_step"]]["aihtr"]) if table[row["_step"]]["aihtr"] else True
+    assert second["rows"][-1]["frames"] == max(table)
+    evaluation = load_run(tmp_path).evaluation
+    assert second["summary"]["final/aihtr"] == evaluation.aihtr
+    assert not any(key.startswith("final/") for key in first["summary"])
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # mlflow's database layer calls deprecated names
+def test_mlflow_in_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One run with the options as parameters, each row once although two processes logged it, and final figures."""
+    pytest.importorskip("mlflow")
+    from mlflow import MlflowClient
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        at_iteration(patch, 6, killed)
+        train(tmp_path, "log=[mlflow]")
+    train(tmp_path, "log=[mlflow]", "resume=auto")
+    client = MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
+    experiment = client.get_experiment_by_name("trackmdp")
+    (run,) = client.search_runs([experiment.experiment_id])
+    assert run.info.status == "FINISHED"
+    assert run.data.params["seed"] == str(load_run_config(tmp_path).seed)
+    assert run.data.params["log.mlflow.every"] == "1"
+    table = rows(tmp_path)
+    history = client.get_metric_history(run.info.run_id, "frames")
+    assert [int(each.value) for each in history] == [int(row["frames"]) for row in table]
+    aihtr = {each.step: each.value for each in client.get_metric_history(run.info.run_id, "aihtr")}
+    assert aihtr == {int(row["frames"]): float(row["aihtr"]) for row in table if row["aihtr"]}
+    assert run.data.metrics["final/aihtr"] == load_run(tmp_path).evaluation.aihtr
+    assert not (tmp_path / "mlruns").exists()
+
+
+@pytest.mark.parametrize("name", ["wandb", "mlflow", "tensorboard"])
+def test_a_missing_package_is_one_line_and_leaves_no_folder(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda module: None)
+    message = f"log=[{name}]: needs {name}, which pip install 'trackmdp[{name}]' adds"
+    assert main(["train", f"log=[csv,{name}]", f"hydra.run.dir={tmp_path / 'a'}"]) == 2
+    assert capsys.readouterr().err == f"trackmdp train: {message}\n"
+    with pytest.raises(UserError) as caught:
+        train_in_python(make_world(size=3), folder=tmp_path / "a", log=[name])
+    assert str(caught.value) == message
+    assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("log=[wandb] log.wandb.mode=dryrun", "log.wandb.mode=dryrun: expected one of offline, online"),
+        ("log=[mlflow] log.mlflow.experiment=", "log.mlflow.experiment"),
+    ],
+)
+def test_what_is_wrong_is_one_line(words: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", *words.split()]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"trackmdp train: {message}")
+    assert error.count("\n") == 1
+
+
+def test_a_server_that_is_not_there_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("mlflow")
+    words = ["log=[mlflow]", "log.mlflow.uri=nonsense://", f"hydra.run.dir={tmp_path / 'a'}", "quiet=true"]
+    assert main(["train", *words, "algo.total_frames=512", "algo.frames_per_batch=256", "algo.envs=32"]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("trackmdp train: log=[mlflow]: ")
+    assert error.count("\n") == 1

@@ -1,0 +1,103 @@
+"""Schema of what a training writes of itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from trackmdp.config.options import choice, option
+from trackmdp.config.schema import ChoiceConfig
+from trackmdp.errors import require
+
+__all__ = [
+    "CsvConfig",
+    "LogConfig",
+    "McapConfig",
+    "MlflowConfig",
+    "RowsConfig",
+    "TensorboardConfig",
+    "WandbConfig",
+    "require_packages",
+]
+
+
+@dataclass(kw_only=True)
+class LogConfig(ChoiceConfig):
+    """Base of the group `log`: what is written of each iteration, next to `summary.json`; any of them together.
+
+    What a choice makes is called with its config and the run's folder, and returns a callback of the training.
+    """
+
+    episodes_only: ClassVar[bool] = False
+    package: ClassVar[str | None] = None
+    """What it imports beyond trackmdp's own dependencies; it comes with the extra called as the choice is."""
+
+
+@dataclass(kw_only=True)
+class RowsConfig(LogConfig):
+    """A row for each iteration that is due."""
+
+    every: int = option("iterations from one row to the next", unit="iterations", ge=1)
+
+
+@choice("log", "csv", makes="trackmdp.training.metrics:CsvLogger")
+@dataclass(kw_only=True)
+class CsvConfig(RowsConfig):
+    """`metrics.csv`, which a training always writes: without this choice a row for every iteration."""
+
+
+@choice("log", "tensorboard", makes="trackmdp.training.metrics:TensorboardLogger")
+@dataclass(kw_only=True)
+class TensorboardConfig(RowsConfig):
+    """TensorBoard event files."""
+
+    package: ClassVar[str | None] = "tensorboard"
+
+
+@choice("log", "wandb", makes="trackmdp.training.trackers:WandbLogger")
+@dataclass(kw_only=True)
+class WandbConfig(RowsConfig):
+    """Weights & Biases. `wandb sync` uploads what was logged offline, in the run's folder."""
+
+    package: ClassVar[str | None] = "wandb"
+    mode: str = option("offline = to files alone, online = to the server", choices=("offline", "online"))
+    project: str = option("project of the run", expects="a name", pattern=r"[\w .-]{1,128}")
+
+
+@choice("log", "mlflow", makes="trackmdp.training.trackers:MlflowLogger")
+@dataclass(kw_only=True)
+class MlflowConfig(RowsConfig):
+    """MLflow, in a database or on a server."""
+
+    package: ClassVar[str | None] = "mlflow"
+    uri: str | None = option("tracking database or server; null = mlflow.db in the run's folder", expects="a URI")
+    experiment: str = option("experiment of the run", expects="a name", pattern=r"[\w .-]{1,128}")
+
+
+@choice("log", "mcap", makes="trackmdp.episodes.logger:EpisodeLogger")
+@dataclass(kw_only=True)
+class McapConfig(LogConfig):
+    """`episodes.mcap`: simulated episodes, step by step, for `replay` and viewers."""
+
+    episodes_only: ClassVar[bool] = True
+    evaluations: int = option(
+        "training: from one recorded evaluation to the next; the last is recorded too", unit="evaluations", ge=1
+    )
+    episodes: int = option("training: episodes recorded of each such evaluation", unit="episodes", ge=1, le=10**6)
+    layout: bool = option("write a viewer's layout next to the log")
+
+    def ignored(self, root: Any) -> dict[str, str]:
+        """An evaluation logs all the episodes that it simulates."""
+        return {} if root.learns else dict.fromkeys(("evaluations", "episodes"), "outside training")
+
+
+def require_packages(log: Mapping[str, LogConfig]) -> None:
+    """See that what the loggers import is there, before the run's folder is made.
+
+    Raises:
+        UserError: a package is not installed.
+    """
+    for name, node in log.items():
+        if node.package is not None:
+            require(node.package, name, f"log=[{name}]")

@@ -1,0 +1,186 @@
+"""The loggers that keep runs side by side: Weights & Biases, and MLflow."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from trackmdp.config import MlflowConfig, WandbConfig, to_dict
+from trackmdp.durable import own_folder
+from trackmdp.errors import Preempted, RunError
+from trackmdp.training.callbacks import Callback, Row, Training
+from trackmdp.training.metrics import final_figures, known
+
+__all__ = ["MlflowLogger", "WandbLogger"]
+
+
+class WandbLogger(Callback):
+    """Weights & Biases through TorchRL's logger: config, a row per logged iteration over frames, final figures.
+
+    A resumed run goes on under the same id. Offline each process leaves a folder `wandb/offline-run-*` of its own;
+    `wandb sync` puts them together.
+
+    Args:
+        cfg: how often, and where to.
+        folder: of the run.
+    """
+
+    name = "wandb"
+
+    def __init__(self, cfg: WandbConfig, folder: Path) -> None:
+        self._cfg, self._folder = cfg, folder
+        self._id = secrets.token_hex(4)
+
+    def on_start(self, trainer: Training) -> None:
+        """Begin the run, or go on with it.
+
+        Raises:
+            RunError: the server cannot be reached, or nobody is logged in.
+        """
+        if self._cfg.mode == "offline":
+            # Reports of wandb's own faults would go out over the network all the same.
+            os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
+        import wandb
+        from torchrl.record.loggers.wandb import WandbLogger as TorchrlLogger
+
+        own_folder(self._folder / "wandb")
+        # No console capture, machine statistics or code: what is logged is the run's figures.
+        quiet: dict[str, Any] = dict.fromkeys(("silent", "x_disable_stats", "disable_code", "disable_git"), True)
+        quiet |= {"console": "off", "x_save_requirements": False}
+        with _answering("wandb"):
+            self._logger = TorchrlLogger(
+                self._folder.resolve().name,
+                save_dir=self._folder,
+                id=self._id,
+                project=self._cfg.project,
+                # TorchRL's own `offline` would set WANDB_MODE for the whole process.
+                mode=self._cfg.mode,
+                log_env_packages=False,
+                config=to_dict(trainer.config),
+                settings=wandb.Settings(**quiet),
+            )
+
+    def on_update(self, trainer: Training, row: Row) -> None:
+        """Log the row where it is due."""
+        if trainer.due(self._cfg.every):
+            self._logger.log_metrics(known(row), step=trainer.position.frames, override_global_step=True)
+
+    def on_end(self, trainer: Training) -> None:
+        """Leave the final figures in the run's summary, and close it."""
+        self._logger.experiment.summary.update(final_figures(trainer))
+        self._logger.experiment.finish(exit_code=0 if trainer.error is None else 1)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The id of the run."""
+        return {"id": self._id}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on with the run of that id."""
+        self._id = str(state["id"])
+
+
+class MlflowLogger(Callback):
+    """MLflow: the options as parameters, a row per logged iteration over frames, final figures.
+
+    By MLflow's client itself, for TorchRL's logger always begins another run. A resumed run goes on with the same one;
+    rows that an earlier process logged after its last checkpoint are not logged twice.
+
+    Args:
+        cfg: how often, and where to.
+        folder: of the run.
+    """
+
+    name = "mlflow"
+
+    def __init__(self, cfg: MlflowConfig, folder: Path) -> None:
+        self._cfg, self._folder = cfg, folder
+        self._id = ""  # until the run is begun
+        self._logged = -1  # frames of the last row that is there
+
+    def on_start(self, trainer: Training) -> None:
+        """Begin the run, or go on with it.
+
+        Raises:
+            RunError: the server or the database cannot be reached.
+        """
+        if self._cfg.uri is None:
+            # Reports of how mlflow is used would go out over the network from a run that is to stay here.
+            os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+        # Its database tells on standard error what tables it makes.
+        os.environ.setdefault("MLFLOW_LOGGING_LEVEL", "WARNING")
+        from mlflow import MlflowClient
+
+        uri = self._cfg.uri or f"sqlite:///{self._folder.resolve() / 'mlflow.db'}"
+        with _answering("mlflow"):
+            self._client = MlflowClient(uri)
+            if not self._id:
+                self._begin(trainer)
+            else:
+                self._client.update_run(self._id, status="RUNNING")
+                rows = self._client.get_metric_history(self._id, "frames")
+                self._logged = max((row.step for row in rows), default=-1)
+
+    def _begin(self, trainer: Training) -> None:
+        from mlflow.entities import Param
+
+        found = self._client.get_experiment_by_name(self._cfg.experiment)
+        # Where artifacts would lie must be said: the default is a folder where the command was typed.
+        place = (self._folder.resolve() / "mlflow").as_uri() if self._cfg.uri is None else None
+        number = found.experiment_id if found else self._client.create_experiment(self._cfg.experiment, place)
+        run = self._client.create_run(number, run_name=self._folder.resolve().name)
+        self._id = run.info.run_id
+        options = [Param(key, str(value)) for key, value in _flat(to_dict(trainer.config))]
+        for begin in range(0, len(options), 100):  # no more are taken at a time
+            self._client.log_batch(self._id, params=options[begin : begin + 100])
+
+    def on_update(self, trainer: Training, row: Row) -> None:
+        """Log the row where it is due."""
+        if trainer.due(self._cfg.every) and trainer.position.frames > self._logged:
+            self._log(known(row), trainer.position.frames)
+
+    def _log(self, row: Mapping[str, float], frames: int) -> None:
+        from mlflow.entities import Metric
+
+        now = int(time.time() * 1000)
+        with _answering("mlflow"):
+            self._client.log_batch(self._id, metrics=[Metric(key, value, now, frames) for key, value in row.items()])
+
+    def on_end(self, trainer: Training) -> None:
+        """Log the final figures, and how the run ended."""
+        error = trainer.error
+        if final := final_figures(trainer):
+            self._log(final, trainer.position.frames)
+        ended = "FINISHED" if error is None else "KILLED" if isinstance(error, Preempted) else "FAILED"
+        self._client.set_terminated(self._id, ended)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The id of the run."""
+        return {"id": self._id}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on with the run of that id."""
+        self._id = str(state["id"])
+
+
+@contextmanager
+def _answering(name: str) -> Iterator[None]:
+    """One line where a logger cannot do its work; the run can be resumed."""
+    try:
+        yield
+    except Exception as error:  # whatever the package, its network or its database raises
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise RunError(f"log=[{name}]: {reason}") from error
+
+
+def _flat(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Options by their dotted names."""
+    for key, value in node.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
