@@ -44,6 +44,7 @@ def test_the_wheel_brings_its_command_and_its_options(installed: Path, tmp_path:
     where = run(installed, tmp_path, "train", "--info", "searchpath")
     assert f"file://{installed.parent}" in where.stdout
     assert str(ROOT) not in where.stdout
+    assert list(installed.parent.glob("lib/python*/site-packages/trackmdp/py.typed"))  # its types are to be used
 
 
 @pytest.mark.slow
