@@ -62,7 +62,7 @@ def test_chosen_sets_cost_less() -> None:
 
 def test_its_uncertainty_shrinks_and_covers_the_truth() -> None:
     world = small_world(3)
-    learner, rows = learn(world, 12, "algo.samples=50")
+    learner, rows = learn(world, 12, "algo.samples=50", "algo.plan_every=1")
     assert rows[-1]["believed_deviation"] < 0.6 * rows[0]["believed_deviation"]
     truth = evaluate(world, learner.actor).aihtr
     assert abs(rows[-1]["believed_aihtr"] - truth) < 4 * rows[-1]["believed_deviation"]

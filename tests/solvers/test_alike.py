@@ -59,3 +59,12 @@ def test_alike_cells_are_drawn_once() -> None:
     np.testing.assert_array_equal(first[44, [43, 45, 34, 54]], first[55, [54, 56, 45, 65]])
     assert first[44, 45] != second[44, 45]
     np.testing.assert_allclose(first.sum(axis=1), 1.0)
+
+
+def test_a_drawn_kernel_has_a_way_out_though_no_exit_was_seen() -> None:
+    """The exit's posterior after 50 moves from each cell is Beta(0.01, 150): most draws are 0 but for rounding."""
+    estimate = KernelEstimate(3, weight=0.1, exit_weight=100.0)
+    moves = np.tile(np.arange(9), 50)
+    estimate.add_moves(moves, np.roll(np.arange(9), 1)[moves])
+    for seed in range(5):
+        assert estimate.sample(np.random.default_rng(seed)).toarray()[:, 9].min() >= 1e-9

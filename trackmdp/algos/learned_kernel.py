@@ -72,7 +72,8 @@ class LearnedKernel:
             self._spent += [batch.numel(), _sensors_on(batch)]
         last = self._iteration == self.iterations
         # With all sensors on nothing that is collected depends on a plan: it can wait, on a large grid at length.
-        if not (last or self._chooses or self._iteration % self.cfg.plan_every == 0):
+        every = self.cfg.plan_every or max(1, self.iterations // 6)
+        if not (last or self._chooses or self._iteration % every == 0):
             return self._diagnostics()
         self._estimate.fit(self.cfg.rounds_at_end if last else self.cfg.rounds)
         plan = self._plan(self._estimate.mean())

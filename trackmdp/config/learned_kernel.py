@@ -21,8 +21,10 @@ class LearnedKernelConfig(AlgoConfig):
     warm_up: int = option("with chosen sets: env steps with all sensors on before them", unit="frames", ge=0)
     prior: float = option("the pooled motion counts as much as this many moves out of each cell", unit="moves", gt=0)
     exit_prior: float = option("the pooled exit probability counts as much as this many moves", unit="moves", gt=0)
-    plan_every: int = option(
-        "with all sensors on: batches from one plan to the next; after the last one is planned in any case", ge=1
+    plan_every: int | None = option(
+        "with all sensors on: batches from one plan to the next; after the last one is planned in any case; null: six "
+        "plans in a run",
+        ge=1,
     )
     negligible: float = option(
         "moves that are believed less likely are planned without; 0 = none are", unit="per step", ge=0, lt=1

@@ -12,7 +12,7 @@ __all__ = ["register_resolvers"]
 
 
 def register_resolvers() -> None:
-    """Register `${first:a,b}` and `${per_cell:count,size}`."""
+    """Register `${first:a,b}` and `${per_cell:count,size}`, or `${per_cell:count,size,least}`."""
     # replace=True: resolvers are global to the process, and a second composing would otherwise fail on the first name.
     OmegaConf.register_new_resolver("first", _first_given, replace=True)
     OmegaConf.register_new_resolver("per_cell", _per_cell, replace=True)
@@ -23,9 +23,9 @@ def _first_given(*values: Any) -> Any:
     return next((value for value in values if value is not None), None)
 
 
-def _per_cell(count: int, size: Any) -> int:
-    """`count` for each cell of a grid of N x N cells, or of [rows, columns]."""
+def _per_cell(count: int, size: Any, least: int = 0) -> int:
+    """`count` for each cell of a grid of N x N cells, or of [rows, columns]; `least` in all."""
     sides = (size, size) if isinstance(size, int) else size
     if not isinstance(sides, Sequence) or not all(isinstance(side, int) for side in sides):
         return count  # such a size is refused when its own option is checked
-    return count * math.prod(sides)
+    return max(count * math.prod(sides), least)

@@ -23,6 +23,8 @@ __all__ = ["KernelEstimate", "ObservedPaths"]
 
 OPEN = 0.01
 """Weight, in the first round's kernel, of moves that were not seen yet."""
+LEAST_EXIT = 1e-9
+"""Exit probability of a kernel drawn from the posterior, at least."""
 NEGLIGIBLE = 1e-3
 """Expected counts below this are dropped, so that the counts stay sparse."""
 
@@ -158,7 +160,8 @@ class KernelEstimate:
         moves, exits = self._parameters()
         # A Dirichlet draw is a row of gamma draws, scaled to 1; 1e-300 keeps a row of tiny parameters from 0 / 0.
         moves.data = rng.standard_gamma(moves.data) + 1e-300
-        drawn = self._kernel(moves, rng.beta(exits[:, 0], exits[:, 1]))
+        # Where exits are rare and few were seen most draws are 0 but for rounding, and an episode may never end.
+        drawn = self._kernel(moves, np.maximum(rng.beta(exits[:, 0], exits[:, 1]), LEAST_EXIT))
         # Cells that move alike are drawn once: the draws of many would average out.
         return drawn if self.share_cells is False else self._alike().spread(drawn)
 
