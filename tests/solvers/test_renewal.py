@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import sparse
 
+import trackmdp as tm
 from tests.helpers import random_kernel
 from trackmdp.errors import UserError
 from trackmdp.solvers import clocked, renewal
@@ -89,3 +90,17 @@ def test_all_figures_and_bounds_of_a_large_world_are_those_of_the_factorisation(
 
 def test_expected_steps_of_a_world_are_its_mean_time_to_the_exit() -> None:
     np.testing.assert_allclose(expected_steps(_small()), 100.0)
+
+
+@pytest.mark.parametrize("layers", [1, 2])
+def test_a_level_below_a_level_gives_the_same_solution(monkeypatch: pytest.MonkeyPatch, layers: int) -> None:
+    monkeypatch.setattr(renewal, "_COARSEST", 4 * layers)  # 30 x 21 cells, 8 x 6 blocks, 2 x 2 blocks of those
+    world = tm.make_world("random_support", size=[30, 21], support_size=5)
+    # with two states a cell, half of all that moves changes its state
+    kernel = world.kernel if layers == 1 else sparse.kron(np.full((2, 2), 0.5), world.kernel, format="csr")
+    system = RenewalSystem(sparse.csr_array(kernel), (30, 21), direct=0)
+    gathered = np.random.default_rng(0).random(630 * layers)
+    expected = np.linalg.solve(np.eye(630 * layers) - kernel.toarray(), gathered)
+    np.testing.assert_allclose(system.solve(gathered), expected, rtol=1e-10)
+    assert isinstance(system._precondition._below, renewal._Level)
+    assert system._precondition._below._below is None
