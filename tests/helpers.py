@@ -26,7 +26,7 @@ def _without_files(group: str) -> list[str]:
     return [name for name in GROUPS[group] if "???" not in conf_file(f"{group}/{name}").read_text()]
 
 
-KERNELS = _without_files("kernel")
+KERNELS = [name for name in _without_files("kernel") if not GROUPS["kernel"][name].hides]
 ALGORITHMS = _without_files("algo")
 BASELINES = _without_files("baseline")
 

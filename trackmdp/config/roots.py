@@ -46,6 +46,8 @@ class WorldConfig(CommandConfig):
     """What every command has that takes place in a world."""
 
     needs_motion: ClassVar[bool] = True
+    knows_modes: ClassVar[bool] = False
+    """Whether the target may have a hidden mode."""
     grid: GridConfig
     kernel: KernelConfig
     cost: CostConfig
@@ -97,6 +99,7 @@ class TrainConfig(WorldConfig):
     """Learn a policy without the motion model, and evaluate it exactly."""
 
     needs_motion: ClassVar[bool] = False
+    knows_modes: ClassVar[bool] = True
     learns: ClassVar[bool] = True
     seed: int = option("every random draw of the run derives from it", ge=0)
     device: str = option("device the networks live on", expects="cpu, cuda, cuda:N or auto", pattern=DEVICE)
@@ -153,9 +156,16 @@ class EvaluateConfig(WorldConfig):
 class SolveConfig(WorldConfig):
     """Solve the world with its motion model."""
 
+    knows_modes: ClassVar[bool] = True
+    task: TaskConfig
     solver: BaselineConfig
     partition: PartitionConfig
     verify: bool = option("check the paper's theorems on this world as well")
+
+    @property
+    def remembered(self) -> dict[str, Any]:
+        """The options of `task`."""
+        return {"memory": self.task.memory, "clip": self.task.clip}
 
 
 @dataclass(kw_only=True)

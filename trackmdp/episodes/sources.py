@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from trackmdp.world.model import World
+from trackmdp.world.modes import HiddenWorld
 from trackmdp.world.motion import Motion
 from trackmdp.world.tracks import Problem, Recorded
 
@@ -43,8 +44,8 @@ class Source(Protocol):
 class _Sampled:
     """Targets that move as the kernel says, from a uniform start; a place is a cell."""
 
-    def __init__(self, world: World) -> None:
-        self._cells, self._motion = world.num_cells, Motion(world.kernel)
+    def __init__(self, world: World | HiddenWorld) -> None:
+        self._cells, self._motion = world.kernel.shape[0], Motion(world.kernel)
 
     def start(self, generators: Sequence[torch.Generator]) -> Tensor:
         return torch.cat([torch.randint(self._cells, (1,), generator=rng) for rng in generators])
@@ -60,6 +61,17 @@ class _Sampled:
 
     def stops(self, place: Tensor) -> Tensor:
         return torch.zeros_like(place, dtype=torch.bool)
+
+
+class _Hidden(_Sampled):
+    """The same of targets with a hidden mode; a place is the cell and the mode."""
+
+    def __init__(self, world: HiddenWorld) -> None:
+        super().__init__(world)
+        self._modes = world.modes
+
+    def cell(self, place: Tensor) -> Tensor:
+        return place // self._modes
 
 
 class _Replayed:
@@ -95,4 +107,6 @@ class _Replayed:
 
 def source_of(problem: Problem) -> Source:
     """The targets of a world or of recorded tracks."""
+    if isinstance(problem, HiddenWorld):
+        return _Hidden(problem)
     return _Sampled(problem) if isinstance(problem, World) else _Replayed(problem)

@@ -16,10 +16,12 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.alarms import believed
 from trackmdp.solvers.evaluation import Evaluation, pooled, summed_up
 from trackmdp.solvers.horizon import truncated_value
+from trackmdp.solvers.keyed import evaluate_keys
 from trackmdp.solvers.prediction import renewal
 from trackmdp.solvers.recorded import evaluate_recorded
 from trackmdp.solvers.renewal import RenewalSystem, check_length, expected_steps
 from trackmdp.world.model import Array, BoolArray, World
+from trackmdp.world.modes import HiddenWorld
 from trackmdp.world.tracks import Problem
 
 if TYPE_CHECKING:  # torch is loaded where something that acts is asked for its sets
@@ -51,6 +53,8 @@ def evaluate(
     table = _table(problem, policy)
     if false_alarm:
         return believed(problem, table, false_alarm)
+    if isinstance(problem, HiddenWorld):
+        return evaluate_keys(problem, table)
     if not isinstance(problem, World):
         return evaluate_recorded(problem, table)
     if problem.max_steps is not None:

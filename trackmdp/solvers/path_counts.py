@@ -23,7 +23,7 @@ from trackmdp.world.tracks import Tracks
 
 __all__ = ["Planned", "plan_keys"]
 
-_UNVISITED = 0.05
+_UNVISITED = 0.01
 """Weight of a state that the policy does not get to on its path: it shows what follows a key that is rare, but not as
 the policy itself comes by the key."""
 _IN_VIEW = 0.999

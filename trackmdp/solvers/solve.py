@@ -15,9 +15,11 @@ from trackmdp.config.partition import PartitionConfig
 from trackmdp.config.registry import make, maker
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers.keyed_search import solve_keys
 from trackmdp.solvers.partition import narrow_halo, plan_by_blocks
 from trackmdp.solvers.solution import SearchProgress, Solution, bracketed
 from trackmdp.world.model import World
+from trackmdp.world.modes import HiddenWorld
 from trackmdp.world.tracks import Problem
 
 if TYPE_CHECKING:  # torch is loaded where a policy is to act
@@ -27,7 +29,7 @@ __all__ = ["baseline_policy", "run_solver", "solve"]
 
 
 def solve(
-    world: World,
+    world: World | HiddenWorld,
     solver: str = default("solver", "solve"),
     *,
     nodes: int = default("solver.nodes", "solve"),
@@ -43,7 +45,8 @@ def solve(
     The defaults are those of `conf/`, the checks those of ``trackmdp solve``.
 
     Args:
-        world: the problem with its motion model.
+        world: the problem with its motion model. With a hidden mode the policy remembers what `world.memory` says, and
+            is found by policy iteration over keys, whatever the solver.
         solver: ``optimal``, ``clocked``, ``qmdp``, ``fcr``, ``lookahead``, or one of an installed plugin.
         nodes: work after which `optimal` stops closing the bracket, the same on every machine.
         time_limit: seconds after which it stops even so; None: never. Neither is an option of the others.
@@ -67,18 +70,20 @@ def solve(
     blocks = given({"partition.block": block, "partition.halo": halo, "partition.workers": workers})
     cfg = compose("solve", named | own | blocks)
     solution = run_solver(world, cfg.solver, on_progress, cfg.partition)
-    if said := narrow_halo(world, cfg.partition, solution):
+    if isinstance(world, World) and (said := narrow_halo(world, cfg.partition, solution)):
         warnings.warn(said, stacklevel=2)
     return solution
 
 
 def run_solver(
-    world: World,
+    world: World | HiddenWorld,
     choice: BaselineConfig,
     on_progress: Callable[[SearchProgress], None] | None = None,
     partition: PartitionConfig | None = None,
 ) -> Solution:
     """What the solver of a config finds; a policy without a proof is bracketed by the clocked bound."""
+    if isinstance(world, HiddenWorld):
+        return solve_keys(world)
     if not isinstance(world, World):
         raise UserError(f"solver={choice.name}: needs a motion model; recorded tracks have none")
     started = time.monotonic()

@@ -11,9 +11,11 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import bounds, qmdp
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import Evaluation, regret_per_step
+from trackmdp.solvers.keyed_search import mode_bound
 from trackmdp.world.model import Task, World
+from trackmdp.world.modes import HiddenWorld
 
-__all__ = ["Evaluator", "ExactEvaluator", "Score", "figures", "while_collecting"]
+__all__ = ["Evaluator", "ExactEvaluator", "HiddenEvaluator", "Score", "figures", "while_collecting"]
 
 _PER_CELL = ("value", "steps", "detections", "sensors", "safe_actions")
 
@@ -100,6 +102,21 @@ class ExactEvaluator(Evaluator):
         self.bounds = {"paper": paper, "valid": float(bounds.valid(world).mean()), "clocked": self.upper}
         self.qmdp = evaluate(world, qmdp.solve(world))
         self.lower = self.qmdp.aihtr
+
+    def evaluate(self, policy: PolicyTable) -> Evaluation:
+        """Exact figures of a policy."""
+        return evaluate(self.world, policy)
+
+
+class HiddenEvaluator(Evaluator):
+    """Evaluates exactly where the target's mode is hidden; the bound knows it at all times."""
+
+    world: HiddenWorld
+
+    def __init__(self, world: HiddenWorld) -> None:
+        self.world, self.qmdp = world, None
+        self.upper, self.lower = float(mode_bound(world)[:, 0].mean()), -math.inf
+        self.bounds = {"paper": None, "valid": None, "clocked": self.upper}
 
     def evaluate(self, policy: PolicyTable) -> Evaluation:
         """Exact figures of a policy."""

@@ -16,8 +16,9 @@ from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.kernel_estimate import KernelEstimate
 from trackmdp.solvers.recorded import replay
 from trackmdp.statistics import MeanInterval
-from trackmdp.training.evaluator import Evaluator, ExactEvaluator, Score
+from trackmdp.training.evaluator import Evaluator, ExactEvaluator, HiddenEvaluator, Score
 from trackmdp.world.model import World
+from trackmdp.world.modes import HiddenWorld
 from trackmdp.world.tracks import Problem, Recorded, Tracks
 
 __all__ = ["ESTIMATED", "HeldOutEvaluator", "estimated_kernel", "make_evaluator"]
@@ -28,6 +29,8 @@ ESTIMATED = "Q_MDP of the estimated kernel"
 
 def make_evaluator(problem: Problem) -> Evaluator:
     """Exact where there is a motion model, else on the held-out tracks."""
+    if isinstance(problem, HiddenWorld):
+        return HiddenEvaluator(problem)
     return ExactEvaluator(problem) if isinstance(problem, World) else HeldOutEvaluator(problem)
 
 

@@ -15,7 +15,6 @@ from trackmdp.config.resume import config_text
 from trackmdp.durable import write_bytes, write_text
 from trackmdp.errors import UserError
 from trackmdp.untrusted import parse_json, read_bytes
-from trackmdp.world.model import World
 from trackmdp.world.recording import recording_bytes
 from trackmdp.world.tracks import Problem, Recorded
 
@@ -53,13 +52,13 @@ def check_inputs(problem: Problem, folder: Path) -> None:
     """
     file = folder / _name(problem)
     if not _is_content(problem, read_bytes(file, most=LARGE)):
-        what = "kernel" if isinstance(problem, World) else "recording"
+        what = "recording" if isinstance(problem, Recorded) else "kernel"
         raise UserError(f"{file}: the run's {what} is not the one that its config describes now; it cannot change")
 
 
 def _is_content(problem: Problem, stored: bytes) -> bool:
     """Whether `stored` describes the problem; what was left out of a file of positions does not count."""
-    if isinstance(problem, World):
+    if not isinstance(problem, Recorded):
         return stored == _content(problem)
     try:
         found = parse_json(stored, "tracks.json")
@@ -70,12 +69,12 @@ def _is_content(problem: Problem, stored: bytes) -> bool:
 
 
 def _name(problem: Problem) -> str:
-    return "kernel.npz" if isinstance(problem, World) else "tracks.json"
+    return "tracks.json" if isinstance(problem, Recorded) else "kernel.npz"
 
 
 def _content(problem: Problem) -> bytes:
     """Of `kernel.npz` or `tracks.json`; the same problem, the same bytes."""
-    if not isinstance(problem, World):
+    if isinstance(problem, Recorded):
         return _described(problem)
     buffer = io.BytesIO()
     # Indices of one width, whatever the size of the kernel, and whatever is fastest to work with.

@@ -24,6 +24,7 @@ from trackmdp.training.summary import summarize
 from trackmdp.training.trainer import Trainer
 from trackmdp.untrusted import decoded, read_text
 from trackmdp.world.model import Array, World
+from trackmdp.world.tracks import Recorded
 
 __all__ = ["Metrics", "Run", "complete", "load_run", "read_metrics"]
 
@@ -78,7 +79,7 @@ def complete(trainer: Trainer) -> Run:
     solution = _solve(trainer, policy)
     # Exact figures are those that were scored; on recorded tracks the held-out ones are looked at here for the first
     # time.
-    final = score.evaluation if isinstance(trainer.problem, World) else trainer.evaluator.evaluate(policy)
+    final = trainer.evaluator.evaluate(policy) if isinstance(trainer.problem, Recorded) else score.evaluation
     if solution is not None:
         score = trainer.evaluator.tighten(solution.lower, solution.upper, score)  # keeps the evaluation that it is of
     times = {

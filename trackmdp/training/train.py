@@ -22,6 +22,7 @@ from trackmdp.training.run import Run, complete
 from trackmdp.training.trainer import Trainer
 from trackmdp.world.make import sensor_words
 from trackmdp.world.model import Array, World
+from trackmdp.world.modes import HiddenWorld
 from trackmdp.world.tracks import Problem
 
 __all__ = ["train"]
@@ -109,6 +110,10 @@ def _described(problem: Problem, folder: Path | None) -> dict[str, Any]:
     if isinstance(problem, World):
         where = (folder or Path()).absolute() / "kernel.npz"
         return given | {"kernel": "table", "kernel.path": str(where)}
+    if isinstance(problem, HiddenWorld):
+        if folder is not None:
+            raise UserError("folder: a world with a hidden mode made in Python is in no file; expected folder=None")
+        return given | {"kernel": "heading"}  # stands for any: the world is in memory
     # Without a folder a path must be given all the same, and nothing reads it: the tracks are in memory.
     tracks = {
         "kernel": "tracks",

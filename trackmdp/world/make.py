@@ -11,11 +11,13 @@ import numpy.typing as npt
 
 from trackmdp.config import WorldConfig
 from trackmdp.config.compose import compose, default, given
+from trackmdp.config.options import refuse
 from trackmdp.config.registry import make
 from trackmdp.config.world import LARGEST
 from trackmdp.world.checks import canonical_kernel, check_kernel
 from trackmdp.world.files import per_cell
 from trackmdp.world.model import Size, World, grid_size
+from trackmdp.world.modes import HiddenWorld
 from trackmdp.world.recording import read_recording
 from trackmdp.world.track_files import read_track_file
 from trackmdp.world.tracks import Problem, Recorded, split
@@ -127,6 +129,9 @@ def make_problem(cfg: WorldConfig) -> Problem:
     Raises:
         UserError: a file is missing or malformed, or the kernel or a track breaks a rule.
     """
+    if cfg.kernel.hides:
+        kernel, modes = make(cfg.kernel, cfg.grid.size)
+        return HiddenWorld(kernel, cfg.grid.size, modes=modes, **_of_task(cfg))
     if cfg.kernel.is_motion:
         return build_world(cfg)
     tracks: Recorded = make(cfg.kernel, cfg.grid.size, **_of_task(cfg))
@@ -139,6 +144,8 @@ def build_world(cfg: WorldConfig) -> World:
     Raises:
         UserError: a file is missing or malformed, or the kernel breaks a rule (`checks.check_kernel`).
     """
+    if cfg.kernel.hides:
+        raise refuse("kernel", cfg.kernel.name, "a kernel without a hidden mode")
     size, source = cfg.grid.sides, cfg.kernel.source
     # `World` checks again; here the message names the option at fault (`source`).
     kernel = canonical_kernel(make(cfg.kernel, cfg.grid.size), source)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from trackmdp.seeding import generator
 from trackmdp.world.model import World
+from trackmdp.world.modes import HiddenWorld
 from trackmdp.world.motion import Motion
 from trackmdp.world.tracks import Problem, Recorded, Tracks
 
@@ -53,14 +54,14 @@ def make_targets(setting: Problem, device: torch.device) -> Targets:
     """The targets of a world or of recorded tracks."""
     if isinstance(setting, World):
         return SampledTargets(setting, device)
-    return RecordedTargets(setting, device)
+    return HiddenTargets(setting, device) if isinstance(setting, HiddenWorld) else RecordedTargets(setting, device)
 
 
 class SampledTargets:
     """Targets that move as the kernel says; they start uniformly over the cells."""
 
-    def __init__(self, world: World, device: torch.device) -> None:
-        self._cells, self._device = world.num_cells, device
+    def __init__(self, world: World | HiddenWorld, device: torch.device) -> None:
+        self._cells, self._device = world.kernel.shape[0], device
         self._motion = Motion(world.kernel, device)
 
     def seed(self, seed: int, stream: str) -> None:
@@ -91,6 +92,26 @@ class SampledTargets:
 
     def cut(self, moved: Mapping[str, Tensor]) -> None:
         """See `Targets`."""
+
+
+class HiddenTargets(SampledTargets):
+    """Targets with a hidden mode: `state`, beside `target`, is the cell and the mode; all are as likely to start."""
+
+    def __init__(self, world: HiddenWorld, device: torch.device) -> None:
+        super().__init__(world, device)
+        self._modes = world.modes
+
+    def start(self, count: int, rows: Tensor | None) -> dict[str, Tensor]:
+        """See `Targets`."""
+        return self._shown(super().start(count, rows)["target"])
+
+    def move(self, state: Mapping[str, Tensor], draws: Tensor) -> dict[str, Tensor]:
+        """See `Targets`."""
+        return self._shown(self._motion.move(state["state"], draws))
+
+    def _shown(self, state: Tensor) -> dict[str, Tensor]:
+        # The exit is state M · H, and so cell M.
+        return {"target": state // self._modes, "state": state}
 
 
 class RecordedTargets:

@@ -16,6 +16,7 @@ from trackmdp.errors import UserError
 from trackmdp.seeding import derive
 from trackmdp.world.files import read_columns
 from trackmdp.world.model import Array, BoolArray, Size, Task, World, grid_size
+from trackmdp.world.modes import HiddenWorld
 
 __all__ = ["Indices", "Problem", "Recorded", "Tracks", "check_tracks", "ends_of", "read_tracks", "split"]
 
@@ -150,8 +151,8 @@ class Recorded(Task):
         return replace(self, held_out=self.validation)
 
 
-Problem: TypeAlias = World | Recorded
-"""What learning and evaluation take place in: a world with its motion model, or recorded tracks."""
+Problem: TypeAlias = World | Recorded | HiddenWorld
+"""What learning and evaluation take place in: a world with its motion model, whose modes may be hidden, or tracks."""
 
 
 def read_tracks(path: str | Path, size: Size, *, exits: bool) -> Tracks:

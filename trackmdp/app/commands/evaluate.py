@@ -18,6 +18,7 @@ from trackmdp.episodes.batch import Episodes
 from trackmdp.episodes.figures import Simulation
 from trackmdp.episodes.log import EpisodeLog
 from trackmdp.episodes.simulate import simulate
+from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import sets_name, write_sets
 from trackmdp.reports.picture import draw_picture
@@ -28,6 +29,7 @@ from trackmdp.training.display import make_console, table
 from trackmdp.training.evaluator import ExactEvaluator, Score, figures
 from trackmdp.world.make import make_problem
 from trackmdp.world.model import World
+from trackmdp.world.modes import HiddenWorld
 from trackmdp.world.tracks import Problem, Recorded
 
 __all__ = ["run"]
@@ -49,6 +51,8 @@ def run(cfg: EvaluateConfig, folder: Path, problem: Problem | None = None) -> fl
     if isinstance(cfg.sensor, FalseAlarmConfig):
         return alarms.run(world, cfg.sensor, policy, subject, folder, console)
     # Recorded tracks have no kernel, hence no exact value and no bound: figures come from the held-out tracks.
+    if isinstance(world, HiddenWorld):
+        raise UserError(f"run={cfg.run}: its target has a hidden mode; training has valued its policy exactly")
     if isinstance(world, Recorded):
         return held_out.run(world, policy, subject, folder, console, cfg.seed)
     evaluator = ExactEvaluator(world)

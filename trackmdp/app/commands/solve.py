@@ -20,9 +20,10 @@ from trackmdp.solvers.solution import SearchProgress, Solution
 from trackmdp.solvers.solve import run_solver
 from trackmdp.training.display import make_console, table
 from trackmdp.training.evaluator import figures
-from trackmdp.world.make import build_world
+from trackmdp.world.make import make_problem
 from trackmdp.world.model import World
-from trackmdp.world.tracks import Problem
+from trackmdp.world.modes import HiddenWorld
+from trackmdp.world.tracks import Problem, Recorded
 
 __all__ = ["run"]
 
@@ -39,20 +40,21 @@ def run(cfg: SolveConfig, folder: Path, problem: Problem | None = None) -> float
     console = make_console(cfg.quiet)
     if cfg.grid.max_steps is not None:
         raise UserError(f"grid.max_steps={cfg.grid.max_steps}: only whole episodes are solved, expected null")
-    world = build_world(cfg) if problem is None else problem
-    assert isinstance(world, World)  # recorded tracks are refused: there is no kernel to solve with
+    world = make_problem(cfg) if problem is None else problem
+    assert not isinstance(world, Recorded)  # they are refused: there is no kernel to solve with
     with _SearchDisplay(console, f"solve {cfg.solver.name}") as display:
         solution = run_solver(world, cfg.solver, display.update, cfg.partition)
-    bound = {name: float(each(world).mean()) for name, each in _BOUNDS.items()}
+    # The paper's bounds are on targets without a hidden mode.
+    bound = {name: float(each(world).mean()) for name, each in _BOUNDS.items()} if isinstance(world, World) else {}
     arrays = write_sets(folder, solution.table, value=solution.value, upper_value=solution.bound)
     write_json(folder / "solution.json", _report(cfg, solution, bound) | arrays)
     _show(console, cfg, world, solution, bound, folder)
-    if said := narrow_halo(world, cfg.partition, solution):
+    if isinstance(world, World) and (said := narrow_halo(world, cfg.partition, solution)):
         console.print(f"warning: {said}")
     # After the results are written: the command still ends with the status of an interruption.
     if solution.interrupted:
         raise KeyboardInterrupt
-    if cfg.verify:
+    if cfg.verify and isinstance(world, World):
         from trackmdp.app.commands.verify import show_checks, write_checks  # loads what is about the paper
 
         checks = write_checks(world, 1e-9, folder)
@@ -77,11 +79,19 @@ def _report(cfg: SolveConfig, solution: Solution, bound: dict[str, float]) -> di
 
 
 def _show(
-    console: Console, cfg: SolveConfig, world: World, solution: Solution, bound: dict[str, float], folder: Path
+    console: Console,
+    cfg: SolveConfig,
+    world: World | HiddenWorld,
+    solution: Solution,
+    bound: dict[str, float],
+    folder: Path,
 ) -> None:
+    found = {cfg.solver.name: solution.evaluation}
+    if isinstance(world, World):
+        found["Q_MDP"] = evaluate(world, qmdp.solve(world))
     rows = [
         [name, f"{e.aihtr:,.6f}", f"{100 * e.accuracy:.2f} %", f"{e.sensors_per_step:.3f}", f"{e.safe_per_episode:.3f}"]
-        for name, e in ((cfg.solver.name, solution.evaluation), ("Q_MDP", evaluate(world, qmdp.solve(world))))
+        for name, e in found.items()
     ]
     rows.append(["upper bound proved", f"{solution.upper:,.6f}", "", "", ""])
     rows += [[f"{name} bound", f"{value:,.6f}", "", "", ""] for name, value in bound.items()]

@@ -1,0 +1,112 @@
+"""Targets with a hidden heading: exact values of policies that remember, their bound, and solving for them."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import sparse
+
+from tests.helpers import random_kernel
+from trackmdp.episodes.simulate import simulate
+from trackmdp.errors import UserError
+from trackmdp.policies.policy import Policy
+from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers.bounds import clocked
+from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers.keyed_search import mode_bound, solve_keys
+from trackmdp.world.model import World
+from trackmdp.world.modes import HiddenWorld, heading_kernel
+
+MORE = ("displacement", "displacement_gap", "two_displacements")
+
+
+def headings(size: int = 3, keep: float = 0.8, *, cost: float = 0.2, t_max: int = 1, **more: Any) -> HiddenWorld:
+    kernel, modes = heading_kernel(size, keep=keep, go=0.9, exit_probability=0.05)
+    return HiddenWorld(kernel, size, modes=modes, cost=cost, t_max=t_max, **{"clip": 1, **more})
+
+
+def random_policy(task: HiddenWorld, seed: int, share: float = 0.3) -> PolicyTable:
+    on = np.random.default_rng(seed).random((task.num_keys * task.num_choices, task.num_cells)) < share
+    return PolicyTable(task, sparse.csr_array(on))
+
+
+def test_a_heading_by_hand() -> None:
+    """From the middle of 3 x 3, going right: kept .8, turned .1 to either side; moved .9, else still."""
+    kernel, modes = heading_kernel(3, keep=0.8, go=0.9, exit_probability=0.05)
+    row = kernel[[4 * modes + 0]].toarray()[0]
+    assert modes == 8
+    assert row.sum() == pytest.approx(0.95)
+    assert row[5 * 8 + 0] == pytest.approx(0.95 * 0.8 * 0.9)
+    assert row[2 * 8 + 1] == pytest.approx(0.95 * 0.1 * 0.9)  # up and right
+    assert row[8 * 8 + 7] == pytest.approx(0.95 * 0.1 * 0.9)  # down and right
+    assert row[4 * 8 + 0] == pytest.approx(0.95 * 0.8 * 0.1)
+    # At the right border, going right: turned back in its cell.
+    assert kernel[5 * 8 + 0, 5 * 8 + 4] == pytest.approx(0.95 * 0.8 * 0.9)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_one_mode_is_the_world_without_modes(seed: int) -> None:
+    """With H = 1 and the cell as key, figures and bound are those of `World`."""
+    kernel = random_kernel(np.random.default_rng(seed), 9, 0.1)
+    world = World(kernel, 3, cost=0.2, t_max=1, detection=0.9)
+    hidden = HiddenWorld(kernel, 3, modes=1, cost=0.2, t_max=1, detection=0.9)
+    policy = random_policy(hidden, seed)
+    ours, known = evaluate(hidden, policy), evaluate(world, PolicyTable(world, policy.sets))
+    assert ours.value == pytest.approx(known.value)
+    for name in ("accuracy", "sensors_per_step", "safe_per_episode", "expected_length"):
+        assert getattr(ours, name) == pytest.approx(getattr(known, name))
+    assert mode_bound(hidden)[:, 0] == pytest.approx(clocked(world), rel=1e-6)
+
+
+@pytest.mark.parametrize("memory", ["cell", *MORE])
+@pytest.mark.parametrize("detection", [1.0, 0.8])
+def test_the_exact_value_is_that_of_the_game(memory: str, detection: float) -> None:
+    """4,000 simulated episodes agree within 3 standard errors, whatever the policy remembers."""
+    world = headings(memory=memory, detection=detection, safe_cost=0.5)
+    policy = random_policy(world, 3)
+    exact = evaluate(world, policy)
+    played = simulate(world, Policy.from_table(policy), 4000, seed=5).figures()
+    assert abs(played.aihtr.mean - exact.aihtr) < 3 * played.aihtr.standard_error
+    assert abs(played.accuracy.mean - exact.accuracy) < 4 * played.accuracy.standard_error
+    assert abs(played.expected_length.mean - exact.expected_length) < 3 * played.expected_length.standard_error
+
+
+def test_the_best_keyed_policy_of_a_tiny_world() -> None:
+    """Brute force over all plans of keys on a line of 2 cells, t_max = 0: 4 sets for each of the keys that occur."""
+    # Two modes: to and fro (the cell changes with .9), or lazy (it stays with .9); the mode changes with .2.
+    move = {0: np.array([[0.1, 0.9], [0.9, 0.1]]), 1: np.array([[0.9, 0.1], [0.1, 0.9]])}
+    kernel = np.zeros((4, 4))
+    for x, u, y, v in itertools.product(range(2), repeat=4):
+        kernel[2 * x + u, 2 * y + v] = 0.9 * move[v][x, y] * (0.8 if u == v else 0.2)
+    world = HiddenWorld(kernel, (1, 2), modes=2, cost=0.45, t_max=0, safe_cost=0.7, memory="displacement", clip=1)
+    # On a line the displacements are -1, 0 and 1: of class 0 (start) and three more each cell has two that occur.
+    found = solve_keys(world)
+    occurring = [int(x * 10 + u) for x, u in ((0, 0), (0, 5), (0, 4), (1, 0), (1, 5), (1, 6))]
+    best = -np.inf
+    sets = list(itertools.product([False, True], repeat=2))
+    for choice in itertools.product(sets, repeat=len(occurring)):
+        table = np.zeros((world.num_keys, 1, 2), dtype=bool)
+        table[occurring, 0] = choice
+        best = max(best, evaluate(world, PolicyTable.from_dense(world, table)).aihtr)
+    assert found.lower == pytest.approx(best)
+    assert best <= found.upper
+
+
+def test_a_bound_is_above_what_solving_finds_and_memory_pays() -> None:
+    cell, known = (solve_keys(headings(5, 0.9, cost=0.16, memory=memory)) for memory in ("cell", "displacement"))
+    assert cell.upper == pytest.approx(known.upper)
+    assert cell.lower < known.lower < known.upper
+    # Forgetting the heading costs more than half of what there is to lose.
+    assert known.upper - known.lower < 0.5 * (cell.upper - cell.lower)
+
+
+def test_what_a_hidden_mode_does_not_go_with() -> None:
+    with pytest.raises(UserError, match="safe action must not miss"):
+        headings(safe_detection=0.9)
+    with pytest.raises(UserError, match=r"expected grid\.window=null"):
+        headings(window=1)
+    with pytest.raises(UserError, match="72 rows"):
+        headings(size=4).__class__(headings().kernel, 4, modes=8, cost=0.1, t_max=1)

@@ -1,0 +1,175 @@
+"""Policies that remember a key, against targets with a hidden mode: exact values, and improvements of plans.
+
+At a detection the pair (key, hidden state) is a Markov chain, whatever the key forgets: V = (I - K)^-1 b over all
+pairs, where b is what the key's plan earns until the next detection and K where that is (theory-extensions, section
+0). A plan belongs to a key, so that it is improved against the modes as the policy's own visits distribute them. An
+improvement may be a loss for some of the modes: it is kept only if the exact value rises.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from scipy import sparse
+
+from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers.evaluation import Evaluation, pooled
+from trackmdp.solvers.layers import Layer, reachable
+from trackmdp.solvers.renewal import RenewalSystem, check_length, per_row
+from trackmdp.world.model import Array, BoolArray
+from trackmdp.world.modes import HiddenWorld
+
+__all__ = ["KeyedPairs", "evaluate_keys"]
+
+
+class KeyedPairs:
+    """Where the target may be 1 ... t_max + 2 moves after each pair (key, mode): B pairs, numbered key · H + mode.
+
+    Entries are as in `layers`, with a row for each pair and hidden states for cells; layer t_max + 2 is the forced
+    step's. Plans are of keys and sensors of cells, so that entries with one key and one cell are decided together: they
+    are a group.
+    """
+
+    def __init__(self, world: HiddenWorld) -> None:
+        self.world, keys, h = world, world.keys, world.modes
+        self.key = np.repeat(np.arange(keys.num_keys), h)
+        mode = np.tile(np.arange(h), keys.num_keys)
+        self.count = len(self.key)
+        layers = reachable(world.kernel, keys.cell(self.key) * h + mode, world.num_choices + 1)
+        self.layers: list[Layer] = layers[1:]
+        self.stay = [world.stay_probability[layer.cells] for layer in layers]
+        self.rows = [layer.rows for layer in layers]
+        self.cells, self.following = [], []
+        for n, layer in enumerate(self.layers):
+            cell = layer.cells // h
+            self.cells.append(cell)
+            self.following.append(keys.next(self.key[layer.rows], n, cell) * h + layer.cells % h)
+        codes = [self.key[layer.rows] * world.num_cells + cell for layer, cell in zip(self.layers, self.cells)]  # noqa: B905
+        found = [np.unique(code, return_inverse=True) for code in codes[:-1]]
+        self.groups, self.group = [each[0] for each in found], [each[1] for each in found]
+        self.start = np.zeros(self.count)
+        cells = np.arange(world.num_cells)
+        self.start[(keys.start(cells)[:, None] * h + np.arange(h)).ravel()] = 1.0 / world.num_states
+
+    @cached_property
+    def chance(self) -> list[Array]:
+        """Per layer `[E]`, p_d of the entry's sensor."""
+        return [self.world.detection[cell] for cell in self.cells]
+
+    def run(self, seen: list[Array], spent: list[Array], sensors: list[Array]) -> tuple[sparse.csr_array, Array]:
+        """K `[B, B]`, and `[B, 6]` what happens until the next detection: reward, steps in the grid, detections, ...
+
+        Args:
+            seen: per free choice `[E]`, probability that the target is reported there.
+            spent: per free choice `[B]`, price of the set.
+            sensors: per free choice `[B]`, sensors in it.
+        """
+        world, b, mass = self.world, self.count, np.ones(self.count)
+        gathered, hits = np.zeros((b, 6)), []
+        for n, layer in enumerate(self.layers):
+            forced = n == world.num_choices
+            gathered[:, 5] += per_row(self.rows[n], mass, b)
+            mass = mass @ layer.moves
+            inside = per_row(layer.rows, mass, b)
+            found = mass if forced else mass * seen[n]
+            located = per_row(layer.rows, found, b)
+            price = world.safe_cost if forced else spent[n]
+            gathered[:, 0] += world.reward * located - price * inside
+            gathered[:, 1] += inside
+            gathered[:, 2] += located
+            gathered[:, 4 if forced else 3] += inside if forced else sensors[n] * inside
+            hits.append((found, layer.rows, self.following[n]))
+            mass = mass - found
+        data, rows, columns = (np.concatenate(part) for part in zip(*hits, strict=True))
+        return sparse.csr_array((data, (rows, columns)), shape=(b, b)), gathered
+
+    def of_policy(self, policy: PolicyTable) -> tuple[list[Array], list[Array], list[Array]]:
+        """A policy as arguments of `run`."""
+        free, one = range(self.world.num_choices), np.ones(self.world.num_cells)
+        key = [self.key[layer.rows] for layer in self.layers]
+        seen = [policy.on(n, key[n], self.cells[n]) * self.chance[n] for n in free]
+        spent, sensors = ([policy.spent(n, each)[self.key] for n in free] for each in (self.world.cost, one))
+        return seen, spent, sensors
+
+    def of_sets(self, sets: list[BoolArray]) -> tuple[list[Array], list[Array], list[Array]]:
+        """Sets, a bool for each group, as arguments of `run`."""
+        seen = [on[group] * chance for on, group, chance in zip(sets, self.group, self.chance, strict=False)]
+        spent, sensors = [], []
+        for on, groups in zip(sets, self.groups, strict=True):
+            key, cell = np.divmod(groups[on], self.world.num_cells)
+            spent.append(per_row(key, self.world.cost[cell], self.world.num_keys)[self.key])
+            sensors.append(per_row(key, np.ones(len(key)), self.world.num_keys)[self.key])
+        return seen, spent, sensors
+
+    def value(self, sets: list[BoolArray]) -> tuple[Array, Array, float]:
+        """`[B]` V, `[B]` visits of an episode, and the AIHTR."""
+        located, gathered = self.run(*self.of_sets(sets))
+        value = RenewalSystem(located).solve(gathered[:, 0])
+        visits = RenewalSystem(sparse.csr_array(located.T)).solve(self.start)
+        return value, visits, float(self.start @ value)
+
+    def improved(
+        self, sets: list[BoolArray], value: Array, visits: Array, bound: Array, optimism: float
+    ) -> list[BoolArray]:
+        """Of every step the best set given the others, forward and backward, as in `search`.
+
+        Args:
+            sets: now.
+            value: `[B]`.
+            visits: `[B]`, which weigh the modes of a key; a key that is never visited takes them for equally likely.
+            bound: `[M · H, t_max + 2]`, whose credit counts with `optimism` against the exact one.
+            optimism: 0 ... 1.
+        """
+        world, later, chosen = self.world, self._undetected(sets, value), []
+        total = per_row(self.key, visits, world.num_keys)[self.key]
+        mass = np.where(total > 1e-12, visits / np.maximum(total, 1e-300), 1.0 / world.modes)
+        for n in range(world.num_choices):
+            layer, z = self.layers[n], self.layers[n].cells
+            mass = mass @ layer.moves
+            gain = world.reward + value[self.following[n]] - later[n]
+            gain = (1.0 - optimism) * gain + optimism * (world.reward + bound[z, 0] - bound[z, n + 1])
+            key, cell = np.divmod(self.groups[n], world.num_cells)
+            inside = per_row(self.key[layer.rows], mass, world.num_keys)
+            gains = per_row(self.group[n], mass * gain * self.chance[n], len(cell))
+            on = gains > world.cost[cell] * inside[key]
+            chosen.append(on)
+            mass = mass * (1.0 - on[self.group[n]] * self.chance[n])
+        return chosen
+
+    def _undetected(self, sets: list[BoolArray], value: Array) -> list[Array]:
+        """Per free choice `[E]` W: what follows when the target is there, undetected, and `sets` go on."""
+        world, (seen, spent, _) = self.world, self.of_sets(sets)
+        last = world.num_choices
+        worth = world.reward + value[self.following[last]]
+        later = [self.layers[last].moves @ worth - world.safe_cost * self.stay[last]]
+        for n in range(last - 1, 0, -1):
+            worth = seen[n] * (world.reward + value[self.following[n]]) + (1.0 - seen[n]) * later[0]
+            later.insert(0, self.layers[n].moves @ worth - spent[n][self.rows[n]] * self.stay[n])
+        return later
+
+    def table(self, sets: list[BoolArray]) -> PolicyTable:
+        """The policy of sets."""
+        world, parts = self.world, []
+        for n, (on, groups) in enumerate(zip(sets, self.groups, strict=True)):
+            key, cell = np.divmod(groups[on], world.num_cells)
+            parts.append((key * world.num_choices + n, cell))
+        rows, cells = (np.concatenate(part) for part in zip(*parts, strict=True))
+        shape = (world.num_keys * world.num_choices, world.num_cells)
+        return PolicyTable(world, sparse.csr_array((np.ones(len(rows), dtype=bool), (rows, cells)), shape=shape))
+
+
+def evaluate_keys(world: HiddenWorld, policy: PolicyTable) -> Evaluation:
+    """Exact figures of a policy, whatever it remembers; episodes start in any cell and mode alike."""
+    known = HiddenWorld(
+        world.kernel, modes=world.modes, **(world.known | {"memory": policy.task.memory, "clip": policy.task.clip})
+    )
+    pairs = KeyedPairs(known)
+    located, gathered = pairs.run(*pairs.of_policy(policy))
+    totals = RenewalSystem(located).solve(gathered)
+    check_length(totals[:, 5])
+    h, keys = world.modes, known.keys
+    # The value of a start cell is the mean over its modes: those of its start key.
+    first = keys.start(np.arange(world.num_cells))[:, None] * h + np.arange(h)
+    of_cell = totals[first].mean(axis=1)
+    return pooled(of_cell[:, :5], of_cell[:, 5])
