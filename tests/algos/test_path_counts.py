@@ -121,3 +121,26 @@ def test_what_remembers_the_cell_alone_says_so(here: Path, capsys: pytest.Captur
     told = refused(capsys, "train", "algo=path_counts", "task.clip=3")
     assert told == "task.clip=3: without effect with task.memory=cell"
     assert not list(here.iterdir())
+
+
+def test_a_hidden_heading_is_solved_and_learned(here: Path) -> None:
+    """By the command line: what is learned from sensed paths is no better than solved, and valued exactly."""
+    world = ["kernel=heading", "grid.size=3", "kernel.exit_probability=0.1", "task.memory=displacement", "task.clip=1"]
+    assert main(["solve", *world, "quiet=true", f"hydra.run.dir={here}/solved"]) == 0
+    solved = json.loads((here / "solved/solution.json").read_text())
+    words = ["algo=path_counts", "algo.total_frames=20000", "collector.frames_per_batch=10000", "quiet=true"]
+    assert main(["train", *world, *words, f"hydra.run.dir={here}/run"]) == 0
+    learned = load_run(here / "run").evaluation.aihtr
+    assert solved["lower"] - 0.5 < learned <= solved["lower"] + 0.05 < solved["upper"]
+
+
+def test_what_does_not_know_hidden_modes_says_so(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    told = refused(capsys, "train", "kernel=heading")
+    assert told == "algo=hindsight: expected path_counts with kernel=heading"
+    told = refused(capsys, "solve", "kernel=heading", "solver=qmdp")
+    assert told == "kernel=heading: expected with it solver=optimal, verify=false and no blocks"
+    told = refused(capsys, "evaluate", "kernel=heading", "baseline=qmdp")
+    assert told == "kernel=heading: expected a kernel without a hidden mode, which solve and train know"
+    told = refused(capsys, "solve", "task.memory=displacement")
+    assert told.startswith("task.memory=displacement: expected cell with kernel=random_support")
+    assert not list(here.iterdir())

@@ -17,6 +17,7 @@ REFUSED = {("evaluate", f"log={name}") for name in ("csv", "tensorboard", "wandb
     (command, "kernel=tracks") for command in ("evaluate", "solve", "verify", "benchmark")
 }
 REFUSED |= {(command, "sensor=false_alarm") for command in ("train", "solve", "verify", "benchmark")}
+REFUSED |= {(command, "kernel=heading") for command in ("train", "evaluate", "verify", "benchmark")}
 """Choices that a command's group offers and its rules refuse."""
 
 COMBINATIONS = [

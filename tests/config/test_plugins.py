@@ -70,7 +70,10 @@ def test_a_solver_is_valued(site: Path, tmp_path: Path) -> None:
         (f"{TRAIN} algo.naps=10", "algo.naps=10: expected an integer from 0 to 9 (naps)"),
         (f"{TRAIN} algo.naps=5 algo.envs=4", "algo.naps=5: expected at most collector.envs=4"),
         (f"{TRAIN} algo.bed=1000000000000000", "algo.bed=1000000000000000: needs about"),
-        ("train kernel=jmup", "kernel=jmup: expected one of random_support, random_walk, drift, table, tracks, jump"),
+        (
+            "train kernel=jmup",
+            "kernel=jmup: expected one of random_support, random_walk, drift, heading, table, tracks, jump",
+        ),
     ],
 )
 def test_its_options_are_checked(site: Path, tmp_path: Path, words: str, message: str) -> None:
