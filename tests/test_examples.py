@@ -103,3 +103,9 @@ def test_the_plugin_learns_by_its_name(tmp_path: Path) -> None:
     (line,) = run("-c", code, path=(PLUGIN, tmp_path))
     learned, qmdp, upper = numbers(line)
     assert 0.9 * qmdp < learned <= upper
+
+
+def test_remembering_the_displacement_pays_on_the_ring() -> None:
+    """A vehicle that is known to go round one way: no sensor is on behind it."""
+    known = {line.split()[0]: numbers(line)[0] for line in example("memory")}
+    assert known["displacement"] > known["cell"] + 0.1
