@@ -108,6 +108,10 @@ def test_mistakes(here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: p
         (["seed=1"], "hydra/sweeper=optuna: expected a word to search"),
         (["seed=1,2", "hydra.sweeper.storage=nowhere"], "hydra.sweeper.storage=nowhere: expected a data base's URL"),
         (["seed=1,2", "hydra.sweeper.n_trials=0"], "hydra.sweeper.n_trials=0: expected an integer >= 1 (runs)"),
+        (
+            ["seed=1,2", "hydra.sweeper.objective=regret_per_step", "optimal.time_limit=9"],
+            "optimal.time_limit: a regret",
+        ),
         (["algo.hiden=1,2"], "algo.hiden: unknown option, did you mean algo.hidden?"),
     ):
         assert main([*line, *words]) == 2

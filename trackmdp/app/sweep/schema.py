@@ -83,7 +83,8 @@ class OptunaConfig(SweeperConfig):
 
     n_trials: int = option("runs of the whole study, those of earlier calls among them", unit="runs", ge=1)
     objective: str = option(
-        "what is searched for: the largest AIHTR, the least regret: the oracle's choice, made with the motion, and "
+        "what is searched for: the largest AIHTR (of any bound, and of the clock, it knows nothing), or the least "
+        "regret to the bound that each run proves in optimal.nodes; the oracle's choice, made with the motion, and "
         "with kernel=tracks the validation tracks'",
         choices=("aihtr", "regret_per_step"),
     )

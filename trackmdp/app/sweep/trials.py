@@ -46,6 +46,9 @@ def trials(
     fixed = [word for word, each in zip(words, read, strict=True) if not each.is_sweep_override()]
     if not searched:
         raise UserError("hydra/sweeper=optuna: expected a word to search, such as algo.gamma=interval(0.9,0.99)")
+    timed = [each.value() for each in read if each.get_key_element() == "optimal.time_limit"]
+    if cfg.objective == "regret_per_step" and any(value is not None for value in timed):
+        raise UserError("optimal.time_limit: a regret would be chosen by the clock, expected null (or objective=aihtr)")
     with _study(cfg, folder) as study:
         # The words are kept with each trial: Optuna's own parameters would have to be put into Hydra's notation again.
         told = [trial.user_attrs.get(_WORDS, []) for trial in study.trials if trial.state == _states().COMPLETE]
