@@ -38,7 +38,7 @@ def test_exact_values_are_those_of_playing(seed: int) -> None:
     detection = np.where(np.arange(9) < 3, 1.0, 1 - 0.5 * rng.random(9))
     world = World(random_kernel(rng, 9, 0.2), 3, cost=0.1, t_max=seed % 3, detection=detection)
     table = rng.random((9, world.num_choices, 9)) < 0.4
-    policy, p_f = PolicyTable.from_dense(world, table), 0.1
+    policy, p_f = PolicyTable.from_dense(world, table), 0.4
     exact = believed(world, policy, p_f)
     returns = _played(world, table, p_f, 20_000, rng)
     assert abs(returns.mean() - exact.aihtr) <= 3 * returns.std() / len(returns) ** 0.5

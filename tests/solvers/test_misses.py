@@ -34,6 +34,9 @@ def test_two_cells_by_hand() -> None:
     """V = .8 (.5 (1 + V) - .1) + .4 · .8 (1 - .3 + V) = .544 + .72 V: half of all looks miss; the safe one follows."""
     world = _two_cells(detection=0.5)
     assert evaluate(world, _other_cell(world)).value == pytest.approx([0.544 / 0.28] * 2)
+    # Where the target is, is known at all times: the bound that reveals it is the optimum.
+    assert bounds.clocked(world) == pytest.approx([0.544 / 0.28] * 2)
+    assert bounds.clocked(replace(world, max_steps=1)) == pytest.approx([0.8 * 0.4] * 2)
 
 
 def test_a_safe_action_that_misses_is_repeated() -> None:

@@ -48,6 +48,7 @@ def test_a_miss_costs_and_a_safe_action_that_misses_is_repeated() -> None:
     assert [step["steps_since_detection"].item() for step in (first, second, third)] == [1, 1, 0]
     assert [step["last_cell"].item() for step in (first, second, third)] == [0, 0, 3]
     # What the safe action replaced is not remembered, and what was chosen before it stays.
+    assert torch.equal(first["action_history"], action.unsqueeze(1))
     assert torch.equal(first["action_history"], second["action_history"])
     assert not third["action_history"].any()
 
