@@ -33,7 +33,7 @@ def test_no_cells_value_falls_from_whatever_sets_it_starts(world: World, seed: i
     # Nor does what one round makes of the plans fall short of them, from whatever mass is left.
     layers, mass = reachable_layers(world, world.num_choices), np.random.default_rng(seed).random(9)
     problem = InnerProblem.of(world, layers, before)
-    sets = layer_sets(layers, PolicyTable.from_dense(world, chains))
+    sets = problem.ascend(layer_sets(layers, PolicyTable.from_dense(world, chains)), mass, sweeps=9)
     worth = problem.worth(sets, mass)
     assert (problem.worth(exchange.exchange(problem, sets, mass), mass) >= worth - 1e-9 * (1.0 + np.abs(worth))).all()
 
