@@ -239,7 +239,7 @@ def test_help_names_every_option_with_range_unit_and_default(command: str, capsy
     ("words", "shown", "hidden"),
     [
         (["algo=ppo"], "algo.clip_epsilon=0.2", ["algo.blend", "kernel.", "algo.buffer_size"]),
-        (["algo=ppo", "credit=per_sensor"], "algo.surrogate=all_action", ["algo.gae_lambda", "kernel."]),
+        (["algo=ppo", "credit=per_sensor"], "algo.surrogate=all_action", ["algo.gae_lambda", "  kernel."]),
         (["kernel=drift", "seed=3"], "kernel.persistence=", ["kernel.stay", "algo."]),
         (["hydra/launcher=submitit_slurm"], "hydra.launcher.partition=null", ["n_jobs", "algo."]),
     ],

@@ -28,9 +28,14 @@ def bad_values(item: Option) -> list[str]:
         bad += ["perhaps", "[true]", "3.5"]
     if item.kind in (int, float):
         bad += ["many", "nan", "inf", "[1]", "{a: 1}", "true"]
-        step = 1 if item.kind is int else 1e-6
-        limits = [(item.ge, -step), (item.gt, 0), (item.le, step), (item.lt, 0)]
-        bad += [str(item.kind(limit + by)) for limit, by in limits if limit is not None]
+        limits = [(item.ge, -1), (item.gt, 0), (item.le, 1), (item.lt, 0)]
+        # A float is put beyond its limit by a millionth of it: 1e15 + 1e-6 would be 1e15.
+        beyond = [
+            limit + by * (1 if item.kind is int else max(1e-6, 1e-6 * abs(limit)))
+            for limit, by in limits
+            if limit is not None
+        ]
+        bad += [str(item.kind(value)) for value in beyond]
     if item.kind is int:
         bad += ["1.5"]
     if item.kind is str and (item.choices or item.expects.startswith("cpu")):

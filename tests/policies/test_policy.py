@@ -217,11 +217,10 @@ def test_draws_that_depend_on_draws_before_are_refused_and_can_be_simulated() ->
 def test_in_a_window_a_mixture_is_over_its_sensors() -> None:
     world = windowed()
     made = as_policy(world, stochastic(reads_history=False, width=9))
-    state = {"last_cell": torch.tensor([0]), "steps_since_detection": torch.tensor([1])}
     # Around cell 0 the local sensors 4, 5, 7 and 8 are the cells 0, 1, 4 and 5; the others lie outside the grid.
     expected = torch.zeros(12)
     expected[[0, 1, 4, 5]] = torch.sigmoid((1 + torch.tensor([4.0, 5, 7, 8])) / 4 - 2)
-    assert torch.allclose(made.probabilities(**state)[0], expected)
+    assert torch.allclose(made.probabilities(torch.tensor([0]), torch.tensor([1]))[0], expected)
 
 
 class Signs(torch.distributions.HalfNormal):

@@ -88,7 +88,14 @@ def run_solver(
         raise UserError(f"solver={choice.name}: needs a motion model; recorded tracks have none")
     started = time.monotonic()
     if partition is not None and partition.block is not None:
-        table = plan_by_blocks(world, _Planner(choice), **vars(partition))
+        table = plan_by_blocks(
+            world,
+            _Planner(choice),
+            block=partition.block,
+            halo=partition.halo,
+            workers=partition.workers,
+            cluster=partition.cluster,
+        )
         return bracketed(world, table, time.monotonic() - started)
     watched = {"on_progress": on_progress} if "on_progress" in signature(maker(choice)).parameters else {}
     made = make(choice, world, **watched)

@@ -59,7 +59,8 @@ def test_evaluate_reads_every_option(baseline: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("solver", GROUPS["solver"])
 def test_solve_reads_every_option(solver: str, tmp_path: Path) -> None:
-    assert not never_read("solve", f"solver={solver} grid.size=3 quiet=true", tmp_path)
+    # with blocks, without which nothing of `partition` but its block is read
+    assert not never_read("solve", f"solver={solver} grid.size=3 quiet=true partition.block=2", tmp_path)
 
 
 def test_verify_reads_every_option(tmp_path: Path) -> None:
