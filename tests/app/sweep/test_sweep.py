@@ -167,7 +167,7 @@ def test_blocks_of_an_experiment_are_the_sweep(here: Path, capfd: pytest.Capture
     assert main([*line[:-1], "experiment=fwe"]) == 2
     assert (
         capfd.readouterr().err
-        == "trackmdp train: experiment=fwe: expected one of few, growth, learned_kernel, pairs, paper, quality\n"
+        == "trackmdp train: experiment=fwe: expected one of exchange, few, growth, learned_kernel, pairs, paper, quality\n"
     )
 
 
