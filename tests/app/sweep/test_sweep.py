@@ -166,8 +166,8 @@ def test_blocks_of_an_experiment_are_the_sweep(here: Path, capfd: pytest.Capture
     assert capfd.readouterr().err.startswith("trackmdp train: grid.sise: unknown option, did you mean grid.size?")
     assert main([*line[:-1], "experiment=fwe"]) == 2
     assert (
-        capfd.readouterr().err
-        == "trackmdp train: experiment=fwe: expected one of exchange, few, growth, learned_kernel, pairs, paper, quality\n"
+        capfd.readouterr().err == "trackmdp train: experiment=fwe: expected one of exchange, few, growth, "
+        "learned_kernel, pairs, paper, quality\n"
     )
 
 
