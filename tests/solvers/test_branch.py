@@ -118,6 +118,20 @@ def test_what_is_paid_on_the_way_covers_what_any_plan_gains() -> None:
     assert less > 0.1
 
 
+def test_what_is_paid_is_enough_by_its_own_rate_and_less_than_after_three_steps() -> None:
+    """The proof needs e >= rate(e). From 0 every odd number of steps gives such an e, the more the less it is."""
+    tree, value, _ = _tree()
+    tree.run(lambda tree: tree.nodes < 3000)
+    steps = [np.zeros_like(value)]
+    for _ in range(4):
+        steps.append(np.maximum(tree.rate(value, steps[-1]), 0.0))
+    paid = payment(tree, value)
+    assert (paid >= tree.rate(value, paid) - 1e-12).all()
+    assert (steps[4] < tree.rate(value, steps[4]) - 1e-4).any()  # an even number of steps is not enough
+    assert (paid <= steps[3] + 1e-12).all()
+    assert paid.mean() < 0.96 * steps[3].mean()
+
+
 def test_joint_losses_hold_for_all_sets_of_undecided_cells() -> None:
     """A state of six cells, the first three decided: one more set for what is left, worth by definition, all ways."""
     rng = np.random.default_rng(0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -207,3 +208,28 @@ def test_the_regret_is_the_same_on_a_busy_machine(monkeypatch: pytest.MonkeyPatc
     assert idle.solution is not None
     length = idle.evaluation.expected_length
     assert low == pytest.approx((idle.solution.lower - idle.evaluation.aihtr) / length, abs=1e-12)
+
+
+@pytest.mark.parametrize("solved", [True, False])
+def test_an_evaluation_of_a_run_measures_against_what_the_run_proved(tmp_path: Path, solved: bool) -> None:
+    """The regret of `evaluate run=` is that of the run's summary; without a bracket there, to the clocked bound."""
+    kernel = drift(5, direction=0.0, persistence=0.5, exit_probability=0.01, border="renormalize")
+    np.save(tmp_path / "kernel.npy", kernel.toarray())
+    words = "kernel=table grid.size=5 grid.t_max=2 cost.sensor=0.3 algo=ppo collector.total_frames=512 quiet=true"
+    frames = ["collector.frames_per_batch=256", "collector.envs=32", "optimal.nodes=2000"]
+    own = [f"kernel.path={tmp_path / 'kernel.npy'}", f"optimal.enabled={solved}", f"hydra.run.dir={tmp_path / 'run'}"]
+    assert main(["train", *words.split(), *frames, *own]) == 0
+    judge = ["evaluate", f"run={tmp_path / 'run'}", "episodes=0", "quiet=true", f"hydra.run.dir={tmp_path / 'judged'}"]
+    assert main(judge) == 0
+    summary, found = (
+        json.loads((tmp_path / name).read_text()) for name in ("run/summary.json", "judged/evaluation.json")
+    )
+    for name in ("regret_per_step", "regret_per_step_lower"):
+        assert found[name] == pytest.approx(summary[name], abs=1e-12)
+    length = found["exact"]["expected_length"]
+    clocked = (found["bounds"]["clocked"] - found["exact"]["aihtr"]) / length
+    assert (found["regret_per_step"] < clocked - 1e-4) is solved
+    if solved:
+        # A bracket of another world would make the regret what it is not.
+        (tmp_path / "run/config.yaml").write_text((tmp_path / "run/config.yaml").read_text() + "# touched\n")
+        assert main(judge) != 0

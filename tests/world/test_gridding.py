@@ -79,6 +79,14 @@ def test_a_position_beyond_the_projection_is_outside() -> None:
     assert report["steps outside of the grid"] >= 1
 
 
+def test_positions_beyond_the_projection_do_not_move_the_grid() -> None:
+    """A third of all reports, far more than the percentiles leave out: the others stay in the middle of the grid."""
+    near = [(0, 5 * k, 9.0 + 1e-6 * k, 47.0) for k in range(20)]
+    away = [(1, 5 * k, -81.0, 0.0) for k in range(10)]
+    tracks, _ = made(seen(*near, *away, geographic=True), size=(3, 3), cell=100.0, origin=None, crs="EPSG:32632")
+    assert cells(tracks) == [[4] * 20]
+
+
 def test_a_longer_gap_cuts_a_track() -> None:
     """15 s are bridged, 16 s are not; before the gap the target has not left."""
     tracks, report = made(seen((0, 0, 5, 5), (0, 15, 15, 5), (0, 31, 25, 5), (0, 36, 25, 15)))

@@ -83,6 +83,13 @@ def test_of_reports_at_one_time_the_first_counts(tmp_path: Path) -> None:
     assert sorted(found.x.tolist()) == list(range(15))
 
 
+def test_infinite_numbers_are_no_position(tmp_path: Path) -> None:
+    """Nor a time: left in, they would sort last and stretch the path over everything."""
+    found = read(tmp_path, "id,t,x,y\na,0,1,2\na,inf,1,2\na,1,-inf,2\na,2,1,inf\na,3,nan,2\na,4,5,6\n")
+    assert rows(found) == [(0, 0, 0, 1, 2), (0, 0, 4, 5, 6)]
+    assert found.dropped == {NO_POSITION: 4, REPEATED: 0}
+
+
 def test_ais_by_its_usual_columns(tmp_path: Path) -> None:
     found = read(tmp_path, AIS)
     assert rows(found) == [(0, 0, NOON, 12.5, 55.5), (0, 0, NOON + 10, 12.5, 55.6)]

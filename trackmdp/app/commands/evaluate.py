@@ -27,6 +27,8 @@ from trackmdp.solvers.solve import baseline_policy
 from trackmdp.training.devices import make_device
 from trackmdp.training.display import make_console, table
 from trackmdp.training.evaluator import ExactEvaluator, Score, figures
+from trackmdp.training.sealing import SUMMARY, check_files, read_summary
+from trackmdp.untrusted import decoded
 from trackmdp.world.make import make_problem
 from trackmdp.world.model import World
 from trackmdp.world.modes import HiddenWorld
@@ -56,16 +58,23 @@ def run(cfg: EvaluateConfig, folder: Path, problem: Problem | None = None) -> fl
     if isinstance(world, Recorded):
         return held_out.run(world, policy, subject, folder, console, cfg.seed)
     evaluator = ExactEvaluator(world)
+    # The run's own summary has measured against what it proved; the same world gets the same regret here.
+    proved = _proved(cfg.run) if cfg.run else None
     score = evaluator.score(policy)
+    if proved:
+        score = evaluator.tighten(proved["lower"], proved["upper"], score)
     episodes = simulate(world, policy, cfg.episodes or _FOR_THE_PICTURE, seed=cfg.seed)
     simulation = episodes.figures() if cfg.episodes else None
     # Theorem thm:estimator is about Q of whole episodes and of a policy that is a table.
     told = policy.deterministic and world.max_steps is None and world.perfect
     estimate = estimator.accuracy(world, policy) if told else None
-    report = _report(subject, evaluator, score, simulation) | {"estimator": asdict(estimate) if estimate else None}
+    report = _report(subject, evaluator, score, simulation) | {
+        "optimal": proved,
+        "estimator": asdict(estimate) if estimate else None,
+    }
     write_json(folder / "evaluation.json", report | write_sets(folder, policy, value=score.evaluation.value))
     write_text(folder / "picture.txt", draw_picture(episodes, world))
-    _show(console, subject, evaluator, score, simulation, folder)
+    _show(console, subject, evaluator, score, simulation, folder, "run's bracket" if proved else "clocked")
     if isinstance(mcap := cfg.log.get("mcap"), McapConfig):
         _log_episodes(cfg, mcap, world, episodes, subject, folder, console)
     if estimate is not None:
@@ -103,6 +112,24 @@ def _trained(cfg: EvaluateConfig, device: torch.device) -> tuple[Problem, Policy
     return found.world, found.policy, found.subject
 
 
+def _proved(run: str) -> dict[str, Any] | None:
+    """`lower` and `upper` of the optimum as the run in the folder `run` proved them; None where it has not (yet).
+
+    Raises:
+        UserError: the summary is damaged, or of another run.
+    """
+    folder = Path(run)
+    if not (folder / SUMMARY).is_file():
+        return None
+    summary = read_summary(folder)
+    # `trained` has compared the kernel with the config; the bracket is of the world that these describe.
+    check_files(folder, summary, "config.yaml")
+    if summary.get("optimal") is None:
+        return None
+    with decoded(str(folder / SUMMARY), "the summary of a run"):
+        return {name: float(summary["optimal"][name]) for name in ("lower", "upper")}
+
+
 def _baseline(cfg: EvaluateConfig, problem: Problem | None) -> tuple[Problem, Policy, str]:
     assert cfg.baseline is not None
     world = make_problem(cfg) if problem is None else problem
@@ -122,7 +149,13 @@ def _report(subject: str, evaluator: ExactEvaluator, score: Score, simulation: S
 
 
 def _show(
-    console: Console, subject: str, evaluator: ExactEvaluator, score: Score, simulation: Simulation | None, folder: Path
+    console: Console,
+    subject: str,
+    evaluator: ExactEvaluator,
+    score: Score,
+    simulation: Simulation | None,
+    folder: Path,
+    source: str,
 ) -> None:
     names = {
         "aihtr": "AIHTR",
@@ -140,4 +173,4 @@ def _show(
     title = f"simulated, {simulation.episodes} episodes ± s.e." if simulation else "simulated"
     console.print(table(subject, ["figure", "exact", title, "Q_MDP exact"], rows))
     where = f"results in {folder}, sets in {sets_name(evaluator.world)}"
-    console.print(f"upper bound (clocked) {evaluator.upper:,.4f}; {score.regret}; {where}")
+    console.print(f"upper bound ({source}) {evaluator.upper:,.4f}; {score.regret}; {where}")
