@@ -125,6 +125,7 @@ def test_every_option_says_what_it_is_and_what_it_may_be(where: str, item: Optio
         assert item.ge is not None or item.gt is not None, where
         assert not item.allows(math.nan)
         assert not item.allows(math.inf)
+        assert not item.allows(10**400)  # more digits than a float has
     if item.kind is str:
         assert item.choices or item.expects, where
 

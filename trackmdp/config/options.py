@@ -6,8 +6,8 @@ Values live in `conf/*.yaml` only; types, units and ranges live in the dataclass
 from __future__ import annotations
 
 import dataclasses
-import math
 import re
+import sys
 import types
 import typing
 from collections.abc import Iterator
@@ -21,6 +21,7 @@ __all__ = [
     "SELECTORS",
     "Option",
     "Selector",
+    "as_float",
     "choice",
     "leaves",
     "listed",
@@ -94,7 +95,7 @@ class Option:
         # `cost.reward=10` is a number to whoever types it, but an int to YAML. `True` is an int to Python,
         # and no number.
         if self.kind is float and isinstance(value, int) and not isinstance(value, bool):
-            value = float(value)
+            value = as_float(value)
         # `type`, not isinstance: True would pass as the integer 1.
         if self.kind in _KINDS and type(value) is not self.kind:
             return False
@@ -116,7 +117,8 @@ class Option:
     def _in_range(self, value: float) -> bool:
         # Without this an option that has no upper bound would let .inf pass, and one that has no bound at
         # all .nan: YAML has words for both.
-        return math.isfinite(value) and (
+        # An integer may have more digits than a float can hold: isfinite would raise, comparisons are exact.
+        return abs(value) <= sys.float_info.max and (
             (self.ge is None or value >= self.ge)
             and (self.gt is None or value > self.gt)
             and (self.le is None or value <= self.le)
@@ -248,6 +250,11 @@ def leaves(cfg: Any, prefix: str = "") -> Iterator[tuple[str, Option, Any]]:
                 yield from leaves(node, f"{key}.{each}.")
         elif value is not None:
             yield from leaves(value, f"{key}.")
+
+
+def as_float(value: int) -> float:
+    """An integer given for a number; one beyond the largest float stays as it is, and is refused for its type."""
+    return float(value) if abs(value) <= sys.float_info.max else value
 
 
 def refuse(key: str, value: object, expected: str) -> UserError:

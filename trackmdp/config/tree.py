@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from trackmdp.config.checks import absolute_paths, validate
-from trackmdp.config.options import GROUPS, Option, options, several
+from trackmdp.config.options import GROUPS, Option, as_float, options, several
 from trackmdp.config.refusals import suggestion, unknown_choice
 from trackmdp.config.roots import CommandConfig, TrainConfig, WorldConfig
 from trackmdp.config.schema import ChoiceConfig
@@ -182,7 +182,7 @@ def build_config(plain: Mapping[Any, Any], schema: type[Any], prefix: str = "", 
         # `reward: 10` in a file is an int to YAML; `type` leaves True alone, which is an int as well, for `validate`
         # to refuse.
         elif isinstance(described, Option) and described.kind is float and type(value) is int:
-            values[key] = float(value)
+            values[key] = as_float(value)
     return schema(**values)
 
 
