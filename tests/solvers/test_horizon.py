@@ -83,3 +83,13 @@ def test_a_target_that_never_exits() -> None:
     figures = evaluate(world, everything)
     assert figures.aihtr == pytest.approx(50 * (1.0 - 9 * 0.2))
     assert figures.expected_length == pytest.approx(50.0)
+
+
+def test_a_limit_that_no_episode_reaches_takes_no_longer() -> None:
+    # 10^18 rounds of the recursion would have no end; it stops where its values do not change any more.
+    world = small_world(exit_probability=0.1)
+    everything = np.ones((9, 2, 9), dtype=bool)
+    cut = limited(world, 10**18)
+    assert evaluate(cut, everything).aihtr == pytest.approx(evaluate(world, everything).aihtr)
+    np.testing.assert_allclose(bounds.clocked(cut), bounds.clocked(world))
+    np.testing.assert_allclose(bounds.valid(cut), bounds.valid(world))

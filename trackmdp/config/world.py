@@ -44,7 +44,7 @@ class GridConfig(NodeConfig):
     )
     t_max: int = option("T_max: free choices at n = 0 ... t_max, then the safe action", unit="steps", ge=0, le=16)
     max_steps: int | None = option(
-        "truncate an episode after so many steps; null = only the exit ends it", unit="steps", ge=1
+        "truncate an episode after so many steps; null = only the exit ends it", unit="steps", ge=1, le=1_000_000
     )
     window: int | None = option(
         "W: only the sensors up to W rows and columns from the last located cell can be chosen, and moves out of that "

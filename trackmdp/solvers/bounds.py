@@ -181,7 +181,9 @@ def _truncated_valid(world: World, max_steps: int) -> Array:
     """`[M]` the valid bound on episodes of at most `max_steps` steps."""
     best, value = _best_step(world), np.zeros(world.num_cells)
     for _ in range(max_steps):
-        value = best + world.kernel @ value
+        before, value = value, best + world.kernel @ value
+        if np.array_equal(before, value):  # the target is gone to the last bit: nothing changes from here on
+            break
     return value
 
 
@@ -198,5 +200,7 @@ def _truncated_clocked(world: World, max_steps: int) -> Array:
         best = [per_row(rows, np.maximum(on, off), m) for on, off in zip(*_gains(world, table), strict=True)]
         # n = t_max + 1: r - D, and located again, whose clock is 0; or missed, and the safe action again.
         forced = per_row(rows, p * _after_safe_action(world, table)[cells], m)
-        table = np.stack([*best, forced], axis=1)
+        before, table = table, np.stack([*best, forced], axis=1)
+        if np.array_equal(before, table):
+            break
     return table[:, 0]

@@ -27,6 +27,10 @@ def truncated_value(world: World, policy: PolicyTable, max_steps: int) -> Evalua
     for h in range(1, max_steps + 1):
         # zip stops at the shorter one: with h steps left only the first h steps of a renewal happen.
         now = sum(earned + hit @ later for (hit, earned), later in zip(steps[:h], left, strict=False))
+        # V_h is made of the t_max + 2 before it alone: where it is the same as they are, to the last bit, so are all
+        # that follow.
+        if len(left) == len(steps) and all(np.array_equal(now, later) for later in left):
+            break
         left = [np.asarray(now), *left[: len(steps) - 1]]
     figures = left[0][: world.num_cells]
     return pooled(figures[:, :5], figures[:, 5])
