@@ -30,7 +30,7 @@ def _line(**sensors: float) -> World:
 
 def _from_zero(env: TrackEnv, action: torch.Tensor, reports: list[float]) -> list[TensorDict]:
     """The steps of one target from cell 0 that moves on and is reported where the draw is below p."""
-    state = dict(env._fresh()) | {"target": torch.tensor([0]), "last_cell": torch.tensor([0])}
+    state = dict(env._fresh(env._every)) | {"target": torch.tensor([0]), "last_cell": torch.tensor([0])}
     steps = []
     for report in reports:
         draws = torch.tensor([0.5], dtype=torch.float64), torch.tensor([report], dtype=torch.float64)

@@ -50,6 +50,9 @@ class TrackEnv(EnvBase):
     state itself and reads nothing but `action`: transforms may scale, join or delete what is observed. The tensors
     observed are those of the state: whoever writes to them in place moves the target's clock.
 
+    `torch.compile(env.step_and_maybe_reset, fullgraph=True)` gives one graph and the same bits, as it does of `step`,
+    `reset` and ``rollout(..., break_when_any_done=False)``, whose steps are unrolled: keep it to a few.
+
     An `action` `[*B, K]` bool is a set of sensors. Without `window` in the world K = M and sensor k is that of cell k.
     With it K = (2W + 1)² and actions, those remembered included, are in the local numbers of `Window`, as seen from
     `last_cell`: a sensor farther away cannot be chosen, and one outside the grid costs and senses nothing.
@@ -75,7 +78,9 @@ class TrackEnv(EnvBase):
         device: torch.device | str = "cpu",
     ) -> None:
         shape = torch.Size([batch_size] if isinstance(batch_size, int) else batch_size)
-        super().__init__(device=torch.device(device), batch_size=shape)
+        # A reset leaves no row done. Without the option TorchRL 0.14.1 looks whether one is after each reset, with an
+        # `if` on a tensor (`_reset_check_done`), which no graph of `torch.compile` can hold.
+        super().__init__(device=torch.device(device), batch_size=shape, allow_done_after_reset=True)
         self.num_envs, self.max_steps = shape.numel(), world.max_steps
         self.num_cells, self.t_max = world.num_cells, world.t_max
         self._stream, self._grid = stream, world.size
@@ -86,11 +91,12 @@ class TrackEnv(EnvBase):
         self._rows = torch.arange(self.num_envs, device=self.device)
         # Shared by all steps that truncate nothing; handed out as a clone only.
         self._no = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
+        self._every = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         # By its keys `[num_envs, ...]`; empty before the first reset. Its tensors are replaced, never written to: those
         # observed are the same ones.
         self._state: dict[str, Tensor] = {}
-        # For `render`: the last action, from which cells and after how many misses it was chosen, and the rows begun
-        # anew since.
+        # For `render`: the last action, from which cells and after how many misses it was chosen, and masks of the rows
+        # begun anew since.
         self._acted: tuple[Tensor, Tensor, Tensor] | None = None
         self._begun: list[Tensor] = []
         self._make_specs()
@@ -126,7 +132,7 @@ class TrackEnv(EnvBase):
             raise UserError(f"render({mode!r}, {row}): expected rgb_array or text, a row of 0 ... {self.num_envs - 1}")
         cell, n = (int(self._now[key][row]) for key in ("target", "steps_since_detection"))
         on = np.zeros(self.num_cells, dtype=bool)
-        if self._acted is not None and not any((rows == row).any() for rows in self._begun):
+        if self._acted is not None and not any(rows[row] for rows in self._begun):
             action, last, misses = (each[row : row + 1] for each in self._acted)
             on |= (self._window.to_global(last, action)[0] | (misses > self.t_max)).cpu().numpy()
         draw = pixels if mode == "rgb_array" else text_rows
@@ -174,21 +180,25 @@ class TrackEnv(EnvBase):
         """Begin anew the rows whose `_reset` mask is set, all without one; returns what is observed in every row."""
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None or not self._state:
-            self._state, self._acted = self._fresh(), None
+            self._state, self._acted = self._fresh(self._every), None
         else:
-            self._begin(mask.reshape(-1).nonzero().squeeze(-1))
+            self._begin(mask.reshape(-1))
         return self._shaped(self._state, self._observed)
 
     def _begin(self, rows: Tensor) -> None:
-        """New episodes in some rows; the others are made as well, so that shapes stay fixed, and thrown away."""
-        if len(rows):
-            self._begun.append(rows)
+        """New episodes in the rows of a mask; the others are made as well, so that shapes stay fixed, and left out."""
+        if torch.compiler.is_compiling():
+            # No shape and no branch may depend on how many rows there are.
             fresh = self._fresh(rows)
-            self._state = {key: value.index_copy(0, rows, fresh[key][rows]) for key, value in self._state.items()}
+            self._state = {key: _where(rows, fresh[key], value) for key, value in self._state.items()}
+        elif len(at := rows.nonzero().squeeze(-1)):
+            fresh = self._fresh(rows)
+            self._state = {key: value.index_copy(0, at, fresh[key][at]) for key, value in self._state.items()}
+        self._begun.append(rows)
 
-    def _fresh(self, rows: Tensor | None = None) -> dict[str, Tensor]:
-        """Initial states s_0 = (x_0, 0, ∅), the target located; the caller uses only `rows` of them, None for all."""
-        state = self._targets.start(self.num_envs, rows)
+    def _fresh(self, rows: Tensor) -> dict[str, Tensor]:
+        """Initial states s_0 = (x_0, 0, ∅), the target located, `[num_envs, ...]`; used are the `rows` of a mask."""
+        state = self._targets.start(rows)
         start = state["target"]
         state |= {
             "last_cell": start.clone(),
@@ -211,7 +221,7 @@ class TrackEnv(EnvBase):
         flat = action.reshape(self.num_envs, self._window.width)
         now = self._now
         self._acted, self._begun = (flat, now["last_cell"], now["steps_since_detection"]), []
-        draws, reports = self._targets.draw(self.num_envs), self._reports.draw(self.num_envs)
+        draws, reports = self._targets.draw(self._every), self._reports.draw(self._every)
         following = self.advance(now | {"action": flat}, draws, reports)
         self._state = {key: following[key] for key in self._state}
         return following
@@ -266,6 +276,10 @@ class TrackEnv(EnvBase):
     def _remember(self, history: Tensor, action: Tensor, n: Tensor, missed: Tensor) -> Tensor:
         """h_{k+1}: `action` in slot n where the target was missed, empty elsewhere; misses are few."""
         # With t_max = 1: missed at n = 0 gives slots (a, -), missed again at n = 1 gives (a, b); n = 2 is forced.
+        if torch.compiler.is_compiling():
+            # All rows, since a graph has no shape that depends on how many were missed; fused into one loop.
+            here = torch.arange(self.t_max + 1, device=n.device) == n.unsqueeze(-1)
+            return _where(missed, torch.where(here.unsqueeze(-1), action.unsqueeze(1), history), False)
         kept = torch.zeros_like(history)
         rows = missed.nonzero().squeeze(-1)
         kept[rows] = history[rows]
@@ -281,6 +295,11 @@ class TrackEnv(EnvBase):
         following = self._stepped(tensordict["action"])
         tensordict.set("next", self._shaped(following, self._shown))
         done = following["done"]
-        self._begin(done.squeeze(-1).nonzero().squeeze(-1))
+        self._begin(done.squeeze(-1))
         flags = {key: torch.zeros_like(done) for key in _FLAGS}
         return tensordict, self._shaped(self._state | flags, (*self._observed, *_FLAGS))
+
+
+def _where(rows: Tensor, this: Tensor, that: Tensor | bool) -> Tensor:
+    """`this` `[B, ...]` in the rows of a mask `[B]`, `that` in the others."""
+    return torch.where(rows.reshape(-1, *[1] * (this.ndim - 1)), this, that)

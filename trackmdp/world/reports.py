@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from trackmdp.seeding import generator
+from trackmdp.world.draws import Draw
 from trackmdp.world.model import Task
 
 __all__ = ["Reports"]
@@ -30,6 +31,7 @@ class Reports:
         # [2, M + 1]: p_d in row 0, p_s in row 1; an exited target, at M, is never reported.
         table = np.pad(np.stack([task.detection, task.safe_detection]), ((0, 0), (0, 1)))
         self._probability = torch.as_tensor(table, device=device)
+        self._draw = Draw(self._draw_of, torch.float64, self._device)
 
     def seed(self, seed: int, stream: str) -> None:
         """Begin the draws of the generator called (`stream`, "report")."""
@@ -45,11 +47,12 @@ class Reports:
         if not self.certain:
             self._generator.set_state(state["report"])
 
-    def draw(self, count: int) -> Tensor | None:
-        """`[count]` float64 uniform draws for `seen`; None where all reports are certain."""
-        if self.certain:
-            return None
-        return torch.rand(count, dtype=torch.float64, generator=self._generator, device=self._device)
+    def draw(self, rows: Tensor) -> Tensor | None:
+        """`[B]` float64 uniform draws for `seen` of the targets `rows` `[B]`; None where all reports are certain."""
+        return None if self.certain else self._draw(rows)
+
+    def _draw_of(self, rows: Tensor) -> Tensor:
+        return torch.rand(len(rows), dtype=torch.float64, generator=self._generator, device=self._device)
 
     def seen(self, target: Tensor, forced: Tensor, draws: Tensor | None) -> Tensor | bool:
         """`[B]` whether a sensor at `target` `[B]`, if it is on, reports it; where `forced`, the safe action does."""

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from trackmdp.seeding import generator
+from trackmdp.world.draws import Draw
 from trackmdp.world.model import World
 from trackmdp.world.modes import HiddenWorld
 from trackmdp.world.motion import Motion
@@ -33,12 +34,12 @@ class Targets(Protocol):
         """Go on where `state` was taken."""
         ...
 
-    def start(self, count: int, rows: Tensor | None) -> dict[str, Tensor]:
-        """`target`, and what else a move depends on, `[count]` of fresh targets; `rows` of them are used, None: all."""
+    def start(self, rows: Tensor) -> dict[str, Tensor]:
+        """`target`, and what else a move depends on, `[B]` of fresh targets, of which the mask `rows` `[B]` is used."""
         ...
 
-    def draw(self, count: int) -> Tensor:
-        """The random numbers for the next move of `count` targets, `[count]`; empty where moves are not random."""
+    def draw(self, rows: Tensor) -> Tensor:
+        """The random numbers for the next move of the targets `rows` `[B]`; empty where moves are not random."""
         ...
 
     def move(self, state: Mapping[str, Tensor], draws: Tensor) -> dict[str, Tensor]:
@@ -63,6 +64,8 @@ class SampledTargets:
     def __init__(self, world: World | HiddenWorld, device: torch.device) -> None:
         self._cells, self._device = world.kernel.shape[0], device
         self._motion = Motion(world.kernel, device)
+        self._start = Draw(self._start_of, torch.int64, device)
+        self._draw = Draw(self._draw_of, torch.float64, device)
 
     def seed(self, seed: int, stream: str) -> None:
         """The generators are those called (`stream`, "motion") and (`stream`, "start")."""
@@ -77,14 +80,19 @@ class SampledTargets:
         for name, rng in self._generators.items():
             rng.set_state(state[name])
 
-    def start(self, count: int, rows: Tensor | None) -> dict[str, Tensor]:  # noqa: ARG002
+    def start(self, rows: Tensor) -> dict[str, Tensor]:
         """See `Targets`; draws for all rows, so that what a row gets does not depend on the others."""
-        start = torch.randint(self._cells, (count,), generator=self._generators["start"], device=self._device)
-        return {"target": start}
+        return {"target": self._start(rows)}
 
-    def draw(self, count: int) -> Tensor:
-        """`[count]` uniform draws."""
-        return self._motion.draw(count, self._generators["motion"])
+    def _start_of(self, rows: Tensor) -> Tensor:
+        return torch.randint(self._cells, rows.shape, generator=self._generators["start"], device=self._device)
+
+    def draw(self, rows: Tensor) -> Tensor:
+        """`[B]` uniform draws."""
+        return self._draw(rows)
+
+    def _draw_of(self, rows: Tensor) -> Tensor:
+        return self._motion.draw(len(rows), self._generators["motion"])
 
     def move(self, state: Mapping[str, Tensor], draws: Tensor) -> dict[str, Tensor]:
         """See `Targets`."""
@@ -101,9 +109,9 @@ class HiddenTargets(SampledTargets):
         super().__init__(world, device)
         self._modes = world.modes
 
-    def start(self, count: int, rows: Tensor | None) -> dict[str, Tensor]:
+    def start(self, rows: Tensor) -> dict[str, Tensor]:
         """See `Targets`."""
-        return self._shown(super().start(count, rows)["target"])
+        return self._shown(super().start(rows)["target"])
 
     def move(self, state: Mapping[str, Tensor], draws: Tensor) -> dict[str, Tensor]:
         """See `Targets`."""
@@ -127,6 +135,7 @@ class RecordedTargets:
             torch.as_tensor(part, device=device) for part in (cells, following, starts, cut)
         )
         self._device, self._drawn = device, 0
+        self._start = Draw(self._start_of, torch.int64, device)
 
     def seed(self, seed: int, stream: str) -> None:
         """The e-th order of the starts comes from the generator called (`stream`, "tracks", e)."""
@@ -141,13 +150,17 @@ class RecordedTargets:
         """See `Targets`."""
         self._drawn = int(state["drawn"])
 
-    def start(self, count: int, rows: Tensor | None) -> dict[str, Tensor]:
+    def start(self, rows: Tensor) -> dict[str, Tensor]:
         """See `Targets`."""
-        wanted = torch.arange(count, device=self._device) if rows is None else rows
-        point = self._starts.new_zeros(count)
+        point = self._start(rows)
+        return {"target": self._cells[point], "point": point}
+
+    def _start_of(self, rows: Tensor) -> Tensor:
+        wanted = rows.nonzero().squeeze(-1)
+        point = self._starts.new_zeros(len(rows))
         # Rows that are not wanted use up no start, or tracks would be left out; they stand at point 0, unused.
         point[wanted] = self._next(len(wanted))
-        return {"target": self._cells[point], "point": point}
+        return point
 
     def _next(self, count: int) -> Tensor:
         """`[count]` starts, the next ones in order."""
@@ -171,7 +184,7 @@ class RecordedTargets:
         order = torch.randperm(len(self._starts), generator=generator(seed, stream, "tracks", number))
         return self._starts[order.to(self._device)]
 
-    def draw(self, count: int) -> Tensor:  # noqa: ARG002
+    def draw(self, rows: Tensor) -> Tensor:  # noqa: ARG002
         """Empty: a recorded target's next move is known."""
         return torch.empty(0, device=self._device)
 

@@ -1,0 +1,68 @@
+"""Random draws that `torch.compile` takes into its graph, with the same numbers as without it."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import Any
+from weakref import WeakValueDictionary
+
+import torch
+from torch import Tensor
+
+__all__ = ["Draw"]
+
+_DRAWS: WeakValueDictionary[int, Draw] = WeakValueDictionary()
+"""Number -> what draws: a graph can hold a number, but no generator."""
+
+_numbers = itertools.count()
+
+
+class Draw:
+    """One draw for a batch of rows from a generator that its owner keeps.
+
+    TorchDynamo cannot put a call with a `torch.Generator` into a graph (torch 2.13: "Failed to convert args/kwargs to
+    proxy", gb0055), and breaks the graph in two around it. There the draw is an operator of its own, which the compiler
+    does not look into.
+
+    Args:
+        draw: gives `[B]` draws for the mask `[B]` of the rows that use theirs.
+        dtype: of the draws.
+        device: where they live.
+    """
+
+    def __init__(self, draw: Callable[[Tensor], Tensor], dtype: torch.dtype, device: torch.device) -> None:
+        self._draw, self._dtype = draw, dtype
+        self._turn = torch.zeros((), device=device)
+        self._enter()
+
+    def _enter(self) -> None:
+        self._number = next(_numbers)
+        _DRAWS[self._number] = self
+
+    def __call__(self, rows: Tensor) -> Tensor:
+        """`[B]` draws, of which the rows of the mask `rows` `[B]` use theirs."""
+        if torch.compiler.is_compiling():
+            return torch.ops.trackmdp.draw(self._number, rows, self._turn, self._dtype)
+        return self._draw(rows)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        # A copy has a generator of its own, and so needs a number of its own: by the old one a compiled function would
+        # draw from the original's.
+        self.__dict__.update(state)
+        self._enter()
+
+
+# `turn` is never written to. That it might be keeps the compiler from merging, dropping or swapping two draws.
+@torch.library.custom_op("trackmdp::draw", mutates_args={"turn"})
+def _draw(number: int, rows: Tensor, turn: Tensor, dtype: torch.dtype) -> Tensor:  # noqa: ARG001
+    # As without the compiler, where the caller looks first: nothing is drawn for no row.
+    return _DRAWS[number]._draw(rows) if bool(rows.any()) else torch.zeros(rows.shape, dtype=dtype, device=rows.device)
+
+
+@_draw.register_fake
+def _(number: int, rows: Tensor, turn: Tensor, dtype: torch.dtype) -> Tensor:  # noqa: ARG001
+    return torch.empty(rows.shape, dtype=dtype, device=rows.device)
