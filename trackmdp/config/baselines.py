@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 
 from trackmdp.config.options import choice, listed, option, refuse
 from trackmdp.config.schema import ChoiceConfig
+from trackmdp.machine import SIZE_PATTERN
 
 __all__ = [
     "AllOnConfig",
@@ -129,6 +130,11 @@ class OptimalConfig(BaselineConfig):
         "stop after this long even so, where the machine is slow; said where it happens; null = never", unit="s", gt=0
     )
     tolerance: float = option("bracket that counts as closed, relative to the value", ge=0, lt=1)
+    memory: str | None = option(
+        "memory that may be used: large grids are then gone through in smaller regions; null = what the machine has",
+        pattern=SIZE_PATTERN,
+        expects="bytes, or a size such as 500MiB or 2GiB",
+    )
 
 
 @choice("baseline", "sets", makes="trackmdp.policies.saved:read_sets")

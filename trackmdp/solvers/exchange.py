@@ -28,7 +28,7 @@ from trackmdp.solvers.renewal import IndexArray, per_row, row_index
 from trackmdp.solvers.search import InnerProblem, located_value
 from trackmdp.world.model import Array, BoolArray, World
 
-__all__ = ["exchange", "exchanged", "improve", "solve"]
+__all__ = ["exchange", "exchanged", "improve", "revealed", "solve"]
 
 MOST_NUMBERS = 2**17
 """Numbers in one array of a part, 1 MB: larger parts leave the caches, and took twice the time."""
@@ -125,7 +125,7 @@ def exchange(
     improved = [on.copy() for on in sets]
     worth = problem.worth(sets, mass)
     # A located cell whose plan is worth what it could be if the position were revealed after every set is done with.
-    could_gain = _revealed(problem, mass) - worth > 1e-9 * (1.0 + np.abs(worth))
+    could_gain = revealed(problem, mass) - worth > 1e-9 * (1.0 + np.abs(worth))
     for cells in _parts(problem.layers, np.flatnonzero(could_gain if tried is None else could_gain & tried)):
         if not go_on():
             break
@@ -136,7 +136,7 @@ def exchange(
     return improved
 
 
-def _revealed(problem: InnerProblem, mass: Array) -> Array:
+def revealed(problem: InnerProblem, mass: Array) -> Array:
     """`[M]` the worth of the best plans if the position were revealed after every set; no plan is worth more."""
     kernel, world, worth = problem.world.kernel, problem.world, problem.missed
     rows, cells, p = row_index(kernel), kernel.indices, kernel.data

@@ -27,6 +27,7 @@ from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.exchange import exchanged
 from trackmdp.solvers.known import next_table
 from trackmdp.solvers.layers import Layer, layer_sets, policy_table, reachable_layers
+from trackmdp.solvers.regions import adopted, improved, proved, region_side
 from trackmdp.solvers.renewal import RenewalSystem, expected_steps, row_index
 from trackmdp.solvers.search import InnerProblem, follow_credit
 from trackmdp.solvers.solution import SearchProgress, Solution
@@ -44,6 +45,10 @@ NODES_BETWEEN_REPORTS = 100_000
 RESTARTS, SPREAD, MOST_RESTARTED = 4, 0.05, 1_000
 """Searches led by another kernel where the first tree leaves the bracket open, how far its entries are off (standard
 deviation of their logarithms), and the cells above which the time is better spent on the tree."""
+NODES_A_CELL = 4
+"""The same in regions, for each cell of the grid: more than most regions need."""
+WORTH_A_ROUND = 0.02
+"""Share of the bracket that a round of ascent and exchange has to close to be followed by another one."""
 WORTH_A_RESTART = 0.02
 """Share of the bracket that improvements have to close for the search to start anew with them."""
 
@@ -54,6 +59,7 @@ def solve(
     nodes: int = 5_000_000,
     time_limit: float | None = None,
     tolerance: float = 1e-6,
+    memory: str | None = None,
     start: PolicyTable | None = None,
     on_progress: Callable[[SearchProgress], None] | None = None,
 ) -> Solution:
@@ -69,12 +75,14 @@ def solve(
         time_limit: seconds after which to stop before; what is returned then depends on the machine, and says so
             (`Solution.timed_out`). None: no limit.
         tolerance: bracket that counts as closed, relative to the value.
+        memory: bytes that may be used, about, such as ``"2GiB"``; None: what the machine has left. A grid that needs
+            more, or has more than 20,000 cells, is searched region by region.
         start: a deterministic policy that is known, such as a learned one: what is returned is no worse.
         on_progress: told how far the search has come.
     """
     if world.max_steps is not None:
         raise UserError(f"grid.max_steps={world.max_steps}: only whole episodes are solved, expected null")
-    run = _Run(world, _Budget(nodes, time_limit), tolerance, start, on_progress)
+    run = _Run(world, _Budget(nodes, time_limit), tolerance, start, on_progress, region_side(world, memory))
     interrupted = False
     try:
         run.search()
@@ -126,6 +134,24 @@ class _Budget:
             self.spent = spent + tree.nodes - before
 
 
+class _Shares:
+    """The `nodes` of a round, shared out among trees that are run one after the other, region by region."""
+
+    def __init__(self, budget: _Budget, nodes: int, passed: Callable[[float], bool]) -> None:
+        self._budget, self._ends, self._passed = budget, budget.spent + nodes, passed
+        self.closed = True
+
+    def run(self, done: int, regions: int, tree: Tree) -> None:
+        """Run a tree of the next region, `done` of all `regions` being done.
+
+        With 60 of 100 regions done and 800 nodes left, it has 800 / 40 = 20: what it leaves over goes to the others.
+        """
+        self._passed(done / regions)
+        most = (self._ends - self._budget.spent) / (regions - done)
+        self._budget.run(tree, lambda tree: tree.nodes < most)
+        self.closed = self.closed and tree.closed
+
+
 class _Run:
     """One search: the policy and the bracket so far."""
 
@@ -136,9 +162,10 @@ class _Run:
         tolerance: float,
         start: PolicyTable | None,
         on_progress: Callable[[SearchProgress], None] | None,
+        side: int | None,
     ) -> None:
         self.world, self.tolerance, self.on_progress, self.budget = world, tolerance, on_progress, budget
-        self.start = start
+        self.start, self.side = start, side
         self.restarted = False
         self.found: PolicyTable | None = None
         # U(x, 0) >= V*(x) before anything is searched; `tighten` only lowers it.
@@ -168,14 +195,22 @@ class _Run:
     def certified(self) -> bool:
         return float((self.bound - self.value).mean()) + self.evaluation.error <= self.gap_allowed
 
-    def report(self) -> None:
+    def open(self) -> bool:
+        """Whether there is something left to prove, and work left to do it."""
+        return not self.certified and self.budget.left()
+
+    def report(self, stage: str = "", left: float | None = None) -> None:
         if self.on_progress is not None:
+            bracket = float(self.value.mean()), float(self.bound.mean())
             seconds, nodes = time.monotonic() - self.budget.started, self.budget.spent
-            self.on_progress(SearchProgress(float(self.value.mean()), float(self.bound.mean()), seconds, nodes))
+            self.on_progress(SearchProgress(*bracket, seconds, nodes, stage, left))
 
     def search(self) -> None:
         if self.certified:  # the clocked policy attains its bound
             self.report()
+            return
+        if self.side is not None:
+            self.search_regions(self.side)
             return
         self.ground = _Ground(self.world)
         layers = self.ground.layers
@@ -187,13 +222,61 @@ class _Run:
             self.use(self.start)
         self.report()
         patience = FIRST_NODES
-        while not self.certified and self.budget.left():
+        while self.open():
             improved = self.round(patience)
             self.report()
             # No better plan: the tree was searched to its end, or the budget is spent.
             if not improved:
                 return
             patience *= 2
+
+    def search_regions(self, side: int) -> None:
+        """The same with the layers of one region of `side` x `side` located cells at a time.
+
+        Ascent and exchange, with V made anew after each round, end where the homotopy does, within a few rounds.
+        """
+        longest = float(expected_steps(self.world).max())
+        paths = RenewalSystem(self.world.kernel, self.world.size)
+        patience = max(FIRST_NODES, NODES_A_CELL * self.world.num_cells)
+        while self.open():
+            self.improve_regions(side)
+            # Last: what the search finds by itself is the same whatever is handed to it.
+            if self.start is not None:
+                self.use(self.start)
+            if not self.open():
+                return
+            shares = _Shares(self.budget, patience, self.clock("branch and bound"))
+            slack = 0.5 * self.gap_allowed / longest
+            # e(x) = eps_x pays for every plan of x (see the module), and asks for one tree at a time; `payment` asks
+            # for all of them at once.
+            short, policy = proved(self.world, self.policy, self.value, side, slack, shares.run)
+            self.bound = np.minimum(self.bound, self.value + paths.upper(short, longest))
+            better = self.use(policy)
+            self.report()
+            # All trees were searched to their ends and hold no better plan: more nodes would change nothing.
+            if shares.closed and not better:
+                return
+            patience *= 2
+
+    def improve_regions(self, side: int) -> None:
+        """Rounds of ascent and exchange, until one closes little of what was open before the first."""
+        gap = gained = float((self.bound - self.value).mean())
+        while gained > WORTH_A_ROUND * gap and self.open():
+            before, passed = float(self.value.mean()), self.clock("policy iteration")
+            self.use(improved(self.world, self.policy, self.value, side, passed))
+            gained = float(self.value.mean()) - before
+            self.report()
+
+    def clock(self, stage: str) -> Callable[[float], bool]:
+        """Told the share of a round that is done, it reports how long the rest will take; whether to go on."""
+        began = time.monotonic()
+
+        def passed(share: float) -> bool:
+            if share:
+                self.report(stage, (time.monotonic() - began) * (1.0 / share - 1.0))
+            return self.budget.left()
+
+        return passed
 
     def restart(self) -> bool:
         """Search once more, led by kernels that are a little off; whether that gave a better policy, to be used next.
@@ -239,16 +322,9 @@ class _Run:
 
     def adopt(self, tree: Tree) -> bool:
         """Use the better plans that the tree has found; whether the policy is better with them."""
-        better, left = tree.improvements()
-        if not better.any():
-            return False
-        layers, mass, sets = self.ground.layers, np.ones(self.world.num_cells), []
-        for layer, on, out in zip(layers[1:], layer_sets(layers, self.policy), left, strict=True):
-            mass = mass @ layer.moves
-            # a plan of the tree senses every possible cell but those left out
-            sets.append(np.where(better[layer.rows], (mass > 0) & ~out.has(layer.rows, layer.cells), on))
-            mass = mass * (1.0 - sets[-1] * self.world.detects(layer.cells))
-        return self.use(self.exchanged(sets))
+        problem = InnerProblem.of(self.world, self.ground.layers, self.value)
+        sets = adopted(problem, layer_sets(self.ground.layers, self.policy), tree)
+        return sets is not None and self.use(self.exchanged(sets))
 
     def exchanged(self, sets: list[BoolArray]) -> PolicyTable:
         """The policy that exchange makes of `sets`."""

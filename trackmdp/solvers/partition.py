@@ -29,7 +29,7 @@ from trackmdp.solvers.solution import Solution
 from trackmdp.solvers.workers import run_jobs
 from trackmdp.world.model import World
 
-__all__ = ["Block", "blocks", "default_halo", "narrow_halo", "plan_by_blocks", "reach", "sub_world"]
+__all__ = ["Block", "blocks", "cells_of", "default_halo", "narrow_halo", "plan_by_blocks", "reach", "sub_world"]
 
 Planner: TypeAlias = "Callable[[World], PolicyTable]"
 Rectangle: TypeAlias = tuple[range, range]
@@ -79,7 +79,7 @@ def blocks(size: tuple[int, int], side: int, halo: int) -> list[Block]:
 def sub_world(world: World, seen: Rectangle) -> World:
     """The world inside a rectangle of the grid; whoever leaves it has exited."""
     rows, columns = seen
-    cells = _cells(world, seen)
+    cells = cells_of(world, seen)
     moves = world.kernel[cells]
     # Not by kernel[cells][:, cells], which takes M steps for each block. With 10 columns, cell 57 is (5, 7): in the
     # rectangle of rows 4 to 8 and columns 6 to 8 it is (1, 1), number 1 * 3 + 1 = 4.
@@ -188,7 +188,7 @@ def _joined(parts: Sequence[tuple[IndexArray, IndexArray]]) -> tuple[IndexArray,
     return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
 
 
-def _cells(world: World, part: Rectangle) -> IndexArray:
+def cells_of(world: World, part: Rectangle) -> IndexArray:
     """Numbers of the cells of a rectangle, row by row."""
     rows, columns = part
     return (np.array(rows)[:, None] * world.columns + np.array(columns)).ravel()

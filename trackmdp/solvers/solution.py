@@ -78,12 +78,18 @@ class Solution:
 
 @dataclass(frozen=True)
 class SearchProgress:
-    """How far a search has come: the bracket around the optimal AIHTR, and seconds and nodes so far."""
+    """How far a search has come: the bracket around the optimal AIHTR, and seconds and nodes so far.
+
+    `stage` says what is being done and `left` how many seconds more that will take, where a grid is gone through region
+    by region.
+    """
 
     lower: float
     upper: float
     seconds: float
     nodes: int
+    stage: str = ""
+    left: float | None = None
 
 
 def bracketed(world: World, table: PolicyTable, seconds: float, tolerance: float = 1e-6) -> Solution:

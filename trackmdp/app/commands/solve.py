@@ -16,6 +16,7 @@ from trackmdp.solvers import bounds, qmdp
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import regret_per_step
 from trackmdp.solvers.partition import narrow_halo
+from trackmdp.solvers.renewal import DIRECT_CELLS
 from trackmdp.solvers.solution import SearchProgress, Solution
 from trackmdp.solvers.solve import run_solver
 from trackmdp.training.display import make_console, table
@@ -87,7 +88,8 @@ def _show(
     folder: Path,
 ) -> None:
     found = {cfg.solver.name: solution.evaluation}
-    if isinstance(world, World):
+    # Where it senses little it is a matter of minutes on a large grid; `evaluate baseline=qmdp` values it there.
+    if isinstance(world, World) and world.num_cells <= DIRECT_CELLS:
         found["Q_MDP"] = evaluate(world, qmdp.solve(world))
     rows = [
         [name, f"{e.aihtr:,.6f}", f"{100 * e.accuracy:.2f} %", f"{e.sensors_per_step:.3f}", f"{e.safe_per_episode:.3f}"]
@@ -123,6 +125,8 @@ class _SearchDisplay:
         """Show how far the search has come."""
         bracket = f"bracket {progress.lower:,.4f} ... {progress.upper:,.4f}"
         line = f"{self._title}: {progress.seconds:.0f} s  {bracket}  {progress.nodes:,} nodes"
+        if progress.left is not None:
+            line += f"  {progress.stage}, {progress.left:.0f} s left"
         if self._console.is_terminal:
             self._status.update(line)
         elif time.monotonic() - self._last_line >= _SECONDS_BETWEEN_LINES:

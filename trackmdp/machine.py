@@ -1,0 +1,62 @@
+"""Memory: what the machine has left, and sizes as they are typed and told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+__all__ = ["SIZE_PATTERN", "free_bytes", "gib", "parse_bytes"]
+
+SIZE_PATTERN = r"[0-9]+(\.[0-9]+)?([KMGT]iB|B)?"
+"""Sizes of memory as text: bytes, or with a unit of powers of 1,024."""
+
+_UNITS = {"B": 0, "KiB": 1, "MiB": 2, "GiB": 3, "TiB": 4}
+_CGROUPS = (
+    ("memory.max", "memory.current", "inactive_file"),
+    ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+)
+
+
+def parse_bytes(text: str) -> int:
+    """The bytes of a text of `SIZE_PATTERN`: 1.5GiB are 1.5 · 1,024³."""
+    number = text.rstrip("KMGTiB")
+    return int(float(number) * 1024 ** _UNITS[text[len(number) :] or "B"])
+
+
+def gib(size: float) -> str:
+    """A size as it is told."""
+    return f"{size / 2**30:,.2f} GiB"
+
+
+def free_bytes(root: Path = Path("/")) -> int:
+    """Bytes of memory that can still be had: what the system, and the job's own limit, leave.
+
+    A system that does not say counts as unlimited. `root` is where its files are.
+    """
+    free = [_entry(root / "proc/meminfo", "MemAvailable:", 1024)]
+    for limit, used, cache in _CGROUPS:
+        for folder in (root / "sys/fs/cgroup", root / "sys/fs/cgroup/memory"):
+            # A job's own limit (version 2 of cgroups, then version 1) may be far below what the machine has; the
+            # kernel kills whoever exceeds it without a message. Pages of files that are not in use count as used, but
+            # are given back.
+            most, now = _number(folder / limit), _number(folder / used)
+            if most is not None and now is not None:
+                free.append(most - now + (_entry(folder / "memory.stat", cache, 1) or 0))
+    return min((each for each in free if each is not None), default=2**63)
+
+
+def _entry(file: Path, name: str, unit: int) -> int | None:
+    """The number after `name` in a file of lines."""
+    try:
+        rows = (line.split() for line in file.read_text().splitlines())
+        return next((int(row[1]) * unit for row in rows if row and row[0] == name), None)
+    except OSError:
+        return None
+
+
+def _number(file: Path) -> int | None:
+    try:
+        text = file.read_text().strip()
+    except OSError:
+        return None
+    # Version 2 writes `max` where there is no limit.
+    return int(text) if text.isdigit() else None

@@ -1,0 +1,216 @@
+"""One round of policy iteration on a large grid, region by region, with the memory that one region takes.
+
+The value V of being located given, the best plan of each located cell is a problem of its own, about the cells within
+t_max + 1 moves. So a region, a square block of located cells with a halo of R (t_max + 1) cells, has all that its plans
+depend on: V and the worth of the safe action come from the whole grid, and nothing is lost at its border, unlike where
+blocks plan without knowing V (`partition`). Plans of all regions together, each worth no less than before, make a
+policy of no less value anywhere, and what is proved of each plan bounds the whole (`optimal`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+
+import numpy as np
+from scipy import sparse
+
+from trackmdp.errors import UserError
+from trackmdp.machine import free_bytes, gib, parse_bytes
+from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers.branch import Tree
+from trackmdp.solvers.exchange import exchange, revealed
+from trackmdp.solvers.known import next_table
+from trackmdp.solvers.layers import Layer, reachable_layers, sensed_csr
+from trackmdp.solvers.partition import Block, blocks, cells_of, reach, sub_world
+from trackmdp.solvers.renewal import DIRECT_CELLS, IndexArray, forced_worth
+from trackmdp.solvers.search import InnerProblem
+from trackmdp.world.model import Array, BoolArray, World
+
+__all__ = ["adopted", "improved", "proved", "region_side"]
+
+ROOM, SMALLEST, LARGEST = 2**28, 32, 128
+"""Bytes of a region, and its located cells in each direction, unless there is less memory. Wider ones have a smaller
+share of halo, 13 % at 128 cells, R = 2 and T_max = 1; in narrow ones most of the work is for the halo."""
+
+Pairs = tuple[IndexArray, IndexArray]
+"""Located cells and sensors, a pair for each sensor that is on."""
+
+
+class _Region:
+    """The plans of the located cells of a block, cells numbered as in the rectangle that it sees.
+
+    Attributes:
+        cells: `[L]`, numbers of the region's cells on the whole grid.
+        own: `[L]`, the located cells whose plans belong to it.
+        value: `[L]`, V.
+        problem: the search from each of its cells; plans of cells of the halo are not looked at.
+        sets: sensed entries of each layer but the first, those of the policy at hand.
+    """
+
+    def __init__(self, world: World, block: Block, policy: PolicyTable, worth: Sequence[Array]) -> None:
+        self.cells = cells_of(world, block.seen)
+        row, column = (np.isin(np.array(seen), np.array(own)) for seen, own in zip(block.seen, block.own, strict=True))
+        self.own = (row[:, None] & column).ravel()
+        here = sub_world(world, block.seen)
+        self.layers: list[Layer] = reachable_layers(here, here.num_choices)
+        self.value, detected, missed = (each[self.cells] for each in worth)
+        self.problem = InnerProblem(here, self.layers, detected, missed)
+        self.sets: list[BoolArray] = [
+            policy.on(n, self.cells[layer.rows], self.cells[layer.cells]) > 0 for n, layer in enumerate(self.layers[1:])
+        ]
+
+    def sensed(self, sets: Sequence[BoolArray]) -> list[Pairs]:
+        """What `sets` sense at each n, of its own located cells, numbered as on the whole grid."""
+        kept = [on & self.own[layer.rows] for layer, on in zip(self.layers[1:], sets, strict=True)]
+        parts = zip(self.layers[1:], kept, strict=True)
+        return [(self.cells[layer.rows[on]], self.cells[layer.cells[on]]) for layer, on in parts]
+
+
+def region_side(world: World, memory: str | None = None) -> int | None:
+    """Located cells of a region in each direction; None where the grid is small enough to be searched at once.
+
+    It does not depend on the machine: with a `memory` of its own a region is made smaller, never larger.
+
+    Raises:
+        UserError: no region is small enough for `memory`, or for what the machine has left.
+    """
+    whole, limit = _whole_bytes(world), free_bytes() if memory is None else parse_bytes(memory)
+    if world.num_cells <= DIRECT_CELLS and whole + _region_bytes(world, max(world.size)) <= limit:
+        return None
+    room, smallest = (ROOM, SMALLEST) if memory is None else (min(ROOM, limit - whole), 1)
+    fits = [side for side in range(smallest, LARGEST + 1) if _region_bytes(world, side) <= room]
+    side = max(fits, default=smallest)
+    if (needed := whole + _region_bytes(world, side)) > limit:
+        said = f"{gib(limit)} are available" if memory is None else "expected at least that"
+        size = f"{world.rows} x {world.columns} cells need about {gib(needed)}"
+        raise UserError(f"solver.memory={memory or 'null'}: {size}, {said}")
+    return side
+
+
+def _whole_bytes(world: World) -> int:
+    """About the memory, Python included, of what is there for the whole grid: bounds, policies, their systems.
+
+    Measured from N = 256 to 1,000, for policies that leave little of the target's mass unsensed.
+    """
+    moves = world.kernel.nnz / world.num_cells
+    return int(70 * 2**20 + world.num_cells * 180 * (1 + moves) * (1 + 0.25 * max(world.t_max - 1, 0)))
+
+
+def _region_bytes(world: World, side: int) -> int:
+    """About the memory of one region of `side` x `side` located cells, its halo included."""
+    halo = 2 * reach(world) * world.num_choices
+    seen = min(side + halo, world.rows) * min(side + halo, world.columns)
+    moves, entries, each = int(np.diff(world.kernel.indptr).max(initial=0)), 1, 0
+    for step in range(1, world.num_choices + 1):
+        # After t moves of up to R cells the target is within a window of 2 R t + 1 rows and columns.
+        after = min(entries * moves, (halo // world.num_choices * step + 1) ** 2, world.num_cells)
+        # 24 bytes for each move while a layer is made, 60 in all for what is kept of each of its entries
+        each, entries = each + 24 * entries * moves + 60 * after, after
+    return seen * each
+
+
+def _regions(world: World, policy: PolicyTable, value: Array, side: int) -> Iterator[_Region]:
+    detected = world.reward + value
+    worth = (value, detected, forced_worth(world, detected))
+    for block in blocks(world.size, side, reach(world) * world.num_choices):
+        yield _Region(world, block, policy, worth)
+
+
+def improved(
+    world: World, policy: PolicyTable, value: Array, side: int, passed: Callable[[float], bool]
+) -> PolicyTable:
+    """The policy that ascent and exchange make of `policy`, whose value is `value` `[M]`; worth no less anywhere.
+
+    Args:
+        world: the problem.
+        policy: where to start.
+        value: `[M]`, V.
+        side: located cells of a region, in each direction.
+        passed: told the share of the regions that are done; whether to look further.
+    """
+    found, count, go_on = [], len(blocks(world.size, side, 0)), True
+    for number, region in enumerate(_regions(world, policy, value, side), start=1):
+        sets, problem, located = region.sets, region.problem, np.ones(len(region.cells))
+        if go_on:
+            sets = exchange(problem, problem.ascend(sets, located, sweeps=10), located, region.own)
+            go_on = passed(number / count)
+        found.append(region.sensed(sets))
+    return _joined(world, found)
+
+
+def proved(
+    world: World,
+    policy: PolicyTable,
+    value: Array,
+    side: int,
+    slack: float,
+    run: Callable[[int, int, Tree], None],
+) -> tuple[Array, PolicyTable]:
+    """Search the plans of all located cells that may not be the best by branch and bound, region by region.
+
+    Args:
+        world: the problem.
+        policy: a policy.
+        value: `[M]`, its value.
+        side: located cells of a region, in each direction.
+        slack: worth of a plan that may be missed.
+        run: runs a tree as far as the budget allows; told how many regions are done, and of how many.
+
+    Returns:
+        `[M]` no less than what any plan is worth more than V, and the policy with the better plans found.
+    """
+    short, found, count = np.full(world.num_cells, slack), [], len(blocks(world.size, side, 0))
+    for number, region in enumerate(_regions(world, policy, value, side)):
+        sets, excess = _closed(region, slack, partial(run, number, count))
+        own = region.own
+        short[region.cells[own]] = np.maximum(excess[own], 0.0)
+        found.append(region.sensed(sets))
+    return short, _joined(world, found)
+
+
+def _closed(region: _Region, slack: float, run: Callable[[Tree], None]) -> tuple[list[BoolArray], Array]:
+    """Better plans, and `[L]` what a plan of each own cell may be worth more than V."""
+    problem, located = region.problem, np.ones(len(region.cells))
+    most = revealed(problem, located) - region.value
+    open_ = np.flatnonzero(region.own & (most > slack))
+    if not len(open_):
+        return region.sets, most
+    # R_1, R_2, ...: what 1, 2, ... more sets are worth from a known position, each from those before
+    known = [problem.missed]
+    for length in range(1, problem.length):
+        inner = InnerProblem(problem.world, region.layers[: length + 1], problem.detected, problem.missed)
+        table = next_table(inner, known, slack)
+        run(table)
+        known.append(table.upper())
+    # One problem per cell, so that the window of problem x is that around cell x; those that are closed have no mass,
+    # and nothing is better than what they have.
+    start = np.zeros(len(located))
+    start[open_] = 1.0
+    mass = sparse.csr_array(sparse.diags_array(start))
+    mass.eliminate_zeros()
+    lower = np.full(len(located), np.inf)
+    lower[open_] = region.value[open_]
+    tree = Tree(problem.world, problem.detected, known, lower, slack, mass)
+    run(tree)
+    most[open_] = np.minimum(most, tree.upper() - region.value)[open_]
+    return adopted(problem, region.sets, tree) or region.sets, most
+
+
+def adopted(problem: InnerProblem, sets: list[BoolArray], tree: Tree) -> list[BoolArray] | None:
+    """`sets` with the better plans that a tree has found, from mass 1 in each located cell; None if there are none."""
+    better, left = tree.improvements()
+    if not better.any():
+        return None
+    found, mass = [], np.ones(problem.world.num_cells)
+    for layer, on, out in zip(problem.layers[1:], sets, left, strict=True):
+        mass = mass @ layer.moves
+        # a plan of the tree senses every possible cell but those left out
+        found.append(np.where(better[layer.rows], (mass > 0) & ~out.has(layer.rows, layer.cells), on))
+        mass = mass * (1.0 - found[-1] * problem.world.detects(layer.cells))
+    return found
+
+
+def _joined(world: World, found: Sequence[Sequence[Pairs]]) -> PolicyTable:
+    parts = [tuple(np.concatenate(each) for each in zip(*step, strict=True)) for step in zip(*found, strict=True)]
+    return PolicyTable(world, sensed_csr(world, [(rows, cells) for rows, cells in parts]))
