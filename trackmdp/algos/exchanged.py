@@ -1,7 +1,7 @@
 """The last step of hindsight: exchange on the moves that were sensed, counted.
 
 The counts are the exact expectation of the paths that hindsight puts together from sensed moves, so that what is chosen
-on them uses nothing more than the paths do.
+on them uses nothing more than the paths do. They are corrected by what all of them together say (`shrinkage`).
 """
 
 from __future__ import annotations
@@ -14,12 +14,11 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import exchange
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.kernel_estimate import KernelEstimate
+from trackmdp.solvers.shrinkage import least_worth_planning, without
 from trackmdp.world.model import Task, World
 
 __all__ = ["counted_world", "exchanged_sets"]
 
-UNSEEN = 1e-9
-"""Weight in moves of what was not seen: it counts where a cell was never left, and nowhere else."""
 EXIT_WEIGHT = 1.0
 """The exit probability of all cells counts as one move in each, so that no episode is endless on the counts."""
 MOST_MOVES = 20_000_000
@@ -36,15 +35,15 @@ def counted_world(task: Task, start: Tensor, end: Tensor, *, share_cells: bool) 
         share_cells: the target moves alike from all cells away from the border; False: judge by the counts whether it
             does, cells at the same distance from the borders together.
     """
-    estimate = KernelEstimate(task.size, weight=UNSEEN, exit_weight=EXIT_WEIGHT, share_cells=share_cells or None)
+    # `believed` has a prior of its own in place of `weight`.
+    estimate = KernelEstimate(task.size, weight=1.0, exit_weight=EXIT_WEIGHT, share_cells=share_cells or None)
     estimate.add_moves(start.cpu().numpy(), end.cpu().numpy())
     if not task.perfect:
         # Of the moves to a cell the share p_d is known (`report_weights`): each counts for 1 / p_d.
         counts = estimate.counts
         counts.data /= np.append(task.detection, 1.0)[counts.indices]
-    kernel = estimate.mean()[:, :-1]
-    # In rows that were seen the prior stands for moves that were not: sets and work would grow with every one of them.
-    kernel.data[kernel.data < 10 * UNSEEN] = 0.0
+    least = least_worth_planning(task)
+    kernel = without(sparse.csr_array(estimate.believed(least)[:, :-1]), least)
     return World.of(task, kernel, max_steps=None)
 
 

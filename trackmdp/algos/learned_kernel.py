@@ -25,7 +25,7 @@ from trackmdp.solvers import exchange
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.kernel_estimate import KernelEstimate, ObservedPaths
 from trackmdp.solvers.partition import plan_by_blocks
-from trackmdp.solvers.renewal import per_row, row_index
+from trackmdp.solvers.shrinkage import least_worth_planning, without
 from trackmdp.world.model import Task, World
 from trackmdp.world.windows import Window
 
@@ -57,6 +57,7 @@ class LearnedKernel:
             detection=detection,
             share_cells=cfg.share_cells,
         )
+        self._least = least_worth_planning(task) if cfg.negligible is None else cfg.negligible
         self._rng = np.random.default_rng(derive(seed, "learned_kernel"))
         self._chooses, self._warm_up = cfg.sensing == "chosen", cfg.warm_up
         self._iteration, self._spent = 0, np.zeros(2)
@@ -76,35 +77,31 @@ class LearnedKernel:
         if not (last or self._chooses or self._iteration % every == 0):
             return self._diagnostics()
         self._estimate.fit(self.cfg.rounds_at_end if last else self.cfg.rounds)
-        plan = self._plan(self._estimate.mean())
+        believed = self._estimate.believed(self._least)
+        # What is only looked at on the way starts from the plan before, which saves half of the time.
+        plan = self._plan(believed, None if last or self._chooses else self.actor.sets)
         self.actor = as_policy(self.task, plan)
         # Acting on a draw, not on the mean: where the estimate is unsure the draws differ, and so moves get sensed that
         # the mean may leave out for good.
         if isinstance(self.policy, RenewedTable) and self._spent[0] >= self._warm_up:
             self.policy.renew(self._plan(self._estimate.sample(self._rng)))
-        self._believed = self._beliefs(plan)
+        self._believed = self._beliefs(plan, believed)
         return self._diagnostics()
 
-    def _plan(self, kernel: sparse.csr_array) -> PolicyTable:
-        """The plan for the `[M, M + 1]` kernel believed; by blocks, the halo is that of the reach believed."""
+    def _plan(self, kernel: sparse.csr_array, start: sparse.csr_array | None = None) -> PolicyTable:
+        """The plan for the `[M, M + 1]` kernel believed, from the sets `start` where there are any.
+
+        By blocks, the halo is that of the reach believed.
+        """
         world = self._world(kernel)
         if self.cfg.block is None:
-            return exchange.solve(world)
+            return exchange.solve(world) if start is None else exchange.improve(world, PolicyTable(self.task, start))
         return plan_by_blocks(world, exchange.solve, self.cfg.block)
 
     def _world(self, kernel: sparse.csr_array) -> World:
         """The task with the `[M, M + 1]` kernel believed, but for what is negligible."""
-        moves = sparse.csr_array(kernel[:, :-1])
-        if self.cfg.negligible > 0:
-            # The prior puts every displacement seen anywhere down at each cell: 25 moves where 5 are made, and plans
-            # on several moves grow with a power of that. A row keeps its sum, and with it the exit its probability.
-            rows, kept = row_index(moves), moves.data >= self.cfg.negligible
-            before = per_row(rows, moves.data, moves.shape[0])
-            after = per_row(rows, moves.data * kept, moves.shape[0])
-            kept |= (after == 0)[rows]  # a row of nothing else stays as it is
-            share = np.divide(before, after, out=np.ones_like(before), where=after > 0)
-            moves.data = moves.data * kept * share[rows]
-        return World.of(self.task, moves, max_steps=None)
+        # Plans on several moves grow with a power of the number of moves, most of which the prior may have added.
+        return World.of(self.task, without(sparse.csr_array(kernel[:, :-1]), self._least), max_steps=None)
 
     def _diagnostics(self) -> dict[str, float]:
         """What the last plan is believed to be worth, how sure that is, and what learning has cost so far."""
@@ -112,10 +109,10 @@ class LearnedKernel:
         seen = {"least_visits": float(self._estimate.visits.min()), "sensors_per_frame": sensors / max(frames, 1.0)}
         return self._believed | seen
 
-    def _beliefs(self, plan: PolicyTable) -> dict[str, float]:
+    def _beliefs(self, plan: PolicyTable, kernel: sparse.csr_array) -> dict[str, float]:
         drawn = [self._world(self._estimate.sample(self._rng)) for _ in range(self.cfg.samples)]
         believed = np.array([evaluate(world, plan).aihtr for world in drawn])
-        believes = evaluate(self._world(self._estimate.mean()), plan).aihtr
+        believes = evaluate(self._world(kernel), plan).aihtr
         return {"believed_aihtr": believes, "believed_deviation": float(believed.std())}
 
     def state_dict(self) -> dict[str, Any]:

@@ -19,15 +19,24 @@ class LearnedKernelConfig(AlgoConfig):
     credit: ClassVar[str | None] = None
     sensing: str = option("all sensors on, or sets chosen by posterior sampling", choices=("all", "chosen"))
     warm_up: int = option("with chosen sets: env steps with all sensors on before them", unit="frames", ge=0)
-    prior: float = option("the pooled motion counts as much as this many moves out of each cell", unit="moves", gt=0)
+    prior: float = option(
+        "the pooled motion counts as much as this many moves out of each cell in kernels that are drawn, or used to "
+        "infer moves from misses; for plans the counts themselves say how much",
+        unit="moves",
+        gt=0,
+    )
     exit_prior: float = option("the pooled exit probability counts as much as this many moves", unit="moves", gt=0)
     plan_every: int | None = option(
         "with all sensors on: batches from one plan to the next; after the last one is planned in any case; null: six "
         "plans in a run",
         ge=1,
     )
-    negligible: float = option(
-        "moves that are believed less likely are planned without; 0 = none are", unit="per step", ge=0, lt=1
+    negligible: float | None = option(
+        "moves that are believed less likely are planned without; 0 = none are; null: where missing them costs next to "
+        "nothing, by the prices",
+        unit="per step",
+        ge=0,
+        lt=1,
     )
     share_cells: bool | None = option(
         "count moves of all cells as far from each border together; null: where the moves seen do not tell them apart"

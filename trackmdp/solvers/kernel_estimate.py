@@ -16,7 +16,8 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.solvers.alike import AlikeCells
-from trackmdp.solvers.renewal import IndexArray, row_index
+from trackmdp.solvers.renewal import IndexArray, per_row, row_index
+from trackmdp.solvers.shrinkage import posterior_mean, unseen
 from trackmdp.world.model import Array, grid_size
 
 __all__ = ["KernelEstimate", "ObservedPaths"]
@@ -155,6 +156,35 @@ class KernelEstimate:
         moves, exits = self._parameters()
         return self._kernel(moves, exits[:, 0] / exits.sum(axis=1))
 
+    def believed(self, least: float = 0.0) -> sparse.csr_array:
+        """`[M, M + 1]` posterior mean under a prior that is estimated as well, which plans are made on.
+
+        Args:
+            least: cells where a move that was not seen yet is less likely have none.
+
+        The prior of `mean` weighs next to nothing and is the same at all moves; this one, of `shrinkage`, is what the
+        counts themselves say about how probabilities differ and how much of what happens was not seen yet.
+        """
+        counts = self._pooled()
+        exits, moved = self._exits(counts), sparse.csr_array(counts[:, :-1])
+        moved.eliminate_zeros()
+        rows, out = row_index(moved), moved.sum(axis=1)
+        likely = posterior_mean(moved.data, out[rows])
+        # The shares of a cell add up to 1, which its estimates need not do.
+        likely /= per_row(rows, likely, self.num_cells)[rows]
+        new, stands_for = unseen(rows, likely, out[rows], self.num_cells)
+        # A little of every displacement: a cell that was never left needs some, whatever it is.
+        typical = self._typical_moves(moved, stands_for + 1e-12 * likely)
+        typical = sparse.csr_array(typical - typical.multiply(moved > 0))
+        total = typical.sum(axis=1)
+        share = np.divide(new, total, out=np.zeros_like(new), where=(total > 0) & (new >= least))
+        # The rest is for what was seen.
+        scale = (1.0 - share * total)[rows]
+        seen = sparse.csr_array((likely * scale, moved.indices, moved.indptr), shape=moved.shape)
+        moves = sparse.csr_array(seen + sparse.diags_array(share) @ typical)
+        moves.eliminate_zeros()
+        return self._kernel(moves, exits[:, 0] / exits.sum(axis=1))
+
     def sample(self, rng: np.random.Generator) -> sparse.csr_array:
         """`[M, M + 1]` one kernel drawn from the posterior, censored paths taken at their expected moves."""
         moves, exits = self._parameters()
@@ -182,18 +212,26 @@ class KernelEstimate:
         stay = sparse.csr_array((moves.data * scale[row_index(moves)], moves.indices, moves.indptr), shape=moves.shape)
         return sparse.csr_array(sparse.hstack([stay, sparse.csr_array(leave[:, None])], format="csr"))
 
+    def _pooled(self) -> sparse.csr_array:
+        """`[M, M + 1]` counts, of cells that move alike together."""
+        return self.counts if self.share_cells is False else self._alike().pooled(self.counts)
+
     def _parameters(self) -> tuple[sparse.csr_array, Array]:
         """Dirichlet parameters `[M, M]` of the moves and Beta parameters `[M, 2]` of the exit."""
-        counts = self.counts if self.share_cells is False else self._alike().pooled(self.counts)
-        moved, left = counts[:, :-1], counts[:, [-1]].toarray()[:, 0]
+        counts = self._pooled()
+        moved = sparse.csr_array(counts[:, :-1])
+        moves = sparse.csr_array(moved + self.weight * self._typical_moves(moved))
+        moves.eliminate_zeros()
+        moves.sort_indices()  # draws are made entry by entry, row by row
+        return moves, self._exits(counts)
+
+    def _exits(self, counts: sparse.csr_array) -> Array:
+        """Beta parameters `[M, 2]` of the exit."""
+        moved, left = counts[:, :-1].sum(axis=1), counts[:, [-1]].toarray()[:, 0]
         # half an exit in one more move keeps the pooled probability between 0 and 1 before any exit is seen
         pooled = (left.sum() + 0.5) / (counts.sum() + 1.0)
         # Beta(exits + w p, moves + w (1 - p)), with p the pooled exit probability and w the weight of the prior.
-        exits = np.stack([left + self.exit_weight * pooled, moved.sum(axis=1) + self.exit_weight * (1 - pooled)], 1)
-        moves = sparse.csr_array(moved + self.weight * self._typical_moves(sparse.csr_array(moved)))
-        moves.eliminate_zeros()
-        moves.sort_indices()  # draws are made entry by entry, row by row
-        return moves, exits
+        return np.stack([left + self.exit_weight * pooled, moved + self.exit_weight * (1 - pooled)], axis=1)
 
     def _open_moves(self, paths: ObservedPaths) -> sparse.csr_array:
         """`[M, M + 1]` uniform over the cells that one move may reach, judging by the fastest path seen."""
@@ -204,20 +242,26 @@ class KernelEstimate:
         near = self._near(int(max(fastest, self._farthest(self.direct[:, :-1]))) + 1)
         return sparse.csr_array(sparse.hstack([near, sparse.csr_array((self.num_cells, 1))], format="csr"))
 
-    def _typical_moves(self, moved: sparse.csr_array) -> sparse.csr_array:
-        """`[M, M]` pooled displacements applied at every cell, rows scaled to 1; the class says what if none fits."""
+    def _typical_moves(self, moved: sparse.csr_array, weight: Array | None = None) -> sparse.csr_array:
+        """`[M, M]` pooled displacements applied at every cell, rows scaled to 1; the class says what if none fits.
+
+        Args:
+            moved: `[M, M]`, counts of moves.
+            weight: of each stored entry; None for its share of the moves out of its cell.
+        """
         start, end, data = row_index(moved), moved.indices, moved.data
         seen = data > 1e-9
         # Shares within each row, not counts: a cell the target visits often says no more about the typical move than
         # others.
-        start, end, share = start[seen], end[seen], (data / moved.sum(axis=1)[start])[seen]
+        weight = data / moved.sum(axis=1)[start] if weight is None else weight
+        start, end, share = start[seen], end[seen], weight[seen]
         # On 10 x 10 cells, 2 rows down and 1 column to the left is the shift (2 + 10) · 20 + (-1 + 10) = 249.
         width = 2 * self.columns
         shift = (end // self.columns - start // self.columns + self.rows) * width
         shift = shift + end % self.columns - start % self.columns + self.columns
         shifts, place = np.unique(shift, return_inverse=True)
-        weight = np.bincount(place, weights=share, minlength=len(shifts)).astype(np.float64)
-        typical = self._put_down(shifts // width - self.rows, shifts % width - self.columns, weight)
+        each = np.bincount(place, weights=share, minlength=len(shifts)).astype(np.float64)
+        typical = self._put_down(shifts // width - self.rows, shifts % width - self.columns, each)
         total = typical.sum(axis=1)
         without = np.flatnonzero(total <= 0)
         if len(without):

@@ -1,0 +1,130 @@
+"""Probabilities of moves from counts, by empirical Bayes: what is alike among all moves seen corrects each of them.
+
+A move seen k times in n from its cell has the share k / n, whose error is largest where a plan looks hardest: at moves
+near the price of a sensor. So each count is read as a draw from Binomial(n, p), p itself from one mixture of Beta
+distributions for all moves of the grid, whose weights make all counts together likeliest (expectation-maximisation;
+Robbins 1956, Efron 2010). The posterior mean of p shrinks towards what moves of that size mostly are: where all have
+.15 or .21, towards these two; where they differ in every way, hardly at all.
+
+A move of probability p was seen with probability s = 1 - (1 - p)^n. So each move seen stands for (1 - s) / s moves that
+were not, of p each (Horvitz & Thompson 1952): their sum is the probability of a move that is new, from this cell. It is
+divided among the cells not yet reached as the displacements of the moves that account for it, in the whole grid.
+
+With k = 1 twice and k = 8 of n = 10 from one cell, and those shares taken as the truth, the two stand for .1 · .349 /
+.651 = .054 each: a new move is made with probability .107 / 1.107 = .097.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy import sparse
+from scipy.special import betaln
+
+from trackmdp.solvers.renewal import IndexArray, per_row, row_index
+from trackmdp.world.model import Array, Task
+
+__all__ = ["least_worth_planning", "posterior_mean", "unseen", "without"]
+
+PRECISIONS = (30.0, 300.0, 3000.0)
+"""a + b of the Beta(a, b) of the mixture: what stands for broad and for narrow groups of probabilities."""
+ROUNDS = 50
+MOST_PAIRS = 2**14
+"""Different counts (k, n) that the mixture is fitted to, and that are worked on at once: 16 MB an array."""
+SHARE_OF_PRICE = 0.01
+
+
+def posterior_mean(count: Array, moves: Array) -> Array:
+    """`[E]` the probability of each move.
+
+    Args:
+        count: `[E]`, k > 0, how often it was seen; a fraction where it was inferred.
+        moves: `[E]`, n >= k, all moves seen out of its cell.
+    """
+    if not len(count):
+        return np.zeros(0)
+    # Equal counts have equal estimates: of 2,000 moves with 300 each, some 200 pairs (k, n) differ.
+    pairs, place, copies = np.unique(np.stack([count, moves]), axis=1, return_inverse=True, return_counts=True)
+    alpha, beta = _components()
+    # They are sorted, so that every 2nd or 3rd of very many is a fair sample of them.
+    step = -(-pairs.shape[1] // MOST_PAIRS)
+    likelihood, times = _likelihood(pairs[:, ::step], alpha, beta), copies[::step, None]
+    weight = np.full(len(alpha), 1.0 / len(alpha))
+    for _ in range(ROUNDS):
+        share = likelihood * weight
+        share *= times / share.sum(axis=1, keepdims=True)
+        weight = share.sum(axis=0) / times.sum()
+    mean = np.zeros(pairs.shape[1])
+    for first in range(0, len(mean), MOST_PAIRS):
+        part = pairs[:, first : first + MOST_PAIRS]
+        share = _likelihood(part, alpha, beta) * weight
+        # The posterior of one component is Beta(a + k, b + n - k), of mean (a + k) / (a + b + n).
+        means = (part[0][:, None] + alpha) / (part[1][:, None] + alpha + beta)
+        mean[first : first + MOST_PAIRS] = (share * means).sum(axis=1) / share.sum(axis=1)
+    found: Array = mean[place.ravel()]
+    return found
+
+
+def _components() -> tuple[Array, Array]:
+    """`[C]`, a and b of each Beta: means as far apart as two standard deviations of one of them."""
+    alpha, beta = [], []
+    for precision in PRECISIONS:
+        number = math.ceil(1.6 * math.sqrt(precision))
+        # Of Beta(s m, s (1 - m)) the angle arcsin sqrt p has a standard deviation of 1 / (2 sqrt s), whatever m is:
+        # equal steps in the angle, pi / 2 in 1.6 sqrt s parts.
+        mean = np.sin(np.pi / 2 * (np.arange(number) + 0.5) / number) ** 2
+        alpha.append(precision * mean)
+        beta.append(precision * (1.0 - mean))
+    return np.concatenate(alpha), np.concatenate(beta)
+
+
+def _likelihood(pairs: Array, alpha: Array, beta: Array) -> Array:
+    """`[P, C]` of k in n moves under each component, up to a factor for each pair."""
+    count, rest = pairs[0][:, None], (pairs[1] - pairs[0])[:, None]
+    log = betaln(count + alpha, rest + beta) - betaln(alpha, beta)
+    scaled: Array = np.exp(log - log.max(axis=1, keepdims=True))
+    return scaled
+
+
+def unseen(rows: IndexArray, probability: Array, moves: Array, cells: int) -> tuple[Array, Array]:
+    """What was not seen: the probability of a new move from each cell, and of what moves seen it is made up.
+
+    Args:
+        rows: `[E]`, cell that each move seen starts from.
+        probability: `[E]`, its own.
+        moves: `[E]`, moves seen out of its cell.
+        cells: M.
+
+    Returns:
+        `[M]` the probability that the next move from a cell is one not seen from there, 1 where none was; `[E]` the
+        probability of unseen moves that each one seen stands for.
+    """
+    seen = -np.expm1(moves * np.log1p(-np.minimum(probability, 1.0 - 1e-12)))
+    stands_for = probability * (1.0 - seen) / seen
+    missing = per_row(rows, stands_for, cells)
+    # What was seen has the odds 1 to `missing` of what was not.
+    left = np.bincount(rows, minlength=cells) > 0
+    return np.where(left, missing / (1.0 + missing), 1.0), stands_for
+
+
+def least_worth_planning(task: Task) -> float:
+    """The probability of a move below which it is planned without.
+
+    Missing it is worth no more than r + D; that is below a hundredth of the cheapest sensor's price. With c = .16 and
+    D = 16 that is .0001, with D = 1000 it is 1.6e-6: what is dear to miss is looked for.
+    """
+    paid = task.cost[task.cost > 0]
+    return SHARE_OF_PRICE * float(paid.min(initial=task.reward)) / (task.reward + task.safe_cost)
+
+
+def without(moves: sparse.csr_array, least: float) -> sparse.csr_array:
+    """`moves` `[M, M]` without entries below `least`, whose probability goes to the others of their row."""
+    rows, kept = row_index(moves), moves.data >= least
+    before = per_row(rows, moves.data, moves.shape[0])
+    after = per_row(rows, moves.data * kept, moves.shape[0])
+    kept |= (after == 0)[rows]  # a row of nothing else stays as it is
+    share = np.divide(before, after, out=np.ones_like(before), where=after > 0)
+    found = sparse.csr_array((moves.data * kept * share[rows], moves.indices, moves.indptr), shape=moves.shape)
+    found.eliminate_zeros()
+    return found
