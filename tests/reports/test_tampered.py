@@ -81,6 +81,7 @@ SPOILT: dict[str, tuple[Change, str]] = {
     "policy": (resealed(policy=True), "summary.json: not the summary of a run"),
     "frames": (resealed(frames="x"), "summary.json: not the summary of a run"),
     "1e308": (resealed(wall_seconds=1e308), "summary.json: not the summary of a run"),
+    "no time": (resealed(cpu_seconds=None), "summary.json: not the summary of a run"),
     "versions": (resealed(versions={"torch": {"a": [1]}}), "summary.json: not the summary of a run"),
     "no files": (resealed(files=None), "summary.json: names no files"),
 }

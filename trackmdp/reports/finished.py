@@ -110,7 +110,9 @@ def _check_origin(summary: Mapping[str, Any]) -> None:
 def _figures(summary: Mapping[str, Any]) -> dict[str, float | None]:
     """`FIGURES` of a summary; on recorded tracks there is no Q_MDP, no bound and no optimum."""
     groups = {"qmdp": summary["qmdp"], "bound": summary["bounds"], "optimal": summary["optimal"]}
-    raw = {key: summary[key] for key in ("frames", "wall_seconds", "cpu_seconds")} | summary["policy"]
+    # What a run took is known of every run; of its other figures some are null, as on recorded tracks.
+    took = {key: _number(key, summary[key]) for key in ("frames", "wall_seconds", "cpu_seconds")}
+    raw = took | summary["policy"]
     raw |= {f"{group}_{key}": value for group, values in groups.items() for key, value in (values or {}).items()}
     return {key: None if raw.get(key) is None else _number(key, raw[key]) for key in FIGURES}
 
