@@ -24,7 +24,35 @@ Observation: TypeAlias = dict[str, Any]
 _MODES = {"ansi": "text", "rgb_array": "rgb_array"}
 
 
-class TrackGym(gymnasium.Env[Observation, npt.NDArray[np.int8]]):
+class _Tracking:
+    """What the single and the vector environment share: the problem, its seeding, its picture."""
+
+    world: Problem
+    render_mode: str | None
+    _env: TrackEnv
+
+    def _make(
+        self, world: Problem | None, options: dict[str, Any], render_mode: str | None, shape: tuple[int, ...]
+    ) -> tuple[spaces.Dict, spaces.MultiBinary]:
+        """Set the three up; returns the spaces of one target."""
+        self.world, self.render_mode = _problem(world, options), render_mode
+        if render_mode is not None and render_mode not in _MODES:
+            raise UserError(f"render_mode={render_mode}: expected one of {', '.join(_MODES)}")
+        self._env = TrackEnv(self.world, shape)
+        return _spaces(self.world)
+
+    def _begin(self, rng: np.random.Generator, seed: int | None, *, begun: bool) -> TensorDictBase:
+        """New episodes; the first ones of what `rng` gives, if there is a seed or none have been before."""
+        if seed is not None or not begun:
+            self._env.set_seed(int(rng.integers(2**31)))
+        return self._env.reset()
+
+    def render(self) -> Any:
+        """The (first target's) grid after the last step, in the render mode."""
+        return None if self.render_mode is None else self._env.render(_MODES[self.render_mode])
+
+
+class TrackGym(_Tracking, gymnasium.Env[Observation, npt.NDArray[np.int8]]):
     """One target (paper, Section II); `info["target"]` is its true cell, M once it has exited.
 
     An observation has the keys of `TrackEnv`, an action is a `MultiBinary(K)`: the sensors to switch on.
@@ -42,10 +70,7 @@ class TrackGym(gymnasium.Env[Observation, npt.NDArray[np.int8]]):
     metadata: dict[str, Any] = {"render_modes": list(_MODES), "render_fps": 4}  # noqa: RUF012, Gymnasium's own form
 
     def __init__(self, world: Problem | None = None, *, render_mode: str | None = None, **options: Any) -> None:
-        self.world, self.render_mode = _problem(world, options), render_mode
-        _check_mode(render_mode)
-        self.observation_space, self.action_space = _spaces(self.world)
-        self._env = TrackEnv(self.world, ())
+        self.observation_space, self.action_space = self._make(world, options, render_mode, ())
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -53,19 +78,13 @@ class TrackGym(gymnasium.Env[Observation, npt.NDArray[np.int8]]):
         """A new episode; with a seed, the first one of it. There are no `options`."""
         begun = self._np_random is not None
         super().reset(seed=seed, options=options)
-        if seed is not None or not begun:
-            self._env.set_seed(int(self.np_random.integers(2**31)))
-        return self._seen(self._env.reset()), self._info()
+        return self._seen(self._begin(self.np_random, seed, begun=begun)), self._info()
 
     def step(self, action: npt.NDArray[np.int8]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One step with the sensors of `action` `[K]` on."""
         after = self._env.step(_acting(action, ()))["next"]
         ends = (bool(after[key].item()) for key in ("terminated", "truncated"))
         return self._seen(after), after["reward"].item(), *ends, self._info()
-
-    def render(self) -> Any:
-        """The grid after the last step, in the render mode."""
-        return None if self.render_mode is None else self._env.render(_MODES[self.render_mode])
 
     def _seen(self, state: TensorDictBase) -> Observation:
         seen = _numpy(state, self.observation_space)
@@ -76,7 +95,7 @@ class TrackGym(gymnasium.Env[Observation, npt.NDArray[np.int8]]):
         return {"target": int(self._env.target)}
 
 
-class TrackVector(VectorEnv[Observation, npt.NDArray[np.int8], npt.NDArray[Any]]):
+class TrackVector(_Tracking, VectorEnv[Observation, npt.NDArray[np.int8], npt.NDArray[Any]]):
     """A batch of targets stepped at once; an episode that ends is begun anew in the same step.
 
     `infos["target"]` `[B]` are the true cells at the end of the step; where an episode ended, `infos["final_obs"]` is
@@ -97,12 +116,10 @@ class TrackVector(VectorEnv[Observation, npt.NDArray[np.int8], npt.NDArray[Any]]
     def __init__(
         self, num_envs: int = 1, world: Problem | None = None, *, render_mode: str | None = None, **options: Any
     ) -> None:
-        self.world, self.num_envs, self.render_mode = _problem(world, options), num_envs, render_mode
-        _check_mode(render_mode)
-        self.single_observation_space, self.single_action_space = _spaces(self.world)
+        self.num_envs = num_envs
+        self.single_observation_space, self.single_action_space = self._make(world, options, render_mode, (num_envs,))
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._env = TrackEnv(self.world, num_envs)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -110,9 +127,8 @@ class TrackVector(VectorEnv[Observation, npt.NDArray[np.int8], npt.NDArray[Any]]
         """New episodes; with a seed, the first ones of it. There are no `options`."""
         begun = self._np_random is not None
         super().reset(seed=seed, options=options)
-        if seed is not None or not begun:
-            self._env.set_seed(int(self.np_random.integers(2**31)))
-        return _numpy(self._env.reset(), self.observation_space), {"target": self._env.target.numpy()}
+        rows = self._begin(self.np_random, seed, begun=begun)
+        return _numpy(rows, self.observation_space), {"target": self._env.target.numpy()}
 
     def step(
         self, actions: npt.NDArray[np.int8]
@@ -140,20 +156,11 @@ class TrackVector(VectorEnv[Observation, npt.NDArray[np.int8], npt.NDArray[Any]]
         info = {"target": np.where(done, self._env.target.numpy(), 0), "_target": done}
         return {"final_obs": final, "_final_obs": done, "final_info": info, "_final_info": done}
 
-    def render(self) -> Any:
-        """The first target's grid after the last step, in the render mode."""
-        return None if self.render_mode is None else self._env.render(_MODES[self.render_mode])
-
 
 def _problem(world: Problem | None, options: dict[str, Any]) -> Problem:
     if world is not None and options:
         raise UserError(f"{', '.join(options)}: expected either a world, or options to make one of")
     return make_world(**options) if world is None else world
-
-
-def _check_mode(mode: str | None) -> None:
-    if mode is not None and mode not in _MODES:
-        raise UserError(f"render_mode={mode}: expected one of {', '.join(_MODES)}")
 
 
 def _spaces(world: Problem) -> tuple[spaces.Dict, spaces.MultiBinary]:
