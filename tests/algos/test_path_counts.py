@@ -138,9 +138,11 @@ def test_what_does_not_know_hidden_modes_says_so(here: Path, capsys: pytest.Capt
     told = refused(capsys, "train", "kernel=heading")
     assert told == "algo=hindsight: expected path_counts with kernel=heading"
     told = refused(capsys, "solve", "kernel=heading", "solver=qmdp")
-    assert told == "kernel=heading: expected with it solver=optimal, verify=false and no blocks"
-    told = refused(capsys, "evaluate", "kernel=heading", "baseline=qmdp")
-    assert told == "kernel=heading: expected a kernel without a hidden mode, which solve and train know"
+    assert told == "kernel=heading: expected with it solver=optimal, and no blocks"
+    told = refused(capsys, "benchmark", "kernel=heading")
+    assert told == "kernel=heading: expected a kernel without a hidden mode"
+    told = refused(capsys, "train", "algo=path_counts", "kernel=heading", "kernel.reveals=true")
+    assert told == "kernel.reveals=true: expected false with train, whose algorithms learn no modes"
     told = refused(capsys, "solve", "task.memory=displacement")
     assert told.startswith("task.memory=displacement: expected cell with kernel=random_support")
     assert not list(here.iterdir())

@@ -72,7 +72,8 @@ def test_a_solver_is_valued(site: Path, tmp_path: Path) -> None:
         (f"{TRAIN} algo.bed=1000000000000000", "algo.bed=1000000000000000: needs about"),
         (
             "train kernel=jmup",
-            "kernel=jmup: expected one of random_support, random_walk, drift, heading, table, tracks, jump",
+            "kernel=jmup: expected one of random_support, random_walk, drift, table, tracks, heading, regimes, "
+            "constant_velocity, coordinated_turn, jump",
         ),
     ],
 )

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from scipy import sparse
 
 from tests.helpers import random_kernel
@@ -16,7 +17,9 @@ from trackmdp.policies.policy import Policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.bounds import clocked
 from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers.keyed import averaged
 from trackmdp.solvers.keyed_search import mode_bound, solve_keys
+from trackmdp.world.env import TrackEnv
 from trackmdp.world.model import World
 from trackmdp.world.modes import HiddenWorld, heading_kernel
 
@@ -61,11 +64,12 @@ def test_one_mode_is_the_world_without_modes(seed: int) -> None:
     assert mode_bound(hidden)[:, 0] == pytest.approx(clocked(world), rel=1e-6)
 
 
-@pytest.mark.parametrize("memory", ["cell", *MORE])
+@pytest.mark.parametrize("known", ["cell", *MORE, "mode"])
 @pytest.mark.parametrize("detection", [1.0, 0.8])
-def test_the_exact_value_is_that_of_the_game(memory: str, detection: float) -> None:
-    """4,000 simulated episodes agree within 3 standard errors, whatever the policy remembers."""
-    world = headings(memory=memory, detection=detection, safe_cost=0.5)
+def test_the_exact_value_is_that_of_the_game(known: str, detection: float) -> None:
+    """4,000 simulated episodes agree within 3 standard errors, whatever the policy remembers or is told."""
+    more: dict[str, Any] = {"revealed": 8} if known == "mode" else {"memory": known}
+    world = headings(detection=detection, safe_cost=0.5, **more)
     policy = random_policy(world, 3)
     exact = evaluate(world, policy)
     played = simulate(world, Policy.from_table(policy), 4000, seed=5).figures()
@@ -74,17 +78,28 @@ def test_the_exact_value_is_that_of_the_game(memory: str, detection: float) -> N
     assert abs(played.expected_length.mean - exact.expected_length) < 3 * played.expected_length.standard_error
 
 
-def test_the_best_keyed_policy_of_a_tiny_world() -> None:
-    """Brute force over all plans of keys on a line of 2 cells, t_max = 0: 4 sets for each of the keys that occur."""
-    # Two modes: to and fro (the cell changes with .9), or lazy (it stays with .9); the mode changes with .2.
+def to_and_fro(**more: Any) -> HiddenWorld:
+    """Two cells and two modes: to and fro (the cell changes with .9), or lazy (it stays); the mode changes with .2."""
     move = {0: np.array([[0.1, 0.9], [0.9, 0.1]]), 1: np.array([[0.9, 0.1], [0.1, 0.9]])}
     kernel = np.zeros((4, 4))
     for x, u, y, v in itertools.product(range(2), repeat=4):
         kernel[2 * x + u, 2 * y + v] = 0.9 * move[v][x, y] * (0.8 if u == v else 0.2)
-    world = HiddenWorld(kernel, (1, 2), modes=2, cost=0.45, t_max=0, safe_cost=0.7, memory="displacement", clip=1)
-    # On a line the displacements are -1, 0 and 1: of class 0 (start) and three more each cell has two that occur.
+    return HiddenWorld(kernel, (1, 2), modes=2, cost=0.45, t_max=0, safe_cost=0.7, **more)
+
+
+@pytest.mark.parametrize(
+    ("more", "occurring"),
+    [
+        # On a line the displacements are -1, 0 and 1: of class 0 (start) and three more each cell has two that occur.
+        ({"memory": "displacement", "clip": 1}, [0, 5, 4, 10, 15, 16]),
+        ({"revealed": 2}, [0, 1, 2, 3]),
+        ({"revealed": 2, "detection": 0.8}, [0, 1, 2, 3]),
+    ],
+)
+def test_the_best_keyed_policy_of_a_tiny_world(more: dict[str, Any], occurring: list[int]) -> None:
+    """Brute force over all plans of the keys that occur: 4 sets for each, t_max = 0."""
+    world = to_and_fro(**more)
     found = solve_keys(world)
-    occurring = [int(x * 10 + u) for x, u in ((0, 0), (0, 5), (0, 4), (1, 0), (1, 5), (1, 6))]
     best = -np.inf
     sets = list(itertools.product([False, True], repeat=2))
     for choice in itertools.product(sets, repeat=len(occurring)):
@@ -93,6 +108,65 @@ def test_the_best_keyed_policy_of_a_tiny_world() -> None:
         best = max(best, evaluate(world, PolicyTable.from_dense(world, table)).aihtr)
     assert found.lower == pytest.approx(best)
     assert best <= found.upper
+
+
+def test_values_by_hand_where_the_mode_is_told() -> None:
+    """t_max = 0, and .9 to be in the grid after a step."""
+    world = to_and_fro(revealed=2)
+    # All on, 2 sensors: V = .9 (1 - .9 + V) = .09 / .1.
+    assert evaluate(world, PolicyTable.all_on(world)).value == pytest.approx([0.9, 0.9])
+    # After mode 0 the other cell alone, after mode 1 its own: right with .8 · .9 + .2 · .1 = .74. By symmetry one V:
+    # .9 (.74 - .45 + .74 V) + .9 · .26 · .9 (1 - .7 + V) whatever the mode.
+    table = np.zeros((4, 1, 2), dtype=bool)
+    table[[0, 1, 2, 3], 0, [1, 0, 0, 1]] = True
+    hit, missed = 0.9 * 0.74, 0.9 * 0.26 * 0.9
+    by_hand = (hit - 0.9 * 0.45 + missed * (1 - 0.7)) / (1 - hit - missed)
+    assert evaluate(world, PolicyTable.from_dense(world, table)).value == pytest.approx([by_hand, by_hand])
+
+
+@pytest.mark.parametrize(("keep", "cost", "loss"), [(0.9, 0.16, 0.052), (0.7, 0.16, 0.033), (0.9, 0.08, 0.014)])
+def test_a_told_heading_leaves_little_to_lose(keep: float, cost: float, loss: float) -> None:
+    """Per step to the bound that knows the heading at all times, on 6 x 6: at most what the prototype found."""
+    kernel, modes = heading_kernel(6, keep=keep, go=0.9, exit_probability=0.01)
+    found = solve_keys(HiddenWorld(kernel, 6, modes=modes, cost=cost, t_max=1, revealed=8))
+    lost = (found.upper - found.lower) / found.evaluation.expected_length
+    assert 0.9 * loss < lost < loss + 0.001
+
+
+def test_a_told_mode_is_worth_more_than_any_memory() -> None:
+    told, remembered = solve_keys(headings(revealed=8)), solve_keys(headings(memory="displacement_gap"))
+    assert remembered.lower < told.lower < told.upper
+    # Whoever is told may still remember the displacement alone, and is worth what that is.
+    again = evaluate(headings(revealed=8), remembered.table)
+    assert again.aihtr == pytest.approx(remembered.lower)
+
+
+def test_averaged_moves_are_those_that_are_seen() -> None:
+    """Counted over 20,000 steps of the environment, cell to cell; the mode differs from cell to cell at the border."""
+    world = headings(keep=0.9)
+    cells = averaged(world)
+    assert (cells.memory, cells.revealed, cells.kernel.shape) == ("cell", 1, (9, 9))
+    env, seen = TrackEnv(world, 2000, seed=1), np.zeros((9, 10))
+    state = env.reset()
+    for _ in range(40):
+        before = env.target.numpy()
+        state["action"] = torch.ones(2000, 9, dtype=torch.bool)
+        frame, state = env.step_and_maybe_reset(state)
+        after = np.where(frame["next", "terminated"].squeeze(-1), 9, frame["next", "last_cell"])
+        np.add.at(seen, (before, after), 1)
+    total = seen.sum(axis=1, keepdims=True)
+    expected = np.append(cells.kernel.toarray(), 1 - cells.kernel.sum(axis=1)[:, None], axis=1)
+    error = np.sqrt(expected * (1 - expected) / total)
+    assert (np.abs(seen / total - expected) < 5 * error + 1e-12).all()
+
+
+def test_a_policy_with_a_memory_is_worth_the_same_where_memory_is_none() -> None:
+    """In a world without modes a keyed policy whose plans are those of its cells earns what these do."""
+    world = World(random_kernel(np.random.default_rng(4), 9, 0.1), 3, cost=0.2, t_max=1)
+    plans = np.random.default_rng(5).random((9, 2, 9)) < 0.4
+    task = world.remembering("displacement", clip=1)
+    keyed = PolicyTable.from_dense(task, np.repeat(plans, task.keys.num_classes, axis=0))
+    assert evaluate(world, keyed).value == pytest.approx(evaluate(world, plans).value)
 
 
 def test_a_bound_is_above_what_solving_finds_and_memory_pays() -> None:

@@ -26,7 +26,15 @@ def absolute_paths(cfg: Any, folder: Path) -> None:
     for _, node in nodes(cfg):
         for name, described in options(type(node)).items():
             value = vars(node)[name]
-            if isinstance(described, Option) and described.path and isinstance(value, str):
-                # resume=auto is a word, not a file called `auto`. `folder / value` is `value`
-                # itself where that is absolute.
-                setattr(node, name, value if value in described.words else str(folder / value))
+            if isinstance(described, Option) and described.path:
+                # resume=auto is a word, not a file called `auto`.
+                setattr(node, name, value if value in described.words else _absolute(value, folder))
+
+
+def _absolute(value: Any, folder: Path) -> Any:
+    """A path, or in a list of choices with their options (`kernel.regimes`) each `path`; anything else as it is."""
+    if isinstance(value, str):
+        return str(folder / value)  # `value` itself where that is absolute
+    if isinstance(value, list):
+        return [_absolute(each, folder) if isinstance(each, dict) else each for each in value]
+    return value | {"path": _absolute(value["path"], folder)} if isinstance(value, dict) and "path" in value else value

@@ -7,25 +7,18 @@ contain a selector (``${credit}/ppo``). Packages, `override` and `experiment` ar
 
 from __future__ import annotations
 
-import copy
 import os
 from collections.abc import Iterator, Mapping
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
-
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from trackmdp.config.checks import absolute_paths, validate
 from trackmdp.config.ignored import refuse_ignored
 from trackmdp.config.options import GROUPS, SELECTORS, Option, optional, options, refuse, several
 from trackmdp.config.refusals import refuse_renamed, unknown_choice, unknown_option
-from trackmdp.config.registry import conf_file
-from trackmdp.config.resolvers import register_resolvers
 from trackmdp.config.roots import ROOTS
 from trackmdp.config.tree import build_config
-from trackmdp.errors import UserError
+from trackmdp.config.values import choice_values, read_values, resolved
 
 __all__ = ["Default", "compose", "default", "given"]
 
@@ -42,7 +35,7 @@ def compose(command: str, overrides: Mapping[str, Any] | None = None, *, folder:
         UserError: a name, a type or a range is wrong, or a rule between options is broken.
     """
     typed = {key: _plain(value) for key, value in (overrides or {}).items()}
-    root = _read(command)
+    root = read_values(command)
     schema = ROOTS[command]
     chosen = _chosen(root, schema, typed)
     # Only what the schema names: the files of the commands also have `defaults` and `hydra`, which are for the
@@ -58,7 +51,7 @@ def compose(command: str, overrides: Mapping[str, Any] | None = None, *, folder:
     for key, value in typed.items():
         if key not in chosen:
             _put(values, key, value, known)
-    cfg = build_config(_resolved(values, known), schema)
+    cfg = build_config(resolved(values, known), schema)
     validate(cfg)
     refuse_ignored(cfg, typed, chosen)
     absolute_paths(cfg, folder or Path.cwd())
@@ -120,31 +113,12 @@ def _chosen(root: Mapping[str, Any], schema: type[Any], typed: Mapping[str, Any]
 def _values_of(group: str, name: Any, chosen: Mapping[str, Any]) -> dict[str, Any] | None:
     """The values of what is chosen from a group: of a list of choices by their names, and null of none."""
     if isinstance(name, list):
-        return {each: _without_name(_choice(group, each, chosen)) for each in name}
-    return None if name is None else _choice(group, name, chosen)
+        return {each: _without_name(choice_values(group, each, chosen)) for each in name}
+    return None if name is None else choice_values(group, name, chosen)
 
 
 def _without_name(values: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in values.items() if key != "name"}
-
-
-def _choice(group: str, name: str, chosen: Mapping[str, Any]) -> dict[str, Any]:
-    """The values of one choice with its `name`, its defaults list followed."""
-    # Example: algo=ppo credit=per_sensor. conf/algo/ppo.yaml names /credit@_here_: '${credit}/ppo', hence
-    # conf/credit/per_sensor/ppo.yaml, whose own list names /algo/base_ppo_per_sensor@_here_: the choice's name
-    # is ppo_per_sensor.
-    values = _read(f"{group}/{name}")
-    merged: dict[str, Any] = {}
-    for entry in values.pop("defaults", []):
-        if isinstance(entry, str):  # base_ppo, or /algo/base_ppo@_here_: the schema
-            merged["name"] = entry.split("/")[-1].split("@")[0].removeprefix("base_")
-            continue
-        for target, other in entry.items():  # {/credit@_here_: '${credit}/ppo'}
-            for selector, selected in chosen.items():
-                other = other.replace(f"${{{selector}}}", str(selected))
-            merged |= _choice(target.strip("/").split("@")[0], other, chosen)
-    # The file's own values win over those of its defaults list, as in Hydra (1.1 and later) without `_self_`.
-    return merged | values
 
 
 def _known(schema: type[Any], values: Any, prefix: str = "") -> Iterator[tuple[str, Option]]:
@@ -184,44 +158,12 @@ def _put(values: dict[str, Any], key: str, value: Any, known: Mapping[str, Optio
     values[last] = value
 
 
-def _resolved(values: dict[str, Any], known: Mapping[str, Option]) -> dict[str, Any]:
-    """The values with every ``${...}`` replaced by what it stands for."""
-    register_resolvers()
-    config = OmegaConf.create(values)
-    # Looked for before resolving, which would leave `???` in place; sorted, since a set names another key at
-    # each call.
-    for key in sorted(OmegaConf.missing_keys(config)):
-        raise UserError(f"{key}: missing, expected {known[key].expected}")
-    try:
-        # Resolved last: `${algo.total_frames}` in the collector must stand for the value that was given,
-        # not for the default.
-        plain: Any = OmegaConf.to_container(config, resolve=True)
-    except OmegaConfBaseException as error:
-        # OmegaConf's further lines (full_key, object_type) are of no use to whoever typed the option.
-        raise UserError(str(error).splitlines()[0]) from error
-    return dict(plain)
-
-
-def _read(name: str) -> dict[str, Any]:
-    """A file of `conf/`, uninterpreted."""
-    file = conf_file(name)
-    # A copy, since the callers pop and set keys, and the cached dict is shared by every later call. The time of
-    # the last change is part of the cache's key, so that an edited file is read again.
-    return copy.deepcopy(_load(file, file.stat().st_mtime_ns))
-
-
-@lru_cache(maxsize=128)  # parsing is nine tenths of composing
-def _load(file: Path, stamp: int) -> dict[str, Any]:  # noqa: ARG001  (the stamp tells a file from what it was before)
-    plain = OmegaConf.to_container(OmegaConf.load(file))
-    # YAML keys may be numbers; dataclass fields are named by texts.
-    assert isinstance(plain, dict), file
-    return {str(key): value for key, value in plain.items()}
-
-
 def _plain(value: Any) -> Any:
     """A value as it would be read from a file: numpy's numbers and arrays, tuples and paths become plain ones."""
     if hasattr(value, "tolist"):
         return value.tolist()
     if isinstance(value, os.PathLike):
         return os.fspath(value)
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
     return [_plain(item) for item in value] if isinstance(value, (list, tuple)) else value

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from trackmdp.config import learned_kernel, path_counts, per_sensor  # noqa: F401  (more algorithms to choose from)
+from trackmdp.config import learned_kernel, modes, path_counts, per_sensor  # noqa: F401  (more to choose from)
 from trackmdp.config.baselines import BaselineConfig
 from trackmdp.config.learning import DEVICE, AlgoConfig, CollectorConfig
 from trackmdp.config.loggers import LogConfig
@@ -46,7 +46,7 @@ class WorldConfig(CommandConfig):
     """What every command has that takes place in a world."""
 
     needs_motion: ClassVar[bool] = True
-    knows_modes: ClassVar[bool] = False
+    knows_modes: ClassVar[bool] = True
     """Whether the target may have a hidden mode."""
     grid: GridConfig
     kernel: KernelConfig
@@ -56,7 +56,8 @@ class WorldConfig(CommandConfig):
     @property
     def remembered(self) -> dict[str, Any]:
         """What policies remember, as arguments of `Task`: the cell, where the command has no options of it."""
-        return {}
+        task: TaskConfig | None = getattr(self, "task", None)
+        return {} if task is None else {"memory": task.memory, "clip": task.clip}
 
 
 @dataclass(kw_only=True)
@@ -99,7 +100,6 @@ class TrainConfig(WorldConfig):
     """Learn a policy without the motion model, and evaluate it exactly."""
 
     needs_motion: ClassVar[bool] = False
-    knows_modes: ClassVar[bool] = True
     learns: ClassVar[bool] = True
     seed: int = option("every random draw of the run derives from it", ge=0)
     device: str = option("device the networks live on", expects="cpu, cuda, cuda:N or auto", pattern=DEVICE)
@@ -121,17 +121,13 @@ class TrainConfig(WorldConfig):
         "start from the weights of another run, where shapes fit", expects="the folder of a run", path=True
     )
 
-    @property
-    def remembered(self) -> dict[str, Any]:
-        """The options of `task`."""
-        return {"memory": self.task.memory, "clip": self.task.clip}
-
 
 @dataclass(kw_only=True)
 class EvaluateConfig(WorldConfig):
     """Value a trained policy (run=) or a baseline (baseline=), exactly and by simulation."""
 
     needs_motion: ClassVar[bool] = False
+    task: TaskConfig
     run: str | None = option(
         "folder of a training run; its world is taken from there", expects="the folder of a run", path=True
     )
@@ -156,16 +152,10 @@ class EvaluateConfig(WorldConfig):
 class SolveConfig(WorldConfig):
     """Solve the world with its motion model."""
 
-    knows_modes: ClassVar[bool] = True
     task: TaskConfig
     solver: BaselineConfig
     partition: PartitionConfig
     verify: bool = option("check the paper's theorems on this world as well")
-
-    @property
-    def remembered(self) -> dict[str, Any]:
-        """The options of `task`."""
-        return {"memory": self.task.memory, "clip": self.task.clip}
 
 
 @dataclass(kw_only=True)
@@ -179,6 +169,7 @@ class VerifyConfig(WorldConfig):
 class BenchmarkConfig(WorldConfig):
     """Measure time and memory on this machine; how good the policies are, sweeps and reports say."""
 
+    knows_modes: ClassVar[bool] = False
     part: str = option(
         "what is measured",
         choices=("env", "collector", "train", "size", "handoff", "memory", "peers", "log"),

@@ -90,6 +90,8 @@ class TaskConfig(NodeConfig):
         if root.kernel.is_motion and not root.kernel.hides:
             expected = f"cell with kernel={root.kernel.name}, whose next move depends on the cell alone"
             raise refuse(f"{key}.memory", self.memory, expected)
+        if root.kernel.hides and root.kernel.reveals:
+            raise refuse(f"{key}.memory", self.memory, "cell with kernel.reveals=true: a detection tells all there is")
 
     def ignored(self, root: Any) -> dict[str, str]:
         """Where the cell alone is remembered there is no displacement."""
@@ -105,7 +107,7 @@ class KernelConfig(ChoiceConfig):
 
     is_motion: ClassVar[bool] = True
     hides: ClassVar[bool] = False
-    """Whether the target has a hidden mode: it then makes a kernel on (cell, mode), and the number of modes."""
+    """Whether the target has a mode beside its cell (`trackmdp.config.modes`)."""
 
     @property
     def source(self) -> str:
@@ -156,33 +158,6 @@ class DriftConfig(KernelConfig):
     persistence: float = option("probability of keeping to the heading", unit="per step", ge=0, le=1)
     exit_probability: float = option("probability of leaving the grid", unit="per step", ge=0, lt=1)
     border: str = option("what becomes of positions outside the grid", choices=BORDERS)
-
-
-@choice("kernel", "heading", makes="trackmdp.world.modes:heading_kernel")
-@dataclass(kw_only=True)
-class HeadingConfig(KernelConfig):
-    """A target with one of eight headings, which the tracker is not shown; at the border it turns back."""
-
-    hides: ClassVar[bool] = True
-    keep: float = option("probability of keeping the heading; else it turns by 45 degrees", unit="per step", ge=0, le=1)
-    go: float = option("probability of moving one cell that way; else it stays", unit="per step", ge=0, le=1)
-    exit_probability: float = option("probability of leaving the grid", unit="per step", gt=0, lt=1)
-
-    def check(self, key: str, root: Any) -> None:
-        """What knows of hidden modes: `solve` over keys, and learners that remember."""
-        if not root.knows_modes:
-            raise refuse(key, self.name, "a kernel without a hidden mode, which solve and train know")
-        if root.learns:
-            if not root.algo.remembers:
-                readers = [name for name, schema in GROUPS["algo"].items() if schema.remembers]
-                raise refuse("algo", root.algo.name, f"{' or '.join(readers)} with kernel={self.name}")
-            if any(node.episodes_only for node in root.log.values()):
-                raise refuse("log", listed(root.log), f"none but csv and tensorboard with kernel={self.name}")
-        elif root.solver.name != "optimal" or root.verify or root.partition.block is not None:
-            raise refuse(key, self.name, "with it solver=optimal, verify=false and no blocks")
-        for name in ("max_steps", "window"):
-            if (value := getattr(root.grid, name)) is not None:
-                raise refuse(f"grid.{name}", value, f"null with kernel={self.name}")
 
 
 @choice("kernel", "table", makes="trackmdp.world.kernels:load_table")

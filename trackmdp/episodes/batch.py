@@ -85,6 +85,7 @@ class Episodes(Sequence[Episode]):
         sensors: `[S]`, how many were on.
         bits: `[S, ceil(M/8)]`, the actions, eight sensors to a byte; None where they follow from the policy.
         key: `[S]`, what the policy remembered before each step; None where that is the last cell alone.
+        mode: `[S]`, the target's mode after the step, 0 once exited; None where targets have none.
     """
 
     problem: Problem
@@ -100,6 +101,7 @@ class Episodes(Sequence[Episode]):
     sensors: npt.NDArray[np.int32]
     bits: npt.NDArray[np.uint8] | None
     key: npt.NDArray[np.int32] | None = None
+    mode: npt.NDArray[np.int32] | None = None
 
     @classmethod
     def of(cls, problem: Problem, policy: Policy | None, seeds: Sequence[int], batches: Sequence[Steps]) -> Episodes:
@@ -146,6 +148,7 @@ class Episodes(Sequence[Episode]):
             # Cell M stands for the exit, which no later step follows.
             terminated=bool(target[-1] == self.problem.num_cells),
             truncated=bool(self.truncated[steps][-1]),
+            mode=None if self.mode is None else self.mode[steps].astype(np.int64),
         )
 
     def _keys(self, steps: slice, last_cell: Integers) -> Integers:

@@ -39,6 +39,7 @@ class Episode:
         belief: `[T, M]` probability of each cell after the move, given all that was observed before it; a row sums to
             the probability of no exit. None unless it was asked for.
         probability: `[T, M]` with which the policy switched each sensor on. None unless it was asked for.
+        mode: `[T]` the target's mode after the move, 0 once exited; None where targets have none.
     """
 
     number: int
@@ -54,6 +55,7 @@ class Episode:
     truncated: bool
     belief: Floats | None = None
     probability: Floats | None = None
+    mode: Integers | None = None
     first_tick: int | None = field(default=None)
     """Place of its first step on the log's time line; None until it is logged."""
 

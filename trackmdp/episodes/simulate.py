@@ -18,6 +18,7 @@ from trackmdp.policies.playback import Playback
 from trackmdp.policies.policy import PolicyLike
 from trackmdp.seeding import derive, preserved_global_rng
 from trackmdp.world.costs import Costs
+from trackmdp.world.modes import check_revealed
 from trackmdp.world.reports import Reports
 from trackmdp.world.tracks import Problem
 
@@ -57,6 +58,8 @@ def resimulate(problem: Problem, policy: PolicyLike | Playback, seeds: Sequence[
     """One episode for each of `seeds`, in their order; each the same whatever the others are. See `simulate`."""
     costs, reports, source = Costs(problem), Reports(problem), source_of(problem)
     actor = actor_of(problem.task, policy, costs)
+    if actor.policy is not None:
+        check_revealed(problem, actor.policy.task.revealed)
     at_once = [seeds[begin : begin + actor.most_rows] for begin in range(0, len(seeds), actor.most_rows)]
     with preserved_global_rng():
         # What a function or module draws from torch's global generator is then the same in every call.
@@ -127,16 +130,17 @@ class _Batch:
         self._task, self._source, self._actor = problem, source, actor
         self._costs, self._reports = rules
         # What a policy remembers is its own; whatever else acts knows the cell.
-        self._keys = (actor.policy.task if actor.policy else problem.forgetful).keys
+        self._keys = (actor.policy.task if actor.policy else problem.remembering()).keys
         self._draws = _Draws(source, seeds, actor.num_draws, certain=self._reports.certain)
         self._steps = Steps(len(seeds))
 
     def run(self) -> Steps:
         """Step until the last episode has ended."""
         place = self._draws.starts()
-        start = self._source.cell(place)
+        start, mode = self._source.cell(place), self._source.mode(place)
         self._steps.begin(start)
-        at = _At(torch.arange(len(start)), place, start, self._keys.start(start), torch.zeros_like(start))
+        key = self._keys.start(start, mode)
+        at = _At(torch.arange(len(start)), place, start, key, torch.zeros_like(start))
         step = 0
         while len(at.row):
             at = self._step(at, step)
@@ -158,14 +162,16 @@ class _Batch:
         reward = self._costs.reward_of(choice.spent, located, forced, in_grid)
         # An exit on the last step allowed is an exit (terminated), not a truncation.
         truncated = self._truncated(place, step) & in_grid
-        columns = {"key": at.key} if self._keys.order else {}
+        mode = self._source.mode(place)
+        columns = {"key": at.key} if self._keys.num_classes > 1 else {}
+        columns |= {} if mode is None else {"mode": mode}
         columns |= {"misses": at.misses, "target": target, "located": located, "reward": reward}
         self._steps.add(at.row, choice, truncated=truncated, **columns)
         # `[R']`, the positions of those still running: only they are carried over, so that a step's cost falls as
         # episodes end.
         going_on = (in_grid & ~truncated).nonzero().squeeze(-1)
         last_cell = torch.where(located, target, at.last_cell)
-        known = self._keys.next(at.key, at.misses, target.clamp_max(self._task.num_cells - 1))
+        known = self._keys.next(at.key, at.misses, target.clamp_max(self._task.num_cells - 1), mode)
         key = torch.where(located, known, at.key)
         # The clock stands still while the safe action is repeated.
         misses = torch.where(located, 0, (at.misses + 1).clamp_max(self._task.t_max + 1))

@@ -36,6 +36,10 @@ class Source(Protocol):
         """`[B]` cells; M for a target that has exited."""
         ...
 
+    def mode(self, place: Tensor) -> Tensor | None:
+        """`[B]` modes, 0 for a target that has exited; None where targets have none."""
+        ...
+
     def stops(self, place: Tensor) -> Tensor:
         """`[B]` bool, whether the recording stops here with the target still in the grid."""
         ...
@@ -59,6 +63,9 @@ class _Sampled:
     def cell(self, place: Tensor) -> Tensor:
         return place
 
+    def mode(self, place: Tensor) -> Tensor | None:  # noqa: ARG002
+        return None
+
     def stops(self, place: Tensor) -> Tensor:
         return torch.zeros_like(place, dtype=torch.bool)
 
@@ -72,6 +79,9 @@ class _Hidden(_Sampled):
 
     def cell(self, place: Tensor) -> Tensor:
         return place // self._modes
+
+    def mode(self, place: Tensor) -> Tensor | None:
+        return place % self._modes
 
 
 class _Replayed:
@@ -100,6 +110,9 @@ class _Replayed:
 
     def cell(self, place: Tensor) -> Tensor:
         return self._line[place]
+
+    def mode(self, place: Tensor) -> Tensor | None:  # noqa: ARG002
+        return None
 
     def stops(self, place: Tensor) -> Tensor:
         return self._stops[place]

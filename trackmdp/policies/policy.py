@@ -83,7 +83,7 @@ class Policy(TensorDictModuleBase, PolicyTable):
     ) -> None:
         TensorDictModuleBase.__init__(self)
         PolicyTable.__init__(self, task, sets, probability=probability, k=k)
-        if task.order:
+        if task.keyed:
             self.in_keys = ["last_cell", "key", "steps_since_detection"]
         self.generator: torch.Generator | None = None
         self._lookup: DenseTable | SparseTable | None = None
@@ -143,7 +143,7 @@ class Policy(TensorDictModuleBase, PolicyTable):
 
     @classmethod
     def _unrolled(cls, task: Task, rule: Rule, device: torch.device | str, *, check: bool) -> Policy:
-        task = task.forgetful  # a rule is asked what it does knowing the cell
+        task = task.remembering()  # a rule is asked what it does knowing the cell
         sets = unrolled(task, rule, torch.device(device))
         if check and draws(task, rule, torch.device(device), sets):
             raise DrawsError(f"policy: draws at random, so that it has no exact value; {TAKE_ITS_MODE}")
@@ -199,7 +199,7 @@ class Policy(TensorDictModuleBase, PolicyTable):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action` `[*B, K]`: over all cells, or in the local numbers of the window around `last_cell`."""
         last_cell, n = tensordict["last_cell"], tensordict["steps_since_detection"]
-        key = tensordict["key"] if self.task.order else last_cell
+        key = tensordict["key"] if self.task.keyed else last_cell
         if self.deterministic:
             return tensordict.set("action", self._near(key, n))
         # A generator draws on its own device only.
@@ -274,7 +274,7 @@ def as_policy(task: Task, policy: PolicyLike, *, device: torch.device | str | No
 
 def actor_table(task: Task, actor: TensorDictModuleBase, *, device: torch.device, check: bool = True) -> Policy:
     """The table of a learner's actor; one that has a table already, or remembers more than the cell, is it."""
-    if isinstance(actor, Policy) and (actor.sets is not None or actor.task.order):
+    if isinstance(actor, Policy) and (actor.sets is not None or actor.task.keyed):
         return actor
     return Policy.from_module(task, actor, device=device, check=check)
 

@@ -44,6 +44,8 @@ def save_policy(file: Path, policy: PolicyTable, value: Array | None = None, **m
     content: dict[str, Any] = {f"task_{name}": _number(getattr(policy.task, name)) for name in names}
     if policy.task.memory != "cell":  # what is not there is the paper's
         content |= {"task_memory": np.str_(policy.task.memory), "task_clip": np.int64(policy.task.clip)}
+    if policy.task.revealed > 1:
+        content["task_revealed"] = np.int64(policy.task.revealed)
     if policy.sets is None:
         content["probability"] = np.float64(policy.probability)
     else:
@@ -100,7 +102,7 @@ def write_sets(folder: Path, policy: PolicyTable, **arrays: Array) -> dict[str, 
 
 
 def read_sets(task: Task, file: str | Path) -> PolicyTable:
-    """The policy in a `sets.json`, or in a `sets.npz` or `policy.npz`, for `task`.
+    """The policy in a `sets.json`, or in a `sets.npz` or `policy.npz`, for `task`; what it remembers is its own.
 
     Raises:
         UserError: the file is missing or damaged, holds something else, or is for another grid or t_max.
@@ -109,20 +111,25 @@ def read_sets(task: Task, file: str | Path) -> PolicyTable:
     if file.suffix == ".npz":
         table = load_policy(file)[0]
         table.check_fits(task)
-        return PolicyTable(task, table.sets, probability=table.probability, k=table.k)
+        made = table.task
+        own = task.remembering(made.memory, clip=made.clip, revealed=made.revealed)
+        return PolicyTable(own, table.sets, probability=table.probability, k=table.k)
     if file.suffix != ".json":
         raise UserError(f"{file}: expected a sets.json, or a sets.npz or policy.npz")
     content = read_object(file, most=LARGE)
     with decoded(str(file), "sets"):
-        return PolicyTable(task, _listed(task, content))
+        memory = content.get("memory", {"kind": "cell", "clip": 2})
+        own = task.remembering(memory["kind"], clip=memory["clip"], revealed=memory.get("revealed", 1))
+        return PolicyTable(own, _listed(own, content))
 
 
 def _listed(task: Task, content: dict[str, Any]) -> sparse.csr_array:
-    """`[M (t_max + 1), M]` bool of what `PolicyTable.as_lists` wrote."""
-    cells, expected = content["sets"], {str(cell) for cell in range(task.num_cells)}
-    if content["t_max"] != task.t_max or set(cells) != expected:
-        raise ValueError(f"{len(cells)} cells, t_max {content['t_max']}; expected {len(expected)}, {task.t_max}")
-    rows = [each for cell in range(task.num_cells) for each in cells[str(cell)]]
+    """`[keys (t_max + 1), M]` bool of what `PolicyTable.as_lists` wrote."""
+    keys, count = content["sets"], task.num_keys
+    # Counted first: what a stranger's file says is remembered may make any number of keys.
+    if content["t_max"] != task.t_max or len(keys) != count or any(str(key) not in keys for key in range(count)):
+        raise ValueError(f"{len(keys)} plans, t_max {content['t_max']}; expected {count}, {task.t_max}")
+    rows = [each for key in range(count) for each in keys[str(key)]]
     pointer = np.cumsum([0, *map(len, rows)])
     indices = np.array([each for row in rows for each in row], dtype=np.int64)
     return _sets({"indices": indices, "indptr": pointer}, task)
@@ -148,6 +155,7 @@ def _task(content: dict[str, npt.NDArray[Any]]) -> Task:
         **{name: content[f"task_{name}"] for name in _SENSORS if f"task_{name}" in content},
         memory=str(content.get("task_memory", "cell")),
         clip=int(content.get("task_clip", 2)),
+        revealed=int(content.get("task_revealed", 1)),
     )
 
 

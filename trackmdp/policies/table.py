@@ -138,7 +138,8 @@ class PolicyTable:
     def as_lists(self) -> dict[str, Any]:
         """Plain lists, as `sets.json` has them: for each key the sensed cells at n = 0 ... t_max.
 
-        With `task.memory` "cell" the keys are the located cells; else `memory` says how they are numbered.
+        With `task.memory` "cell" the keys are the located cells; else `memory` says how they are numbered, and
+        where a detection tells the mode its kind is "cell", each cell's classes being the modes.
         """
         m, choices = self.task.num_cells, self.task.num_choices
         if self.sets is None:
@@ -146,9 +147,10 @@ class PolicyTable:
             return {"t_max": self.task.t_max, "sets": {str(cell): [each] * choices for cell in range(m)}}
         lists = [part.tolist() for part in np.split(self.sets.indices, self.sets.indptr[1:-1])]
         sets = {str(key): lists[key * choices : (key + 1) * choices] for key in range(self.task.num_keys)}
-        if self.task.memory == "cell":
+        if not self.task.keyed:
             return {"t_max": self.task.t_max, "sets": sets}
         memory = {"kind": self.task.memory, "clip": self.task.clip, "classes": self.task.keys.num_classes}
+        memory |= {"revealed": self.task.revealed} if self.task.revealed > 1 else {}
         return {"t_max": self.task.t_max, "memory": memory, "sets": sets}
 
 

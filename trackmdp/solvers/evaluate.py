@@ -21,7 +21,7 @@ from trackmdp.solvers.prediction import renewal
 from trackmdp.solvers.recorded import evaluate_recorded
 from trackmdp.solvers.renewal import RenewalSystem, check_length, expected_steps
 from trackmdp.world.model import Array, BoolArray, World
-from trackmdp.world.modes import HiddenWorld
+from trackmdp.world.modes import HiddenWorld, check_revealed
 from trackmdp.world.tracks import Problem
 
 if TYPE_CHECKING:  # torch is loaded where something that acts is asked for its sets
@@ -51,6 +51,10 @@ def evaluate(
         UserError: the policy draws at random and is not one whose probabilities are known, or is for another grid.
     """
     table = _table(problem, policy)
+    check_revealed(problem, table.task.revealed)
+    if isinstance(problem, World) and table.task.keyed and not false_alarm:
+        # A policy that remembers more than it needs: the cell's one mode tells nothing.
+        problem = HiddenWorld(problem.kernel, modes=1, **problem.given)
     if false_alarm:
         return believed(problem, table, false_alarm)
     if isinstance(problem, HiddenWorld):

@@ -17,14 +17,16 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.evaluation import Evaluation, pooled
 from trackmdp.solvers.layers import Layer, reachable
 from trackmdp.solvers.renewal import RenewalSystem, check_length, per_row
-from trackmdp.world.model import Array, BoolArray
+from trackmdp.world.model import Array, BoolArray, World
 from trackmdp.world.modes import HiddenWorld
 
-__all__ = ["KeyedPairs", "evaluate_keys"]
+__all__ = ["KeyedPairs", "averaged", "evaluate_keys"]
 
 
 class KeyedPairs:
     """Where the target may be 1 ... t_max + 2 moves after each pair (key, mode): B pairs, numbered key · H + mode.
+
+    Where a detection tells the mode the key is (cell, mode), the hidden state itself, and B the number of keys.
 
     Entries are as in `layers`, with a row for each pair and hidden states for cells; layer t_max + 2 is the forced
     step's. Plans are of keys and sensors of cells, so that entries with one key and one cell are decided together: they
@@ -33,10 +35,11 @@ class KeyedPairs:
 
     def __init__(self, world: HiddenWorld) -> None:
         self.world, keys, h = world, world.keys, world.modes
-        self.key = np.repeat(np.arange(keys.num_keys), h)
-        mode = np.tile(np.arange(h), keys.num_keys)
+        of_key = 1 if world.revealed > 1 else h  # pairs of each key
+        self.key = np.repeat(np.arange(keys.num_keys), of_key)
         self.count = len(self.key)
-        layers = reachable(world.kernel, keys.cell(self.key) * h + mode, world.num_choices + 1)
+        known = self.key % h if of_key == 1 else np.tile(np.arange(h), keys.num_keys)
+        layers = reachable(world.kernel, keys.cell(self.key) * h + known, world.num_choices + 1)
         self.layers: list[Layer] = layers[1:]
         self.stay = [world.stay_probability[layer.cells] for layer in layers]
         self.rows = [layer.rows for layer in layers]
@@ -44,13 +47,17 @@ class KeyedPairs:
         for n, layer in enumerate(self.layers):
             cell = layer.cells // h
             self.cells.append(cell)
-            self.following.append(keys.next(self.key[layer.rows], n, cell) * h + layer.cells % h)
+            mode = layer.cells % h
+            following = keys.next(self.key[layer.rows], n, cell, mode)
+            self.following.append(following if of_key == 1 else following * h + mode)
         codes = [self.key[layer.rows] * world.num_cells + cell for layer, cell in zip(self.layers, self.cells)]  # noqa: B905
         found = [np.unique(code, return_inverse=True) for code in codes[:-1]]
         self.groups, self.group = [each[0] for each in found], [each[1] for each in found]
+        modes, cells = np.arange(h), np.arange(world.num_cells)[:, None]
+        # [M, H], the pairs in which episodes start: any cell and mode alike
+        self.first = keys.start(cells, modes) if of_key == 1 else keys.start(cells) * h + modes
         self.start = np.zeros(self.count)
-        cells = np.arange(world.num_cells)
-        self.start[(keys.start(cells)[:, None] * h + np.arange(h)).ravel()] = 1.0 / world.num_states
+        self.start[self.first.ravel()] = 1.0 / world.num_states
 
     @cached_property
     def chance(self) -> list[Array]:
@@ -123,7 +130,7 @@ class KeyedPairs:
         """
         world, later, chosen = self.world, self._undetected(sets, value), []
         total = per_row(self.key, visits, world.num_keys)[self.key]
-        mass = np.where(total > 1e-12, visits / np.maximum(total, 1e-300), 1.0 / world.modes)
+        mass = np.where(total > 1e-12, visits / np.maximum(total, 1e-300), world.num_keys / self.count)
         for n in range(world.num_choices):
             layer, z = self.layers[n], self.layers[n].cells
             mass = mass @ layer.moves
@@ -161,15 +168,25 @@ class KeyedPairs:
 
 def evaluate_keys(world: HiddenWorld, policy: PolicyTable) -> Evaluation:
     """Exact figures of a policy, whatever it remembers; episodes start in any cell and mode alike."""
-    known = HiddenWorld(
-        world.kernel, modes=world.modes, **(world.known | {"memory": policy.task.memory, "clip": policy.task.clip})
-    )
-    pairs = KeyedPairs(known)
+    remembered = {name: getattr(policy.task, name) for name in ("memory", "clip", "revealed")}
+    pairs = KeyedPairs(world.but(**remembered))
     located, gathered = pairs.run(*pairs.of_policy(policy))
     totals = RenewalSystem(located).solve(gathered)
     check_length(totals[:, 5])
-    h, keys = world.modes, known.keys
-    # The value of a start cell is the mean over its modes: those of its start key.
-    first = keys.start(np.arange(world.num_cells))[:, None] * h + np.arange(h)
-    of_cell = totals[first].mean(axis=1)
+    # The value of a start cell is the mean over its modes.
+    of_cell = totals[pairs.first].mean(axis=1)
     return pooled(of_cell[:, :5], of_cell[:, 5])
+
+
+def averaged(world: HiddenWorld) -> World:
+    """The target as it looks to who knows of no mode: each cell's moves, averaged over its modes as they occur.
+
+    Sensing does not move the target, so that the expected visits (I - Q^T)^-1 s of an episode are those of any policy.
+    """
+    visits = RenewalSystem(sparse.csr_array(world.kernel.T)).solve(np.full(world.num_states, 1.0 / world.num_states))
+    of_cell = visits.reshape(world.num_cells, world.modes)
+    share = (of_cell / of_cell.sum(axis=1, keepdims=True)).ravel()  # episodes start anywhere: no cell is unvisited
+    state = np.arange(world.num_states)
+    into = sparse.csr_array((np.ones(len(state)), (state, state // world.modes)))
+    out = sparse.csr_array((share, (state // world.modes, state)))
+    return World.of(world, out @ world.kernel @ into, memory="cell", revealed=1)

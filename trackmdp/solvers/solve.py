@@ -15,6 +15,7 @@ from trackmdp.config.partition import PartitionConfig
 from trackmdp.config.registry import make, maker
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers.keyed import averaged
 from trackmdp.solvers.keyed_search import solve_keys
 from trackmdp.solvers.partition import narrow_halo, plan_by_blocks
 from trackmdp.solvers.solution import SearchProgress, Solution, bracketed
@@ -115,11 +116,18 @@ class _Planner:
 def baseline_policy(problem: Problem, choice: BaselineConfig) -> Policy:
     """The policy of a fixed rule or of a solver.
 
+    Against targets with a mode `optimal` solves over keys; the other solvers take the next move to depend on the cell
+    alone, as it does on average (`averaged`).
+
     Raises:
         UserError: it needs a motion model, and recorded tracks have none.
     """
     from trackmdp.policies.policy import as_policy
 
+    if isinstance(problem, HiddenWorld) and choice.reads_motion:
+        if choice.name == "optimal":
+            return solve_keys(problem).policy
+        problem = averaged(problem)
     if choice.reads_motion and not isinstance(problem, World):
         raise UserError(f"baseline={choice.name}: needs a motion model; recorded tracks have none")
     if choice.whole_episodes:

@@ -11,6 +11,7 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import bounds, qmdp
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import Evaluation, regret_per_step
+from trackmdp.solvers.keyed import averaged
 from trackmdp.solvers.keyed_search import mode_bound
 from trackmdp.world.model import Task, World
 from trackmdp.world.modes import HiddenWorld
@@ -109,13 +110,15 @@ class ExactEvaluator(Evaluator):
 
 
 class HiddenEvaluator(Evaluator):
-    """Evaluates exactly where the target's mode is hidden; the bound knows it at all times."""
+    """Evaluates exactly where targets have a mode; the bound knows it at all times, Q_MDP plans with cells alone."""
 
     world: HiddenWorld
+    qmdp: Evaluation
 
     def __init__(self, world: HiddenWorld) -> None:
-        self.world, self.qmdp = world, None
-        self.upper, self.lower = float(mode_bound(world)[:, 0].mean()), -math.inf
+        self.world = world
+        self.qmdp = evaluate(world, qmdp.solve(averaged(world)))
+        self.upper, self.lower = float(mode_bound(world)[:, 0].mean()), self.qmdp.aihtr
         self.bounds = {"paper": None, "valid": None, "clocked": self.upper}
 
     def evaluate(self, policy: PolicyTable) -> Evaluation:

@@ -44,7 +44,9 @@ def short_indices(matrix: sparse.csr_array) -> sparse.csr_array:
     return sparse.csr_array((matrix.data, *pointers), shape=matrix.shape)
 
 
-def check_kernel(kernel: sparse.csr_array, size: tuple[int, int], *, truncates: bool, source: str = "kernel") -> None:
+def check_kernel(
+    kernel: sparse.csr_array, size: tuple[int, int], *, truncates: bool, source: str = "kernel", modes: int = 1
+) -> None:
     """See that `kernel` is one for this grid; else say which rule it breaks, and where.
 
     Args:
@@ -52,6 +54,7 @@ def check_kernel(kernel: sparse.csr_array, size: tuple[int, int], *, truncates: 
         size: (rows, columns); M is their product.
         truncates: whether episodes are truncated; if not, the target must be able to exit from anywhere.
         source: named at the start of the message.
+        modes: states in each cell, one after the other.
 
     Raises:
         UserError: a rule is broken.
@@ -68,7 +71,7 @@ def check_kernel(kernel: sparse.csr_array, size: tuple[int, int], *, truncates: 
         row = int(np.flatnonzero(high)[0])
         raise UserError(f"{source}: row {row} sums to {sums[row]:.6g}, expected at most 1 (the rest is the exit)")
     if not truncates and not (leaves := _can_exit(kernel, sums)).all():
-        cell = int(np.flatnonzero(~leaves)[0])
+        cell = int(np.flatnonzero(~leaves)[0]) // modes
         raise UserError(f"{source}: from cell {cell} the target never exits, so no episode ends; set grid.max_steps")
 
 

@@ -11,8 +11,8 @@ import numpy.typing as npt
 
 from trackmdp.config import WorldConfig
 from trackmdp.config.compose import compose, default, given
-from trackmdp.config.options import refuse
-from trackmdp.config.registry import make
+from trackmdp.config.options import options, refuse
+from trackmdp.config.registry import make, maker
 from trackmdp.config.world import LARGEST
 from trackmdp.world.checks import canonical_kernel, check_kernel
 from trackmdp.world.files import per_cell
@@ -130,12 +130,19 @@ def make_problem(cfg: WorldConfig) -> Problem:
         UserError: a file is missing or malformed, or the kernel or a track breaks a rule.
     """
     if cfg.kernel.hides:
-        kernel, modes = make(cfg.kernel, cfg.grid.size)
-        return HiddenWorld(kernel, cfg.grid.size, modes=modes, **_of_task(cfg))
+        return _hidden(cfg)
     if cfg.kernel.is_motion:
         return build_world(cfg)
     tracks: Recorded = make(cfg.kernel, cfg.grid.size, **_of_task(cfg))
     return tracks
+
+
+def _hidden(cfg: WorldConfig) -> HiddenWorld:
+    """The world of a target with a mode, which a detection tells where `kernel.reveals` says so."""
+    own = {name: getattr(cfg.kernel, name) for name in options(type(cfg.kernel))}
+    reveals = own.pop("reveals")
+    kernel, modes = maker(cfg.kernel)(cfg.grid.size, **own)
+    return HiddenWorld(kernel, cfg.grid.size, modes=modes, **_of_task(cfg), revealed=modes if reveals else 1)
 
 
 def build_world(cfg: WorldConfig) -> World:

@@ -1,7 +1,8 @@
 """What a policy remembers at a detection: a key, from which its plan of sets is read until the next detection.
 
 A key is the located cell and a class of what came before it, numbered cell · C + class, with C classes. Class 0 stands
-for nothing: it is that of an episode's start, and with `cell`, the paper's policies, the only one.
+for nothing: it is that of an episode's start, and with `cell`, the paper's policies, the only one. Where a detection
+tells the target's mode (`kernel.reveals`) nothing before it matters, and the class is the mode.
 
 A displacement is kept up to `clip` rows and columns, larger ones count as that; its number is that of a window of
 2 · clip + 1 rows and columns. With clip 1, one row down and two columns to the right is clipped to (1, 1), and has the
@@ -26,12 +27,14 @@ class KeySpace:
         memory: one of `trackmdp.config.world.MEMORIES`: the cell; and the displacement since the detection before; and
             the misses between the two; or the last two displacements, of the earlier one the direction alone (clip 1).
         clip: rows and columns up to which displacements are told apart.
+        modes: that a detection tells apart, and then `memory` is "cell"; 1 where it tells the cell alone.
     """
 
     size: tuple[int, int]
     t_max: int
     memory: str
     clip: int
+    modes: int = 1
 
     @property
     def order(self) -> int:
@@ -49,7 +52,7 @@ class KeySpace:
         last = self.displacements
         # 1 for the start; after two_displacements' first detection there is one displacement, and the earlier one is
         # class 0 of the 9 directions and none.
-        counts = {"cell": 1, "displacement": 1 + last, "displacement_gap": 1 + (self.t_max + 2) * last}
+        counts = {"cell": self.modes, "displacement": 1 + last, "displacement_gap": 1 + (self.t_max + 2) * last}
         return counts.get(self.memory, (1 + last) * 10)
 
     @property
@@ -57,18 +60,18 @@ class KeySpace:
         """M · C."""
         return self.size[0] * self.size[1] * self.num_classes
 
-    def start(self, cells: Any) -> Any:
-        """Keys of an episode that starts located in `cells`."""
-        return cells * self.num_classes
+    def start(self, cells: Any, modes: Any = 0) -> Any:
+        """Keys of an episode that starts located in `cells`, in `modes` where a detection tells them."""
+        return cells * self.num_classes + (modes if self.modes > 1 else 0)
 
     def cell(self, keys: Any) -> Any:
         """The located cells of `keys`."""
         return keys // self.num_classes
 
-    def next(self, keys: Any, misses: Any, cells: Any) -> Any:
+    def next(self, keys: Any, misses: Any, cells: Any, modes: Any = 0) -> Any:
         """Keys after a detection in `cells`, the one before having left `keys`, with `misses` in between."""
         if self.memory == "cell":
-            return cells
+            return self.start(cells, modes)
         before, columns = self.cell(keys), self.size[1]
         rows, across = cells // columns - before // columns, cells % columns - before % columns
         # number + 1, for 0 is the start
@@ -97,7 +100,7 @@ class KeySpace:
         if self.memory == "displacement_gap":
             # Class 1 + gap · D + number: without the gap it is 1 + number; class 0 stays.
             found.append((((known - 1) % self.displacements + 1) * (known > 0), 1 + self.displacements))
-        if self.memory != "cell":
+        if self.num_classes > 1:
             found.append((known, self.num_classes))
         return [*found, (keys, self.num_keys)]
 

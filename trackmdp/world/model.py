@@ -50,6 +50,7 @@ class Task:
             moves seen on different ones.
         memory: what a policy remembers at a detection, one of `trackmdp.config.world.MEMORIES`; see `KeySpace`.
         clip: rows and columns up to which remembered displacements are told apart.
+        revealed: modes of the target that a detection tells apart; 1 where it tells the cell alone.
 
     Raises:
         UserError: a number is out of its range, or `cost` does not have one price per cell.
@@ -67,6 +68,7 @@ class Task:
     markov: bool
     memory: str
     clip: int
+    revealed: int
 
     def __init__(
         self,
@@ -83,6 +85,7 @@ class Task:
         markov: bool = True,
         memory: str = "cell",
         clip: int = 2,
+        revealed: int = 1,
     ) -> None:
         if memory not in MEMORIES:
             raise UserError(f"memory={memory}: expected one of {', '.join(MEMORIES)}")
@@ -101,12 +104,15 @@ class Task:
             "markov": markov,
             "memory": memory,
             "clip": _at_least(1, "clip", clip),
+            "revealed": _at_least(1, "revealed", revealed),
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)  # the dataclass is frozen
         # Keys are counted up to t_max + 1 misses, and a safe action that misses is repeated.
         if memory != "cell" and not self.safe:
             raise UserError(f"memory={memory}: with a safe action that may miss, expected cell")
+        if memory != "cell" and revealed > 1:
+            raise UserError(f"memory={memory}: where a detection tells the mode, expected cell")
 
     @property
     def rows(self) -> int:
@@ -154,18 +160,22 @@ class Task:
 
     @cached_property
     def keys(self) -> KeySpace:
-        """What a policy may remember at a detection; with `memory` "cell" the keys are the cells."""
-        return KeySpace(self.size, self.t_max, self.memory, self.clip)
+        """What a policy may remember at a detection; with `memory` "cell" the keys are the cells, or (cell, mode)."""
+        return KeySpace(self.size, self.t_max, self.memory, self.clip, self.revealed)
 
-    @property
-    def forgetful(self) -> Task:
-        """The same task, in which a policy remembers the cell alone."""
-        return Task(**self._known() | {"memory": "cell"}) if self.order else self.task
+    def remembering(self, memory: str = "cell", *, clip: int = 2, revealed: int = 1) -> Task:
+        """The same task, in which a policy remembers this: by default the cell alone."""
+        return Task(**self.given | {"memory": memory, "clip": clip, "revealed": revealed})
 
     @property
     def order(self) -> int:
         """Detections before the last one that a policy may remember something of."""
         return self.keys.order
+
+    @property
+    def keyed(self) -> bool:
+        """Whether a policy knows more at a detection than the cell."""
+        return self.keys.num_classes > 1
 
     @property
     def num_keys(self) -> int:
@@ -175,9 +185,10 @@ class Task:
     @property
     def task(self) -> Task:
         """The same task without the motion."""
-        return Task(**self._known())
+        return Task(**self.given)
 
-    def _known(self) -> dict[str, Any]:
+    @property
+    def given(self) -> dict[str, Any]:
         """All that a `Task` holds, as arguments of its constructor and of that of `World`."""
         return {name: getattr(self, name) for name in Task.__dataclass_fields__}
 
@@ -215,6 +226,7 @@ class World(Task):
         markov: bool = True,
         memory: str = "cell",
         clip: int = 2,
+        revealed: int = 1,
     ) -> None:
         super().__init__(
             size,
@@ -229,6 +241,7 @@ class World(Task):
             markov=markov,
             memory=memory,
             clip=clip,
+            revealed=revealed,
         )
         # Checked after it is canonical: duplicates are added up and zeros dropped, so that the checks see what solvers
         # will.
@@ -239,7 +252,7 @@ class World(Task):
     @classmethod
     def of(cls, task: Task, kernel: sparse.sparray | npt.NDArray[np.generic], **changes: Any) -> World:
         """The world of a task with a `kernel` `[M, M]`; `changes` are arguments that differ from the task's."""
-        return cls(kernel, **(Task._known(task) | changes))
+        return cls(kernel, **(task.given | changes))
 
     @cached_property
     def stay_probability(self) -> Array:

@@ -1,12 +1,17 @@
 """Targets with a hidden mode: the next move depends on the cell and on a mode, such as a heading, that is not shown.
 
 A hidden state is z = cell · H + mode, H modes in every cell. The tracker sees cells alone, so that what it knows at a
-detection is what it remembers (`task.memory`), not the state.
+detection is what it remembers (`task.memory`), not the state; or the state itself, where a detection tells the mode too
+(`kernel.reveals`: Doppler, AIS).
+
+A target first changes its mode, by a table S of its own, then moves as the new mode says: Q((x, u), (y, v)) =
+S(u, v) P_v(x, y).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,7 +23,7 @@ from trackmdp.world.checks import canonical_kernel, check_kernel
 from trackmdp.world.model import Array, Size, Task, grid_size
 from trackmdp.world.rows import pairwise_row_sums
 
-__all__ = ["HiddenWorld", "heading_kernel"]
+__all__ = ["HiddenWorld", "check_revealed", "heading_kernel", "turning_back"]
 
 _HEADINGS = np.array([(0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1), (1, 0), (1, 1)])
 """Rows and columns of a step; 0 is to the right, and each of the eight turns left by 45 degrees."""
@@ -31,7 +36,8 @@ class HiddenWorld(Task):
     Args:
         kernel: `[M · H, M · H]` sub-stochastic, sparse or dense, on the hidden states z = cell · H + mode.
         modes: H.
-        size: of the grid; further arguments are those of `Task`.
+        size: of the grid; further arguments are those of `Task`, `revealed` being 1, or H where a detection tells the
+            mode.
 
     Attributes:
         kernel: canonical CSR; row z sums to 1 - p_exit(z).
@@ -50,28 +56,78 @@ class HiddenWorld(Task):
         super().__init__(size, **(of_task | {"markov": False}))
         if not self.safe:
             raise UserError("kernel: with a hidden mode the safe action must not miss")
+        if self.revealed not in (1, modes):
+            raise UserError(f"revealed={self.revealed}: expected 1 or {modes}, the modes of the target")
         if self.window is not None or self.max_steps is not None:
             raise UserError("kernel: with a hidden mode, expected grid.window=null and grid.max_steps=null")
         canonical = canonical_kernel(kernel)
         # As if every hidden state were a cell of a grid with H times as many columns.
-        check_kernel(canonical, (self.rows, self.columns * modes), truncates=False)
+        check_kernel(canonical, (self.rows, self.columns * modes), truncates=False, modes=modes)
         for name, value in (("kernel", canonical), ("modes", modes)):
             object.__setattr__(self, name, value)  # the dataclass is frozen
 
-    @property
-    def known(self) -> dict[str, Any]:
-        """All that the task holds, as arguments of the constructor."""
-        return self._known()
+    def but(self, **changes: Any) -> HiddenWorld:
+        """The same motion in a task that differs in `changes`."""
+        return HiddenWorld(self.kernel, modes=self.modes, **(self.given | changes))
 
     @property
     def num_states(self) -> int:
         """M · H."""
         return self.num_cells * self.modes
 
-    @property
+    @cached_property
     def stay_probability(self) -> Array:
         """`[M · H]` probability of still being in the grid after one step."""
         return pairwise_row_sums(self.kernel)
+
+
+def check_revealed(problem: Task, told: int) -> None:
+    """See that a policy that knows `told` modes apart at a detection can act in `problem`; 1 where it knows none.
+
+    Raises:
+        UserError: the targets have other modes, or none.
+    """
+    modes = problem.modes if isinstance(problem, HiddenWorld) else 1
+    if told not in (1, modes):
+        raise UserError(f"policy: made for targets with {told} modes; expected {modes}")
+
+
+def turning_back(
+    size: Size,
+    switch: sparse.csr_array | Array,
+    offsets: npt.NDArray[np.int64],
+    shares: Array,
+    opposite: npt.NDArray[np.int64],
+    exit_probability: float,
+) -> sparse.csr_array:
+    """A target that changes its mode, then takes one of the steps of the new mode; at the border it turns back.
+
+    There it stays in its cell, in the opposite mode. It leaves the grid from anywhere with `exit_probability`.
+
+    Args:
+        size: of the grid.
+        switch: `[H, H]` probability of each next mode.
+        offsets: `[H, K, 2]` rows and columns of the K steps of each mode.
+        shares: `[H, K]` probability of each.
+        opposite: `[H]`, the mode after turning back.
+        exit_probability: of each step.
+
+    Returns:
+        `[M · H, M · H]` on z = cell · H + mode.
+    """
+    (rows, columns), modes = grid_size(size), len(offsets)
+    table = sparse.coo_array(switch)
+    # [E] changes of mode; [E, K] steps after them; and with a cell before them [M, E, K] ends.
+    before, mode, cell = table.row, table.col, np.arange(rows * columns)[:, None, None]
+    row, column = cell // columns + offsets[mode, :, 0], cell % columns + offsets[mode, :, 1]
+    free = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+    ahead = (row * columns + column) * modes + mode[:, None]
+    end = np.where(free, ahead, cell * modes + opposite[mode][:, None])
+    weight = ((1.0 - exit_probability) * table.data)[:, None] * shares[mode]
+    begin = cell * modes + before[:, None]
+    begin, weight = (np.broadcast_to(each, end.shape).ravel() for each in (begin, weight))
+    some, states = weight > 0, rows * columns * modes
+    return sparse.csr_array((weight[some], (begin[some], end.ravel()[some])), shape=(states, states))
 
 
 def heading_kernel(size: Size, *, keep: float, go: float, exit_probability: float) -> tuple[sparse.csr_array, int]:
@@ -83,17 +139,9 @@ def heading_kernel(size: Size, *, keep: float, go: float, exit_probability: floa
     Returns:
         The kernel on (cell, heading), and 8.
     """
-    (rows, columns), modes = grid_size(size), len(_HEADINGS)
-    states = np.arange(rows * columns * modes)
-    cell, mode = np.divmod(states, modes)
-    parts = []
-    for turn, chance in ((0, keep), (1, (1.0 - keep) / 2), (-1, (1.0 - keep) / 2)):
-        heading = (mode + turn) % modes
-        row, column = cell // columns + _HEADINGS[heading, 0], cell % columns + _HEADINGS[heading, 1]
-        free = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-        ahead = np.where(free, (row * columns + column) * modes + heading, cell * modes + (heading + 4) % modes)
-        still = cell * modes + heading
-        for end, share in ((ahead, go), (still, 1.0 - go)):
-            weight = np.full(len(states), (1.0 - exit_probability) * chance * share)
-            parts.append(sparse.csr_array((weight, (states, end)), shape=(len(states), len(states))))
-    return sparse.csr_array(sum(parts[1:], parts[0])), modes
+    modes = np.arange(len(_HEADINGS))
+    turn = (modes - modes[:, None]) % 8  # from one heading to another, in eighths
+    switch = np.select([turn == 0, (turn == 1) | (turn == 7)], [keep, (1.0 - keep) / 2], 0.0)
+    offsets = np.stack([_HEADINGS, np.zeros_like(_HEADINGS)], axis=1)
+    shares = np.tile([go, 1.0 - go], (8, 1))
+    return turning_back(size, switch, offsets, shares, (modes + 4) % 8, exit_probability), 8

@@ -103,7 +103,7 @@ class SampledTargets:
 
 
 class HiddenTargets(SampledTargets):
-    """Targets with a hidden mode: `state`, beside `target`, is the cell and the mode; all are as likely to start."""
+    """Targets with a mode: `state`, beside `target`, is the cell and the mode; all are as likely to start."""
 
     def __init__(self, world: HiddenWorld, device: torch.device) -> None:
         super().__init__(world, device)

@@ -124,6 +124,7 @@ class Recorded(Task):
         anywhere: bool = False,
         memory: str = "cell",
         clip: int = 2,
+        revealed: int = 1,
         loaded: Mapping[str, int] | None = None,
     ) -> None:
         super().__init__(
@@ -139,6 +140,7 @@ class Recorded(Task):
             markov=markov,
             memory=memory,
             clip=clip,
+            revealed=revealed,
         )
         parts = {"tracks": tracks, "validation": validation, "held_out": held_out}
         own: dict[str, object] = {**parts, "anywhere": anywhere, "loaded": loaded or {}}

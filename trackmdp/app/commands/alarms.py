@@ -30,7 +30,7 @@ def run(
         UserError: tracks instead of a world, or what `trackmdp.solvers.alarms.believed` refuses.
     """
     if not isinstance(problem, World):
-        raise UserError("sensor=false_alarm: needs a motion model; recorded tracks have none")
+        raise UserError("sensor=false_alarm: needs a motion model of cells alone, without modes; not recorded tracks")
     # A trained policy's world is that of its run, with the sensors asked for.
     world = World.of(
         problem, problem.kernel, safe_detection=1.0, **false_alarm(problem.size, p_d=sensor.p_d, p_f=sensor.p_f)

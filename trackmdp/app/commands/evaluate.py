@@ -18,7 +18,6 @@ from trackmdp.episodes.batch import Episodes
 from trackmdp.episodes.figures import Simulation
 from trackmdp.episodes.log import EpisodeLog
 from trackmdp.episodes.simulate import simulate
-from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import sets_name, write_sets
 from trackmdp.reports.picture import draw_picture
@@ -26,12 +25,12 @@ from trackmdp.solvers import estimator
 from trackmdp.solvers.solve import baseline_policy
 from trackmdp.training.devices import make_device
 from trackmdp.training.display import make_console, table
-from trackmdp.training.evaluator import ExactEvaluator, Score, figures
+from trackmdp.training.evaluator import Evaluator, Score, figures
+from trackmdp.training.held_out import make_evaluator
 from trackmdp.training.sealing import SUMMARY, check_files, read_summary
 from trackmdp.untrusted import decoded
 from trackmdp.world.make import make_problem
 from trackmdp.world.model import World
-from trackmdp.world.modes import HiddenWorld
 from trackmdp.world.tracks import Problem, Recorded
 
 __all__ = ["run"]
@@ -53,11 +52,9 @@ def run(cfg: EvaluateConfig, folder: Path, problem: Problem | None = None) -> fl
     if isinstance(cfg.sensor, FalseAlarmConfig):
         return alarms.run(world, cfg.sensor, policy, subject, folder, console)
     # Recorded tracks have no kernel, hence no exact value and no bound: figures come from the held-out tracks.
-    if isinstance(world, HiddenWorld):
-        raise UserError(f"run={cfg.run}: its target has a hidden mode; training has valued its policy exactly")
     if isinstance(world, Recorded):
         return held_out.run(world, policy, subject, folder, console, cfg.seed)
-    evaluator = ExactEvaluator(world)
+    evaluator = make_evaluator(world)
     # The run's own summary has measured against what it proved; the same world gets the same regret here.
     proved = _proved(cfg.run) if cfg.run else None
     score = evaluator.score(policy)
@@ -65,9 +62,9 @@ def run(cfg: EvaluateConfig, folder: Path, problem: Problem | None = None) -> fl
         score = evaluator.tighten(proved["lower"], proved["upper"], score)
     episodes = simulate(world, policy, cfg.episodes or _FOR_THE_PICTURE, seed=cfg.seed)
     simulation = episodes.figures() if cfg.episodes else None
-    # Theorem thm:estimator is about Q of whole episodes and of a policy that is a table.
-    told = policy.deterministic and world.max_steps is None and world.perfect
-    estimate = estimator.accuracy(world, policy) if told else None
+    # Theorem thm:estimator is about Q of whole episodes and of a policy that is a table of cells.
+    told = policy.deterministic and world.max_steps is None and world.perfect and not policy.task.keyed
+    estimate = estimator.accuracy(world, policy) if told and isinstance(world, World) else None
     report = _report(subject, evaluator, score, simulation) | {
         "optimal": proved,
         "estimator": asdict(estimate) if estimate else None,
@@ -75,7 +72,7 @@ def run(cfg: EvaluateConfig, folder: Path, problem: Problem | None = None) -> fl
     write_json(folder / "evaluation.json", report | write_sets(folder, policy, value=score.evaluation.value))
     write_text(folder / "picture.txt", draw_picture(episodes, world))
     _show(console, subject, evaluator, score, simulation, folder, "run's bracket" if proved else "clocked")
-    if isinstance(mcap := cfg.log.get("mcap"), McapConfig):
+    if isinstance(mcap := cfg.log.get("mcap"), McapConfig) and isinstance(world, World):
         _log_episodes(cfg, mcap, world, episodes, subject, folder, console)
     if estimate is not None:
         shares = (
@@ -136,12 +133,12 @@ def _baseline(cfg: EvaluateConfig, problem: Problem | None) -> tuple[Problem, Po
     return world, baseline_policy(world, cfg.baseline), cfg.baseline.name
 
 
-def _report(subject: str, evaluator: ExactEvaluator, score: Score, simulation: Simulation | None) -> dict[str, Any]:
+def _report(subject: str, evaluator: Evaluator, score: Score, simulation: Simulation | None) -> dict[str, Any]:
     return {
         "policy": subject,
         "exact": figures(score.evaluation),
         "simulated": asdict(simulation) if simulation else None,
-        "qmdp": figures(evaluator.qmdp),
+        "qmdp": figures(evaluator.qmdp) if evaluator.qmdp else None,
         "bounds": evaluator.bounds,
         "regret_per_step": score.regret_per_step,
         "regret_per_step_lower": score.regret_per_step_lower,
@@ -151,7 +148,7 @@ def _report(subject: str, evaluator: ExactEvaluator, score: Score, simulation: S
 def _show(
     console: Console,
     subject: str,
-    evaluator: ExactEvaluator,
+    evaluator: Evaluator,
     score: Score,
     simulation: Simulation | None,
     folder: Path,
@@ -164,6 +161,7 @@ def _show(
         "safe_per_episode": "safe actions per episode",
         "expected_length": "steps per episode",
     }
+    assert evaluator.qmdp is not None  # there is a motion model
     exact, qmdp = figures(score.evaluation), figures(evaluator.qmdp)
     rows = []
     for key, label in names.items():

@@ -49,7 +49,7 @@ def run(cfg: ExportConfig, folder: Path) -> None:
         "grid_size": str(task.rows),
         "t_max": str(task.t_max),
     }
-    if task.order:
+    if task.keyed:
         about |= {"memory": task.memory, "clip": str(task.clip), "classes": str(task.keys.num_classes)}
     if cfg.format == "sets":
         file = folder / sets_name(task)

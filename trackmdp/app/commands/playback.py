@@ -16,9 +16,10 @@ from trackmdp.episodes.simulate import resimulate, simulate
 from trackmdp.errors import UserError
 from trackmdp.policies.playback import Playback
 from trackmdp.training.display import table
-from trackmdp.world.make import build_world
+from trackmdp.world.make import make_problem
 from trackmdp.world.model import World
-from trackmdp.world.tracks import Problem
+from trackmdp.world.modes import HiddenWorld
+from trackmdp.world.tracks import Problem, Recorded
 
 __all__ = ["run"]
 
@@ -29,8 +30,8 @@ def run(cfg: EvaluateConfig, folder: Path, console: Console, problem: Problem | 
     Such a policy ignores what it observes, so that it has no table and no exact value.
     """
     assert isinstance(cfg.baseline, PlaybackConfig)
-    world = build_world(cfg) if problem is None else problem
-    assert isinstance(world, World)  # recorded tracks are refused
+    world = make_problem(cfg) if problem is None else problem
+    assert not isinstance(world, Recorded)  # they are refused
     with EpisodeReader(cfg.baseline.file) as reader:
         recorded = size_of_grid(reader.run)
         if recorded != world.size:
@@ -66,7 +67,7 @@ def _size(rows: int, columns: int) -> str:
     return str(rows) if rows == columns else f"[{rows},{columns}]"
 
 
-def reissued(world: World, logged: Episode) -> Episode:
+def reissued(world: World | HiddenWorld, logged: Episode) -> Episode:
     """The episode with its own seed and its own actions, in `world`."""
     (again,) = resimulate(world, Playback(world, logged.action), [logged.seed]).complete()
     return replace(again, number=logged.number)

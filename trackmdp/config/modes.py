@@ -1,0 +1,162 @@
+"""Schema of the kernels of targets with a hidden mode: heading, regimes, velocity."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+from trackmdp.config.options import GROUPS, Option, choice, listed, option, refuse
+from trackmdp.config.values import nested_choice
+from trackmdp.config.world import KernelConfig
+
+__all__ = [
+    "ConstantVelocityConfig",
+    "CoordinatedTurnConfig",
+    "HeadingConfig",
+    "HiddenKernelConfig",
+    "RegimesConfig",
+    "VelocityConfig",
+]
+
+MOST_MODES = 1_000
+"""Velocities, or velocities and turns; the states of a target are as many times the cells."""
+
+
+@dataclass(kw_only=True)
+class HiddenKernelConfig(KernelConfig):
+    """Base of the kernels with a mode; what a choice makes returns a kernel on (cell, mode), and the number of modes.
+
+    `reveals` is not handed to it.
+    """
+
+    hides: ClassVar[bool] = True
+    reveals: bool = option("whether a detection tells the mode as well (Doppler, AIS); false: the cell alone")
+
+    def check(self, key: str, root: Any) -> None:
+        """What knows of modes: learners that remember, solving over keys, and exact evaluation."""
+        if not root.knows_modes:
+            raise refuse(key, self.name, "a kernel without a hidden mode")
+        if root.learns and self.reveals:
+            raise refuse(f"{key}.reveals", "true", "false with train, whose algorithms learn no modes")
+        if root.learns and not root.algo.remembers:
+            readers = [name for name, schema in GROUPS["algo"].items() if schema.remembers]
+            raise refuse("algo", root.algo.name, f"{' or '.join(readers)} with kernel={self.name}")
+        if any(node.episodes_only for node in getattr(root, "log", {}).values()):
+            raise refuse("log", listed(root.log), f"none that holds episodes with kernel={self.name}")
+        solver = getattr(root, "solver", None)
+        if solver is not None and (solver.name != "optimal" or root.partition.block is not None):
+            raise refuse(key, self.name, "with it solver=optimal, and no blocks")
+        for name in ("max_steps", "window"):
+            if (value := getattr(root.grid, name)) is not None:
+                raise refuse(f"grid.{name}", value, f"null with kernel={self.name}")
+        if root.sensor.name == "false_alarm":
+            raise refuse("sensor", root.sensor.name, f"perfect or miss with kernel={self.name}")
+        if getattr(root.sensor, "p_s", 1) != 1:
+            raise refuse("sensor.p_s", root.sensor.p_s, f"1 with kernel={self.name}")
+
+
+@choice("kernel", "heading", makes="trackmdp.world.modes:heading_kernel")
+@dataclass(kw_only=True)
+class HeadingConfig(HiddenKernelConfig):
+    """A target with one of eight headings, which the tracker is not shown; at the border it turns back."""
+
+    keep: float = option("probability of keeping the heading; else it turns by 45 degrees", unit="per step", ge=0, le=1)
+    go: float = option("probability of moving one cell that way; else it stays", unit="per step", ge=0, le=1)
+    exit_probability: float = option("probability of leaving the grid", unit="per step", gt=0, lt=1)
+
+
+@choice("kernel", "regimes", makes="trackmdp.world.regimes:regimes")
+@dataclass(kw_only=True)
+class RegimesConfig(HiddenKernelConfig):
+    """A target that switches between other kernels, such as to linger and to travel; the one in force is its mode.
+
+    It switches first, then moves as the new regime says, whose own border and exit hold.
+    """
+
+    stay: Any = option(
+        "probability of staying in the regime, for all or for each; else any of the others is as likely",
+        unit="per step",
+        expects="a number from 0 to 1, or a list of one per regime",
+    )
+    regimes: Any = option(
+        "two or more kernels: {kernel: NAME, OPTION: VALUE, ...}, the rest as in conf/, or a table's file",
+        expects="a list, each {kernel: NAME, OPTION: VALUE, ...} or a path to a .npy, .npz or .csv file",
+        path=True,
+    )
+
+    def check(self, key: str, root: Any) -> None:
+        """Each regime is a kernel of cells that exists, with options that it has; what was left out is filled in."""
+        super().check(key, root)
+        if not isinstance(self.regimes, list) or not 2 <= len(self.regimes) <= MOST_MODES:
+            raise refuse(f"{key}.regimes", self.regimes, f"a list of 2 to {MOST_MODES:,} kernels")
+        self.regimes = [_regime(f"{key}.regimes[{place}]", entry, root) for place, entry in enumerate(self.regimes)]
+        shares, probability = self.stay if isinstance(self.stay, list) else [self.stay], Option("", ge=0, le=1)
+        if isinstance(self.stay, list) and len(shares) != len(self.regimes):
+            raise refuse(f"{key}.stay", self.stay, f"one number, or {len(self.regimes)} (one per regime)")
+        for share in shares:
+            if isinstance(share, bool) or not isinstance(share, (int, float)) or not probability.allows(share):
+                raise refuse(f"{key}.stay", self.stay, "numbers from 0 to 1")
+
+
+@dataclass(kw_only=True)
+class VelocityConfig(HiddenKernelConfig):
+    """What the kernels in metres and seconds have in common.
+
+    At the border the target turns back: it stays in its cell, with the opposite velocity.
+    """
+
+    cell: float = option("side of a cell", unit="m", gt=0)
+    step: float = option("time from one step to the next", unit="s", gt=0)
+    speed: float = option("greatest speed along rows, and along columns; a faster target has that", unit="m/s", gt=0)
+    spacing: float = option("velocities are told apart by so much: the modes are multiples of it", unit="m/s", gt=0)
+    noise: float = option(
+        "standard deviation of the acceleration along rows, and along columns, the same for one step (discrete white "
+        "noise)",
+        unit="m/s²",
+        ge=0,
+    )
+    exit_probability: float = option("probability of leaving the grid", unit="per step", gt=0, lt=1)
+
+    def check(self, key: str, root: Any) -> None:
+        """Some velocities, and not too many."""
+        super().check(key, root)
+        if self.spacing > self.speed:
+            raise refuse(f"{key}.spacing", self.spacing, f"at most {key}.speed={self.speed:g}")
+        if (modes := (2 * self.speed / self.spacing + 1) ** 2) > MOST_MODES:
+            expected = (
+                f"more: with {key}.speed={self.speed:g} these are {modes:,.0f} velocities, {MOST_MODES:,} at most"
+            )
+            raise refuse(f"{key}.spacing", self.spacing, expected)
+
+
+@choice("kernel", "constant_velocity", makes="trackmdp.world.velocity:constant_velocity")
+@dataclass(kw_only=True)
+class ConstantVelocityConfig(VelocityConfig):
+    """Nearly constant velocity, the mode, in metres and seconds; displacements have its mean exactly, never rounded."""
+
+
+@choice("kernel", "coordinated_turn", makes="trackmdp.world.velocity:coordinated_turn")
+@dataclass(kw_only=True)
+class CoordinatedTurnConfig(VelocityConfig):
+    """As constant_velocity, but the target turns left, right or not at all; turn and velocity are the mode."""
+
+    turn_rate: float = option("how fast it turns", unit="degrees/s", gt=0, le=180)
+    stay: float = option("probability of going on as it turns; else the other two are as likely", ge=0, le=1)
+
+
+def _regime(key: str, entry: Any, root: Any) -> dict[str, Any]:
+    """One regime with all its options.
+
+    Raises:
+        UserError: there is no such kernel of cells, or an option is not allowed.
+    """
+    if isinstance(entry, str) and Path(entry).suffix in (".npy", ".npz", ".csv"):
+        entry = {"kernel": "table", "path": entry}
+    known = [name for name, schema in GROUPS["kernel"].items() if schema.is_motion and not schema.hides]
+    if not isinstance(entry, dict) or "kernel" not in entry:
+        raise refuse(key, entry, "{kernel: NAME, OPTION: VALUE, ...}, or a path to a .npy, .npz or .csv file")
+    given = dict(entry)
+    if (name := given.pop("kernel")) not in known:
+        raise refuse(f"{key}.kernel", name, f"one of {', '.join(known)}")
+    return {"kernel": name} | vars(nested_choice("kernel", name, given, key, root))
