@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from trackmdp.config.options import GROUPS, Option, choice, listed, option, refuse
+from trackmdp.config.options import GROUPS, Option, choice, option, refuse
 from trackmdp.config.values import nested_choice
 from trackmdp.config.world import KernelConfig
 
@@ -42,8 +42,6 @@ class HiddenKernelConfig(KernelConfig):
         if root.learns and not root.algo.remembers:
             readers = [name for name, schema in GROUPS["algo"].items() if schema.remembers]
             raise refuse("algo", root.algo.name, f"{' or '.join(readers)} with kernel={self.name}")
-        if any(node.episodes_only for node in getattr(root, "log", {}).values()):
-            raise refuse("log", listed(root.log), f"none that holds episodes with kernel={self.name}")
         solver = getattr(root, "solver", None)
         if solver is not None and (solver.name != "optimal" or root.partition.block is not None):
             raise refuse(key, self.name, "with it solver=optimal, and no blocks")

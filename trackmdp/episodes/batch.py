@@ -17,12 +17,12 @@ from trackmdp.episodes.episode import Episode, Floats, Integers, last_cells
 from trackmdp.episodes.figures import Simulation, summary
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
-from trackmdp.world.model import Array, BoolArray, World
-from trackmdp.world.tracks import Problem
+from trackmdp.world.model import Array, BoolArray
+from trackmdp.world.tracks import Problem, Recorded
 
 __all__ = ["Episodes", "Steps"]
 
-_BELIEF = 25_600  # cells of the beliefs that are updated together: memory stays bounded on large grids
+_BELIEF = 25_600  # cells, or hidden states, of the beliefs updated together: memory stays bounded on large grids
 
 
 class Steps:
@@ -36,9 +36,10 @@ class Steps:
         self._episodes = episodes
         self._taken: dict[str, list[npt.NDArray[Any]]] = {}
 
-    def begin(self, start: Tensor) -> None:
-        """Note the cells `[B]` in which the targets start."""
+    def begin(self, start: Tensor, mode: Tensor | None) -> None:
+        """Note the cells `[B]` in which the targets start, and their modes `[B]`, if they have any."""
         self.start = start.numpy().copy()
+        self.start_mode = np.zeros_like(self.start) if mode is None else mode.numpy().copy()
 
     def add(self, row: Tensor, choice: Choice, **columns: Tensor) -> None:
         """Note one step of the episodes `row`; the columns are `[R]`."""
@@ -85,7 +86,8 @@ class Episodes(Sequence[Episode]):
         sensors: `[S]`, how many were on.
         bits: `[S, ceil(M/8)]`, the actions, eight sensors to a byte; None where they follow from the policy.
         key: `[S]`, what the policy remembered before each step; None where that is the last cell alone.
-        mode: `[S]`, the target's mode after the step, 0 once exited; None where targets have none.
+        mode: `[S]`, the target's mode after the step, -1 once exited; None where targets have none.
+        start_mode: `[E]`, their modes at the start; 0 where they have none.
     """
 
     problem: Problem
@@ -102,6 +104,7 @@ class Episodes(Sequence[Episode]):
     bits: npt.NDArray[np.uint8] | None
     key: npt.NDArray[np.int32] | None = None
     mode: npt.NDArray[np.int32] | None = None
+    start_mode: Integers | None = None
 
     @classmethod
     def of(cls, problem: Problem, policy: Policy | None, seeds: Sequence[int], batches: Sequence[Steps]) -> Episodes:
@@ -113,11 +116,14 @@ class Episodes(Sequence[Episode]):
             # No episode: columns of length 0, of the types that they have otherwise.
             columns = dict.fromkeys(("misses", "target", "sensors", "length"), none)
             columns |= {"located": none > 0, "truncated": none > 0, "reward": none.astype(np.float32)}
-        start = np.concatenate([np.zeros(0, dtype=np.int64), *(batch.start for batch in batches)])
+        start, start_mode = (
+            np.concatenate([np.zeros(0, dtype=np.int64), *(getattr(batch, name) for batch in batches)])
+            for name in ("start", "start_mode")
+        )
         # Lengths 2 1 3 begin at 0 2 3, and end at 6: episode i has the steps first[i] ... first[i + 1] - 1.
         first = np.concatenate([[0], np.cumsum(columns.pop("length"))])
         bits = columns.pop("bits", None)
-        return cls(problem, policy, list(seeds), start, first, bits=bits, **columns)
+        return cls(problem, policy, list(seeds), start, first, bits=bits, start_mode=start_mode, **columns)
 
     def __len__(self) -> int:
         return len(self.seeds)
@@ -149,6 +155,7 @@ class Episodes(Sequence[Episode]):
             terminated=bool(target[-1] == self.problem.num_cells),
             truncated=bool(self.truncated[steps][-1]),
             mode=None if self.mode is None else self.mode[steps].astype(np.int64),
+            start_mode=0 if self.start_mode is None else int(self.start_mode[number]),
         )
 
     def _keys(self, steps: slice, last_cell: Integers) -> Integers:
@@ -184,9 +191,9 @@ class Episodes(Sequence[Episode]):
         Raises:
             UserError: recorded tracks have no motion model, and so no belief.
         """
-        if not isinstance(self.problem, World):
+        if isinstance(self.problem, Recorded):
             raise UserError("episodes: recorded tracks have no motion model, and so no belief")
-        at_once = max(1, min(256, _BELIEF // self.problem.num_cells))
+        at_once = max(1, min(256, _BELIEF // self.problem.kernel.shape[0]))
         for begin in range(0, len(self), at_once):
             some = self[begin : begin + at_once]
             for episode, belief in zip(some, beliefs(self.problem, some), strict=True):

@@ -13,24 +13,33 @@ from torch import Tensor
 
 from trackmdp.episodes.episode import Episode, Floats
 from trackmdp.world.belief import BeliefFilter
-from trackmdp.world.model import World
+from trackmdp.world.model import Task
+from trackmdp.world.modes import HiddenWorld, Modelled
 
 __all__ = ["beliefs"]
 
 
-def beliefs(world: World, episodes: Sequence[Episode]) -> list[Floats]:
+def beliefs(world: Modelled, episodes: Sequence[Episode]) -> list[Floats]:
     """For each episode `[T, M]`, the probability of each cell after a step's move, given what was observed before it.
 
-    A row sums to the probability of no exit. Each is the same to the bit whatever the other episodes are.
+    A row sums to the probability of no exit. Each is the same to the bit whatever the other episodes are. Targets with
+    a mode are followed as (cell, mode), through detections that do not tell it as well.
     """
     exact, into = BeliefFilter(world.kernel), world.kernel.T.tocsr()
+    modes = world.modes if isinstance(world, HiddenWorld) else 1
+    cell = torch.arange(exact.num_cells) // modes  # of each hidden state
+    cells = sparse.csr_array((np.ones(len(cell)), (cell.numpy(), np.arange(len(cell)))))
+    told = modes == world.revealed  # with a single mode, too
     lengths = torch.tensor([len(episode) for episode in episodes])
     first = lengths.cumsum(0) - lengths
     action = torch.as_tensor(np.concatenate([_reported(world, episode) for episode in episodes]))
     target = torch.as_tensor(np.concatenate([episode.target for episode in episodes]))
     located = torch.as_tensor(np.concatenate([episode.located for episode in episodes]))
+    mode = torch.as_tensor(np.concatenate([_modes_of(episode) for episode in episodes]))
     found = torch.zeros(len(target), world.num_cells)
-    belief = exact.detect(torch.tensor([episode.start for episode in episodes]))
+    start, first_mode = (torch.tensor([getattr(each, name) for each in episodes]) for name in ("start", "start_mode"))
+    # Where the mode is not told, any of the cell's is as likely at the start.
+    belief = exact.detect(start * modes + first_mode) if told else (cell == start[:, None]).double() / modes
     rows = torch.arange(len(episodes))
     for t in range(int(lengths.max())):
         # Episodes that have ended leave the batch, `rows` says which ones the rows of `belief` belong to.
@@ -38,14 +47,25 @@ def beliefs(world: World, episodes: Sequence[Episode]) -> list[Floats]:
         rows, belief = rows[going_on], belief[going_on]
         step = first[rows] + t
         predicted = _predict(into, belief)
-        found[step] = predicted.float()
+        found[step] = (predicted if modes == 1 else _predict(cells, predicted)).float()
         # An exit ends the episode; its cell M has no belief, and cell 0 stands in, unused.
-        seen = exact.detect(target[step] * located[step])
-        belief = torch.where(located[step, None], seen, exact.miss(predicted, action[step]))
+        at = target[step] * located[step]
+        if told:
+            seen = exact.detect(at * modes + mode[step] * located[step])
+        else:  # what was predicted of the cell's modes
+            seen = exact.miss(predicted, cell != at[:, None])
+        belief = torch.where(
+            located[step, None], seen, exact.miss(predicted, action[step].repeat_interleave(modes, -1))
+        )
     return [part.numpy() for part in found.split(lengths.tolist())]
 
 
-def _reported(world: World, episode: Episode) -> npt.NDArray[Any]:
+def _modes_of(episode: Episode) -> npt.NDArray[Any]:
+    """`[T]` the mode after each step; 0 where targets have none."""
+    return np.zeros(len(episode), dtype=np.int64) if episode.mode is None else episode.mode
+
+
+def _reported(world: Task, episode: Episode) -> npt.NDArray[Any]:
     """`[T, M]` probability that a step reports a target in each cell; the action itself where reports are certain."""
     if world.perfect and world.safe:
         return episode.action
@@ -54,7 +74,7 @@ def _reported(world: World, episode: Episode) -> npt.NDArray[Any]:
 
 
 def _predict(into: sparse.csr_array, belief: Tensor) -> Tensor:
-    """`BeliefFilter.predict`, with sums whose order does not depend on how many rows there are.
+    """`into` `[Y, X]` times each row of `belief` `[B, X]`, with sums whose order does not depend on B.
 
     A product of dense matrices may add up in another order for one row than for many, which would make an episode
     differ in the last bit when it is simulated again alone; a sparse one adds up each result entry by entry.

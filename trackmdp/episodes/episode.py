@@ -39,7 +39,8 @@ class Episode:
         belief: `[T, M]` probability of each cell after the move, given all that was observed before it; a row sums to
             the probability of no exit. None unless it was asked for.
         probability: `[T, M]` with which the policy switched each sensor on. None unless it was asked for.
-        mode: `[T]` the target's mode after the move, 0 once exited; None where targets have none.
+        mode: `[T]` the target's mode after the move, -1 once exited; None where targets have none.
+        start_mode: its mode at the start; 0 where targets have none.
     """
 
     number: int
@@ -56,6 +57,7 @@ class Episode:
     belief: Floats | None = None
     probability: Floats | None = None
     mode: Integers | None = None
+    start_mode: int = 0
     first_tick: int | None = field(default=None)
     """Place of its first step on the log's time line; None until it is logged."""
 
@@ -164,8 +166,8 @@ def _ends(steps: int, terminated: bool, truncated: bool) -> dict[str, Any]:
     return flags
 
 
-SCALARS = ("seed", "policy", "start", "terminated", "truncated")
-PER_STEP = ("target", "misses", "action", "located", "reward", "probability", "belief")
+SCALARS = ("seed", "policy", "start", "start_mode", "terminated", "truncated")
+PER_STEP = ("target", "mode", "misses", "action", "located", "reward", "probability", "belief")
 
 
 def first_difference(logged: Episode, again: Episode, *, belief_tolerance: float = 0.0) -> str | None:
@@ -181,7 +183,8 @@ def first_difference(logged: Episode, again: Episode, *, belief_tolerance: float
         if mine != other:
             return f"{name}: logged {mine}, re-simulated {other}"
     steps = min(len(logged), len(again))
-    found = [_differing(logged, again, name, steps, belief_tolerance) for name in PER_STEP]
+    known = [name for name in PER_STEP if name != "mode" or logged.mode is not None]
+    found = [_differing(logged, again, name, steps, belief_tolerance) for name in known]
     earliest = min((each for each in found if each is not None), default=None, key=lambda each: each[0])
     if earliest is not None:
         return f"step {earliest[0]}, {earliest[1]}"

@@ -13,7 +13,16 @@ from typing import Any
 
 from trackmdp.episodes import schema
 
-__all__ = ["check_policy", "check_row", "check_run", "check_steps", "size_of_grid", "tables_of", "policy_file"]
+__all__ = [
+    "check_policy",
+    "check_row",
+    "check_run",
+    "check_steps",
+    "modes_of",
+    "size_of_grid",
+    "tables_of",
+    "policy_file",
+]
 
 _MOST = 10**9
 """Steps, episodes, T_max: beyond any log, and small enough to be multiplied without overflow."""
@@ -23,6 +32,11 @@ _FINITE = 1e30
 """A reward is stored as float32, whose largest number is 3.4e38; a sum of many must stay below it."""
 
 
+def modes_of(run: Mapping[str, str]) -> int:
+    """Modes of the targets of a log; 0 where they have none."""
+    return int(run.get("modes") or 0)
+
+
 def check_run(run: Mapping[str, str]) -> None:
     """See that the metadata `trackmdp.run` describe a world.
 
@@ -30,9 +44,10 @@ def check_run(run: Mapping[str, str]) -> None:
         ValueError: they do not.
     """
     _count(run, "size", 1, _LARGEST_GRID)
-    for name in ("columns", "window"):  # of rectangles, and of worlds with a window
+    # Of rectangles, of worlds with a window, and of targets with modes and detections that tell them.
+    for name, least in {"columns": 1, "window": 0, "modes": 1, "revealed": 1}.items():
         if run.get(name):
-            _count(run, name, 0 if name == "window" else 1, _LARGEST_GRID)
+            _count(run, name, least, _LARGEST_GRID)
     _count(run, "t_max", 0, _MOST)
     if run["max_steps"]:
         _count(run, "max_steps", 1, _MOST)
@@ -69,19 +84,24 @@ def check_policy(facts: Mapping[str, str], cells: int) -> None:
         raise ValueError("the digest of a policy's table")
     if facts["kind"] == "random_k":
         _count(facts, "k", 0, cells)
+    if "memory" in facts:
+        _count(facts, "clip", 1, _LARGEST_GRID)
+        _count(facts, "revealed", 1, _LARGEST_GRID)
 
 
-def check_row(row: Any, cells: int) -> dict[str, Any]:
+def check_row(row: Any, cells: int, modes: int = 0) -> dict[str, Any]:
     """An entry of the index of episodes, or the `/episode` message, which is the same.
 
     Args:
         row: as it was decoded.
         cells: M.
+        modes: of the targets, 0 where they have none.
 
     Raises:
         ValueError, KeyError, TypeError: it is something else.
     """
     whole = {"episode": _MOST, "policy": _MOST, "start": cells, "length": _MOST, "detections": _MOST, "forced": _MOST}
+    whole |= {"start_mode": modes} if modes else {}
     for name, limit in whole.items():
         if type(row[name]) is not int or not 0 <= row[name] < limit:
             raise ValueError(f"{name} {str(row[name])[:40]} of an episode")
@@ -97,8 +117,8 @@ def check_row(row: Any, cells: int) -> dict[str, Any]:
     return dict(row)
 
 
-def check_steps(steps: Sequence[Any], cells: int) -> None:
-    """See that the `/step` messages name cells of the grid, and finite rewards.
+def check_steps(steps: Sequence[Any], cells: int, modes: int = 0) -> None:
+    """See that the `/step` messages name cells of the grid, modes where targets have any, and finite rewards.
 
     Raises:
         ValueError, KeyError, TypeError: one does not.
@@ -110,6 +130,8 @@ def check_steps(steps: Sequence[Any], cells: int) -> None:
         "reward": _is_number,
         "active": lambda on: type(on) is list and all(type(cell) is int and 0 <= cell < cells for cell in on),
     }
+    if modes:
+        rules["mode"] = lambda mode: type(mode) is int and -1 <= mode < modes
     for step in steps:
         for name, holds in rules.items():
             if not holds(step[name]):

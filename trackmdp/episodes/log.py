@@ -12,7 +12,7 @@ from trackmdp.episodes.recover import taken_over
 from trackmdp.episodes.simulate import simulate
 from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.policies.policy import PolicyLike
-from trackmdp.world.model import World
+from trackmdp.world.modes import Modelled
 
 __all__ = ["EpisodeLog", "free_name"]
 
@@ -37,7 +37,7 @@ class EpisodeLog:
     def __init__(
         self,
         folder: Path,
-        world: World,
+        world: Modelled,
         *,
         seed: int,
         config: str,

@@ -13,7 +13,7 @@ from trackmdp.episodes.log import EpisodeLog
 from trackmdp.policies.policy import Policy
 from trackmdp.training.callbacks import Callback, Training
 from trackmdp.training.evaluator import Score
-from trackmdp.world.model import World
+from trackmdp.world.tracks import Recorded
 
 __all__ = ["EpisodeLogger"]
 
@@ -34,7 +34,7 @@ class EpisodeLogger(Callback):
 
     def on_start(self, trainer: Training) -> None:
         """Open the log; what an earlier process recorded after its last checkpoint is cut off."""
-        assert isinstance(trainer.problem, World)
+        assert not isinstance(trainer.problem, Recorded)  # they are refused: there is no belief
 
         def tell(line: str) -> None:
             self._lost = line

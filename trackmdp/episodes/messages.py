@@ -32,7 +32,8 @@ _WORDS = ("false", "true")
 
 def row_of(episode: Episode, t_max: int, first_tick: int) -> dict[str, Any]:
     """The `/episode` message."""
-    return {
+    of_mode = {} if episode.mode is None else {"start_mode": episode.start_mode}
+    return of_mode | {
         "episode": episode.number,
         # Seeds have 63 bits and times in ns 60: as JSON numbers, a viewer in JavaScript would round them, which it
         # does beyond 2^53.
@@ -66,6 +67,8 @@ def step_messages(episode: Episode, size: tuple[int, int], t_max: int) -> Iterat
     active = [",".join(map(str, each.tolist())) for each in np.split(ids, np.searchsorted(steps, range(1, last + 1)))]
     known = (episode.misses, episode.last_cell, episode.action.sum(1), episode.forced(t_max))
     came = (target, x, y, episode.observation, episode.reward.astype(np.float64), episode.returns)
+    # Of targets with a mode, one more entry at the end.
+    modes = [""] * len(episode) if episode.mode is None else [f',"mode":{mode}' for mode in episode.mode.tolist()]
     # tolist() once for each column: Python's numbers are formatted several times faster than NumPy's scalars.
     for t, (n, cell, count, forced, at, at_x, at_y, obs, reward, total) in enumerate(
         zip(*(column.tolist() for column in (*known, *came)), strict=True)
@@ -74,7 +77,7 @@ def step_messages(episode: Episode, size: tuple[int, int], t_max: int) -> Iterat
             f'{{"episode":{episode.number},"t":{t},"n":{n},"last_cell":{cell},"active":[{active[t]}],'
             f'"n_active":{count},"forced":{_WORDS[forced]},"target":{at},"target_x":{at_x},"target_y":{at_y},'
             f'"obs":{obs},"reward":{reward!r},"ep_return":{total!r},'
-            f'"first":{_WORDS[t == 0]},"last":{_WORDS[t == last]}}}'
+            f'"first":{_WORDS[t == 0]},"last":{_WORDS[t == last]}{modes[t]}}}'
         ).encode()
 
 
@@ -100,9 +103,9 @@ def grid_messages(episode: Episode, size: tuple[int, int], first_tick: int) -> I
 
 
 def decode(
-    row: dict[str, Any], steps: list[bytes], grids: list[bytes], size: tuple[int, int], first_tick: int
+    row: dict[str, Any], steps: list[bytes], grids: list[bytes], size: tuple[int, int], first_tick: int, modes: int
 ) -> Episode:
-    """The episode that these messages were made from.
+    """The episode that these messages were made from; `modes` of the targets, 0 where they have none.
 
     Raises:
         UserError: they do not fit together.
@@ -114,7 +117,7 @@ def decode(
         (each["episode"], each["t"]) != (number, t) for t, each in enumerate(said)
     ):
         raise UserError(f"episode={number}: its steps do not fit together")
-    check_steps(said, m)
+    check_steps(said, m, modes)
     packed = b"".join(base64.b64decode(json.loads(grid)["data"], validate=True) for grid in grids)
     # frombuffer and reshape refuse a length that does not fit: `count` grids of M cells of ten bytes.
     cells = np.frombuffer(packed, _CELL).reshape(count, *size)[:, ::-1].reshape(count, m)
@@ -137,4 +140,6 @@ def decode(
         terminated=row["terminated"],
         truncated=row["truncated"],
         first_tick=first_tick,
+        mode=np.array([each["mode"] for each in said], dtype=np.int64) if modes else None,
+        start_mode=row["start_mode"] if modes else 0,
     )

@@ -14,6 +14,8 @@ from trackmdp.durable import write_text
 from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.solvers import bounds
+from trackmdp.solvers.keyed_search import cell_bound
+from trackmdp.world.modes import HiddenWorld
 
 __all__ = ["MOST_CELLS", "MOST_STEPS", "page", "write_page"]
 
@@ -47,7 +49,7 @@ def page(reader: EpisodeReader, episode: Episode) -> str:
 
 def _content(reader: EpisodeReader, episode: Episode) -> dict[str, Any]:
     world, shown = reader.world(), slice(0, MOST_STEPS)
-    bound = bounds.clocked(world)
+    bound = cell_bound(world) if isinstance(world, HiddenWorld) else bounds.clocked(world)
     target = np.where(episode.target == world.num_cells, -1, episode.target)
     about = f"{world.rows} x {world.columns} grid, {len(episode)} steps, seed {reader.run.get('seed', '')}"
     if len(episode) > MOST_STEPS:

@@ -27,6 +27,7 @@ from trackmdp.policies.policy import Policy
 from trackmdp.untrusted import decoded, reason
 from trackmdp.world.files import csr_of
 from trackmdp.world.model import Array, BoolArray, World
+from trackmdp.world.modes import HiddenWorld, Modelled
 
 __all__ = ["EpisodeReader", "checked_run"]
 
@@ -49,7 +50,7 @@ class EpisodeReader:
     def __init__(self, file: Path | str) -> None:
         self.file = Path(file)
         self._container = Container(self.file)
-        self._built: World | None = None
+        self._built: Modelled | None = None
         try:
             self._open()
         except BaseException:
@@ -82,7 +83,8 @@ class EpisodeReader:
         self.policies = [self._told(f"{schema.POLICY}.{k}") for k in range(int(self.end["policies"]))]
         for facts in self.policies:
             check_policy(facts, cells)
-        self.rows: list[dict[str, Any]] = [check_row(row, cells) for row in json.loads(index)]
+        modes = limits.modes_of(self.run)
+        self.rows: list[dict[str, Any]] = [check_row(row, cells, modes) for row in json.loads(index)]
         self._numbers = [row["episode"] for row in self.rows]
         steps = sum(row["length"] for row in self.rows)
         if (str(len(self.rows)), str(steps)) != (self.end["episodes"], self.end["steps"]):
@@ -153,8 +155,8 @@ class EpisodeReader:
         # The index at the end and the message at the episode's own place say the same, or one of them was changed.
         if self._checked(lambda: [json.loads(text) for text in mine["/episode"]]) != [row]:
             raise self._damage(f"episode {number} is not what the index says")
-        size = limits.size_of_grid(self.run)
-        return self._checked(decode, row, mine["/step"], mine["/grid"], size, schema.tick_of(begin))
+        size, tick = limits.size_of_grid(self.run), schema.tick_of(begin)
+        return self._checked(decode, row, mine["/step"], mine["/grid"], size, tick, limits.modes_of(self.run))
 
     def _between(self, begin: int, end: int) -> list[Message]:
         """The messages from one log time to another; the chunk read last is kept, for the episode after."""
@@ -183,45 +185,49 @@ class EpisodeReader:
         Raises:
             UserError: it is of a kind that cannot act again.
         """
-        facts, task, table = self.policies[number], self.world().task, self.policy_table(number)
+        facts, task, table = self.policies[number], self.world().remembering(), self.policy_table(number)
+        if "memory" in facts:
+            clip, revealed = int(facts["clip"]), int(facts["revealed"])
+            task = task.remembering(facts["memory"], clip=clip, revealed=revealed)
         if facts["kind"] == "random_k":
             return Policy.random_k(task, int(facts["k"]))
         if facts["kind"] != "chains" or table is None:
             raise UserError(f"file={self.file}: policy {number} is a {facts['kind']!r}, expected chains or random_k")
         if limits.policy_file(number, self.run).endswith(".npz"):
             return Policy(task, self._checked(_matrix, table))
-        return Policy.from_dense(task, self._checked(self._unpacked, table))
+        return Policy.from_dense(task, self._checked(self._unpacked, table, task.num_keys))
 
-    def _unpacked(self, table: bytes) -> BoolArray:
+    def _unpacked(self, table: bytes, keys: int) -> BoolArray:
         cells, bits = math.prod(limits.size_of_grid(self.run)), _load(table)
-        if bits.dtype != np.uint8 or bits.shape != (cells, self.t_max + 1, -(-cells // 8)):
+        if bits.dtype != np.uint8 or bits.shape != (keys, self.t_max + 1, -(-cells // 8)):
             raise Damaged("the table of a policy")
-        # `[M, t_max+1, ceil(M/8)]` to `[M, t_max+1, M]`; `count` drops the bits that fill the last byte.
+        # `[keys, t_max+1, ceil(M/8)]` to `[keys, t_max+1, M]`; `count` drops the bits that fill the last byte.
         return np.unpackbits(bits.astype(np.uint8), axis=-1, count=cells).astype(bool)
 
-    def world(self) -> World:
+    def world(self) -> Modelled:
         """The world in which the episodes were recorded."""
         # Kept, since every episode that becomes a TensorDict needs it.
         if self._built is None:
             self._built = self._checked(self._world)
         return self._built
 
-    def _world(self) -> World:
+    def _world(self) -> Modelled:
         run = self.run
         # Kernel and prices, and where sensors may miss `[2, M]`, p_d and p_s.
         kernel, cost, *sensors = (_loaded(name, self.attachment(name)) for name in limits.tables_of(run)[1:])
         may_miss = dict(zip(("detection", "safe_detection"), sensors[0], strict=True)) if sensors else {}
-        return World(
-            kernel,
-            limits.size_of_grid(run),
-            cost=cost,
-            safe_cost=float(run["safe_cost"]),
-            t_max=self.t_max,
-            reward=float(run["reward"]),
-            max_steps=self.max_steps,
-            window=int(run["window"]) if run.get("window") else None,
-            **may_miss,
-        )
+        of_task: dict[str, Any] = may_miss | {
+            "size": limits.size_of_grid(run),
+            "cost": cost,
+            "safe_cost": float(run["safe_cost"]),
+            "t_max": self.t_max,
+            "reward": float(run["reward"]),
+            "max_steps": self.max_steps,
+            "window": int(run["window"]) if run.get("window") else None,
+        }
+        if modes := limits.modes_of(run):
+            return HiddenWorld(kernel, modes=modes, revealed=int(run["revealed"]), **of_task)
+        return World(kernel, **of_task)
 
     def check_all(self) -> None:
         """Check every byte of the file, those without meaning to this reader included."""

@@ -13,7 +13,7 @@ from typing import Any
 
 from trackmdp.episodes import container, schema
 from trackmdp.episodes.container import Damaged
-from trackmdp.episodes.limits import check_policy, check_row, policy_file, size_of_grid, tables_of
+from trackmdp.episodes.limits import check_policy, check_row, modes_of, policy_file, size_of_grid, tables_of
 from trackmdp.episodes.messages import decode
 from trackmdp.episodes.reader import checked_run
 from trackmdp.episodes.writer import EpisodeWriter
@@ -115,7 +115,8 @@ def _rewrite(file: Path, target: Path, damaged: list[str], most: float = math.in
             try:
                 if writer is None:
                     raise Damaged("what says how it was recorded")
-                row = check_row(json.loads(data), math.prod(size_of_grid(found.metadata[schema.RUN])))
+                run = found.metadata[schema.RUN]
+                row = check_row(json.loads(data), math.prod(size_of_grid(run)), modes_of(run))
                 # Episodes of policies recorded after the checkpoint: the resumed run records them again.
                 if row["policy"] >= most:
                     break
@@ -208,6 +209,6 @@ def _copy(row: dict[str, Any], found: _Found, writer: EpisodeWriter) -> int:
     # By time: messages of an episode whose own end was lost may stand before it.
     steps = [data for time, data in found.steps.items() if begin <= time <= end]
     grids = [data for time, data in found.grids.items() if begin <= time <= end]
-    size = size_of_grid(found.metadata[schema.RUN])
-    writer.add(decode(row, steps, grids, size, schema.tick_of(begin)))
+    run = found.metadata[schema.RUN]
+    writer.add(decode(row, steps, grids, size_of_grid(run), schema.tick_of(begin), modes_of(run)))
     return 1

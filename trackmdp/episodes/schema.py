@@ -13,6 +13,7 @@ from trackmdp import __version__
 __all__ = [
     "END",
     "LOG_FORMAT",
+    "MODE",
     "POLICY",
     "RUN",
     "SCHEMAS",
@@ -120,6 +121,9 @@ SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
 
 Cells are numbered row by row from the top left; -1 stands for no cell: a target that exited, nothing observed.
 """
+
+MODE = {"/step": {"mode": _INTEGER}, "/episode": {"start_mode": _INTEGER}}
+"""Topic -> what its messages have besides, in logs of targets with a mode."""
 
 
 def digest(content: bytes) -> str:

@@ -138,7 +138,7 @@ class _Batch:
         """Step until the last episode has ended."""
         place = self._draws.starts()
         start, mode = self._source.cell(place), self._source.mode(place)
-        self._steps.begin(start)
+        self._steps.begin(start, mode)
         key = self._keys.start(start, mode)
         at = _At(torch.arange(len(start)), place, start, key, torch.zeros_like(start))
         step = 0

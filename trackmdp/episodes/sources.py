@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from trackmdp.world.model import World
-from trackmdp.world.modes import HiddenWorld
+from trackmdp.world.modes import HiddenWorld, Modelled
 from trackmdp.world.motion import Motion
 from trackmdp.world.tracks import Problem, Recorded
 
@@ -37,7 +37,7 @@ class Source(Protocol):
         ...
 
     def mode(self, place: Tensor) -> Tensor | None:
-        """`[B]` modes, 0 for a target that has exited; None where targets have none."""
+        """`[B]` modes, -1 for a target that has exited; None where targets have none."""
         ...
 
     def stops(self, place: Tensor) -> Tensor:
@@ -48,7 +48,7 @@ class Source(Protocol):
 class _Sampled:
     """Targets that move as the kernel says, from a uniform start; a place is a cell."""
 
-    def __init__(self, world: World | HiddenWorld) -> None:
+    def __init__(self, world: Modelled) -> None:
         self._cells, self._motion = world.kernel.shape[0], Motion(world.kernel)
 
     def start(self, generators: Sequence[torch.Generator]) -> Tensor:
@@ -75,13 +75,13 @@ class _Hidden(_Sampled):
 
     def __init__(self, world: HiddenWorld) -> None:
         super().__init__(world)
-        self._modes = world.modes
+        self._modes, self._states = world.modes, world.num_states
 
     def cell(self, place: Tensor) -> Tensor:
         return place // self._modes
 
     def mode(self, place: Tensor) -> Tensor | None:
-        return place % self._modes
+        return torch.where(place < self._states, place % self._modes, -1)
 
 
 class _Replayed:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from trackmdp.episodes.episode import Episode
+from trackmdp.episodes.limits import modes_of
 from trackmdp.episodes.reader import EpisodeReader
 
 __all__ = ["write_tables"]
@@ -25,7 +26,7 @@ def write_tables(reader: EpisodeReader, folder: Path, number: int | None = None)
     files = [folder / "steps.csv", folder / "episodes.csv"]
     with files[0].open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)
-        writer.writerow(_STEP)
+        writer.writerow([*_STEP, "mode"] if modes_of(reader.run) else _STEP)
         for row in rows:
             writer.writerows(_steps(reader.read(row["episode"]), reader.t_max))
     with files[1].open("w", newline="", encoding="utf-8") as stream:
@@ -53,4 +54,5 @@ def _steps(episode: Episode, t_max: int) -> Iterator[list[Any]]:
             int(episode.observation[t]),
             float(episode.reward[t]),
             float(episode.returns[t]),
+            *([] if episode.mode is None else [int(episode.mode[t])]),
         ]

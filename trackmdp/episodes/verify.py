@@ -11,7 +11,7 @@ from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.episodes.schema import versions_apart
 from trackmdp.episodes.simulate import resimulate
 from trackmdp.policies.policy import Policy
-from trackmdp.world.model import World
+from trackmdp.world.modes import Modelled
 
 __all__ = ["BELIEF_TOLERANCE", "Verified", "verify"]
 
@@ -57,7 +57,7 @@ def verify(
     return Verified(done, steps, None)
 
 
-def _again(reader: EpisodeReader, world: World, policy: Policy, numbers: list[int]) -> Iterator[tuple[int, Episode]]:
+def _again(reader: EpisodeReader, world: Modelled, policy: Policy, numbers: list[int]) -> Iterator[tuple[int, Episode]]:
     rows = [reader.row(number) for number in numbers]
     again = resimulate(world, policy, [int(row["seed"]) for row in rows]).complete()
     # Simulated episodes do not know under which number and policy they were logged.

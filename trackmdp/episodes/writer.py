@@ -21,7 +21,7 @@ from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.limits import policy_file, size_of_grid
 from trackmdp.episodes.schema import time_of
 from trackmdp.policies.policy import Policy
-from trackmdp.world.model import World
+from trackmdp.world.modes import HiddenWorld, Modelled
 
 __all__ = ["EpisodeWriter"]
 
@@ -45,7 +45,7 @@ class EpisodeWriter:
         config: text of the run's `config.yaml`.
     """
 
-    def __init__(self, file: Path, world: World, *, facts: Mapping[str, str], config: str) -> None:
+    def __init__(self, file: Path, world: Modelled, *, facts: Mapping[str, str], config: str) -> None:
         tables = {
             "config.yaml": config.encode(),
             **_kernel(world),
@@ -60,6 +60,7 @@ class EpisodeWriter:
             "size": str(world.rows),
             **({} if world.rows == world.columns else {"columns": str(world.columns)}),
             **({} if world.window is None else {"window": str(world.window)}),
+            **({"modes": str(world.modes), "revealed": str(world.revealed)} if isinstance(world, HiddenWorld) else {}),
             "t_max": str(world.t_max),
             "max_steps": "" if world.max_steps is None else str(world.max_steps),
             # repr: the shortest text that reads back as the same float64.
@@ -90,15 +91,17 @@ class EpisodeWriter:
         self._writer = Writer(self._stream, enable_data_crcs=True)
         self._writer.start(library=f"trackmdp {run['trackmdp']}")
         # Once, and the numbers kept: registering a topic a second time would make a second channel of the same name.
-        self._channels = {topic: self._register(topic) for topic in schema.SCHEMAS}
+        more = schema.MODE if "modes" in run else {}
+        self._channels = {topic: self._register(topic, more.get(topic, {})) for topic in schema.SCHEMAS}
         self._tell(schema.RUN, run)
         for name, content in tables.items():
             self._attach(name, content)
         # In the file at once: a log that is cut off later can be recovered only with what it starts with.
         self._flush()
 
-    def _register(self, topic: str) -> int:
+    def _register(self, topic: str, more: dict[str, Any]) -> int:
         name, description = schema.SCHEMAS[topic]
+        description = description | {"properties": description["properties"] | more}
         text = json.dumps(description, separators=(",", ":")).encode()
         number = self._writer.register_schema(name, "jsonschema", text)
         return self._writer.register_channel(topic, "json", number)
@@ -115,7 +118,9 @@ class EpisodeWriter:
             facts: what the log says of it, for a reader: its `label`.
             policy: from which `replay verify=true` simulates them again; None where there is none.
         """
-        kind, table = _described(policy)
+        kind, table = _described(policy, sparse="kernel.npz.sha256" in self._run)
+        if policy is not None and policy.task.keyed:
+            kind |= {name: str(getattr(policy.task, name)) for name in ("memory", "clip", "revealed")}
         with self._lock:
             return self._add_policy({**facts, **kind}, table)
 
@@ -226,10 +231,11 @@ class EpisodeWriter:
         self._writer.add_attachment(time, time, name, _MEDIA[Path(name).suffix], content)
 
 
-def _described(policy: Policy | None) -> tuple[dict[str, str], bytes | None]:
+def _described(policy: Policy | None, *, sparse: bool) -> tuple[dict[str, str], bytes | None]:
     """What a log says of how a policy acts, and its table.
 
-    `[M, t_max+1, ceil(M/8)]`, eight sensors to a byte; on a large grid the CSR matrix of its sets, as SciPy saves it.
+    `[keys, t_max+1, ceil(M/8)]`, eight sensors to a byte; where the kernel is `sparse` the CSR matrix of its sets, as
+    SciPy saves it.
     """
     if policy is None:
         return {"kind": "unknown"}, None
@@ -237,16 +243,19 @@ def _described(policy: Policy | None) -> tuple[dict[str, str], bytes | None]:
         return {"kind": "random_k", "k": str(policy.k)}, None
     if not policy.deterministic:
         return {"kind": "probabilities"}, None
-    if policy.task.num_cells > DENSE_CELLS:
+    if sparse:
         if policy.sets is None:  # all on or none: as many as there are drawn, or not one, which needs no table
             return {"kind": "random_k", "k": str(round((policy.probability or 0.0) * policy.task.num_cells))}, None
         return {"kind": "chains"}, _npz(policy.sets)
     return {"kind": "chains"}, _npy(np.packbits(policy.dense(), axis=-1))
 
 
-def _kernel(world: World) -> dict[str, bytes]:
-    """The attachment that holds the kernel: dense, for any reader, or on a large grid as SciPy saves a CSR matrix."""
-    if world.num_cells > DENSE_CELLS:
+def _kernel(world: Modelled) -> dict[str, bytes]:
+    """The attachment that holds the kernel: dense, for any reader, or as SciPy saves a CSR matrix.
+
+    That on a large grid, and of targets with a mode, whose kernel is on (cell, mode).
+    """
+    if world.num_cells > DENSE_CELLS or isinstance(world, HiddenWorld):
         return {"kernel.npz": _npz(world.kernel)}
     return {"kernel.npy": _npy(world.kernel.toarray())}
 

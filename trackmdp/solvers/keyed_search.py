@@ -12,7 +12,7 @@ from trackmdp.solvers.solution import Solution
 from trackmdp.world.model import Array
 from trackmdp.world.modes import HiddenWorld
 
-__all__ = ["mode_bound", "solve_keys"]
+__all__ = ["cell_bound", "mode_bound", "solve_keys"]
 
 _SETTLED = 1e-10  # of the bound: it is approached from above, so that stopping anywhere is valid
 
@@ -45,6 +45,17 @@ def mode_bound(world: HiddenWorld) -> Array:
             return bound
 
 
+def cell_bound(world: HiddenWorld) -> Array:
+    """`[M]` `mode_bound` just after a detection in each cell, any mode as likely."""
+    return _of_cells(world, mode_bound(world))
+
+
+def _of_cells(world: HiddenWorld, bound: Array) -> Array:
+    """`[M]` of a bound `[M · H, t_max + 2]`, at n = 0."""
+    mean: Array = bound[:, 0].reshape(world.num_cells, world.modes).mean(axis=1)
+    return mean
+
+
 def solve_keys(world: HiddenWorld, *, steps: int = 12, rounds: int = 20) -> Solution:
     """A policy over keys by the homotopy from the bound's credit to the exact one, then by policy iteration.
 
@@ -69,7 +80,7 @@ def solve_keys(world: HiddenWorld, *, steps: int = 12, rounds: int = 20) -> Solu
             break
         best, value, visits, aihtr = tried
     table = pairs.table(best)
-    upper = bound[:, 0].reshape(world.num_cells, world.modes).mean(axis=1)
+    upper = _of_cells(world, bound)
     evaluation = evaluate_keys(world, table)
     certified = float(upper.mean()) - evaluation.aihtr <= 1e-6 * max(1.0, abs(evaluation.aihtr))
     return Solution(table, evaluation, upper, certified, time.monotonic() - began, nodes=0, interrupted=False)

@@ -20,7 +20,7 @@ from trackmdp.solvers.keyed_search import solve_keys
 from trackmdp.solvers.partition import narrow_halo, plan_by_blocks
 from trackmdp.solvers.solution import SearchProgress, Solution, bracketed
 from trackmdp.world.model import World
-from trackmdp.world.modes import HiddenWorld
+from trackmdp.world.modes import HiddenWorld, Modelled
 from trackmdp.world.tracks import Problem
 
 if TYPE_CHECKING:  # torch is loaded where a policy is to act
@@ -30,7 +30,7 @@ __all__ = ["baseline_policy", "run_solver", "solve"]
 
 
 def solve(
-    world: World | HiddenWorld,
+    world: Modelled,
     solver: str = default("solver", "solve"),
     *,
     nodes: int = default("solver.nodes", "solve"),
@@ -77,7 +77,7 @@ def solve(
 
 
 def run_solver(
-    world: World | HiddenWorld,
+    world: Modelled,
     choice: BaselineConfig,
     on_progress: Callable[[SearchProgress], None] | None = None,
     partition: PartitionConfig | None = None,

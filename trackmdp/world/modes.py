@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -20,10 +20,10 @@ from scipy import sparse
 
 from trackmdp.errors import UserError
 from trackmdp.world.checks import canonical_kernel, check_kernel
-from trackmdp.world.model import Array, Size, Task, grid_size
+from trackmdp.world.model import Array, Size, Task, World, grid_size
 from trackmdp.world.rows import pairwise_row_sums
 
-__all__ = ["HiddenWorld", "check_revealed", "heading_kernel", "turning_back"]
+__all__ = ["HiddenWorld", "Modelled", "check_revealed", "heading_kernel", "turning_back"]
 
 _HEADINGS = np.array([(0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1), (1, 0), (1, 1)])
 """Rows and columns of a step; 0 is to the right, and each of the eight turns left by 45 degrees."""
@@ -79,6 +79,10 @@ class HiddenWorld(Task):
     def stay_probability(self) -> Array:
         """`[M · H]` probability of still being in the grid after one step."""
         return pairwise_row_sums(self.kernel)
+
+
+Modelled: TypeAlias = World | HiddenWorld
+"""A task with a motion model."""
 
 
 def check_revealed(problem: Task, told: int) -> None:

@@ -12,7 +12,7 @@ from torch import Tensor
 from trackmdp.seeding import generator
 from trackmdp.world.draws import Draw
 from trackmdp.world.model import World
-from trackmdp.world.modes import HiddenWorld
+from trackmdp.world.modes import HiddenWorld, Modelled
 from trackmdp.world.motion import Motion
 from trackmdp.world.tracks import Problem, Recorded, Tracks
 
@@ -61,7 +61,7 @@ def make_targets(setting: Problem, device: torch.device) -> Targets:
 class SampledTargets:
     """Targets that move as the kernel says; they start uniformly over the cells."""
 
-    def __init__(self, world: World | HiddenWorld, device: torch.device) -> None:
+    def __init__(self, world: Modelled, device: torch.device) -> None:
         self._cells, self._device = world.kernel.shape[0], device
         self._motion = Motion(world.kernel, device)
         self._start = Draw(self._start_of, torch.int64, device)

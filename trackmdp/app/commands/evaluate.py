@@ -31,6 +31,7 @@ from trackmdp.training.sealing import SUMMARY, check_files, read_summary
 from trackmdp.untrusted import decoded
 from trackmdp.world.make import make_problem
 from trackmdp.world.model import World
+from trackmdp.world.modes import Modelled
 from trackmdp.world.tracks import Problem, Recorded
 
 __all__ = ["run"]
@@ -72,7 +73,7 @@ def run(cfg: EvaluateConfig, folder: Path, problem: Problem | None = None) -> fl
     write_json(folder / "evaluation.json", report | write_sets(folder, policy, value=score.evaluation.value))
     write_text(folder / "picture.txt", draw_picture(episodes, world))
     _show(console, subject, evaluator, score, simulation, folder, "run's bracket" if proved else "clocked")
-    if isinstance(mcap := cfg.log.get("mcap"), McapConfig) and isinstance(world, World):
+    if isinstance(mcap := cfg.log.get("mcap"), McapConfig):
         _log_episodes(cfg, mcap, world, episodes, subject, folder, console)
     if estimate is not None:
         shares = (
@@ -85,7 +86,7 @@ def run(cfg: EvaluateConfig, folder: Path, problem: Problem | None = None) -> fl
 def _log_episodes(
     cfg: EvaluateConfig,
     mcap: McapConfig,
-    world: World,
+    world: Modelled,
     episodes: Episodes,
     subject: str,
     folder: Path,

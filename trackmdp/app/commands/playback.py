@@ -17,8 +17,7 @@ from trackmdp.errors import UserError
 from trackmdp.policies.playback import Playback
 from trackmdp.training.display import table
 from trackmdp.world.make import make_problem
-from trackmdp.world.model import World
-from trackmdp.world.modes import HiddenWorld
+from trackmdp.world.modes import Modelled
 from trackmdp.world.tracks import Problem, Recorded
 
 __all__ = ["run"]
@@ -67,7 +66,7 @@ def _size(rows: int, columns: int) -> str:
     return str(rows) if rows == columns else f"[{rows},{columns}]"
 
 
-def reissued(world: World | HiddenWorld, logged: Episode) -> Episode:
+def reissued(world: Modelled, logged: Episode) -> Episode:
     """The episode with its own seed and its own actions, in `world`."""
     (again,) = resimulate(world, Playback(world, logged.action), [logged.seed]).complete()
     return replace(again, number=logged.number)

@@ -19,7 +19,8 @@ from trackmdp.episodes.tables import write_tables
 from trackmdp.episodes.verify import verify
 from trackmdp.errors import RunError, UserError
 from trackmdp.training.display import make_console, table
-from trackmdp.world.make import build_world
+from trackmdp.world.make import make_problem
+from trackmdp.world.tracks import Recorded
 
 __all__ = ["run"]
 
@@ -96,9 +97,12 @@ def _kernel_difference(reader: EpisodeReader) -> str | None:
     """Where the kernel of the log is not the one its config describes; a table of the user's own is taken as it is."""
     cfg = world_of(reader.attachment("config.yaml"))
     tables = [getattr(cfg.cost, "sensor", None), *vars(cfg.sensor).values()]
-    if isinstance(cfg.kernel, TableConfig) or any(isinstance(table, str) for table in tables):
+    own = isinstance(cfg.kernel, TableConfig) or any("path" in regime for regime in getattr(cfg.kernel, "regimes", ()))
+    if own or any(isinstance(table, str) for table in tables):
         return None
-    described, logged = build_world(cfg).kernel, reader.world().kernel
+    problem = make_problem(cfg)
+    assert not isinstance(problem, Recorded)  # of them there is no log
+    described, logged = problem.kernel, reader.world().kernel
     if described.shape != logged.shape:
         return f"kernel: logged {logged.shape}, the config gives {described.shape}"
     places = (described != logged).tocoo()

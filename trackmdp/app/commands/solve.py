@@ -23,7 +23,7 @@ from trackmdp.training.display import make_console, table
 from trackmdp.training.evaluator import figures
 from trackmdp.world.make import make_problem
 from trackmdp.world.model import World
-from trackmdp.world.modes import HiddenWorld
+from trackmdp.world.modes import Modelled
 from trackmdp.world.tracks import Problem, Recorded
 
 __all__ = ["run"]
@@ -82,7 +82,7 @@ def _report(cfg: SolveConfig, solution: Solution, bound: dict[str, float]) -> di
 def _show(
     console: Console,
     cfg: SolveConfig,
-    world: World | HiddenWorld,
+    world: Modelled,
     solution: Solution,
     bound: dict[str, float],
     folder: Path,
