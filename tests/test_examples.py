@@ -71,6 +71,17 @@ def test_gymnasium_sb3() -> None:
 
 
 @pytest.mark.slow
+def test_stone_soup() -> None:
+    """The same rewards on both sides; who is located more often is less far off."""
+    pytest.importorskip("stonesoup", reason="needs the extra: pip install 'trackmdp[stonesoup]'")
+    off, qmdp, optimal = (numbers(line) for line in example("stone_soup"))
+    assert all(ours == pytest.approx(theirs, abs=1e-4) for ours, theirs, *_ in (off, qmdp, optimal))
+    assert off[0] < qmdp[0] < optimal[0]
+    assert off[2] < qmdp[2] < optimal[2]
+    assert off[3] > qmdp[3] > optimal[3]
+
+
+@pytest.mark.slow
 def test_recorded_tracks() -> None:
     loaded, *rows = example("recorded_tracks")
     assert loaded.startswith("17,970 reports read, 719 targets")
