@@ -165,7 +165,7 @@ def test_issued_actions_give_the_episode_again() -> None:
 
 
 def test_playback_of_another_grid_is_refused() -> None:
-    with pytest.raises(UserError, match=r"actions for \(9,\) cells, expected 16"):
+    with pytest.raises(UserError, match=r"actions of \(9,\) sensors, expected 16"):
         Playback(WORLD, np.zeros((3, 9), dtype=bool))
 
 

@@ -36,11 +36,13 @@ class BaselineConfig(ChoiceConfig):
 
     Attributes:
         reads_motion: needs the kernel, which recorded tracks have not.
+        knows_footprints: sensors may cover several cells.
         whole_episodes: plans for episodes that only the exit ends; `grid.max_steps` then counts in the valuing alone.
     """
 
     reads_motion: ClassVar[bool] = True
     whole_episodes: ClassVar[bool] = False
+    knows_footprints: ClassVar[bool] = True
 
 
 @choice("baseline", "qmdp", makes="trackmdp.solvers.qmdp:solve")
@@ -74,12 +76,13 @@ class RandomKConfig(BaselineConfig):
     """k sensors drawn at random each step."""
 
     reads_motion: ClassVar[bool] = False
-    k: int = option("sensors switched on, at most M", unit="sensors", ge=0)
+    k: int = option("sensors switched on, at most as many as there are", unit="sensors", ge=0)
 
     def check(self, key: str, root: Any) -> None:
-        """There are only M sensors."""
-        if self.k > root.grid.num_cells:
-            expected = f"at most {root.grid.num_cells}, the sensors of a grid.size={root.grid.size} grid"
+        """There are only so many sensors."""
+        count = root.sensor.count(root.grid)
+        if count is not None and self.k > count:
+            expected = f"at most {count}, the sensors of a grid.size={root.grid.size} grid"
             raise refuse(f"{key}.k", self.k, expected)
 
 
@@ -112,6 +115,8 @@ class FcrConfig(BaselineConfig):
 @dataclass(kw_only=True)
 class LookaheadConfig(BaselineConfig):
     """Plan some sets ahead, then count on a simpler value."""
+
+    knows_footprints: ClassVar[bool] = False
 
     depth: int = option("sets planned ahead", unit="steps", ge=1, le=16)
     tail: str = option("value counted on after them", choices=("qmdp", "clocked"))

@@ -71,6 +71,8 @@ class AlgoConfig(ChoiceConfig):
     credit: ClassVar[str | None] = "joint"
     remembers: ClassVar[bool] = False
     """Whether it learns policies that remember more than the cell (`task.memory`)."""
+    knows_footprints: ClassVar[bool] = False
+    """Whether sensors may cover several cells."""
     total_frames: int = option("env steps the algorithm needs", unit="frames", ge=1, le=MOST_FRAMES)
     frames_per_batch: int = option("env steps per collected batch", unit="frames", ge=1)
     envs: int = option("environments stepped together", ge=1)
@@ -80,6 +82,7 @@ class AlgoConfig(ChoiceConfig):
 class ActorCriticConfig(AlgoConfig):
     """What A2C and PPO have in common."""
 
+    knows_footprints: ClassVar[bool] = True
     gamma: float = option("discount while learning; policies are evaluated undiscounted", ge=0, le=1)
     gae_lambda: float = option("λ of the generalised advantage estimate", ge=0, le=1)
     learning_rate: ScheduleConfig
@@ -137,6 +140,7 @@ class PrioritizedConfig(NodeConfig):
 class DqnConfig(AlgoConfig):
     """Double DQN with a Q that adds up over the sensors."""
 
+    knows_footprints: ClassVar[bool] = True
     gamma: float = option("discount while learning; policies are evaluated undiscounted", ge=0, le=1)
     learning_rate: ScheduleConfig
     epsilon: ScheduleConfig

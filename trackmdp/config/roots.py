@@ -164,6 +164,11 @@ class VerifyConfig(WorldConfig):
 
     tolerance: float = option("deviation that still counts as equal", unit="reward", gt=0, lt=1)
 
+    def check(self, key: str, root: Any) -> None:
+        """The theorems are on sensors of one cell."""
+        if self.sensor.covers:
+            raise refuse("sensor", self.sensor.name, "perfect or miss; the theorems are on sensors of one cell")
+
 
 @dataclass(kw_only=True)
 class BenchmarkConfig(WorldConfig):

@@ -15,6 +15,7 @@ __all__ = [
     "CostConfig",
     "DriftConfig",
     "FalseAlarmConfig",
+    "FootprintConfig",
     "GridConfig",
     "KernelConfig",
     "MissConfig",
@@ -26,6 +27,7 @@ __all__ = [
     "TaskConfig",
     "TracksConfig",
     "MEMORIES",
+    "lattice",
 ]
 
 LARGEST = 1e15
@@ -37,10 +39,13 @@ MEMORIES = ("cell", "displacement", "displacement_gap", "two_displacements")
 
 @dataclass(kw_only=True)
 class GridConfig(NodeConfig):
-    """The grid of cells, one sensor in each, and the limits on an episode."""
+    """The grid of cells and the limits on an episode."""
 
     size: Any = option(
-        "N, cells along each side, or [rows, columns]; M cells and sensors in all", unit="cells", ge=3, pair=True
+        "N, cells along each side, or [rows, columns]; M cells in all, by default with a sensor in each",
+        unit="cells",
+        ge=3,
+        pair=True,
     )
     t_max: int = option("T_max: free choices at n = 0 ... t_max, then the safe action", unit="steps", ge=0, le=16)
     max_steps: int | None = option(
@@ -258,9 +263,9 @@ class PaperCostConfig(CostConfig):
 
     reward: float = option("r, earned by a detection", unit="reward", ge=1 / LARGEST, le=LARGEST)
     sensor: Any = option(
-        "c, price of one sensor switched on for one step, for all cells or for each",
+        "c, price of one sensor switched on for one step, for all sensors or for each",
         unit="reward per sensor-step",
-        expects="a number from 0 to 1e15, a list of one per cell, or a path to a .npy or .csv file of one per cell",
+        expects="a number from 0 to 1e15, a list of one per sensor, or a path to a .npy or .csv file of one per sensor",
         path=True,
     )
     safe: float | None = option(
@@ -270,7 +275,8 @@ class PaperCostConfig(CostConfig):
     def check(self, key: str, root: Any) -> None:
         """One price for all sensors, or one for each; a file is read later."""
         price = Option("", ge=0, le=LARGEST, kind=float)
-        _check_per_cell(f"{key}.sensor", self.sensor, root, price, "number from 0 to 1e15")
+        count, each = root.sensor.count(root.grid), "sensor" if root.sensor.covers else "cell"
+        _check_per_cell(f"{key}.sensor", self.sensor, count, price, "number from 0 to 1e15", each)
 
 
 @dataclass(kw_only=True)
@@ -279,6 +285,13 @@ class SensorConfig(ChoiceConfig):
 
     What a choice makes is called with the grid's size and the choice's options, and returns arguments of `Task`.
     """
+
+    covers: ClassVar[bool] = False
+    """Whether a sensor covers a set of cells, so that there need not be one in each cell."""
+
+    def count(self, grid: GridConfig) -> int | None:
+        """S, how many sensors there are; None where only a file tells."""
+        return grid.num_cells
 
 
 @choice("sensor", "perfect", makes="trackmdp.world.sensors:perfect")
@@ -307,7 +320,8 @@ class MissConfig(SensorConfig):
         """One probability for all cells, or one for each; a file is read later."""
         for name in ("p_d", "p_s"):
             number = Option("", gt=0, le=1, kind=float)
-            _check_per_cell(f"{key}.{name}", getattr(self, name), root, number, "number above 0, at most 1")
+            given = getattr(self, name)
+            _check_per_cell(f"{key}.{name}", given, root.grid.num_cells, number, "number above 0, at most 1")
 
 
 @choice("sensor", "false_alarm", makes="trackmdp.world.sensors:false_alarm")
@@ -332,26 +346,88 @@ class FalseAlarmConfig(SensorConfig):
             )
         if root.log:
             raise refuse("log", listed(root.log), f"[] with {key}={self.name}, where nothing is simulated")
-        _check_per_cell(f"{key}.p_d", self.p_d, root, Option("", gt=0, le=1, kind=float), "number above 0, at most 1")
+        number = Option("", gt=0, le=1, kind=float)
+        _check_per_cell(f"{key}.p_d", self.p_d, root.grid.num_cells, number, "number above 0, at most 1")
 
 
-def _check_per_cell(key: str, value: Any, root: Any, number: Option, allowed: str) -> None:
-    """Refuse what is neither one number for all cells, nor a list of one for each, nor the name of a table.
+@choice("sensor", "footprint", makes="trackmdp.world.sensors:footprint")
+@dataclass(kw_only=True)
+class FootprintConfig(SensorConfig):
+    """Wide sensors: each covers several cells, and if on it always locates the target in any of them, never misses."""
+
+    covers: ClassVar[bool] = True
+    radius: float = option(
+        "how far from its own cell the centres of the cells are that a sensor covers", unit="cells", ge=0
+    )
+    spacing: int = option("rows and columns from one sensor to the next, on a lattice", unit="cells", ge=1)
+    path: str | None = option(
+        "file in place of the lattice: a row per sensor, 1 in the column of each cell that it covers",
+        expects="a path to a .npz (scipy.sparse.save_npz or an array), .npy or .csv file",
+        path=True,
+    )
+
+    def count(self, grid: GridConfig) -> int | None:
+        """As many as the lattice has places."""
+        rows, columns = (len(lattice(side, self.spacing)) for side in grid.sides)
+        return None if self.path is not None else rows * columns
+
+    def check(self, key: str, root: Any) -> None:
+        """What footprints do not go together with."""
+        if self.path is not None and Path(self.path).suffix not in (".npz", ".npy", ".csv"):
+            raise refuse(f"{key}.path", self.path, "a path to a .npz, .npy or .csv file")
+        if root.grid.window is not None:
+            raise refuse("grid.window", root.grid.window, f"null with {key}={self.name}, whose sensors lie at no cell")
+        self._check_solver(key, root)
+        if root.kernel.hides:
+            raise refuse("kernel", root.kernel.name, f"a kernel without a hidden mode with {key}={self.name}")
+        if getattr(root, "task", None) is not None and root.task.memory != "cell":
+            raise refuse("task.memory", root.task.memory, f"cell with {key}={self.name}")
+
+    def _check_solver(self, key: str, root: Any) -> None:
+        """What plans and proves for sensors of one cell alone."""
+        for group in ("solver", "baseline"):
+            planner = getattr(root, group, None)
+            if planner is not None and not planner.knows_footprints:
+                known = [name for name, schema in GROUPS[group].items() if schema.knows_footprints]
+                raise refuse(group, planner.name, f"one of {', '.join(known)} with {key}={self.name}")
+        if root.learns and not root.algo.knows_footprints:
+            known = [name for name, schema in GROUPS["algo"].items() if schema.knows_footprints]
+            raise refuse("algo", root.algo.name, f"one of {', '.join(known)} with {key}={self.name}")
+        if getattr(root, "verify", False):
+            raise refuse("verify", True, f"false with {key}={self.name}: the theorems are on sensors of one cell")
+        if (partition := getattr(root, "partition", None)) is not None and partition.block is not None:
+            raise refuse("partition.block", partition.block, f"null with {key}={self.name}")
+
+    def ignored(self, root: Any) -> dict[str, str]:
+        """A file holds the footprints themselves."""
+        why = f"with sensor.path={self.path}"
+        return {} if self.path is None else {"radius": why, "spacing": why}
+
+
+def lattice(side: int, spacing: int) -> range:
+    """Rows, or columns, of a lattice on `side` of them; with a spacing of 3, 0 3 6 9 of 10, and 1 4 7 of 9."""
+    return range((side - 1) % spacing // 2, side, spacing)
+
+
+def _check_per_cell(
+    key: str, value: Any, count: int | None, number: Option, allowed: str, each_of: str = "cell"
+) -> None:
+    """Refuse what is neither one number for all cells or sensors, nor a list of one for each, nor the name of a table.
 
     Such options are declared Any, since OmegaConf has no union of number, list and text; so values are checked here.
 
     Raises:
         UserError: it is something else.
     """
-    cells = root.grid.num_cells
     if isinstance(value, list):
-        if len(value) != cells:
-            raise UserError(f"{key}: {len(value)} values, expected one number or {cells} (one per cell)")
+        if count is not None and len(value) != count:
+            raise UserError(f"{key}: {len(value)} values, expected one number or {count} (one per {each_of})")
         for index, each in enumerate(value):
             if each is None or not number.allows(each):
                 raise refuse(f"{key}[{index}]", each, f"a {allowed}")
         return
     fine = Path(value).suffix in (".npy", ".csv") if isinstance(value, str) else number.allows(value)
     if value is None or not fine:
-        expected = f"a {allowed}, a list of {cells} of them (one per cell), or a path to a .npy or .csv file"
+        several = "" if count is None else f" of {count} of them"
+        expected = f"a {allowed}, a list{several} (one per {each_of}), or a path to a .npy or .csv file"
         raise refuse(key, value, expected)

@@ -1,8 +1,8 @@
 """Actors: the decisions of a policy, playback or function in a batch of states, given the uniform draws.
 
-A step asks three things of a decision: whether the sensor where the target turns up is on, how many sensors are on, and
+A step asks three things of a decision: whether the target is sensed where it turns up, how many sensors are on, and
 what they cost. A table answers them from one row per state, so that a step costs the same on any grid; whatever else
-acts writes its action out over all M sensors.
+acts writes its action out over all S sensors.
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ import torch
 from torch import Tensor
 
 from trackmdp.policies.playback import Playback
-from trackmdp.policies.policy import Policy, PolicyLike, as_policy, rule_of
+from trackmdp.policies.policy import Policy, PolicyLike, as_policy, looked_up, rule_of
 from trackmdp.policies.unroll import DrawsError, Rule, acting
 from trackmdp.world.costs import Costs
 from trackmdp.world.model import Task
+from trackmdp.world.sight import Sight
 from trackmdp.world.windows import Window
 
 __all__ = ["Actor", "Asking", "Choice", "Drawing", "Following", "Issuing", "States", "Uniform", "actor_of"]
@@ -63,11 +64,11 @@ class Choice(Protocol):
 
     @property
     def action(self) -> Tensor | None:
-        """`[B, M]` bool; None where it follows from the state, and need not be kept."""
+        """`[B, S]` bool; None where it follows from the state, and need not be kept."""
         ...
 
     def sensed(self, cell: Tensor) -> Tensor:
-        """`[B]` bool, whether the sensor at `cell` `[B]` is on."""
+        """`[B]` bool, whether a sensor that is on sees `cell` `[B]`."""
         ...
 
 
@@ -112,26 +113,25 @@ class _Rows:
 class _Same:
     """All sensors, or none, in every state."""
 
-    on: bool
+    seen: Tensor
     count: Tensor
     spent: Tensor
     action: ClassVar[Tensor | None] = None
 
     def sensed(self, cell: Tensor) -> Tensor:
-        return torch.full_like(cell, self.on, dtype=torch.bool)
+        return self.seen[cell]
 
 
 class _Written:
     """Actions written out over all sensors."""
 
-    def __init__(self, action: Tensor, costs: Costs) -> None:
+    def __init__(self, action: Tensor, costs: Costs, sight: Sight) -> None:
         self.action: Tensor | None = action
-        self._on = action
+        self._on, self._sight = action, sight
         self.count, self.spent = action.sum(-1), costs.price_of(action)
 
     def sensed(self, cell: Tensor) -> Tensor:
-        # `[B, M]` at `[B, 1]`: of each row the entry of its own cell.
-        return self._on.gather(1, cell.unsqueeze(1)).squeeze(1)
+        return self._sight.sees(self._on, cell, cell)
 
 
 class Following:
@@ -141,7 +141,8 @@ class Following:
 
     def __init__(self, policy: Policy, costs: Costs) -> None:
         assert policy.sets is not None
-        self.policy, self._table = policy, policy.lookup(torch.device("cpu"))
+        self.policy, cpu = policy, torch.device("cpu")
+        self._table = policy.lookup(cpu) if policy.seen is policy.sets else looked_up(policy.seen, cpu)
         # A CSR matrix's indptr says where each row's entries begin: 0 2 2 5 are rows of 2, 0 and 3 sensors.
         self._count = torch.as_tensor(np.diff(policy.sets.indptr).astype(np.int64))
         self._spent = costs.of_sets(policy.sets)
@@ -159,14 +160,18 @@ class Uniform:
 
     def __init__(self, policy: Policy, costs: Costs) -> None:
         self.policy = policy
-        action = torch.full((1, policy.task.num_cells), policy.probability == 1.0)
-        self._on, self._count, self._spent = bool(action[0, 0]), action.sum(-1), costs.price_of(action)
+        on, coverage = policy.probability == 1.0, policy.task.coverage
+        action = torch.full((1, policy.task.total_sensors), on)
+        self._seen = torch.full((policy.task.num_cells,), on)
+        if coverage is not None:
+            self._seen &= torch.as_tensor(coverage.degree) > 0
+        self._count, self._spent = action.sum(-1), costs.price_of(action)
 
     def decide(self, states: States, draws: Tensor) -> Choice:  # noqa: ARG002
         """See `Actor`."""
         b = len(states.row)
         # expand repeats one number B times without memory of its own.
-        return _Same(self._on, self._count.expand(b), self._spent.expand(b))
+        return _Same(self._seen, self._count.expand(b), self._spent.expand(b))
 
 
 class Drawing:
@@ -174,11 +179,12 @@ class Drawing:
 
     def __init__(self, policy: Policy, costs: Costs) -> None:
         self.policy, self._costs, self.num_draws = policy, costs, policy.num_draws
+        self._sight = Sight(policy.task, everywhere=True)
         self.most_rows = max(1, min(256, _DRAWS // policy.num_draws))
 
     def decide(self, states: States, draws: Tensor) -> Choice:
         """See `Actor`."""
-        return _Written(self.policy.act(states.key, states.misses, draws), self._costs)
+        return _Written(self.policy.act(states.key, states.misses, draws), self._costs, self._sight)
 
 
 class Issuing:
@@ -188,13 +194,14 @@ class Issuing:
 
     def __init__(self, playback: Playback, costs: Costs) -> None:
         self._playback, self._costs, self._window = playback, costs, Window.of(playback.task)
+        self._sight = Sight(playback.task, everywhere=True)
 
     def decide(self, states: States, draws: Tensor) -> Choice:  # noqa: ARG002
         """See `Actor`."""
         action = self._playback.at(states.step).expand(len(states.row), -1).contiguous()
         if self._window.is_local:  # what lies outside the window cannot be chosen
             action = self._window.to_global(states.last_cell, self._window.to_local(states.last_cell, action))
-        return _Written(action, self._costs)
+        return _Written(action, self._costs, self._sight)
 
 
 class Asking:
@@ -204,6 +211,7 @@ class Asking:
 
     def __init__(self, task: Task, rule: Rule, costs: Costs) -> None:
         self._rule, self._costs, self._window = rule, costs, Window.of(task)
+        self._sight = Sight(task, everywhere=True)
         self._slots = torch.arange(task.num_choices)
         self.most_rows = max(1, min(_MOST_ROWS, _HISTORY // (task.num_choices * task.num_sensors)))
         self._history = torch.zeros(self.most_rows, task.num_choices, task.num_sensors, dtype=torch.bool)
@@ -216,7 +224,7 @@ class Asking:
         with acting():
             action = self._rule(states.last_cell, states.misses, history)
         self._history[states.row, states.misses.clamp_max(len(self._slots) - 1)] = action
-        return _Written(self._window.to_global(states.last_cell, action), self._costs)
+        return _Written(self._window.to_global(states.last_cell, action), self._costs, self._sight)
 
 
 def actor_of(task: Task, policy: PolicyLike | Playback, costs: Costs) -> Actor:

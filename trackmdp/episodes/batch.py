@@ -84,7 +84,7 @@ class Episodes(Sequence[Episode]):
         reward: `[S]`.
         truncated: `[S]`, whether the step was the last one allowed.
         sensors: `[S]`, how many were on.
-        bits: `[S, ceil(M/8)]`, the actions, eight sensors to a byte; None where they follow from the policy.
+        bits: `[S, ceil(sensors/8)]`, the actions, eight sensors to a byte; None where they follow from the policy.
         key: `[S]`, what the policy remembered before each step; None where that is the last cell alone.
         mode: `[S]`, the target's mode after the step, -1 once exited; None where targets have none.
         start_mode: `[E]`, their modes at the start; 0 where they have none.
@@ -163,11 +163,11 @@ class Episodes(Sequence[Episode]):
         return last_cell if self.key is None else self.key[steps].astype(np.int64)
 
     def _action(self, steps: slice, key: Integers, misses: Integers) -> BoolArray:
-        """`[T, M]`."""
+        """`[T, S]`."""
         # A policy with a table needs no bits: its action follows from (key, misses), and S rows of M bits are not
         # kept.
         if self.bits is not None:
-            return np.unpackbits(self.bits[steps], axis=-1, count=self.problem.num_cells).astype(np.bool_)
+            return np.unpackbits(self.bits[steps], axis=-1, count=self.problem.total_sensors).astype(np.bool_)
         assert self.policy is not None
         return self.policy.act(torch.from_numpy(key), torch.from_numpy(misses)).numpy()
 
@@ -201,8 +201,8 @@ class Episodes(Sequence[Episode]):
 
     def _probability(self, episode: Episode) -> Floats:
         if self.policy is None:
-            return episode.action.astype(np.float32)
+            return self.problem.covered(episode.action).astype(np.float32)
         steps = slice(int(self.first[episode.number]), int(self.first[episode.number + 1]))
         key = self._keys(steps, episode.last_cell)
         state = torch.from_numpy(key), torch.from_numpy(episode.misses)
-        return self.policy.probabilities(*state).float().numpy()
+        return self.policy.seeing(*state).float().numpy()

@@ -68,7 +68,7 @@ def _modes_of(episode: Episode) -> npt.NDArray[Any]:
 def _reported(world: Task, episode: Episode) -> npt.NDArray[Any]:
     """`[T, M]` probability that a step reports a target in each cell; the action itself where reports are certain."""
     if world.perfect and world.safe:
-        return episode.action
+        return world.covered(episode.action)
     forced = episode.misses > world.t_max
     return np.where(forced[:, None], world.safe_detection, episode.action * world.detection)
 

@@ -30,7 +30,7 @@ class Episode:
         policy: which of the log's policies acted.
         start: cell in which the target was located at the start.
         misses: `[T]` n before the step.
-        action: `[T, M]` sensors on; where the safe action is forced (n > t_max) it counts for nothing.
+        action: `[T, S]` sensors on; where the safe action is forced (n > t_max) it counts for nothing.
         target: `[T]` the true cell after the move, M once exited.
         located: `[T]` whether the target was located in that cell.
         reward: `[T]` reward of the step.
@@ -38,7 +38,7 @@ class Episode:
         truncated: the last step was the last one allowed.
         belief: `[T, M]` probability of each cell after the move, given all that was observed before it; a row sums to
             the probability of no exit. None unless it was asked for.
-        probability: `[T, M]` with which the policy switched each sensor on. None unless it was asked for.
+        probability: `[T, M]` with which the policy sensed each cell. None unless it was asked for.
         mode: `[T]` the target's mode after the move, -1 once exited; None where targets have none.
         start_mode: its mode at the start; 0 where targets have none.
     """
@@ -81,8 +81,9 @@ class Episode:
 
     def forced(self, t_max: int) -> BoolArray:
         """`[T]` whether the safe action replaced the chosen one."""
-        exited = self.target == self.action.shape[1]
-        return (self.misses > t_max) & ~exited
+        found = self.misses > t_max
+        found[-1] &= not self.terminated  # the last step is the exit's
+        return found
 
     def to_tensordict(self, task: Task) -> TensorDict:
         """`[T]` steps under the keys of `TrackEnv`, as a rollout has them: the outcome of each step under `next`.

@@ -51,7 +51,7 @@ def frame(episode: Episode, t: int, task: Task) -> str:
     levels = np.digitize(belief, [1e-6, 0.05, 0.2, 0.5])
     marks = np.array(list(_SHADES))[levels]
     if outcome(episode, t, task) != "forced":
-        marks = np.where(episode.action[t], ON, marks)
+        marks = np.where(task.covered(episode.action[t]), ON, marks)
     if episode.target[t] < task.num_cells:
         marks[episode.target[t]] = FOUND if episode.located[t] else MISSED
     rows = [" ".join(row) for row in marks.reshape(task.size)]

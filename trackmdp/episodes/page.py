@@ -67,7 +67,7 @@ def _content(reader: EpisodeReader, episode: Episode) -> dict[str, Any]:
         "n": episode.misses[shown].tolist(),
         "reward": episode.reward[shown].tolist(),
         "total": episode.returns[shown].tolist(),
-        "active": [row.nonzero()[0].tolist() for row in episode.action[shown]],
+        "active": [row.nonzero()[0].tolist() for row in world.covered(episode.action[shown])],
         "belief": [_sparse(row) for row in episode.belief[shown]],
     }
 

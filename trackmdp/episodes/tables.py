@@ -19,7 +19,7 @@ _STEP = ("episode", "t", "n", "last_cell", "active", "n_active", "forced", "targ
 def write_tables(reader: EpisodeReader, folder: Path, number: int | None = None) -> list[Path]:
     """Write `steps.csv` and `episodes.csv` of all episodes, or of one; returns the files.
 
-    Cells are numbers, -1 for none; `active` holds the cells of the sensors on, separated by blanks.
+    Cells are numbers, -1 for none; `active` holds the numbers of the sensors on, separated by blanks.
     """
     rows = [reader.row(number)] if number is not None else reader.rows
     folder.mkdir(parents=True, exist_ok=True)
@@ -37,11 +37,9 @@ def write_tables(reader: EpisodeReader, folder: Path, number: int | None = None)
 
 
 def _steps(episode: Episode, t_max: int) -> Iterator[list[Any]]:
-    m = episode.action.shape[1]
-    forced = episode.forced(t_max)
+    forced, last = episode.forced(t_max), len(episode) - 1
     for t in range(len(episode)):
         active = episode.action[t].nonzero()[0].tolist()
-        target = int(episode.target[t])
         yield [
             episode.number,
             t,
@@ -50,7 +48,7 @@ def _steps(episode: Episode, t_max: int) -> Iterator[list[Any]]:
             " ".join(map(str, active)),
             len(active),
             bool(forced[t]),
-            -1 if target == m else target,
+            -1 if episode.terminated and t == last else int(episode.target[t]),
             int(episode.observation[t]),
             float(episode.reward[t]),
             float(episode.returns[t]),

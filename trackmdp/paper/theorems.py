@@ -11,18 +11,17 @@ from scipy import sparse
 
 from trackmdp.errors import UserError
 from trackmdp.paper import histories
-from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import bounds, estimator, pomdp, qmdp
 from trackmdp.solvers import optimal as optimum
 from trackmdp.solvers.branch import Tree
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.known import tables
 from trackmdp.solvers.layers import Layer, layer_sets, reachable_layers
-from trackmdp.solvers.prediction import Prediction, unroll
+from trackmdp.solvers.prediction import followed
 from trackmdp.solvers.renewal import per_row, row_index
 from trackmdp.solvers.search import InnerProblem
 from trackmdp.solvers.solution import Solution
-from trackmdp.world.model import Array, BoolArray, World
+from trackmdp.world.model import Array, World
 
 __all__ = ["Check", "changed", "check_theorems", "corner", "dearer", "summarize_checks"]
 
@@ -123,9 +122,7 @@ def _track_property(world: World, solution: Solution) -> Iterator[Check]:
     # -inf stands for "no case": max(..., initial=-inf) leaves it where no cell is left unsensed.
     worst = {"printed": -np.inf, "sharp": -np.inf}
     states = 0
-
-    def follow(seen: Prediction) -> BoolArray:
-        nonlocal states
+    for seen in followed(world, solution.table):
         states += int((seen.before > 0).sum())
         sensed = solution.table.on(seen.n, seen.rows, seen.cells) > 0
         # Theorem tracking_property: Pr(X_{k+1} = b | s_k) > c/r is sensed. `mass` and `inside` are joint with the
@@ -135,9 +132,6 @@ def _track_property(world: World, solution: Solution) -> Iterator[Check]:
         for which, mass in (("printed", seen.before), ("sharp", seen.inside)):
             gain = (earned - world.cost[seen.cells] * mass[seen.rows]) / seen.before[seen.rows]
             worst[which] = max(worst[which], float(gain[~sensed].max(initial=-np.inf)))
-        return sensed
-
-    unroll(world, follow)
     note = f"{states} info states"
     yield _row("Theorem 1", "p_j > c/r is sensed: largest p_j r - c left unsensed", worst["printed"], note=note)
     yield _row("Theorem 1, sharp", "p_j > c p_in / r is sensed: largest p_j r - c p_in left unsensed", worst["sharp"])
@@ -289,18 +283,13 @@ def _qmdp_derivation(world: World) -> Iterator[Check]:
     # charges).
     for in_grid, threshold in ((False, "c/r"), (True, "c p_in / r")):
         policy, worst = qmdp.solve(world, in_grid=in_grid), -np.inf
-
-        def follow(seen: Prediction, policy: PolicyTable = policy, in_grid: bool = in_grid) -> BoolArray:
-            nonlocal worst
+        for seen in followed(world, policy):
             sensed = policy.on(seen.n, seen.rows, seen.cells) > 0
             charged = (seen.inside if in_grid else seen.before)[seen.rows]
             earned = seen.mass * world.detects(seen.cells) * world.reward
             gain = (earned - world.cost[seen.cells] * charged) / seen.before[seen.rows]
             # Switching a sensor on gains `gain`, switching it off -gain; none may be positive.
             worst = max(worst, float(np.where(sensed, -gain, gain).max(initial=-np.inf)))
-            return sensed
-
-        unroll(world, follow)
         yield _row("Q_MDP", f"threshold {threshold}: largest gain of switching one sensor over", worst)
     # eq. upper_bound_v at a known position, gamma = 1: V(x) = sum_j max(P_xj r - c_j, 0) + sum_j P_xj V(j).
     value, move = bounds.paper(world), world.kernel

@@ -70,7 +70,8 @@ class RelativeBias(nn.Module):
     def __init__(self, task: Task) -> None:
         super().__init__()
         side, places = 2 * task.columns - 1, (2 * task.rows - 1) * (2 * task.columns - 1)
-        self._whole = task.window is None
+        # Sensors with footprints stand at no cell: each has a number of its own, whatever the cell.
+        self._whole = task.window is None and task.coverage is None
         self.table = nn.Parameter(torch.zeros(task.t_max + 2, places if self._whole else task.num_sensors))
         # Displacements (row, column) from (1 - rows, 1 - columns) to (rows - 1, columns - 1), row by row; (0, 0) is the
         # one in the middle. On 3 x 3, side 5, from cell 4 (code 6) to cell 5 (code 7): 7 - 6 + 12, right of the middle.

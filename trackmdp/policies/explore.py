@@ -41,7 +41,7 @@ class RenewedTable(TensorDictModuleBase):
 
     def __init__(self, task: Task, device: torch.device | str = "cpu", *, on: bool = False) -> None:
         super().__init__()
-        self.num_choices = task.num_choices
+        self.num_choices, self.num_sensors = task.num_choices, task.num_sensors
         self.window = Window.of(task, device)
         # Row x (t_max + 1) + n, as in `PolicyTable`; 8 sensors per byte: 10 x 10 cells take 13 bytes a row.
         shape = (task.num_cells * task.num_choices, -(-task.num_sensors // 8))
@@ -73,7 +73,7 @@ class RenewedTable(TensorDictModuleBase):
         # n = t_max + 1 has no row of its own: the safe action replaces whatever is written there.
         packed = self.bits[cell * self.num_choices + n.clamp_max(self.num_choices - 1)]
         # [*B, bytes, 1] >> [8] = [*B, bytes, 8], flattened to bits in the order of the sensors; the padding is cut off.
-        chosen = ((packed.unsqueeze(-1) >> self._place) & 1).flatten(-2)[..., : self.window.width].bool()
+        chosen = ((packed.unsqueeze(-1) >> self._place) & 1).flatten(-2)[..., : self.num_sensors].bool()
         return tensordict.set("action", chosen)
 
 

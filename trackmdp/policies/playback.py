@@ -19,18 +19,18 @@ class Playback:
 
     Args:
         task: grid, costs and limits.
-        actions: `[T, M]` bool, in their order.
+        actions: `[T, S]` bool, in their order.
 
     Raises:
         UserError: the actions are those of another grid.
     """
 
     def __init__(self, task: Task, actions: BoolArray) -> None:
-        if actions.shape[1:] != (task.num_cells,):
-            raise UserError(f"playback: actions for {actions.shape[1:]} cells, expected {task.num_cells}")
+        if actions.shape[1:] != (task.total_sensors,):
+            raise UserError(f"playback: actions of {actions.shape[1:]} sensors, expected {task.total_sensors}")
         self.task = task
         self.actions = torch.as_tensor(actions, dtype=torch.bool)
 
     def at(self, step: int) -> Tensor:
-        """`[M]` bool, the action of a step."""
+        """`[S]` bool, the action of a step."""
         return self.actions[step] if step < len(self.actions) else torch.zeros_like(self.actions[0])

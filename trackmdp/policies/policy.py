@@ -39,7 +39,7 @@ from trackmdp.policies.unroll import (
 from trackmdp.world.model import Array, Task
 from trackmdp.world.windows import Window
 
-__all__ = ["Policy", "PolicyLike", "actor_table", "as_policy", "rule_of"]
+__all__ = ["Policy", "PolicyLike", "actor_table", "as_policy", "looked_up", "rule_of"]
 
 PolicyLike: TypeAlias = "PolicyTable | TensorDictModuleBase | Callable[..., Any]"
 """A policy or its table, a TensorDict module, or a function as `Policy.from_function` takes it."""
@@ -55,12 +55,12 @@ class Policy(TensorDictModuleBase, PolicyTable):
 
     Args:
         task: grid, costs and limits.
-        sets: `[keys * (t_max + 1), M]` sparse; row `key * (t_max + 1) + n` is the set at n misses after the detection
+        sets: `[keys * (t_max + 1), S]` sparse; row `key * (t_max + 1) + n` is the set at n misses after the detection
             that left `key`: the located cell, or more where the task's memory holds more. Bool entries are sensors on;
             entries in (0, 1] are the probabilities of switching them on, independently of each other and of the
             history.
         probability: the same for every sensor in every state, instead of `sets`.
-        k: exactly k sensors are on, each such subset equally likely; `probability` is then k / M.
+        k: exactly k sensors are on, each such subset equally likely; `probability` is then k / S.
 
     Attributes:
         deterministic: whether the policy is the same function of the state each time.
@@ -101,7 +101,7 @@ class Policy(TensorDictModuleBase, PolicyTable):
         In a window that the border leaves fewer than k sensors, all of them are on.
         """
         if task.window is None:
-            return cls(task, probability=k / task.num_cells, k=k)
+            return cls(task, probability=k / task.total_sensors, k=k)
         near = PolicyTable.all_on(task).sets
         assert near is not None
         count = np.diff(near.indptr)
@@ -154,10 +154,10 @@ class Policy(TensorDictModuleBase, PolicyTable):
     @property
     def num_draws(self) -> int:
         """Uniform draws that one decision takes: none, or one per sensor."""
-        return 0 if self.deterministic else self.task.num_cells
+        return 0 if self.deterministic else self.task.total_sensors
 
     def act(self, key: Tensor, steps_since_detection: Tensor, draws: Tensor | None = None) -> Tensor:
-        """`[*B, M]` bool, the sensors on, as a function of state and draws.
+        """`[*B, S]` bool, the sensors on, as a function of state and draws.
 
         Args:
             key: `[*B]` int64, what was remembered at the last detection; the cell, where that is all.
@@ -177,13 +177,24 @@ class Policy(TensorDictModuleBase, PolicyTable):
         return on.scatter_(-1, largest, value=True) & (probability > 0)
 
     def probabilities(self, key: Tensor, steps_since_detection: Tensor) -> Tensor:
-        """`[*B, M]` with which each sensor is switched on: bool for a deterministic policy, else float32."""
-        device, shape = key.device, (*key.shape, self.task.num_cells)
+        """`[*B, S]` with which each sensor is switched on: bool for a deterministic policy, else float32."""
+        device, shape = key.device, (*key.shape, self.task.total_sensors)
         if self.sets is None:
             assert self.probability is not None
             dtype = torch.bool if self.deterministic else torch.float32
             return torch.full(shape, self.probability, dtype=dtype, device=device)
         return self.lookup(device)(self.row(key, steps_since_detection))
+
+    def seeing(self, key: Tensor, steps_since_detection: Tensor) -> Tensor:
+        """`[*B, M]` with which a sensor that is on sees each cell: `probabilities`, but for footprints."""
+        coverage = self.task.coverage
+        if coverage is None:
+            return self.probabilities(key, steps_since_detection)
+        if self.sets is None:
+            assert self.probability is not None
+            share = torch.as_tensor(coverage.share(self.probability, self.k), device=key.device)
+            return share.float().expand(*key.shape, -1)
+        return looked_up(self.seen, key.device)(self.row(key, steps_since_detection))
 
     def row(self, key: Tensor, steps_since_detection: Tensor) -> Tensor:
         """`[*B]`, the row of `sets` for a state; where the safe action is forced, that of the last free choice."""
@@ -193,7 +204,7 @@ class Policy(TensorDictModuleBase, PolicyTable):
         """The rows of `sets` on a device."""
         assert self.sets is not None
         if self._lookup is None or self._lookup.device != device:
-            self._lookup = _made(self.sets, device)
+            self._lookup = looked_up(self.sets, device)
         return self._lookup
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -225,7 +236,7 @@ class Policy(TensorDictModuleBase, PolicyTable):
             local = Window.of(self.task).find(start, cells).numpy()
             shape = (self.sets.shape[0], self.task.num_sensors)
             table = sparse.csr_array((self.sets.data, local, self.sets.indptr), shape=shape)
-            self._local = _made(table, key.device)
+            self._local = looked_up(table, key.device)
         return self._local(self.row(key, steps_since_detection))
 
     # Files.
@@ -300,6 +311,6 @@ def _device_of(policy: TensorDictModuleBase | Callable[..., Any]) -> torch.devic
     return torch.device("cpu") if first is None else first.device
 
 
-def _made(table: sparse.csr_array, device: torch.device) -> DenseTable | SparseTable:
+def looked_up(table: sparse.csr_array, device: torch.device) -> DenseTable | SparseTable:
     """The faster way to look up rows of a table that does not cost too much memory."""
     return (DenseTable if table.shape[0] * table.shape[1] <= _DENSE else SparseTable)(table, device)

@@ -19,6 +19,7 @@ from trackmdp.durable import write_bytes, write_json
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.untrusted import decoded, opened, read_object
+from trackmdp.world.coverage import Coverage
 from trackmdp.world.model import Array, Task
 
 __all__ = ["LISTED_CELLS", "load_policy", "read_sets", "save_policy", "sets_name", "write_sets"]
@@ -42,6 +43,8 @@ def save_policy(file: Path, policy: PolicyTable, value: Array | None = None, **m
     """
     names = _TASK if policy.task.perfect and policy.task.safe else (*_TASK, *_SENSORS)
     content: dict[str, Any] = {f"task_{name}": _number(getattr(policy.task, name)) for name in names}
+    if policy.task.coverage is not None:
+        content |= _footprints(policy.task.coverage)
     if policy.task.memory != "cell":  # what is not there is the paper's
         content |= {"task_memory": np.str_(policy.task.memory), "task_clip": np.int64(policy.task.clip)}
     if policy.task.revealed > 1:
@@ -124,7 +127,9 @@ def read_sets(task: Task, file: str | Path) -> PolicyTable:
 
 
 def _listed(task: Task, content: dict[str, Any]) -> sparse.csr_array:
-    """`[keys (t_max + 1), M]` bool of what `PolicyTable.as_lists` wrote."""
+    """`[keys (t_max + 1), S]` bool of what `PolicyTable.as_lists` wrote."""
+    if content.get("footprints") != (None if task.coverage is None else task.coverage.as_lists()):
+        raise ValueError("sets of sensors of other footprints")
     keys, count = content["sets"], task.num_keys
     # Counted first: what a stranger's file says is remembered may make any number of keys.
     if content["t_max"] != task.t_max or len(keys) != count or any(str(key) not in keys for key in range(count)):
@@ -153,6 +158,7 @@ def _task(content: dict[str, npt.NDArray[Any]]) -> Task:
         window=None if np.isnan(given["window"]) else int(given["window"]),
         markov=bool(given["markov"]),
         **{name: content[f"task_{name}"] for name in _SENSORS if f"task_{name}" in content},
+        coverage=_read_footprints(content, rows * columns),
         memory=str(content.get("task_memory", "cell")),
         clip=int(content.get("task_clip", 2)),
         revealed=int(content.get("task_revealed", 1)),
@@ -162,9 +168,27 @@ def _task(content: dict[str, npt.NDArray[Any]]) -> Task:
 def _sets(content: dict[str, npt.NDArray[Any]], task: Task) -> sparse.csr_array:
     indices, indptr = content["indices"], content["indptr"]
     data = content.get("data", np.ones(len(indices), dtype=bool))
-    shape = (task.num_keys * task.num_choices, task.num_cells)
-    sets = sparse.csr_array((data, indices, indptr), shape=shape)
-    sets.check_format(full_check=True)  # indices of somebody else's file may lead anywhere
+    sets = _csr(data, indices, indptr, (task.num_keys * task.num_choices, task.total_sensors))
     if not np.isfinite(sets.data).all():
         raise UserError("a probability that is not finite")
     return sets
+
+
+def _footprints(coverage: Coverage) -> dict[str, Any]:
+    """The cells of each sensor, one sensor after another, and where each begins."""
+    matrix = coverage.matrix
+    return {"footprint_cells": matrix.indices.astype(np.int32), "footprint_begin": matrix.indptr.astype(np.int64)}
+
+
+def _read_footprints(content: dict[str, npt.NDArray[Any]], cells: int) -> sparse.csr_array | None:
+    """`[S, M]` bool of what `_footprints` wrote; None where it wrote nothing."""
+    if "footprint_cells" not in content:
+        return None
+    indices, indptr = content["footprint_cells"], content["footprint_begin"]
+    return _csr(np.ones(len(indices), dtype=bool), indices, indptr, (len(indptr) - 1, cells))
+
+
+def _csr(data: Any, indices: Any, indptr: Any, shape: tuple[int, int]) -> sparse.csr_array:
+    matrix = sparse.csr_array((data, indices, indptr), shape=shape)
+    matrix.check_format(full_check=True)  # indices of somebody else's file may lead anywhere
+    return matrix

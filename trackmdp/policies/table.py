@@ -26,9 +26,10 @@ class PolicyTable:
 
     Args:
         task: grid, costs, limits and memory.
-        sets: `[keys * (t_max + 1), M]` sparse; row `key * (t_max + 1) + n` is the set at n misses after the detection
-            that left `key`. Bool entries are sensors on; entries in (0, 1] are the probabilities of switching them on,
-            independently of each other and of the history.
+        sets: `[keys * (t_max + 1), S]` sparse; row `key * (t_max + 1) + n` is the set at n misses after the detection
+            that left `key`; S = M, a sensor in each cell, or the sensors of `task.coverage`. Bool entries are sensors
+            on; entries in (0, 1] are the probabilities of switching them on, independently of each other and of the
+            history.
         probability: the same for every sensor in every state, instead of `sets`; in a task with a window, for every
             sensor in the window of the located cell, which is then written out as `sets`.
         k: exactly k sensors are on, each such subset equally likely; `sets` or `probability` then has each sensor's
@@ -56,8 +57,8 @@ class PolicyTable:
         if probability and task.window is not None:
             # Which sensors there are depends on where the target was located: no longer the same everywhere.
             sets, probability = _window_sets(task, probability), None
-        if k is not None and not 0 <= k <= task.num_cells:
-            raise UserError(f"policy: expected k from 0 to {task.num_cells} sensors, got {k}")
+        if k is not None and not 0 <= k <= task.total_sensors:
+            raise UserError(f"policy: expected k from 0 to {task.total_sensors} sensors, got {k}")
         self.task, self.probability, self.k = task.task, probability, k
         self.sets = None if sets is None else _checked(task, sets)
         self.deterministic = probability in (0.0, 1.0) if self.sets is None else self.sets.dtype == np.bool_
@@ -74,18 +75,20 @@ class PolicyTable:
 
     @classmethod
     def from_dense(cls, task: Task, table: npt.NDArray[np.generic]) -> Self:
-        """A policy from `[keys, t_max + 1, M]`, bool or probabilities."""
-        expected = (task.num_keys, task.num_choices, task.num_cells)
+        """A policy from `[keys, t_max + 1, S]`, bool or probabilities."""
+        expected = (task.num_keys, task.num_choices, task.total_sensors)
         if table.shape != expected:
-            raise UserError(f"policy: expected shape {expected} (keys, t_max + 1, M), got {table.shape}")
-        return cls(task, sparse.csr_array(np.ascontiguousarray(table).reshape(-1, task.num_cells)))
+            raise UserError(f"policy: expected shape {expected} (keys, t_max + 1, sensors), got {table.shape}")
+        return cls(task, sparse.csr_array(np.ascontiguousarray(table).reshape(-1, task.total_sensors)))
 
     # What exact evaluation reads, for arrays of any E.
 
     def on(self, n: int, rows: npt.NDArray[Any], cells: npt.NDArray[Any]) -> Array:
-        """`[E]` probability that sensor `cells` `[E]` is on, n misses after the detection of key `rows` `[E]`."""
+        """`[E]` probability that a sensor on sees `cells` `[E]`, n misses after the detection of key `rows` `[E]`."""
         if self.sets is None:
             assert self.probability is not None
+            if self.task.coverage is not None:
+                return self.task.coverage.share(self.probability, self.k)[cells]
             return np.full(len(rows), self.probability)
         # Entry (row r, column j) of the table has the number r * M + j; the numbers of those stored are in order.
         # With M = 4 and t_max = 1: located in 2, after 1 miss, sensor 3 is entry (2 * 2 + 1) * 4 + 3 = 23.
@@ -94,10 +97,20 @@ class PolicyTable:
         found: BoolArray = self._entries[place] == wanted
         if self.deterministic:
             return found.astype(np.float64)
-        return np.where(found, np.append(self.sets.data, 0.0)[place], 0.0)
+        return np.where(found, np.append(self.seen.data, 0.0)[place], 0.0)
+
+    def chosen(self, n: int, rows: npt.NDArray[Any], sensors: npt.NDArray[Any]) -> Array:
+        """`[E]` probability that `sensors` `[E]` are on, n misses after the detection of key `rows` `[E]`."""
+        if self.task.coverage is None:
+            return self.on(n, rows, sensors)
+        if self.sets is None:
+            return np.full(len(rows), self.probability)
+        # Entry by entry: with footprints only planners ask, for the few pairs of their layers.
+        wanted = np.asarray(rows) * self.task.num_choices + n
+        return np.asarray(self.sets[wanted, sensors], dtype=np.float64)
 
     def spent(self, n: int, price: Array) -> Array:
-        """`[keys]` expected price of the sensors on, n misses after each key; `price` `[M]` is per sensor."""
+        """`[keys]` expected price of the sensors on, n misses after each key; `price` `[S]` is per sensor."""
         if self.sets is None:
             assert self.probability is not None
             return np.full(self.task.num_keys, self.probability * price.sum())
@@ -106,52 +119,68 @@ class PolicyTable:
         return rows.astype(np.float64) @ price
 
     @cached_property
-    def _entries(self) -> npt.NDArray[np.int64]:
-        """`[nnz + 1]` sorted numbers r * M + j of the stored entries, closed by the largest int64 as a sentinel."""
+    def seen(self) -> sparse.csr_array:
+        """`[keys * (t_max + 1), M]`, which cells the sets see, or with what probability: `sets`, but for footprints."""
         assert self.sets is not None
-        row = np.repeat(np.arange(self.sets.shape[0], dtype=np.int64), np.diff(self.sets.indptr))
-        return np.append(row * self.task.num_cells + self.sets.indices, np.iinfo(np.int64).max)
+        return self.sets if self.task.coverage is None else self.task.coverage.seen(self.sets)
+
+    @cached_property
+    def _entries(self) -> npt.NDArray[np.int64]:
+        """`[nnz + 1]` sorted numbers r * M + j of the entries of `seen`, closed by the largest int64 as a sentinel."""
+        row = np.repeat(np.arange(self.seen.shape[0], dtype=np.int64), np.diff(self.seen.indptr))
+        return np.append(row * self.task.num_cells + self.seen.indices, np.iinfo(np.int64).max)
 
     def check_fits(self, task: Task) -> None:
-        """Refuse a task of another grid or t_max.
+        """Refuse a task of another grid, of other footprints or of another t_max.
 
         Raises:
             UserError: it is.
         """
+        mine, other = self.task.coverage, task.coverage
+        if not (mine is other or (mine is not None and mine.same_as(other))):
+            raise UserError("policy: made for sensors of other footprints than the world's")
         if (self.task.num_cells, self.task.t_max) != (task.num_cells, task.t_max):
             theirs, ours = (f"{each.num_cells} cells, t_max {each.t_max}" for each in (self.task, task))
             raise UserError(f"policy: made for {theirs}; expected {ours}")
 
     def dense(self) -> BoolArray:
-        """`[keys, t_max + 1, M]`, the sets of a deterministic policy, a byte each, so for small worlds alone.
+        """`[keys, t_max + 1, S]`, the sets of a deterministic policy, a byte each, so for small worlds alone.
 
         Raises:
             UserError: the policy draws its sets.
         """
         if not self.deterministic:
             raise UserError("policy: draws its sets at random, so that there is no table of them")
-        shape = (self.task.num_keys, self.task.num_choices, self.task.num_cells)
+        shape = (self.task.num_keys, self.task.num_choices, self.task.total_sensors)
         if self.sets is None:
             return np.full(shape, self.probability == 1.0)
         return self.sets.toarray().reshape(shape)
 
     def as_lists(self) -> dict[str, Any]:
-        """Plain lists, as `sets.json` has them: for each key the sensed cells at n = 0 ... t_max.
+        """Plain lists, as `sets.json` has them: for each key the sensors on at n = 0 ... t_max.
 
         With `task.memory` "cell" the keys are the located cells; else `memory` says how they are numbered, and
-        where a detection tells the mode its kind is "cell", each cell's classes being the modes.
+        where a detection tells the mode its kind is "cell", each cell's classes being the modes. Where
+        sensors do not each cover the cell of their number, `footprints` says which cells each covers.
         """
         m, choices = self.task.num_cells, self.task.num_choices
         if self.sets is None:
-            each = list(range(m)) if self.probability == 1.0 else []
-            return {"t_max": self.task.t_max, "sets": {str(cell): [each] * choices for cell in range(m)}}
+            each = list(range(self.task.total_sensors)) if self.probability == 1.0 else []
+            return self._of_task() | {"sets": {str(cell): [each] * choices for cell in range(m)}}
         lists = [part.tolist() for part in np.split(self.sets.indices, self.sets.indptr[1:-1])]
         sets = {str(key): lists[key * choices : (key + 1) * choices] for key in range(self.task.num_keys)}
-        if not self.task.keyed:
-            return {"t_max": self.task.t_max, "sets": sets}
-        memory = {"kind": self.task.memory, "clip": self.task.clip, "classes": self.task.keys.num_classes}
-        memory |= {"revealed": self.task.revealed} if self.task.revealed > 1 else {}
-        return {"t_max": self.task.t_max, "memory": memory, "sets": sets}
+        return self._of_task() | {"sets": sets}
+
+    def _of_task(self) -> dict[str, Any]:
+        """What a reader of the lists has to know; what is not there is the paper's."""
+        task = self.task
+        told: dict[str, Any] = {"t_max": task.t_max}
+        if task.coverage is not None:
+            told["footprints"] = task.coverage.as_lists()
+        if task.keyed:
+            told["memory"] = {"kind": task.memory, "clip": task.clip, "classes": task.keys.num_classes}
+            told["memory"] |= {"revealed": task.revealed} if task.revealed > 1 else {}
+        return told
 
 
 def _checked(task: Task, sets: sparse.csr_array) -> sparse.csr_array:
@@ -160,9 +189,9 @@ def _checked(task: Task, sets: sparse.csr_array) -> sparse.csr_array:
     Raises:
         UserError: another shape, or entries that are no probabilities.
     """
-    expected = (task.num_keys * task.num_choices, task.num_cells)
+    expected = (task.num_keys * task.num_choices, task.total_sensors)
     if sets.shape != expected:
-        raise UserError(f"policy: expected sets of shape {expected} (keys (t_max + 1), M), got {sets.shape}")
+        raise UserError(f"policy: expected sets of shape {expected} (keys (t_max + 1), sensors), got {sets.shape}")
     sets = sparse.csr_array(sets, copy=True)
     if sets.dtype != np.bool_:
         if not ((sets.data >= 0) & (sets.data <= 1)).all():

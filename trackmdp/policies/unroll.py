@@ -92,7 +92,7 @@ def _checked(action: Tensor, shape: tuple[int, int], what: str) -> Tensor:
 
 
 def unrolled(task: Task, rule: Rule, device: torch.device) -> sparse.csr_array:
-    """`[M * (t_max + 1), M]` bool, the sets of a rule; row x * (t_max + 1) + n as in `Policy.sets`.
+    """`[M * (t_max + 1), S]` bool, the sets of a rule; row x * (t_max + 1) + n as in `Policy.sets`.
 
     Torch's global generators are left as they were.
     """
@@ -116,7 +116,7 @@ def draws(task: Task, rule: Rule, device: torch.device, sets: sparse.csr_array) 
 
 
 def mixture(task: Task, module: TensorDictModuleBase, device: torch.device) -> sparse.csr_array | None:
-    """`[M * (t_max + 1), M]` float64, with what probability a stochastic actor switches each sensor on.
+    """`[M * (t_max + 1), S]` float64, with what probability a stochastic actor switches each sensor on.
 
     Exact values need no more than these where they do not depend on the history: the next state then depends on the
     sensor at the target's cell alone, and the price is a sum over the sensors.
@@ -192,7 +192,7 @@ def _table(task: Task, rule: Rule, device: torch.device, dtype: torch.dtype = to
         on = _followed(rule, cells, choices, k, dtype).reshape(-1, k)
         if window.is_local:
             on *= window.inside(cells).repeat_interleave(choices, dim=0).cpu().numpy()
-        # Row-major order: flat place p of [rows, K] is column p mod K. Without a window K = M and columns are cells.
+        # Row-major order: flat place p of [rows, K] is column p mod K. Without a window K = S and columns are sensors.
         place = np.flatnonzero(on)
         chosen = place % k
         if window.is_local:
@@ -204,7 +204,7 @@ def _table(task: Task, rule: Rule, device: torch.device, dtype: torch.dtype = to
         lengths.append(np.count_nonzero(on, axis=1))
     indptr = np.concatenate([[0], np.cumsum(np.concatenate(lengths))])
     found = np.concatenate(values), np.concatenate(columns), indptr
-    return sparse.csr_array(found, shape=(m * choices, m))
+    return sparse.csr_array(found, shape=(m * choices, task.total_sensors))
 
 
 def _followed(rule: Rule, cells: Tensor, choices: int, sensors: int, dtype: torch.dtype) -> npt.NDArray[Any]:

@@ -62,9 +62,9 @@ def _frame(task: Task, rows: range, columns: range, cell: int, on: BoolArray) ->
 
 
 def _steps(episode: Episode, task: Task, steps: int) -> Iterator[tuple[int, BoolArray]]:
-    """The target's cell and the sensors on, `[M]`, of each step in the grid; all of them where the safe action is."""
+    """The target's cell and the cells sensed, `[M]`, of each step in the grid; all of them where the safe action is."""
     forced = episode.forced(task.t_max)
     for t, cell in enumerate(episode.target[:steps].tolist()):
         # The cell numbered M stands for having left the grid.
         if cell < task.num_cells:
-            yield cell, episode.action[t] | forced[t]
+            yield cell, task.covered(episode.action[t]) | forced[t]

@@ -13,7 +13,7 @@ from scipy import sparse
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.evaluation import Evaluation, pooled
-from trackmdp.solvers.prediction import predict
+from trackmdp.solvers.prediction import followed
 from trackmdp.solvers.renewal import IndexArray, RenewalSystem, per_row, row_index
 from trackmdp.world.model import Array, World
 from trackmdp.world.tracks import Problem
@@ -76,6 +76,8 @@ def _checked(world: Problem, policy: PolicyTable, false_alarm: float) -> World:
         raise UserError(f"false_alarm={false_alarm}: {world.num_cells} cells, expected at most {_MOST_CELLS}")
     if world.max_steps is not None or not world.safe:
         raise UserError(f"false_alarm={false_alarm}: expected whole episodes, and a safe action that always locates")
+    if world.coverage is not None:
+        raise UserError(f"false_alarm={false_alarm}: expected sensors that each cover one cell")
     if not policy.deterministic:
         raise UserError(f"false_alarm={false_alarm}: expected a policy that does not draw its sets")
     return world
@@ -85,17 +87,15 @@ def _ranked(world: World, policy: PolicyTable) -> list[tuple[IndexArray, IndexAr
     """For each n the sets as (row pointer `[M + 1]`, cells), in each row the likeliest cell first."""
     m = world.num_cells
     rows, cells = np.divmod(np.arange(m * m), m)
-    undetected, ranked = sparse.eye_array(m, format="csr"), []
-    for n in range(world.num_choices):
-        seen = predict(world, undetected, n)
-        on = policy.on(n, rows, cells) > 0
+    ranked = []
+    for seen in followed(world, policy):
+        on = policy.on(seen.n, rows, cells) > 0
         mass = np.zeros((m, m))
         mass[seen.rows, seen.cells] = seen.mass
         entry = np.flatnonzero(on)
         order = entry[np.lexsort((cells[entry], -mass.ravel()[entry], rows[entry]))]
         pointer = np.concatenate([[0], np.cumsum(np.bincount(rows[entry], minlength=m))])
         ranked.append((pointer, cells[order]))
-        undetected = seen.part(1.0 - policy.on(n, seen.rows, seen.cells) * world.detects(seen.cells))
     return ranked
 
 

@@ -9,9 +9,9 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers.cover import Offer, best_sets
 from trackmdp.solvers.layers import sensed_csr, within_window
 from trackmdp.solvers.prediction import predict
-from trackmdp.solvers.qmdp import TIE
 from trackmdp.world.model import World
 
 __all__ = ["solve"]
@@ -27,12 +27,11 @@ def solve(world: World, *, in_grid: bool = False) -> PolicyTable:
     moved, sensed = sparse.eye_array(world.num_cells, format="csr"), []
     for n in range(world.num_choices):
         seen = predict(world, moved, n)
-        charged = seen.inside[seen.rows] if in_grid else 1.0
+        charged = seen.inside if in_grid else np.ones(world.num_cells)
         # seen.mass is e_x P^(n+1) itself: since nothing is taken away at a miss, no probability of misses has to be
         # divided by.
-        on = seen.mass * world.detects(seen.cells) * world.reward >= world.cost[seen.cells] * charged * (1.0 - TIE)
-        allowed = within_window(world, seen.rows, seen.cells)
-        on = on if allowed is None else on & allowed
-        sensed.append((seen.rows[on], seen.cells[on]))
+        offer = Offer(seen.mass * world.detects(seen.cells) * world.reward, world.cost, charged, ties=True)
+        on = best_sets(world, seen.rows, seen.cells, offer, within_window(world, seen.rows, seen.cells))
+        sensed.append((on.rows, on.sensors))
         moved = seen.part(np.ones(len(seen.mass)))  # nothing is taken away: a miss is not learned from
     return PolicyTable(world, sensed_csr(world, sensed))

@@ -8,7 +8,9 @@ On a line of four cells whose target moves one cell to the right, or stays in ce
     layer 0: (0,0) (1,1) (2,2) (3,3)        layer 1: (0,1) (1,2) (2,3) (3,3)        layer 2: (0,2) (1,3) (2,3) (3,3)
 
 The sets of a plan are one bool per entry of the layers from the first on: `on[e]` says whether, after as many misses,
-the sensor at `cells[e]` is switched on by a plan made when the target was located in `rows[e]`.
+the sensor at `cells[e]` is switched on by a plan made when the target was located in `rows[e]`. Where sensors have
+footprints, they are one bool per pair of located cell and sensor (`Layer.covering`), and `Layer.seen` says which
+entries those see.
 """
 
 from __future__ import annotations
@@ -20,9 +22,10 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers.cover import Covering
 from trackmdp.solvers.renewal import IndexArray, row_index
 from trackmdp.world.checks import short_indices
-from trackmdp.world.model import BoolArray, Task, World
+from trackmdp.world.model import Array, BoolArray, Task, World
 
 __all__ = ["Layer", "layer_sets", "policy_table", "reachable", "reachable_layers", "sensed_csr", "within_window"]
 
@@ -36,12 +39,42 @@ class Layer:
         moves: `[E_before, E]`, probability of moving from an entry of the layer before to one of this layer; in
             layer 0, where nothing has moved yet, the identity.
         allowed: `[E]`, whether the sensor at `cells` can be chosen from `rows`; None where all can.
+        covering: the sensors that may see the target; None where each covers its own cell, and entries are sensors.
     """
 
     rows: IndexArray
     cells: IndexArray
     moves: sparse.csr_array
     allowed: BoolArray | None = None
+    covering: Covering | None = None
+
+    @property
+    def on_rows(self) -> IndexArray:
+        """Located cell of each bool of a set."""
+        return self.rows if self.covering is None else self.covering.rows
+
+    @property
+    def sensors(self) -> IndexArray:
+        """The sensor that each bool of a set stands for."""
+        return self.cells if self.covering is None else self.covering.sensors
+
+    def seen(self, on: BoolArray) -> BoolArray:
+        """`[E]`, the entries that the set `on` sees."""
+        return on if self.covering is None else self.covering.seen(on)
+
+    def best(self, on: BoolArray, gain: Array, cost: Array, inside: Array, *, exact: bool) -> BoolArray:
+        """The set that gains most where seeing each entry gains `gain` `[E]`, the one before being `on`.
+
+        A sensor costs `cost` `[S]` times the mass `inside` `[M]`. With footprints the best set is looked for by greedy
+        and add-drop, no worse than `on`, or with `exact` found by linear and integer programs.
+        """
+        price = cost[self.sensors] * inside[self.on_rows]
+        if self.covering is None:
+            # strict: an entry without mass is never sensed, not even by a sensor that costs nothing
+            return gain > price
+        if exact:
+            return self.covering.best(gain, price, exact=True).on > 0
+        return self.covering.improve(on, gain, price)
 
 
 def reachable_layers(world: World, length: int) -> list[Layer]:
@@ -56,7 +89,7 @@ def reachable(kernel: sparse.csr_array, start: IndexArray, length: int, task: Ta
         kernel: `[M, M]`.
         start: `[K]`.
         length: moves.
-        task: whose window limits the sensors, row k being located in cell k; None for no limit.
+        task: whose sensors there are, row k being located in cell k; None for one in each cell, all within reach.
     """
     m = kernel.shape[0]
     # Layer 0: entry k is (row k, cell start[k]), before any move.
@@ -72,7 +105,8 @@ def reachable(kernel: sparse.csr_array, start: IndexArray, length: int, task: Ta
         # layer.
         moves = sparse.csr_array((step.data, target, step.indptr), shape=(len(rows), len(keys)))
         rows, cells = np.divmod(keys, m)
-        layers.append(Layer(rows, cells, moves, None if task is None else within_window(task, rows, cells)))
+        limits = (None, None) if task is None else (within_window(task, rows, cells), Covering.of(task, rows, cells))
+        layers.append(Layer(rows, cells, moves, *limits))
     return layers
 
 
@@ -91,13 +125,14 @@ def within_window(task: Task, rows: IndexArray, cells: IndexArray) -> BoolArray 
 
 
 def sensed_csr(task: Task, parts: Sequence[tuple[IndexArray, IndexArray]]) -> sparse.csr_array:
-    """`[M * (t_max + 1), M]` bool, the sets of a `PolicyTable`, from what is sensed at each n: (rows, cells)."""
+    """`[M * (t_max + 1), S]` bool, the sets of a `PolicyTable`, from what is on at each n: (rows, sensors)."""
     choices, m = task.num_choices, task.num_cells
     # Located in x after n misses is row x (t_max + 1) + n: with t_max = 1, (x, n) = (3, 1) is row 7.
     # rows of several n interleave, so that the table is sorted once all are there
     rows = np.concatenate([part[0] * choices + n for n, part in enumerate(parts)])
-    cells = np.concatenate([part[1] for part in parts])
-    table = sparse.csr_array((np.ones(len(rows), dtype=bool), (rows, cells)), shape=(m * choices, m))
+    sensors = np.concatenate([part[1] for part in parts])
+    shape = (m * choices, task.total_sensors)
+    table = sparse.csr_array((np.ones(len(rows), dtype=bool), (rows, sensors)), shape=shape)
     table.sort_indices()
     return short_indices(table)
 
@@ -105,10 +140,10 @@ def sensed_csr(task: Task, parts: Sequence[tuple[IndexArray, IndexArray]]) -> sp
 def policy_table(task: Task, layers: Sequence[Layer], sets: Sequence[BoolArray]) -> PolicyTable:
     """The policy whose `sets` are given on layers 1 ... t_max + 1."""
     # Layer n + 1 is where the target may be when it is looked for after n misses: zip starts at layers[1].
-    sensed = [(layer.rows[on], layer.cells[on]) for layer, on in zip(layers[1:], sets, strict=True)]
+    sensed = [(layer.on_rows[on], layer.sensors[on]) for layer, on in zip(layers[1:], sets, strict=True)]
     return PolicyTable(task, sensed_csr(task, sensed))
 
 
 def layer_sets(layers: Sequence[Layer], policy: PolicyTable) -> list[BoolArray]:
-    """The sensed entries of layers 1 ... t_max + 1; what a policy senses where the target cannot be is left out."""
-    return [policy.on(n, layer.rows, layer.cells) > 0 for n, layer in enumerate(layers[1:])]
+    """The sets of layers 1 ... t_max + 1; what a policy senses where the target cannot be is left out."""
+    return [policy.chosen(n, layer.on_rows, layer.sensors) > 0 for n, layer in enumerate(layers[1:])]

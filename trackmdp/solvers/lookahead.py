@@ -7,6 +7,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 from scipy import sparse
 
+from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.bounds import clocked_table, valid
 from trackmdp.solvers.branch import Tree
@@ -33,6 +34,8 @@ def solve(world: World, *, depth: int = 2, tail: Tail = "clocked") -> PolicyTabl
         depth: sets planned, at least 1; 1 gives Q_MDP (with the in-grid factor) and the clocked policy.
         tail: the value after them: `qmdp`, the position known after every action, or `clocked`, U(j, n).
     """
+    if world.coverage is not None:
+        raise UserError("solver=lookahead: plans for sensors that each cover one cell; expected clocked or optimal")
     table = _tail_table(world, tail)
     layers = reachable_layers(world, world.num_choices)
     sets: list[BoolArray] = []

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import qmdp
+from trackmdp.solvers.cover import Offer
 from trackmdp.solvers.prediction import Prediction, unroll
-from trackmdp.world.model import BoolArray, World
+from trackmdp.world.model import World
 
 __all__ = ["solve"]
 
@@ -18,7 +21,10 @@ def solve(world: World, *, threshold: float | None = None) -> PolicyTable:
     if threshold is None:
         return qmdp.solve(world, in_grid=True)
 
-    def likely(seen: Prediction) -> BoolArray:
-        return seen.mass * world.detects(seen.cells) >= threshold * seen.before[seen.rows] * (1.0 - qmdp.TIE)
+    # The threshold is as a price, the same of all sensors.
+    limit = np.full(world.total_sensors, threshold)
+
+    def likely(seen: Prediction) -> Offer:
+        return Offer(seen.mass * world.detects(seen.cells), limit, seen.before, ties=True)
 
     return unroll(world, likely)

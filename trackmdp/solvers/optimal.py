@@ -20,7 +20,7 @@ from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
 from trackmdp.solvers import clocked
-from trackmdp.solvers.bounds import clocked_table
+from trackmdp.solvers.bounds import exact_clocked_table
 from trackmdp.solvers.branch import Tree
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import Evaluation
@@ -67,7 +67,9 @@ def solve(
 
     The budget is work, so that a world has the same bracket on a busy and on an idle machine. Where the clocked policy
     attains the clocked bound, as it does wherever at most one possible cell is ever left unsensed, nothing is
-    searched. Ctrl-C ends a search like the budget does: the bracket so far is returned.
+    searched. Ctrl-C ends a search like the budget does: the bracket so far is returned. Where sensors have footprints
+    there is no tree: the bracket is that of policy iteration, with the best set at each step, and of the clocked bound;
+    it is closed for t_max = 0.
 
     Args:
         world: the problem with its motion model.
@@ -165,11 +167,12 @@ class _Run:
         side: int | None,
     ) -> None:
         self.world, self.tolerance, self.on_progress, self.budget = world, tolerance, on_progress, budget
-        self.start, self.side = start, side
+        # Sensors with footprints have no tree, and so no regions.
+        self.start, self.side = start, side if world.coverage is None else None
         self.restarted = False
         self.found: PolicyTable | None = None
         # U(x, 0) >= V*(x) before anything is searched; `tighten` only lowers it.
-        self.bound = clocked_table(world).value
+        self.bound = exact_clocked_table(world).value
         self.policy = clocked.solve(world)
         self.evaluation: Evaluation = evaluate(world, self.policy, guess=self.bound)
 
@@ -216,13 +219,15 @@ class _Run:
         layers = self.ground.layers
         # first the policy, then the proof: branch and bound is the faster the better its start
         self.use(policy_table(self.world, layers, follow_credit(self.world, layers, layer_sets(layers, self.policy))))
-        self.use(self.exchanged(layer_sets(layers, self.policy)))
+        if self.world.coverage is None:
+            self.use(self.exchanged(layer_sets(layers, self.policy)))
         # Last: what the search finds by itself is the same whatever is handed to it.
         if self.start is not None:
             self.use(self.start)
         self.report()
         patience = FIRST_NODES
-        while self.open():
+        # The tree decides which cells to leave out, one by one, and knows no sensors that cover several.
+        while self.world.coverage is None and self.open():
             improved = self.round(patience)
             self.report()
             # No better plan: the tree was searched to its end, or the budget is spent.

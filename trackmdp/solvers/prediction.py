@@ -11,11 +11,12 @@ import numpy.typing as npt
 from scipy import sparse
 
 from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers.cover import Offer, best_sets
 from trackmdp.solvers.layers import sensed_csr, within_window
 from trackmdp.solvers.renewal import IndexArray, per_row, row_index
-from trackmdp.world.model import Array, BoolArray, World
+from trackmdp.world.model import Array, World
 
-__all__ = ["Prediction", "predict", "renewal", "unroll"]
+__all__ = ["Prediction", "followed", "predict", "renewal", "unroll"]
 
 
 @dataclass(frozen=True)
@@ -56,19 +57,27 @@ def predict(world: World, undetected: sparse.csr_array, n: int) -> Prediction:
     return Prediction(n, rows, moved.indices, moved.data, before, per_row(rows, moved.data, world.num_cells))
 
 
-def unroll(world: World, rule: Callable[[Prediction], BoolArray]) -> PolicyTable:
-    """The policy of a `rule` from a prediction to the entries sensed, bool `[E]`, within the task's window.
+def unroll(world: World, rule: Callable[[Prediction], Offer]) -> PolicyTable:
+    """The policy that takes the set of most worth by a `rule` from a prediction, within the task's window.
 
     Cells of probability zero are never sensed, and after a miss that cannot happen nothing is.
     """
     undetected, sensed = sparse.eye_array(world.num_cells, format="csr"), []
     for n in range(world.num_choices):
         seen = predict(world, undetected, n)
-        on, allowed = rule(seen), within_window(world, seen.rows, seen.cells)
-        on = on if allowed is None else on & allowed
-        sensed.append((seen.rows[on], seen.cells[on]))
-        undetected = seen.part(1.0 - on * world.detects(seen.cells))
+        on = best_sets(world, seen.rows, seen.cells, rule(seen), within_window(world, seen.rows, seen.cells))
+        sensed.append((on.rows, on.sensors))
+        undetected = seen.part(1.0 - on.seen * world.detects(seen.cells))
     return PolicyTable(world, sensed_csr(world, sensed))
+
+
+def followed(world: World, policy: PolicyTable) -> Iterator[Prediction]:
+    """The predictions after 0 ... t_max misses along the plans of a policy."""
+    undetected = sparse.eye_array(world.num_cells, format="csr")
+    for n in range(world.num_choices):
+        seen = predict(world, undetected, n)
+        yield seen
+        undetected = seen.part(1.0 - policy.on(n, seen.rows, seen.cells) * world.detects(seen.cells))
 
 
 def renewal(world: World, policy: PolicyTable) -> Iterator[tuple[sparse.csr_array, Array]]:
@@ -114,7 +123,7 @@ def _free_choice(
     detected = per_row(seen.rows, seen.mass * report, m)
     # sensors are paid while the target is in the grid, whether or not it is where they look
     reward = world.reward * detected - policy.spent(seen.n, world.cost) * seen.inside
-    sensors = policy.spent(seen.n, np.ones(m)) * seen.inside
+    sensors = policy.spent(seen.n, np.ones(world.total_sensors)) * seen.inside
     figures = np.stack([reward, seen.inside, detected, sensors, nothing, seen.before], axis=1)
     return seen.part(report), seen.part(1.0 - report), figures
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers.cover import Offer
 from trackmdp.solvers.prediction import Prediction, unroll
-from trackmdp.world.model import BoolArray, World
+from trackmdp.world.model import World
 
-__all__ = ["solve", "TIE"]
-
-TIE = 1e-12
-"""Relative slack of a threshold: probabilities equal to c/r but for rounding are sensed, the same way each time."""
+__all__ = ["solve"]
 
 
 def solve(world: World, *, in_grid: bool = False) -> PolicyTable:
@@ -23,10 +21,9 @@ def solve(world: World, *, in_grid: bool = False) -> PolicyTable:
         in_grid: charge sensors like the reward does, only while the target is in the grid: p_d p_j r >= c_j p_in.
     """
 
-    def worth_it(seen: Prediction) -> BoolArray:
+    def worth_it(seen: Prediction) -> Offer:
         # multiplied by the probability of the misses, which need not be divided by then
         charged = seen.inside if in_grid else seen.before
-        earned = seen.mass * world.detects(seen.cells) * world.reward
-        return earned >= world.cost[seen.cells] * charged[seen.rows] * (1.0 - TIE)
+        return Offer(seen.mass * world.detects(seen.cells) * world.reward, world.cost, charged, ties=True)
 
     return unroll(world, worth_it)

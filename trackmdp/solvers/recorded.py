@@ -201,7 +201,7 @@ def _renewals(
         if n < task.num_choices:
             key = events.key[at]
             sensed = policy.on(n, key, cell) * task.detects(cell)
-            sensors, price = (policy.spent(n, each)[key] for each in (np.ones(task.num_cells), task.cost))
+            sensors, price = (policy.spent(n, each)[key] for each in (np.ones(task.total_sensors), task.cost))
             safe: float | Array = 0.0
         else:
             sensed, sensors, safe = task.safe_detection[cell], np.zeros(len(at)), 1.0

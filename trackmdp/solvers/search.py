@@ -66,8 +66,8 @@ class InnerProblem:
         # A set belongs to a located cell, so its price c(A_t) is that of the entry's row.
         later = [self.missed[self.layers[-1].cells]]
         for before, layer, on in reversed(list(zip(self.layers, self.layers[1:], sets, strict=False))):
-            paid = per_row(layer.rows, on * self.world.cost[layer.cells], self.world.num_cells)
-            report = on * self.world.detects(layer.cells)
+            paid = per_row(layer.on_rows, on * self.world.cost[layer.sensors], self.world.num_cells)
+            report = layer.seen(on) * self.world.detects(layer.cells)
             gross = layer.moves @ (report * self.detected[layer.cells] + (1.0 - report) * later[0])
             later.insert(0, gross - paid[before.rows] * self.world.stay_probability[before.cells])
         return later
@@ -84,6 +84,7 @@ class InnerProblem:
         sweeps: int,
         optimism: float = 0.0,
         credit: list[Array] | None = None,
+        exact: bool = False,
     ) -> list[BoolArray]:
         """At most `sweeps` times, the best set at each step given the others; `sets` is left as it is.
 
@@ -93,6 +94,7 @@ class InnerProblem:
             sweeps: passes over the steps; ends early where nothing changes.
             optimism: weight of `credit` against the exact credit r + V - W_t.
             credit: per step, `[M]` optimistic credit.
+            exact: whether the sets of sensors with footprints are the best ones, not only good ones.
         """
         for _ in range(sweeps):
             later, now, chosen = self.undetected(sets), mass, []
@@ -105,11 +107,10 @@ class InnerProblem:
                 gain = self.detected[layer.cells] - later[t + 1]
                 if credit is not None:
                     gain = optimism * credit[t][layer.cells] + (1.0 - optimism) * gain
-                # strict: an entry without mass is never sensed, not even by a sensor that costs nothing
                 detects = self.world.detects(layer.cells)
-                on = now * detects * gain > self.world.cost[layer.cells] * inside[layer.rows]
+                on = layer.best(sets[t], now * detects * gain, self.world.cost, inside, exact=exact)
                 chosen.append(on & layer.allowed if self.windowed and layer.allowed is not None else on)
-                now = now * (1.0 - chosen[-1] * detects)
+                now = now * (1.0 - layer.seen(chosen[-1]) * detects)
             if all((new == old).all() for new, old in zip(chosen, sets, strict=True)):
                 break
             # All steps are replaced at once, each against the sets before it in this sweep and those after it in the
@@ -119,7 +120,7 @@ class InnerProblem:
 
     def none_sensed(self) -> list[BoolArray]:
         """Sets to start from."""
-        return [np.zeros(len(layer.rows), dtype=bool) for layer in self.layers[1:]]
+        return [np.zeros(len(layer.sensors), dtype=bool) for layer in self.layers[1:]]
 
 
 def solve(world: World, *, steps: int = 30, sweeps: int = 3) -> PolicyTable:
@@ -159,15 +160,18 @@ def _improve(
     """Policy iteration by ascent, until the mean value no longer grows; `value` `[M]`: that of `sets`, where known."""
     located = np.ones(world.num_cells)
     value = located_value(world, layers, sets) if value is None else value
+    exact = False
     while True:
-        candidate = InnerProblem.of(world, layers, value).ascend(sets, located, sweeps=sweeps)
-        if all((new == old).all() for new, old in zip(candidate, sets, strict=True)):
-            return sets
-        better = located_value(world, layers, candidate, value)
+        candidate = InnerProblem.of(world, layers, value).ascend(sets, located, sweeps=sweeps, exact=exact)
+        same = all((new == old).all() for new, old in zip(candidate, sets, strict=True))
+        better = value if same else located_value(world, layers, candidate, value)
         # Sums over all cells: V is compared from a uniform start, as AIHTR does; the margin is rounding.
-        if better.sum() <= value.sum() + 1e-12 * np.abs(value).sum():
+        if better.sum() > value.sum() + 1e-12 * np.abs(value).sum():
+            sets, value = candidate, better
+        elif exact or world.coverage is None:
             return sets
-        sets, value = candidate, better
+        else:
+            exact = True  # with footprints, once good sets gain no more, the best ones may
 
 
 def located_value(world: World, layers: list[Layer], sets: list[BoolArray], guess: Array | None = None) -> Array:
@@ -180,12 +184,12 @@ def located_value(world: World, layers: list[Layer], sets: list[BoolArray], gues
         now = mass @ layer.moves
         inside = per_row(layer.rows, now, m)
         # c(A_t(x)); paid as long as the target is undetected and in the grid, so times the mass `inside`.
-        paid = per_row(layer.rows[on], world.cost[layer.cells[on]], m)
-        found = now[on] * world.detects(layer.cells[on])
-        earned += world.reward * per_row(layer.rows[on], found, m) - paid * inside
+        paid, seen = per_row(layer.on_rows[on], world.cost[layer.sensors[on]], m), layer.seen(on)
+        found = now[seen] * world.detects(layer.cells[seen])
+        earned += world.reward * per_row(layer.rows[seen], found, m) - paid * inside
         # The entries of T(x, j): mass located in j after a plan made in x.
-        hits.append((found, layer.rows[on], layer.cells[on]))
-        mass = now * (1.0 - on * world.detects(layer.cells))
+        hits.append((found, layer.rows[seen], layer.cells[seen]))
+        mass = now * (1.0 - seen * world.detects(layer.cells))
     # what is left after the last set moves once more and is located by the safe action
     left = mass > 0
     missed = sparse.csr_array((mass[left], (layers[-1].rows[left], layers[-1].cells[left])), shape=(m, m))

@@ -87,6 +87,8 @@ def run_solver(
         return solve_keys(world)
     if not isinstance(world, World):
         raise UserError(f"solver={choice.name}: needs a motion model; recorded tracks have none")
+    if world.coverage is not None and partition is not None and partition.block is not None:
+        raise UserError(f"partition.block={partition.block}: expected null with sensors that have footprints")
     started = time.monotonic()
     if partition is not None and partition.block is not None:
         table = plan_by_blocks(

@@ -17,6 +17,7 @@ from trackmdp.errors import UserError
 from trackmdp.world.costs import Costs
 from trackmdp.world.render import PICTURE_LEGEND, pixels, text_rows
 from trackmdp.world.reports import Reports
+from trackmdp.world.sight import Sight
 from trackmdp.world.targets import make_targets
 from trackmdp.world.tracks import Problem
 from trackmdp.world.windows import Window
@@ -33,6 +34,7 @@ class TrackEnv(EnvBase):
     reward 0; else if it has been missed t_max + 1 times in a row the safe action replaces `action` and locates it;
     else it is located exactly where its cell's sensor is on. Sensors that miss (`detection` in the world) locate it
     with their probability; a safe action that misses is repeated, while the clock stands still, until it locates it.
+    Sensors with footprints (`coverage`) locate it exactly where one that covers its cell is on.
 
     On recorded tracks the target goes along one of them; where its recording stops before it exits, the episode is
     truncated.
@@ -53,9 +55,10 @@ class TrackEnv(EnvBase):
     `torch.compile(env.step_and_maybe_reset, fullgraph=True)` gives one graph and the same bits, as it does of `step`,
     `reset` and ``rollout(..., break_when_any_done=False)``, whose steps are unrolled: keep it to a few.
 
-    An `action` `[*B, K]` bool is a set of sensors. Without `window` in the world K = M and sensor k is that of cell k.
-    With it K = (2W + 1)² and actions, those remembered included, are in the local numbers of `Window`, as seen from
-    `last_cell`: a sensor farther away cannot be chosen, and one outside the grid costs and senses nothing.
+    An `action` `[*B, K]` bool is a set of sensors. Without `window` in the world these are all sensors: K = M and
+    sensor k is that of cell k, or K = S with footprints. With a window K = (2W + 1)² and actions, those remembered
+    included, are in the local numbers of `Window`, as seen from `last_cell`: a sensor farther away cannot be chosen,
+    and one outside the grid costs and senses nothing.
 
     Args:
         world: the task and the target's motion, or recorded tracks.
@@ -85,10 +88,10 @@ class TrackEnv(EnvBase):
         self.num_cells, self.t_max = world.num_cells, world.t_max
         self._stream, self._grid = stream, world.size
         self._targets = make_targets(world, self.device)
-        self._window = Window.of(world, self.device)
+        self._window, self._sight = Window.of(world, self.device), Sight(world, self.device)
+        self.num_sensors, self._covered = world.num_sensors, world.covered
         self._costs, self._reports, self._safe = Costs(world, self.device), Reports(world, self.device), world.safe
         self._keys = world.keys if world.keyed else None
-        self._rows = torch.arange(self.num_envs, device=self.device)
         # Shared by all steps that truncate nothing; handed out as a clone only.
         self._no = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
         self._every = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
@@ -103,7 +106,7 @@ class TrackEnv(EnvBase):
         self._set_seed(seed)
 
     def __repr__(self) -> str:
-        grid = f"{self._grid[0]} x {self._grid[1]} cells, {self._window.width} sensors, t_max={self.t_max}"
+        grid = f"{self._grid[0]} x {self._grid[1]} cells, {self.num_sensors} sensors, t_max={self.t_max}"
         limit = f", max_steps={self.max_steps}" if self.max_steps else ""
         return f"{type(self).__name__}({grid}{limit}, batch_size={list(self.batch_size)}, device={self.device})"
 
@@ -134,13 +137,13 @@ class TrackEnv(EnvBase):
         on = np.zeros(self.num_cells, dtype=bool)
         if self._acted is not None and not any(rows[row] for rows in self._begun):
             action, last, misses = (each[row : row + 1] for each in self._acted)
-            on |= (self._window.to_global(last, action)[0] | (misses > self.t_max)).cpu().numpy()
+            on |= self._covered(self._window.to_global(last, action)[0].cpu().numpy()) | bool(misses > self.t_max)
         draw = pixels if mode == "rgb_array" else text_rows
         picture = draw(self._grid, cell, on, found=n == 0)
         return picture if isinstance(picture, np.ndarray) else "\n".join([*picture, PICTURE_LEGEND])
 
     def _make_specs(self) -> None:
-        b, m, k, choices = self.batch_size, self.num_cells, self._window.width, self.t_max + 1
+        b, m, k, choices = self.batch_size, self.num_cells, self.num_sensors, self.t_max + 1
         index: dict[str, Any] = {"shape": b, "dtype": torch.int64, "device": self.device}
         observation = Composite(
             # n takes t_max + 2 values: 0 ... t_max + 1, the last one with the safe action forced.
@@ -204,7 +207,7 @@ class TrackEnv(EnvBase):
             "last_cell": start.clone(),
             "steps_since_detection": torch.zeros_like(start),
             "action_history": torch.zeros(
-                *start.shape, self.t_max + 1, self._window.width, dtype=torch.bool, device=self.device
+                *start.shape, self.t_max + 1, self.num_sensors, dtype=torch.bool, device=self.device
             ),
         }
         if self._keys:
@@ -218,7 +221,7 @@ class TrackEnv(EnvBase):
 
     def _stepped(self, action: Tensor) -> dict[str, Tensor]:
         """One step of all targets in a row, `[num_envs, ...]`, from an action `[*B, K]`."""
-        flat = action.reshape(self.num_envs, self._window.width)
+        flat = action.reshape(self.num_envs, self.num_sensors)
         now = self._now
         self._acted, self._begun = (flat, now["last_cell"], now["steps_since_detection"]), []
         draws, reports = self._targets.draw(self._every), self._reports.draw(self._every)
@@ -241,11 +244,7 @@ class TrackEnv(EnvBase):
         moved = self._targets.move(state, draws)
         target = moved["target"]
         in_grid = target < self.num_cells
-        # The sensor that could see the target: K, none, where it has exited or left the window.
-        sensor = self._window.find(last, target)
-        # Indexing needs a valid number, so K is clamped to K - 1, and what was read there is discarded by the
-        # comparison.
-        sensed = action[self._rows, sensor.clamp_max(self._window.width - 1)] & (sensor < self._window.width)
+        sensed = self._sight.sees(action, last, target)
         # n = t_max + 1: the policy's action does not count any more.
         forced = n > self.t_max
         located = (sensed | forced) & in_grid & self._reports.seen(target, forced, reports)

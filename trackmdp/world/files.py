@@ -42,9 +42,14 @@ def read_numbers(key: str, path: str | Path, *, name: str) -> Array:
 
 
 def per_cell(
-    key: str, given: float | list[float] | str, size: Size, allowed: Callable[[Array], BoolArray], expected: str
+    key: str,
+    given: float | list[float] | str,
+    size: Size,
+    allowed: Callable[[Array], BoolArray],
+    expected: str,
+    sensors: int | None = None,
 ) -> Array:
-    """`[M]` one number per cell: one for all, a list, or what is in a file.
+    """`[M]` one number per cell, or `[S]` per sensor: one for all, a list, or what is in a file.
 
     Args:
         key: the option, for messages.
@@ -52,19 +57,23 @@ def per_cell(
         size: of the grid.
         allowed: which of the numbers in a file are in range.
         expected: the range in words.
+        sensors: S, where the numbers are those of sensors that lie at no cell.
 
     Raises:
-        UserError: a file is missing or malformed, or holds another number of numbers, or one out of range.
+        UserError: a list or file is missing or malformed, holds another number of numbers, or one out of range.
     """
-    cells = math.prod(grid_size(size))
+    count, each = (math.prod(grid_size(size)), "cell") if sensors is None else (sensors, "sensor")
     if not isinstance(given, str):
-        return np.broadcast_to(np.asarray(given, dtype=np.float64), (cells,)).copy()
+        numbers = np.asarray(given, dtype=np.float64)
+        if numbers.shape not in ((), (count,)):
+            raise UserError(f"{key}: {numbers.size} values, expected one number or {count} (one per {each})")
+        return np.broadcast_to(numbers, (count,)).copy()
     values = read_numbers(key, given, name=key.rpartition(".")[2]).ravel()
-    if values.size != cells:
-        raise UserError(f"{key}={given}: {values.size} values, expected {cells} (one per cell)")
+    if values.size != count:
+        raise UserError(f"{key}={given}: {values.size} values, expected {count} (one per {each})")
     if not (fine := allowed(values)).all():
         bad = int(np.flatnonzero(~fine)[0])
-        raise UserError(f"{key}={given}: cell {bad} has {values[bad]}, expected {expected}")
+        raise UserError(f"{key}={given}: {each} {bad} has {values[bad]}, expected {expected}")
     return values
 
 

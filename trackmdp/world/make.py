@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -204,13 +205,21 @@ def recorded(
     return Recorded(mine, size, validation=chosen, held_out=judged, loaded=loaded, **of_task)
 
 
-def paper_cost(size: Size, *, reward: float, sensor: float | list[float] | str, safe: float | None) -> dict[str, Any]:
-    """r, c and D as arguments of `Task`.
+def paper_cost(
+    size: Size,
+    *,
+    reward: float,
+    sensor: float | list[float] | str,
+    safe: float | None,
+    sensors: int | None = None,
+) -> dict[str, Any]:
+    """r, c and D as arguments of `Task`; `sensors` is their number where there is not one in each cell.
 
     Raises:
-        UserError: a file of prices is missing or malformed, or does not have one price per cell.
+        UserError: a file of prices is missing or malformed, or does not have one price per sensor.
     """
-    price = per_cell("cost.sensor", sensor, size, lambda c: (c >= 0) & (c <= LARGEST), "a number from 0 to 1e15")
+    allowed = "a number from 0 to 1e15"
+    price = per_cell("cost.sensor", sensor, size, lambda c: (c >= 0) & (c <= LARGEST), allowed, sensors)
     return {"reward": reward, "cost": price, "safe_cost": safe}
 
 
@@ -240,7 +249,11 @@ def sensor_words(detection: Any, safe_detection: Any) -> dict[str, Any]:
 
 def _of_task(cfg: WorldConfig) -> dict[str, Any]:
     """Costs and limits of a world config, as arguments of `Task`."""
-    costs: dict[str, Any] = make(cfg.cost, cfg.grid.size)
     sensors: dict[str, Any] = make(cfg.sensor, cfg.grid.size)
+    # Prices per sensor: how many those are is told to costs that ask for it.
+    told = {}
+    if (coverage := sensors.get("coverage")) is not None and "sensors" in signature(maker(cfg.cost)).parameters:
+        told = {"sensors": coverage.num_sensors}
+    costs: dict[str, Any] = make(cfg.cost, cfg.grid.size, **told)
     limits = {"t_max": cfg.grid.t_max, "max_steps": cfg.grid.max_steps, "window": cfg.grid.window}
     return costs | sensors | limits | cfg.remembered

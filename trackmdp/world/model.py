@@ -14,6 +14,7 @@ from scipy import sparse
 from trackmdp.config.world import LARGEST, MEMORIES
 from trackmdp.errors import UserError
 from trackmdp.world.checks import canonical_kernel, check_kernel
+from trackmdp.world.coverage import Coverage
 from trackmdp.world.memory import KeySpace
 from trackmdp.world.rows import pairwise_row_sums
 
@@ -35,8 +36,7 @@ class Task:
 
     Attributes:
         size: (rows, columns) of the grid; the constructor takes one number for a square grid.
-        cost: `[M]`, c per cell: the price of one sensor switched on for one step; the constructor takes one number for
-            all cells.
+        cost: `[S]`, c: the price of each sensor switched on for one step; the constructor takes one number for all.
         t_max: T_max; the controller chooses freely at n = 0 ... t_max.
         safe_cost: D, the price of the safe action, forced after t_max + 1 misses in a row; default: the sum of `cost`.
         reward: r, earned when the target is sensed.
@@ -46,6 +46,8 @@ class Task:
             constructor takes one number for all cells.
         safe_detection: `[M]`, p_s per cell, in (0, 1]: the same of the safe action; below 1 it is repeated, at D each,
             until it locates the target.
+        coverage: the cells that each of the S sensors covers, where that is not its own cell alone; the constructor
+            takes a table or sparse matrix `[S, M]` of 0 and 1. None: S = M, sensor s covers cell s.
         markov: whether the next move depends on the target's cell alone, so that a learner may put paths together from
             moves seen on different ones.
         memory: what a policy remembers at a detection, one of `trackmdp.config.world.MEMORIES`; see `KeySpace`.
@@ -53,7 +55,8 @@ class Task:
         revealed: modes of the target that a detection tells apart; 1 where it tells the cell alone.
 
     Raises:
-        UserError: a number is out of its range, or `cost` does not have one price per cell.
+        UserError: a number is out of its range, `cost` does not have one price per sensor, or footprints go together
+            with a window, with sensors that miss, or with a memory of more than the cell.
     """
 
     size: tuple[int, int]
@@ -65,6 +68,7 @@ class Task:
     window: int | None
     detection: Array
     safe_detection: Array
+    coverage: Coverage | None
     markov: bool
     memory: str
     clip: int
@@ -82,6 +86,7 @@ class Task:
         window: int | None = None,
         detection: npt.ArrayLike = 1.0,
         safe_detection: npt.ArrayLike = 1.0,
+        coverage: Any = None,
         markov: bool = True,
         memory: str = "cell",
         clip: int = 2,
@@ -90,7 +95,8 @@ class Task:
         if memory not in MEMORIES:
             raise UserError(f"memory={memory}: expected one of {', '.join(MEMORIES)}")
         rows, columns = grid_size(size)
-        prices = _prices(cost, rows * columns)
+        footprints = Coverage.of(coverage, rows * columns)
+        prices = _prices(cost, rows * columns, footprints)
         values = {
             "size": (rows, columns),
             "cost": prices,
@@ -101,6 +107,7 @@ class Task:
             "window": None if window is None else _at_least(0, "window", window),
             "detection": _probabilities("detection", detection, rows * columns),
             "safe_detection": _probabilities("safe_detection", safe_detection, rows * columns),
+            "coverage": footprints,
             "markov": markov,
             "memory": memory,
             "clip": _at_least(1, "clip", clip),
@@ -113,6 +120,17 @@ class Task:
             raise UserError(f"memory={memory}: with a safe action that may miss, expected cell")
         if memory != "cell" and revealed > 1:
             raise UserError(f"memory={memory}: where a detection tells the mode, expected cell")
+        if footprints is not None:
+            self._check_footprints()
+
+    def _check_footprints(self) -> None:
+        """Refuse what sensors that cover several cells do not go together with."""
+        if self.window is not None:
+            raise UserError(f"window={self.window}: expected None with coverage, whose sensors lie at no cell")
+        if self.memory != "cell":
+            raise UserError(f"memory={self.memory}: expected cell with coverage")
+        if not (self.perfect and self.safe):
+            raise UserError("detection, safe_detection: expected 1 with coverage; within a footprint nothing is missed")
 
     @property
     def rows(self) -> int:
@@ -126,8 +144,13 @@ class Task:
 
     @property
     def num_cells(self) -> int:
-        """M = rows · columns, the number of cells and of sensors."""
+        """M = rows · columns."""
         return self.rows * self.columns
+
+    @property
+    def total_sensors(self) -> int:
+        """S, all sensors there are: one in each cell, or those of `coverage`."""
+        return self.num_cells if self.coverage is None else self.coverage.num_sensors
 
     @property
     def num_choices(self) -> int:
@@ -136,8 +159,8 @@ class Task:
 
     @property
     def num_sensors(self) -> int:
-        """K, the sensors that can be chosen from one located cell: M, or (2W+1)² with a window."""
-        return self.num_cells if self.window is None else (2 * self.window + 1) ** 2
+        """K, the sensors that can be chosen from one located cell: S, or (2W+1)² with a window."""
+        return self.total_sensors if self.window is None else (2 * self.window + 1) ** 2
 
     @cached_property
     def perfect(self) -> bool:
@@ -152,6 +175,10 @@ class Task:
     def detects(self, cells: npt.NDArray[Any]) -> Array | float:
         """`[E]` p_d of `cells` `[E]`; simply 1.0 where no sensor misses, so that perfect sensors cost no look-up."""
         return 1.0 if self.perfect else self.detection[cells]
+
+    def covered(self, action: BoolArray) -> BoolArray:
+        """`[..., M]`, the cells that the sensors of `action` `[..., S]` see: the action itself, but for footprints."""
+        return action if self.coverage is None else self.coverage.cells(action)
 
     @property
     def safe_misses(self) -> Array | float:
@@ -223,6 +250,7 @@ class World(Task):
         window: int | None = None,
         detection: npt.ArrayLike = 1.0,
         safe_detection: npt.ArrayLike = 1.0,
+        coverage: Any = None,
         markov: bool = True,
         memory: str = "cell",
         clip: int = 2,
@@ -238,6 +266,7 @@ class World(Task):
             window=window,
             detection=detection,
             safe_detection=safe_detection,
+            coverage=coverage,
             markov=markov,
             memory=memory,
             clip=clip,
@@ -279,15 +308,16 @@ def grid_size(size: Size) -> tuple[int, int]:
     return int(pair[0]), int(pair[1])
 
 
-def _prices(cost: npt.ArrayLike, cells: int) -> Array:
-    """`[M]` price of each sensor, from one number for all or from one for each."""
-    prices = np.asarray(cost, dtype=np.float64)
-    if prices.shape not in ((), (cells,)):
-        raise UserError(f"cost: expected one number or {cells} (one per cell), got shape {prices.shape}")
+def _prices(cost: npt.ArrayLike, cells: int, coverage: Coverage | None) -> Array:
+    """`[S]` price of each sensor, from one number for all or from one for each."""
+    prices, each = np.asarray(cost, dtype=np.float64), "cell" if coverage is None else "sensor"
+    count = cells if coverage is None else coverage.num_sensors
+    if prices.shape not in ((), (count,)):
+        raise UserError(f"cost: expected one number or {count} (one per {each}), got shape {prices.shape}")
     if not (fine := (prices >= 0) & (prices <= LARGEST)).all():
         bad = int(np.flatnonzero(~fine)[0])
-        raise UserError(f"cost: cell {bad} costs {prices.flat[bad]}, expected a number from 0 to 1e15")
-    return np.broadcast_to(prices, (cells,)).copy()
+        raise UserError(f"cost: {each} {bad} costs {prices.flat[bad]}, expected a number from 0 to 1e15")
+    return np.broadcast_to(prices, (count,)).copy()
 
 
 def _probabilities(name: str, given: npt.ArrayLike, cells: int) -> Array:

@@ -60,6 +60,8 @@ class HiddenWorld(Task):
             raise UserError(f"revealed={self.revealed}: expected 1 or {modes}, the modes of the target")
         if self.window is not None or self.max_steps is not None:
             raise UserError("kernel: with a hidden mode, expected grid.window=null and grid.max_steps=null")
+        if self.coverage is not None:
+            raise UserError("kernel: with a hidden mode, expected sensors that each cover one cell")
         canonical = canonical_kernel(kernel)
         # As if every hidden state were a cell of a grid with H times as many columns.
         check_kernel(canonical, (self.rows, self.columns * modes), truncates=False, modes=modes)

@@ -6,10 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from trackmdp.world.files import per_cell
-from trackmdp.world.model import Array, Size
+from trackmdp.config.world import lattice
+from trackmdp.errors import UserError
+from trackmdp.world.coverage import Coverage, discs
+from trackmdp.world.files import per_cell, read_matrix
+from trackmdp.world.model import Array, Size, grid_size
 
-__all__ = ["false_alarm", "miss", "perfect"]
+__all__ = ["false_alarm", "footprint", "miss", "perfect"]
 
 
 def perfect(size: Size) -> dict[str, Any]:  # noqa: ARG001
@@ -36,6 +39,23 @@ def false_alarm(size: Size, *, p_d: float | list[float] | str, p_f: float) -> di
         UserError: as `miss`.
     """
     return {"detection": _probabilities("sensor.p_d", p_d, size)}
+
+
+def footprint(size: Size, *, radius: float, spacing: int, path: str | None) -> dict[str, Any]:
+    """Discs of `radius` around the places of a lattice, or the footprints in a file.
+
+    Raises:
+        UserError: the file is missing or malformed, or holds no footprints on this grid.
+    """
+    rows, columns = grid_size(size)
+    if path is not None:
+        table = read_matrix("sensor.path", path, name="coverage")
+        try:
+            return {"coverage": Coverage.of(table, rows * columns)}
+        except UserError as error:  # the option at fault is told with it
+            raise UserError(f"sensor.path={path}: {str(error).removeprefix('coverage: ')}") from error
+    places = np.stack(np.meshgrid(lattice(rows, spacing), lattice(columns, spacing), indexing="ij"), axis=-1)
+    return {"coverage": Coverage.of(discs((rows, columns), places.reshape(-1, 2), radius), rows * columns)}
 
 
 def _probabilities(key: str, given: float | list[float] | str, size: Size) -> Array:

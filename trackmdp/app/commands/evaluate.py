@@ -63,8 +63,9 @@ def run(cfg: EvaluateConfig, folder: Path, problem: Problem | None = None) -> fl
         score = evaluator.tighten(proved["lower"], proved["upper"], score)
     episodes = simulate(world, policy, cfg.episodes or _FOR_THE_PICTURE, seed=cfg.seed)
     simulation = episodes.figures() if cfg.episodes else None
-    # Theorem thm:estimator is about Q of whole episodes and of a policy that is a table of cells.
+    # Theorem thm:estimator is about Q of whole episodes, a policy that is a table of cells, and sensors of one cell.
     told = policy.deterministic and world.max_steps is None and world.perfect and not policy.task.keyed
+    told = told and world.coverage is None
     estimate = estimator.accuracy(world, policy) if told and isinstance(world, World) else None
     report = _report(subject, evaluator, score, simulation) | {
         "optimal": proved,

@@ -43,7 +43,13 @@ def run(cfg: VerifyConfig, folder: Path, problem: Problem | None = None) -> floa
 
 
 def write_checks(world: World, tolerance: float, folder: Path) -> list[Check]:
-    """Solve the world, run every check, and write `verification.json`."""
+    """Solve the world, run every check, and write `verification.json`.
+
+    Raises:
+        UserError: its sensors are not those of the paper's theorems.
+    """
+    if world.coverage is not None:
+        raise UserError("sensor=footprint: the paper's theorems are on sensors of one cell; expected perfect or miss")
     solution = optimal.solve(world, nodes=NODES, tolerance=tolerance)
     if solution.interrupted:
         raise KeyboardInterrupt
