@@ -54,7 +54,7 @@ def test_steps_by_hand() -> None:
     env = TrackEnv(_line(), 3)
     assert env.action_spec.shape == (3, 2)
     start = torch.tensor([0, 1, 2])  # the target moves on to 1, 2 and 3
-    state = dict(env._fresh()) | {"target": start, "last_cell": start}
+    state = dict(env._fresh(env._every)) | {"target": start, "last_cell": start}
     action = torch.tensor([[True, False], [False, True], [True, True]])
     after = env.advance(state | {"action": action}, torch.full((3,), 0.5, dtype=torch.float64))
     assert after["reward"].squeeze(-1).tolist() == [0.5, 0.75, -0.75]
