@@ -137,3 +137,12 @@ def test_blocks_plan_what_the_whole_grid_does() -> None:
     assert believed[-1]["believed_aihtr"] == pytest.approx(rows[-1]["believed_aihtr"], abs=0.05)
     assert believed[-1]["believed_aihtr"] > 0
     assert parts.actor.sets.nnz == pytest.approx(whole.actor.sets.nnz, rel=0.05)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(("cells", "planned"), [(9, 6), (8, 1)])
+def test_above_so_many_cells_it_plans_once(cells: int, planned: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("trackmdp.algos.learned_kernel.DIRECT_CELLS", cells)
+    _, rows = learn(small_world(3), 6, "algo.samples=2")
+    believed = [row["believed_aihtr"] for row in rows]
+    new = [after for before, after in zip([np.nan, *believed], believed, strict=False) if after != before]
+    assert len([value for value in new if not np.isnan(value)]) == planned

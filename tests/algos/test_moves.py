@@ -153,3 +153,15 @@ def test_a_saved_buffer_draws_the_same_paths() -> None:
     buffer, other = filled([0, 0, 1], [1, 2, 0], seed=3), MoveBuffer(M, 100, torch.Generator().manual_seed(3))
     other.load_state_dict(buffer.state_dict())
     assert torch.equal(buffer.paths(50, 4), other.paths(50, 4))
+
+
+def test_however_moves_come_they_are_kept_in_order() -> None:
+    rng = torch.Generator().manual_seed(0)
+    start, end = (torch.randint(M, (60,), generator=rng).tolist() for _ in range(2))
+    one = MoveBuffer(M, 50, torch.Generator())
+    for size, begin in ((1, 0), (2, 1), (40, 3), (17, 43)):
+        one.extend(batch(start[begin : begin + size], end[begin : begin + size]))
+        assert len(one) == min(begin + size, 50)
+    assert one.moves()[0].tolist() == start[-50:]
+    assert one.moves()[1].tolist() == end[-50:]
+    assert len(one) == 50

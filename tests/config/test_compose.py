@@ -67,3 +67,20 @@ def test_what_only_training_reads_is_refused_elsewhere() -> None:
     with pytest.raises(UserError, match=r"log\.mcap\.evaluations=2: without effect outside training"):
         compose("evaluate", {"baseline": "qmdp", "log": "mcap", "log.mcap.evaluations": 2})
     assert compose("evaluate", {"baseline": "qmdp", "log": "mcap", "log.mcap.layout": True}).log["mcap"].layout
+
+
+@pytest.mark.parametrize(
+    ("algo", "size", "frames", "per_batch", "envs"),
+    [
+        ("learned_kernel", 10, 30_000, 5_000, 1_000),
+        ("learned_kernel", 70, 1_470_000, 5_000, 1_000),
+        ("learned_kernel", 110, 3_630_000, 15_000, 3_000),
+        ("learned_kernel", [300, 300], 27_000_000, 90_000, 18_000),
+        ("hindsight", 10, 300_000, 10_000, 1_000),
+        ("hindsight", 128, 49_152_000, 20_000, 2_000),
+    ],
+)
+def test_batches_grow_with_the_grid(algo: str, size: Any, frames: int, per_batch: int, envs: int) -> None:
+    cfg = compose("train", {"algo": algo, "grid.size": size, "grid.window": 2})
+    found = cfg.collector
+    assert (found.total_frames, found.frames_per_batch, found.envs) == (frames, per_batch, envs)

@@ -28,3 +28,18 @@ def test_cells_of_a_group_share_all_weights() -> None:
     assert net.cell.grad is not None
     assert net.cell.grad[0].any()
     assert not net.cell.grad[1].any()
+
+
+def test_without_hidden_units_every_output_has_a_number_of_its_own() -> None:
+    generator = torch.Generator().manual_seed(0)
+    table = CellClockNet(4, 2, hidden=0, outputs=3, bias=-1.0, generator=generator)
+    assert table.table.shape == (4, 2, 3)
+    assert (table() == -1.0).all()
+    table(slice(1, 3)).sum().backward()
+    assert table.table.grad is not None
+    assert table.table.grad.sum((1, 2)).tolist() == [0, 6, 6, 0]
+    grouped = CellClockNet(4, 2, hidden=0, outputs=3, bias=0.0, generator=generator, groups=torch.tensor([0, 1, 1, 0]))
+    with torch.no_grad():
+        grouped.table[1] += 1.0
+    assert grouped().sum((1, 2)).tolist() == [0, 6, 6, 0]
+    assert grouped(slice(2, 4)).sum((1, 2)).tolist() == [6, 0]

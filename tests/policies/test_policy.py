@@ -363,3 +363,17 @@ def test_a_sensor_outside_the_window_is_refused() -> None:
     on[0, 2, 2] = True
     with pytest.raises(UserError, match=r"sensor 2 cannot be chosen from cell 0 with grid\.window=1"):
         Policy.from_dense(windowed(), on)
+
+
+@pytest.mark.parametrize("t_max", [0, 2])
+def test_every_sensor_of_a_window_is_on_however_it_is_looked_up(t_max: int) -> None:
+    world = World(random_kernel(np.random.default_rng(0), 20, 0.1), (4, 5), cost=0.1, t_max=t_max, window=1)
+    everything = Policy.all_on(world)
+    cell = torch.arange(20).repeat_interleave(t_max + 2).view(2, -1)
+    state = TensorDict(
+        {"last_cell": cell, "steps_since_detection": torch.arange(t_max + 2).repeat(20).view(2, -1)}, [2]
+    )
+    assert torch.equal(everything(state.clone())["action"], Policy(world, everything.sets)(state.clone())["action"])
+    assert isinstance(everything._local, lookup.WindowTable)
+    assert everything.sets is not None
+    assert (everything.sets.dtype, everything.sets.indices.dtype) == (np.bool_, np.int32)

@@ -15,9 +15,10 @@ from scipy import sparse
 from torchrl.collectors import Collector
 
 from tests.training.runs import assert_same_run, at_iteration, tensors, train
+from trackmdp.algos.moves import MoveBuffer
 from trackmdp.app.commands.trained import trained
 from trackmdp.errors import Preempted, RunError, UserError
-from trackmdp.training import checkpoint
+from trackmdp.training import checkpoint, state
 
 CPU = torch.device("cpu")
 
@@ -179,9 +180,9 @@ def test_a_sealed_state_that_makes_no_sense_is_refused_in_one_line(
 ) -> None:
     mine = tmp_path / "mine"
     shutil.copytree(whole, mine)
-    state = checkpoint.load(checkpoint.newest(mine))
+    saved = checkpoint.load(checkpoint.newest(mine))
     shutil.rmtree(mine / "checkpoints")
-    checkpoint.save(mine / "checkpoints", 8, {**state, **damage}, keep=1)
+    checkpoint.save(mine / "checkpoints", 8, {**saved, **damage}, keep=1)
     (mine / "summary.json").unlink()
     before = (mine / "metrics.csv").read_bytes()
     with pytest.raises(UserError) as refused:
@@ -201,3 +202,31 @@ def test_metrics_of_rubbish_stop_a_resume_before_anything_is_written(
     with pytest.raises(UserError, match=r"metrics\.csv: not the metrics of this run"):
         train(mine, "resume=auto")
     assert (mine / "metrics.csv").read_bytes() == content
+
+
+@pytest.mark.parametrize("package", ["hydra-core", "numpy"])
+def test_another_version_of_a_package_that_composes_or_computes_is_refused(
+    package: str, tmp_path: Path, whole: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mine = tmp_path / "mine"
+    shutil.copytree(whole, mine)
+    (mine / "summary.json").unlink()
+    found = state.version
+    monkeypatch.setattr(state, "version", lambda name: "0.1" if name == package else found(name))
+    with pytest.raises(UserError, match=rf"written with {package} \d[^ ]*, this is 0.1; expected the same"):
+        train(mine, "resume=auto")
+
+
+def test_a_batch_is_whoever_s_it_was_given_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Learners may keep parts of a batch: the collector must not write the next one over it."""
+    kept: list[tuple[torch.Tensor, torch.Tensor]] = []
+    step = MoveBuffer.extend
+
+    def extend(self: MoveBuffer, batch: Any) -> None:
+        kept.append((batch["last_cell"], batch["last_cell"].clone()))
+        step(self, batch)
+
+    monkeypatch.setattr(MoveBuffer, "extend", extend)
+    train(tmp_path / "run", algo="hindsight")
+    assert len(kept) == 8
+    assert all(torch.equal(now, then) for now, then in kept)

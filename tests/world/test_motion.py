@@ -135,3 +135,17 @@ def test_frequencies_are_those_of_the_table() -> None:
             stats.chisquare(observed[likely], expected[likely] * observed[likely].sum() / expected[likely].sum())[1]
             > 1e-3
         )
+
+
+@given(kernels(), st.integers(0, 2**32 - 1))
+def test_short_rows_are_compared_to_what_a_search_finds(kernel: np.ndarray, seed: int) -> None:
+    m, motion = len(kernel), Motion(sparse.csr_array(kernel))
+    edges = np.floor(np.cumsum(closed(kernel), axis=1) * 2**40)
+    near = np.concatenate([edges + step for step in (-1, 0, 1)], axis=1)
+    draws = np.clip(np.append(near, np.random.default_rng(seed).random((m, 9)) * 2**40, axis=1) // 1, 0, 2**40 - 1)
+    # the exited target, M, as well
+    cells = torch.arange(m + 1).repeat_interleave(draws.shape[1])
+    draws = torch.as_tensor(np.append(draws, draws[:1], axis=0) / 2**40).flatten()
+    compared = motion.move(cells, draws)
+    motion._within = None
+    assert torch.equal(compared, motion.move(cells, draws))

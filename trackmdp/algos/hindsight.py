@@ -36,13 +36,18 @@ from trackmdp.world.windows import Window
 
 __all__ = ["Hindsight", "budget"]
 
+_MOST_CELLS_OF_NETS = 4_096
+"""Above, embeddings of each (cell, clock) take time and memory that tables do not. At N = 32 tables end .007 per step
+below the optimum where nets end .002 below, and both .002 after the exchange."""
 _LOSSES = ("clocked_actor", "clocked_critic", "actor", "critic")
 
 
 def budget(task: Task, cfg: PerSensorConfig) -> tuple[int, int]:
     """Updates and hidden units: as configured, else by the number of rows (x, n) that the actor has to get right."""
     few = task.num_cells * task.num_choices <= 300
-    return cfg.updates or round(cfg.effort * (500 if few else 800)), cfg.hidden or (128 if few else 256)
+    hidden = 128 if few else 256 if task.num_cells <= _MOST_CELLS_OF_NETS else 0
+    updates = cfg.updates or round(cfg.effort * (500 if few else 800))
+    return updates, hidden if cfg.hidden is None else cfg.hidden
 
 
 class Hindsight:

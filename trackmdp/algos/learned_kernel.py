@@ -25,6 +25,7 @@ from trackmdp.solvers import exchange
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.kernel_estimate import KernelEstimate, ObservedPaths
 from trackmdp.solvers.partition import plan_by_blocks
+from trackmdp.solvers.renewal import DIRECT_CELLS
 from trackmdp.solvers.shrinkage import least_worth_planning, without
 from trackmdp.world.model import Task, World
 from trackmdp.world.windows import Window
@@ -72,8 +73,9 @@ class LearnedKernel:
             self._estimate.add(observed_paths(batch, self.task))
             self._spent += [batch.numel(), _sensors_on(batch)]
         last = self._iteration == self.iterations
-        # With all sensors on nothing that is collected depends on a plan: it can wait, on a large grid at length.
-        every = self.cfg.plan_every or max(1, self.iterations // 6)
+        # With all sensors on nothing that is collected depends on a plan: it can wait, on a large grid to the end.
+        few = self.iterations if self.task.num_cells > DIRECT_CELLS else max(1, self.iterations // 6)
+        every = self.cfg.plan_every or few
         if not (last or self._chooses or self._iteration % every == 0):
             return self._diagnostics()
         self._estimate.fit(self.cfg.rounds_at_end if last else self.cfg.rounds)

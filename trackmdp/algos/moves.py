@@ -28,22 +28,36 @@ class MoveBuffer:
         self, num_cells: int, capacity: int, generator: torch.Generator, weights: Tensor | None = None
     ) -> None:
         self.num_cells, self._capacity, self._generator, self._weights = num_cells, capacity, generator, weights
-        # Oldest first.
+        # Oldest first; those of the last batches wait to be appended, which copies all that is there.
         self._moves = torch.empty(2, 0, dtype=cell_dtype(num_cells), device=generator.device)
+        self._fresh: list[Tensor] = []
         self._index: tuple[Tensor, CellIndex] | None = None
 
     def __len__(self) -> int:
-        return self._moves.shape[1]
+        return min(self._moves.shape[1] + self._waiting, self._capacity)
 
     def extend(self, batch: TensorDictBase) -> None:
         """Add the moves sensed in a collected batch `[B, time]`."""
-        fresh = torch.stack(sensed_moves(batch, self.num_cells)).to(self._moves)
-        self._moves = torch.cat([self._moves, fresh], dim=1)[:, -self._capacity :].contiguous()
+        self._fresh.append(torch.stack(sensed_moves(batch, self.num_cells)).to(self._moves))
         self._index = None
+        # As many waiting as appended: every move is then copied a few times at most, however long the run.
+        if self._waiting > self._moves.shape[1]:
+            self._appended()
+
+    @property
+    def _waiting(self) -> int:
+        return sum(part.shape[1] for part in self._fresh)
+
+    def _appended(self) -> Tensor:
+        """`[2, K]`, all moves kept."""
+        if self._fresh:
+            self._moves = torch.cat([self._moves, *self._fresh], dim=1)[:, -self._capacity :].contiguous()
+            self._fresh = []
+        return self._moves
 
     def moves(self) -> tuple[Tensor, Tensor]:
         """Cells before and after every move, int64 `[K]` each."""
-        start, end = self._moves.long()
+        start, end = self._appended().long()
         return start, end
 
     def paths(self, count: int, steps: int) -> Tensor:
@@ -74,11 +88,11 @@ class MoveBuffer:
 
     def state_dict(self) -> dict[str, Tensor]:
         """The moves; the generator is its owner's to save."""
-        return {"moves": self._moves}
+        return {"moves": self._appended()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Continue from a `state_dict`."""
-        self._moves, self._index = state["moves"].to(self._moves), None
+        self._moves, self._fresh, self._index = state["moves"].to(self._moves), [], None
 
 
 def sensed_moves(batch: TensorDictBase, num_cells: int) -> tuple[Tensor, Tensor]:

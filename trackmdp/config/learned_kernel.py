@@ -28,7 +28,7 @@ class LearnedKernelConfig(AlgoConfig):
     exit_prior: float = option("the pooled exit probability counts as much as this many moves", unit="moves", gt=0)
     plan_every: int | None = option(
         "with all sensors on: batches from one plan to the next; after the last one is planned in any case; null: six "
-        "plans in a run",
+        "plans in a run, above 20,000 cells that one alone",
         ge=1,
     )
     negligible: float | None = option(

@@ -258,5 +258,5 @@ def networks(task: Sizes, hidden: int | None) -> int:
     """Bytes of two networks of one hidden layer (256 units where `hidden` is left open), with Adam's two moments."""
     # located cell, n and both at once by number; the history by sensor, as are the outputs
     inputs = task.num_cells * (task.num_choices + 3) + task.num_choices * (task.num_sensors + 1) + 1
-    weights = (hidden or 256) * (inputs + task.num_sensors)
+    weights = (256 if hidden is None else hidden) * (inputs + task.num_sensors)
     return 2 * weights * 4 * BYTES["float32"]  # weight, gradient, two moments

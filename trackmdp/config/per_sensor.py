@@ -51,7 +51,11 @@ class PerSensorConfig(AlgoConfig):
     updates: int | None = option("updates of the whole run; null: by the size of the problem", ge=1, le=10**9)
     updates_per_iteration: int = option("updates from one evaluation, log row or checkpoint to the next at most", ge=1)
     hidden: int | None = option(
-        "units of each net's hidden layer; null: by the size of the problem", unit="units", ge=1, le=4096
+        "units of each net's hidden layer, 0 = plain tables without one; null: by the size of the problem, from 4,097 "
+        "cells on tables",
+        unit="units",
+        ge=0,
+        le=4096,
     )
     buffer_size: int = option("path segments kept for replay", unit="segments", ge=1)
     share_cells: bool = option(

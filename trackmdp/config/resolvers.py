@@ -23,9 +23,15 @@ def _first_given(*values: Any) -> Any:
     return next((value for value in values if value is not None), None)
 
 
-def _per_cell(count: int, size: Any, least: int = 0) -> int:
-    """`count` for each cell of a grid of N x N cells, or of [rows, columns]; `least` in all."""
+def _per_cell(count: float, size: Any, least: int = 0) -> int:
+    """`count` for each cell of a grid of N x N cells, or of [rows, columns]; `least` in all.
+
+    A fraction gives a whole number of `least`: .2 for each of 100 x 100 cells in thousands are 2000, of 110 x 110 3000.
+    """
     sides = (size, size) if isinstance(size, int) else size
     if not isinstance(sides, Sequence) or not all(isinstance(side, int) for side in sides):
-        return count  # such a size is refused when its own option is checked
-    return max(count * math.prod(sides), least)
+        return max(math.ceil(count), least)  # such a size is refused when its own option is checked
+    if isinstance(count, int):
+        return max(count * math.prod(sides), least)
+    # Rounded before it is rounded up: .2 · M / 1000 and M / 5000 have to agree, whatever the last bit.
+    return max(math.ceil(round(count * math.prod(sides) / least, 9)), 1) * least

@@ -6,7 +6,10 @@ import torch
 from scipy import sparse
 from torch import Tensor
 
-__all__ = ["DenseTable", "SparseTable"]
+from trackmdp.world.model import Task
+from trackmdp.world.windows import Window
+
+__all__ = ["DenseTable", "SparseTable", "WindowTable"]
 
 
 class DenseTable:
@@ -72,3 +75,23 @@ class SparseTable:
         wanted = row * self._columns + column
         found = torch.searchsorted(self._place, wanted).clamp_max(len(self._place) - 1)
         return self._data[found] * (self._place[found] == wanted)
+
+
+class WindowTable:
+    """Rows with every sensor of the window on, in local numbers.
+
+    There are as many different ones as ways in which the border cuts off a window, (2W + 1)² at most: they stay in the
+    caches, which a table of all M (t_max + 1) rows does not.
+
+    Args:
+        task: the window, and a memory of the cell alone.
+        device: where rows are looked up.
+    """
+
+    def __init__(self, task: Task, device: torch.device) -> None:
+        self.device, self._choices, self._window = device, task.num_choices, Window.of(task, device)
+
+    def __call__(self, row: Tensor) -> Tensor:
+        """`[*B, K]` bool of `row` `[*B]`."""
+        cell = row.reshape(-1).div(self._choices, rounding_mode="floor")
+        return self._window.inside(cell).view(*row.shape, -1)

@@ -21,7 +21,7 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from trackmdp.errors import UserError
-from trackmdp.policies.lookup import DenseTable, SparseTable
+from trackmdp.policies.lookup import DenseTable, SparseTable, WindowTable
 from trackmdp.policies.saved import load_policy, save_policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.policies.unroll import (
@@ -87,7 +87,8 @@ class Policy(TensorDictModuleBase, PolicyTable):
             self.in_keys = ["last_cell", "key", "steps_since_detection"]
         self.generator: torch.Generator | None = None
         self._lookup: DenseTable | SparseTable | None = None
-        self._local: DenseTable | SparseTable | None = None  # of the window's sensors alone
+        self._local: DenseTable | SparseTable | WindowTable | None = None  # of the window's sensors alone
+        self._everything = probability == 1.0 and not task.order
 
     @classmethod
     def from_table(cls, table: PolicyTable) -> Policy:
@@ -228,6 +229,8 @@ class Policy(TensorDictModuleBase, PolicyTable):
         if self.sets is None:
             shape = (*key.shape, self.task.num_sensors)
             return torch.zeros(shape, dtype=torch.bool, device=key.device)
+        if self._everything and (self._local is None or self._local.device != key.device):
+            self._local = WindowTable(self.task, key.device)
         if self._local is None or self._local.device != key.device:
             row = np.repeat(np.arange(self.sets.shape[0]), np.diff(self.sets.indptr))
             start = torch.as_tensor(self.task.keys.cell(row // self.task.num_choices))

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from trackmdp.errors import UserError
+from trackmdp.world.checks import short_indices
 from trackmdp.world.model import Array, BoolArray, Task
 
 __all__ = ["PolicyTable"]
@@ -54,13 +55,13 @@ class PolicyTable:
             raise UserError("policy: expected either sets or one probability for all sensors")
         if probability is not None and not 0.0 <= probability <= 1.0:
             raise UserError(f"policy: expected a probability between 0 and 1, got {probability}")
-        if probability and task.window is not None:
-            # Which sensors there are depends on where the target was located: no longer the same everywhere.
-            sets, probability = _window_sets(task, probability), None
         if k is not None and not 0 <= k <= task.total_sensors:
             raise UserError(f"policy: expected k from 0 to {task.total_sensors} sensors, got {k}")
         self.task, self.probability, self.k = task.task, probability, k
         self.sets = None if sets is None else _checked(task, sets)
+        if probability and task.window is not None:
+            # Which sensors there are depends on where the target was located: no longer the same everywhere.
+            self.sets, self.probability = _window_sets(task, probability), None
         self.deterministic = probability in (0.0, 1.0) if self.sets is None else self.sets.dtype == np.bool_
 
     @classmethod
@@ -227,5 +228,6 @@ def _window_sets(task: Task, probability: float) -> sparse.csr_array:
     inside = (rows >= 0) & (rows < task.rows) & (columns >= 0) & (columns < task.columns)
     cells, count = (rows * task.columns + columns)[inside], inside.sum(axis=(1, 2))
     begin = np.concatenate([[0], np.cumsum(count)])
-    near = sparse.csr_array((np.full(len(cells), probability), cells, begin), shape=(m, m))
+    data: npt.NDArray[Any] = np.full(len(cells), probability, dtype=np.float64 if probability < 1 else np.bool_)
+    near = short_indices(sparse.csr_array((data, cells, begin), shape=(m, m)))
     return near[np.repeat(np.arange(m), task.keys.num_classes * task.num_choices)]

@@ -43,8 +43,9 @@ def single(
     """
     env, common = _env_options(cfg, seed), _common(cfg, device, done)
     # Trajectory numbers are read by no learner here, take a tenth of the collecting time, and would be one more state
-    # to save.
-    return Collector(TrackEnv(problem, **env), policy, track_traj_ids=False, **common)
+    # to save. A buffer would be copied out for every batch: without one each batch is stacked once and is the caller's.
+    once = {"use_buffers": False, "return_same_td": True}
+    return Collector(TrackEnv(problem, **env), policy, track_traj_ids=False, **once, **common)
 
 
 def multi_sync(

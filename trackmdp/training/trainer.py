@@ -168,7 +168,8 @@ class Trainer:
     def _loop(self) -> None:
         self._batches = iter(self.collector)
         # Before any learning: rows between evaluations and the display use the last score, and there must be one.
-        self.score = self.evaluator.score(self.policy())
+        self._valued: tuple[object, Policy] | None = None
+        self._revalue()
         for iteration in range(self.position.iteration + 1, self.iterations + 1):
             batch = self._collect(iteration)
             # Summed before learning: an algorithm may scale the rewards of its batch in place.
@@ -223,13 +224,21 @@ class Trainer:
         """Evaluate where that is due, and tell the callbacks; `earned`: mean reward of the batch's frames, if any."""
         evaluated = self.position.iteration == 1 or self.due(self.config.evaluation.every)
         if evaluated:
-            policy = self.policy()
-            self.score = self.evaluator.score(policy)
+            policy = self._revalue()
             for callback in self.callbacks:
                 callback.on_evaluation(self, policy, self.score)
         row = self._row(evaluated, diagnostics, earned)
         for callback in self.callbacks:
             callback.on_update(self, row)
+
+    def _revalue(self) -> Policy:
+        """The policy as it is now; `score` is then its own."""
+        actor = self.algorithm.actor
+        # A learner that plans now and then has one table as its actor in between, valued once; nets change in place.
+        if self._valued is None or self._valued[0] is not actor or not isinstance(actor, Policy):
+            self._valued = (actor, self.policy())
+            self.score = self.evaluator.score(self._valued[1])
+        return self._valued[1]
 
     def _row(self, evaluated: bool, diagnostics: dict[str, float], earned: float | None) -> Row:
         """Counters, exact figures (empty between evaluations), diagnostics, and last the columns that time decides."""

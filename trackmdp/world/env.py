@@ -196,7 +196,12 @@ class TrackEnv(EnvBase):
             self._state = {key: _where(rows, fresh[key], value) for key, value in self._state.items()}
         elif len(at := rows.nonzero().squeeze(-1)):
             fresh = self._fresh(rows)
-            self._state = {key: value.index_copy(0, at, fresh[key][at]) for key, value in self._state.items()}
+            # The largest part by far, and empty already where the episode did not end in a miss.
+            same = () if self._state["steps_since_detection"][at].any() else ("action_history",)
+            self._state = {
+                key: value if key in same else value.index_copy(0, at, fresh[key][at])
+                for key, value in self._state.items()
+            }
         self._begun.append(rows)
 
     def _fresh(self, rows: Tensor) -> dict[str, Tensor]:
@@ -284,8 +289,11 @@ class TrackEnv(EnvBase):
             # All rows, since a graph has no shape that depends on how many were missed; fused into one loop.
             here = torch.arange(self.t_max + 1, device=n.device) == n.unsqueeze(-1)
             return _where(missed, torch.where(here.unsqueeze(-1), action.unsqueeze(1), history), False)
-        kept = torch.zeros_like(history)
         rows = missed.nonzero().squeeze(-1)
+        # Slots n and later are empty: with n = 0 everywhere, as with all sensors on, all are, and stay so.
+        if not len(rows) and not n.any():
+            return history
+        kept = torch.zeros_like(history)
         kept[rows] = history[rows]
         if not self._safe:  # an action that the safe one replaced is none
             rows = rows[n[rows] <= self.t_max]

@@ -15,6 +15,9 @@ __all__ = ["Motion"]
 _RESOLUTION = 2**40
 """Draws are multiples of 2^-40; no successor is more or less likely than in the kernel by more than that."""
 
+_SHORT = 32
+"""Entries of a row up to which its edges are compared one by one."""
+
 _MOST_CELLS = 2**23 - 2
 """(M + 1) · 2^40, the end of the line, must be an int64."""
 
@@ -46,6 +49,10 @@ class Motion:
         successors = np.append(np.insert(kernel.indices.astype(np.int64), kernel.indptr[1:], m), m)
         self._edges = torch.as_tensor(closed, device=device)
         self._successors = torch.as_tensor(successors, device=device)
+        # Each row has one edge more than entries, so that x's begin at indptr[x] + x; M's is the last of all.
+        self._first = torch.as_tensor(kernel.indptr.astype(np.int64) + np.arange(m + 1), device=device)
+        width = int(np.diff(kernel.indptr).max(initial=0))
+        self._within = torch.arange(width, device=device)[:, None] if 0 < width <= _SHORT else None
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """`[count]` float64 uniform draws for `move`."""
@@ -58,6 +65,13 @@ class Motion:
         # The first edge beyond x + u: from cell 0, u = .3 finds edge .5 (to cell 1) and u = .7 finds 1 (exit).
         # right=True, since an edge is the first draw that no longer belongs to its successor.
         place = (draws * _RESOLUTION).long().add_(cells, alpha=_RESOLUTION)
+        if self._within is not None:
+            # Of a short row every edge is compared, which reads far less than a search in the edges of a large grid.
+            # Edges of later rows, beyond x + u, are not counted, and no row has more below x + u than entries.
+            first = self._first.index_select(0, cells)
+            near = (first + self._within).clamp_max_(len(self._edges) - 1)
+            passed = self._edges.index_select(0, near.view(-1)).view(near.shape) <= place
+            return self._successors.index_select(0, first.add_(passed.sum(0)))
         return self._successors[torch.searchsorted(self._edges, place, right=True)]
 
 
