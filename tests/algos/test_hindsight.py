@@ -79,7 +79,4 @@ def test_where_the_target_moves_alike_few_frames_are_enough() -> None:
 
 
 def test_tables_learn_as_nets_do() -> None:
-    world = small_world(t_max=1)
-    words = ("algo.updates=200", "algo.updates_per_iteration=100", "algo.batch_size=2048", "algo.exchange=false")
-    found = evaluate(world, learn(world, batches(world, 32), *words, "algo.hidden=0").actor)
-    assert regret_per_step(float(bounds.clocked(world).mean()), found) <= 0.01
+    assert_it_learns("hindsight", ("algo.hidden=0", "algo.exchange=false"), 1)
