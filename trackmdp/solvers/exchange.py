@@ -28,7 +28,7 @@ from trackmdp.solvers.renewal import IndexArray, per_row, row_index
 from trackmdp.solvers.search import InnerProblem, located_value
 from trackmdp.world.model import Array, BoolArray, World
 
-__all__ = ["exchange", "exchanged", "improve", "revealed", "solve"]
+__all__ = ["FLIPPED", "SINGLES", "PlansPart", "exchange", "exchanged", "improve", "ranked", "revealed", "solve"]
 
 MOST_NUMBERS = 2**17
 """Numbers in one array of a part, 1 MB: larger parts leave the caches, and took twice the time."""
@@ -129,7 +129,7 @@ def exchange(
     for cells in _parts(problem.layers, np.flatnonzero(could_gain if tried is None else could_gain & tried)):
         if not go_on():
             break
-        part = _Part(problem, cells, mass)
+        part = PlansPart(problem, cells, mass)
         plans = part.exchange([on[entries] for on, entries in zip(sets, part.entries[1:], strict=True)])
         for on, entries, plan in zip(improved, part.entries[1:], plans, strict=True):
             on[entries] = plan
@@ -158,7 +158,7 @@ def _parts(layers: list[Layer], cells: IndexArray) -> Iterator[IndexArray]:
     yield from np.split(cells, np.flatnonzero(np.diff(number)) + 1) if len(cells) else []
 
 
-class _Part:
+class PlansPart:
     """The plans of some located cells and their candidates.
 
     Attributes:
@@ -235,13 +235,8 @@ class _Part:
         price = self.cost[step] * (self.sums[step] @ mass)[self.rows[step]]
         # Free sensors come last: there is no price that would make them nearly worth leaving out.
         margin = np.divide(np.abs(gain - price), price, out=np.full_like(gain, np.inf), where=price > 0)[:, 0]
-        order = np.lexsort((margin, mass[:, 0] <= 0, self.rows[step]))
-        # Entries are in order of their rows, and ranks run from 0 within each: with rows 0 0 1 1 1 the first entries
-        # are 0 0 2 2 2, and the ranks of `order` 0 1 0 1 2.
-        first = np.searchsorted(self.rows[step], self.rows[step])
-        rank = np.empty(len(order), dtype=np.int64)
-        rank[order] = np.arange(len(order)) - first
         possible = mass[:, 0] > 0
+        rank = ranked(self.rows[step], margin, possible)
         if (allowed := self.allowed[step]) is not None:
             possible &= allowed[:, 0]
         return np.where(possible, np.minimum(rank, SINGLES), SINGLES)
@@ -277,14 +272,26 @@ class _Part:
             later, now, chosen = self.undetected(sets, since), mass, []
             for t in range(since + 1, self.length + 1):
                 now = self.back[t] @ now
-                inside = self.sums[t] @ now
-                gain = self.reports[t] * (self.detected[t] - later[t - since])
-                on = now * gain > self.cost[t] * inside[self.rows[t]]
-                if (allowed := self.allowed[t]) is not None:
-                    on &= allowed
+                on = self.best(t, now, self.reports[t] * (self.detected[t] - later[t - since]))
                 chosen.append(on)
                 now = self.missing(t, on, now)
             if all((new == old).all() for new, old in zip(chosen, sets, strict=True)):
                 break
             sets = chosen
         return sets
+
+    def best(self, t: int, mass: Array, gain: Array) -> BoolArray:
+        """`[E, C]` the best set at step t, where sensing `mass` there gains `gain` times as much."""
+        on: BoolArray = mass * gain > self.cost[t] * (self.sums[t] @ mass)[self.rows[t]]
+        allowed = self.allowed[t]
+        return on if allowed is None else on & allowed
+
+
+def ranked(rows: IndexArray, margin: Array, possible: BoolArray) -> IndexArray:
+    """`[E]` place of each entry among those of its row, least margin first, what is not possible last."""
+    order = np.lexsort((margin, ~possible, rows))
+    # Entries are in order of their rows, and ranks run from 0 within each: with rows 0 0 1 1 1 the first entries
+    # are 0 0 2 2 2, and the ranks of `order` 0 1 0 1 2.
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order)) - np.searchsorted(rows, rows)
+    return rank

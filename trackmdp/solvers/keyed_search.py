@@ -1,4 +1,4 @@
-"""Solving for policies that remember a key, against targets with a hidden mode: a bound, and policy iteration."""
+"""Solving for policies that remember a key, against targets with a hidden mode: a bound, a homotopy and exchange."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import time
 import numpy as np
 
 from trackmdp.solvers.keyed import KeyedPairs, evaluate_keys
+from trackmdp.solvers.keyed_exchange import exchanged_pairs
 from trackmdp.solvers.renewal import accumulate, check_length, per_row, row_index
 from trackmdp.solvers.solution import Solution
 from trackmdp.world.model import Array
@@ -57,12 +58,12 @@ def _of_cells(world: HiddenWorld, bound: Array) -> Array:
 
 
 def solve_keys(world: HiddenWorld, *, steps: int = 12, rounds: int = 20) -> Solution:
-    """A policy over keys by the homotopy from the bound's credit to the exact one, then by policy iteration.
+    """A policy over keys by the homotopy from the bound's credit to the exact one, then by exchange.
 
     Args:
         world: whose `memory` says what a key is.
         steps: of the homotopy.
-        rounds: of policy iteration at most; one is kept only if the exact AIHTR rises.
+        rounds: of exchange at most; one is kept only if the exact AIHTR rises.
     """
     began, pairs, bound = time.monotonic(), KeyedPairs(world), mode_bound(world)
     best = [np.zeros(len(groups), dtype=bool) for groups in pairs.groups]
@@ -74,11 +75,11 @@ def solve_keys(world: HiddenWorld, *, steps: int = 12, rounds: int = 20) -> Solu
         if now[3] > aihtr:
             best, value, visits, aihtr = now
     for _ in range(rounds):
-        sets = pairs.improved(best, value, visits, bound, 0.0)
-        tried = (sets, *pairs.value(sets))
-        if tried[3] <= aihtr + 1e-12 * abs(aihtr):
+        tried = exchanged_pairs(pairs, best, value, visits)
+        found = pairs.value(tried)
+        if found[2] <= aihtr + 1e-12 * abs(aihtr):
             break
-        best, value, visits, aihtr = tried
+        best, (value, visits, aihtr) = tried, found
     table = pairs.table(best)
     upper = _of_cells(world, bound)
     evaluation = evaluate_keys(world, table)

@@ -82,7 +82,14 @@ def reachable_layers(world: World, length: int) -> list[Layer]:
     return reachable(world.kernel, np.arange(world.num_cells), length, world)
 
 
-def reachable(kernel: sparse.csr_array, start: IndexArray, length: int, task: Task | None = None) -> list[Layer]:
+def reachable(
+    kernel: sparse.csr_array,
+    start: IndexArray,
+    length: int,
+    task: Task | None = None,
+    *,
+    rows: IndexArray | None = None,
+) -> list[Layer]:
     """Layers 0 ... `length` from any cells `start` `[K]`; the rows of the entries are 0 ... K - 1.
 
     Args:
@@ -90,10 +97,12 @@ def reachable(kernel: sparse.csr_array, start: IndexArray, length: int, task: Ta
         start: `[K]`.
         length: moves.
         task: whose sensors there are, row k being located in cell k; None for one in each cell, all within reach.
+        rows: `[K]` in order, where several starts belong to one row; None for a row each.
     """
     m = kernel.shape[0]
     # Layer 0: entry k is (row k, cell start[k]), before any move.
-    rows, cells = np.arange(len(start), dtype=np.int64), start.astype(np.int64)
+    rows = np.arange(len(start), dtype=np.int64) if rows is None else rows
+    cells = start.astype(np.int64)
     layers = [Layer(rows, cells, sparse.eye_array(len(start), format="csr"))]
     for _ in range(length):
         # [E, M], row e the moves out of the cell of entry e: one kernel row per entry, however many entries share a

@@ -21,7 +21,7 @@ from trackmdp.solvers.renewal import IndexArray, per_row
 from trackmdp.world.model import Array, BoolArray, Task
 from trackmdp.world.tracks import Tracks
 
-__all__ = ["Planned", "plan_keys"]
+__all__ = ["AlongPaths", "Paths", "Planned", "plan_keys"]
 
 _UNVISITED = 0.01
 """Weight of a state that the policy does not get to on its path: it shows what follows a key that is rare, but not as
@@ -58,7 +58,7 @@ def plan_keys(task: Task, tracks: Tracks, *, prior: float, discount: float, roun
         discount: γ of the credit.
         rounds: at most so many.
     """
-    paths = _Paths(task, tracks)
+    paths = Paths(task, tracks)
     # The first round is myopic: a detection is worth r, and nothing follows from it.
     gain = np.full((task.num_choices, paths.states), task.reward)
     best = _Counted(paths, gain, np.ones(paths.states), prior)
@@ -75,21 +75,23 @@ def plan_keys(task: Task, tracks: Tracks, *, prior: float, discount: float, roun
 
 
 @dataclass(frozen=True)
-class _Followed:
+class AlongPaths:
     """A policy followed along all paths.
 
     Attributes:
         reward: earned, all paths together, undiscounted.
         visited: `[S]` whether the policy gets to the state.
         gain: `[T+1, S]`, what sensing the target at n misses is worth.
+        value: `[S]` V.
     """
 
     reward: float
     visited: BoolArray
     gain: Array
+    value: Array
 
 
-class _Paths:
+class Paths:
     """All states (point, key) of the paths, and where the target is 1 ... t_max + 2 steps later.
 
     S states, T + 2 steps (`[T+2, S]` arrays), K displacements in view.
@@ -141,7 +143,7 @@ class _Paths:
         inside = (row >= 0) & (row < self.task.rows) & (column >= 0) & (column < self.task.columns)
         return row * self.task.columns + column, inside
 
-    def follow(self, hits: BoolArray, spent: Array, discount: float) -> _Followed:
+    def follow(self, hits: BoolArray, spent: Array, discount: float) -> AlongPaths:
         """What a policy earns on every path, given where its plans hit `[T+1, S]` and what they cost `[T+1, S]`."""
         task, last = self.task, self.task.num_choices
         # Backwards through a plan: what it earns until its detection, and which state that leads to (the state itself
@@ -165,7 +167,7 @@ class _Paths:
         visited = self._visited(onward[0], factor[0] > 0)
         missed = earned + factor * value[onward]  # [T+2, S], W_n
         gain = task.reward + discount * (value[self.following[:-1]] - missed[1:])
-        return _Followed(float(plain[visited].sum()), visited, gain)
+        return AlongPaths(float(plain[visited].sum()), visited, gain, value)
 
     def _visited(self, onward: IndexArray, goes_on: BoolArray) -> BoolArray:
         visited = np.zeros(self.states, dtype=bool)
@@ -192,7 +194,7 @@ class _Counted:
         spent: `[T+1, S]`, what its set costs.
     """
 
-    def __init__(self, paths: _Paths, gain: Array, weight: Array, prior: float) -> None:
+    def __init__(self, paths: Paths, gain: Array, weight: Array, prior: float) -> None:
         self._paths, self._prior = paths, prior
         choices = paths.task.num_choices
         *shared, (key, _) = paths.task.keys.contexts(paths.key)
