@@ -2,8 +2,8 @@
 
 A key's plan is judged on all that may follow the key: hidden states, weighted as the policy's visits distribute them
 (`exchanged_pairs`), or the recorded ways on from it (`path_exchange`). What a detection is worth is given, so that
-the search for each key stands alone, and is that of `exchange.PlansPart` but for the groups: entries with one key and one
-cell are switched on together, and paid for once.
+the search for each key stands alone, and is that of `exchange.PlansPart` but for the groups: entries with one key and
+one cell are switched on together, and paid for once.
 
 Example: a key whose target may have moved to cell 5 with heading 0 or 1, or to cell 6: three entries, the groups 0 0 1.
 """
