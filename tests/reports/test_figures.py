@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 import pytest
+from scipy import sparse
 
 from tests.reports.sweeps import write_sweep
 from trackmdp.errors import UserError
@@ -14,7 +15,8 @@ from trackmdp.reports import figures, learning, maps, style
 from trackmdp.reports.figures import Panel
 from trackmdp.reports.gather import gather_runs
 from trackmdp.reports.grouping import Study, study
-from trackmdp.reports.results import Results
+from trackmdp.reports.policy import Sensed
+from trackmdp.reports.results import MotionTable, Results
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +81,6 @@ def test_regret_is_to_the_proved_bound(grouped: Study, panel: Panel) -> None:
 
 def test_a_learning_curve_ends_where_the_runs_do(results: Results, grouped: Study) -> None:
     figure = learning.curves(grouped, results.curves, "frames")
-    assert figure
     last = [row for row in figure.table.rows if row[0] == "a2c"][-1]
     regrets = [value for world in grouped.worlds for value in grouped.regrets(world, "a2c")]
     assert last[1] == pytest.approx(8000.0)
@@ -94,7 +95,6 @@ def test_a_curve_is_a_staircase() -> None:
 
 def test_profiles_count_runs(grouped: Study) -> None:
     figure = learning.profiles(grouped, None)
-    assert figure
     row = next(row for row in figure.table.rows if row[0] == "a2c")
     regrets = [value for world in grouped.worlds for value in grouped.regrets(world, "a2c")]
     marks = (0.001, 0.005, 0.01, 0.02, 0.05, 0.1)
@@ -106,14 +106,13 @@ def test_a_map_draws_what_can_happen(results: Results) -> None:
     kept = next(policy for run, policy in results.policies.items() if run.startswith("hindsight-0.16"))
     motion = results.motions["a2c-0.16-0"]
     figure = maps.policy_map(name, "here", kept, motion, (3, 3))
-    assert figure
     for located, n, on, possible, cells in figure.table.rows:
-        assert on == kept.chains[located, n].sum() == len(str(cells).split())  # type: ignore[index]
+        assert on == kept.on(n).toarray()[located].sum() == len(str(cells).split())  # type: ignore[index]
         if n == 0:
             assert possible == (motion.kernel.toarray()[located] > 0).sum()  # type: ignore[call-overload]
     first = [row for row in figure.table.rows if row[1] == 0]
     assert len(first) == 9
-    everything = type(kept)(np.ones_like(kept.chains), kept.value)
+    everything = Sensed(sparse.csr_array(np.ones(kept.sets.shape, dtype=bool)), kept.value)
     drawn = maps.policy_map(name, "here", everything, motion, (3, 3))
     assert drawn
     assert {row[1] for row in drawn.table.rows} == {0}  # no miss can happen, so there is no second set
@@ -123,13 +122,37 @@ def test_a_value_map_holds_every_cell(results: Results) -> None:
     name, kept = next(iter(results.policies.items()))
     motion = results.motions["a2c-0.16-0"]
     figure = maps.value_map(name, "here", kept, motion, (3, 3))
-    assert figure
     assert [row[3] for row in figure.table.rows] == kept.value.tolist()
     assert figure.table.rows[5][:3] == [5, 2, 3]
     assert [row[4] for row in figure.table.rows] == pytest.approx(motion.clocked - kept.value)
     assert [row[5] for row in figure.table.rows] == pytest.approx(motion.clocked - motion.qmdp)
-    large = type(kept)(np.zeros((900, 1, 900), dtype=bool), np.zeros(900))
-    assert maps.value_map(name, "here", large, motion, (30, 30)) is None
+
+
+def test_a_large_grid_is_drawn_as_means_over_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(maps, "MOST_MAP_CELLS", 20)
+    monkeypatch.setattr(maps, "MOST_TILES", 3)
+    # 5 rows of 7 cells, tiles of 3 x 3: two rows of three tiles, the last ones of 2 rows or 1 column.
+    size, cells = (5, 7), 35
+    value = np.arange(35.0)
+    assert maps.binned(value, size).tolist() == pytest.approx(
+        np.array([[8.0, 11.0, 13.0], [25.5, 28.5, 30.5]]), abs=1e-12
+    )
+    # Located in x, x % 4 sensors are on at once, and one after a miss.
+    on = np.zeros((cells, 2, cells), dtype=bool)
+    for x in range(cells):
+        on[x, 0, : x % 4] = on[x, 1, 0] = True
+    kept = Sensed(sparse.csr_array(on.reshape(2 * cells, cells)), value)
+    motion = MotionTable(sparse.csr_array((cells, cells)), np.full(cells, np.nan), value + 0.5)
+    sets = maps.policy_map("x", "here", kept, motion, size)
+    number = maps.binned(np.arange(cells) % 4.0, size)
+    assert [row[3] for row in sets.table.rows] == pytest.approx(number.ravel())
+    assert [row[4] for row in sets.table.rows] == [1.0] * 6
+    assert [row[:3] for row in sets.table.rows][4] == [24, 4, 4]
+    assert "n = 0: mean 1.46" in sets.text and "tiles of 3 x 3 cells" in sets.text
+    values = maps.value_map("x", "here", kept, motion, size)
+    # Q_MDP was not valued: two layers
+    assert [len(row) for row in values.table.rows] == [5] * 6
+    assert [row[4] for row in values.table.rows] == pytest.approx([0.5] * 6)
 
 
 def test_the_same_figure_has_the_same_bytes_and_no_date(grouped: Study, panel: Panel) -> None:

@@ -79,6 +79,11 @@ def test_all_figures_and_bounds_of_a_large_world_are_those_of_the_factorisation(
     assert np.abs(iterated.value - exact.value).max() <= iterated.error
     for figure in ("accuracy", "sensors_per_step", "safe_per_episode", "expected_length"):
         assert getattr(iterated, figure) == pytest.approx(getattr(exact, figure), rel=1e-10)
+    for each in ("steps", "detections", "sensors", "safe_actions"):
+        np.testing.assert_allclose(getattr(iterated, each), getattr(exact, each), rtol=1e-9, atol=1e-12)
+    pooled = evaluate(again, clocked.solve(again), per_cell=False)
+    assert pooled.sensors is None
+    assert pooled.sensors_per_step == pytest.approx(exact.sensors_per_step, rel=1e-10)
     loose = clocked_table(again)
     assert (loose.value >= table.value - 1e-12).all()
     np.testing.assert_allclose(loose.table, table.table, atol=1e-9)

@@ -6,9 +6,13 @@ import numpy as np
 
 from trackmdp.episodes.episode import Episode
 from trackmdp.world.model import Task
+from trackmdp.world.render import around
 
 __all__ = ["LEGEND", "frame", "outcome", "sentence", "where"]
 
+WIDE, STEP = 37, 9
+"""Rows and columns of a grid that are drawn at most, which 80 characters hold, and how far the part drawn moves at
+once: it stays where it is while the target does not leave 9 x 9 cells."""
 FOUND, MISSED, ON = "●", "○", "▪"
 _SHADES = " ·░▒▓"
 LEGEND = f"{FOUND} target, located   {MISSED} target, missed   {ON} sensor on   ·░▒▓ where it was expected"
@@ -45,7 +49,7 @@ def sentence(episode: Episode, t: int, task: Task) -> str:
 
 
 def frame(episode: Episode, t: int, task: Task) -> str:
-    """The grid at a step: the target over the sensors that are on over the belief."""
+    """The grid at a step, of a large one the part around the target: it, over the sensors on, over the belief."""
     belief = np.zeros(task.num_cells) if episode.belief is None else episode.belief[t]
     # digitize gives 0 below 1e-6, 1 below .05, ... 4 from .5 on: an index into the shades.
     levels = np.digitize(belief, [1e-6, 0.05, 0.2, 0.5])
@@ -54,6 +58,22 @@ def frame(episode: Episode, t: int, task: Task) -> str:
         marks = np.where(task.covered(episode.action[t]), ON, marks)
     if episode.target[t] < task.num_cells:
         marks[episode.target[t]] = FOUND if episode.located[t] else MISSED
-    rows = [" ".join(row) for row in marks.reshape(task.size)]
-    edge = "─" * (2 * task.columns + 1)
-    return "\n".join([f"┌{edge}┐", *(f"│ {row} │" for row in rows), f"└{edge}┘"])
+    down, across = _part(episode, t, task)
+    rows = [" ".join(row[across.start : across.stop]) for row in marks.reshape(task.size)[down.start : down.stop]]
+    edge = "─" * (2 * len(across) + 1)
+    lines = [f"┌{edge}┐", *(f"│ {row} │" for row in rows), f"└{edge}┘"]
+    if (len(down), len(across)) != task.size:
+        cut = zip(("rows", "columns"), (down, across), task.size, strict=True)
+        # counted from 1, as in `where`
+        lines.append(", ".join(f"{name} {part[0] + 1} to {part[-1] + 1} of {length}" for name, part, length in cut))
+    return "\n".join(lines)
+
+
+def _part(episode: Episode, t: int, task: Task) -> tuple[range, range]:
+    """The rows and columns that are drawn: those around the target, or around where it was before it left."""
+    at = int(episode.target[t])
+    if at == task.num_cells:
+        at = int(episode.target[t - 1]) if t else int(episode.start)
+    # Row 100 lies in the part of rows 99 to 107, whose middle is 103.
+    row, column = (place // STEP * STEP + STEP // 2 for place in divmod(at, task.columns))
+    return around(row, task.rows, WIDE), around(column, task.columns, WIDE)

@@ -22,6 +22,9 @@ __all__ = ["MOST_CELLS", "MOST_STEPS", "page", "write_page"]
 MOST_STEPS = 2000
 """Steps on a page; a longer episode is cut there, and the page says so."""
 
+WIDE = 41
+"""Rows and columns of a grid that are drawn at most: those around the target."""
+
 MOST_CELLS = 100
 """Shaded cells of a step, the likeliest."""
 
@@ -54,10 +57,13 @@ def _content(reader: EpisodeReader, episode: Episode) -> dict[str, Any]:
     about = f"{world.rows} x {world.columns} grid, {len(episode)} steps, seed {reader.run.get('seed', '')}"
     if len(episode) > MOST_STEPS:
         about += f"; the first {MOST_STEPS:,} steps are shown"
+    if max(world.size) > WIDE:
+        about += f"; of the grid, the {min(world.rows, WIDE)} x {min(world.columns, WIDE)} cells around the target"
     assert episode.belief is not None  # a logged episode has it
     return {
         "rows": world.rows,
         "columns": world.columns,
+        "wide": WIDE,
         "about": about,
         "bound": float(bound[episode.start]),
         "start": int(episode.start),

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from omegaconf import OmegaConf
+from scipy import sparse
 
 from trackmdp.config import TableConfig, WorldConfig, world_of
 from trackmdp.errors import UserError
@@ -22,11 +23,12 @@ from trackmdp.reports.maps import MOST_MAP_CELLS
 from trackmdp.reports.results import Anomaly, FinishedRun, MotionTable, Results
 from trackmdp.solvers import bounds, qmdp
 from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers.renewal import DIRECT_CELLS
 from trackmdp.training.folders import FAILED_FILE, PLAN, read_run_json
 from trackmdp.training.sealing import SUMMARY, check_files, read_summary
 from trackmdp.untrusted import printable
 from trackmdp.world.make import build_world
-from trackmdp.world.model import grid_size
+from trackmdp.world.model import World
 
 __all__ = ["gather_runs", "planned", "run_folders"]
 
@@ -158,13 +160,11 @@ def _missing_seeds(grouped: Study) -> list[Anomaly]:
     return found
 
 
-def _policies(folder: Path, grouped: Study) -> tuple[dict[str, policy.StoredPolicy], list[Anomaly]]:
+def _policies(folder: Path, grouped: Study) -> tuple[dict[str, policy.Sensed], list[Anomaly]]:
     """Of each world and method the policy of the run in the middle, or of the one next to it that can be read."""
-    found: dict[str, policy.StoredPolicy] = {}
+    found: dict[str, policy.Sensed] = {}
     anomalies = []
     for runs in grouped.groups.values():
-        if not _is_drawn(runs[0]):
-            continue
         # The middle one by AIHTR: the best would flatter the method, and a mean of policies is not a policy.
         ranked = sorted(runs, key=lambda run: (run.figure("aihtr"), run.seed))
         middle = (len(ranked) - 1) / 2
@@ -180,11 +180,6 @@ def _policies(folder: Path, grouped: Study) -> tuple[dict[str, policy.StoredPoli
     return found, anomalies
 
 
-def _is_drawn(run: FinishedRun) -> bool:
-    """Whether its policy is drawn cell by cell; only then policy and motion are kept."""
-    return math.prod(grid_size(run.settings["grid.size"])) <= MOST_MAP_CELLS
-
-
 def _motions(folder: Path, runs: Iterable[FinishedRun]) -> tuple[dict[str, MotionTable], list[Anomaly]]:
     """MotionTable and references of each world, from the `kernel.npz` of its first run."""
     found: dict[str, MotionTable] = {}
@@ -194,16 +189,25 @@ def _motions(folder: Path, runs: Iterable[FinishedRun]) -> tuple[dict[str, Motio
         if world_key(run) in seen:
             continue
         seen.add(world_key(run))
-        if run.settings["kernel.name"] == "tracks" or not _is_drawn(run):
-            continue  # no motion is known there, or the grid is too large for a map
+        if run.settings["kernel.name"] == "tracks":
+            continue  # no motion is known there
         try:
             check_files(folder / run.name, read_summary(folder / run.name), "kernel.npz")
             world = build_world(_world_config(folder / run.name))
         except UserError as error:
             anomalies.append(Anomaly(run.name, f"its world cannot be built ({error})"))
             continue
-        found[run.name] = MotionTable(world.kernel, evaluate(world, qmdp.solve(world)).value, bounds.clocked(world))
+        found[run.name] = _motion(world)
     return found, anomalies
+
+
+def _motion(world: World) -> MotionTable:
+    """What maps show besides the policy; the motion only where it is drawn, cell by cell."""
+    m, kernel = world.num_cells, world.kernel
+    drawn = kernel if m <= MOST_MAP_CELLS else sparse.csr_array(kernel.shape)
+    # Where Q_MDP senses little, its value takes minutes and gigabytes on a large grid.
+    simple = evaluate(world, qmdp.solve(world)).value if m <= DIRECT_CELLS else np.full(m, np.nan)
+    return MotionTable(drawn, simple, bounds.clocked(world))
 
 
 def _world_config(place: Path) -> WorldConfig:

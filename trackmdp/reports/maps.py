@@ -1,13 +1,16 @@
-"""Maps of one policy: the sets it senses from each located cell, and what it earns from each start cell."""
+"""Maps of one policy: the sets it senses from each located cell, and what it earns from each start cell.
+
+Of a large grid the number of sensors in place of the sets, and means over square tiles in place of cells.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from trackmdp.reports.policy import StoredPolicy
+from trackmdp.reports.policy import Sensed
 from trackmdp.reports.results import MotionTable
 from trackmdp.reports.style import INK, LINE, Figure, draw_figure
 from trackmdp.reports.tables import Cell, Column, Table
@@ -17,33 +20,34 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Canvas
 
-__all__ = ["MOST_MAP_CELLS", "policy_map", "value_map"]
+__all__ = ["MOST_MAP_CELLS", "binned", "policy_map", "value_map"]
 
 # 20 x 20: with tiles of four to six cells each, more would not be seen on a page.
 MOST_MAP_CELLS = 400
-"""Cells of a grid that is still drawn cell by cell."""
+"""Cells of a grid whose sets are still drawn, one tile around each located cell."""
+MOST_TILES = 60
+"""Tiles of a map in each direction: a square of 3 pixels on a page, and 3,600 rows of its table."""
 LEVELS = 24
 """Shades of a colour scale."""
 ON, OFF, IDLE = "#0072b2", "#dcebf4", "#d55e01"
 
 
-def policy_map(
-    name: str, where: str, policy: StoredPolicy, motion: MotionTable, size: tuple[int, int]
-) -> Figure | None:
-    """Around each located cell, the sensors that are on after no miss and after one; None for a large grid.
+def policy_map(name: str, where: str, policy: Sensed, motion: MotionTable, size: tuple[int, int]) -> Figure:
+    """Around each located cell, the sensors that are on after no miss and after one; of a large grid how many are.
 
     Where the first set leaves nothing out, a miss cannot happen, and nothing is drawn for it.
     """
-    cells, choices, _ = policy.chains.shape
+    cells, choices = len(policy.value), policy.choices
     if cells > MOST_MAP_CELLS:
-        return None
+        return _intensity_map(name, where, policy, size)
     shown = list(range(min(choices, 2)))
     # `[n][M, M]`, row x belonging to the target located in x.
-    possible = _possible(policy, motion, len(shown))
+    chains = [policy.on(n).toarray() for n in range(choices)]
+    possible = _possible(chains, motion, len(shown))
 
     def paint(figure: Canvas) -> None:
         # A stored plan has a set for every n; where the miss cannot happen it is arbitrary, and never comes about.
-        drawn = [policy.chains[:, n] & possible[n].any(axis=1, keepdims=True) for n in shown]
+        drawn = [chains[n] & possible[n].any(axis=1, keepdims=True) for n in shown]
         # One size of tile for all, so that they can be compared: that of the farthest cell drawn.
         reach = max(_farthest(can | on, size[1]) for can, on in zip(possible, drawn, strict=True))
         for axes, n in zip(np.atleast_1d(figure.subplots(len(shown), 1)), shown, strict=True):
@@ -51,7 +55,7 @@ def policy_map(
             axes.set_title("just located (n = 0)" if n == 0 else "after one miss (n = 1)")
 
     rows: list[list[Cell]] = [
-        [x, n, int((on := policy.chains[x, n]).sum()), int(possible[n][x].sum()), _cells_text(on, size[1])]
+        [x, n, int((on := chains[n][x]).sum()), int(possible[n][x].sum()), _cells_text(on, size[1])]
         for x in range(cells)
         for n in shown
         # No row where this many misses cannot happen.
@@ -61,10 +65,9 @@ def policy_map(
     title = f"Sets sensed around each located cell, {where}"
     table = Table(f"sets-{name}", title, [*columns, Column("cells sensed (row.column)")], rows)
     reached = [possible[n].any(axis=1) for n in shown]
-    mean = [float(policy.chains[r, n].sum(axis=1).mean()) if r.any() else 0.0 for n, r in enumerate(reached)]
+    mean = [float(chains[n][r].sum(axis=1).mean()) if r.any() else 0.0 for n, r in enumerate(reached)]
     unsensed = [
-        float((possible[n] & ~policy.chains[:, n])[r].sum(axis=1).mean()) if r.any() else 0.0
-        for n, r in enumerate(reached)
+        float((possible[n] & ~chains[n])[r].sum(axis=1).mean()) if r.any() else 0.0 for n, r in enumerate(reached)
     ]
     text = "Each tile is one located cell and its neighbourhood. " + " ".join(
         f"At n = {n}: {on:.2f} sensors on, {off:.2f} possible cells left out on average."
@@ -73,38 +76,89 @@ def policy_map(
     return draw_figure(f"sets-{name}", title, text, table, 0.4 + 3.9 * len(shown), paint)
 
 
-def value_map(name: str, where: str, policy: StoredPolicy, motion: MotionTable, size: tuple[int, int]) -> Figure | None:
-    """Exact value per start cell, and what the policy and Q_MDP miss to the clocked bound; None for a large grid."""
-    if len(policy.value) > MOST_MAP_CELLS:
-        return None
+def _intensity_map(name: str, where: str, policy: Sensed, size: tuple[int, int]) -> Figure:
+    """How many sensors are on after no miss and after one, by where the target was located."""
+    shown = range(min(policy.choices, 2))
+    layers = {f"sensors on at n = {n}": np.diff(policy.on(n).indptr).astype(np.float64) for n in shown}
+    means = {label: binned(number, size) for label, number in layers.items()}
+
+    def paint(figure: Canvas) -> None:
+        every = list(np.atleast_1d(figure.subplots(1, len(shown))))
+        _shade(figure, every, list(means.values()), "viridis", low=0.0)
+        for axes, n in zip(every, shown, strict=True):
+            axes.set_title("just located (n = 0)" if n == 0 else "after one miss (n = 1)")
+
+    title = f"Sensors on, by where the target was located, {where}"
+    return draw_figure(
+        f"sets-{name}", title, _said(layers, size), _tiles_table(f"sets-{name}", title, means, size), 3.2, paint
+    )
+
+
+def value_map(name: str, where: str, policy: Sensed, motion: MotionTable, size: tuple[int, int]) -> Figure:
+    """Exact value per start cell, and what the policy and Q_MDP, where it was valued, miss to the clocked bound."""
     layers = {
         "value V(x)": policy.value,
         # Both against the clocked bound, which is the optimum wherever a policy attains it.
         "missing to the clocked bound": _rounded(motion.clocked - policy.value),
-        "the same, Q_MDP": _rounded(motion.clocked - motion.qmdp),
     }
+    if np.isfinite(motion.qmdp).all():
+        layers["the same, Q_MDP"] = _rounded(motion.clocked - motion.qmdp)
+    means = {label: binned(values, size) for label, values in layers.items()}
 
     def paint(figure: Canvas) -> None:
         # Two scales of colour: values and what is missing are not to be compared by shade. Bright is good in both, much
         # in viridis and little in magma_r. What is missing has one scale for both policies.
-        first, *missing = figure.subplots(1, 3)
-        value, *short = (values.reshape(size) for values in layers.values())
+        first, *missing = figure.subplots(1, len(means))
+        value, *short = means.values()
         _shade(figure, [first], [value], "viridis")
         _shade(figure, missing, short, "magma_r", low=0.0)
-        for axes, label in zip((first, *missing), ("value V(x)", "below the bound", "Q_MDP's"), strict=True):
+        labels = ("value V(x)", "below the bound", "Q_MDP's")
+        for axes, label in zip((first, *missing), labels, strict=False):
             axes.set_title(label)
 
-    columns = [Column("start cell"), Column("row"), Column("column"), *(Column(label, 3) for label in layers)]
-    rows = [
-        [x, x // size[1] + 1, x % size[1] + 1, *(float(values[x]) for values in layers.values())]
-        for x in range(len(policy.value))
-    ]
     title = f"Value of each start cell, and what is missing of the clocked bound, {where}"
+    table = _tiles_table(f"value-{name}", title, means, size)
+    return draw_figure(f"value-{name}", title, _said(layers, size), table, 2.1, paint)
+
+
+def _side(size: tuple[int, int]) -> int:
+    """Cells of a tile in each direction: as few as `MOST_TILES` allows, one on most grids."""
+    return -(-max(size) // MOST_TILES)
+
+
+def binned(values: Array, size: tuple[int, int]) -> Array:
+    """Means of `values` `[M]` over square tiles, `[rows of tiles, columns of tiles]`.
+
+    150 rows and columns make tiles of 3 x 3 cells, 50 in each direction; those at the end may be cut off.
+    """
+    begins = [np.arange(0, length, _side(size)) for length in size]
+    sums = np.add.reduceat(np.add.reduceat(values.reshape(size), begins[0], axis=0), begins[1], axis=1)
+    rows, columns = (np.diff([*begin, length]) for begin, length in zip(begins, size, strict=True))
+    means: Array = sums / (rows[:, None] * columns)
+    return means
+
+
+def _said(layers: Mapping[str, Array], size: tuple[int, int]) -> str:
+    """Mean and range of each layer, over cells, and what is drawn."""
     text = "; ".join(
         f"{label}: mean {values.mean():.2f}, from {values.min():.2f} to {values.max():.2f}"
         for label, values in layers.items()
     )
-    return draw_figure(f"value-{name}", title, f"{text}.", Table(f"value-{name}", title, columns, rows), 2.1, paint)
+    side = _side(size)
+    return f"{text}." if side == 1 else f"{text}. Drawn are means over tiles of {side} x {side} cells."
+
+
+def _tiles_table(name: str, title: str, means: Mapping[str, Array], size: tuple[int, int]) -> Table:
+    """A row for each tile, called by its first cell."""
+    side, layers = _side(size), list(means.values())
+    first = "" if side == 1 else "first "
+    columns = [Column(f"{first}start cell"), Column(f"{first}row"), Column(f"{first}column")]
+    rows: list[list[Cell]] = [
+        # Tile (2, 3) of 3 x 3 cells on a grid of 150 columns begins in row 6, column 9, cell 909, counted from 0.
+        [side * (i * size[1] + j), side * i + 1, side * j + 1, *(float(layer[i, j]) for layer in layers)]
+        for i, j in np.ndindex(*layers[0].shape)
+    ]
+    return Table(name, title, [*columns, *(Column(label, 3) for label in means)], rows)
 
 
 def _shade(
@@ -142,7 +196,7 @@ def _rounded(values: Array) -> Array:
     return np.where(np.abs(values) < 1e-9, 0.0, values)
 
 
-def _possible(policy: StoredPolicy, motion: MotionTable, steps: int) -> list[BoolArray]:
+def _possible(chains: Sequence[BoolArray], motion: MotionTable, steps: int) -> list[BoolArray]:
     """`[M, M]` each: where the target may be after n misses and one more move."""
     # `[M, M]` joint mass: row x, the target located in x and moved once. Sensed mass is taken out before the next
     # move: had it been there, it would have been located.
@@ -150,7 +204,7 @@ def _possible(policy: StoredPolicy, motion: MotionTable, steps: int) -> list[Boo
     found = []
     for n in range(steps):
         found.append(mass > 0)
-        mass = np.where(policy.chains[:, n], 0.0, mass) @ motion.kernel
+        mass = np.where(chains[n], 0.0, mass) @ motion.kernel
     return found
 
 

@@ -174,7 +174,7 @@ def _learning(results: Results, grouped: Study, threshold: float | None) -> list
 
 def _maps(results: Results, grouped: Study) -> list[Section]:
     """Policies and values in the first and the last world."""
-    sets, values = list[Figure | None](), list[Figure | None]()
+    sets, values, large = list[Figure](), list[Figure](), False
     # The last and the first world differ most, since worlds are in the order of Z and c; a dict, as they may be the
     # same.
     for world in dict.fromkeys((grouped.worlds[-1], grouped.worlds[0])):
@@ -188,14 +188,18 @@ def _maps(results: Results, grouped: Study) -> list[Section]:
             size = grid_size(run.settings["grid.size"])
             sets.append(maps.policy_map(name, where, policy, motion, size))
             values.append(maps.value_map(name, where, policy, motion, size))
-    shown = [[figure for figure in group if figure is not None] for group in (values, sets)]
-    if not any(shown):
+            large = large or len(policy.value) > maps.MOST_MAP_CELLS
+    if not sets:
         return []
     note = (
-        "<p>Dot: where the target was located. Filled: sensor on. Pale: possible cell left out. "
-        "Contrasting: sensor on where the target cannot be. The run is the one in the middle of its seeds.</p>"
+        ""
+        if large
+        else (
+            "<p>Dot: where the target was located. Filled: sensor on. Pale: possible cell left out. "
+            "Contrasting: sensor on where the target cannot be. The run is the one in the middle of its seeds.</p>"
+        )
     )
-    return [Section("maps", "Policies and values, cell by cell", [shown[0], note, shown[1]])]
+    return [Section("maps", "Policies and values, cell by cell", [values, note, sets])]
 
 
 def _made(manifest: Any) -> str:

@@ -7,9 +7,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from trackmdp.episodes.episode import Episode
-from trackmdp.solvers.renewal import IndexArray
 from trackmdp.world.model import BoolArray, Task
-from trackmdp.world.render import PICTURE_LEGEND, text_rows
+from trackmdp.world.render import PICTURE_LEGEND, around, text_rows
 
 __all__ = ["draw_picture"]
 
@@ -32,7 +31,9 @@ def draw_picture(episodes: Sequence[Episode], task: Task, *, steps: int = 6) -> 
     episode = next((each for each in episodes if len(each) > steps), None) or max(episodes, key=len)
     shown = list(_steps(episode, task, steps))
     way = np.divmod(np.array([cell for cell, _ in shown], dtype=np.int64), task.columns)
-    rows, columns = (_around(each, length) for each, length in zip(way, task.size, strict=True))
+    # around the middle of its way
+    middle = [(int(each.min()) + int(each.max())) // 2 if len(each) else 0 for each in way]
+    rows, columns = (around(place, length, WIDE) for place, length in zip(middle, task.size, strict=True))
     frames = [_frame(task, rows, columns, cell, on) for cell, on in shown]
     pieces = [[f"step {k}", *frame] for k, frame in enumerate(frames, start=1)]
     wide = [[row.ljust(max(map(len, column))) for row in column] for column in pieces]
@@ -40,16 +41,6 @@ def draw_picture(episodes: Sequence[Episode], task: Task, *, steps: int = 6) -> 
     whole = (len(rows), len(columns)) == task.size
     where = f"rows {rows[0]} to {rows[-1]} of {task.rows}, columns {columns[0]} to {columns[-1]} of {task.columns}"
     return "\n".join([*(line.rstrip() for line in lines), "", *([] if whole else [where]), PICTURE_LEGEND, ""])
-
-
-def _around(places: IndexArray, length: int) -> range:
-    """The rows, or columns, that are drawn of a large grid: those around where the target is, `WIDE` of them."""
-    if length <= WIDE or not len(places):
-        return range(min(length, WIDE))
-    # Around the middle of its way, as far as the border leaves room: places 3 to 5 of 40 give 0 to 20.
-    middle = (int(places.min()) + int(places.max())) // 2
-    begin = min(max(middle - WIDE // 2, 0), length - WIDE)
-    return range(begin, begin + WIDE)
 
 
 def _frame(task: Task, rows: range, columns: range, cell: int, on: BoolArray) -> list[str]:

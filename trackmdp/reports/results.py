@@ -20,7 +20,7 @@ from scipy import sparse
 
 from trackmdp.durable import write_bytes, write_text
 from trackmdp.errors import UserError
-from trackmdp.reports.policy import StoredPolicy, arrays, pack_all, unpack_all
+from trackmdp.reports.policy import Sensed, arrays, pack_all, unpack_all
 from trackmdp.untrusted import decoded, read_bytes, read_object, read_text, sealed, unsealed
 from trackmdp.world.model import Array
 
@@ -38,7 +38,7 @@ __all__ = [
 ]
 
 # Counted up when a file changes its meaning: results of another format are then not taken for stored results.
-RESULTS_FORMAT = "trackmdp results 2"
+RESULTS_FORMAT = "trackmdp results 3"
 MANIFEST, FILES = "manifest.json", ("runs.csv", "curves.csv", "policies.npz", "worlds.npz")
 LARGEST = 2**28
 """Bytes of the longest of these files."""
@@ -147,7 +147,7 @@ class Results:
 
     runs: Sequence[FinishedRun]
     curves: Mapping[str, Sequence[CurvePoint]] = field(default_factory=dict)
-    policies: Mapping[str, StoredPolicy] = field(default_factory=dict)
+    policies: Mapping[str, Sensed] = field(default_factory=dict)
     motions: Mapping[str, MotionTable] = field(default_factory=dict)
     anomalies: Sequence[Anomaly] = ()
     manifest: Mapping[str, Any] = field(default_factory=dict)

@@ -36,6 +36,7 @@ def evaluate(
     *,
     guess: Array | None = None,
     false_alarm: float = 0.0,
+    per_cell: bool = True,
 ) -> Evaluation:
     """What `policy` earns: exactly on a `World`, as replayed on the held-out tracks of a `Recorded`.
 
@@ -45,6 +46,8 @@ def evaluate(
             that does not draw (`Policy.from_function`).
         false_alarm: p_f, with which a sensor that is on reports the target in a step in which it is not there; the
             policy takes each report for the truth (`trackmdp.solvers.alarms`).
+        per_cell: whether detections, sensors and safe actions are wanted of each start cell as well, which takes half
+            as long again on a grid too large to factorise (a smaller one has them for nothing).
         guess: `[M]`, where the solve begins on a grid too large to factorise, such as the clocked bound.
 
     Raises:
@@ -63,10 +66,10 @@ def evaluate(
         return evaluate_recorded(problem, table)
     if problem.max_steps is not None:
         return truncated_value(problem, table, problem.max_steps)
-    return _whole_episodes(problem, table, guess)
+    return _whole_episodes(problem, table, guess, per_cell)
 
 
-def _whole_episodes(world: World, policy: PolicyTable, guess: Array | None) -> Evaluation:
+def _whole_episodes(world: World, policy: PolicyTable, guess: Array | None, per_cell: bool) -> Evaluation:
     m = world.num_cells
     states = m if world.safe else 2 * m  # see `renewal`
     located, gathered = sparse.csr_array((states, states)), np.zeros((states, 6))
@@ -85,13 +88,17 @@ def _whole_episodes(world: World, policy: PolicyTable, guess: Array | None) -> E
     # |V - V̂| <= max (I - T)^-1 1 · max |residual|, and an episode has no more renewals than steps (theory-extensions:
     # section 0); the steps are those of I - P, themselves iterated.
     error = float(length.max()) * float(np.abs(system.residual(gathered[:, 0], value)).max())
+    # Sensing does not move the target, and each episode has one exit step: the steps in the grid are all but that one.
+    steps = length - 1.0
+    if per_cell:
+        others = system.solve(gathered[:, 2:5])[:m]
+        return pooled(np.column_stack([value[:m], steps, others]), length, error)
     # Detections and the like are wanted for a uniform start s alone, s (I - T)^-1 b: with the visits v = s (I - T)^-1,
     # that is v = s + v T, each is a scalar product v b. One system goes before the next comes: both are large.
     del system
     system = RenewalSystem(sparse.csr_array(located.T), world.size)
     visits = system.solve(np.concatenate([np.full(m, 1 / m), np.zeros(states - m)]))
-    # Sensing does not move the target, and each episode has one exit step: the steps in the grid are all but that one.
-    return summed_up(value[:m], length - 1.0, length, list(visits @ gathered[:, 2:5]), error)
+    return summed_up(value[:m], steps, length, list(visits @ gathered[:, 2:5]), error)
 
 
 def _table(problem: Problem, policy: PolicyLike | Array | BoolArray) -> PolicyTable:

@@ -22,7 +22,8 @@ class Evaluation:
         safe_per_episode: forced safe actions per episode.
         expected_length: steps per episode, the exit step included.
         steps: `[M]`, steps in the grid per episode from each start cell.
-        detections, sensors, safe_actions: `[M]`, the same of these; None where the system was too large to factorise.
+        detections, sensors, safe_actions: `[M]`, the same of these; None where they were not asked for
+            (`evaluate`, `per_cell`) and the system was too large to factorise.
         error: no entry of `value` is farther from the exact one; 0 where the system was factorised.
     """
 

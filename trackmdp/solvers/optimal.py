@@ -174,7 +174,7 @@ class _Run:
         # U(x, 0) >= V*(x) before anything is searched; `tighten` only lowers it.
         self.bound = exact_clocked_table(world).value
         self.policy = clocked.solve(world)
-        self.evaluation: Evaluation = evaluate(world, self.policy, guess=self.bound)
+        self.evaluation: Evaluation = evaluate(world, self.policy, guess=self.bound, per_cell=False)
 
     @property
     def value(self) -> Array:
@@ -183,7 +183,7 @@ class _Run:
 
     def use(self, policy: PolicyTable) -> bool:
         """Take `policy` as the one at hand if it is better."""
-        evaluation = evaluate(self.world, policy, guess=self.value)
+        evaluation = evaluate(self.world, policy, guess=self.value, per_cell=False)
         # By more than rounding, so that another way to write the same policy changes nothing.
         better = bool(evaluation.value.sum() > self.value.sum() + 1e-13 * np.abs(self.value).sum())
         if better:

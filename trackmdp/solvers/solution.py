@@ -94,7 +94,7 @@ class SearchProgress:
 
 def bracketed(world: World, table: PolicyTable, seconds: float, tolerance: float = 1e-6) -> Solution:
     """A policy found in another way, in `seconds`, with the clocked bound as what is proved."""
-    evaluation = evaluate(world, table)
+    evaluation = evaluate(world, table, per_cell=False)
     bound = np.maximum(clocked(world), evaluation.value)
     gap = float((bound - evaluation.value).mean()) + evaluation.error
     certified = gap <= tolerance * max(1.0, abs(evaluation.aihtr))

@@ -106,7 +106,7 @@ class ExactEvaluator(Evaluator):
 
     def evaluate(self, policy: PolicyTable) -> Evaluation:
         """Exact figures of a policy."""
-        return evaluate(self.world, policy)
+        return evaluate(self.world, policy, per_cell=False)
 
 
 class HiddenEvaluator(Evaluator):

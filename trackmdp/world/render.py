@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from trackmdp.world.model import BoolArray
 
-__all__ = ["PICTURE_LEGEND", "pixels", "text_rows"]
+__all__ = ["PICTURE_LEGEND", "around", "pixels", "text_rows"]
 
 FOUND, MISSED, ON, OFF = "●", "○", "▪", "·"
 PICTURE_LEGEND = f"{FOUND} target, detected   {MISSED} target, missed   {ON} sensor on   {OFF} sensor off"
@@ -25,6 +25,15 @@ def _marks(size: Sequence[int], cell: int, on: BoolArray, found: bool) -> npt.ND
     if cell < len(marks):
         marks[cell] = FOUND if found else MISSED
     return marks.reshape(tuple(size))
+
+
+def around(place: int, length: int, wide: int) -> range:
+    """The rows, or columns, that are drawn of a large grid: `wide` of `length`, as near around `place` as they can be.
+
+    Place 4 of 40, 21 wide, gives 0 to 20; place 15 gives 5 to 25.
+    """
+    begin = min(max(place - wide // 2, 0), max(length - wide, 0))
+    return range(begin, min(begin + wide, length))
 
 
 def text_rows(size: Sequence[int], cell: int, on: BoolArray, *, found: bool) -> list[str]:
