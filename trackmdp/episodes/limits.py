@@ -19,6 +19,7 @@ __all__ = [
     "check_run",
     "check_steps",
     "modes_of",
+    "sensors_of",
     "size_of_grid",
     "tables_of",
     "policy_file",
@@ -48,6 +49,8 @@ def check_run(run: Mapping[str, str]) -> None:
     for name, least in {"columns": 1, "window": 0, "modes": 1, "revealed": 1}.items():
         if run.get(name):
             _count(run, name, least, _LARGEST_GRID)
+    if run.get("sensors"):
+        _count(run, "sensors", 1, _LARGEST_GRID**2)
     _count(run, "t_max", 0, _MOST)
     if run["max_steps"]:
         _count(run, "max_steps", 1, _MOST)
@@ -64,9 +67,18 @@ def size_of_grid(run: Mapping[str, str]) -> tuple[int, int]:
 
 
 def tables_of(run: Mapping[str, str]) -> tuple[str, ...]:
-    """The attachments that a log's world and config are read from; `sensors.npy` only where sensors may miss."""
+    """The attachments that a log's world and config are read from.
+
+    `sensors.npy` only where sensors may miss, `footprints.npz` only where they cover several cells.
+    """
     every = ("config.yaml", "kernel.npz" if "kernel.npz.sha256" in run else "kernel.npy", "cost.npy")
-    return (*every, "sensors.npy") if "sensors.npy.sha256" in run else every
+    return (*every, *(name for name in ("sensors.npy", "footprints.npz") if f"{name}.sha256" in run))
+
+
+def sensors_of(run: Mapping[str, str]) -> int:
+    """S, the sensors of a log's world; said of those with footprints alone, else there is one in each cell."""
+    rows, columns = size_of_grid(run)
+    return int(run.get("sensors") or rows * columns)
 
 
 def policy_file(number: int, run: Mapping[str, str]) -> str:
@@ -74,7 +86,7 @@ def policy_file(number: int, run: Mapping[str, str]) -> str:
     return f"policy-{number}.{'npz' if 'kernel.npz.sha256' in run else 'npy'}"
 
 
-def check_policy(facts: Mapping[str, str], cells: int) -> None:
+def check_policy(facts: Mapping[str, str], sensors: int) -> None:
     """See that the metadata of a policy name its kind and its table.
 
     Raises:
@@ -83,7 +95,7 @@ def check_policy(facts: Mapping[str, str], cells: int) -> None:
     if not re.fullmatch(r"([0-9a-f]{64})?", facts["table.sha256"]):
         raise ValueError("the digest of a policy's table")
     if facts["kind"] == "random_k":
-        _count(facts, "k", 0, cells)
+        _count(facts, "k", 0, sensors)
     if "memory" in facts:
         _count(facts, "clip", 1, _LARGEST_GRID)
         _count(facts, "revealed", 1, _LARGEST_GRID)
@@ -117,18 +129,21 @@ def check_row(row: Any, cells: int, modes: int = 0) -> dict[str, Any]:
     return dict(row)
 
 
-def check_steps(steps: Sequence[Any], cells: int, modes: int = 0) -> None:
-    """See that the `/step` messages name cells of the grid, modes where targets have any, and finite rewards.
+def check_steps(steps: Sequence[Any], cells: int, modes: int = 0, sensors: int | None = None) -> None:
+    """See that `/step` messages name cells, sensors and modes that there are, and finite rewards.
+
+    `sensors` None stands for one in each cell.
 
     Raises:
         ValueError, KeyError, TypeError: one does not.
     """
+    number = cells if sensors is None else sensors
     rules: dict[str, Callable[[Any], bool]] = {
         "n": lambda n: type(n) is int and 0 <= n < _MOST,
         "target": lambda cell: type(cell) is int and -1 <= cell < cells,
         "obs": lambda cell: type(cell) is int and -1 <= cell < cells,
         "reward": _is_number,
-        "active": lambda on: type(on) is list and all(type(cell) is int and 0 <= cell < cells for cell in on),
+        "active": lambda on: type(on) is list and all(type(each) is int and 0 <= each < number for each in on),
     }
     if modes:
         rules["mode"] = lambda mode: type(mode) is int and -1 <= mode < modes

@@ -13,6 +13,7 @@ from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.limits import check_steps
 from trackmdp.episodes.schema import time_of
 from trackmdp.errors import UserError
+from trackmdp.world.model import BoolArray
 
 __all__ = ["decode", "grid_messages", "row_of", "step_messages"]
 
@@ -62,8 +63,8 @@ def step_messages(episode: Episode, size: tuple[int, int], t_max: int) -> Iterat
     # cell 0 at x = 0, y = 2.
     y = np.where(target < 0, -1, rows - 1 - target // columns)
     steps, ids = np.nonzero(episode.action)
-    # np.nonzero lists (step, cell) in order of steps: steps 0 0 1 3 with cells 2 5 4 0. searchsorted finds where steps
-    # 1, 2, 3 begin, 2 3 3, and split makes of the cells [2 5] [4] [] [0].
+    # np.nonzero lists (step, sensor) in order of steps: steps 0 0 1 3 with sensors 2 5 4 0. searchsorted finds where
+    # steps 1, 2, 3 begin, 2 3 3, and split makes of those [2 5] [4] [] [0].
     active = [",".join(map(str, each.tolist())) for each in np.split(ids, np.searchsorted(steps, range(1, last + 1)))]
     known = (episode.misses, episode.last_cell, episode.action.sum(1), episode.forced(t_max))
     came = (target, x, y, episode.observation, episode.reward.astype(np.float64), episode.returns)
@@ -81,14 +82,19 @@ def step_messages(episode: Episode, size: tuple[int, int], t_max: int) -> Iterat
         ).encode()
 
 
-def grid_messages(episode: Episode, size: tuple[int, int], first_tick: int) -> Iterator[bytes]:
-    """The `/grid` messages; the grid is turned upside down, since a viewer's first row is the lowest."""
+def grid_messages(
+    episode: Episode, size: tuple[int, int], first_tick: int, covered: BoolArray | None = None
+) -> Iterator[bytes]:
+    """The `/grid` messages; the grid is turned upside down, since a viewer's first row is the lowest.
+
+    `covered` `[T, M]` are the cells that the sensors on see; None where each sees its own.
+    """
     rows, columns = size
     # One cell more, for targets that exited (cell M): it is written to and dropped.
     cells = np.zeros((len(episode), rows * columns + 1), _CELL)
     cells["belief"][:, :-1] = episode.belief
     cells["policy"][:, :-1] = episode.probability
-    cells["active"][:, :-1] = episode.action
+    cells["active"][:, :-1] = episode.action if covered is None else covered
     cells["target"][np.arange(len(episode)), episode.target] = 1
     turned = np.ascontiguousarray(cells[:, :-1].reshape(-1, rows, columns)[:, ::-1])
     stride = _CELL.itemsize
@@ -103,9 +109,17 @@ def grid_messages(episode: Episode, size: tuple[int, int], first_tick: int) -> I
 
 
 def decode(
-    row: dict[str, Any], steps: list[bytes], grids: list[bytes], size: tuple[int, int], first_tick: int, modes: int
+    row: dict[str, Any],
+    steps: list[bytes],
+    grids: list[bytes],
+    size: tuple[int, int],
+    first_tick: int,
+    modes: int,
+    sensors: int | None = None,
 ) -> Episode:
     """The episode that these messages were made from; `modes` of the targets, 0 where they have none.
+
+    `sensors` are S, None where there is one in each cell.
 
     Raises:
         UserError: they do not fit together.
@@ -117,12 +131,12 @@ def decode(
         (each["episode"], each["t"]) != (number, t) for t, each in enumerate(said)
     ):
         raise UserError(f"episode={number}: its steps do not fit together")
-    check_steps(said, m, modes)
+    check_steps(said, m, modes, sensors)
     packed = b"".join(base64.b64decode(json.loads(grid)["data"], validate=True) for grid in grids)
     # frombuffer and reshape refuse a length that does not fit: `count` grids of M cells of ten bytes.
     cells = np.frombuffer(packed, _CELL).reshape(count, *size)[:, ::-1].reshape(count, m)
     target = np.array([each["target"] for each in said], dtype=np.int64)
-    action = np.zeros((count, m), dtype=bool)
+    action = np.zeros((count, m if sensors is None else sensors), dtype=bool)
     for t, each in enumerate(said):
         action[t, each["active"]] = True
     return Episode(

@@ -82,7 +82,7 @@ class EpisodeReader:
         # A count that is too large ends at the first name that is missing, before any list has that length.
         self.policies = [self._told(f"{schema.POLICY}.{k}") for k in range(int(self.end["policies"]))]
         for facts in self.policies:
-            check_policy(facts, cells)
+            check_policy(facts, limits.sensors_of(self.run))
         modes = limits.modes_of(self.run)
         self.rows: list[dict[str, Any]] = [check_row(row, cells, modes) for row in json.loads(index)]
         self._numbers = [row["episode"] for row in self.rows]
@@ -156,7 +156,8 @@ class EpisodeReader:
         if self._checked(lambda: [json.loads(text) for text in mine["/episode"]]) != [row]:
             raise self._damage(f"episode {number} is not what the index says")
         size, tick = limits.size_of_grid(self.run), schema.tick_of(begin)
-        return self._checked(decode, row, mine["/step"], mine["/grid"], size, tick, limits.modes_of(self.run))
+        counts = limits.modes_of(self.run), limits.sensors_of(self.run)
+        return self._checked(decode, row, mine["/step"], mine["/grid"], size, tick, *counts)
 
     def _between(self, begin: int, end: int) -> list[Message]:
         """The messages from one log time to another; the chunk read last is kept, for the episode after."""
@@ -198,11 +199,11 @@ class EpisodeReader:
         return Policy.from_dense(task, self._checked(self._unpacked, table, task.num_keys))
 
     def _unpacked(self, table: bytes, keys: int) -> BoolArray:
-        cells, bits = math.prod(limits.size_of_grid(self.run)), _load(table)
-        if bits.dtype != np.uint8 or bits.shape != (keys, self.t_max + 1, -(-cells // 8)):
+        sensors, bits = limits.sensors_of(self.run), _load(table)
+        if bits.dtype != np.uint8 or bits.shape != (keys, self.t_max + 1, -(-sensors // 8)):
             raise Damaged("the table of a policy")
-        # `[keys, t_max+1, ceil(M/8)]` to `[keys, t_max+1, M]`; `count` drops the bits that fill the last byte.
-        return np.unpackbits(bits.astype(np.uint8), axis=-1, count=cells).astype(bool)
+        # `[keys, t_max+1, ceil(S/8)]` to `[keys, t_max+1, S]`; `count` drops the bits that fill the last byte.
+        return np.unpackbits(bits.astype(np.uint8), axis=-1, count=sensors).astype(bool)
 
     def world(self) -> Modelled:
         """The world in which the episodes were recorded."""
@@ -213,10 +214,16 @@ class EpisodeReader:
 
     def _world(self) -> Modelled:
         run = self.run
-        # Kernel and prices, and where sensors may miss `[2, M]`, p_d and p_s.
-        kernel, cost, *sensors = (_loaded(name, self.attachment(name)) for name in limits.tables_of(run)[1:])
-        may_miss = dict(zip(("detection", "safe_detection"), sensors[0], strict=True)) if sensors else {}
+        # Kernel and prices; where sensors may miss `[2, M]`, p_d and p_s; where they have footprints `[S, M]`.
+        names = limits.tables_of(run)[1:]
+        kernel, cost, *more = (_loaded(name, self.attachment(name)) for name in names)
+        sensors = dict(zip(names[2:], more, strict=True))
+        chances = sensors.get("sensors.npy")
+        may_miss = {} if chances is None else dict(zip(("detection", "safe_detection"), chances, strict=True))
+        if "footprints.npz" in sensors and sensors["footprints.npz"].shape[0] != limits.sensors_of(run):
+            raise Damaged("how many sensors there are")
         of_task: dict[str, Any] = may_miss | {
+            "coverage": sensors.get("footprints.npz"),
             "size": limits.size_of_grid(run),
             "cost": cost,
             "safe_cost": float(run["safe_cost"]),

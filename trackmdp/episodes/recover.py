@@ -13,7 +13,7 @@ from typing import Any
 
 from trackmdp.episodes import container, schema
 from trackmdp.episodes.container import Damaged
-from trackmdp.episodes.limits import check_policy, check_row, modes_of, policy_file, size_of_grid, tables_of
+from trackmdp.episodes.limits import check_policy, check_row, modes_of, policy_file, sensors_of, size_of_grid, tables_of
 from trackmdp.episodes.messages import decode
 from trackmdp.episodes.reader import checked_run
 from trackmdp.episodes.writer import EpisodeWriter
@@ -194,7 +194,7 @@ def _policies_up_to(number: int, writer: EpisodeWriter, found: _Found, done: set
         if not facts:
             raise Damaged(f"policy {each} is lost")
         writer.flush()  # as when it was recorded, so that a copy has the same bytes
-        check_policy(facts, math.prod(size_of_grid(found.metadata[schema.RUN])))
+        check_policy(facts, sensors_of(found.metadata[schema.RUN]))
         run = found.metadata[schema.RUN]
         sha256, table = facts.pop("table.sha256"), found.attachments.get(policy_file(each, run))
         if sha256 and (table is None or schema.digest(table) != sha256):
@@ -210,5 +210,6 @@ def _copy(row: dict[str, Any], found: _Found, writer: EpisodeWriter) -> int:
     steps = [data for time, data in found.steps.items() if begin <= time <= end]
     grids = [data for time, data in found.grids.items() if begin <= time <= end]
     run = found.metadata[schema.RUN]
-    writer.add(decode(row, steps, grids, size_of_grid(run), schema.tick_of(begin), modes_of(run)))
+    tick = schema.tick_of(begin)
+    writer.add(decode(row, steps, grids, size_of_grid(run), tick, modes_of(run), sensors_of(run)))
     return 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import os
 import threading
 from collections.abc import Mapping
@@ -15,12 +16,15 @@ import numpy.typing as npt
 from mcap.writer import Writer
 from scipy import sparse
 
+from trackmdp.arrays import load_npz
 from trackmdp.durable import create, sync, sync_folder
 from trackmdp.episodes import messages, schema
 from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.limits import policy_file, size_of_grid
 from trackmdp.episodes.schema import time_of
 from trackmdp.policies.policy import Policy
+from trackmdp.world.coverage import Coverage
+from trackmdp.world.files import csr_of
 from trackmdp.world.modes import HiddenWorld, Modelled
 
 __all__ = ["EpisodeWriter"]
@@ -53,6 +57,8 @@ class EpisodeWriter:
         }
         if not (world.perfect and world.safe):
             tables["sensors.npy"] = _npy(np.stack([world.detection, world.safe_detection]))
+        if world.coverage is not None:
+            tables["footprints.npz"] = _npz(world.coverage.matrix)
         run = {
             **schema.versions(),
             **facts,
@@ -60,6 +66,7 @@ class EpisodeWriter:
             "size": str(world.rows),
             **({} if world.rows == world.columns else {"columns": str(world.columns)}),
             **({} if world.window is None else {"window": str(world.window)}),
+            **({} if world.coverage is None else {"sensors": str(world.total_sensors)}),
             **({"modes": str(world.modes), "revealed": str(world.revealed)} if isinstance(world, HiddenWorld) else {}),
             "t_max": str(world.t_max),
             "max_steps": "" if world.max_steps is None else str(world.max_steps),
@@ -70,6 +77,7 @@ class EpisodeWriter:
             **{f"{name}.sha256": schema.digest(content) for name, content in tables.items()},
         }
         self._size, self._t_max, self._run = world.size, world.t_max, run
+        self._coverage = world.coverage
         self._open(file, run, tables)
 
     @classmethod
@@ -77,6 +85,9 @@ class EpisodeWriter:
         """A log that starts with the metadata `trackmdp.run` and the attachments of another."""
         writer = cls.__new__(cls)
         writer._size, writer._t_max, writer._run = size_of_grid(run), int(run["t_max"]), dict(run)
+        footprints = tables.get("footprints.npz")
+        given = None if footprints is None else csr_of(load_npz(io.BytesIO(footprints)))
+        writer._coverage = Coverage.of(given, math.prod(writer._size))
         writer._open(file, dict(run), dict(tables))
         return writer
 
@@ -169,7 +180,8 @@ class EpisodeWriter:
             raise ValueError(f"episode {episode.number}: a reward that is not finite, or a time out of range")
         add, step, grid = self._writer.add_message, self._channels["/step"], self._channels["/grid"]
         steps = messages.step_messages(episode, self._size, self._t_max)
-        grids = messages.grid_messages(episode, self._size, tick)
+        covered = None if self._coverage is None else self._coverage.cells(episode.action)
+        grids = messages.grid_messages(episode, self._size, tick, covered)
         for place, (said, cells) in enumerate(zip(steps, grids, strict=True), start=tick):
             # MCAP's sequence number has 32 bits, the log time 64.
             time, sequence = time_of(place), place & 0xFFFFFFFF
@@ -234,7 +246,7 @@ class EpisodeWriter:
 def _described(policy: Policy | None, *, sparse: bool) -> tuple[dict[str, str], bytes | None]:
     """What a log says of how a policy acts, and its table.
 
-    `[keys, t_max+1, ceil(M/8)]`, eight sensors to a byte; where the kernel is `sparse` the CSR matrix of its sets, as
+    `[keys, t_max+1, ceil(S/8)]`, eight sensors to a byte; where the kernel is `sparse` the CSR matrix of its sets, as
     SciPy saves it.
     """
     if policy is None:
@@ -245,7 +257,7 @@ def _described(policy: Policy | None, *, sparse: bool) -> tuple[dict[str, str], 
         return {"kind": "probabilities"}, None
     if sparse:
         if policy.sets is None:  # all on or none: as many as there are drawn, or not one, which needs no table
-            return {"kind": "random_k", "k": str(round((policy.probability or 0.0) * policy.task.num_cells))}, None
+            return {"kind": "random_k", "k": str(round((policy.probability or 0.0) * policy.task.total_sensors))}, None
         return {"kind": "chains"}, _npz(policy.sets)
     return {"kind": "chains"}, _npy(np.packbits(policy.dense(), axis=-1))
 

@@ -1,4 +1,4 @@
-"""Inputs of a run in its folder: `config.yaml`, `kernel.npz` or `tracks.json`, and recorded tracks of no other file."""
+"""Inputs of a run in its folder: `config.yaml`, `kernel.npz` or `tracks.json`, footprints, tracks of no other file."""
 
 from __future__ import annotations
 
@@ -18,10 +18,12 @@ from trackmdp.untrusted import parse_json, read_bytes
 from trackmdp.world.recording import recording_bytes
 from trackmdp.world.tracks import Problem, Recorded
 
-__all__ = ["RECORDING", "check_inputs", "write_inputs"]
+__all__ = ["FOOTPRINTS", "RECORDING", "check_inputs", "write_inputs"]
 
 RECORDING = "recording.npz"
 """The tracks of a run that was begun in Python, which may have been read from any file, or from none."""
+FOOTPRINTS = "footprints.npz"
+"""The cells that each sensor covers, where that is not its own cell alone."""
 
 
 def write_inputs(config: TrainConfig, problem: Problem, folder: Path, *, resumed: bool) -> None:
@@ -38,6 +40,8 @@ def write_inputs(config: TrainConfig, problem: Problem, folder: Path, *, resumed
     # only the process that read the positions can say what it left out of them.
     if not resumed:
         write_bytes(file, content)
+        if problem.coverage is not None:
+            write_bytes(folder / FOOTPRINTS, _saved(problem.coverage.matrix))
     own = folder.absolute() / RECORDING
     if isinstance(problem, Recorded) and getattr(config.kernel, "path", None) == str(own) and not resumed:
         write_bytes(own, recording_bytes(problem))
@@ -54,6 +58,10 @@ def check_inputs(problem: Problem, folder: Path) -> None:
     if not _is_content(problem, read_bytes(file, most=LARGE)):
         what = "recording" if isinstance(problem, Recorded) else "kernel"
         raise UserError(f"{file}: the run's {what} is not the one that its config describes now; it cannot change")
+    if problem.coverage is not None:
+        file = folder / FOOTPRINTS
+        if read_bytes(file, most=LARGE) != _saved(problem.coverage.matrix):
+            raise UserError(f"{file}: the run's footprints are not those of its config now; they cannot change")
 
 
 def _is_content(problem: Problem, stored: bytes) -> bool:
@@ -76,11 +84,14 @@ def _content(problem: Problem) -> bytes:
     """Of `kernel.npz` or `tracks.json`; the same problem, the same bytes."""
     if isinstance(problem, Recorded):
         return _described(problem)
+    return _saved(problem.kernel)
+
+
+def _saved(matrix: sparse.csr_array) -> bytes:
+    """A CSR matrix as SciPy saves it, its indices of one width, whatever its size and whatever is fastest."""
     buffer = io.BytesIO()
-    # Indices of one width, whatever the size of the kernel, and whatever is fastest to work with.
-    kernel = problem.kernel
-    wide = (kernel.data, kernel.indices.astype(np.int64), kernel.indptr.astype(np.int64))
-    sparse.save_npz(buffer, sparse.csr_array(wide, shape=kernel.shape))
+    wide = (matrix.data, matrix.indices.astype(np.int64), matrix.indptr.astype(np.int64))
+    sparse.save_npz(buffer, sparse.csr_array(wide, shape=matrix.shape))
     return buffer.getvalue()
 
 

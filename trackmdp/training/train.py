@@ -16,7 +16,7 @@ from trackmdp.errors import UserError
 from trackmdp.seeding import preserved_global_rng
 from trackmdp.training.callbacks import Callback
 from trackmdp.training.display import make_console
-from trackmdp.training.inputs import RECORDING
+from trackmdp.training.inputs import FOOTPRINTS, RECORDING
 from trackmdp.training.lock import locked
 from trackmdp.training.run import Run, complete
 from trackmdp.training.trainer import Trainer
@@ -105,6 +105,8 @@ def _described(problem: Problem, folder: Path | None) -> dict[str, Any]:
         "cost.safe": None if np.isclose(problem.safe_cost, price.sum(), rtol=1e-15) else problem.safe_cost,
     }
     given |= sensor_words(_short(problem.detection), _short(problem.safe_detection))
+    if problem.coverage is not None:
+        given |= {"sensor": "footprint", "sensor.path": str((folder or Path()).absolute() / FOOTPRINTS)}
     if problem.memory != "cell":
         given["task.clip"] = problem.clip
     if isinstance(problem, World):

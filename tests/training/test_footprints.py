@@ -1,0 +1,51 @@
+"""Learning with sensors that have footprints: joint credit, from Python and the command line, resumed and logged."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import trackmdp as tm
+from tests.helpers import small_world
+from trackmdp.app.cli import main
+from trackmdp.errors import UserError
+from trackmdp.world.coverage import discs
+from trackmdp.world.model import World
+
+SHORT = {"total_frames": 2048, "collector.envs": 64, "frames_per_batch": 512, "optimal.enabled": False}
+
+
+def _world() -> World:
+    places = np.array([(0, 0), (0, 2), (2, 0), (2, 2)])
+    return World.of(small_world(), small_world().kernel, coverage=discs((3, 3), places, 1), cost=[0.1, 0.2, 0.3, 0.4])
+
+
+@pytest.mark.parametrize("algo", ["a2c", "ppo", "dqn"])
+def test_joint_credit_learns_sets_of_sensors(algo: str, tmp_path: Path) -> None:
+    run = tm.train(_world(), algo, folder=tmp_path / "run", **SHORT)
+    assert run.policy.task.total_sensors == 4
+    assert tm.evaluate(_world(), run.policy).aihtr == pytest.approx(run.evaluation.aihtr)
+    again = tm.load_run(tmp_path / "run")
+    assert (again.policy.dense() == run.policy.dense()).all()
+
+
+def test_a_run_of_other_footprints_is_not_resumed(tmp_path: Path) -> None:
+    tm.train(_world(), "a2c", folder=tmp_path, **SHORT)
+    other = World.of(_world(), _world().kernel, coverage=np.ones((4, 9)))
+    with pytest.raises(UserError, match="footprints are not those"):
+        tm.train(other, "a2c", folder=tmp_path, resume="auto", **SHORT)
+
+
+def test_algorithms_that_know_no_footprints_say_so_before_anything_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for algo in ("hindsight", "learned_kernel", "path_counts"):
+        assert main(["train", "sensor=footprint", f"algo={algo}", f"hydra.run.dir={tmp_path / 'run'}"]) != 0
+        shown = capsys.readouterr().err
+        assert f"algo={algo}: expected one of" in shown
+        assert shown.count("\n") == 1
+        with pytest.raises(UserError, match="expected one of"):
+            tm.train(_world(), algo)
+    assert not (tmp_path / "run").exists()
