@@ -1,4 +1,4 @@
-"""`torch.compile` of the environment: one graph, and the same bits as without it."""
+"""`torch.compile` of the environment: one graph, and the same bits as without it; every tensor on its own device."""
 
 from __future__ import annotations
 
@@ -96,6 +96,21 @@ def test_a_step_is_one_graph_and_the_same_step(name: str) -> None:
     assert sum(int(frame["next", "done"].sum()) for frame in plain[:-1]) > 2
     assert all((one == other).all() for one, other in zip(ours, plain, strict=True))
     assert same(mine, theirs)
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_every_tensor_is_made_on_the_environments_device(name: str) -> None:
+    """With `meta`, which holds no data, as torch's default device: a tensor made without a device would be empty."""
+    mine, theirs = pair(name)
+    plain = stepped(theirs.step_and_maybe_reset, theirs, 20)
+    with torch.device("meta"):
+        env = TrackEnv(PROBLEMS[name](), 5, seed=3, device="cpu")
+        env.reset()
+        rows = env.restore(mine.snapshot())
+        for frame in plain[:-1]:
+            after, rows = env.step_and_maybe_reset(rows.set("action", frame["action"]))
+            assert (after == frame).all()
+        env.restore(env.snapshot())
 
 
 @pytest.mark.slow

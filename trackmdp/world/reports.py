@@ -45,7 +45,7 @@ class Reports:
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Go on where `state` was taken."""
         if not self.certain:
-            self._generator.set_state(state["report"])
+            self._generator.set_state(state["report"].cpu())
 
     def draw(self, rows: Tensor) -> Tensor | None:
         """`[B]` float64 uniform draws for `seen` of the targets `rows` `[B]`; None where all reports are certain."""

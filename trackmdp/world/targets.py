@@ -78,7 +78,8 @@ class SampledTargets:
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """See `Targets`."""
         for name, rng in self._generators.items():
-            rng.set_state(state[name])
+            # A checkpoint read for a GPU has all its tensors there; a generator's state is on the CPU at all times.
+            rng.set_state(state[name].cpu())
 
     def start(self, rows: Tensor) -> dict[str, Tensor]:
         """See `Targets`; draws for all rows, so that what a row gets does not depend on the others."""
@@ -144,7 +145,7 @@ class RecordedTargets:
 
     def state(self) -> dict[str, Tensor]:
         """How many episodes have begun."""
-        return {"drawn": torch.tensor(self._drawn)}
+        return {"drawn": torch.tensor(self._drawn, device="cpu")}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """See `Targets`."""
@@ -181,7 +182,9 @@ class RecordedTargets:
 
     def _order(self, number: int) -> Tensor:
         seed, stream = self._names
-        order = torch.randperm(len(self._starts), generator=generator(seed, stream, "tracks", number))
+        rng = generator(seed, stream, "tracks", number)
+        # On the CPU, whatever the default device is: there is one order for all devices.
+        order = torch.randperm(len(self._starts), generator=rng, device="cpu")
         return self._starts[order.to(self._device)]
 
     def draw(self, rows: Tensor) -> Tensor:  # noqa: ARG002
