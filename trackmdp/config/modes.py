@@ -48,7 +48,7 @@ class HiddenKernelConfig(KernelConfig):
         for name in ("max_steps", "window"):
             if (value := getattr(root.grid, name)) is not None:
                 raise refuse(f"grid.{name}", value, f"null with kernel={self.name}")
-        if root.sensor.name == "false_alarm":
+        if root.sensor.name not in ("perfect", "miss"):
             raise refuse("sensor", root.sensor.name, f"perfect or miss with kernel={self.name}")
         if getattr(root.sensor, "p_s", 1) != 1:
             raise refuse("sensor.p_s", root.sensor.p_s, f"1 with kernel={self.name}")

@@ -31,6 +31,14 @@ class Sizes(Protocol):
         """T_max."""
 
     @property
+    def num_keys(self) -> int:
+        """Plans of a policy."""
+
+    @property
+    def pair_bytes(self) -> int:
+        """Bytes that exact evaluation over pairs of a key and a mode takes; 0 where there is none."""
+
+    @property
     def order(self) -> int:
         """Detections before the last one that are remembered."""
 

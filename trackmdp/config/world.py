@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from trackmdp.config.options import GROUPS, Option, choice, listed, option, refuse
-from trackmdp.config.schema import ChoiceConfig, NodeConfig
+from trackmdp.config.schema import ChoiceConfig, NodeConfig, Sizes
 from trackmdp.errors import UserError
 
 __all__ = [
@@ -97,6 +97,13 @@ class TaskConfig(NodeConfig):
             raise refuse(f"{key}.memory", self.memory, expected)
         if root.kernel.hides and root.kernel.reveals:
             raise refuse(f"{key}.memory", self.memory, "cell with kernel.reveals=true: a detection tells all there is")
+
+    def needs(self, task: Sizes, root: Any) -> dict[str, int]:
+        """A set for every key and n, with what finding it takes; and exact evaluation where targets have a mode."""
+        if self.memory == "cell" and not task.pair_bytes:
+            return {}
+        # Some six sensors a set, each 60 bytes while plans are put together, and a row pointer or two.
+        return {"task.memory": task.num_keys * (task.t_max + 1) * 400 + task.pair_bytes}
 
     def ignored(self, root: Any) -> dict[str, str]:
         """Where the cell alone is remembered there is no displacement."""

@@ -14,7 +14,8 @@ import numpy as np
 from omegaconf import OmegaConf
 from scipy import sparse
 
-from trackmdp.config import TableConfig, WorldConfig, world_of
+from trackmdp.config import GROUPS, TableConfig, WorldConfig, world_of
+from trackmdp.config.registry import make
 from trackmdp.errors import UserError
 from trackmdp.reports import policy
 from trackmdp.reports.finished import plain_config, read_curve, read_run
@@ -23,12 +24,15 @@ from trackmdp.reports.maps import MOST_MAP_CELLS
 from trackmdp.reports.results import Anomaly, FinishedRun, MotionTable, Results
 from trackmdp.solvers import bounds, qmdp
 from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers.keyed import averaged
+from trackmdp.solvers.keyed_search import cell_bound
 from trackmdp.solvers.renewal import DIRECT_CELLS
 from trackmdp.training.folders import FAILED_FILE, PLAN, read_run_json
 from trackmdp.training.sealing import SUMMARY, check_files, read_summary
 from trackmdp.untrusted import printable
-from trackmdp.world.make import build_world
-from trackmdp.world.model import World
+from trackmdp.world.checks import canonical_kernel
+from trackmdp.world.make import build_world, of_task
+from trackmdp.world.modes import HiddenWorld
 
 __all__ = ["gather_runs", "planned", "run_folders"]
 
@@ -165,6 +169,9 @@ def _policies(folder: Path, grouped: Study) -> tuple[dict[str, policy.Sensed], l
     found: dict[str, policy.Sensed] = {}
     anomalies = []
     for runs in grouped.groups.values():
+        # A map has one plan a cell; what remembers more has too many to be drawn.
+        if runs[0].settings.get("task.memory", "cell") != "cell":
+            continue
         # The middle one by AIHTR: the best would flatter the method, and a mean of policies is not a policy.
         ranked = sorted(runs, key=lambda run: (run.figure("aihtr"), run.seed))
         middle = (len(ranked) - 1) / 2
@@ -193,21 +200,33 @@ def _motions(folder: Path, runs: Iterable[FinishedRun]) -> tuple[dict[str, Motio
             continue  # no motion is known there
         try:
             check_files(folder / run.name, read_summary(folder / run.name), "kernel.npz")
-            world = build_world(_world_config(folder / run.name))
+            found[run.name] = _motion(_world_config(folder / run.name), hides=_hides(run))
         except UserError as error:
             anomalies.append(Anomaly(run.name, f"its world cannot be built ({error})"))
-            continue
-        found[run.name] = _motion(world)
     return found, anomalies
 
 
-def _motion(world: World) -> MotionTable:
+def _hides(run: FinishedRun) -> bool:
+    """Whether its target has a mode: its kernel is then on (cell, mode)."""
+    schema = GROUPS["kernel"].get(str(run.settings["kernel.name"]))
+    return schema is not None and schema.hides
+
+
+def _motion(cfg: WorldConfig, *, hides: bool) -> MotionTable:
     """What maps show besides the policy; the motion only where it is drawn, cell by cell."""
-    m, kernel = world.num_cells, world.kernel
-    drawn = kernel if m <= MOST_MAP_CELLS else sparse.csr_array(kernel.shape)
+    if hides:
+        kernel = canonical_kernel(make(cfg.kernel, cfg.grid.size))
+        modes = kernel.shape[0] // cfg.grid.num_cells
+        hidden = HiddenWorld(kernel, cfg.grid.size, modes=modes, **of_task(cfg))
+        world, bound = averaged(hidden), cell_bound(hidden)
+    else:
+        hidden, world = None, build_world(cfg)
+        bound = bounds.clocked(world)
+    m = world.num_cells
+    drawn = world.kernel if m <= MOST_MAP_CELLS else sparse.csr_array(world.kernel.shape)
     # Where Q_MDP senses little, its value takes minutes and gigabytes on a large grid.
-    simple = evaluate(world, qmdp.solve(world)).value if m <= DIRECT_CELLS else np.full(m, np.nan)
-    return MotionTable(drawn, simple, bounds.clocked(world))
+    simple = evaluate(hidden or world, qmdp.solve(world)).value if m <= DIRECT_CELLS else np.full(m, np.nan)
+    return MotionTable(drawn, simple, bound)
 
 
 def _world_config(place: Path) -> WorldConfig:

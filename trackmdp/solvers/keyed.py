@@ -13,6 +13,8 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse
 
+from trackmdp.errors import UserError
+from trackmdp.machine import free_bytes, gib
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.evaluation import Evaluation, pooled
 from trackmdp.solvers.layers import Layer, reachable
@@ -21,6 +23,9 @@ from trackmdp.world.model import Array, BoolArray, World
 from trackmdp.world.modes import HiddenWorld
 
 __all__ = ["KeyedPairs", "averaged", "evaluate_keys"]
+
+_DIRECT = 1_000
+"""Pairs up to which systems are factorised: each leads to all cells in reach, so that the factors soon fill up."""
 
 
 class KeyedPairs:
@@ -34,6 +39,8 @@ class KeyedPairs:
     """
 
     def __init__(self, world: HiddenWorld) -> None:
+        if (needed := world.pair_bytes) > (free := free_bytes()):
+            raise UserError(f"task.memory={world.memory}: needs about {gib(needed)}, {gib(free)} are available")
         self.world, keys, h = world, world.keys, world.modes
         of_key = 1 if world.revealed > 1 else h  # pairs of each key
         self.key = np.repeat(np.arange(keys.num_keys), of_key)
@@ -112,8 +119,13 @@ class KeyedPairs:
     def value(self, sets: list[BoolArray]) -> tuple[Array, Array, float]:
         """`[B]` V, `[B]` visits of an episode, and the AIHTR."""
         located, gathered = self.run(*self.of_sets(sets))
-        value = RenewalSystem(located).solve(gathered[:, 0])
-        visits = RenewalSystem(sparse.csr_array(located.T)).solve(self.start)
+        value = _solved(located, gathered[:, 0])[0]
+        # Begun after some detections: no key is come by a second time where it stands for an episode's start, so that
+        # all that is left of the start at first would be orthogonal to what follows, and BiCGSTAB would break down.
+        into, guess = sparse.csr_array(located.T), self.start
+        for _ in range(4):
+            guess = self.start + into @ guess
+        visits = _solved(into, self.start, guess)[0]
         return value, visits, float(self.start @ value)
 
     def improved(
@@ -171,11 +183,24 @@ def evaluate_keys(world: HiddenWorld, policy: PolicyTable) -> Evaluation:
     remembered = {name: getattr(policy.task, name) for name in ("memory", "clip", "revealed")}
     pairs = KeyedPairs(world.but(**remembered))
     located, gathered = pairs.run(*pairs.of_policy(policy))
-    totals = RenewalSystem(located).solve(gathered)
+    totals, left = _solved(located, gathered)
     check_length(totals[:, 5])
     # The value of a start cell is the mean over its modes.
     of_cell = totals[pairs.first].mean(axis=1)
-    return pooled(of_cell[:, :5], of_cell[:, 5])
+    # |V - V̂| <= (steps of an episode) · max |residual|, as an episode has no more renewals than steps.
+    return pooled(of_cell[:, :5], of_cell[:, 5], left * float(totals[:, 5].max()))
+
+
+def _solved(transition: sparse.csr_array, gathered: Array, guess: Array | None = None) -> tuple[Array, float]:
+    """The solution of v = gathered + transition v, and its largest residual, 0 where it was factorised."""
+    system = RenewalSystem(transition, direct=_DIRECT)
+    found = system.solve(gathered, guess)
+    if system.exact:
+        return found, 0.0
+    left = float(np.abs(system.residual(gathered, found)).max())
+    if left <= 1e-10 * max(1.0, float(np.abs(found).max())):
+        return found, left
+    return RenewalSystem(transition, direct=len(found)).solve(gathered), 0.0
 
 
 def averaged(world: HiddenWorld) -> World:

@@ -7,6 +7,7 @@ probability that a target located in x is located next in j.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, TypeAlias
 
@@ -59,7 +60,7 @@ class RenewalSystem:
 
     Args:
         transition: `[M, M]` sub-stochastic; or `[KM, KM]` of K states per cell, cell j in its k-th state being kM + j.
-        size: (rows, columns) of the grid; None where the states are no cells, for always direct.
+        size: (rows, columns) of the grid; None where the states are no cells, and there is no coarser grid.
         direct: cells up to which a factorisation is used.
 
     Attributes:
@@ -74,11 +75,12 @@ class RenewalSystem:
     ) -> None:
         # I - T is an M-matrix with a dominant diagonal: its inverse is non-negative, and no pivoting is needed.
         self._system = short_indices(sparse.csr_array(sparse.eye_array(transition.shape[0], format="csr") - transition))
-        self.exact = size is None or transition.shape[0] <= direct
-        if self.exact or size is None:
+        self.exact = transition.shape[0] <= direct
+        if self.exact:
             self._factors = _factorise(self._system)
             return
-        self._precondition = _Level(self._system, size)
+        self._precondition: Callable[[Array], Array]
+        self._precondition = _Jacobi(self._system) if size is None else _Level(self._system, size)
 
     def solve(self, gathered: Array, guess: Array | None = None) -> Array:
         """`[M]` or `[M, K]`, as `gathered` is; `guess`, of the same shape, is where an iteration starts.
@@ -160,6 +162,17 @@ class RenewalSystem:
             daxpy(moved, residual, a=-omega)
             products += 2
         return solution, products
+
+
+class _Jacobi:
+    """The inverse of the diagonal: where states are pairs of many classes that share their cells, 40 products do."""
+
+    def __init__(self, system: sparse.csr_array) -> None:
+        self._diagonal = system.diagonal()
+
+    def __call__(self, right: Array) -> Array:
+        found: Array = right / self._diagonal
+        return found
 
 
 class _Level:

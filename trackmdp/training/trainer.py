@@ -79,7 +79,7 @@ class Trainer:
             self.callbacks[:0] = make_loggers(config, folder)
         self.start, self.position = Position(), Position()
         self.error: BaseException | None = None
-        self.console.print(memory.check_memory(config, problem.task, self.device))
+        self.console.print(memory.check_memory(config, problem, self.device))
 
     @property
     def iterations(self) -> int:

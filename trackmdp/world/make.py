@@ -23,7 +23,7 @@ from trackmdp.world.recording import read_recording
 from trackmdp.world.track_files import read_track_file
 from trackmdp.world.tracks import Problem, Recorded, split
 
-__all__ = ["build_world", "load_tracks", "make_problem", "make_world", "paper_cost", "recorded"]
+__all__ = ["build_world", "load_tracks", "make_problem", "make_world", "of_task", "paper_cost", "recorded"]
 
 
 def make_world(
@@ -134,7 +134,7 @@ def make_problem(cfg: WorldConfig) -> Problem:
         return _hidden(cfg)
     if cfg.kernel.is_motion:
         return build_world(cfg)
-    tracks: Recorded = make(cfg.kernel, cfg.grid.size, **_of_task(cfg))
+    tracks: Recorded = make(cfg.kernel, cfg.grid.size, **of_task(cfg))
     return tracks
 
 
@@ -143,7 +143,7 @@ def _hidden(cfg: WorldConfig) -> HiddenWorld:
     own = {name: getattr(cfg.kernel, name) for name in options(type(cfg.kernel))}
     reveals = own.pop("reveals")
     kernel, modes = maker(cfg.kernel)(cfg.grid.size, **own)
-    return HiddenWorld(kernel, cfg.grid.size, modes=modes, **_of_task(cfg), revealed=modes if reveals else 1)
+    return HiddenWorld(kernel, cfg.grid.size, modes=modes, **of_task(cfg), revealed=modes if reveals else 1)
 
 
 def build_world(cfg: WorldConfig) -> World:
@@ -158,7 +158,7 @@ def build_world(cfg: WorldConfig) -> World:
     # `World` checks again; here the message names the option at fault (`source`).
     kernel = canonical_kernel(make(cfg.kernel, cfg.grid.size), source)
     check_kernel(kernel, size, truncates=cfg.grid.max_steps is not None, source=source)
-    return World(kernel, size, **_of_task(cfg))
+    return World(kernel, size, **of_task(cfg))
 
 
 def recorded(
@@ -247,7 +247,7 @@ def sensor_words(detection: Any, safe_detection: Any) -> dict[str, Any]:
     return {"sensor": "miss", "sensor.p_d": detection, "sensor.p_s": safe_detection}
 
 
-def _of_task(cfg: WorldConfig) -> dict[str, Any]:
+def of_task(cfg: WorldConfig) -> dict[str, Any]:
     """Costs and limits of a world config, as arguments of `Task`."""
     sensors: dict[str, Any] = make(cfg.sensor, cfg.grid.size)
     # Prices per sensor: how many those are is told to costs that ask for it.

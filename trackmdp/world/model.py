@@ -205,6 +205,11 @@ class Task:
         return self.keys.num_classes > 1
 
     @property
+    def pair_bytes(self) -> int:
+        """Bytes that exact evaluation takes where targets have a mode (`HiddenWorld`)."""
+        return 0
+
+    @property
     def num_keys(self) -> int:
         """Plans of a policy, one for each key."""
         return self.keys.num_keys

@@ -56,6 +56,8 @@ class HiddenWorld(Task):
         super().__init__(size, **(of_task | {"markov": False}))
         if not self.safe:
             raise UserError("kernel: with a hidden mode the safe action must not miss")
+        if self.coverage is not None:
+            raise UserError("kernel: with a hidden mode, expected sensors of one cell each")
         if self.revealed not in (1, modes):
             raise UserError(f"revealed={self.revealed}: expected 1 or {modes}, the modes of the target")
         if self.window is not None or self.max_steps is not None:
@@ -71,6 +73,26 @@ class HiddenWorld(Task):
     def but(self, **changes: Any) -> HiddenWorld:
         """The same motion in a task that differs in `changes`."""
         return HiddenWorld(self.kernel, modes=self.modes, **(self.given | changes))
+
+    @cached_property
+    def pair_bytes(self) -> int:
+        """About what following the target from every pair (key, mode) takes (`trackmdp.solvers.keyed`).
+
+        Counted on 256 hidden states, or all: where the target may be after 1 ... t_max + 2 moves, and the moves there.
+        """
+        start = np.unique(np.linspace(0, self.num_states - 1, 256).astype(np.int64))
+        moves = sparse.csr_array(self.kernel.astype(bool))
+        reached = sparse.csr_array(
+            (np.ones(len(start), dtype=bool), (np.arange(len(start)), start)), shape=(len(start), self.num_states)
+        )
+        fan, places, steps = np.diff(moves.indptr), 0, [0]
+        for _ in range(self.num_choices + 1):
+            steps.append(int(fan[reached.indices].sum()))
+            reached = reached @ moves
+            places += reached.nnz
+        # Measured: 64 bytes a place, 12 a move, and 48 more while the last moves are sorted.
+        pairs = self.num_keys if self.revealed > 1 else self.num_keys * self.modes
+        return int((64 * places + 12 * sum(steps) + 48 * steps[-1]) * pairs / len(start))
 
     @property
     def num_states(self) -> int:

@@ -55,7 +55,7 @@ def run(cfg: SolveConfig, folder: Path, problem: Problem | None = None) -> float
     # After the results are written: the command still ends with the status of an interruption.
     if solution.interrupted:
         raise KeyboardInterrupt
-    if cfg.verify and isinstance(world, World):
+    if cfg.verify:
         from trackmdp.app.commands.verify import show_checks, write_checks  # loads what is about the paper
 
         checks = write_checks(world, 1e-9, folder)

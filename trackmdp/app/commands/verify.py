@@ -13,12 +13,14 @@ from trackmdp.config import VerifyConfig
 from trackmdp.durable import write_json
 from trackmdp.errors import UserError
 from trackmdp.paper import remarks, theorems
+from trackmdp.paper.modes import check_modes
 from trackmdp.paper.theorems import Check
 from trackmdp.solvers import optimal
+from trackmdp.solvers.keyed_search import solve_keys
 from trackmdp.training.display import make_console
-from trackmdp.world.make import build_world
-from trackmdp.world.model import World
-from trackmdp.world.tracks import Problem
+from trackmdp.world.make import make_problem
+from trackmdp.world.modes import HiddenWorld, Modelled
+from trackmdp.world.tracks import Problem, Recorded
 
 __all__ = ["run", "show_checks", "write_checks"]
 
@@ -35,25 +37,32 @@ def run(cfg: VerifyConfig, folder: Path, problem: Problem | None = None) -> floa
     if cfg.grid.max_steps is not None:
         raise UserError(f"grid.max_steps={cfg.grid.max_steps}: theorems are on whole episodes, expected null")
     with console.status("checking the paper's theorems"):
-        world = build_world(cfg) if problem is None else problem
-        assert isinstance(world, World)  # recorded tracks are refused
+        world = make_problem(cfg) if problem is None else problem
+        assert not isinstance(world, Recorded)  # they are refused
         checks = write_checks(world, cfg.tolerance, folder)
     show_checks(console, checks, folder)
     return float(sum(not check.passed for check in checks))
 
 
-def write_checks(world: World, tolerance: float, folder: Path) -> list[Check]:
+def write_checks(world: Modelled, tolerance: float, folder: Path) -> list[Check]:
     """Solve the world, run every check, and write `verification.json`.
 
     Raises:
         UserError: its sensors are not those of the paper's theorems.
     """
-    if world.coverage is not None:
-        raise UserError("sensor=footprint: the paper's theorems are on sensors of one cell; expected perfect or miss")
-    solution = optimal.solve(world, nodes=NODES, tolerance=tolerance)
+    if isinstance(world, HiddenWorld):
+        solution = solve_keys(world)
+        found = check_modes(world, solution, tolerance)
+    else:
+        if world.coverage is not None:
+            raise UserError(
+                "sensor=footprint: the paper's theorems are on sensors of one cell; expected perfect or miss"
+            )
+        solution = optimal.solve(world, nodes=NODES, tolerance=tolerance)
+        found = theorems.check_theorems(world, solution, tolerance)
     if solution.interrupted:
         raise KeyboardInterrupt
-    checks = [*theorems.check_theorems(world, solution, tolerance), *remarks.check_remarks(tolerance)]
+    checks = [*found, *remarks.check_remarks(tolerance)]
     content = {
         "optimum": {"lower": solution.lower, "upper": solution.upper, "certified": solution.certified},
         "tolerance": tolerance,
