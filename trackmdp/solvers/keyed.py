@@ -18,7 +18,7 @@ from trackmdp.machine import free_bytes, gib
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.evaluation import Evaluation, pooled
 from trackmdp.solvers.layers import Layer, reachable
-from trackmdp.solvers.renewal import RenewalSystem, check_length, per_row
+from trackmdp.solvers.renewal import IndexArray, RenewalSystem, check_length, per_row
 from trackmdp.world.model import Array, BoolArray, World
 from trackmdp.world.modes import HiddenWorld
 
@@ -46,17 +46,15 @@ class KeyedPairs:
         self.key = np.repeat(np.arange(keys.num_keys), of_key)
         self.count = len(self.key)
         known = self.key % h if of_key == 1 else np.tile(np.arange(h), keys.num_keys)
-        layers = reachable(world.kernel, keys.cell(self.key) * h + known, world.num_choices + 1)
+        self.state = keys.cell(self.key) * h + known  # the hidden state of each pair
+        layers = reachable(world.kernel, self.state, world.num_choices + 1)
         self.layers: list[Layer] = layers[1:]
         self.stay = [world.stay_probability[layer.cells] for layer in layers]
         self.rows = [layer.rows for layer in layers]
         self.cells, self.following = [], []
         for n, layer in enumerate(self.layers):
-            cell = layer.cells // h
-            self.cells.append(cell)
-            mode = layer.cells % h
-            following = keys.next(self.key[layer.rows], n, cell, mode)
-            self.following.append(following if of_key == 1 else following * h + mode)
+            self.cells.append(layer.cells // h)
+            self.following.append(self.after(self.key[layer.rows], n, layer.cells))
         codes = [self.key[layer.rows] * world.num_cells + cell for layer, cell in zip(self.layers, self.cells)]  # noqa: B905
         found = [np.unique(code, return_inverse=True) for code in codes[:-1]]
         self.groups, self.group = [each[0] for each in found], [each[1] for each in found]
@@ -65,6 +63,12 @@ class KeyedPairs:
         self.first = keys.start(cells, modes) if of_key == 1 else keys.start(cells) * h + modes
         self.start = np.zeros(self.count)
         self.start[self.first.ravel()] = 1.0 / world.num_states
+
+    def after(self, key: IndexArray, misses: int, state: IndexArray) -> IndexArray:
+        """`[E]` pairs after a detection of `state` `[E]`, `misses` after the one that left `key` `[E]`."""
+        h, told = self.world.modes, self.world.revealed > 1
+        following: IndexArray = self.world.keys.next(key, misses, state // h, state % h)
+        return following if told else following * h + state % h
 
     @cached_property
     def chance(self) -> list[Array]:

@@ -97,17 +97,16 @@ def exchanged_pairs(pairs: KeyedPairs, sets: list[BoolArray], value: Array, visi
 
 def _of_pairs(pairs: KeyedPairs, value: Array, visits: Array) -> tuple[Chains, list[IndexArray]]:
     """The searches of all visited keys, and which of the groups of `pairs` theirs are, per step."""
-    world, keys, h = pairs.world, pairs.world.keys, pairs.world.modes
+    world, h = pairs.world, pairs.world.modes
     start = np.flatnonzero(visits > _SEEN)
     # Row k of the search is the k-th key that is visited.
     visited, rows = np.unique(pairs.key[start], return_inverse=True)
-    state = keys.cell(pairs.key[start]) * h + start % h
-    layers = reachable(world.kernel, state, world.num_choices + 1, rows=rows.astype(np.int64))
+    layers = reachable(world.kernel, pairs.state[start], world.num_choices + 1, rows=rows.astype(np.int64))
     steps, worth = [], np.zeros(0)
     owners: list[IndexArray] = []
     for n, layer in enumerate(layers[1:]):
         cell, key = layer.cells // h, visited[layer.rows]
-        worth = world.reward + value[keys.next(key, n, cell) * h + layer.cells % h]
+        worth = world.reward + value[pairs.after(key, n, layer.cells)]
         codes, group = np.unique(key * world.num_cells + cell, return_inverse=True)
         if n < world.num_choices:
             price = world.cost[codes % world.num_cells]
