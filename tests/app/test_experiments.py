@@ -10,7 +10,7 @@ from trackmdp.app.compose import Composer
 from trackmdp.app.sweep.plan import combinations, plan
 from trackmdp.config import conf_dir
 
-RUNS = {"paper": 216, "quality": 12, "pairs": 180, "growth": 40, "learned_kernel": 108, "exchange": 720}
+RUNS = {"paper": 216, "quality": 12, "pairs": 180, "growth": 40, "learned_kernel": 108}
 
 
 def test_these_are_all_experiments() -> None:

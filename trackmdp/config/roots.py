@@ -177,7 +177,7 @@ class BenchmarkConfig(WorldConfig):
     knows_modes: ClassVar[bool] = False
     part: str = option(
         "what is measured",
-        choices=("env", "collector", "train", "size", "handoff", "memory", "peers", "log"),
+        choices=("env", "collector", "train", "size", "handoff", "memory", "peers", "log", "regret", "bracket"),
     )
     seed: int = option("every random draw derives from it", ge=0)
     device: str = option("device of environments and networks", expects="cpu, cuda, cuda:N or auto", pattern=DEVICE)
@@ -190,7 +190,9 @@ class BenchmarkConfig(WorldConfig):
     halos: list[int] = option("`handoff`: cells around a block, besides the default", unit="cells", ge=0)
     # Evaluated while this module is imported, before plugins are: only this package's own algorithms.
     algos: list[str] = option("`memory`: algorithms that train", choices=tuple(GROUPS["algo"]))
-    seeds: list[int] = option("`peers`: seeds that all train with", ge=0)
+    seeds: list[int] = option("`peers`, `regret`: seeds that all train with", ge=0)
+    worlds: list[str] | None = option("`regret`, `bracket`: words that a world's name holds; null for all worlds")
+    nodes: int = option("`regret`, `bracket`: choices that branch and bound looks at", unit="nodes", ge=1)
     peers: str = option(
         "`peers`: folder with the scripts <name>_peer.py to run beside ours",
         expects="the folder of the scripts",

@@ -6,7 +6,7 @@ with one or two cells flipped, is held while the sets after it are chosen anew b
 sweeps go over all of its sets, and what is worth more than the plan at hand, in exact expectation, replaces it.
 
 The candidates of all located cells are worked on together, as columns: `[E, C]` has a row for each entry of a layer (a
-pair of located cell and possible position) and a column for each of the C = 61 candidates of that located cell. With
+pair of located cell and possible position) and a column for each of the C = 33 candidates of that located cell. With
 E_t entries in layer t and Z successors per cell, a sweep over all H = t_max + 1 steps takes 2 C Z (E_0 + ... + E_H-1)
 multiplications, and the candidates of the H - 1 steps take about three sweeps each; E_t is at most M min(Z^t, M). Some
 3 H + 10 arrays of 8 C E bytes are alive at once, E being the largest E_t of a part: located cells are gone through in
@@ -32,7 +32,7 @@ __all__ = ["FLIPPED", "SINGLES", "PlansPart", "exchange", "exchanged", "improve"
 
 MOST_NUMBERS = 2**17
 """Numbers in one array of a part, 1 MB: larger parts leave the caches, and took twice the time."""
-SINGLES, PAIRED = 25, 9
+SINGLES, PAIRED = 12, 7
 """Cells of one set that are flipped alone, and how many of these in pairs: those nearest to the other choice first."""
 LATER_SWEEPS, ALL_SWEEPS = 1, 2
 """Sweeps over the sets after the flip alone, then over all sets. More of the first gained nothing on drifts and walks;

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from trackmdp.app.bench import handoff, log, memory, peers, size, speed
+from trackmdp.app.bench import handoff, log, memory, peers, size, speed, spreading
 from trackmdp.config import BenchmarkConfig
 from trackmdp.durable import write_json
 from trackmdp.training.devices import make_device
@@ -29,6 +29,8 @@ PARTS: dict[str, Callable[[BenchmarkConfig, World, torch.device], Iterable[dict[
     "memory": memory.memory,
     "peers": peers.peers,
     "log": log.log_speed,
+    "regret": spreading.regret,
+    "bracket": spreading.bracket,
 }
 
 
