@@ -31,6 +31,22 @@ def test_joint_credit_learns_sets_of_sensors(algo: str, tmp_path: Path) -> None:
     assert (again.policy.dense() == run.policy.dense()).all()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("sensing", ["all", "chosen"])
+def test_the_kernel_is_learned_from_what_footprints_see(sensing: str) -> None:
+    """Two cells are covered by no sensor: moves to them are told by what is missed, and by the safe action."""
+    kernel = np.full((9, 9), 0.02)
+    kernel[np.arange(9), (np.arange(9) + 1) % 9] = 0.78
+    coverage = discs((3, 3), np.array([(0, 0), (0, 2), (2, 0)]), 1)
+    world = World(kernel, 3, cost=0.2, t_max=1, safe_cost=1.0, coverage=coverage)
+    assert world.coverage is not None
+    assert (world.coverage.degree == 0).sum() == 2
+    run = tm.train(world, "learned_kernel", sensing=sensing, total_frames=20_480, **{"optimal.enabled": False})
+    best = tm.solve(world)
+    regret = (best.lower - run.evaluation.aihtr) / run.evaluation.expected_length
+    assert regret < 0.004
+
+
 def test_a_run_of_other_footprints_is_not_resumed(tmp_path: Path) -> None:
     tm.train(_world(), "a2c", folder=tmp_path, **SHORT)
     other = World.of(_world(), _world().kernel, coverage=np.ones((4, 9)))
@@ -41,7 +57,7 @@ def test_a_run_of_other_footprints_is_not_resumed(tmp_path: Path) -> None:
 def test_algorithms_that_know_no_footprints_say_so_before_anything_is_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for algo in ("hindsight", "learned_kernel", "path_counts"):
+    for algo in ("hindsight", "path_counts"):
         assert main(["train", "sensor=footprint", f"algo={algo}", f"hydra.run.dir={tmp_path / 'run'}"]) != 0
         shown = capsys.readouterr().err
         assert f"algo={algo}: expected one of" in shown

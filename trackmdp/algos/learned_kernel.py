@@ -21,7 +21,7 @@ from trackmdp.policies.explore import RenewedTable
 from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
-from trackmdp.solvers import exchange
+from trackmdp.solvers import exchange, search
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.kernel_estimate import KernelEstimate, ObservedPaths
 from trackmdp.solvers.partition import plan_by_blocks
@@ -96,6 +96,8 @@ class LearnedKernel:
         By blocks, the halo is that of the reach believed.
         """
         world = self._world(kernel)
+        if world.coverage is not None:  # exchange is of cells, not of sensors that cover several
+            return search.solve(world)
         if self.cfg.block is None:
             return exchange.solve(world) if start is None else exchange.improve(world, PolicyTable(self.task, start))
         return plan_by_blocks(world, exchange.solve, self.cfg.block)
@@ -156,8 +158,13 @@ def observed_paths(batch: TensorDictBase, task: Task) -> ObservedPaths:
     # Of the step that ended the path: its history holds the sets of all misses since the detection, wherever the batch
     # began.
     history = batch["action_history"][ended]
-    # Sensors are numbered within the window of the located cell; those outside the grid sense nothing.
     path, miss, sensor = history.nonzero(as_tuple=True)
+    if task.coverage is not None:
+        place = (path * history.shape[1] + miss).cpu().numpy(), sensor.cpu().numpy()
+        shape = (len(start) * history.shape[1], task.total_sensors)
+        sensed = task.coverage.seen(sparse.csr_array((np.ones(len(place[0]), dtype=bool), place), shape=shape))
+        return ObservedPaths(start.cpu().numpy(), misses.cpu().numpy(), sensed, end.cpu().numpy())
+    # Sensors are numbered within the window of the located cell; those outside the grid sense nothing.
     cell = sensor if task.window is None else Window.of(task, history.device).around(start)[path, sensor]
     row, inside = path * history.shape[1] + miss, cell < task.num_cells
     places = (row[inside].cpu().numpy(), cell[inside].cpu().numpy())
@@ -197,5 +204,5 @@ def policy_tensors(policy: PolicyTable) -> dict[str, torch.Tensor] | None:
 def tensors_policy(task: Task, tensors: dict[str, torch.Tensor]) -> Policy:
     """The policy of `policy_tensors`."""
     indices, indptr = (tensors[name].cpu().numpy().copy() for name in ("indices", "indptr"))
-    shape = (task.num_keys * task.num_choices, task.num_cells)
+    shape = (task.num_keys * task.num_choices, task.total_sensors)
     return Policy(task, sparse.csr_array((np.ones(len(indices), dtype=bool), indices, indptr), shape=shape))

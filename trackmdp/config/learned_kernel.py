@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from trackmdp.config.learning import AlgoConfig
-from trackmdp.config.options import choice, option
+from trackmdp.config.options import choice, option, refuse
 
 __all__ = ["LearnedKernelConfig"]
 
@@ -17,6 +17,7 @@ class LearnedKernelConfig(AlgoConfig):
     """Estimate the motion from detections, then plan with the estimate; no networks."""
 
     credit: ClassVar[str | None] = None
+    knows_footprints: ClassVar[bool] = True
     sensing: str = option("all sensors on, or sets chosen by posterior sampling", choices=("all", "chosen"))
     warm_up: int = option("with chosen sets: env steps with all sensors on before them", unit="frames", ge=0)
     prior: float = option(
@@ -49,6 +50,11 @@ class LearnedKernelConfig(AlgoConfig):
     rounds: int = option("EM rounds after each batch", ge=1, le=10**6)
     rounds_at_end: int = option("EM rounds after the last batch", ge=1, le=10**6)
     samples: int = option("kernels drawn for the uncertainty reported", ge=2, le=10**4)
+
+    def check(self, key: str, root: Any) -> None:
+        """Blocks are of cells with a sensor in each."""
+        if self.block is not None and root.sensor.covers:
+            raise refuse(f"{key}.block", self.block, f"null with sensor={root.sensor.name}")
 
     def ignored(self, root: Any) -> dict[str, str]:
         """With all sensors on throughout, nothing comes before chosen sets."""
