@@ -24,8 +24,8 @@ CPU = torch.device("cpu")
 MEMORY = ("kernel=tracks", "kernel.path=t.csv", "algo=path_counts", "task.memory=displacement", "task.clip=1")
 
 
-def learner(task: Recorded, iterations: int = 2) -> PathCounts:
-    cfg = train_config(*MEMORY, "algo.prior=0").algo
+def learner(task: Recorded, iterations: int = 2, prior: str = "0") -> PathCounts:
+    cfg = train_config(*MEMORY, f"algo.prior={prior}").algo
     return PathCounts(task.task, cfg, iterations=iterations, seed=0, device=CPU)  # type: ignore[arg-type]
 
 
@@ -59,9 +59,10 @@ def test_a_path_ends_where_the_target_is_missed() -> None:
     assert [tuple(part) for part in np.split(tracks.cells, tracks.first[1:-1])] == [(0, 1, 2), (1, 2, 5)]
 
 
-def test_it_learns_the_zigzag_from_the_environment() -> None:
+@pytest.mark.parametrize("prior", ["0", "null"])
+def test_it_learns_the_zigzag_from_the_environment(prior: str) -> None:
     task = swept(memory="displacement", clip=1)
-    algorithm = learner(task)
+    algorithm = learner(task, prior=prior)
     figures = algorithm.step(collect(task, algorithm.policy, 20, 20))
     assert replay(task, task.tracks, algorithm.actor).totals[:, 0] == pytest.approx(12 * 0.8)
     assert figures["keys_seen"] > 7

@@ -14,6 +14,7 @@ from trackmdp.config.path_counts import PathCountsConfig
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.solvers.path_counts import plan_keys
+from trackmdp.solvers.path_exchange import choose_plan
 from trackmdp.world.model import Task
 from trackmdp.world.tracks import Tracks
 
@@ -52,7 +53,10 @@ class PathCounts:
         if batch is not None:
             self._paths.extend(batch)
         tracks, cfg = self._paths.tracks(), self.cfg
-        found = plan_keys(self.task, tracks, prior=cfg.prior, discount=cfg.gamma, rounds=cfg.rounds)
+        if cfg.prior is None:
+            found = choose_plan(self.task, tracks, judge=None, discount=cfg.gamma, rounds=cfg.rounds)
+        else:
+            found = plan_keys(self.task, tracks, prior=cfg.prior, discount=cfg.gamma, rounds=cfg.rounds)
         self.actor = as_policy(self.task, found.policy)
         moves = max(len(tracks.cells) - len(tracks), 1)
         return {

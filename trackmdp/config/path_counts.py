@@ -22,7 +22,11 @@ class PathCountsConfig(AlgoConfig):
 
     credit: ClassVar[str | None] = None
     remembers: ClassVar[bool] = True
-    prior: float = option("what is known without the cell counts as much as so many detections", ge=0)
+    prior: float | None = option(
+        "what is known without the cell counts as much as so many detections; null: chosen, as is whether plans are "
+        "improved by exchange, by a quarter of the paths, which then count as well",
+        ge=0,
+    )
     gamma: float = option("discount inside the credit; policies are evaluated undiscounted", ge=0, le=1)
     rounds: int = option("rounds of policy iteration after each batch at most", ge=1)
 

@@ -21,7 +21,7 @@ from trackmdp.solvers.renewal import IndexArray, per_row
 from trackmdp.world.model import Array, BoolArray, Task
 from trackmdp.world.tracks import Tracks
 
-__all__ = ["AlongPaths", "Paths", "Planned", "plan_keys"]
+__all__ = ["AlongPaths", "Paths", "Planned", "plan_keys", "plan_paths"]
 
 _UNVISITED = 0.01
 """Weight of a state that the policy does not get to on its path: it shows what follows a key that is rare, but not as
@@ -58,7 +58,12 @@ def plan_keys(task: Task, tracks: Tracks, *, prior: float, discount: float, roun
         discount: γ of the credit.
         rounds: at most so many.
     """
-    paths = Paths(task, tracks)
+    return plan_paths(Paths(task, tracks), prior=prior, discount=discount, rounds=rounds)
+
+
+def plan_paths(paths: Paths, *, prior: float, discount: float, rounds: int) -> Planned:
+    """See `plan_keys`."""
+    task = paths.task
     # The first round is myopic: a detection is worth r, and nothing follows from it.
     gain = np.full((task.num_choices, paths.states), task.reward)
     best = _Counted(paths, gain, np.ones(paths.states), prior)

@@ -1,0 +1,98 @@
+"""Exchange on recorded paths against brute force, and the choice of a plan by paths that were not counted."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from tests.tracks import by_hand, recorded
+from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers.path_counts import Paths, plan_keys
+from trackmdp.solvers.path_exchange import _on_paths, _parted, choose_plan, exchanged_keys
+from trackmdp.solvers.recorded import replay
+from trackmdp.world.tracks import Recorded, Tracks
+
+
+def line_walks(seed: int, count: int = 12) -> Tracks:
+    """Paths on the cells 0 and 1 whose next cell depends on the last two."""
+    rng, tracks = np.random.default_rng(seed), []
+    chance = rng.random((2, 2))
+    for _ in range(count):
+        cells = [0, 1]
+        for _ in range(10):
+            cells.append(int(rng.random() < chance[cells[-2], cells[-1]]))
+        tracks.append(cells)
+    return by_hand(*tracks, exits=False)
+
+
+def earned(paths: Paths, plan: np.ndarray, states: np.ndarray, value: np.ndarray, discount: float) -> float:
+    """What a plan `[2, M]` earns after the states of a key up to the next detection, and `value` from there on."""
+    task, total = paths.task, 0.0
+    for state in states:
+        for n in range(3):
+            if not paths.inside[n, state]:
+                break
+            forced, cell = n == 2, paths.cells[n, state]
+            total -= discount**n * (task.safe_cost if forced else task.cost @ plan[n])
+            if forced or plan[n, cell]:
+                total += discount**n * (task.reward + discount * value[paths.following[n, state]])
+                break
+    return total
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("first", [False, True])
+def test_a_round_finds_the_best_plan_of_each_key(seed: int, first: bool) -> None:
+    """t_max = 1 on two cells: 16 plans for either, what follows a detection being that of the policy before."""
+    tracks = line_walks(seed)
+    task = Recorded(tracks, (1, 2), validation=tracks, held_out=tracks, cost=0.4, safe_cost=0.6, t_max=1)
+    paths, policy = Paths(task, tracks), PolicyTable.from_dense(task, np.full((2, 2, 2), first))
+    followed = paths.follow(*_on_paths(paths, policy), 0.9)
+    found = exchanged_keys(paths, policy, followed, 0.9, 1).dense()
+    plans = np.array(list(itertools.product([False, True], repeat=4))).reshape(16, 2, 2)
+    for key in range(2):
+        states = np.flatnonzero(followed.visited & (paths.key == key))
+        best = max(earned(paths, plan, states, followed.value, 0.9) for plan in plans)
+        assert earned(paths, found[key], states, followed.value, 0.9) == pytest.approx(best)
+
+
+def test_rare_keys_keep_their_plans() -> None:
+    task = recorded(line_walks(1), memory="displacement", clip=1)
+    paths, policy = Paths(task, task.tracks), PolicyTable.from_dense(task, np.zeros((90, 2, 9), dtype=bool))
+    followed = paths.follow(*_on_paths(paths, policy), 0.9)
+    assert exchanged_keys(paths, policy, followed, 0.9, 10**6) is policy
+    assert exchanged_keys(paths, policy, followed, 0.9, 1).dense().any()
+
+
+def test_a_recording_that_was_followed_twice_is_in_one_part() -> None:
+    tracks = line_walks(2, count=40)
+    cells = np.split(tracks.cells, tracks.first[1:-1])
+    twice = by_hand(*(list(each) for each in [*cells, *cells]), exits=False)
+    task = recorded(twice)
+    learned, judged = _parted(task, twice)
+    assert learned is not None
+    assert judged is not None
+    counts = {tuple(each) for each in np.split(judged.cells, judged.first[1:-1])}
+    assert 0 < len(judged) < 40
+    assert len(judged) == sum(2 for each in cells if tuple(each) in counts)
+
+
+def test_the_choice_is_the_one_that_earns_most_where_it_is_judged() -> None:
+    """Of what is tried, weights 3, 10 and 30 and then exchange, none earns more on the paths that judge."""
+    tracks, judge = line_walks(5, count=30), line_walks(5, count=31).select(np.arange(31) > 20)
+    task = recorded(tracks, memory="displacement", clip=1)
+    found = choose_plan(task, tracks, judge=judge, discount=1.0, rounds=5)
+    for prior in (3.0, 10.0, 30.0):
+        other = plan_keys(task, tracks, prior=prior, discount=1.0, rounds=5)
+        assert (
+            replay(task, judge, found.policy).totals[:, 0].sum() >= replay(task, judge, other.policy).totals[:, 0].sum()
+        )
+
+
+def test_where_all_paths_are_one_there_is_nothing_to_choose_by() -> None:
+    tracks = by_hand(*[[0, 1, 2, 1]] * 8, exits=False)
+    task = recorded(tracks)
+    found = choose_plan(task, tracks, judge=None, discount=0.9, rounds=5)
+    assert (found.policy.dense() == plan_keys(task, tracks, prior=10.0, discount=0.9, rounds=5).policy.dense()).all()

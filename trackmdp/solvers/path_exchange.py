@@ -1,0 +1,170 @@
+"""Exchange on recorded paths: plans of keys that only change well together, found on what followed each key.
+
+Policy iteration on the counts (`path_counts`) changes one set of a plan given the others, and stops where two would
+have to change together. Here a key's recorded ways on are a tree: after each miss, where the target then was and how
+often. Exchange searches whole plans on the trees of all keys that came often enough (`keyed_exchange`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy import sparse
+
+from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers.keyed_exchange import Chains, ChainStep, exchange_chains
+from trackmdp.solvers.path_counts import AlongPaths, Paths, Planned, plan_paths
+from trackmdp.solvers.renewal import IndexArray, per_row
+from trackmdp.world.model import Array, BoolArray, Task
+from trackmdp.world.tracks import Tracks
+
+__all__ = ["choose_plan", "exchanged_keys"]
+
+PRIORS = (3.0, 10.0, 30.0)
+"""Weights of what keys share that are tried."""
+_LEAST = 100
+"""Detections of a key from which its plan is searched by exchange: plans of rarer keys would follow chance."""
+_ROUNDS = 4
+_JUDGED = 4
+"""One path in so many judges, where no others are there for it."""
+
+_OUT_OF_VIEW = 1e18
+"""Price of a sensor beyond the window: none is worth it, and times no mass it is still nothing."""
+
+
+def choose_plan(task: Task, tracks: Tracks, *, judge: Tracks | None, discount: float, rounds: int) -> Planned:
+    """A plan with the weight of what keys share, and with exchange or not, as paths say that were not counted.
+
+    Args:
+        task: prices, limits and memory.
+        tracks: the paths; what was chosen is planned again on all of them.
+        judge: paths to choose by; None for a part of `tracks`, which then does not count until all is chosen.
+        discount: γ of the credit.
+        rounds: of policy iteration at most.
+    """
+    whole = Paths(task, tracks)
+    learned, judged = (whole, judge) if judge is not None else _parted(task, tracks)
+    if learned is None or judged is None or not len(judged):  # nothing to choose by
+        return plan_paths(whole, prior=PRIORS[1], discount=discount, rounds=rounds)
+    paths = Paths(task, judged)
+
+    def score(plan: Planned) -> float:
+        return paths.follow(*_on_paths(paths, plan.policy), discount).reward
+
+    plans = [plan_paths(learned, prior=prior, discount=discount, rounds=rounds) for prior in PRIORS]
+    scores = [score(plan) for plan in plans]
+    best = int(np.argmax(scores))
+    other = _searched(learned, plans[best], discount)
+    exchange = score(other) > scores[best]
+    if learned is whole:
+        return other if exchange else plans[best]
+    final = plan_paths(whole, prior=PRIORS[best], discount=discount, rounds=rounds)
+    return _searched(whole, final, discount) if exchange else final
+
+
+def _parted(task: Task, tracks: Tracks) -> tuple[Paths | None, Tracks | None]:
+    """Paths to count on and paths to judge by; a recorded path that was followed several times is in one part alone."""
+    # Wherever a path began, it ends as its recording does: the last cells say which one it was.
+    last, code = tracks.first[1:] - 1, np.zeros(len(tracks), dtype=np.uint64)
+    for back in range(8):
+        at = np.maximum(last - back, tracks.first[:-1])
+        code = (
+            code * np.uint64(6364136223846793005) + tracks.cells[at].astype(np.uint64) + np.uint64(1442695040888963407)
+        )
+    judged: BoolArray = (code >> np.uint64(33)) % np.uint64(_JUDGED) == 0
+    if judged.all() or not judged.any():
+        return None, None
+    return Paths(task, tracks.select(~judged)), tracks.select(judged)
+
+
+def _searched(paths: Paths, plan: Planned, discount: float) -> Planned:
+    """Rounds of exchange from `plan`, as long as the paths earn more."""
+    followed = paths.follow(*_on_paths(paths, plan.policy), discount)
+    for _ in range(_ROUNDS):
+        policy = exchanged_keys(paths, plan.policy, followed, discount, _LEAST)
+        followed = paths.follow(*_on_paths(paths, policy), discount)
+        if followed.reward <= plan.reward:
+            break
+        plan = replace(plan, policy=policy, reward=followed.reward, rounds=plan.rounds + 1)
+    return plan
+
+
+def exchanged_keys(paths: Paths, policy: PolicyTable, followed: AlongPaths, discount: float, least: int) -> PolicyTable:
+    """One round: the plans of keys that `policy` came by `least` times or more, on what followed them.
+
+    Args:
+        paths: all states of the recorded paths.
+        policy: deterministic.
+        followed: what it earns on the paths.
+        discount: γ of the credit.
+        least: keys that came less often keep their plans.
+    """
+    arrived = np.bincount(paths.of_seen[followed.visited], minlength=len(paths.seen))
+    often = np.flatnonzero(arrived >= least)
+    if policy.sets is None or not len(often):
+        return policy
+    chains, owners = _trees(paths, followed, often, discount)
+    keys, m = paths.seen[often], paths.task.num_cells
+    before = [policy.on(n, keys[owner // m], owner % m) > 0 for n, owner in enumerate(owners)]
+    found = exchange_chains(chains, before)
+    # The rows of these keys are replaced, those of all others stay.
+    choices = paths.task.num_choices
+    parts = [(keys[o[on] // m] * choices + n, o[on] % m) for n, (o, on) in enumerate(zip(owners, found, strict=True))]
+    rows, cells = (np.concatenate(each) for each in zip(*parts, strict=True))
+    kept = np.ones(policy.sets.shape[0])
+    kept[(keys[:, None] * choices + np.arange(choices)).ravel()] = 0.0
+    new = sparse.csr_array((np.ones(len(rows)), (rows, cells)), shape=policy.sets.shape)
+    table = sparse.csr_array(sparse.diags_array(kept).tocsr() @ policy.sets.astype(np.float64) + new)
+    table.eliminate_zeros()
+    return PolicyTable(paths.task, table.astype(bool))
+
+
+def _trees(paths: Paths, followed: AlongPaths, keys: IndexArray, discount: float) -> tuple[Chains, list[IndexArray]]:
+    """What followed `keys` (places among those seen), and per step the groups' codes row · M + cell.
+
+    Example: after a key the target was twice in 4 then 5, once in 4 then 6, and once in 7: the first step has the
+    entries 4 and 7 with mass 3 and 1, the second 5, 6 and 8 (say) with 2, 1 and 1; 4 moves to 5 with 2/3.
+    """
+    task, m = paths.task, paths.task.num_cells
+    number = np.full(len(paths.seen), -1)
+    number[keys] = np.arange(len(keys))
+    at = np.flatnonzero(followed.visited & (number[paths.of_seen] >= 0))
+    row = number[paths.of_seen[at]]
+    count = np.bincount(row, minlength=len(keys)).astype(np.float64)
+    entry, mass, steps, owners = row, count, [], []
+    for n in range(task.num_choices):
+        there = paths.inside[n, at]
+        at, row, entry = at[there], row[there], entry[there]
+        cell = paths.cells[n, at]
+        # Entries stay in order of their rows: a code begins with the entry before, and that with its row.
+        codes, now = np.unique(entry * m + cell, return_inverse=True)
+        before, arrived = codes // m, np.bincount(now, minlength=len(codes)).astype(np.float64)
+        # A miss costs a factor γ, as in `Paths.follow`: the move after it carries it.
+        weight = arrived / mass[before] * (discount if n else 1.0)
+        moves = sparse.csr_array((weight, (before, np.arange(len(codes)))), shape=(len(mass), len(codes)))
+        worth = task.reward + discount * followed.value[paths.following[n, at]]
+        rows = np.zeros(len(codes), dtype=np.int64)
+        rows[now] = row
+        owner, group = np.unique(rows * m + codes % m, return_inverse=True)
+        price = np.zeros(len(owner))
+        price[group[now]] = np.minimum(paths.price[n, at], _OUT_OF_VIEW)
+        steps.append(
+            ChainStep(rows, moves, per_row(now, worth, len(codes)) / arrived, np.ones(len(codes)), group, price)
+        )
+        owners.append(owner)
+        entry, mass = now, arrived
+    forced = task.reward + discount * followed.value[paths.following[-1, at]] - task.safe_cost
+    missed = discount * per_row(entry, paths.inside[-1, at] * forced, len(mass)) / mass
+    return Chains(np.arange(len(keys)), count, steps, missed), owners
+
+
+def _on_paths(paths: Paths, policy: PolicyTable) -> tuple[BoolArray, Array]:
+    """`[T+1, S]` whether a policy's plans sense the target, and what its sets cost."""
+    shape = (paths.task.num_choices, paths.states)
+    hits, spent = np.zeros(shape, dtype=bool), np.zeros(shape)
+    for n in range(paths.task.num_choices):
+        there = np.flatnonzero(paths.inside[n])
+        hits[n, there] = policy.on(n, paths.key[there], paths.cells[n, there]) > 0
+        spent[n] = policy.spent(n, paths.task.cost)[paths.key]
+    return hits, spent
