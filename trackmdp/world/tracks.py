@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -125,6 +125,7 @@ class Recorded(Task):
         memory: str = "cell",
         clip: int = 2,
         revealed: int = 1,
+        coverage: Any = None,
         loaded: Mapping[str, int] | None = None,
     ) -> None:
         super().__init__(
@@ -140,6 +141,7 @@ class Recorded(Task):
             markov=markov,
             memory=memory,
             clip=clip,
+            coverage=coverage,
             revealed=revealed,
         )
         parts = {"tracks": tracks, "validation": validation, "held_out": held_out}
