@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from trackmdp.reports.grouping import Study
-from trackmdp.reports.style import INK, LOOKS, Figure, draw_figure, legend, look_of, tidy
+from trackmdp.reports.labels import label_lines
+from trackmdp.reports.style import INK, LOOKS, PAGE, Figure, Look, draw_figure, looks_of, tidy
 from trackmdp.reports.summaries import estimate_cells, estimate_columns
 from trackmdp.reports.tables import Cell, Column, Table
 from trackmdp.statistics import MeanInterval, mean_over_groups
@@ -70,11 +71,13 @@ def against_cost(study: Study, panel: Panel) -> Figure:
     # would become one line.
     split = axis_break([e.mean for row in learned.values() for e in row] + [v for row in exact.values() for v in row])
 
+    looks = looks_of(study.methods)
+
     def paint(figure: Canvas) -> None:
         # The upper part, where the methods differ, gets four fifths of the height.
         split_axes = figure.subplots(2, 1, sharex=True, height_ratios=[4, 1]) if split else [figure.subplots()]
         for axes in split_axes:
-            _learned_lines(axes, panel, learned)
+            _learned_lines(axes, panel, learned, looks)
             for label, values in exact.items():
                 style = LOOKS[label]
                 axes.plot(panel.costs, values, style.line, marker=style.marker, color=style.colour, label=label, lw=1.1)
@@ -85,7 +88,7 @@ def against_cost(study: Study, panel: Panel) -> Figure:
         split_axes[-1].set_xlabel("c, price of a sensor for one step")
         # Ticks at the prices that were run: between them nothing was measured.
         split_axes[-1].set_xticks(panel.costs)
-        legend(figure, split_axes[0], first=list(learned))
+        label_lines(figure, split_axes, first=list(learned))
 
     table = _cost_table(panel, learned, exact, "aihtr", "AIHTR", digits=3)
     text = _spoken(panel, learned, exact, digits=1) + (
@@ -100,25 +103,28 @@ def regret_against_cost(study: Study, panel: Panel, threshold: float | None) -> 
     learned = _estimates(study, panel, regret=True)
     exact = {"Q_MDP": [_qmdp_regret(study, world) for world in panel.worlds]}
 
+    looks = looks_of(study.methods)
+
     def paint(figure: Canvas) -> None:
         axes = figure.subplots()
         # Interval ends are cut at the floor as well: one at or below zero would vanish from a logarithmic axis.
-        _learned_lines(axes, panel, learned, floor=FLOOR)
+        _learned_lines(axes, panel, learned, looks, floor=FLOOR)
         style = LOOKS["Q_MDP"]
         axes.plot(
             panel.costs, np.maximum(exact["Q_MDP"], FLOOR), style.line, marker="x", color=style.colour, label="Q_MDP"
         )
         if threshold is not None:
-            axes.axhline(threshold, color=INK, linewidth=0.6, linestyle=(0, (1, 2)))
-            at, where = (1.01, threshold), ("axes fraction", "data")
-            # x in parts of the axes, y in data: right of the frame, at the height of the line.
-            axes.annotate(f"{threshold:g}", at, xycoords=where, va="center", clip_on=False)
+            axes.axhline(threshold, color=INK, linewidth=0.6, linestyle=(0, (1, 2)), zorder=1)
+            at, where = (0.01, threshold), ("axes fraction", "data")
+            # x in parts of the axes, y in data: on the left, on the line; the names of the lines stand on the right.
+            free = {"facecolor": PAGE, "edgecolor": "none", "pad": 0.4}
+            axes.annotate(f"{threshold:g}", at, xycoords=where, va="center", bbox=free, zorder=1)
         axes.set_yscale("log")
         axes.set_ylabel("regret per step")
         axes.set_xlabel("c, price of a sensor for one step")
         axes.set_xticks(panel.costs)
         tidy(axes)
-        legend(figure, axes, first=list(learned))
+        label_lines(figure, [axes], first=list(learned))
 
     table = _cost_table(panel, learned, exact, "regret", "regret per step", digits=5)
     title = f"Regret per step to the proved upper bound, {panel.title}; {_n_text(learned)}"
@@ -151,13 +157,17 @@ def _qmdp_regret(study: Study, world: str) -> float:
 
 
 def _learned_lines(
-    axes: Axes, panel: Panel, learned: Mapping[str, Sequence[MeanInterval]], floor: float = -math.inf
+    axes: Axes,
+    panel: Panel,
+    learned: Mapping[str, Sequence[MeanInterval]],
+    looks: Mapping[str, Look],
+    floor: float = -math.inf,
 ) -> None:
     """Lines with error bars, a little apart so that the bars can be told from each other."""
     # 4 % of the smallest distance of two prices: error bars stand side by side, and still over their price.
     step = min(np.diff(panel.costs), default=0.02) * 0.04
     for place, (method, row) in enumerate(learned.items()):
-        style = look_of(method, place)
+        style = looks[method]
         x = np.asarray(panel.costs) + step * (place - (len(learned) - 1) / 2)
         mean = np.maximum([e.mean for e in row], floor)
         # No interval (fewer than three seeds): a bar of length zero, which is only the point.

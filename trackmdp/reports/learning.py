@@ -10,8 +10,9 @@ import numpy as np
 
 from trackmdp.reports.figures import FLOOR
 from trackmdp.reports.grouping import Study
+from trackmdp.reports.labels import label_lines
 from trackmdp.reports.results import CurvePoint, FinishedRun
-from trackmdp.reports.style import INK, Figure, draw_figure, legend, look_of, tidy
+from trackmdp.reports.style import INK, Figure, draw_figure, legend, looks_of, tidy
 from trackmdp.reports.summaries import estimate_cells, estimate_columns
 from trackmdp.reports.tables import Cell, Column, Table
 from trackmdp.statistics import MeanInterval, mean_over_groups, share
@@ -29,12 +30,13 @@ def curves(study: Study, points: Mapping[str, Sequence[CurvePoint]], by: str) ->
     found = {method: curve for method, curve in averaged.items() if curve is not None}
     if not found:
         return None
+    looks = looks_of(study.methods)
     unit = {"frames": "env steps", "seconds": "wall seconds of learning"}[by]
 
     def paint(figure: Canvas) -> None:
         axes = figure.subplots()
-        for place, (method, (grid, row)) in enumerate(found.items()):
-            style = look_of(method, place)
+        for method, (grid, row) in found.items():
+            style = looks[method]
             mean = np.maximum([e.mean for e in row], FLOOR)
             # A marker at every sixth position, so that curves are told apart without colours as well.
             axes.plot(grid, mean, style.line, color=style.colour, label=method, marker=style.marker, markevery=6)
@@ -47,7 +49,7 @@ def curves(study: Study, points: Mapping[str, Sequence[CurvePoint]], by: str) ->
         axes.set_xlabel(unit)
         axes.set_ylabel("regret per step")
         tidy(axes)
-        legend(figure, axes)
+        label_lines(figure, [axes], first=list(found))
 
     columns = [Column("method"), Column(unit, 1 if by == "seconds" else 0)]
     columns += [*estimate_columns("regret per step", 5), Column("n")]
@@ -95,11 +97,13 @@ def profiles(study: Study, threshold: float | None) -> Figure | None:
     levels = np.geomspace(1e-4, max(1.0, 1.05 * max(values.max() for values in regrets.values())), 60)
     found = {m: [share(int((values <= level).sum()), len(values)) for level in levels] for m, values in regrets.items()}
 
+    looks = looks_of(study.methods)
+
     def paint(figure: Canvas) -> None:
         axes = figure.subplots()
-        for place, (method, row) in enumerate(found.items()):
-            style, label = look_of(method, place), f"{method} (n = {row[0].n})"
-            axes.plot(levels, [e.mean for e in row], style.line, color=style.colour, label=label)
+        for method, row in found.items():
+            style = looks[method]
+            axes.plot(levels, [e.mean for e in row], style.line, color=style.colour, label=method)
             if row[0].low is not None:
                 # Clopper-Pearson intervals, one for each level: no joint band of the whole curve.
                 low, high = [e.low or 0.0 for e in row], [e.high or 0.0 for e in row]
@@ -111,7 +115,7 @@ def profiles(study: Study, threshold: float | None) -> Figure | None:
         axes.set_xlabel("τ, regret per step")
         axes.set_ylabel("share of runs with regret ≤ τ")
         tidy(axes)
-        legend(figure, axes, columns=2)
+        legend(figure, axes, columns=2)  # all profiles end at 1: there is no end to write a name at
 
     counts = ", ".join(f"{method} n = {len(values)}" for method, values in regrets.items())
     title = f"Performance profiles: share of runs whose regret per step is at most τ, with 95 % interval; {counts}"

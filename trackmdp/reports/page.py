@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any, TypeAlias, TypeGuard
 
-from trackmdp.reports import figures, learning, maps, summaries
+from trackmdp.reports import figures, idea, learning, maps, summaries
 from trackmdp.reports.grouping import Study, study
 from trackmdp.reports.results import Results
 from trackmdp.reports.style import Figure
@@ -116,6 +116,7 @@ def build(
         outcome.append(f"<p>Fewer env steps than the algorithm's own options give it: {said}.</p>")
     sections = [Section("outcome", "Outcome", outcome)]
     sections += [missing] if results.anomalies else []
+    sections += _idea(results, grouped)
     sections += [*_against_cost(grouped, threshold), *_learning(results, grouped, threshold), *_maps(results, grouped)]
     by_group = Folded("By world and method", summaries.groups_table(grouped, threshold))
     runs = Section("runs", "All runs", [by_group, Folded("Every run", summaries.runs_table(grouped))])
@@ -170,6 +171,18 @@ def _learning(results: Results, grouped: Study, threshold: float | None) -> list
     drawn = [learning.curves(grouped, results.curves, by) for by in ("frames", "seconds")]
     shown = [figure for figure in (*drawn, learning.profiles(grouped, threshold)) if figure]
     return [Section("learning", "Learning curves and profiles", [shown])] if shown else []
+
+
+def _idea(results: Results, grouped: Study) -> list[Section]:
+    """An example of a miss, by the first policy that is kept and allows for one."""
+    methods = [(world, method) for world in grouped.worlds for method in grouped.methods]
+    every = ((world, method, run) for world, method in methods for run in grouped.of(world, method))
+    for world, method, run in every:
+        if run.name in results.policies and run.name in results.motions:
+            size, where = grid_size(run.settings["grid.size"]), f"{method}, {world}, seed {run.seed}"
+            if drawn := idea.idea_figure(results.policies[run.name], results.motions[run.name], size, where):
+                return [Section("idea", "Why few sensors are enough", [[drawn]])]
+    return []
 
 
 def _maps(results: Results, grouped: Study) -> list[Section]:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:  # an extra, and a second to import
 __all__ = [
     "INK",
     "LINE",
+    "PAGE",
     "PALETTE",
     "TEXT",
     "Figure",
@@ -28,7 +29,7 @@ __all__ = [
     "Say",
     "draw_figure",
     "legend",
-    "look_of",
+    "looks_of",
     "require_matplotlib",
     "tidy",
 ]
@@ -55,6 +56,11 @@ PALETTE = {
     "#a87900": "amber",
     "#2a93c9": "sky",
     "#7a3e00": "brown",
+    "#6a3fb5": "violet",
+    "#b3123f": "crimson",
+    "#0d7f86": "teal",
+    "#667700": "olive",
+    "#d1368a": "pink",
     "#dcebf4": "pale",
 }
 """Colours of the files, and their names in the style sheet of the page, where they change with the scheme."""
@@ -81,12 +87,14 @@ LOOKS = {
     "learned_kernel": Look("#2a93c9", "v"),
     "Q_MDP": Look("#5c5c5d", "x", "--"),
     "printed bound": Look("#a87900", "", ":"),
-    "valid bound": Look("#5c5c5d", "", ":"),
+    "valid bound": Look("#667700", "", ":"),
     "clocked bound": Look("#7a3e00", "", "-."),
     "optimum": Look(INK, "+", "-"),
 }
-# For labels that are not listed, as of one algorithm with several options.
-_MORE = [Look(colour, marker, "--") for marker in "Pp*h<>" for colour in ("#d55e01", "#0072b2", "#00845c", "#b0518c")]
+# For labels that are not listed, as of one algorithm with several options: first the colours that no list has, then
+# those of methods that are not there.
+_METHODS = ("a2c", "hindsight", "ppo", "dqn", "learned_kernel")
+_SPARE = ("#6a3fb5", "#b3123f", "#0d7f86", "#d1368a", *(LOOKS[name].colour for name in _METHODS))
 
 
 @dataclass(frozen=True)
@@ -125,9 +133,16 @@ def require_matplotlib() -> None:
         raise UserError("report: drawing takes matplotlib, expected the extra trackmdp[report] installed") from error
 
 
-def look_of(label: str, place: int) -> Look:
-    """The look of a label: its own in `LOOKS`, else the `place`-th of a list of further ones."""
-    return LOOKS.get(label) or _MORE[place % len(_MORE)]
+def looks_of(labels: Sequence[str]) -> dict[str, Look]:
+    """The look of each label: its own in `LOOKS`, else one whose colour no other has, as long as colours last."""
+    taken = {LOOKS[label].colour for label in labels if label in LOOKS}
+    free = [colour for colour in _SPARE if colour not in taken] or list(_SPARE)
+    others = [label for label in labels if label not in LOOKS]
+    found = {
+        label: Look(free[place % len(free)], "Pp*h<>"[place % 6], "--" if place < len(free) else ":")
+        for place, label in enumerate(others)
+    }
+    return {label: LOOKS.get(label) or found[label] for label in labels}
 
 
 @contextmanager
