@@ -71,7 +71,12 @@ POPULATIONS: dict[str, tuple[Draw, float]] = {
 @pytest.mark.parametrize("name", POPULATIONS)
 @pytest.mark.parametrize("worlds", [1, 12])
 def test_intervals_over_seeds_cover(worlds: int, name: str, count: int) -> None:
-    """At least .93 of 4,000 samples, less twice the error of the simulation, .004."""
+    """At least .93 of 4,000 samples, less twice the error of the simulation, .004.
+
+    Of 40,000 samples (s.e. .001) one world's intervals covered, at n = 3, 5, 10: normal .950, .951, .949; skewed .936,
+    .932, .939; flat **.922**, .934, .947, the only one below .93. Twelve worlds together
+    (20,000, s.e. .0015): .945 to .958.
+    """
     draw, mean = POPULATIONS[name]
     scales, rng, hits = np.geomspace(1, 50, worlds), np.random.default_rng(0), 0
     for _ in range(4000):
@@ -133,7 +138,10 @@ def test_events_that_were_never_seen_may_happen_all_the_same() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("tracks", [25, 100])
 def test_intervals_over_tracks_cover(tracks: int) -> None:
-    """Tracks of 30 steps on average; how often the target is missed differs between them, and rarely it takes D."""
+    """Tracks of 30 steps on average; how often the target is missed differs between them, and rarely it takes D.
+
+    Of 4,000 samples (s.e. .0035): missed .941, .944, safe actions .957, .956, reward .943, .945 at 25 and 100 tracks.
+    """
     rng, trials = np.random.default_rng(2), 1000
     hits = dict.fromkeys(["missed", "safe", "reward"], 0)
 

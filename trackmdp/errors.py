@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
+from pathlib import Path
 
-__all__ = ["FAILED", "INTERRUPTED", "USER_MISTAKE", "Preempted", "RunError", "UserError", "require"]
+__all__ = ["FAILED", "INTERRUPTED", "USER_MISTAKE", "Preempted", "RunError", "UserError", "adding", "require"]
 
 FAILED, USER_MISTAKE, INTERRUPTED = 1, 2, 130
 """Exit statuses of a command: a bug or a run that broke down, a user's mistake, Ctrl-C."""
@@ -37,6 +38,16 @@ class Preempted(BaseException):
         self.signal = signal
 
 
+def adding(extra: str) -> str:
+    """The line that installs an extra: in the clone that this package is imported from, or by the package's name."""
+    clone = Path(__file__).parents[1]
+    return (
+        f"pip install -e '{clone}[{extra}]'"
+        if (clone / "pyproject.toml").is_file()
+        else f"pip install 'trackmdp[{extra}]'"
+    )
+
+
 def require(module: str, extra: str, option: str) -> None:
     """Refuse `option` where the third-party `module`, which comes with the extra `trackmdp[extra]`, is not installed.
 
@@ -44,4 +55,4 @@ def require(module: str, extra: str, option: str) -> None:
         UserError: it is not.
     """
     if importlib.util.find_spec(module) is None:
-        raise UserError(f"{option}: needs {module}, which pip install 'trackmdp[{extra}]' adds")
+        raise UserError(f"{option}: needs {module}, which {adding(extra)} adds")

@@ -1,12 +1,14 @@
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 
 from tests.algos.hindsight import SHORT, assert_it_learns, assert_same, batches, learn, policy
-from tests.helpers import algorithm, small_world
-from trackmdp.algos.hindsight import _within
+from tests.helpers import algorithm, small_world, train_config
+from trackmdp.algos.hindsight import _within, budget
 from trackmdp.errors import UserError
 from trackmdp.solvers import bounds
 from trackmdp.solvers.evaluate import evaluate
@@ -42,6 +44,25 @@ def test_learns_once_the_frames_are_in() -> None:
     assert [row["updates"] for row in figures] == [0] * 16
     assert learner.iterations == 16 + 3
     assert [learner.step(None)["updates"] for _ in range(3)] == [10, 20, 30]
+
+
+@pytest.mark.parametrize(
+    ("words", "t_max", "expected"),
+    [
+        ((), 2, 100),
+        ((), 3, 800),  # 400 rows
+        (("algo.exchange=false",), 2, 500),
+        (("algo.collect=mixed",), 2, 500),
+        (("algo.updates=7",), 2, 7),
+    ],
+)
+def test_few_updates_are_enough_where_exchange_follows(words: tuple[str, ...], t_max: int, expected: int) -> None:
+    assert budget(Task(10, cost=0.1, t_max=t_max), train_config(*words).algo)[0] == expected
+
+
+@pytest.mark.parametrize("more", [{"markov": False}, {"detection": 0.9}, {"window": 2}])
+def test_where_few_were_not_tried_updates_stay_as_many(more: dict[str, Any]) -> None:
+    assert budget(Task(10, cost=0.1, t_max=2, **more), train_config().algo)[0] == 500
 
 
 def test_a_target_that_goes_farther_than_the_nets_see_is_gone() -> None:

@@ -179,7 +179,7 @@ def test_in_the_page_a_figure_has_a_text_alternative_and_the_colours_of_the_page
 
 def test_without_matplotlib_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(UserError, match=r"trackmdp\[report\]"):
+    with pytest.raises(UserError, match=r"pip install .*\[report\]"):
         style.require_matplotlib()
 
 

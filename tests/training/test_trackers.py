@@ -14,7 +14,7 @@ from tests.training.runs import at_iteration, rows, train
 from tests.training.test_log_resume import Killed, killed
 from trackmdp.app.cli import main
 from trackmdp.config import load_run_config, to_dict
-from trackmdp.errors import UserError
+from trackmdp.errors import UserError, adding
 from trackmdp.training.run import load_run
 from trackmdp.training.train import train as train_in_python
 from trackmdp.world.make import make_world
@@ -119,7 +119,7 @@ def test_a_missing_package_is_one_line_and_leaves_no_folder(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda module: None)
-    message = f"log=[{name}]: needs {name}, which pip install 'trackmdp[{name}]' adds"
+    message = f"log=[{name}]: needs {name}, which {adding(name)} adds"
     assert main(["train", f"log=[csv,{name}]", f"hydra.run.dir={tmp_path / 'a'}"]) == 2
     assert capsys.readouterr().err == f"trackmdp train: {message}\n"
     with pytest.raises(UserError) as caught:

@@ -48,7 +48,9 @@ class PerSensorConfig(AlgoConfig):
     blend: ScheduleConfig
     ema_decay: float = option("decay of the exponential moving average of the actor, which is evaluated", ge=0, lt=1)
     batch_size: int = option("path segments per update", unit="segments", ge=1)
-    updates: int | None = option("updates of the whole run; null: by the size of the problem", ge=1, le=10**9)
+    updates: int | None = option(
+        "updates of the whole run; null: by the size of the problem, and few where exchange follows", ge=1, le=10**9
+    )
     updates_per_iteration: int = option("updates from one evaluation, log row or checkpoint to the next at most", ge=1)
     hidden: int | None = option(
         "units of each net's hidden layer, 0 = plain tables without one; null: by the size of the problem, from 4,097 "

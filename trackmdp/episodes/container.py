@@ -26,7 +26,7 @@ MAGIC = b"\x89MCAP0\r\n"
 # A record is its opcode (u8), the length of its content (u64) and the content; a string is its length (u32) and UTF-8.
 # Every number is little-endian. A file's header record, right after the magic, for example:
 #     01 | 16 00 00 00 00 00 00 00 | 00 00 00 00 | 0e 00 00 00  74 72 61 63 ...
-#     HEADER, 22 bytes of content: profile "", then library, the 14 bytes of "trackmdp 0.1.0".
+#     HEADER, 22 bytes of content: profile "", then library, the 14 bytes of "trackmdp 0.2.0".
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
 ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = range(9, 16)
 _FOOTER_LENGTH = 1 + 8 + 20

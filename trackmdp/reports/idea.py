@@ -101,7 +101,7 @@ def idea_figure(policy: StoredPolicy, motion: MotionTable, size: tuple[int, int]
         "Shade: how likely the target is there. Frame: sensor on. Disc: target detected. Ring: target missed, where no "
         "sensor is on; what was sensed in vain is then ruled out, and the next sensors look where the rest may be."
     )
-    return draw_figure("idea", f"{title}. {text}", text, Table("idea", title, columns, rows), 4.6, paint)
+    return draw_figure("story", f"{title}. {text}", text, Table("story", title, columns, rows), 4.6, paint)
 
 
 def _window(story: list[Scene], size: tuple[int, int]) -> tuple[int, int, int, int]:

@@ -179,7 +179,7 @@ def _idea(results: Results, grouped: Study) -> list[Section]:
     every = ((world, method, run) for world, method in methods for run in grouped.of(world, method))
     for world, method, run in every:
         if run.name in results.policies and run.name in results.motions:
-            size, where = grid_size(run.settings["grid.size"]), f"{method}, {world}, seed {run.seed}"
+            size, where = grid_size(run.settings["grid.size"]), f"{method}, {world}, seed {run.seed} (n = 1)"
             if drawn := idea.idea_figure(results.policies[run.name], results.motions[run.name], size, where):
                 return [Section("idea", "Why few sensors are enough", [[drawn]])]
     return []

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from trackmdp.errors import UserError
+from trackmdp.errors import UserError, adding
 from trackmdp.reports.tables import Table
 
 if TYPE_CHECKING:  # an extra, and a second to import
@@ -130,7 +130,7 @@ def require_matplotlib() -> None:
     try:
         import matplotlib  # noqa: F401
     except ImportError as error:
-        raise UserError("report: drawing takes matplotlib, expected the extra trackmdp[report] installed") from error
+        raise UserError(f"report: drawing needs matplotlib, which {adding('report')} adds") from error
 
 
 def looks_of(labels: Sequence[str]) -> dict[str, Look]:

@@ -12,6 +12,7 @@ import pytest
 from tests.reports.sweeps import write_sweep
 from tests.typed import refused
 from trackmdp.app.cli import main
+from trackmdp.errors import adding
 from trackmdp.reports.gather import run_folders
 
 
@@ -88,7 +89,7 @@ def test_mistakes_end_in_one_line(
     assert "no runs in there" in refused(capsys, "report", "sweep=../empty", "watch=true")
     assert not list((tmp_path / "empty").iterdir())
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    assert "trackmdp[report]" in refused(capsys, "report", f"sweep={sweep}", "hydra.run.dir=../out")
+    assert adding("report") in refused(capsys, "report", f"sweep={sweep}", "hydra.run.dir=../out")
     assert not (tmp_path / "out").exists()
 
 

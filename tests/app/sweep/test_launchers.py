@@ -15,6 +15,7 @@ import pytest
 from tests.app.sweep.runs import TINY, here, nothing_left, started, states, swept, table
 from tests.typed import stub
 from trackmdp.app.cli import main
+from trackmdp.errors import adding
 from trackmdp.training.folders import run_of, runs_of
 
 __all__ = ["here", "nothing_left"]
@@ -212,7 +213,7 @@ def test_a_launcher_that_is_not_installed_names_its_extra(
     assert swept("seed=0", f"hydra/launcher={launcher}") == 2
     said = capsys.readouterr().err
     assert said.startswith(f"trackmdp train: hydra/launcher={launcher}: needs ")
-    assert said.endswith(f"which pip install 'trackmdp[{extra}]' adds\n")
+    assert said.endswith(f"which {adding(extra)} adds\n")
     assert not list(here.iterdir())
 
 

@@ -11,6 +11,7 @@ import pytest
 from tests.app.sweep.runs import TINY, here, states, swept, table
 from tests.typed import stub
 from trackmdp.app.cli import main
+from trackmdp.errors import adding
 from trackmdp.training.folders import run_of, runs_of
 
 __all__ = ["here"]
@@ -122,4 +123,4 @@ def test_mistakes(here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: p
     assert "the study is one of another search" in capsys.readouterr().err
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert main([*line, "seed=1,2"]) == 2
-    assert capsys.readouterr().err.endswith("needs optuna, which pip install 'trackmdp[optuna]' adds\n")
+    assert capsys.readouterr().err.endswith(f"needs optuna, which {adding('optuna')} adds\n")

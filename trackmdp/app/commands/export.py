@@ -18,7 +18,7 @@ from trackmdp import __version__
 from trackmdp.app.commands.trained import trained
 from trackmdp.config import ExportConfig
 from trackmdp.durable import write_bytes
-from trackmdp.errors import UserError
+from trackmdp.errors import UserError, adding
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import sets_name, write_sets
 from trackmdp.training.display import make_console
@@ -81,7 +81,7 @@ def to_onnx(policy: Policy, about: dict[str, str]) -> bytes:
         import onnx
         from onnx import TensorProto, helper, numpy_helper
     except ImportError:
-        raise UserError("format=onnx: needs the package onnx, as in pip install 'trackmdp[onnx]'") from None
+        raise UserError(f"format=onnx: needs the package onnx, which {adding('onnx')} adds") from None
 
     table = _table(policy)
     # table[last_cell, min(n, last_row)]: GatherND wants its indices as one `[B, 2]` array, which the nodes put
