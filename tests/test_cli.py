@@ -513,3 +513,10 @@ def test_a_run_that_breaks_down_ends_in_one_line(
     stub(monkeypatch, "train", run)
     assert main(["train"]) == status
     assert capsys.readouterr().err == f"trackmdp train: {line}\n"
+
+
+def test_on_windows_one_line_says_where_it_runs(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("platform.system", lambda: "Windows")
+    assert "Linux in WSL" in refused(capsys, "train")

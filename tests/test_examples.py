@@ -100,6 +100,15 @@ def test_sweep() -> None:
 
 
 @pytest.mark.slow
+def test_sweep_report(tmp_path: Path) -> None:
+    """The page holds the four runs, and a figure of them against the price."""
+    *_, page = run(str(EXAMPLES / "sweep_report.py"), str(tmp_path / "sweep"))
+    text = Path(page).read_text(encoding="utf-8")
+    assert "4 of 4 planned runs" in text
+    assert 'id="regret-z-3"' in text
+
+
+@pytest.mark.slow
 def test_the_plugin_learns_by_its_name(tmp_path: Path) -> None:
     """Installed, the algorithm is found by its name; what it learns is worth about as much as Q_MDP."""
     info = tmp_path / "trackmdp_counts-0.1.dist-info"

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import errno
 import os
+import platform
 import sys
 import traceback
 
@@ -61,6 +62,9 @@ def _dispatch(words: list[str]) -> int:
     try:
         if command not in COMMANDS:
             raise UserError(f"unknown command {command!r}: expected one of {', '.join(COMMANDS)}")
+        # Runs lock their folders and hear signals as POSIX has them; better here than in the middle of an import.
+        if platform.system() == "Windows":
+            raise UserError("Windows is not supported: expected Linux or macOS, or Linux in WSL on Windows")
         return _run(command, words[1:])
     except BrokenPipeError:
         raise
