@@ -11,7 +11,7 @@ from scipy import sparse
 
 from trackmdp.reports.idea import idea_figure, scenes
 from trackmdp.reports.labels import label_lines, spread
-from trackmdp.reports.policy import StoredPolicy
+from trackmdp.reports.policy import Sensed
 from trackmdp.reports.results import MotionTable
 from trackmdp.reports.style import LOOKS, canvas, looks_of
 
@@ -64,7 +64,7 @@ def test_no_two_series_have_one_colour(others: int) -> None:
     assert len(set(colours)) == len(labels)
 
 
-def line_of_four(second: list[bool]) -> tuple[StoredPolicy, MotionTable]:
+def line_of_four(second: list[bool]) -> tuple[Sensed, MotionTable]:
     """A target that goes from 0 to 1 (.6) or 2 (.4), from 2 to 3; first the sensor of 1 is on, then those `second`."""
     kernel = np.zeros((4, 4))
     kernel[0, 1], kernel[0, 2], kernel[1, 1], kernel[2, 3], kernel[3, 3] = 0.6, 0.4, 0.9, 0.9, 0.9
@@ -72,7 +72,7 @@ def line_of_four(second: list[bool]) -> tuple[StoredPolicy, MotionTable]:
     chains[:, 0] = kernel > 0
     chains[0, 0], chains[0, 1] = [False, True, False, False], second
     zeros = np.zeros(4)
-    return StoredPolicy(chains, zeros), MotionTable(sparse.csr_array(kernel), zeros, zeros)
+    return Sensed(sparse.csr_array(chains.reshape(8, 4)), zeros), MotionTable(sparse.csr_array(kernel), zeros, zeros)
 
 
 def test_the_idea_is_a_miss_that_is_made_good() -> None:
@@ -92,4 +92,4 @@ def test_the_idea_is_a_miss_that_is_made_good() -> None:
 def test_where_no_miss_can_be_made_good_there_is_no_such_figure() -> None:
     assert idea_figure(*line_of_four([True, True, True, False]), (1, 4), "here") is None
     policy, motion = line_of_four([False] * 4)
-    assert scenes(StoredPolicy(policy.chains[:, :1], policy.value), motion) == []
+    assert scenes(Sensed(policy.on(0), policy.value), motion) == []

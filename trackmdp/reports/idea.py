@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy import sparse
 
-from trackmdp.reports.policy import StoredPolicy
+from trackmdp.reports.policy import Sensed
 from trackmdp.reports.results import MotionTable
 from trackmdp.reports.style import INK, LINE, Figure, draw_figure
 from trackmdp.reports.tables import Cell, Column, Table
@@ -43,37 +44,40 @@ class Scene:
     found: bool
 
 
-def scenes(policy: StoredPolicy, motion: MotionTable) -> list[Scene]:
+def scenes(policy: Sensed, motion: MotionTable) -> list[Scene]:
     """The story from the cell where a miss that is made good at the next step is likeliest; none where there is none.
 
     Nothing is drawn by chance: the target goes to the likeliest unsensed cell, then to the likeliest sensed one.
     """
-    cells, choices, _ = policy.chains.shape
-    if choices < 2:
+    if policy.choices < 2:
         return []
-    kernel = motion.kernel.toarray()
-    first, second = policy.chains[:, 0], policy.chains[:, 1]
-    # Rows belong to located cells. after[x]: the mass that the first set left unsensed, moved once more.
-    missed = np.where(first, 0.0, kernel)
+    kernel, first, second = motion.kernel, policy.on(0), policy.on(1)
+    # Rows belong to located cells: the mass that the first set left unsensed, and the same moved once more.
+    missed = kernel - kernel.multiply(first)
     after = missed @ kernel
-    again = np.where(second, after, 0.0).sum(axis=1)
+    again = np.asarray(after.multiply(second).sum(axis=1)).ravel()
     x = int(again.argmax())
     if not again[x] > 1e-9:
         return []
-    # The likeliest pair of an unsensed cell y and a sensed cell z after it.
-    pairs = missed[x][:, None] * np.where(second[x], kernel, 0.0)
+
+    def row(table: sparse.csr_array) -> Array:
+        return np.asarray(table[[x]].toarray()[0])
+
+    left, sensed = row(missed), row(second).astype(bool)
+    # The likeliest pair of an unsensed cell y and a sensed cell z after it; y is one of a few.
+    unsensed = np.flatnonzero(left)
+    pairs = left[unsensed, None] * np.where(sensed, kernel[unsensed].toarray(), 0.0)
     y, z = np.unravel_index(int(pairs.argmax()), pairs.shape)
-    none, here = np.zeros(cells, dtype=bool), np.eye(cells)[x]
-    gone = missed[x].sum()
+    none, gone = np.zeros(len(left), dtype=bool), left.sum()
     return [
-        Scene("1  located", here, none, x, found=True),
-        Scene("2  moves; missed", kernel[x], first[x], int(y), found=False),
-        Scene("3  what the miss says", missed[x] / gone, none, None, found=False),
-        Scene("4  found again", after[x] / gone, second[x], int(z), found=True),
+        Scene("1  located", np.where(np.arange(len(left)) == x, 1.0, 0.0), none, x, found=True),
+        Scene("2  moves; missed", row(kernel), row(first).astype(bool), int(unsensed[y]), found=False),
+        Scene("3  what the miss says", left / gone, none, None, found=False),
+        Scene("4  found again", row(after) / gone, sensed, int(z), found=True),
     ]
 
 
-def idea_figure(policy: StoredPolicy, motion: MotionTable, size: tuple[int, int], where: str) -> Figure | None:
+def idea_figure(policy: Sensed, motion: MotionTable, size: tuple[int, int], where: str) -> Figure | None:
     """Belief, sensors, miss and re-detection on the grid; None where no miss that is made good can happen."""
     story = scenes(policy, motion)
     if not story:

@@ -127,6 +127,7 @@ class Recorded(Task):
         revealed: int = 1,
         coverage: Any = None,
         loaded: Mapping[str, int] | None = None,
+        coverage: None = None,  # a field of every task: `replace` hands it over
     ) -> None:
         super().__init__(
             size,
@@ -143,6 +144,7 @@ class Recorded(Task):
             clip=clip,
             coverage=coverage,
             revealed=revealed,
+            coverage=coverage,
         )
         parts = {"tracks": tracks, "validation": validation, "held_out": held_out}
         own: dict[str, object] = {**parts, "anywhere": anywhere, "loaded": loaded or {}}
