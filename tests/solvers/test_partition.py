@@ -15,6 +15,7 @@ import trackmdp as tm
 from trackmdp.app.cli import main
 from trackmdp.config.compose import compose
 from trackmdp.errors import UserError
+from trackmdp.solvers import regions
 from trackmdp.solvers.partition import Block, blocks, default_halo, plan_by_blocks, reach, sub_world
 from trackmdp.solvers.solve import run_solver
 from trackmdp.solvers.workers import run_jobs
@@ -73,6 +74,30 @@ def test_with_the_default_halo_blocks_lose_nothing_and_without_one_they_do(cost:
     assert lost <= stated + 5e-5
 
 
+@pytest.mark.filterwarnings("ignore:partition.halo=0")
+def test_sweeps_over_the_whole_grid_mend_what_blocks_cannot(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = tm.make_world("random_support", size=12, support_size=5, radius=1, cost=0.22, t_max=1, safe_cost=8)
+    whole, alone = tm.solve(world), tm.solve(world, block=4, halo=0, sweeps=0)
+    once, mended = (tm.solve(world, block=4, halo=0, sweeps=sweeps) for sweeps in (1, 10))
+    assert alone.lower < once.lower <= mended.lower <= whole.upper + 1e-9
+    assert whole.lower - mended.lower <= 5e-4 * whole.evaluation.expected_length
+    # no cell's value is lower for it
+    assert (mended.evaluation.value - alone.evaluation.value).min() > -1e-9
+    # a round that gains nothing is the last one
+    rounds: list[float] = []
+    improve = regions.improved
+    monkeypatch.setattr(regions, "improved", lambda *given: [rounds.append(1.0), improve(*given)][1])
+    again = regions.settled(world, mended.table, 4, 10)
+    assert len(rounds) == 1
+    assert again is mended.table
+
+
+def test_other_solvers_plans_are_left_as_they_are() -> None:
+    world = tm.make_world("random_support", size=8, support_size=5, cost=0.22)
+    kept = [tm.solve(world, "qmdp", block=4, sweeps=sweeps).lower for sweeps in (0, 5)]
+    assert kept[0] == kept[1]
+
+
 def test_the_policy_of_blocks_is_bounded_on_the_whole_grid() -> None:
     world = tm.make_world("random_support", size=12, support_size=5, cost=0.16, safe_cost=16)
     found, whole = tm.solve(world, block=6), tm.solve(world)
@@ -91,6 +116,43 @@ def test_two_workers_find_the_same_bytes_as_one() -> None:
     assert together is not None
     assert alone.indices.tobytes() == together.indices.tobytes()
     assert alone.indptr.tobytes() == together.indptr.tobytes()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [1, 2, 4])
+def test_a_ray_cluster_of_any_size_finds_the_same_bytes(workers: int) -> None:
+    pytest.importorskip("ray")
+    cfg = compose("solve", {"partition.block": 4, "grid.size": 9})
+    world = tm.make_world("random_support", size=9, support_size=5, cost=0.22)
+    alone = run_solver(world, cfg.solver, None, cfg.partition).table.sets
+    cfg.partition.workers, cfg.partition.cluster = workers, "local"
+    spread = run_solver(world, cfg.solver, None, cfg.partition).table.sets
+    assert alone is not None
+    assert spread is not None
+    assert alone.indices.tobytes() == spread.indices.tobytes()
+    assert alone.indptr.tobytes() == spread.indptr.tobytes()
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Leaves a line each time a number is begun; the first process that gets 2 is killed."""
+
+    folder: Path
+
+    def __call__(self, number: int) -> int:
+        with (self.folder / str(number)).open("a") as stream:
+            stream.write("begun\n")
+        if number == 2 and (self.folder / "2").read_text().count("begun") == 1:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return number
+
+
+@pytest.mark.slow
+def test_a_killed_worker_of_a_cluster_costs_its_own_job_alone(tmp_path: Path) -> None:
+    pytest.importorskip("ray")
+    assert run_jobs(Counts(tmp_path), range(6), workers=2, cluster="local") == [*range(6)]
+    begun = {number: (tmp_path / str(number)).read_text().count("begun") for number in range(6)}
+    assert begun == {0: 1, 1: 1, 2: 2, 3: 1, 4: 1, 5: 1}
 
 
 @dataclass(frozen=True)

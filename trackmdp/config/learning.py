@@ -242,7 +242,11 @@ class MultiAsyncConfig(WorkersConfig):
 @choice("collector", "ray", makes="trackmdp.training.collect:ray")
 @dataclass(kw_only=True)
 class RayWorkersConfig(WorkersConfig):
-    """In workers of a Ray cluster, for a run larger than one machine; otherwise as multi_sync."""
+    """In workers of a Ray cluster: for one run whose environments need more cores than a machine has.
+
+    On one machine multi_sync does the same for less. For many runs at once take hydra/launcher=ray, for planning one
+    large grid partition.cluster.
+    """
 
     address: str | None = option("cluster to join; null = start one on this machine", expects="auto, or host:port")
     cpus_per_worker: float = option("cores of each worker", unit="cores", gt=0)

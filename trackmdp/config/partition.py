@@ -21,13 +21,25 @@ class PartitionConfig(NodeConfig):
         unit="cells",
         ge=0,
     )
-    workers: int = option("processes that plan, or with a cluster of our own its cores", unit="processes", ge=1)
+    sweeps: int | None = option(
+        "rounds of exchange over the whole grid after the blocks (solver=optimal), all values known, until none grows; "
+        "null = at most 10 with the default halo, none with a halo of its own",
+        unit="rounds",
+        ge=0,
+        le=1000,
+    )
+    workers: int = option(
+        "processes that plan, or with a cluster of our own its cores; on one machine as many as it has cores",
+        unit="processes",
+        ge=1,
+    )
     cluster: str | None = option(
-        "Ray cluster that plans: local = one on this machine with so many workers; null = no Ray",
+        "Ray cluster that plans one large grid, worth it where one machine's cores are not enough; for many runs take "
+        "hydra/launcher=ray. local = one on this machine with so many workers, for tests; null = no Ray",
         expects="local, auto, or host:port",
     )
 
     def ignored(self, root: Any) -> dict[str, str]:
         """Without blocks there is nothing to know of, or to share out."""
         why = "without partition.block, the whole grid being planned at once"
-        return dict.fromkeys(("halo", "workers", "cluster"), why) if self.block is None else {}
+        return dict.fromkeys(("halo", "sweeps", "workers", "cluster"), why) if self.block is None else {}

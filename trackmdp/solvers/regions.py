@@ -19,6 +19,7 @@ from trackmdp.errors import UserError
 from trackmdp.machine import free_bytes, gib, parse_bytes
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.branch import Tree
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.exchange import exchange, revealed
 from trackmdp.solvers.known import next_table
 from trackmdp.solvers.layers import Layer, reachable_layers, sensed_csr
@@ -27,7 +28,7 @@ from trackmdp.solvers.renewal import DIRECT_CELLS, IndexArray, forced_worth
 from trackmdp.solvers.search import InnerProblem
 from trackmdp.world.model import Array, BoolArray, World
 
-__all__ = ["adopted", "improved", "proved", "region_side"]
+__all__ = ["adopted", "improved", "proved", "region_side", "settled"]
 
 ROOM, SMALLEST, LARGEST = 2**28, 32, 128
 """Bytes of a region, and its located cells in each direction, unless there is less memory. Wider ones have a smaller
@@ -137,6 +138,23 @@ def improved(
             go_on = passed(number / count)
         found.append(region.sensed(sets))
     return _joined(world, found)
+
+
+def settled(world: World, policy: PolicyTable, side: int, rounds: int) -> PolicyTable:
+    """The policy after at most `rounds` of `improved`, fewer where no value grows.
+
+    Blocks that planned without each other's values leave plans that none of them would change: .006 per step at
+    c = .22, T_max 2, blocks of 5 and a halo of 4.
+    """
+    value = evaluate(world, policy).value
+    for _ in range(rounds):
+        candidate = improved(world, policy, value, side, lambda _: True)
+        after = evaluate(world, candidate).value
+        # As in `exchange`: no value is lower, so that the sum tells; the margin is rounding.
+        if after.sum() <= value.sum() + 1e-12 * np.abs(value).sum():
+            break
+        policy, value = candidate, after
+    return policy
 
 
 def proved(

@@ -18,6 +18,7 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.keyed import averaged
 from trackmdp.solvers.keyed_search import solve_keys
 from trackmdp.solvers.partition import narrow_halo, plan_by_blocks
+from trackmdp.solvers.regions import settled
 from trackmdp.solvers.solution import SearchProgress, Solution, bracketed
 from trackmdp.world.model import World
 from trackmdp.world.modes import HiddenWorld, Modelled
@@ -27,6 +28,10 @@ if TYPE_CHECKING:  # torch is loaded where a policy is to act
     from trackmdp.policies.policy import Policy
 
 __all__ = ["baseline_policy", "run_solver", "solve"]
+
+
+_SWEEPS = 10
+"""Rounds over the whole grid after the blocks, at most: two or three change anything."""
 
 
 def solve(
@@ -39,6 +44,7 @@ def solve(
     block: int | None = default("partition.block", "solve"),
     halo: int | None = default("partition.halo", "solve"),
     workers: int = default("partition.workers", "solve"),
+    sweeps: int | None = default("partition.sweeps", "solve"),
     **options: Any,
 ) -> Solution:
     """The policy that a solver finds for `world`, what it earns, and an upper bound on what any policy earns.
@@ -55,6 +61,8 @@ def solve(
         block: side of the blocks that plan for themselves (`trackmdp.solvers.partition`); None: the whole grid at once.
         halo: cells around its own that a block knows of; None: as many as lose nothing.
         workers: processes that plan blocks; the result does not depend on it.
+        sweeps: rounds of exchange over the whole grid after the blocks; None: until no value grows, at most 10, with
+            the default halo, and none with a halo of its own.
         **options: the solver's own, such as ``depth=3`` (``trackmdp solve --help`` lists them).
 
     Raises:
@@ -68,7 +76,8 @@ def solve(
     """
     own = {f"solver.{name}": value for name, value in options.items()}
     named = given({"solver": solver, "solver.nodes": nodes, "solver.time_limit": time_limit})
-    blocks = given({"partition.block": block, "partition.halo": halo, "partition.workers": workers})
+    of_blocks = {"block": block, "halo": halo, "workers": workers, "sweeps": sweeps}
+    blocks = given({f"partition.{name}": value for name, value in of_blocks.items()})
     cfg = compose("solve", named | own | blocks)
     solution = run_solver(world, cfg.solver, on_progress, cfg.partition)
     if isinstance(world, World) and (said := narrow_halo(world, cfg.partition, solution)):
@@ -99,6 +108,10 @@ def run_solver(
             workers=partition.workers,
             cluster=partition.cluster,
         )
+        # Other solvers' plans are what they are; what a narrow halo loses stays to be seen, unless asked otherwise.
+        sweeps = (_SWEEPS if partition.halo is None else 0) if partition.sweeps is None else partition.sweeps
+        if choice.name == "optimal":
+            table = settled(world, table, partition.block, sweeps)
         return bracketed(world, table, time.monotonic() - started)
     watched = {"on_progress": on_progress} if "on_progress" in signature(maker(choice)).parameters else {}
     made = make(choice, world, **watched)

@@ -25,12 +25,13 @@ COSTS, T_MAX = (0.16, 0.22), (1, 2)
 def handoff(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator[dict[str, Any]]:  # noqa: ARG001
     """One row per price, T_max, block and halo: what the policy of the blocks lacks to that of the whole grid.
 
-    The kernel and D are those of the config, so that all rows are about one target. The last halo is the default one.
+    The kernel and D are those of the config, so that all rows are about one target. A row for each halo shows what the
+    blocks' own plans lose; the last one, of the default halo, what is left after the sweeps over the whole grid.
     """
     for cost, t_max in product(COSTS, T_MAX):
         here = replace(world, cost=np.full(world.num_cells, cost), t_max=t_max)
         whole = run_solver(here, compose("solve").solver)
-        for block, halo in product(cfg.blocks, sorted({*cfg.halos, default_halo(here)})):
+        for block, halo in product(cfg.blocks, [*sorted({*cfg.halos, default_halo(here)}), None]):
             options = compose("solve", {"partition.block": block, "partition.halo": halo})
             started = time.process_time()
             found = run_solver(here, options.solver, None, options.partition)
@@ -39,8 +40,8 @@ def handoff(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterato
                 "c": cost,
                 "T_max": t_max,
                 "block": block,
-                "halo": halo,
-                "default": halo == default_halo(here),
+                "halo": default_halo(here) if halo is None else halo,
+                "sweeps": halo is None,
                 "loss_per_step": (whole.lower - found.lower) / whole.evaluation.expected_length,
                 "gap_per_step": (found.upper - found.lower) / whole.evaluation.expected_length,
                 "cpu_seconds": time.process_time() - started,

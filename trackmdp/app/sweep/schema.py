@@ -153,7 +153,10 @@ class SubmititSlurmConfig(SubmititConfig):
 @_offered("launcher", "ray")
 @dataclass(kw_only=True)
 class RayConfig(LauncherConfig):
-    """On a Ray cluster that is joined, or one that is started on this machine."""
+    """On a Ray cluster that is joined, or one that is started on this machine: for many runs on many machines.
+
+    On one machine joblib does the same for less.
+    """
 
     address: str | None = option("cluster to join; null = start one here", expects="auto, or host:port")
     num_cpus: int | None = option("cores of a cluster started here; null = all", unit="cores", ge=1)
