@@ -106,10 +106,10 @@ def test_memory_decides_on_the_side_of_a_region() -> None:
     large = make_world("random_support", size=150, support_size=5, radius=2)
     side = regions.region_side(large)
     assert side == regions.LARGEST == regions.region_side(large, "64GiB")
-    narrow = regions.region_side(large, "105MiB")
+    narrow = regions.region_side(large, "125MiB")
     assert narrow is not None and 1 <= narrow < side
     # the sizes add up: what all of it takes is below the limit
-    assert regions._whole_bytes(large) + regions._region_bytes(large, narrow) <= 105 * 2**20
+    assert regions._whole_bytes(large) + regions._region_bytes(large, narrow) <= 125 * 2**20
     with pytest.raises(UserError, match=r"solver.memory=80MiB: 150 x 150 cells need about 0\.\d\d GiB, expected at"):
         regions.region_side(large, "80MiB")
 

@@ -186,6 +186,8 @@ class BenchmarkConfig(WorldConfig):
     batch_sizes: list[int] = option("`env`: environments stepped together", unit="environments", ge=1)
     sizes: list[int] = option("`size`: sides of the grid", unit="cells", ge=3)
     work: list[str] = option("`size`: kinds of work", choices=("solve", "train", "env"))
+    # Its own default budget: that of `hindsight` takes hours from N = 40 on, `learned_kernel`'s seconds.
+    learner: str = option("`size`: algorithm that trains, with its own budget", choices=tuple(GROUPS["algo"]))
     blocks: list[int] = option("`handoff`: sides of the blocks", unit="cells", ge=1)
     halos: list[int] = option("`handoff`: cells around a block, besides the default", unit="cells", ge=0)
     # Evaluated while this module is imported, before plugins are: only this package's own algorithms.

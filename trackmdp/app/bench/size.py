@@ -46,7 +46,8 @@ def _rows(cfg: BenchmarkConfig, device: torch.device) -> Iterator[dict[str, Any]
                 n, f"solve, c = {cost:g}", "regret_per_step", "solution.json", "solve", *at, f"cost.sensor={cost}"
             )
         if "train" in cfg.work:
-            yield _row(n, "train hindsight", "regret_per_step", "summary.json", "train", *at, *own)
+            algo = f"algo={cfg.learner}"
+            yield _row(n, f"train {cfg.learner}", "regret_per_step", "summary.json", "train", *at, *own, algo)
         if "env" not in cfg.work:
             continue
         # A benchmark within the benchmark, so that each size has a process, and a peak memory, of its own.
