@@ -23,6 +23,7 @@ __version__ = "0.2.0"
 __all__ = [
     "Episodes",
     "Evaluation",
+    "HiddenWorld",
     "ObservationVector",
     "Policy",
     "Recorded",
@@ -33,6 +34,7 @@ __all__ = [
     "evaluate",
     "load_run",
     "load_tracks",
+    "make_hidden_world",
     "make_world",
     "simulate",
     "solve",
@@ -42,6 +44,7 @@ __all__ = [
 _HOMES = {
     "Episodes": "trackmdp.episodes.batch",
     "Evaluation": "trackmdp.solvers.evaluation",
+    "HiddenWorld": "trackmdp.world.modes",
     "ObservationVector": "trackmdp.world.observation",
     "Policy": "trackmdp.policies.policy",
     "Recorded": "trackmdp.world.tracks",
@@ -52,6 +55,7 @@ _HOMES = {
     "evaluate": "trackmdp.solvers.evaluate",
     "load_run": "trackmdp.training.run",
     "load_tracks": "trackmdp.world.make",
+    "make_hidden_world": "trackmdp.world.make",
     "make_world": "trackmdp.world.make",
     "simulate": "trackmdp.episodes.simulate",
     "solve": "trackmdp.solvers.solve",
@@ -70,8 +74,9 @@ if TYPE_CHECKING:  # the same once more, for type checkers and editors, which do
     from trackmdp.training.run import Run, load_run
     from trackmdp.training.train import train
     from trackmdp.world.env import TrackEnv
-    from trackmdp.world.make import load_tracks, make_world
+    from trackmdp.world.make import load_tracks, make_hidden_world, make_world
     from trackmdp.world.model import World
+    from trackmdp.world.modes import HiddenWorld
     from trackmdp.world.observation import ObservationVector
     from trackmdp.world.tracks import Recorded
 

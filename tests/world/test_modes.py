@@ -12,6 +12,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+import trackmdp as tm
 from tests.helpers import configured
 from trackmdp.config import load_config, to_yaml
 from trackmdp.config.compose import compose
@@ -252,3 +253,16 @@ def test_a_policy_for_other_modes_is_refused() -> None:
     kernel, modes = heading_kernel(2, keep=0.7, go=0.9, exit_probability=0.05)
     with pytest.raises(UserError, match="revealed=3: expected 1 or 8"):
         HiddenWorld(kernel, 2, modes=modes, cost=0.1, t_max=1, revealed=3)
+
+
+def test_hidden_worlds_from_python() -> None:
+    """As by the command line; a kernel without modes belongs to `make_world`, which names the other way round."""
+    ours = tm.make_hidden_world("constant_velocity", size=4, cost=0.1, memory="displacement", clip=1, noise=0.3)
+    words = ("kernel=constant_velocity", "grid.size=4", "cost.sensor=0.1", "task.memory=displacement", "task.clip=1")
+    same = world_of(*words, "kernel.noise=0.3")
+    assert (ours.kernel != same.kernel).nnz == 0
+    assert (ours.num_keys, ours.modes, ours.cost[0]) == (160, 9, 0.1)
+    with pytest.raises(UserError, match="kernel=drift: expected one of heading, regimes, constant_velocity, coordinat"):
+        tm.make_hidden_world("drift", size=4)
+    with pytest.raises(UserError, match="kernel=heading: expected a kernel without a hidden mode"):
+        tm.make_world("heading", size=4)

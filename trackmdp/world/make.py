@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from trackmdp.config import WorldConfig
 from trackmdp.config.compose import compose, default, given
-from trackmdp.config.options import options, refuse
+from trackmdp.config.options import GROUPS, options, refuse
 from trackmdp.config.registry import make, maker
 from trackmdp.config.world import LARGEST
 from trackmdp.world.checks import canonical_kernel, check_kernel
@@ -23,7 +23,16 @@ from trackmdp.world.recording import read_recording
 from trackmdp.world.track_files import read_track_file
 from trackmdp.world.tracks import Problem, Recorded, split
 
-__all__ = ["build_world", "load_tracks", "make_problem", "make_world", "of_task", "paper_cost", "recorded"]
+__all__ = [
+    "build_world",
+    "load_tracks",
+    "make_hidden_world",
+    "make_problem",
+    "make_world",
+    "of_task",
+    "paper_cost",
+    "recorded",
+]
 
 
 def make_world(
@@ -68,6 +77,50 @@ def make_world(
     of_task = _task_words(size, t_max, cost, safe_cost, reward, max_steps, window, detection, safe_detection)
     own = {f"kernel.{name}": value for name, value in kernel_options.items()}
     return build_world(compose("solve", given({"kernel": kernel}) | of_task | own))
+
+
+def make_hidden_world(
+    kernel: str = "heading",
+    *,
+    size: Size = default("grid.size"),
+    t_max: int = default("grid.t_max"),
+    cost: npt.ArrayLike | str = default("cost.sensor"),
+    safe_cost: float | None = default("cost.safe"),
+    reward: float = default("cost.reward"),
+    detection: npt.ArrayLike | str = 1.0,
+    memory: str = default("task.memory"),
+    clip: int = default("task.clip"),
+    **kernel_options: Any,
+) -> HiddenWorld:
+    """A world whose targets have a mode, such as a heading or a velocity; arguments are those of `make_world`.
+
+    Args:
+        kernel: ``heading``, ``regimes``, ``constant_velocity``, ``coordinated_turn``, or one of an installed plugin.
+        size: N of an N x N grid, or (rows, columns).
+        t_max: T_max.
+        cost: c.
+        safe_cost: D.
+        reward: r.
+        detection: p_d.
+        memory: what a policy remembers at a detection, as in `load_tracks`.
+        clip: rows and columns up to which displacements are told apart.
+        **kernel_options: the kernel's own, such as ``keep=0.7``, or ``reveals=True`` where detections tell the mode.
+
+    Raises:
+        UserError: a name, a type or a range is wrong, or the kernel has no modes.
+
+    Example:
+        >>> make_hidden_world("heading", size=4, reveals=True).num_keys
+        128
+    """
+    of_task = _task_words(size, t_max, cost, safe_cost, reward, None, None, detection, 1.0)
+    known = given({"task.memory": memory, "task.clip": clip})
+    own = {f"kernel.{name}": value for name, value in kernel_options.items()}
+    made = make_problem(compose("solve", {"kernel": kernel} | of_task | known | own))
+    if not isinstance(made, HiddenWorld):
+        hiding = [name for name, schema in GROUPS["kernel"].items() if schema.hides]
+        raise refuse("kernel", kernel, f"one of {', '.join(hiding)}")
+    return made
 
 
 def load_tracks(
