@@ -125,9 +125,8 @@ class Recorded(Task):
         memory: str = "cell",
         clip: int = 2,
         revealed: int = 1,
-        coverage: Any = None,
+        coverage: Any = None,  # a field of every task: `replace` hands it over
         loaded: Mapping[str, int] | None = None,
-        coverage: None = None,  # a field of every task: `replace` hands it over
     ) -> None:
         super().__init__(
             size,
@@ -144,7 +143,6 @@ class Recorded(Task):
             clip=clip,
             coverage=coverage,
             revealed=revealed,
-            coverage=coverage,
         )
         parts = {"tracks": tracks, "validation": validation, "held_out": held_out}
         own: dict[str, object] = {**parts, "anywhere": anywhere, "loaded": loaded or {}}
