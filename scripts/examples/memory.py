@@ -35,13 +35,11 @@ def vehicles(file: Path, count: int = 200) -> Path:
 def main(file: Path, size: tuple[int, int], price: float, safe: float, t_max: int = 1, **position: float) -> None:
     """Print the held-out reward per step of each memory, with its 95 % interval over tracks.
 
-    All is planned on the tracks to learn from, and chosen by the validation tracks: for each memory the weight of what
-    keys share and whether exchange helps, and of the memories the best. The held-out tracks tell the figures alone.
+    Weights, exchange and the memory are chosen by the validation tracks; the held-out ones tell the figures alone.
     """
     found = {}
     for memory in ("cell", "displacement", "displacement_gap"):
-        options = {"t_max": t_max, "cost": price, "safe_cost": safe, "memory": memory, **position}
-        tracks = tm.load_tracks(file, size, **options)
+        tracks = tm.load_tracks(file, size, t_max=t_max, cost=price, safe_cost=safe, memory=memory, **position)
         policy = choose_plan(tracks.task, tracks.tracks, judge=tracks.validation, discount=0.9, rounds=8).policy
         reward = HeldOutEvaluator(tracks).intervals(policy)["reward_per_step"]
         found[memory] = (evaluate(tracks.selection, policy).aihtr, reward)
@@ -55,8 +53,8 @@ if __name__ == "__main__":
     if len(sys.argv) > 3:
         numbers = [float(word) for word in sys.argv[2:]]
         rows, columns, price, safe, t_max, *step_and_cell = numbers + [0.2, 2.0, 1][max(len(numbers) - 2, 0) :]
-        position = dict(zip(("step", "cell"), step_and_cell, strict=False))
-        main(Path(sys.argv[1]), (int(rows), int(columns)), price, safe, int(t_max), **position)
+        known = dict(zip(("step", "cell"), step_and_cell, strict=False))
+        main(Path(sys.argv[1]), (int(rows), int(columns)), price, safe, int(t_max), **known)
     else:
         with tempfile.TemporaryDirectory() as folder:
             main(vehicles(Path(folder) / "ring.csv"), (4, 4), 0.2, 2.0)
