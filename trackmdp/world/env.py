@@ -53,7 +53,8 @@ class TrackEnv(EnvBase):
     observed are those of the state: whoever writes to them in place moves the target's clock.
 
     `torch.compile(env.step_and_maybe_reset, fullgraph=True)` gives one graph and the same bits, as it does of `step`,
-    `reset` and ``rollout(..., break_when_any_done=False)``, whose steps are unrolled: keep it to a few.
+    `reset` and ``rollout(..., break_when_any_done=False)``, whose steps are unrolled: keep it to a few. On a CPU it
+    does not pay: what torch 2.13 makes of sums and masks of bits is several times slower than the plain step.
 
     An `action` `[*B, K]` bool is a set of sensors. Without `window` in the world these are all sensors: K = M and
     sensor k is that of cell k, or K = S with footprints. With a window K = (2W + 1)² and actions, those remembered
