@@ -42,9 +42,6 @@ FIRST_NODES = 100_000
 same world gives the same policy on any machine."""
 NODES_BETWEEN_REPORTS = 100_000
 """Nodes after which the bracket is brought up to date while a tree is searched: about a second's."""
-NODES_A_TABLE = 300
-"""Nodes for each cell, at least, in the search for what 1, 2, ... more sets are worth, within a third of the budget: with
-100,000 in all at N = 30, T_max 5, what is built on these tables took half as long again to close as much."""
 RESTARTS, SPREAD, MOST_RESTARTED = 4, 0.05, 500
 """Searches led by another kernel where the first tree leaves the bracket open, how far its entries are off (standard
 deviation of their logarithms), and the cells above which the time is better spent on the tree."""
@@ -380,9 +377,7 @@ class _Run:
         """`[M]` upper bound of what `length` more sets can earn with the target known to be in each cell."""
         inner = InnerProblem(self.world, self.ground.layers[: length + 1], problem.detected, problem.missed)
         tree = next_table(inner, known, slack)
-        share = self.budget.nodes // (3 * self.world.num_choices)
-        most = max(patience, min(NODES_A_TABLE * self.world.num_cells, share))
-        self.budget.run(tree, lambda tree: tree.nodes < most)
+        self.budget.run(tree, lambda tree: tree.nodes < patience)
         return tree.upper()
 
     def solution(self, interrupted: bool) -> Solution:
