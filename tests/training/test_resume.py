@@ -37,6 +37,8 @@ RECIPES = {
     "hindsight": ["algo=hindsight", "algo.updates=120", "algo.batch_size=1024", "algo.updates_per_iteration=4"],
 }
 # Environment and replay buffer with sensors that miss; the joint learners know of them through the environment alone.
+# As large grids are learned: tables in place of nets, and actions of the window's sensors alone.
+RECIPES["hindsight-tables"] = [*RECIPES["hindsight"], "algo.hidden=0", "grid.window=1"]
 RECIPES |= {f"{name}-miss": [*RECIPES[name], "sensor=miss", "sensor.p_d=.8"] for name in ("hindsight", "ppo")}
 SMALL = ["grid.size=3", "optimal.enabled=false", "evaluation.every=4", "collector.total_frames=61440"]
 BATCHES = ["collector.frames_per_batch=2048", "collector.envs=64"]
