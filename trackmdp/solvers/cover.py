@@ -21,7 +21,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
-from scipy.optimize import Bounds, LinearConstraint, linprog, milp
 
 from trackmdp.solvers.renewal import IndexArray, per_row
 from trackmdp.world.model import Array, BoolArray, Task
@@ -227,6 +226,8 @@ def _relaxed(covers: sparse.csr_array, gain: Array, price: Array) -> tuple[Array
     p, e = covers.shape
     # Minimise price x - gain z; z_e - (covers^T x)_e <= 0.
     constraint = sparse.hstack([-covers.T, sparse.eye_array(e)], format="csr")
+    from scipy.optimize import linprog  # a tenth of a second to load, and most worlds have no footprints
+
     found = linprog(np.concatenate([price, -gain]), A_ub=constraint, b_ub=np.zeros(e), bounds=(0, 1), method="highs")
     if found.status != 0:  # never seen; all on and no prices is a bound as well
         return np.ones(p), np.zeros(e)
@@ -250,6 +251,8 @@ def _integer(covers: sparse.csr_array, gain: Array, price: Array) -> tuple[BoolA
     union = sparse.hstack([-covers.T, sparse.eye_array(e)], format="csr")
     # HiGHS stops once the best set and its bound are within 1e-6: of numbers this much larger that is nothing.
     scale = _SCALE / max(float(gain.max(initial=0.0)), 1e-300)
+    from scipy.optimize import Bounds, LinearConstraint, milp  # as above
+
     found = milp(
         scale * np.concatenate([price, -gain]),
         constraints=LinearConstraint(sparse.vstack([union, forced], format="csr"), ub=0.0),
