@@ -3,8 +3,8 @@
 A move seen k times in n from its cell has the share k / n, whose error is largest where a plan looks hardest: at moves
 near the price of a sensor. So each count is read as a draw from Binomial(n, p), p itself from one mixture of Beta
 distributions for all moves of the grid, whose weights make all counts together likeliest (expectation-maximisation;
-Robbins 1956, Efron 2010). The posterior mean of p shrinks towards what moves of that size mostly are: where all have
-.15 or .21, towards these two; where they differ in every way, hardly at all.
+Robbins 1956, Efron 2010), even ones where there are few. The posterior mean of p shrinks towards what moves of that
+size mostly are: where all have .15 or .21, towards these two; where they differ in every way, hardly at all.
 
 A move of probability p was seen with probability s = 1 - (1 - p)^n. So each move seen stands for (1 - s) / s moves that
 were not, of p each (Horvitz & Thompson 1952): their sum is the probability of a move that is new, from this cell. It is
@@ -30,6 +30,8 @@ __all__ = ["least_worth_planning", "posterior_mean", "unseen", "without"]
 PRECISIONS = (30.0, 300.0, 3000.0)
 """a + b of the Beta(a, b) of the mixture: what stands for broad and for narrow groups of probabilities."""
 ROUNDS = 50
+UNDECIDED = 100.0
+"""Moves' worth of even weights of all components: some 60 moves, as of 3 x 3 cells, cannot tell 120 of them apart."""
 MOST_PAIRS = 2**14
 """Different counts (k, n) that the mixture is fitted to, and that are worked on at once: 16 MB an array."""
 SHARE_OF_PRICE = 0.01
@@ -49,12 +51,12 @@ def posterior_mean(count: Array, moves: Array) -> Array:
     alpha, beta = _components()
     # They are sorted, so that every 2nd or 3rd of very many is a fair sample of them.
     step = -(-pairs.shape[1] // MOST_PAIRS)
-    likelihood, times = _likelihood(pairs[:, ::step], alpha, beta), copies[::step, None]
+    likelihood, times = _likelihood(pairs[:, ::step], alpha, beta), step * copies[::step, None]
     weight = np.full(len(alpha), 1.0 / len(alpha))
     for _ in range(ROUNDS):
         share = likelihood * weight
         share *= times / share.sum(axis=1, keepdims=True)
-        weight = share.sum(axis=0) / times.sum()
+        weight = (share.sum(axis=0) + UNDECIDED / len(alpha)) / (times.sum() + UNDECIDED)
     mean = np.zeros(pairs.shape[1])
     for first in range(0, len(mean), MOST_PAIRS):
         part = pairs[:, first : first + MOST_PAIRS]
