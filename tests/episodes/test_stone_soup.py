@@ -12,7 +12,7 @@ import pytest
 import trackmdp as tm
 from tests.helpers import small_world
 from tests.tracks import by_hand
-from trackmdp.errors import UserError
+from trackmdp.errors import UserError, adding
 from trackmdp.policies.policy import Policy
 
 pytest.importorskip("stonesoup", reason="needs the extra: pip install 'trackmdp[stonesoup]'")
@@ -132,5 +132,5 @@ def test_without_the_extra_it_is_one_line() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr.splitlines()[-1].endswith(
-        "trackmdp.episodes.stone_soup: needs stonesoup, which pip install 'trackmdp[stonesoup]' adds"
+        f"trackmdp.episodes.stone_soup: needs stonesoup, which {adding('stonesoup')} adds"
     )

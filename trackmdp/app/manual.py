@@ -223,7 +223,9 @@ def _described(head: str, text: str) -> list[str]:
     lines = textwrap.wrap(text, _WIDTH - 1, initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False)
     if len(head) + 2 < _COLUMN:
         return [f"  {head}" + lines[0][len(head) + 2 :], *lines[1:]]
-    return [f"  {head}", *lines]
+    # As typed it is one word; only a list of mappings is longer than a line, and breaks at its blanks.
+    heads = textwrap.wrap(f"  {head}", _WIDTH - 1, subsequent_indent=" " * 6, break_long_words=False)
+    return [*heads, *lines]
 
 
 def _wrapped(text: str) -> list[str]:

@@ -166,7 +166,7 @@ def test_blocks_of_an_experiment_are_the_sweep(here: Path, capfd: pytest.Capture
     assert capfd.readouterr().err.startswith("trackmdp train: grid.sise: unknown option, did you mean grid.size?")
     assert main([*line[:-1], "experiment=fwe"]) == 2
     assert (
-        capfd.readouterr().err == "trackmdp train: experiment=fwe: expected one of exchange, few, growth, "
+        capfd.readouterr().err == "trackmdp train: experiment=fwe: expected one of few, growth, "
         "learned_kernel, pairs, paper, quality\n"
     )
 
