@@ -69,6 +69,8 @@ def manual(command: str, words: Sequence[str] = ()) -> str:
     blocks = [f"usage: trackmdp {command} [option=value ...] [group=choice ...]", *_wrapped(_about(ROOTS[command])), ""]
     if typed:
         chosen = " ".join(f"{group}={name}" for group, name in typed.items())
+        # Launchers and sweepers are read by multirun alone.
+        chosen = f"-m {chosen}" if any(group.startswith("hydra/") for group in typed) else chosen
         blocks += ["Examples", f"  trackmdp {command} {chosen}"]
         for group, name in ((group, name) for group, names in typed.items() for name in _names(names)):
             blocks += [
@@ -180,8 +182,7 @@ def _example(command: str, chosen: str, group: str, name: str) -> Iterator[str]:
             shown = "FILE" if value == "???" else json.dumps(value)
             # An interpolation is not something to type after a `=`: the shell would take the `$`.
             if "$" not in shown:
-                flag = "-m " if group.startswith("hydra/") else ""
-                yield f"  trackmdp {command} {flag}{chosen} {_prefix(group, name)}{key}={shown}"
+                yield f"  trackmdp {command} {chosen} {_prefix(group, name)}{key}={shown}"
                 return
 
 
