@@ -112,6 +112,14 @@ def test_a_policy_that_draws_is_refused() -> None:
         manager(Policy(WORLD, probability=0.5))
 
 
+def test_sensors_of_several_cells_are_refused() -> None:
+    wide = tm.World(
+        WORLD.kernel, 3, cost=0.2, t_max=1, coverage=np.array([[1.0] * 4 + [0.0] * 5, [0.0] * 4 + [1.0] * 5])
+    )
+    with pytest.raises(UserError, match="one sensor a cell"):
+        manager(Policy(wide, probability=0.0))
+
+
 def test_two_tracks_share_the_sensors() -> None:
     policy = tm.solve(WORLD, "qmdp").policy
     both = manager(policy)

@@ -204,8 +204,11 @@ class PolicySensorManager(SensorManager):
     def __init__(self, *args: Any, **more: Any) -> None:
         super().__init__(*args, **more)
         task = self.policy.task
-        if not self.policy.deterministic or task.order or not (task.perfect and task.safe):
-            raise UserError("policy: expected a deterministic one of the last cell, and sensors that do not miss")
+        perfect = task.perfect and task.safe and task.coverage is None
+        if not self.policy.deterministic or task.order or not perfect:
+            raise UserError(
+                "policy: expected a deterministic one of the last cell, and one sensor a cell without misses"
+            )
 
     def known(self, track: Track) -> tuple[int, int]:
         """The cell in which a track's target was last located, and the misses since then."""
