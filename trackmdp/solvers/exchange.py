@@ -28,7 +28,18 @@ from trackmdp.solvers.renewal import IndexArray, per_row, row_index
 from trackmdp.solvers.search import InnerProblem, located_value
 from trackmdp.world.model import Array, BoolArray, World
 
-__all__ = ["FLIPPED", "SINGLES", "PlansPart", "exchange", "exchanged", "improve", "ranked", "revealed", "solve"]
+__all__ = [
+    "FLIPPED",
+    "SINGLES",
+    "PlansPart",
+    "exchange",
+    "exchanged",
+    "improve",
+    "ranked",
+    "revealed",
+    "solve",
+    "summing",
+]
 
 MOST_NUMBERS = 2**17
 """Numbers in one array of a part, 1 MB: larger parts leave the caches, and took twice the time."""
@@ -181,10 +192,7 @@ class PlansPart:
             for (layer, entries), before in zip(kept, [self.entries[0][:0], *self.entries], strict=False)
         ]
         self.back = [sparse.csr_array(moves.T) for moves in self.moves]
-        self.sums = [
-            sparse.csr_array((np.ones(len(rows)), (rows, np.arange(len(rows)))), shape=(len(cells), len(rows)))
-            for rows in self.rows
-        ]
+        self.sums = [summing(rows, len(cells)) for rows in self.rows]
         self.detected = [problem.detected[each][:, None] for each in self.cells]
         self.cost = [world.cost[each][:, None] for each in self.cells]
         self.reports = [np.broadcast_to(world.detects(each), each.shape)[:, None] for each in self.cells]
@@ -285,6 +293,11 @@ class PlansPart:
         on: BoolArray = mass * gain > self.cost[t] * (self.sums[t] @ mass)[self.rows[t]]
         allowed = self.allowed[t]
         return on if allowed is None else on & allowed
+
+
+def summing(index: IndexArray, count: int) -> sparse.csr_array:
+    """`[count, E]` that sums the entries of each index, whatever the number of columns (`per_row` is for one)."""
+    return sparse.csr_array((np.ones(len(index)), (index, np.arange(len(index)))), shape=(count, len(index)))
 
 
 def ranked(rows: IndexArray, margin: Array, possible: BoolArray) -> IndexArray:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from trackmdp.solvers.exchange import FLIPPED, MOST_NUMBERS, SINGLES, PlansPart, ranked
+from trackmdp.solvers.exchange import FLIPPED, MOST_NUMBERS, SINGLES, PlansPart, ranked, summing
 from trackmdp.solvers.keyed import KeyedPairs
 from trackmdp.solvers.layers import reachable
 from trackmdp.solvers.renewal import IndexArray, per_row, row_index
@@ -145,7 +145,7 @@ class _GroupedPart(PlansPart):
             ),
         ]
         self.back = [sparse.csr_array(moves.T) for moves in self.moves]
-        self.sums = [_adding(rows, high - low) for rows in self.rows]
+        self.sums = [summing(rows, high - low) for rows in self.rows]
         self.stay = [per_row(row_index(m), m.data, m.shape[0])[:, None] for m in self.moves[1:]]
         self.detected, self.reports = (
             [np.zeros((0, 1)), *(np.asarray(each)[k][:, None] for each, k in zip(column, kept[1:], strict=True))]
@@ -164,7 +164,7 @@ class _GroupedPart(PlansPart):
             cost[first] = step.price[owner]
             self.owners.append(owner)
             self.group.append(group)
-            self.adding.append(_adding(group, len(owner)))
+            self.adding.append(summing(group, len(owner)))
             self.cost.append(cost[:, None])
         self.missed = chains.missed[kept[-1]][:, None]
         self.allowed = [None] * (self.length + 1)
@@ -199,8 +199,3 @@ class _GroupedPart(PlansPart):
         possible = there[:, 0] > 0
         rank: IndexArray = np.where(possible, np.minimum(ranked(row, margin, possible), SINGLES), SINGLES)[group]
         return rank
-
-
-def _adding(index: IndexArray, count: int) -> sparse.csr_array:
-    """`[count, E]` that sums entries by their index."""
-    return sparse.csr_array((np.ones(len(index)), (index, np.arange(len(index)))), shape=(count, len(index)))
