@@ -40,8 +40,6 @@ _MOST_CELLS_OF_NETS = 4_096
 """Above, embeddings of each (cell, clock) take time and memory that tables do not. At N = 32 tables end .007 per step
 below the optimum where nets end .002 below, and both .002 after the exchange."""
 _LOSSES = ("clocked_actor", "clocked_critic", "actor", "critic")
-
-
 _BEFORE_EXCHANGE = 100
 """Updates of a small problem whose sets are exchanged in the end. On 10 x 10 cells (seed 100, not one of any table) the
 exchanged policies after 1, 20, 60, 100 and 500 of them were the same, or of the same regret to .0001; after one update

@@ -56,8 +56,6 @@ class HiddenWorld(Task):
         super().__init__(size, **(of_task | {"markov": False}))
         if not self.safe:
             raise UserError("kernel: with a hidden mode the safe action must not miss")
-        if self.coverage is not None:
-            raise UserError("kernel: with a hidden mode, expected sensors of one cell each")
         if self.revealed not in (1, modes):
             raise UserError(f"revealed={self.revealed}: expected 1 or {modes}, the modes of the target")
         if self.window is not None or self.max_steps is not None:
