@@ -20,27 +20,6 @@ from typing import TYPE_CHECKING, Any
 
 __version__ = "0.2.0"
 
-__all__ = [
-    "Episodes",
-    "Evaluation",
-    "HiddenWorld",
-    "ObservationVector",
-    "Policy",
-    "Recorded",
-    "Run",
-    "Solution",
-    "TrackEnv",
-    "World",
-    "evaluate",
-    "load_run",
-    "load_tracks",
-    "make_hidden_world",
-    "make_world",
-    "simulate",
-    "solve",
-    "train",
-]
-
 _HOMES = {
     "Episodes": "trackmdp.episodes.batch",
     "Evaluation": "trackmdp.solvers.evaluation",
@@ -63,22 +42,33 @@ _HOMES = {
 }
 """Name -> the module it is defined in."""
 
-if TYPE_CHECKING:  # the same once more, for type checkers and editors, which do not run `__getattr__`
-    from trackmdp.episodes.batch import Episodes
-    from trackmdp.episodes.simulate import simulate
-    from trackmdp.policies.policy import Policy
-    from trackmdp.solvers.evaluate import evaluate
-    from trackmdp.solvers.evaluation import Evaluation
-    from trackmdp.solvers.solution import Solution
-    from trackmdp.solvers.solve import solve
-    from trackmdp.training.run import Run, load_run
-    from trackmdp.training.train import train
-    from trackmdp.world.env import TrackEnv
-    from trackmdp.world.make import load_tracks, make_hidden_world, make_world
-    from trackmdp.world.model import World
-    from trackmdp.world.modes import HiddenWorld
-    from trackmdp.world.observation import ObservationVector
-    from trackmdp.world.tracks import Recorded
+__all__ = sorted(_HOMES)
+
+if TYPE_CHECKING:  # the same once more, for type checkers and editors; `X as X` tells them that it is public
+    from trackmdp.episodes.batch import Episodes as Episodes
+    from trackmdp.episodes.simulate import simulate as simulate
+    from trackmdp.policies.policy import Policy as Policy
+    from trackmdp.solvers.evaluate import evaluate as evaluate
+    from trackmdp.solvers.evaluation import Evaluation as Evaluation
+    from trackmdp.solvers.solution import Solution as Solution
+    from trackmdp.solvers.solve import solve as solve
+    from trackmdp.training.run import Run as Run
+    from trackmdp.training.run import load_run as load_run
+    from trackmdp.training.train import train as train
+    from trackmdp.world.env import TrackEnv as TrackEnv
+    from trackmdp.world.make import (
+        load_tracks as load_tracks,
+    )
+    from trackmdp.world.make import (
+        make_hidden_world as make_hidden_world,
+    )
+    from trackmdp.world.make import (
+        make_world as make_world,
+    )
+    from trackmdp.world.model import World as World
+    from trackmdp.world.modes import HiddenWorld as HiddenWorld
+    from trackmdp.world.observation import ObservationVector as ObservationVector
+    from trackmdp.world.tracks import Recorded as Recorded
 
 
 if "gymnasium" in sys.modules:

@@ -16,8 +16,6 @@ from typing import Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["LARGE", "load_npy", "load_npz", "size_of"]
-
 LARGE = 2**32
 """Bytes of the largest table that is read: 4 GiB, once unfolded."""
 

@@ -22,22 +22,6 @@ from typing import IO, Any, BinaryIO
 from trackmdp.errors import UserError
 from trackmdp.untrusted import printable, sealed
 
-__all__ = [
-    "UNSUPPORTED",
-    "create",
-    "own_folder",
-    "reopen",
-    "say_lacking",
-    "second_name",
-    "sync",
-    "sync_folder",
-    "whole_file",
-    "write_bytes",
-    "write_json",
-    "write_sealed",
-    "write_text",
-]
-
 UNSUPPORTED = (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOLCK)
 """What a file system answers to a call that it does not know. EIO and ENOSPC are failures, and stay so."""
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import importlib.util
 from pathlib import Path
 
-__all__ = ["FAILED", "INTERRUPTED", "USER_MISTAKE", "Preempted", "RunError", "UserError", "adding", "require"]
-
 FAILED, USER_MISTAKE, INTERRUPTED = 1, 2, 130
 """Exit statuses of a command: a bug or a run that broke down, a user's mistake, Ctrl-C."""
 

@@ -12,8 +12,6 @@ from __future__ import annotations
 
 from gymnasium.envs.registration import register, registry
 
-__all__ = ["ID"]
-
 ID = "trackmdp/Track-v0"
 
 if ID not in registry:

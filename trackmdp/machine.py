@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-__all__ = ["SIZE_PATTERN", "free_bytes", "gib", "parse_bytes"]
-
 SIZE_PATTERN = r"[0-9]+(\.[0-9]+)?([KMGT]iB|B)?"
 """Sizes of memory as text: bytes, or with a unit of powers of 1,024."""
 

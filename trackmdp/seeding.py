@@ -14,8 +14,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:  # a world, whose draws are numpy's, is made without loading torch
     import torch
 
-__all__ = ["derive", "generator", "seed_global", "preserved_global_rng"]
-
 
 def derive(seed: int, *names: str | int) -> int:
     """A 63-bit seed for the stream called `names`, for example ``derive(0, "world", 3)``."""

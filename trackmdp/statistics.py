@@ -12,8 +12,6 @@ import numpy.typing as npt
 
 from trackmdp.seeding import derive
 
-__all__ = ["FEWEST", "LEVEL", "MeanInterval", "iqm", "mean_over_groups", "ratio", "share"]
-
 Values: TypeAlias = npt.NDArray[np.float64]
 
 LEVEL = 0.95

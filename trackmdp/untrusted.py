@@ -20,22 +20,6 @@ from typing import Any, BinaryIO
 
 from trackmdp.errors import UserError
 
-__all__ = [
-    "decoded",
-    "opened",
-    "parse_json",
-    "SMALL",
-    "no_formula",
-    "printable",
-    "read_bytes",
-    "read_json",
-    "read_object",
-    "read_text",
-    "reason",
-    "sealed",
-    "unsealed",
-]
-
 SMALL = 2**24
 """Bytes of the largest summary, plan, index or table of metrics: 16 MiB."""
 

@@ -14,8 +14,6 @@ import traceback
 from trackmdp import __version__
 from trackmdp.errors import FAILED, INTERRUPTED, USER_MISTAKE, Preempted, RunError, UserError
 
-__all__ = ["COMMANDS", "main"]
-
 COMMANDS = {
     "train": "learn a sensing policy without the motion model, and evaluate it exactly",
     "evaluate": "value a trained policy or a baseline, exactly and by simulation",

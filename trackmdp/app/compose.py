@@ -27,8 +27,6 @@ from trackmdp.config.resolvers import register_resolvers
 from trackmdp.config.untrusted import names_code
 from trackmdp.errors import UserError
 
-__all__ = ["Composer", "run_words", "register"]
-
 _LOGGING = {"class": {"logging.StreamHandler", "logging.FileHandler", "logging.NullHandler"}}
 _LOG_FILE = "${hydra.runtime.output_dir}/${hydra.job.name}.log"
 """The one log file that Hydra's own logging configs write."""
@@ -86,7 +84,7 @@ class Composer:
         extra: str | None = None,
     ) -> None:
         self.command, self.name = command, name or command
-        # Left in, Hydra would read those folders itself, without the checks of `UserFolder`.
+        # Left in, Hydra would read those folders itself, without the checks of `trackmdp.app.sources`.
         self.words = [word for word in words if not _is_search_path(word)]
         """What was typed, but for search paths."""
         named = [path for word in words if _is_search_path(word) for path in _search_path(word)]

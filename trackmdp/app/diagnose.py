@@ -16,8 +16,6 @@ from trackmdp.config.options import listed, several
 from trackmdp.config.refusals import refuse_renamed, unknown_choice, unknown_option
 from trackmdp.errors import UserError
 
-__all__ = ["diagnose"]
-
 Compose = Callable[[Sequence[str]], DictConfig]
 
 

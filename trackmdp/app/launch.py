@@ -24,8 +24,6 @@ from trackmdp.errors import UserError
 if TYPE_CHECKING:
     from trackmdp.app.sweep.plan import Job
 
-__all__ = ["launch"]
-
 
 def launch(command: str, words: Sequence[str]) -> int:
     """Compose, check and run `trackmdp command words...`; returns the exit status.

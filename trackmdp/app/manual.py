@@ -18,8 +18,6 @@ from trackmdp.config.refusals import refuse_renamed, unknown_choice
 from trackmdp.config.registry import conf_dir, conf_file, load_plugins
 from trackmdp.errors import UserError
 
-__all__ = ["EXAMPLES", "manual"]
-
 EXAMPLES = {
     "train": [
         "trackmdp train",

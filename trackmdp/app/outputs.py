@@ -12,8 +12,6 @@ from omegaconf.errors import MissingMandatoryValue
 
 from trackmdp.errors import UserError
 
-__all__ = ["folder_of", "make_folder", "remove_if_empty"]
-
 
 def folder_of(cfg: DictConfig, key: str) -> Path:
     """The folder at a dotted key, such as ``hydra.run.dir``, its interpolations resolved.

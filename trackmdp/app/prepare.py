@@ -33,8 +33,6 @@ from trackmdp.errors import UserError
 if TYPE_CHECKING:
     from trackmdp.world.tracks import Problem
 
-__all__ = ["Prepared", "announce", "check", "prepare", "say", "shown", "typed_config"]
-
 WORLD_KEYS = ("grid", "kernel", "cost", "sensor")
 
 

@@ -12,8 +12,6 @@ from trackmdp import __version__
 from trackmdp.app.compose import Composer
 from trackmdp.errors import UserError
 
-__all__ = ["answer", "is_question", "parse"]
-
 _INFO = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
 
 

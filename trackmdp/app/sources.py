@@ -17,8 +17,6 @@ from trackmdp.config.untrusted import MAX_BYTES, parse_yaml
 from trackmdp.errors import UserError
 from trackmdp.untrusted import read_text
 
-__all__ = ["searched"]
-
 _FORBIDDEN = {
     "hydra.callbacks": "a config does not name code to call",
     "hydra.searchpath": "further folders are named on the command line",
@@ -38,17 +36,17 @@ def searched(users: Sequence[Path], plugins: Sequence[Path], *, main_is_users: b
     """Hydra, initialised inside, also searches these folders, after the main one and in this order.
 
     Args:
-        users: named on the command line; their files are read by `UserFolder`.
+        users: named on the command line; their files are read by `_UserFolder`.
         plugins: of installed packages.
         main_is_users: the main folder is one of the user's as well.
     """
     global _main_is_users
     # Hydra makes both itself, without arguments, when it is initialised: they learn what to do from this module's
     # state.
-    for kind in (UserFolder, _Folders):
+    for kind in (_UserFolder, _Folders):
         Plugins.instance().register(kind)  # what is registered already stays
     # Hydra picks the class that reads a folder by the scheme before `://`; "data" is ours, "file" is Hydra's own.
-    _folders[:] = [("command-line", f"{UserFolder.scheme()}://{folder.absolute()}") for folder in users]
+    _folders[:] = [("command-line", f"{_UserFolder.scheme()}://{folder.absolute()}") for folder in users]
     # An installed package has run its code already: its files are read as those of `conf/` are.
     _folders.extend(("plugin", f"file://{folder.absolute()}") for folder in plugins)
     _main_is_users = main_is_users
@@ -66,13 +64,13 @@ class _Folders(SearchPathPlugin):
         for element in search_path.get_path():
             # Hydra has put the main folder there under `file://` itself; only here can its reader be changed.
             if element.provider == "main" and _main_is_users:
-                element.path = f"{UserFolder.scheme()}://{element.path}"
+                element.path = f"{_UserFolder.scheme()}://{element.path}"
         for provider, path in _folders:
             # After `conf/`: where both have a file of one name, Hydra takes the first.
             search_path.append(provider, path)
 
 
-class UserFolder(ConfigSource):
+class _UserFolder(ConfigSource):
     """A folder of the user's: only plain YAML files in it are read, of bounded size, and none names code."""
 
     @staticmethod

@@ -1,43 +1,13 @@
-"""The configuration: typed options with unit and range (Hydra structured configs); their values live in `conf/`."""
+"""The configuration: typed options with unit and range (Hydra structured configs); their values live in `conf/`.
 
-from trackmdp.config.baselines import (
-    AllOnConfig,
-    BaselineConfig,
-    ClockedConfig,
-    FcrConfig,
-    LookaheadConfig,
-    MyopicConfig,
-    NoSensorsConfig,
-    OptimalConfig,
-    PlaybackConfig,
-    QmdpConfig,
-    RandomKConfig,
-)
-from trackmdp.config.checks import validate
-from trackmdp.config.learned_kernel import LearnedKernelConfig
-from trackmdp.config.learning import (
-    A2cConfig,
-    AlgoConfig,
-    CollectorConfig,
-    DqnConfig,
-    MultiAsyncConfig,
-    MultiSyncConfig,
-    PpoConfig,
-    PrioritizedConfig,
-    RayWorkersConfig,
-    ScheduleConfig,
-    SingleConfig,
-)
+Here stand the names that commands and plugins use most; each schema is in a module of its own.
+"""
+
+from trackmdp.config.baselines import BaselineConfig, PlaybackConfig
+from trackmdp.config.learning import AlgoConfig, CollectorConfig, DqnConfig, ScheduleConfig
 from trackmdp.config.loggers import CsvConfig, LogConfig, McapConfig, MlflowConfig, TensorboardConfig, WandbConfig
 from trackmdp.config.options import GROUPS, SELECTORS, Option, choice, option, options, refuse
-from trackmdp.config.per_sensor import (
-    A2cPerSensorConfig,
-    DqnPerSensorConfig,
-    HindsightConfig,
-    PerSensorConfig,
-    PpoPerSensorConfig,
-)
-from trackmdp.config.refusals import suggestion
+from trackmdp.config.per_sensor import PerSensorConfig
 from trackmdp.config.registry import conf_dir, load_plugins
 from trackmdp.config.roots import (
     ROOTS,
@@ -45,9 +15,7 @@ from trackmdp.config.roots import (
     CheckpointConfig,
     CommandConfig,
     EvaluateConfig,
-    EvaluationConfig,
     ExportConfig,
-    OptimalBoundConfig,
     ReplayConfig,
     ReportConfig,
     SolveConfig,
@@ -57,105 +25,6 @@ from trackmdp.config.roots import (
 )
 from trackmdp.config.schema import ChoiceConfig, NodeConfig, Sizes
 from trackmdp.config.tree import from_hydra, load_config, load_run_config, to_dict, to_yaml, world_of
-from trackmdp.config.world import (
-    CostConfig,
-    DriftConfig,
-    FalseAlarmConfig,
-    FootprintConfig,
-    GridConfig,
-    KernelConfig,
-    MissConfig,
-    PaperCostConfig,
-    PerfectSensorConfig,
-    RandomSupportConfig,
-    RandomWalkConfig,
-    SensorConfig,
-    TableConfig,
-    TracksConfig,
-)
-
-__all__ = [
-    "GROUPS",
-    "ROOTS",
-    "SELECTORS",
-    "A2cConfig",
-    "A2cPerSensorConfig",
-    "AlgoConfig",
-    "AllOnConfig",
-    "BaselineConfig",
-    "BenchmarkConfig",
-    "CheckpointConfig",
-    "ChoiceConfig",
-    "ClockedConfig",
-    "CollectorConfig",
-    "CommandConfig",
-    "CostConfig",
-    "CsvConfig",
-    "DqnConfig",
-    "DqnPerSensorConfig",
-    "DriftConfig",
-    "EvaluateConfig",
-    "EvaluationConfig",
-    "ExportConfig",
-    "FalseAlarmConfig",
-    "FcrConfig",
-    "FootprintConfig",
-    "GridConfig",
-    "HindsightConfig",
-    "KernelConfig",
-    "LearnedKernelConfig",
-    "LogConfig",
-    "LookaheadConfig",
-    "McapConfig",
-    "MlflowConfig",
-    "MissConfig",
-    "MultiAsyncConfig",
-    "MultiSyncConfig",
-    "MyopicConfig",
-    "NoSensorsConfig",
-    "NodeConfig",
-    "OptimalConfig",
-    "OptimalBoundConfig",
-    "Option",
-    "PaperCostConfig",
-    "PerfectSensorConfig",
-    "PerSensorConfig",
-    "PlaybackConfig",
-    "PpoConfig",
-    "PpoPerSensorConfig",
-    "PrioritizedConfig",
-    "QmdpConfig",
-    "RandomKConfig",
-    "RandomSupportConfig",
-    "RandomWalkConfig",
-    "RayWorkersConfig",
-    "ReplayConfig",
-    "ReportConfig",
-    "ScheduleConfig",
-    "SensorConfig",
-    "SingleConfig",
-    "Sizes",
-    "SolveConfig",
-    "TableConfig",
-    "TensorboardConfig",
-    "TracksConfig",
-    "TrainConfig",
-    "VerifyConfig",
-    "WandbConfig",
-    "WorldConfig",
-    "choice",
-    "conf_dir",
-    "from_hydra",
-    "load_config",
-    "load_run_config",
-    "option",
-    "options",
-    "refuse",
-    "suggestion",
-    "to_dict",
-    "to_yaml",
-    "validate",
-    "world_of",
-]
+from trackmdp.config.world import CostConfig, FalseAlarmConfig, KernelConfig, PaperCostConfig, SensorConfig, TableConfig
 
 load_plugins()  # at the end: they import the names above

@@ -12,21 +12,6 @@ from trackmdp.config.options import choice, listed, option, refuse
 from trackmdp.config.schema import ChoiceConfig
 from trackmdp.machine import SIZE_PATTERN
 
-__all__ = [
-    "AllOnConfig",
-    "BaselineConfig",
-    "ClockedConfig",
-    "FcrConfig",
-    "LookaheadConfig",
-    "MyopicConfig",
-    "NoSensorsConfig",
-    "OptimalConfig",
-    "PlaybackConfig",
-    "QmdpConfig",
-    "RandomKConfig",
-    "SetsConfig",
-]
-
 
 @dataclass(kw_only=True)
 class BaselineConfig(ChoiceConfig):

@@ -7,8 +7,6 @@ from typing import Any
 
 from trackmdp.config.options import Option, leaves, nodes, options, refuse
 
-__all__ = ["absolute_paths", "validate"]
-
 
 def validate(cfg: Any) -> None:
     """Raise a `UserError` naming key, value and allowed range for the first option that breaks a rule."""

@@ -20,8 +20,6 @@ from trackmdp.config.roots import ROOTS
 from trackmdp.config.tree import build_config
 from trackmdp.config.values import choice_values, read_values, resolved
 
-__all__ = ["Default", "compose", "default", "given"]
-
 
 def compose(command: str, overrides: Mapping[str, Any] | None = None, *, folder: Path | None = None) -> Any:
     """The checked config of a command with some choices and options replaced.

@@ -9,8 +9,6 @@ from trackmdp.config.options import GROUPS, SELECTORS, nodes
 from trackmdp.config.registry import conf_file
 from trackmdp.errors import UserError
 
-__all__ = ["refuse_ignored"]
-
 
 def refuse_ignored(cfg: Any, typed: Mapping[str, Any], choices: Mapping[str, Any]) -> None:
     """Refuse what has no effect on this config.

@@ -8,8 +8,6 @@ from typing import Any, ClassVar
 from trackmdp.config.learning import AlgoConfig
 from trackmdp.config.options import choice, option, refuse
 
-__all__ = ["LearnedKernelConfig"]
-
 
 @choice("algo", "learned_kernel", makes="trackmdp.algos.learned_kernel:LearnedKernel")
 @dataclass(kw_only=True)

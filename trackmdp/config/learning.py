@@ -8,26 +8,6 @@ from typing import Any, ClassVar
 from trackmdp.config.options import choice, option, refuse
 from trackmdp.config.schema import BYTES, ChoiceConfig, NodeConfig, Sizes
 
-__all__ = [
-    "A2cConfig",
-    "ActorCriticConfig",
-    "AlgoConfig",
-    "CollectorConfig",
-    "DqnConfig",
-    "MultiAsyncConfig",
-    "MultiSyncConfig",
-    "PpoConfig",
-    "PrioritizedConfig",
-    "RayWorkersConfig",
-    "ScheduleConfig",
-    "SingleConfig",
-    "WorkersConfig",
-    "MOST_FRAMES",
-    "DEVICE",
-    "networks",
-    "state_bytes",
-]
-
 MOST_FRAMES = 10**12
 """Of a run: eleven days at a million frames per second. What asks for more would not end, and is a slip."""
 

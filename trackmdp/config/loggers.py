@@ -10,17 +10,6 @@ from trackmdp.config.options import choice, option
 from trackmdp.config.schema import ChoiceConfig
 from trackmdp.errors import require
 
-__all__ = [
-    "CsvConfig",
-    "LogConfig",
-    "McapConfig",
-    "MlflowConfig",
-    "RowsConfig",
-    "TensorboardConfig",
-    "WandbConfig",
-    "require_packages",
-]
-
 
 @dataclass(kw_only=True)
 class LogConfig(ChoiceConfig):

@@ -10,15 +10,6 @@ from trackmdp.config.options import GROUPS, Option, choice, option, refuse
 from trackmdp.config.values import nested_choice
 from trackmdp.config.world import KernelConfig
 
-__all__ = [
-    "ConstantVelocityConfig",
-    "CoordinatedTurnConfig",
-    "HeadingConfig",
-    "HiddenKernelConfig",
-    "RegimesConfig",
-    "VelocityConfig",
-]
-
 MOST_MODES = 1_000
 """Velocities, or velocities and turns; the states of a target are as many times the cells."""
 

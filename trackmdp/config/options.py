@@ -16,23 +16,6 @@ from typing import Any, TypeVar
 
 from trackmdp.errors import UserError
 
-__all__ = [
-    "GROUPS",
-    "SELECTORS",
-    "Option",
-    "Selector",
-    "as_float",
-    "choice",
-    "leaves",
-    "listed",
-    "nodes",
-    "option",
-    "optional",
-    "options",
-    "refuse",
-    "several",
-]
-
 T = TypeVar("T")
 
 GROUPS: dict[str, dict[str, type[Any]]] = {}

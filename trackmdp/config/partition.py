@@ -8,8 +8,6 @@ from typing import Any
 from trackmdp.config.options import option
 from trackmdp.config.schema import NodeConfig
 
-__all__ = ["PartitionConfig"]
-
 
 @dataclass(kw_only=True)
 class PartitionConfig(NodeConfig):

@@ -9,8 +9,6 @@ from trackmdp.config.learning import AlgoConfig
 from trackmdp.config.options import choice, option
 from trackmdp.config.schema import BYTES, Sizes
 
-__all__ = ["PathCountsConfig"]
-
 
 @choice("algo", "path_counts", makes="trackmdp.algos.path_counts:PathCounts")
 @dataclass(kw_only=True)

@@ -9,15 +9,6 @@ from trackmdp.config.learning import AlgoConfig, ScheduleConfig, networks
 from trackmdp.config.options import SELECTORS, Selector, choice, option, refuse
 from trackmdp.config.schema import BYTES, Sizes
 
-__all__ = [
-    "A2cPerSensorConfig",
-    "DqnPerSensorConfig",
-    "HindsightConfig",
-    "PerSensorConfig",
-    "PolicyGradientConfig",
-    "PpoPerSensorConfig",
-]
-
 SELECTORS["credit"] = Selector(
     group="algo",
     about="what a2c, ppo and dqn learn from; hindsight and learned_kernel have a credit of their own",

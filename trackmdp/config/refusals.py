@@ -9,8 +9,6 @@ from typing import Any
 from trackmdp.config.options import GROUPS, SELECTORS, Option
 from trackmdp.errors import UserError
 
-__all__ = ["RENAMED", "refuse_renamed", "suggestion", "unknown_choice", "unknown_option"]
-
 RENAMED: dict[str, str] = {
     "algo.average": "algo.ema_decay",
     "algo.clip": "algo.clip_epsilon",

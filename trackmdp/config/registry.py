@@ -27,8 +27,6 @@ from trackmdp.config.options import GROUPS, options
 from trackmdp.config.schema import ChoiceConfig
 from trackmdp.errors import UserError
 
-__all__ = ["conf_dir", "conf_file", "load_plugins", "make", "maker", "plugin_folders"]
-
 ENTRY_POINTS = "trackmdp.plugins"
 
 

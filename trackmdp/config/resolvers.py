@@ -8,8 +8,6 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-__all__ = ["register_resolvers"]
-
 
 def register_resolvers() -> None:
     """Register `${first:a,b}` and `${per_cell:count,size}`, or `${per_cell:count,size,least}`."""

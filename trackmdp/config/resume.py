@@ -15,8 +15,6 @@ from trackmdp.config.tree import load_run_config, to_yaml
 from trackmdp.errors import UserError
 from trackmdp.untrusted import read_object, unsealed
 
-__all__ = ["CHANGEABLE", "config_text", "continued", "config_digest", "finished", "run_folder"]
-
 CHANGEABLE = (
     "collector.total_frames",
     "optimal",

@@ -15,23 +15,6 @@ from trackmdp.config.schema import NodeConfig
 from trackmdp.config.world import CostConfig, GridConfig, KernelConfig, SensorConfig, TaskConfig
 from trackmdp.errors import UserError
 
-__all__ = [
-    "ROOTS",
-    "BenchmarkConfig",
-    "CheckpointConfig",
-    "CommandConfig",
-    "EvaluateConfig",
-    "EvaluationConfig",
-    "ExportConfig",
-    "OptimalBoundConfig",
-    "ReplayConfig",
-    "ReportConfig",
-    "SolveConfig",
-    "TrainConfig",
-    "VerifyConfig",
-    "WorldConfig",
-]
-
 
 @dataclass(kw_only=True)
 class CommandConfig(NodeConfig):

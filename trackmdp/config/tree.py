@@ -19,17 +19,6 @@ from trackmdp.config.untrusted import MAX_BYTES, parse_yaml
 from trackmdp.errors import UserError
 from trackmdp.untrusted import read_text
 
-__all__ = [
-    "build_config",
-    "from_hydra",
-    "load_config",
-    "load_run_config",
-    "refuse_unknown",
-    "to_dict",
-    "to_yaml",
-    "world_of",
-]
-
 C = TypeVar("C", bound=CommandConfig)
 
 

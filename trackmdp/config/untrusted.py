@@ -10,8 +10,6 @@ from omegaconf.errors import OmegaConfBaseException
 
 from trackmdp.errors import UserError
 
-__all__ = ["MAX_BYTES", "names_code", "parse_yaml"]
-
 MAX_BYTES = 2**20
 """Bytes of the largest config file that is read."""
 

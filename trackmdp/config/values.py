@@ -17,8 +17,6 @@ from trackmdp.config.registry import conf_file
 from trackmdp.config.resolvers import register_resolvers
 from trackmdp.errors import UserError
 
-__all__ = ["choice_values", "nested_choice", "read_values", "resolved"]
-
 
 def nested_choice(group: str, name: str, given: dict[str, Any], key: str, root: Any) -> Any:
     """A choice that stands among the options of another one, checked; what is not given is as in `conf/`.

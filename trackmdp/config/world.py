@@ -10,26 +10,6 @@ from trackmdp.config.options import GROUPS, Option, choice, listed, option, refu
 from trackmdp.config.schema import ChoiceConfig, NodeConfig, Sizes
 from trackmdp.errors import UserError
 
-__all__ = [
-    "LARGEST",
-    "CostConfig",
-    "DriftConfig",
-    "FalseAlarmConfig",
-    "FootprintConfig",
-    "GridConfig",
-    "KernelConfig",
-    "MissConfig",
-    "PerfectSensorConfig",
-    "RandomSupportConfig",
-    "RandomWalkConfig",
-    "SensorConfig",
-    "TableConfig",
-    "TaskConfig",
-    "TracksConfig",
-    "MEMORIES",
-    "lattice",
-]
-
 LARGEST = 1e15
 """Of a price or a reward: sums of them over cells and steps, and squares of those in a loss, stay far from overflow."""
 

@@ -23,8 +23,6 @@ from trackmdp.world.model import Task
 from trackmdp.world.sight import Sight
 from trackmdp.world.windows import Window
 
-__all__ = ["Actor", "Asking", "Choice", "Drawing", "Following", "Issuing", "States", "Uniform", "actor_of"]
-
 _MOST_ROWS = 4096  # episodes stepped together: their generators take 5 kB each
 _DRAWS = 25_600  # of one step: 256 steps of them are held at a time, 26 MB
 _HISTORY = 2**24  # entries of the action history of all rows

@@ -20,8 +20,6 @@ from trackmdp.policies.policy import Policy
 from trackmdp.world.model import Array, BoolArray
 from trackmdp.world.tracks import Problem, Recorded
 
-__all__ = ["Episodes", "Steps"]
-
 _BELIEF = 25_600  # cells, or hidden states, of the beliefs updated together: memory stays bounded on large grids
 
 

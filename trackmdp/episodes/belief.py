@@ -16,8 +16,6 @@ from trackmdp.world.belief import BeliefFilter
 from trackmdp.world.model import Task
 from trackmdp.world.modes import HiddenWorld, Modelled
 
-__all__ = ["beliefs"]
-
 
 def beliefs(world: Modelled, episodes: Sequence[Episode]) -> list[Floats]:
     """For each episode `[T, M]`, the probability of each cell after a step's move, given what was observed before it.

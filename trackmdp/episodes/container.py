@@ -20,8 +20,6 @@ from trackmdp import untrusted
 from trackmdp.errors import UserError
 from trackmdp.untrusted import reason
 
-__all__ = ["MAGIC", "Body", "Chunk", "Container", "Damaged", "Message", "opened_log", "records", "unpacked"]
-
 MAGIC = b"\x89MCAP0\r\n"
 # A record is its opcode (u8), the length of its content (u64) and the content; a string is its length (u32) and UTF-8.
 # Every number is little-endian. A file's header record, right after the magic, for example:

@@ -14,8 +14,6 @@ from tensordict import TensorDict
 from trackmdp.world.model import BoolArray, Task
 from trackmdp.world.windows import Window
 
-__all__ = ["Episode", "Floats", "Integers", "first_difference", "last_cells"]
-
 Floats: TypeAlias = npt.NDArray[np.float32]
 Integers: TypeAlias = npt.NDArray[np.int64]
 

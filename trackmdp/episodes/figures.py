@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 from trackmdp.world.model import Array
 
-__all__ = ["MeanEstimate", "Simulation", "summary"]
-
 
 @dataclass(frozen=True)
 class MeanEstimate:

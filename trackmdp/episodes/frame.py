@@ -8,8 +8,6 @@ from trackmdp.episodes.episode import Episode
 from trackmdp.world.model import Task
 from trackmdp.world.render import around
 
-__all__ = ["LEGEND", "frame", "outcome", "sentence", "where"]
-
 WIDE, STEP = 37, 9
 """Rows and columns of a grid that are drawn at most, which 80 characters hold, and how far the part drawn moves at
 once: it stays where it is while the target does not leave 9 x 9 cells."""

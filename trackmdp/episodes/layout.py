@@ -8,9 +8,6 @@ from typing import Any
 
 from trackmdp.durable import write_text
 
-__all__ = ["layout", "write_layout"]
-
-
 # A panel colours a grid by one of its fields, so that what is on, what is likely and what is true are one map each.
 _MAPS = ("belief", "active", "target", "policy")
 

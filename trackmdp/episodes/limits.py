@@ -13,18 +13,6 @@ from typing import Any
 
 from trackmdp.episodes import schema
 
-__all__ = [
-    "check_policy",
-    "check_row",
-    "check_run",
-    "check_steps",
-    "modes_of",
-    "sensors_of",
-    "size_of_grid",
-    "tables_of",
-    "policy_file",
-]
-
 _MOST = 10**9
 """Steps, episodes, T_max: beyond any log, and small enough to be multiplied without overflow."""
 

@@ -14,8 +14,6 @@ from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.policies.policy import PolicyLike
 from trackmdp.world.modes import Modelled
 
-__all__ = ["EpisodeLog", "free_name"]
-
 
 class EpisodeLog:
     """`episodes.mcap` in a run's folder.

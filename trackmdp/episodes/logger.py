@@ -15,8 +15,6 @@ from trackmdp.training.callbacks import Callback, Training
 from trackmdp.training.evaluator import Score
 from trackmdp.world.tracks import Recorded
 
-__all__ = ["EpisodeLogger"]
-
 
 class EpisodeLogger(Callback):
     """`episodes.mcap`: episodes of the policy at the first evaluation, at every k-th one, and at the last.

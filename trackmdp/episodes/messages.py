@@ -15,8 +15,6 @@ from trackmdp.episodes.schema import time_of
 from trackmdp.errors import UserError
 from trackmdp.world.model import BoolArray
 
-__all__ = ["decode", "grid_messages", "row_of", "step_messages"]
-
 # Ten bytes for each cell, without padding, as `_FIELDS` tells the viewer: belief at 0, policy at 4, active at 8,
 # target at 9. A grid of 100 cells is 1,000 bytes, 1,336 characters in base64.
 _CELL = np.dtype([("belief", "<f4"), ("policy", "<f4"), ("active", "u1"), ("target", "u1")])

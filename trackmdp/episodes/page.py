@@ -17,8 +17,6 @@ from trackmdp.solvers import bounds
 from trackmdp.solvers.keyed_search import cell_bound
 from trackmdp.world.modes import HiddenWorld
 
-__all__ = ["MOST_CELLS", "MOST_STEPS", "page", "write_page"]
-
 MOST_STEPS = 2000
 """Steps on a page; a longer episode is cut there, and the page says so."""
 

@@ -20,8 +20,6 @@ from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.frame import LEGEND, frame, sentence
 from trackmdp.world.model import Task
 
-__all__ = ["KEYS", "Playing", "play"]
-
 KEYS = "space pause   ← → step   + - speed   home end   q quit"
 _ARROWS = {"\x1b[C": "l", "\x1b[D": "h", "\x1b[H": "0", "\x1b[F": "$", "\x1b[1~": "0", "\x1b[4~": "$"}
 

@@ -29,8 +29,6 @@ from trackmdp.world.files import csr_of
 from trackmdp.world.model import Array, BoolArray, World
 from trackmdp.world.modes import HiddenWorld, Modelled
 
-__all__ = ["EpisodeReader", "checked_run"]
-
 R = TypeVar("R")
 
 

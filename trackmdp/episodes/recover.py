@@ -20,8 +20,6 @@ from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.errors import UserError
 from trackmdp.untrusted import reason
 
-__all__ = ["Recovered", "recover", "recovered_name", "taken_over"]
-
 _MOST_HELD = 2**28
 """Bytes of one episode's messages."""
 

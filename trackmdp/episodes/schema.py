@@ -10,23 +10,6 @@ from typing import Any
 
 from trackmdp import __version__
 
-__all__ = [
-    "END",
-    "LOG_FORMAT",
-    "MODE",
-    "POLICY",
-    "RUN",
-    "SCHEMAS",
-    "TICK_NS",
-    "digest",
-    "seal",
-    "tick_of",
-    "time_of",
-    "unsealed_record",
-    "versions",
-    "versions_apart",
-]
-
 LOG_FORMAT = "1"
 """Version of this layout; a reader refuses any other."""
 

@@ -22,8 +22,6 @@ from trackmdp.world.modes import check_revealed
 from trackmdp.world.reports import Reports
 from trackmdp.world.tracks import Problem
 
-__all__ = ["episode_seeds", "resimulate", "simulate"]
-
 _BLOCK = 256  # draws taken from an episode's generator at a time; part of what a seed means, so never to be changed
 
 

@@ -14,8 +14,6 @@ from trackmdp.world.modes import HiddenWorld, Modelled
 from trackmdp.world.motion import Motion
 from trackmdp.world.tracks import Problem, Recorded
 
-__all__ = ["Source", "source_of"]
-
 
 class Source(Protocol):
     """The targets of a problem; a place, int64, is the full state of a target."""

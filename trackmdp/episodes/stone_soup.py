@@ -40,8 +40,6 @@ from stonesoup.types.state import State  # noqa: E402
 from stonesoup.types.track import Track  # noqa: E402
 from stonesoup.types.update import StateUpdate, Update  # noqa: E402
 
-__all__ = ["CellSensor", "Followed", "Places", "PolicySensorManager", "follow", "gospa", "paths_of", "tracks_of"]
-
 
 @dataclass(frozen=True)
 class Places:

@@ -11,8 +11,6 @@ from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.limits import modes_of
 from trackmdp.episodes.reader import EpisodeReader
 
-__all__ = ["write_tables"]
-
 _STEP = ("episode", "t", "n", "last_cell", "active", "n_active", "forced", "target", "obs", "reward", "ep_return")
 
 

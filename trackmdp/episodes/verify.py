@@ -13,8 +13,6 @@ from trackmdp.episodes.simulate import resimulate
 from trackmdp.policies.policy import Policy
 from trackmdp.world.modes import Modelled
 
-__all__ = ["BELIEF_TOLERANCE", "Verified", "verify"]
-
 BELIEF_TOLERANCE = 1e-6
 """How far the belief may be off where other versions wrote the log; all else must still be the same to the bit."""
 

@@ -27,8 +27,6 @@ from trackmdp.world.coverage import Coverage
 from trackmdp.world.files import csr_of
 from trackmdp.world.modes import HiddenWorld, Modelled
 
-__all__ = ["EpisodeWriter"]
-
 FLUSH_STEPS = 100
 """An episode's end closes the chunk once so many steps are in it, and hands it to the operating system."""
 

@@ -16,8 +16,6 @@ from trackmdp.solvers import bounds, qmdp
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.world.kernels import Border
 
-__all__ = ["BORDER", "DRAWS", "SEEDS", "T_MAX", "Candidate", "Setting", "Spread", "candidates", "chosen", "sensitivity"]
-
 BORDER: Border = "renormalize"
 T_MAX = 1
 SEEDS = range(100)

@@ -11,8 +11,6 @@ from trackmdp.reports.grouping import Study
 from trackmdp.reports.tables import Cell, Column, Table
 from trackmdp.solvers import optimal
 
-__all__ = ["bounds_table", "checks", "checks_table", "points"]
-
 TOLERANCE = 1e-9
 # Z = 5 is where Q_MDP fails: each likely move has (1 - 0.15 - 0.005) / 4 = 0.211, below c/r = 0.22.
 HARDEST = 5

@@ -16,8 +16,6 @@ import numpy.typing as npt
 from trackmdp.solvers.pomdp import FiniteMdp
 from trackmdp.world.model import Array, BoolArray, World
 
-__all__ = ["HistoryQ", "estimates", "filtered", "solve_histories"]
-
 History = tuple[int, ...]
 """Sets sensed since the last detection, each as its number in `actions`."""
 

@@ -14,8 +14,6 @@ from trackmdp.solvers.keyed_search import cell_bound
 from trackmdp.solvers.solution import Solution
 from trackmdp.world.modes import HiddenWorld
 
-__all__ = ["check_modes"]
-
 _OF_CELLS = {
     "Theorem 1": "p_j > c/r is sensed, p_j the probability of cell j given the last located cell",
     "Lemma 1": "known at b but undetected is worth at most located at b",

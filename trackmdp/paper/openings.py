@@ -24,8 +24,6 @@ from trackmdp.paper.calibration import (
 from trackmdp.paper.theorems import Check
 from trackmdp.paper.worlds import SUPPORTS
 
-__all__ = ["OPENINGS_FILE", "Openings", "compute", "load_openings", "save_openings"]
-
 OPENINGS_FILE = "paper.json"
 _DIGITS = 6
 

@@ -9,8 +9,6 @@ from trackmdp.paper.worlds import COSTS, EXIT_PROBABILITY, LOW_PROBABILITY, RADI
 from trackmdp.reports.grouping import Study
 from trackmdp.reports.results import FinishedRun
 
-__all__ = ["PRINTED_QMDP", "PRINTED_TMDP", "pair_of", "pairs"]
-
 PRINTED_QMDP: Mapping[tuple[int, float], float] = {
     **{(3, c): 90.74 for c in COSTS},
     **{(4, c): 88.82 for c in COSTS},

@@ -9,8 +9,6 @@ from trackmdp.paper.worlds import paper_kernel, paper_world
 from trackmdp.solvers import bounds, clocked, optimal, qmdp
 from trackmdp.solvers.evaluate import evaluate
 
-__all__ = ["check_remarks"]
-
 
 def check_remarks(tolerance: float) -> Iterator[Check]:
     """Both remarks, each with its figures."""

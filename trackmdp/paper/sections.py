@@ -15,8 +15,6 @@ from trackmdp.reports.grouping import Study
 from trackmdp.reports.page import Part, Section
 from trackmdp.reports.tables import Cell, Column, Table
 
-__all__ = ["accuracy_table", "sections"]
-
 
 def sections(study: Study, openings: Openings) -> list[Section]:
     """The sections that follow those of any sweep."""

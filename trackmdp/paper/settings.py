@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Canvas
 
-__all__ = ["RULE", "calibration_figure", "candidates_table", "fit_table", "sensitivity_figures", "sensitivity_table"]
-
 RULE = (
     f"Of the kernels drawn with seeds {SEEDS[0]} to {SEEDS[-1]} (T_max = {T_MAX}, border {BORDER}), each Z takes the "
     "one whose exact pooled accuracy of Q_MDP deviates least from the printed column, the largest deviation of the "

@@ -23,8 +23,6 @@ from trackmdp.solvers.search import InnerProblem
 from trackmdp.solvers.solution import Solution
 from trackmdp.world.model import Array, World
 
-__all__ = ["Check", "changed", "check_theorems", "corner", "dearer", "summarize_checks"]
-
 # Relative rounding that equalities are allowed, and the gap at which a search for the optimum ends.
 SLACK = 1e-10
 # How far below the plan being followed the search of Lemma 1 begins.

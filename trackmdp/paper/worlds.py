@@ -7,18 +7,6 @@ import numpy as np
 from trackmdp.world.kernels import Border, random_support
 from trackmdp.world.model import Array, World
 
-__all__ = [
-    "COSTS",
-    "EXIT_PROBABILITY",
-    "LOW_PROBABILITY",
-    "RADIUS",
-    "REWARD",
-    "SIZE",
-    "SUPPORTS",
-    "paper_kernel",
-    "paper_world",
-]
-
 SUPPORTS = (3, 4, 5)
 """Z, the positions that the target may move to from a cell."""
 COSTS = (0.16, 0.18, 0.2, 0.22)

@@ -19,8 +19,6 @@ if TYPE_CHECKING:  # the display of a planner is no reason to load torch
     from trackmdp.training.state import Position
     from trackmdp.world.tracks import Problem
 
-__all__ = ["Callback", "Row", "Training"]
-
 Row = Mapping[str, float | int | None]
 """Figures of one iteration by their names, as `metrics.csv` has them; None for what was not measured."""
 

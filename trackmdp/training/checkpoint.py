@@ -22,8 +22,6 @@ from trackmdp.durable import own_folder, second_name, sync_folder, whole_file
 from trackmdp.errors import UserError
 from trackmdp.untrusted import decoded, opened
 
-__all__ = ["BEST", "CHECKPOINT_FORMAT", "LAST", "available_checkpoints", "load", "named", "newest", "point", "save"]
-
 CHECKPOINT_FORMAT = 4
 BEST, LAST = "best.pt", "last.pt"
 _SEAL = 128

@@ -19,8 +19,6 @@ from trackmdp.training.devices import make_device
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.tracks import Problem
 
-__all__ = ["collector_state", "load_collector_state", "multi_async", "multi_sync", "ray", "single"]
-
 
 def single(
     problem: Problem,

@@ -6,8 +6,6 @@ import torch
 
 from trackmdp.errors import UserError
 
-__all__ = ["make_device"]
-
 
 def make_device(name: str, key: str = "device") -> torch.device:
     """The torch device called `name`; `auto` is the first GPU where there is one.

@@ -16,8 +16,6 @@ from rich.text import Text
 from trackmdp.training.callbacks import Callback, Row, Training
 from trackmdp.untrusted import printable
 
-__all__ = ["Display", "make_console", "table"]
-
 _SECONDS_BETWEEN_LINES = 2.0
 _FIGURES_WIDTH = 60
 """Columns of `300,000 frames AIHTR -2,985.00 gap 3,102.25 left 0:00:04`, and of the gaps between."""

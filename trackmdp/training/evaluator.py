@@ -16,8 +16,6 @@ from trackmdp.solvers.keyed_search import mode_bound
 from trackmdp.world.model import Task, World
 from trackmdp.world.modes import HiddenWorld
 
-__all__ = ["Evaluator", "ExactEvaluator", "HiddenEvaluator", "Score", "figures", "while_collecting"]
-
 _PER_CELL = ("value", "steps", "detections", "sensors", "safe_actions")
 
 

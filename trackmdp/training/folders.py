@@ -13,18 +13,6 @@ from trackmdp.training.lock import is_locked
 from trackmdp.training.sealing import read_summary
 from trackmdp.untrusted import read_object
 
-__all__ = [
-    "DONE",
-    "FAILED_FILE",
-    "PLAN",
-    "RunState",
-    "read_run_json",
-    "read_plan",
-    "run_of",
-    "runs_of",
-    "write_plan",
-]
-
 PLAN, FAILED_FILE, DONE = "sweep.json", "failed.json", "done.json"
 """Files: of a sweep; of a run that failed, of a run of another command than `train` that ended."""
 

@@ -21,8 +21,6 @@ from trackmdp.world.model import World
 from trackmdp.world.modes import HiddenWorld
 from trackmdp.world.tracks import Problem, Recorded, Tracks
 
-__all__ = ["ESTIMATED", "HeldOutEvaluator", "estimated_kernel", "make_evaluator"]
-
 ESTIMATED = "Q_MDP of the estimated kernel"
 """Q_MDP for the motion as the tracks to learn from show it."""
 

@@ -18,8 +18,6 @@ from trackmdp.untrusted import parse_json, read_bytes
 from trackmdp.world.recording import recording_bytes
 from trackmdp.world.tracks import Problem, Recorded
 
-__all__ = ["FOOTPRINTS", "RECORDING", "check_inputs", "write_inputs"]
-
 RECORDING = "recording.npz"
 """The tracks of a run that was begun in Python, which may have been read from any file, or from none."""
 FOOTPRINTS = "footprints.npz"

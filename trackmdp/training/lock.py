@@ -19,8 +19,6 @@ from trackmdp.durable import UNSUPPORTED, create, reopen, say_lacking
 from trackmdp.errors import UserError
 from trackmdp.untrusted import opened, read_object
 
-__all__ = ["is_locked", "locked"]
-
 _TRIES, _BETWEEN = 5, 0.05
 _LOCK, _OWNER = ".lock", ".lock.owner"
 _BEAT, _SILENT = 5.0, 60.0

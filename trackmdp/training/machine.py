@@ -10,8 +10,6 @@ from typing import Any
 
 import torch
 
-__all__ = ["machine"]
-
 
 def machine() -> dict[str, Any]:
     """Processor, cores, memory and versions."""

@@ -15,8 +15,6 @@ from trackmdp.training.callbacks import Callback
 from trackmdp.world.model import Task
 from trackmdp.world.tracks import Problem
 
-__all__ = ["make_algorithm", "make_collector", "make_loggers"]
-
 
 def make_algorithm(cfg: TrainConfig, task: Task, device: torch.device) -> Algorithm:
     """The learner; it is given the task, never the motion."""

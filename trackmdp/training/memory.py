@@ -12,8 +12,6 @@ from trackmdp.errors import UserError
 from trackmdp.machine import free_bytes, gib
 from trackmdp.world.model import Task
 
-__all__ = ["available_bytes", "check_memory", "needs"]
-
 
 def check_memory(cfg: TrainConfig, task: Task, device: torch.device) -> str:
     """One line about the memory that the run needs and what there is on `device`.

@@ -16,8 +16,6 @@ from trackmdp.training.callbacks import Callback, Row, Training
 from trackmdp.training.evaluator import figures
 from trackmdp.untrusted import decoded, opened
 
-__all__ = ["CsvLogger", "TensorboardLogger", "final_figures", "known"]
-
 
 class CsvLogger(Callback):
     """`metrics.csv`: one row per logged iteration; the columns are those of the first row.

@@ -15,8 +15,6 @@ from trackmdp.errors import UserError, require
 from trackmdp.training.signals import kept_sigterm
 from trackmdp.world.env import TrackEnv
 
-__all__ = ["make_ray_collector"]
-
 _STORE = 2**30
 """Bytes for the batches on their way, of a cluster that is started here."""
 

@@ -26,8 +26,6 @@ from trackmdp.untrusted import decoded, read_text
 from trackmdp.world.model import Array, World
 from trackmdp.world.tracks import Recorded
 
-__all__ = ["Metrics", "Run", "complete", "load_run", "read_metrics"]
-
 Metrics = dict[str, list[float | int | None]]
 """Columns by their names, as in `metrics.csv`: one value for each logged iteration, None for what was not measured."""
 
@@ -53,7 +51,7 @@ class Run:
     solution: Solution | None = None
 
 
-class Table(Callback):
+class _Rows(Callback):
     """Keeps the rows of all iterations in memory."""
 
     def __init__(self) -> None:
@@ -72,8 +70,8 @@ def complete(trainer: Trainer) -> Run:
         UserError, Preempted, RunError: see `Trainer.run`.
     """
     began, used = time.monotonic(), time.process_time()
-    table = Table()
-    trainer.callbacks.append(table)
+    rows = _Rows()
+    trainer.callbacks.append(rows)
     score = trainer.run()
     policy = trainer.policy()
     solution = _solve(trainer, policy)
@@ -92,8 +90,8 @@ def complete(trainer: Trainer) -> Run:
         # Last, for a folder with a summary is a finished run.
         write_summary(trainer.folder, summary)
     # A resumed run's earlier rows are in its file alone.
-    metrics = table.columns if trainer.folder is None else read_metrics(trainer.folder)
-    return Run(policy, final, metrics or table.columns, summary, trainer.folder, solution)
+    metrics = rows.columns if trainer.folder is None else read_metrics(trainer.folder)
+    return Run(policy, final, metrics or rows.columns, summary, trainer.folder, solution)
 
 
 def _solve(trainer: Trainer, learned: Policy) -> Solution | None:

@@ -16,8 +16,6 @@ from trackmdp.training.callbacks import Callback, Row, Training
 from trackmdp.training.evaluator import Score
 from trackmdp.training.state import Position, capture
 
-__all__ = ["Checkpoints"]
-
 _SAVING = 50  # seconds of training to one of saving, at least
 
 

@@ -15,8 +15,6 @@ from trackmdp.durable import write_sealed
 from trackmdp.errors import UserError
 from trackmdp.untrusted import opened, read_object, unsealed
 
-__all__ = ["SUMMARY", "check_files", "read_summary", "write_summary"]
-
 SUMMARY = "summary.json"
 _FILES = ("config.yaml", "kernel.npz", "tracks.json", "policy.npz")
 _LARGEST = 2**36

@@ -11,8 +11,6 @@ from contextlib import contextmanager
 from types import FrameType, TracebackType
 from typing import Self
 
-__all__ = ["Signals", "kept_sigterm"]
-
 _HEARD = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
 _ONE = 2.0
 """Seconds in which two count as one: `timeout` and some schedulers signal the process, and then its group once more."""

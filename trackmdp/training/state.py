@@ -21,8 +21,6 @@ from trackmdp.training import checkpoint
 from trackmdp.training.collect import collector_state, load_collector_state
 from trackmdp.untrusted import decoded
 
-__all__ = ["Position", "capture", "find", "identity", "load_learned", "restore", "take_weights"]
-
 _EXACT = ("torch", "torchrl", "tensordict", "numpy", "scipy", "hydra-core", "trackmdp")
 _PARTS = {"format", "iteration", "identity", "versions", "algorithm", "collector", "random", "position", "callbacks"}
 """Of the state of a run: what `capture` takes, and the two that `checkpoint.save` adds."""

@@ -14,8 +14,6 @@ from trackmdp.training.callbacks import Training
 from trackmdp.training.evaluator import Score, figures, while_collecting
 from trackmdp.training.machine import machine
 
-__all__ = ["summarize"]
-
 _PACKAGES = ("torch", "torchrl", "tensordict", "hydra-core", "numpy", "scipy")
 
 

@@ -16,8 +16,6 @@ from trackmdp.errors import Preempted, RunError
 from trackmdp.training.callbacks import Callback, Row, Training
 from trackmdp.training.metrics import final_figures, known
 
-__all__ = ["MlflowLogger", "WandbLogger"]
-
 
 class WandbLogger(Callback):
     """Weights & Biases through TorchRL's logger: config, a row per logged iteration over frames, final figures.

@@ -25,8 +25,6 @@ from trackmdp.world.model import Array, World
 from trackmdp.world.modes import HiddenWorld
 from trackmdp.world.tracks import Problem
 
-__all__ = ["train"]
-
 
 def train(
     problem: Problem,

@@ -33,8 +33,6 @@ from trackmdp.training.workers import Watch
 from trackmdp.untrusted import decoded
 from trackmdp.world.tracks import Problem
 
-__all__ = ["Trainer"]
-
 
 class Trainer:
     """One training run, begun anew or resumed from a checkpoint in its folder.

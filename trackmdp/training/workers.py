@@ -11,8 +11,6 @@ from typing import Any
 
 from torchrl.collectors import BaseCollector
 
-__all__ = ["Watch"]
-
 
 class Watch:
     """While entered, the end of a worker process of `collector` interrupts the call that waits for it.

@@ -17,8 +17,6 @@ from trackmdp.solvers.partition import default_halo
 from trackmdp.solvers.solve import run_solver
 from trackmdp.world.model import World
 
-__all__ = ["handoff"]
-
 COSTS, T_MAX = (0.16, 0.22), (1, 2)
 
 

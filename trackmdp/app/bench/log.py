@@ -18,8 +18,6 @@ from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.solvers import qmdp
 from trackmdp.world.model import World
 
-__all__ = ["log_speed"]
-
 _EPISODES = 100
 
 

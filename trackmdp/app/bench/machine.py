@@ -7,8 +7,6 @@ from collections.abc import Callable
 
 import torch
 
-__all__ = ["rate"]
-
 
 def rate(work: Callable[[], int], seconds: float, device: torch.device) -> dict[str, float]:
     """Call `work` for at least `seconds` after a warm-up call; units per wall second and CPU microseconds per unit.

@@ -15,8 +15,6 @@ from trackmdp.training.memory import needs
 from trackmdp.world.make import build_world
 from trackmdp.world.model import World
 
-__all__ = ["memory"]
-
 SIZES, FRAMES = (5, 10, 20), 300_000
 
 

@@ -20,8 +20,6 @@ from trackmdp.policies.policy import Policy
 from trackmdp.training.evaluator import ExactEvaluator
 from trackmdp.world.model import World
 
-__all__ = ["Learned", "chart", "peers"]
-
 GOAL = 0.02
 """Regret per step that the learners are timed to."""
 

@@ -17,8 +17,6 @@ from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 
-__all__ = ["TimedTraining", "Usage", "measured", "on_one_core", "timed_training", "typed"]
-
 # Runs in the child, around the program: only a process itself can read its own peak memory when it ends.
 _WRAPPER = """
 import json, re, resource, runpy, sys

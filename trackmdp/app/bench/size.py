@@ -17,8 +17,6 @@ from trackmdp.app.bench.process import measured, typed
 from trackmdp.config import BenchmarkConfig
 from trackmdp.world.model import World
 
-__all__ = ["size"]
-
 COSTS = (0.16, 0.22)
 """Prices: at the first beliefs hardly spread, at the second all probabilities lie below c/r."""
 WINDOW, ENVS = 2, 1024

@@ -21,8 +21,6 @@ from trackmdp.training.make import make_algorithm, make_collector
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.model import World
 
-__all__ = ["collector_speed", "env_speed", "train_speed"]
-
 Row = dict[str, Any]
 
 

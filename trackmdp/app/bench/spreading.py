@@ -15,8 +15,6 @@ from trackmdp.training.train import train
 from trackmdp.world.make import make_world
 from trackmdp.world.model import Array, World
 
-__all__ = ["bracket", "regret", "worlds"]
-
 Maker: TypeAlias = Callable[[], World]
 
 ALGOS = ("hindsight", "learned_kernel")

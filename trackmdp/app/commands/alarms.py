@@ -18,8 +18,6 @@ from trackmdp.world.model import World
 from trackmdp.world.sensors import false_alarm
 from trackmdp.world.tracks import Problem
 
-__all__ = ["run"]
-
 
 def run(
     problem: Problem, sensor: FalseAlarmConfig, policy: Policy, subject: str, folder: Path, console: Console

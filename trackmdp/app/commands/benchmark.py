@@ -18,8 +18,6 @@ from trackmdp.world.make import build_world
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Problem
 
-__all__ = ["PARTS", "run"]
-
 PARTS: dict[str, Callable[[BenchmarkConfig, World, torch.device], Iterable[dict[str, Any]]]] = {
     "env": speed.env_speed,
     "collector": speed.collector_speed,

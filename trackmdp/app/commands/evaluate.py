@@ -34,8 +34,6 @@ from trackmdp.world.model import World
 from trackmdp.world.modes import Modelled
 from trackmdp.world.tracks import Problem, Recorded
 
-__all__ = ["run"]
-
 _FOR_THE_PICTURE = 16  # episodes simulated where none are asked for
 
 

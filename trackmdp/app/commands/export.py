@@ -24,8 +24,6 @@ from trackmdp.policies.saved import sets_name, write_sets
 from trackmdp.training.display import make_console
 from trackmdp.world.model import BoolArray
 
-__all__ = ["run", "to_onnx", "to_torch"]
-
 FILES = {"torch_export": "policy.pt2", "onnx": "policy.onnx", "sets": "sets.json"}
 _INPUTS = ("last_cell", "steps_since_detection")
 _LARGEST = 2**31  # entries, a byte each

@@ -17,8 +17,6 @@ from trackmdp.training.held_out import HeldOutEvaluator
 from trackmdp.world.gridding import said
 from trackmdp.world.tracks import Problem, Recorded
 
-__all__ = ["run", "show_held_out", "show_loaded"]
-
 
 def run(
     world: Recorded,

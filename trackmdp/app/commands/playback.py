@@ -20,8 +20,6 @@ from trackmdp.world.make import make_problem
 from trackmdp.world.modes import Modelled
 from trackmdp.world.tracks import Problem, Recorded
 
-__all__ = ["run"]
-
 
 def run(cfg: EvaluateConfig, folder: Path, console: Console, problem: Problem | None = None) -> float:
     """Write `evaluation.json` to `folder`; returns the simulated AIHTR.

@@ -22,8 +22,6 @@ from trackmdp.training.display import make_console, table
 from trackmdp.world.make import make_problem
 from trackmdp.world.tracks import Recorded
 
-__all__ = ["run"]
-
 
 def run(cfg: ReplayConfig, folder: Path) -> None:  # noqa: ARG001  what is written has a name of its own
     """Do what `cfg` asks for with the log `cfg.file`.

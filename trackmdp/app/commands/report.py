@@ -20,8 +20,6 @@ from trackmdp.reports.results import Results, is_stored, load_results, save_resu
 from trackmdp.training.display import make_console
 from trackmdp.untrusted import printable
 
-__all__ = ["run"]
-
 
 def run(cfg: ReportConfig, folder: Path) -> float:
     """Write the report to `folder`, or watch the sweep; returns the number of finished runs.

@@ -26,8 +26,6 @@ from trackmdp.world.model import World
 from trackmdp.world.modes import Modelled
 from trackmdp.world.tracks import Problem, Recorded
 
-__all__ = ["run"]
-
 _SECONDS_BETWEEN_LINES = 2.0
 _BOUNDS = {"paper": bounds.paper, "valid": bounds.valid, "clocked": bounds.clocked}
 

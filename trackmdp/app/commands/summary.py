@@ -9,8 +9,6 @@ from trackmdp.training.display import table
 from trackmdp.training.run import Run
 from trackmdp.training.trainer import Trainer
 
-__all__ = ["show_summary"]
-
 
 def show_summary(console: Console, trainer: Trainer, run: Run) -> None:
     """The learned policy beside Q_MDP, all sensors on, and the optimum where it was solved for."""

@@ -16,8 +16,6 @@ from trackmdp.training.trainer import Trainer
 from trackmdp.world.make import make_problem
 from trackmdp.world.tracks import Problem
 
-__all__ = ["run"]
-
 
 def run(cfg: TrainConfig, folder: Path, problem: Problem | None = None) -> float:
     """Train as `cfg` says and write inputs, metrics, checkpoints, policy and summary to `folder`; returns the AIHTR.

@@ -16,8 +16,6 @@ from trackmdp.training.state import load_learned
 from trackmdp.world.make import make_problem
 from trackmdp.world.tracks import Problem
 
-__all__ = ["Trained", "trained"]
-
 
 @dataclass(frozen=True)
 class Trained:

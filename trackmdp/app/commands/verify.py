@@ -22,8 +22,6 @@ from trackmdp.world.make import make_problem
 from trackmdp.world.modes import HiddenWorld, Modelled
 from trackmdp.world.tracks import Problem, Recorded
 
-__all__ = ["run", "show_checks", "write_checks"]
-
 NODES = 10_000_000
 """Work for the optimum the theorems are about: two minutes or so."""
 

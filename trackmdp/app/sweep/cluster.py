@@ -17,8 +17,6 @@ from trackmdp.app.sweep.plan import Job
 from trackmdp.app.sweep.schema import SubmititConfig, SubmititLocalConfig, SubmititSlurmConfig
 from trackmdp.errors import FAILED, UserError
 
-__all__ = ["launcher"]
-
 SUBMISSIONS = ".submissions"
 """Folder, in that of the sweep, of what the scheduler is given and says."""
 

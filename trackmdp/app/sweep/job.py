@@ -18,8 +18,6 @@ from trackmdp.errors import USER_MISTAKE
 from trackmdp.training.folders import DONE, FAILED_FILE, run_of
 from trackmdp.training.sealing import SUMMARY
 
-__all__ = ["STOP", "Launch", "fail", "run_job", "stop_signal"]
-
 Launch = Callable[[Sequence[Job]], None]
 """Runs jobs, and returns once none of them is running."""
 

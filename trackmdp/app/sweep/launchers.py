@@ -18,8 +18,6 @@ from trackmdp.app.sweep.schema import BasicConfig, JoblibConfig, LauncherConfig,
 from trackmdp.config import TrainConfig
 from trackmdp.errors import require
 
-__all__ = ["make_launcher", "threads_of"]
-
 # Each names the threads of one library (OpenMP, OpenBLAS, MKL), which by default take all cores, in every run at once.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 

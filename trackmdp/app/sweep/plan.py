@@ -23,8 +23,6 @@ from trackmdp.config import CommandConfig, TrainConfig, to_dict
 from trackmdp.config.resume import CHANGEABLE
 from trackmdp.errors import UserError
 
-__all__ = ["Job", "combinations", "parsed", "plan", "sweep_name"]
-
 _MOST = 100_000
 """Runs of a sweep; range(10000000) is a slip."""
 

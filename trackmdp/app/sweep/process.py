@@ -19,8 +19,6 @@ from trackmdp.app.prepare import announce, check
 from trackmdp.app.sweep.plan import Job
 from trackmdp.errors import FAILED, USER_MISTAKE, Preempted, RunError, UserError
 
-__all__ = ["METHOD", "OUTPUT", "Outcome", "context_for", "stop_all", "run_in_process"]
-
 OUTPUT = "output.txt"
 """File in a run's folder for what it says, where several runs would say it at once."""
 

@@ -11,8 +11,6 @@ from trackmdp.app.sweep.schema import RayConfig
 from trackmdp.errors import UserError
 from trackmdp.training.signals import kept_sigterm
 
-__all__ = ["launch_on_ray"]
-
 _STORE = 100 * 2**20
 """Bytes for the objects of a cluster started here; the runs hand over none."""
 

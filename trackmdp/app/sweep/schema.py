@@ -11,21 +11,6 @@ from omegaconf import OmegaConf
 from trackmdp.config.options import leaves, option, refuse
 from trackmdp.errors import UserError
 
-__all__ = [
-    "PLUGINS",
-    "BasicConfig",
-    "BlocksConfig",
-    "JoblibConfig",
-    "LauncherConfig",
-    "OptunaConfig",
-    "RayConfig",
-    "SubmititConfig",
-    "SubmititLocalConfig",
-    "SubmititSlurmConfig",
-    "SweeperConfig",
-    "plugin",
-]
-
 T = TypeVar("T")
 
 PLUGINS: dict[str, dict[str, type[Any]]] = {"launcher": {}, "sweeper": {}}

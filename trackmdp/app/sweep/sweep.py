@@ -24,8 +24,6 @@ from trackmdp.training.lock import locked
 from trackmdp.training.sealing import SUMMARY
 from trackmdp.training.signals import Signals
 
-__all__ = ["sweep"]
-
 _ROUNDS = 3
 """How often what a broken launcher left undone is launched."""
 

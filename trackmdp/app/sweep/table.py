@@ -17,8 +17,6 @@ from trackmdp.training.display import table
 from trackmdp.training.folders import FAILED_FILE, RunState, read_run_json
 from trackmdp.untrusted import no_formula
 
-__all__ = ["TABLE", "run_figures", "run_scores", "show_runs", "status_of", "write_table"]
-
 TABLE = "runs.csv"
 
 _FIGURES = ("aihtr", "regret_per_step", "accuracy", "sensors_per_step", "frames")

@@ -17,8 +17,6 @@ from trackmdp.errors import UserError, require
 from trackmdp.seeding import derive
 from trackmdp.training.folders import run_of
 
-__all__ = ["STUDY", "trials"]
-
 STUDY = "study.db"
 """File in the sweep's folder that holds the study, where no other storage is named."""
 
