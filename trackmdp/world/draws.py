@@ -8,7 +8,7 @@ from typing import Any
 from weakref import WeakValueDictionary
 
 import torch
-from torch import Tensor
+from torch import Tensor, library
 
 __all__ = ["Draw"]
 
@@ -57,7 +57,7 @@ class Draw:
 
 
 # `turn` is never written to. That it might be keeps the compiler from merging, dropping or swapping two draws.
-@torch.library.custom_op("trackmdp::draw", mutates_args={"turn"})
+@library.custom_op("trackmdp::draw", mutates_args={"turn"})
 def _draw(number: int, rows: Tensor, turn: Tensor, dtype: torch.dtype) -> Tensor:  # noqa: ARG001
     # As without the compiler, where the caller looks first: nothing is drawn for no row.
     return _DRAWS[number]._draw(rows) if bool(rows.any()) else torch.zeros(rows.shape, dtype=dtype, device=rows.device)
