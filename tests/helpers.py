@@ -19,6 +19,7 @@ from trackmdp.config.world import BORDERS
 from trackmdp.training.make import make_algorithm
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.model import Array, World
+from trackmdp.world.modes import HiddenWorld, heading_kernel
 
 
 def _without_files(group: str) -> list[str]:
@@ -39,6 +40,7 @@ __all__ = [
     "collect",
     "configured",
     "evaluate_config",
+    "headings",
     "hop_world",
     "random_kernel",
     "random_state",
@@ -75,6 +77,11 @@ def hop_world(t_max: int = 1, *, safe_cost: float = 0.9) -> World:
     kernel = np.zeros((4, 4))
     kernel[[0, 1, 2, 3], [1, 2, 3, 0]] = 0.75
     return World(kernel, 2, cost=np.array([0.1, 0.2, 0.3, 0.4]), safe_cost=safe_cost, t_max=t_max, reward=2.0)
+
+
+def headings(size: int = 3, keep: float = 0.8, *, cost: float = 0.2, t_max: int = 1, **more: Any) -> HiddenWorld:
+    kernel, modes = heading_kernel(size, keep=keep, go=0.9, exit_probability=0.05)
+    return HiddenWorld(kernel, size, modes=modes, cost=cost, t_max=t_max, **{"clip": 1, **more})
 
 
 def small_world(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import one_hot
 
-from tests.helpers import random_state, small_world
+from tests.helpers import headings, random_state, small_world
 from trackmdp.policies.encoder import RelativeBias, StateEncoder, StateNetwork
 from trackmdp.world.model import Task, World
 
@@ -40,6 +42,28 @@ def test_it_is_a_linear_layer_on_one_hots(t_max: int) -> None:
     gradients = [*(table.weight.grad.T for table in tables), encoder.history.weight.grad]
     torch.testing.assert_close(torch.cat(gradients, dim=1), weight.grad)
     torch.testing.assert_close(encoder.history.bias.grad, bias.grad)
+
+
+@pytest.mark.parametrize("known", [{"revealed": 8}, {"memory": "displacement"}])
+def test_a_key_adds_what_it_shares_and_its_own(known: dict[str, Any]) -> None:
+    """A class of keys moves the features of its keys alone, at its n alone; one key's own weights those of that key."""
+    world = headings(**known)
+    torch.manual_seed(0)
+    encoder, bias = StateEncoder(world.task, 8).double(), RelativeBias(world.task).double()
+    keys, classes = torch.arange(world.num_keys), world.keys.num_classes
+    state = (world.keys.cell(keys), torch.ones_like(keys), torch.zeros(len(keys), 2, 9, dtype=torch.bool), keys)
+    before = encoder(*state)
+    shared, own = encoder.known
+    for table, moved in ((shared, keys % classes == 5), (own, keys == 4 * classes + 5)):
+        with torch.no_grad():
+            table.weight[(5 if table is shared else 4 * classes + 5) * encoder.stages + 1] += 100.0
+        after = encoder(*state)
+        assert torch.equal((after != before).any(-1), moved)
+        before = after
+    with torch.no_grad():
+        bias.table[5 * encoder.stages + 1] = 1.0
+    assert torch.equal(bias(state[0], state[1], keys).all(-1), keys % classes == 5)
+    assert not bias(state[0], state[1] + 1, keys).any()
 
 
 def test_batches_of_any_shape_and_rows_alone() -> None:

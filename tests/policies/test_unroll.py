@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from tests.helpers import ALGORITHMS, algorithm, collect, small_world
+from tests.helpers import ALGORITHMS, algorithm, collect, headings, small_world
 from trackmdp.episodes.simulate import simulate
 from trackmdp.policies.policy import Policy, as_policy
 
@@ -65,10 +65,36 @@ def test_a_table_holds_what_the_actor_does_in_the_environment(name: str) -> None
         assert {0, 1, 2} <= set(batch["steps_since_detection"].unique().tolist())
 
 
+@pytest.mark.parametrize("known", [{"revealed": 8}, {"memory": "displacement_gap"}])
+@pytest.mark.parametrize("name", ["a2c", "dqn"])
+def test_an_actor_that_knows_more_than_the_cell_has_a_plan_for_each_key(name: str, known: dict[str, Any]) -> None:
+    world = headings(t_max=2, **known)
+    torch.manual_seed(0)
+    actor = algorithm(name, world).actor
+    with torch.no_grad():
+        for parameter in actor.parameters():
+            parameter.normal_(std=0.5)
+    policy = Policy.from_module(world, actor)
+    plans = policy.dense()
+    assert len(plans) == world.num_keys
+    assert len({plan.tobytes() for plan in plans}) > world.num_keys // 2
+    batch = collect(world, _evaluated(actor), 50, 30)
+    free = batch["steps_since_detection"] <= 2
+    followed = torch.as_tensor(plans)[batch["key"][free], batch["steps_since_detection"][free]]
+    assert torch.equal(batch["action"][free], followed)
+    acted = collect(world, policy, 50, 30)
+    assert torch.equal(acted["action"][free], batch["action"][free])
+
+
+def test_a_module_that_does_not_read_the_key_knows_the_cell() -> None:
+    policy = as_policy(headings(revealed=8), scrambled(9))
+    assert (policy.task.keyed, len(policy.dense())) == (False, 9)
+
+
 def _evaluated(actor: Any) -> Callable[[TensorDict], TensorDict]:
     def act(rows: TensorDict) -> TensorDict:
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            return rows.set("action", actor(rows.select(*STATE))["action"])
+            return rows.set("action", actor(rows.select(*STATE, *(["key"] if "key" in rows else [])))["action"])
 
     return act
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from scipy import sparse
 
-from tests.helpers import random_kernel
+from tests.helpers import headings, random_kernel
 from trackmdp.episodes.simulate import simulate
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
@@ -24,11 +24,6 @@ from trackmdp.world.model import World
 from trackmdp.world.modes import HiddenWorld, heading_kernel
 
 MORE = ("displacement", "displacement_gap", "two_displacements")
-
-
-def headings(size: int = 3, keep: float = 0.8, *, cost: float = 0.2, t_max: int = 1, **more: Any) -> HiddenWorld:
-    kernel, modes = heading_kernel(size, keep=keep, go=0.9, exit_probability=0.05)
-    return HiddenWorld(kernel, size, modes=modes, cost=cost, t_max=t_max, **{"clip": 1, **more})
 
 
 def random_policy(task: HiddenWorld, seed: int, share: float = 0.3) -> PolicyTable:

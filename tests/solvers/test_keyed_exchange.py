@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.helpers import random_kernel
-from tests.solvers.test_keyed import headings
+from tests.helpers import headings, random_kernel
 from trackmdp.solvers import optimal
 from trackmdp.solvers.keyed import KeyedPairs
 from trackmdp.solvers.keyed_exchange import exchanged_pairs

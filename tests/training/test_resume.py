@@ -39,6 +39,9 @@ RECIPES = {
 # Environment and replay buffer with sensors that miss; the joint learners know of them through the environment alone.
 # As large grids are learned: tables in place of nets, and actions of the window's sensors alone.
 RECIPES["hindsight-tables"] = [*RECIPES["hindsight"], "algo.hidden=0", "grid.window=1"]
+# Policies that know more at a detection than the cell.
+RECIPES["ppo-told"] = [*RECIPES["ppo"], "kernel=heading", "kernel.reveals=true"]
+RECIPES["dqn-memory"] = [*RECIPES["dqn"], "kernel=heading", "task.memory=displacement"]
 RECIPES |= {f"{name}-miss": [*RECIPES[name], "sensor=miss", "sensor.p_d=.8"] for name in ("hindsight", "ppo")}
 SMALL = ["grid.size=3", "optimal.enabled=false", "evaluation.every=4", "collector.total_frames=61440"]
 BATCHES = ["collector.frames_per_batch=2048", "collector.envs=64"]

@@ -5,6 +5,7 @@ Mnih et al. 2015, van Hasselt et al. 2016; value decomposition after Sunehag et 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -58,7 +59,7 @@ class AdditiveDQNLoss(LossModule):
 
     def _values(self, tensordict: TensorDictBase, params: TensorDictBase) -> TensorDictBase:
         with params.to_module(self.qvalue_network):
-            return self.qvalue_network(tensordict.select(*STATE_KEYS))
+            return self.qvalue_network(tensordict.select(*self.qvalue_network.in_keys))
 
 
 class _ZeroedStorage(LazyTensorStorage):
@@ -103,7 +104,7 @@ class DQN:
         set_learning_rate(self.optimizer, rate)
         if batch is not None:
             batch["next", "reward"] = batch["next", "reward"] * self.cfg.reward_scale
-            self.buffer.extend(n_step(batch, self.cfg.n_step, self.cfg.gamma))
+            self.buffer.extend(n_step(batch, self.cfg.n_step, self.cfg.gamma, self.policy.in_keys))
         averages = Averages()
         for _ in range(self.cfg.updates):
             rows = self.buffer.sample()
@@ -137,7 +138,7 @@ class DQN:
         self.iteration = state["iteration"]
 
 
-def n_step(batch: TensorDictBase, steps: int, gamma: float) -> TensorDictBase:
+def n_step(batch: TensorDictBase, steps: int, gamma: float, state: Sequence[str] = STATE_KEYS) -> TensorDictBase:
     """Transitions `[B · time]` that bootstrap after up to `steps` steps.
 
     A sum stops at the end of an episode and at the end of the batch. `discount` is γ^k for the k steps taken, and
@@ -147,6 +148,7 @@ def n_step(batch: TensorDictBase, steps: int, gamma: float) -> TensorDictBase:
         batch: collected frames `[B, time]`.
         steps: n.
         gamma: discount.
+        state: keys of what a policy reads of a state.
     """
     reward, done = batch["next", "reward"].squeeze(-1), batch["next", "done"].squeeze(-1)
     total, taken, alive = reward.clone(), torch.ones_like(reward, dtype=torch.int64), ~done
@@ -155,11 +157,11 @@ def n_step(batch: TensorDictBase, steps: int, gamma: float) -> TensorDictBase:
         total[:, :-k] += gamma**k * reward[:, k:] * alive[:, :-k]
         taken += alive
         alive[:, :-k] &= ~done[:, k:]
-    following = batch["next"].select(*STATE_KEYS, "terminated")
+    following = batch["next"].select(*state, "terminated")
     if steps > 1:
         following = following.gather(1, torch.arange(batch.shape[1], device=taken.device) + taken - 1)
     following["reward"] = total.unsqueeze(-1)
-    rows = batch.select(*STATE_KEYS, "action")
+    rows = batch.select(*state, "action")
     rows["discount"] = gamma ** taken.to(reward.dtype)
     rows["next"] = following
     return rows.reshape(-1)

@@ -14,12 +14,11 @@ from torchrl.objectives.value import GAE
 from trackmdp.algos.common import explained_variance, set_learning_rate
 from trackmdp.config.learning import ActorCriticConfig
 from trackmdp.policies.actor_critic import make_actor, make_critic
-from trackmdp.policies.unroll import STATE_KEYS
 from trackmdp.world.model import Task
 
 __all__ = ["OnPolicy"]
 
-_KEPT = [*STATE_KEYS, "action", "action_log_prob", "advantage", "value_target"]
+_KEPT = ("action", "action_log_prob", "advantage", "value_target")
 
 
 class OnPolicy:
@@ -59,7 +58,7 @@ class OnPolicy:
         with torch.no_grad():
             self.advantage(batch)
         fit = explained_variance(batch["state_value"], batch["value_target"]).item()
-        data = batch.select(*_KEPT).reshape(-1)
+        data = batch.select(*self.critic.in_keys, *_KEPT).reshape(-1)
         data["advantage"] = _normalised(data["advantage"], data["steps_since_detection"].unsqueeze(-1), self._t_max)
         return data, {"learning_rate": rate, "entropy_coef": entropy, "explained_variance": fit}
 

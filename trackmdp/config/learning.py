@@ -51,6 +51,8 @@ class AlgoConfig(ChoiceConfig):
     credit: ClassVar[str | None] = "joint"
     remembers: ClassVar[bool] = False
     """Whether it learns policies that remember more than the cell (`task.memory`)."""
+    told: ClassVar[bool] = False
+    """Whether it learns what to do where a detection tells the target's mode (`kernel.reveals`)."""
     knows_footprints: ClassVar[bool] = False
     """Whether sensors may cover several cells."""
     total_frames: int = option("env steps the algorithm needs", unit="frames", ge=1, le=MOST_FRAMES)
@@ -62,6 +64,8 @@ class AlgoConfig(ChoiceConfig):
 class ActorCriticConfig(AlgoConfig):
     """What A2C and PPO have in common."""
 
+    remembers: ClassVar[bool] = True
+    told: ClassVar[bool] = True
     knows_footprints: ClassVar[bool] = True
     gamma: float = option("discount while learning; policies are evaluated undiscounted", ge=0, le=1)
     gae_lambda: float = option("λ of the generalised advantage estimate", ge=0, le=1)
@@ -120,6 +124,8 @@ class PrioritizedConfig(NodeConfig):
 class DqnConfig(AlgoConfig):
     """Double DQN with a Q that adds up over the sensors."""
 
+    remembers: ClassVar[bool] = True
+    told: ClassVar[bool] = True
     knows_footprints: ClassVar[bool] = True
     gamma: float = option("discount while learning; policies are evaluated undiscounted", ge=0, le=1)
     learning_rate: ScheduleConfig
@@ -234,13 +240,15 @@ class RayWorkersConfig(WorkersConfig):
 
 
 def state_bytes(task: Sizes) -> int:
-    """Of one observation: located cell, misses, and the actions since the detection."""
-    return 2 * BYTES["int64"] + task.num_choices * task.num_sensors
+    """Of one observation: located cell, misses, the key where there is one, and the actions since the detection."""
+    return (2 + task.keyed) * BYTES["int64"] + task.num_choices * task.num_sensors
 
 
 def networks(task: Sizes, hidden: int | None) -> int:
     """Bytes of two networks of one hidden layer (256 units where `hidden` is left open), with Adam's two moments."""
     # located cell, n and both at once by number; the history by sensor, as are the outputs
     inputs = task.num_cells * (task.num_choices + 3) + task.num_choices * (task.num_sensors + 1) + 1
+    if task.keyed:  # the key, and what it shares, with n: the classes are a few more
+        inputs += (task.num_keys + 2 * task.num_keys // task.num_cells) * (task.num_choices + 1)
     weights = (256 if hidden is None else hidden) * (inputs + task.num_sensors)
     return 2 * weights * 4 * BYTES["float32"]  # weight, gradient, two moments

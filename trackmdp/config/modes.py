@@ -28,11 +28,10 @@ class HiddenKernelConfig(KernelConfig):
         """What knows of modes: learners that remember, solving over keys, and exact evaluation."""
         if not root.knows_modes:
             raise refuse(key, self.name, "a kernel without a hidden mode")
-        if root.learns and self.reveals:
-            raise refuse(f"{key}.reveals", "true", "false with train, whose algorithms learn no modes")
-        if root.learns and not root.algo.remembers:
-            readers = [name for name, schema in GROUPS["algo"].items() if schema.remembers]
-            raise refuse("algo", root.algo.name, f"{' or '.join(readers)} with kernel={self.name}")
+        able = [name for name, schema in GROUPS["algo"].items() if (schema.told if self.reveals else schema.remembers)]
+        if root.learns and root.algo.name not in able:
+            known = f"kernel={self.name}" + f" and {key}.reveals=true" * self.reveals
+            raise refuse("algo", root.algo.name, f"one of {', '.join(able)} with {known}")
         solver = getattr(root, "solver", None)
         if solver is not None and (solver.name != "optimal" or root.partition.block is not None):
             raise refuse(key, self.name, "with it solver=optimal, and no blocks")

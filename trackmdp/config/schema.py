@@ -33,6 +33,10 @@ class Sizes(Protocol):
         """Plans of a policy."""
 
     @property
+    def keyed(self) -> bool:
+        """Whether a key is more than the cell."""
+
+    @property
     def pair_bytes(self) -> int:
         """Bytes that exact evaluation over pairs of a key and a mode takes; 0 where there is none."""
 

@@ -70,7 +70,7 @@ class TaskConfig(NodeConfig):
             return
         readers = [name for name, schema in GROUPS["algo"].items() if schema.remembers]
         if root.learns and not root.algo.remembers:
-            expected = f"cell with algo={root.algo.name}, or algo={' or '.join(readers)}"
+            expected = f"cell with algo={root.algo.name}; more is learned by {', '.join(readers)}"
             raise refuse(f"{key}.memory", self.memory, expected)
         if root.kernel.is_motion and not root.kernel.hides:
             expected = f"cell with kernel={root.kernel.name}, whose next move depends on the cell alone"

@@ -236,7 +236,7 @@ def actor_of(task: Task, policy: PolicyLike | Playback, costs: Costs) -> Actor:
     try:
         made = as_policy(task, policy)
     except DrawsError:
-        return Asking(task, rule_of(task, policy), costs)
+        return Asking(task, rule_of(task.remembering(), policy), costs)  # asked step by step, it is told the cell alone
     if not made.deterministic:
         return Drawing(made, costs)
     return Uniform(made, costs) if made.sets is None else Following(made, costs)

@@ -11,7 +11,7 @@ from torch import distributions as dist
 from torchrl.modules import ProbabilisticActor, ValueOperator
 
 from trackmdp.policies.encoder import RelativeBias, StateNetwork
-from trackmdp.policies.unroll import STATE_KEYS
+from trackmdp.policies.unroll import state_keys
 from trackmdp.world.model import Task
 from trackmdp.world.windows import Window
 
@@ -62,7 +62,7 @@ def make_actor(task: Task, hidden: int, initial_logit: float) -> ProbabilisticAc
     window = None if task.window is None else Window.of(task)
     network = _Logits(StateNetwork(task, hidden, head), RelativeBias(task), window)
     return ProbabilisticActor(
-        TensorDictModule(network, in_keys=list(STATE_KEYS), out_keys=["logits"]),
+        TensorDictModule(network, in_keys=state_keys(task), out_keys=["logits"]),
         in_keys=["logits"],
         distribution_class=SubsetDistribution,
         return_log_prob=True,
@@ -76,9 +76,9 @@ class _Logits(nn.Module):
         super().__init__()
         self.network, self.shared, self.window = network, shared, window
 
-    def forward(self, last_cell: Tensor, steps_since_detection: Tensor, action_history: Tensor) -> Tensor:
-        own = self.network(last_cell, steps_since_detection, action_history)
-        logits = own + self.shared(last_cell, steps_since_detection)
+    def forward(self, last_cell: Tensor, steps_since_detection: Tensor, action_history: Tensor, *key: Tensor) -> Tensor:
+        own = self.network(last_cell, steps_since_detection, action_history, *key)
+        logits = own + self.shared(last_cell, steps_since_detection, *key)
         if self.window is None:
             return logits
         inside = self.window.inside(last_cell.reshape(-1)).view(logits.shape)
@@ -90,4 +90,4 @@ def make_critic(task: Task, hidden: int) -> ValueOperator:
     head = nn.Linear(hidden, 1)
     nn.init.orthogonal_(head.weight)
     nn.init.zeros_(head.bias)
-    return ValueOperator(StateNetwork(task, hidden, head), in_keys=list(STATE_KEYS))
+    return ValueOperator(StateNetwork(task, hidden, head), in_keys=state_keys(task))

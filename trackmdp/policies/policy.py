@@ -32,6 +32,7 @@ from trackmdp.policies.unroll import (
     acting,
     draws,
     function_rule,
+    known_task,
     mixture,
     module_rule,
     unrolled,
@@ -129,7 +130,7 @@ class Policy(TensorDictModuleBase, PolicyTable):
             UserError: it draws, or it returns something else.
         """
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            return cls._unrolled(task, function_rule(task, function), device, check=check)
+            return cls._unrolled(task.remembering(), function_rule(task, function), device, check=check)
 
     @classmethod
     def from_module(
@@ -137,14 +138,16 @@ class Policy(TensorDictModuleBase, PolicyTable):
     ) -> Policy:
         """The table of a TensorDict module that reads the keys of a state and writes `action`; see `from_function`.
 
+        One that does not read `key` knows the cell alone.
+
         The module is run with TorchRL's exploration type DETERMINISTIC: a stochastic actor is taken at its mode.
         """
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            return cls._unrolled(task, module_rule(task, module), device, check=check)
+            known = known_task(task, module)
+            return cls._unrolled(known, module_rule(known, module), device, check=check)
 
     @classmethod
     def _unrolled(cls, task: Task, rule: Rule, device: torch.device | str, *, check: bool) -> Policy:
-        task = task.remembering()  # a rule is asked what it does knowing the cell
         sets = unrolled(task, rule, torch.device(device))
         if check and draws(task, rule, torch.device(device), sets):
             raise DrawsError(f"policy: draws at random, so that it has no exact value; {TAKE_ITS_MODE}")
@@ -276,10 +279,11 @@ def as_policy(task: Task, policy: PolicyLike, *, device: torch.device | str | No
     if not isinstance(policy, PolicyTable):
         where = torch.device(device or _device_of(policy))
         with acting():
-            chances = mixture(task, policy, where) if isinstance(policy, TensorDictModuleBase) else None
+            known = known_task(task, policy)
+            chances = mixture(known, policy, where) if isinstance(policy, TensorDictModuleBase) else None
             if chances is not None:
-                return Policy(task, chances)
-            return Policy._unrolled(task, rule_of(task, policy), where, check=True)
+                return Policy(known, chances)
+            return Policy._unrolled(known, rule_of(known, policy), where, check=True)
     policy.check_fits(task)
     if isinstance(policy, Policy):
         return policy
@@ -287,8 +291,8 @@ def as_policy(task: Task, policy: PolicyLike, *, device: torch.device | str | No
 
 
 def actor_table(task: Task, actor: TensorDictModuleBase, *, device: torch.device, check: bool = True) -> Policy:
-    """The table of a learner's actor; one that has a table already, or remembers more than the cell, is it."""
-    if isinstance(actor, Policy) and (actor.sets is not None or actor.task.keyed):
+    """The table of a learner's actor; one that has a table already is it."""
+    if isinstance(actor, Policy) and actor.sets is not None:
         return actor
     return Policy.from_module(task, actor, device=device, check=check)
 

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from trackmdp.policies.encoder import StateEncoder
-from trackmdp.policies.unroll import STATE_KEYS
+from trackmdp.policies.unroll import state_keys
 from trackmdp.world.model import Task
 from trackmdp.world.windows import Window
 
@@ -45,10 +45,10 @@ class AdditiveQ(nn.Module):
         self.register_buffer("unit", scale * unit)
 
     def forward(
-        self, last_cell: Tensor, steps_since_detection: Tensor, action_history: Tensor
+        self, last_cell: Tensor, steps_since_detection: Tensor, action_history: Tensor, *key: Tensor
     ) -> tuple[Tensor, Tensor]:
         """V `[..., 1]` and q `[..., K]`, the latter 0 where the safe action is forced and outside the grid."""
-        features = self.encoder(last_cell, steps_since_detection, action_history)
+        features = self.encoder(last_cell, steps_since_detection, action_history, *key)
         free = (steps_since_detection <= self.t_max).unsqueeze(-1)
         unit = self.unit if self.window is None else self.unit[self.window.around(last_cell)]
         return self.base(features), unit * self.sensor(features) * free
@@ -90,4 +90,4 @@ class EpsilonFlip(TensorDictModuleBase):
 
 def make_qvalue(task: Task, hidden: int, scale: float) -> TensorDictModule:
     """State -> `base` `[B, 1]`, `sensor_value` `[B, K]`, for rewards multiplied by `scale`."""
-    return TensorDictModule(AdditiveQ(task, hidden, scale), in_keys=list(STATE_KEYS), out_keys=["base", "sensor_value"])
+    return TensorDictModule(AdditiveQ(task, hidden, scale), in_keys=state_keys(task), out_keys=["base", "sensor_value"])

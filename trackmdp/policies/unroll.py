@@ -1,7 +1,8 @@
 """From any deterministic rule to a table, by calling it on every state that it can reach.
 
 After a miss the next state is known in advance: the same located cell, n + 1, and the history with the set just chosen.
-So M * (t_max + 1) states, visited in order of n, determine a policy that does not draw.
+So M * (t_max + 1) states, visited in order of n, determine a policy that does not draw. Where it reads `key` as well,
+what is remembered at a detection, it has as many plans as there are keys.
 """
 
 from __future__ import annotations
@@ -23,12 +24,25 @@ from trackmdp.seeding import preserved_global_rng
 from trackmdp.world.model import Task
 from trackmdp.world.windows import Window
 
-__all__ = ["DrawsError", "Rule", "STATE_KEYS", "acting", "draws", "function_rule", "mixture", "module_rule", "unrolled"]
+__all__ = [
+    "DrawsError",
+    "Rule",
+    "STATE_KEYS",
+    "acting",
+    "draws",
+    "function_rule",
+    "known_task",
+    "mixture",
+    "module_rule",
+    "state_keys",
+    "unrolled",
+]
 
 STATE_KEYS = ("last_cell", "steps_since_detection", "action_history")
 
-Rule: TypeAlias = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""`last_cell` `[B]`, `steps_since_detection` `[B]`, `action_history` `[B, t_max+1, K]` -> bool `[B, K]`.
+Rule: TypeAlias = Callable[..., Tensor]
+"""`last_cell` `[B]`, `steps_since_detection` `[B]`, `action_history` `[B, t_max+1, K]`, and `key` `[B]` where the task
+has keys -> bool `[B, K]`.
 
 K = M, or with a window the sensors around `last_cell`, in the local numbers of `Window`."""
 
@@ -48,6 +62,16 @@ def acting() -> set_exploration_type:
 
 
 _HISTORY_AT_ONCE = 2**22  # entries of the action history in one block; a net's activations follow from it
+
+
+def state_keys(task: Task) -> list[str]:
+    """What is observed of a state: `key` as well, where a policy knows more at a detection than the cell."""
+    return [*STATE_KEYS, "key"] if task.keyed else list(STATE_KEYS)
+
+
+def known_task(task: Task, policy: object) -> Task:
+    """The task as `policy` knows it: a module that does not read `key`, and any function, knows the cell alone."""
+    return task if "key" in getattr(policy, "in_keys", ()) else task.remembering()
 
 
 def function_rule(task: Task, function: Callable[..., Any]) -> Rule:
@@ -71,14 +95,15 @@ def module_rule(task: Task, module: TensorDictModuleBase) -> Rule:
         UserError: it reads or writes other keys, or its action has another form.
     """
     # A table has a row for each state of these keys; one that reads more, its own past say, is no function of them.
-    others = [str(key) for key in module.in_keys if key not in STATE_KEYS]
+    known = state_keys(task)
+    others = [str(key) for key in module.in_keys if key not in known]
     if others:
-        raise UserError(f"policy: the module reads {', '.join(others)}, expected {', '.join(STATE_KEYS)} at most")
+        raise UserError(f"policy: the module reads {', '.join(others)}, expected {', '.join(known)} at most")
     if "action" not in module.out_keys:
         raise UserError("policy: the module writes no action")
 
     def rule(*state: Tensor) -> Tensor:
-        batch = TensorDict(dict(zip(STATE_KEYS, state, strict=True)), state[0].shape, device=state[0].device)
+        batch = TensorDict(dict(zip(known, state, strict=True)), state[0].shape, device=state[0].device)
         return _checked(module(batch)["action"], (len(state[0]), task.num_sensors), "the module's action is")
 
     return rule
@@ -92,7 +117,7 @@ def _checked(action: Tensor, shape: tuple[int, int], what: str) -> Tensor:
 
 
 def unrolled(task: Task, rule: Rule, device: torch.device) -> sparse.csr_array:
-    """`[M * (t_max + 1), S]` bool, the sets of a rule; row x * (t_max + 1) + n as in `Policy.sets`.
+    """`[keys * (t_max + 1), S]` bool, the sets of a rule; row key * (t_max + 1) + n as in `Policy.sets`.
 
     Torch's global generators are left as they were.
     """
@@ -116,7 +141,7 @@ def draws(task: Task, rule: Rule, device: torch.device, sets: sparse.csr_array) 
 
 
 def mixture(task: Task, module: TensorDictModuleBase, device: torch.device) -> sparse.csr_array | None:
-    """`[M * (t_max + 1), S]` float64, with what probability a stochastic actor switches each sensor on.
+    """`[keys * (t_max + 1), S]` float64, with what probability a stochastic actor switches each sensor on.
 
     Exact values need no more than these where they do not depend on the history: the next state then depends on the
     sensor at the target's cell alone, and the price is a sum over the sensors.
@@ -137,11 +162,12 @@ def mixture(task: Task, module: TensorDictModuleBase, device: torch.device) -> s
     if not stochastic or exploration_type() != ExplorationType.RANDOM:
         return None
     module_rule(task, module)  # refuses keys that are not its business
+    names = state_keys(task)
 
     def probabilities(filled: bool) -> Rule:
         def rule(*state: Tensor) -> Tensor:
             known = torch.full_like(state[2], filled) & _taken(state[1], state[2])
-            batch = TensorDict(dict(zip(STATE_KEYS, (*state[:2], known), strict=True)), state[0].shape)
+            batch = TensorDict(dict(zip(names, (*state[:2], known, *state[3:]), strict=True)), state[0].shape)
             chances = _bernoulli(module.get_dist(batch.to(device)))
             if chances is None or chances.shape != (len(state[0]), task.num_sensors):
                 raise _NoProbabilitiesError
@@ -181,15 +207,16 @@ def _bernoulli(found: distributions.Distribution) -> Tensor | None:
 @torch.no_grad()
 def _table(task: Task, rule: Rule, device: torch.device, dtype: torch.dtype = torch.bool) -> sparse.csr_array:
     """A rule's answers of any dtype as rows of a table; where they are bool, each is remembered as the set chosen."""
-    m, k, choices = task.num_cells, task.num_sensors, task.num_choices
-    # One located cell takes a history of (t_max + 1) K bools; blocks keep M of them from being there at once.
+    k, choices = task.num_sensors, task.num_choices
+    # One key takes a history of (t_max + 1) K bools; blocks keep all of them from being there at once.
     at_once = max(1, _HISTORY_AT_ONCE // (choices * k))
     window = Window.of(task, device)
     columns, values, lengths = [], [], []
-    for begin in range(0, m, at_once):
-        cells = torch.arange(begin, min(begin + at_once, m), device=device)
+    for begin in range(0, task.num_keys, at_once):
+        keys = torch.arange(begin, min(begin + at_once, task.num_keys), device=device)
+        cells = task.keys.cell(keys)
         # [B, t_max+1, K] in row-major order is B * (t_max+1) rows of the table, in the table's order.
-        on = _followed(rule, cells, choices, k, dtype).reshape(-1, k)
+        on = _followed(rule, task, keys, dtype).reshape(-1, k)
         if window.is_local:
             on *= window.inside(cells).repeat_interleave(choices, dim=0).cpu().numpy()
         # Row-major order: flat place p of [rows, K] is column p mod K. Without a window K = S and columns are sensors.
@@ -204,16 +231,18 @@ def _table(task: Task, rule: Rule, device: torch.device, dtype: torch.dtype = to
         lengths.append(np.count_nonzero(on, axis=1))
     indptr = np.concatenate([[0], np.cumsum(np.concatenate(lengths))])
     found = np.concatenate(values), np.concatenate(columns), indptr
-    return sparse.csr_array(found, shape=(m * choices, task.total_sensors))
+    return sparse.csr_array(found, shape=(task.num_keys * choices, task.total_sensors))
 
 
-def _followed(rule: Rule, cells: Tensor, choices: int, sensors: int, dtype: torch.dtype) -> npt.NDArray[Any]:
-    """`[B, t_max+1, K]` the answers at n = 0, 1, ... misses from located `cells` `[B]`."""
+def _followed(rule: Rule, task: Task, keys: Tensor, dtype: torch.dtype) -> npt.NDArray[Any]:
+    """`[B, t_max+1, K]` the answers at n = 0, 1, ... misses after detections that left `keys` `[B]`."""
+    cells, choices, known = task.keys.cell(keys), task.num_choices, (keys,) if task.keyed else ()
     # Slot n is written after the call for n: at n misses the rule sees slots 0 ... n - 1, as in the environment.
-    history = torch.zeros(len(cells), choices, sensors, dtype=dtype, device=cells.device)
+    history = torch.zeros(len(cells), choices, task.num_sensors, dtype=dtype, device=cells.device)
     for n in range(choices):
         # Copies, for a rule may keep what it is given, or write to it.
-        history[:, n] = rule(cells.clone(), torch.full_like(cells, n), history.to(torch.bool, copy=True))
+        state = cells.clone(), torch.full_like(cells, n), history.to(torch.bool, copy=True)
+        history[:, n] = rule(*state, *(key.clone() for key in known))
     return history.cpu().numpy()
 
 

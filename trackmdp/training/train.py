@@ -113,7 +113,8 @@ def _described(problem: Problem, folder: Path | None) -> dict[str, Any]:
     if isinstance(problem, HiddenWorld):
         if folder is not None:
             raise UserError("folder: a world with a hidden mode made in Python is in no file; expected folder=None")
-        return given | {"kernel": "heading"}  # stands for any: the world is in memory
+        # `heading` stands for any: the world is in memory
+        return given | {"kernel": "heading", "kernel.reveals": problem.revealed > 1}
     # Without a folder a path must be given all the same, and nothing reads it: the tracks are in memory.
     tracks = {
         "kernel": "tracks",

@@ -1,0 +1,32 @@
+"""Learning what to do for each key: where a detection tells the mode, and where a policy remembers a displacement."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+import trackmdp as tm
+from tests.helpers import headings
+
+SHORT = {"collector.envs": 64, "collector.frames_per_batch": 512, "optimal.enabled": False}
+KNOWN: dict[str, dict[str, Any]] = {"told": {"revealed": 8}, "remembered": {"memory": "displacement"}}
+
+
+@pytest.mark.parametrize("known", KNOWN)
+@pytest.mark.parametrize("algo", ["a2c", "dqn"])
+def test_a_run_learns_a_plan_for_each_key(algo: str, known: str) -> None:
+    world = headings(**KNOWN[known])
+    run, again = (tm.train(world, algo, **SHORT, **{"collector.total_frames": 1024}) for _ in range(2))
+    assert run.policy.task.keys == world.keys
+    assert run.policy.dense().shape == (world.num_keys, 2, 9)
+    assert (run.policy.dense() == again.policy.dense()).all()
+    played = tm.simulate(world, run.policy, 2000, seed=1).figures()
+    assert abs(played.aihtr.mean - run.evaluation.aihtr) < 3 * played.aihtr.standard_error
+
+
+@pytest.mark.slow
+def test_a_told_heading_is_worth_something_to_a_learner() -> None:
+    """A2C ends above the best policy that knows the cell alone."""
+    learned = tm.train(headings(4, 0.9, cost=0.16, revealed=8), "a2c", **{"collector.total_frames": 200_000})
+    assert learned.evaluation.aihtr > tm.solve(headings(4, 0.9, cost=0.16)).lower
