@@ -19,7 +19,7 @@ from trackmdp.episodes.simulate import simulate
 from trackmdp.errors import UserError
 from trackmdp.policies import lookup, policy
 from trackmdp.policies.actor_critic import SubsetDistribution
-from trackmdp.policies.policy import Policy, as_policy
+from trackmdp.policies.policy import Policy, actor_table, as_policy
 from trackmdp.policies.unroll import STATE_KEYS
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.world.model import World
@@ -298,6 +298,13 @@ def test_a_sparse_table_is_brought_into_order_and_left_alone() -> None:
     assert (made.sets.indices == ordered.indices).all()
     assert (made.dense() == on).all()
     assert (jumbled.indices == indices).all()
+
+
+def test_an_actor_that_is_a_policy_is_not_written_out() -> None:
+    """All sensors on at 64 x 64 cells would be 33 million entries, 1.5 GB while they are made and valued."""
+    actor = Policy.all_on(WORLD)
+    assert actor_table(WORLD.task, actor, device=torch.device("cpu")) is actor
+    assert actor.sets is None
 
 
 def windowed() -> World:

@@ -291,8 +291,8 @@ def as_policy(task: Task, policy: PolicyLike, *, device: torch.device | str | No
 
 
 def actor_table(task: Task, actor: TensorDictModuleBase, *, device: torch.device, check: bool = True) -> Policy:
-    """The table of a learner's actor; one that has a table already is it."""
-    if isinstance(actor, Policy) and actor.sets is not None:
+    """The table of a learner's actor; a `Policy` is one already."""
+    if isinstance(actor, Policy):
         return actor
     return Policy.from_module(task, actor, device=device, check=check)
 
