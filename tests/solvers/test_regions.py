@@ -114,6 +114,16 @@ def test_memory_decides_on_the_side_of_a_region() -> None:
         regions.region_side(large, "80MiB")
 
 
+def test_memory_grows_with_what_is_left_unsensed() -> None:
+    """At T_max 3 the clocked plans of 160 x 160 cells took 112 MB at c = .16, and 500 MB at c = .22."""
+    costs = {0.16: (95, 190), 0.22: (450, 650)}
+    for cost, (least, most) in costs.items():
+        world = make_world(
+            "random_support", size=160, support_size=5, radius=2, cost=cost, t_max=3, safe_cost=100 * cost
+        )
+        assert least <= regions._whole_bytes(world) / 2**20 <= most
+
+
 def test_what_the_machine_lacks_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(regions, "free_bytes", lambda: 2**25)
     with pytest.raises(UserError, match=r"solver.memory=null: .* need about .* 0\.03 GiB are available"):

@@ -18,12 +18,14 @@ from scipy import sparse
 from trackmdp.errors import UserError
 from trackmdp.machine import free_bytes, gib, parse_bytes
 from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers import clocked
 from trackmdp.solvers.branch import Tree
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.exchange import exchange, revealed
 from trackmdp.solvers.known import next_table
 from trackmdp.solvers.layers import Layer, reachable_layers, sensed_csr
 from trackmdp.solvers.partition import Block, blocks, cells_of, reach, sub_world
+from trackmdp.solvers.prediction import followed
 from trackmdp.solvers.renewal import DIRECT_CELLS, IndexArray, forced_worth
 from trackmdp.solvers.search import InnerProblem
 from trackmdp.world.model import Array, BoolArray, World
@@ -33,6 +35,9 @@ __all__ = ["adopted", "improved", "proved", "region_side", "settled"]
 ROOM, SMALLEST, LARGEST = 2**28, 32, 128
 """Bytes of a region, and its located cells in each direction, unless there is less memory. Wider ones have a smaller
 share of halo, 13 % at 128 cells, R = 2 and T_max = 1; in narrow ones most of the work is for the halo."""
+
+PATCH = 24
+"""Rows and columns of the middle of the grid that the memory of the whole is estimated on."""
 
 Pairs = tuple[IndexArray, IndexArray]
 """Located cells and sensors, a pair for each sensor that is on."""
@@ -92,10 +97,23 @@ def region_side(world: World, memory: str | None = None) -> int | None:
 def _whole_bytes(world: World) -> int:
     """About the memory, Python included, of what is there for the whole grid: bounds, policies, their systems.
 
-    Measured from N = 256 to 1,000 at c = .22, where a miss is likely; where it is not, a third less.
+    The most that is held at once is the prediction of the policy that senses least, the clocked one, while it is
+    valued: some 200 bytes an entry, measured on 160 x 160 cells at T_max 1 to 3 and c = .16 and .22.
     """
     moves = world.kernel.nnz / world.num_cells
-    return int(70 * 2**20 + world.num_cells * 300 * (1 + moves) * (1 + 0.25 * max(world.t_max - 1, 0)))
+    return int(70 * 2**20 + world.num_cells * (150 * (1 + moves) + 200 * max(moves, _predicted(world))))
+
+
+def _predicted(world: World) -> float:
+    """Where the target may be after t_max misses: entries per located cell, as they are in the middle of the grid.
+
+    At T_max 3 these are 3 cells at c = .16, where what is likely is sensed, and 82 at c = .22, where nothing is.
+    """
+    if world.num_cells <= PATCH**2:  # too few for their memory to matter
+        return 0.0
+    rows, columns = (range(max(side - PATCH, 0) // 2, min(side + PATCH, 2 * side) // 2) for side in world.size)
+    patch = sub_world(world, (rows, columns))
+    return max(len(seen.rows) for seen in followed(patch, clocked.solve(patch))) / patch.num_cells
 
 
 def _region_bytes(world: World, side: int) -> int:
