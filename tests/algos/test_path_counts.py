@@ -97,6 +97,8 @@ def test_a_run_is_valued_loaded_exported_and_resumed(here: Path) -> None:
     assert main(["evaluate", "run=run", "quiet=true", f"hydra.run.dir={here}/judged"]) == 0
     judged = json.loads((here / "judged/evaluation.json").read_text())
     assert judged["held_out"]["figures"]["policy"]["aihtr"]["mean"] == pytest.approx(12 * 0.8)
+    assert "task.memory=cell" in judged["held_out"]["figures"]
+    assert "task.memory=cell: share of steps" in (here / "judged/tracks.html").read_text()
     sets = json.loads((here / "judged/sets.json").read_text())
     assert (sets["memory"], len(sets["sets"])) == ({"kind": "displacement", "clip": 1, "classes": 10}, 90)
     # Located in 1, having come from 0: on to 2.

@@ -164,3 +164,13 @@ def test_probabilities_give_the_mean_over_draws() -> None:
     only = replayed(recorded(by_hand([0])), by_hand([0, 1, 1, 1]), chains)
     assert only.totals[0] == pytest.approx([0.5 - 0.5 * 0.2 + 0.5 * (1 - 1.8), 3, 0.5 + 0.5, 0.5, 0.5])
     assert only.length[0] == 4
+
+
+def test_cells_watched_are_counted_over_all_tracks() -> None:
+    """0 > 1 (sensed) > 4: 2 and 3 are sensed, then 5; the other track senses 1, and nothing on its exit step."""
+    task, tracks = recorded(by_hand([0])), by_hand([0, 1, 4, 4], [0, 1])
+    found = replayed(task, tracks, CHAINS)
+    assert found.watched.tolist() == [0, 2, 1, 1, 0, 1, 0, 0, 0]
+    assert found.watched.sum() == found.totals[:, 3].sum()
+    drawn_sets = replay(task, tracks, PolicyTable(task, probability=0.5))
+    assert drawn_sets.watched == pytest.approx(np.full(9, drawn_sets.totals[:, 3].sum() / 9))

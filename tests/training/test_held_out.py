@@ -24,7 +24,7 @@ from trackmdp.solvers import qmdp
 from trackmdp.training import checkpoint
 from trackmdp.training.evaluator import ExactEvaluator
 from trackmdp.training.folders import run_of
-from trackmdp.training.held_out import ESTIMATED, HeldOutEvaluator, estimated_kernel, make_evaluator
+from trackmdp.training.held_out import CELL_ALONE, ESTIMATED, HeldOutEvaluator, estimated_kernel, make_evaluator
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Tracks, read_tracks, split
 
@@ -74,6 +74,17 @@ def test_the_report_holds_the_policy_and_the_references() -> None:
         assert all(each["low"] <= each["mean"] <= each["high"] for each in figures.values())
 
 
+def test_what_remembers_more_is_compared_with_the_cell_alone() -> None:
+    """From 1 the target goes on as it came, to 0 or to 2: .8 a step for who remembers, .6 for who senses both."""
+    there, back = [0, 1, 2], [2, 1, 0]
+    task = recorded(by_hand(*[there, back] * 20), memory="displacement", clip=1)
+    evaluator = HeldOutEvaluator(task)
+    assert evaluator.intervals(evaluator.references[CELL_ALONE])["aihtr"].mean == pytest.approx(0.8 + 0.6)
+    assert list(evaluator.report(Policy.none(task))["figures"])[:2] == ["policy", CELL_ALONE]
+    for without in (replace(task, memory="cell"), replace(task, detection=0.9)):
+        assert CELL_ALONE not in HeldOutEvaluator(without).references
+
+
 def test_the_estimated_kernel_is_that_of_the_tracks() -> None:
     world = small_world(exit_probability=0.05)
     many = estimated_kernel(drawn(world.kernel, 20_000), 3)
@@ -90,7 +101,7 @@ def test_q_mdp_of_the_estimated_kernel_is_that_of_the_kernel() -> None:
     kernel = 0.6 * np.roll(np.eye(9), 2, axis=1) + 0.3 * np.roll(np.eye(9), 1, axis=1)
     setting = recorded(drawn(sparse.csr_array(kernel), 5_000), by_hand([0, 1]))
     world = World(kernel, 3, cost=setting.cost, safe_cost=setting.safe_cost, t_max=setting.t_max, reward=setting.reward)
-    assert np.array_equal(HeldOutEvaluator(setting).references()[ESTIMATED].dense(), qmdp.solve(world).dense())
+    assert np.array_equal(HeldOutEvaluator(setting).references[ESTIMATED].dense(), qmdp.solve(world).dense())
 
 
 FILE = drawn(small_world(exit_probability=0.05).kernel, 60)

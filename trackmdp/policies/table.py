@@ -119,6 +119,14 @@ class PolicyTable:
         rows = self.sets[n :: self.task.num_choices]
         return rows.astype(np.float64) @ price
 
+    def watched(self, used: Array) -> Array:
+        """`[M]` how often each cell is seen by a sensor, where the sets are used `[keys * (t_max + 1)]` often."""
+        if self.sets is None:
+            every = np.zeros(self.task.num_cells, dtype=np.int64)
+            return used.sum() * self.on(0, every, np.arange(self.task.num_cells))
+        seen: Array = used @ self.seen
+        return seen
+
     @cached_property
     def seen(self) -> sparse.csr_array:
         """`[keys * (t_max + 1), M]`, which cells the sets see, or with what probability: `sets`, but for footprints."""

@@ -63,6 +63,7 @@ class Report:
 
     about: str
     sections: Sequence[Section]
+    title: str = "A sweep of trackmdp"
 
     @property
     def figures(self) -> list[Figure]:
@@ -85,7 +86,7 @@ class Report:
         page = files("trackmdp.reports").joinpath("report.html").read_text(encoding="utf-8")
         nav = "".join(f'<li><a href="#{s.anchor}">{html.escape(s.heading)}</a></li>' for s in self.sections)
         body = "\n".join(section.html() for section in self.sections)
-        texts = {"@ABOUT@": self.about, "@NAV@": nav, "@BODY@": body}
+        texts = {"@TITLE@": html.escape(self.title), "@ABOUT@": self.about, "@NAV@": nav, "@BODY@": body}
         # in one pass: what is put in may hold a mark itself, as a folder's name
         return re.sub("|".join(texts), lambda mark: texts[mark[0]], page)
 

@@ -98,10 +98,12 @@ class ReplayedTracks:
         totals: `[K, 5]` reward, steps in the grid, detections, sensors on by choice, safe actions; expected ones where
             the policy draws or a sensor may miss.
         length: `[K]` steps, the exit step included.
+        watched: `[M]` steps in which each cell was sensed, of all tracks together; the safe action is not counted.
     """
 
     totals: Array
     length: Array
+    watched: Array
 
     def evaluation(self, starts: IndexArray, num_cells: int) -> Evaluation:
         """The figures of all tracks together, and by start cell, nan where no track starts; `starts` is `[K]`."""
@@ -161,7 +163,7 @@ def replay(task: Task, tracks: Tracks, policy: PolicyTable) -> ReplayedTracks:
     """
     events = Events.of(tracks, policy.task.keys)
     states = len(events.point)
-    figures, hits = _renewals(task, events, policy)
+    figures, hits, plans = _renewals(task, events, policy)
     reached = np.zeros(states)
     reached[events.first] = 1.0
     # State s of the recording is reached with probability reached[s]; located there, the plan is missed up to the next
@@ -171,20 +173,26 @@ def replay(task: Task, tracks: Tracks, policy: PolicyTable) -> ReplayedTracks:
     reached = spsolve_triangular(sparse.eye_array(states, format="csr") - onward, reached, unit_diagonal=True)
     track = np.searchsorted(events.line.first, events.point, side="right") - 1
     sums = np.stack([np.bincount(track, reached * figure, len(tracks)) for figure in figures], axis=1)
-    return ReplayedTracks(sums[:, :5].astype(np.float64), sums[:, 5].astype(np.float64))
+    # How often each row of the policy's table was used, key by key and n by n.
+    used = np.zeros((policy.task.num_keys, task.num_choices))
+    for n, (at, undetected) in enumerate(plans[: task.num_choices]):
+        used[:, n] = np.bincount(events.key[at], reached[at] * undetected, len(used))
+    return ReplayedTracks(sums[:, :5].astype(np.float64), sums[:, 5].astype(np.float64), policy.watched(used.ravel()))
 
 
 def _renewals(
     task: Task, events: Events, policy: PolicyTable
-) -> tuple[list[Array], tuple[IndexArray, IndexArray, Array]]:
+) -> tuple[list[Array], tuple[IndexArray, IndexArray, Array], list[tuple[IndexArray, Array]]]:
     """From every state, located there, to the next detection or the end of the track.
 
     Returns:
         Six `[S]`, the columns of `ReplayedTracks.totals` and the steps; and the detections as a sparse matrix: from
-        which state, to which one, with what probability.
+        which state, to which one, with what probability; and for each n the states whose target is then still in the
+        grid and undetected, with what probability.
     """
     m, cells, point = task.num_cells, events.line.cells, events.point
     figures, hits = np.zeros((6, len(point))), []
+    plans: list[tuple[IndexArray, Array]] = []
     at = np.flatnonzero(events.possible)
     undetected = np.ones(len(at))
     for n in itertools.count():  # beyond t_max + 1 only where the safe action may miss
@@ -198,6 +206,7 @@ def _renewals(
         # the exit is a step as well, and costs nothing; a recording that stops has none (`Tracks.closed`)
         figures[5, at] += undetected
         at, undetected, cell = at[inside], undetected[inside], cell[inside]
+        plans.append((at, undetected))
         if n < task.num_choices:
             key = events.key[at]
             sensed = policy.on(n, key, cell) * task.detects(cell)
@@ -212,7 +221,7 @@ def _renewals(
         hits.append((at[found], events.follow(at[found], n), (undetected * sensed)[found]))
         undetected = undetected * (1.0 - sensed)
     start, end, weight = (np.concatenate(part) for part in zip(*hits, strict=True))
-    return list(figures), (start, end, weight)
+    return list(figures), (start, end, weight), plans
 
 
 def _complement(missed: MeanInterval) -> MeanInterval:

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from scipy import sparse
 
+from trackmdp.config.values import choice_values
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import qmdp
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.kernel_estimate import KernelEstimate
-from trackmdp.solvers.recorded import replay
+from trackmdp.solvers.path_exchange import choose_plan
+from trackmdp.solvers.recorded import ReplayedTracks, replay
 from trackmdp.statistics import MeanInterval
 from trackmdp.training.evaluator import Evaluator, ExactEvaluator, HiddenEvaluator, Score
 from trackmdp.world.model import World
@@ -23,6 +26,8 @@ from trackmdp.world.tracks import Problem, Recorded, Tracks
 
 ESTIMATED = "Q_MDP of the estimated kernel"
 """Q_MDP for the motion as the tracks to learn from show it."""
+CELL_ALONE = "task.memory=cell"
+"""The best policy found for those tracks that remembers the cell alone."""
 
 
 def make_evaluator(problem: Problem) -> Evaluator:
@@ -61,22 +66,31 @@ class HeldOutEvaluator(Evaluator):
 
     def intervals(self, policy: PolicyTable) -> dict[str, MeanInterval]:
         """Figure -> its mean over the held-out tracks with a 95 % confidence interval."""
-        return replay(self.world, self.tracks, policy).intervals(self.tracks.names)
+        return self.replayed(policy).intervals(self.tracks.names)
 
+    def replayed(self, policy: PolicyTable) -> ReplayedTracks:
+        """What a policy did on the held-out tracks."""
+        return replay(self.world, self.tracks, policy)
+
+    @cached_property
     def references(self) -> dict[str, PolicyTable]:
         """The policies that a learned one is compared with, by their names in tables."""
         task = self.world
         kernel = estimated_kernel(task.tracks, task.size)
         world = World.of(task, kernel, max_steps=None, window=None, memory="cell")
-        return {
-            "all on": PolicyTable.all_on(task),
-            "no sensors": PolicyTable.none(task),
-            ESTIMATED: qmdp.solve(world),
-        }
+        found: dict[str, PolicyTable] = {}
+        # Only what remembers more is compared with it; and counts take sensors of one cell that never miss.
+        if task.keyed and task.perfect and task.safe and task.coverage is None:
+            gamma, rounds = (choice_values("algo", "path_counts", {})[name] for name in ("gamma", "rounds"))
+            cell = task.remembering()
+            plan = choose_plan(cell, task.tracks, judge=task.validation, discount=gamma, rounds=rounds)
+            found[CELL_ALONE] = plan.policy
+        fixed = {"all on": PolicyTable.all_on(task), "no sensors": PolicyTable.none(task)}
+        return found | fixed | {ESTIMATED: qmdp.solve(world)}
 
     def report(self, policy: PolicyTable) -> dict[str, Any]:
         """What is written of a policy: its figures on the held-out tracks beside those of the references."""
-        policies = {"policy": policy, **self.references()}
+        policies = {"policy": policy, **self.references}
         figures = {
             name: {figure: asdict(interval) for figure, interval in self.intervals(each).items()}
             for name, each in policies.items()

@@ -11,9 +11,10 @@ from trackmdp.durable import write_json, write_text
 from trackmdp.episodes.simulate import simulate
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import write_sets
+from trackmdp.reports.held_out import build
 from trackmdp.reports.picture import draw_picture
 from trackmdp.training.display import table
-from trackmdp.training.held_out import HeldOutEvaluator
+from trackmdp.training.held_out import CELL_ALONE, HeldOutEvaluator
 from trackmdp.world.gridding import said
 from trackmdp.world.tracks import Problem, Recorded
 
@@ -26,7 +27,11 @@ def run(
     console: Console,
     seed: int,
 ) -> float:
-    """Write `evaluation.json`, `sets.json` and `picture.txt` to `folder`; returns the mean reward of a track."""
+    """Write `evaluation.json`, `sets.json`, `picture.txt` and `tracks.html` to `folder`.
+
+    Returns:
+        The mean reward of a track.
+    """
     show_loaded(console, world)
     evaluator = HeldOutEvaluator(world)
     report = evaluator.report(policy)
@@ -34,9 +39,14 @@ def run(
     content = {"policy": subject, "held_out": report} | write_sets(folder, policy, value=value)
     content |= dict.fromkeys(("regret_per_step", "regret_per_step_lower"))
     write_json(folder / "evaluation.json", content)
-    write_text(folder / "picture.txt", draw_picture(simulate(world, policy, 16, seed=seed), world))
+    compared = {"policy": policy, **{n: p for n, p in evaluator.references.items() if n == CELL_ALONE}}
+    # With one seed all of them meet the same targets.
+    episodes = {name: simulate(world, each, 16, seed=seed) for name, each in compared.items()}
+    write_text(folder / "picture.txt", draw_picture(episodes["policy"], world))
+    replayed = {name: evaluator.replayed(each) for name, each in compared.items()}
+    write_text(folder / "tracks.html", build(world, subject, report, replayed, episodes).html())
     show_held_out(console, subject, report)
-    console.print(f"results in {folder}")
+    console.print(f"results in {folder}; the page is tracks.html")
     return float(report["figures"]["policy"]["aihtr"]["mean"])
 
 
