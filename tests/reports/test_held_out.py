@@ -10,7 +10,7 @@ import pytest
 from tests.tracks import by_hand, recorded
 from trackmdp.episodes.simulate import simulate
 from trackmdp.policies.policy import Policy
-from trackmdp.reports.held_out import build
+from trackmdp.reports.held_out import recorded_page
 from trackmdp.training.held_out import HeldOutEvaluator
 
 
@@ -23,7 +23,7 @@ def page(*tracks: list[int], cells: tuple[int, ...] = (1,)) -> str:
     evaluator = HeldOutEvaluator(world)
     episodes = simulate(world, policy, 4, seed=0)
     report = evaluator.report(policy)
-    return build(world, "<mine>", report, {"policy": evaluator.replayed(policy)}, {"policy": episodes}).html()
+    return recorded_page(world, "<mine>", report, {"policy": evaluator.replayed(policy)}, {"policy": episodes}).html()
 
 
 def section(text: str, anchor: str) -> str:

@@ -16,16 +16,16 @@ from trackmdp.world.gridding import said
 from trackmdp.world.model import Array
 from trackmdp.world.tracks import Recorded, Tracks
 
-STEPS = 8
+_STEPS = 8
 """Steps of a track that are drawn."""
-MOST_TRACKS = 400
+_MOST_TRACKS = 400
 """Tracks whose lines are drawn; the others count in the shades."""
-FIGURES = {"reward_per_step": ("reward per step", 1, 4), "accuracy": ("located, %", 100, 1)}
-FIGURES |= {"sensors_per_step": ("sensors per step", 1, 2)}
+_FIGURES = {"reward_per_step": ("reward per step", 1, 4), "accuracy": ("located, %", 100, 1)}
+_FIGURES |= {"sensors_per_step": ("sensors per step", 1, 2)}
 """Figure -> its column, factor and decimals."""
 
 
-def build(
+def recorded_page(
     problem: Recorded,
     subject: str,
     report: Mapping[str, Any],
@@ -58,13 +58,13 @@ def build(
         )
         for name, share in shares.items()
     ]
-    chosen = {name: max(each, key=lambda one: len(np.unique(one.target[:STEPS]))) for name, each in episodes.items()}
+    chosen = {name: max(each, key=lambda one: len(np.unique(one.target[:_STEPS]))) for name, each in episodes.items()}
     part = _part(problem, chosen.values())
     strips = [f"<h3>{html.escape(names[name])}</h3>{_strip(problem, each, part)}" for name, each in chosen.items()]
     note = (
         "<p>Blue: sensor on. Disc: target located; ring: missed; line: where it came from. Of 16 tracks drawn by the "
     )
-    note += f"seed, the one through the most cells in {STEPS} steps.</p>"
+    note += f"seed, the one through the most cells in {_STEPS} steps.</p>"
     sections = [
         Section("earns", "What it earns", [_table(names, report)]),
         Section("where", "Where it senses", [f'<div class="figures">{"".join(maps)}</div>']),
@@ -76,12 +76,12 @@ def build(
 
 def _table(names: Mapping[str, str], report: Mapping[str, Any]) -> Table:
     columns = [Column("policy")]
-    for label, _, digits in FIGURES.values():
+    for label, _, digits in _FIGURES.values():
         columns += [Column(label, digits), Column("95 %")]
     rows: list[list[Cell]] = []
     for name, figures in report["figures"].items():
         row: list[Cell] = [names[name]]
-        for key, (_, factor, digits) in FIGURES.items():
+        for key, (_, factor, digits) in _FIGURES.items():
             mean, low, high = (figures[key][end] for end in ("mean", "low", "high"))
             ends = [Column("", digits).text(None if end is None else factor * end) for end in (low, high)]
             row += [factor * mean, " ... ".join(ends)]
@@ -94,7 +94,7 @@ def _recording(problem: Recorded) -> str:
     """The cells shaded by visits, and the tracks as lines from cell to cell."""
     tracks: Tracks = problem.held_out
     visits = np.bincount(tracks.cells, minlength=problem.num_cells).astype(np.float64)
-    drawn = np.linspace(0, len(tracks) - 1, min(len(tracks), MOST_TRACKS)).astype(np.int64)
+    drawn = np.linspace(0, len(tracks) - 1, min(len(tracks), _MOST_TRACKS)).astype(np.int64)
     x, y = tracks.cells % problem.columns + 0.5, tracks.cells // problem.columns + 0.5
     paths = (
         " ".join(f"{a:g},{b:g}" for a, b in zip(x[begin:end], y[begin:end], strict=True))
@@ -117,8 +117,8 @@ def _part(problem: Recorded, episodes: Iterable[Episode]) -> tuple[tuple[int, in
     """Rows and columns of the smallest part of the grid with all that is drawn of some episodes, and its corner."""
     seen = np.zeros(problem.num_cells + 1, dtype=bool)  # the exit is cell M
     for episode in episodes:
-        seen[[episode.start, *episode.target[:STEPS]]] = True
-        seen[:-1] |= problem.covered(episode.action[:STEPS]).any(axis=0)
+        seen[[episode.start, *episode.target[:_STEPS]]] = True
+        seen[:-1] |= problem.covered(episode.action[:_STEPS]).any(axis=0)
     rows, columns = np.divmod(np.flatnonzero(seen[:-1]), problem.columns)
     return (int(np.ptp(rows)) + 1, int(np.ptp(columns)) + 1), (int(rows.min()), int(columns.min()))
 
@@ -126,7 +126,7 @@ def _part(problem: Recorded, episodes: Iterable[Episode]) -> tuple[tuple[int, in
 def _strip(problem: Recorded, episode: Episode, part: tuple[tuple[int, int], tuple[int, int]]) -> str:
     """The first steps of an episode, side by side."""
     frames, forced = [], episode.forced(problem.t_max)
-    for t, cell in enumerate(episode.target[:STEPS].tolist()):
+    for t, cell in enumerate(episode.target[:_STEPS].tolist()):
         on = problem.covered(episode.action[t]) & (not forced[t])
         body = _shaded(problem, on.astype(np.float64))
         if cell < problem.num_cells:

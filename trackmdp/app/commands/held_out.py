@@ -11,7 +11,7 @@ from trackmdp.durable import write_json, write_text
 from trackmdp.episodes.simulate import simulate
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import write_sets
-from trackmdp.reports.held_out import build
+from trackmdp.reports.held_out import recorded_page
 from trackmdp.reports.picture import draw_picture
 from trackmdp.training.display import table
 from trackmdp.training.held_out import CELL_ALONE, HeldOutEvaluator
@@ -44,7 +44,7 @@ def run(
     episodes = {name: simulate(world, each, 16, seed=seed) for name, each in compared.items()}
     write_text(folder / "picture.txt", draw_picture(episodes["policy"], world))
     replayed = {name: evaluator.replayed(each) for name, each in compared.items()}
-    write_text(folder / "tracks.html", build(world, subject, report, replayed, episodes).html())
+    write_text(folder / "tracks.html", recorded_page(world, subject, report, replayed, episodes).html())
     show_held_out(console, subject, report)
     console.print(f"results in {folder}; the page is tracks.html")
     return float(report["figures"]["policy"]["aihtr"]["mean"])
