@@ -35,7 +35,8 @@ SMALL = {
 
 def train(folder: Path, *overrides: str, algo: str = "ppo") -> float:
     """What `trackmdp train` does once the config is checked, without a process of its own."""
-    folder.mkdir(exist_ok=True)
+    if not folder.is_dir():
+        folder.mkdir()
     return run(train_config(*SMALL[algo], *QUICK, *BUDGET, *overrides), folder)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import os
 import resource
@@ -16,10 +17,12 @@ from typing import Any
 import pytest
 import torch
 
+import trackmdp as tm
 from tests.helpers import train_config
 from tests.training.runs import BUDGET, QUICK, SMALL, assert_same_run, at_iteration, rows, train
 from trackmdp.errors import Preempted, RunError, UserError
 from trackmdp.training import checkpoint
+from trackmdp.training.callbacks import Callback, Training
 from trackmdp.training.lock import locked
 from trackmdp.training.make import make_algorithm
 from trackmdp.training.state import _weights
@@ -212,3 +215,42 @@ worker.join()
         learner.kill()
         # The worker holds the other end of the pipe, which is closed once it has ended too.
         assert learner.communicate(timeout=60)[0] == ""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("mode", "step"), [("kill", 17), ("power", 13), ("error", 19)])
+def test_a_run_that_ends_at_any_file_operation_resumes_to_the_same_run(mode: str, step: int, tmp_path: Path) -> None:
+    """Some of the points only; step 1 goes through all of them, in minutes."""
+    words = [sys.executable, "-m", "tests.training.crashpoints", str(tmp_path), mode, str(step)]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    *failures, count = done.stdout.splitlines()
+    assert not failures
+    assert int(count.split()[0]) >= 3
+
+
+class Held(Callback):
+    """Open files, and bytes of all tensors that are alive, at each checkpoint."""
+
+    def __init__(self) -> None:
+        self.files: list[int] = []
+        self.bytes: list[int] = []
+
+    def on_checkpoint(self, trainer: Training, file: Path) -> None:
+        gc.collect()
+        # `type`, not `isinstance`: that asks an object of torch's own for its class, which warns.
+        self.files.append(len(list(Path("/proc/self/fd").iterdir())))
+        self.bytes.append(sum(found.nbytes for found in gc.get_objects() if issubclass(type(found), torch.Tensor)))
+
+
+@pytest.mark.parametrize("algo", ["ppo", "dqn"])
+def test_a_longer_run_holds_no_more_files_and_tensors(algo: str, tmp_path: Path) -> None:
+    held = Held()
+    options: dict[str, Any] = {"buffer_size": 500, "batch_size": 64, "updates": 1} if algo == "dqn" else {}
+    options |= {"hidden": 16, "total_frames": 16 * 256, "frames_per_batch": 256, "envs": 32}
+    options["checkpoint"] = {"every": 256, "seconds": None}
+    world = tm.make_world("random_walk", size=3, cost=0.1)
+    tm.train(world, algo, folder=tmp_path, callbacks=[held], **options)
+    # From the tenth checkpoint on: until then the buffer fills, and the optimizer's state is made.
+    assert len(held.files) >= 14
+    assert max(held.files[10:]) <= held.files[9]
+    assert max(held.bytes[10:]) <= held.bytes[9]
