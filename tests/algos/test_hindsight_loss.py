@@ -16,6 +16,7 @@ from tests.algos.hindsight import FORMS
 from tests.helpers import small_world
 from trackmdp.algos.actor_loss import Decision, decision_loss
 from trackmdp.algos.hindsight_loss import HindsightLoss
+from trackmdp.world.coverage import discs
 from trackmdp.world.model import World
 
 
@@ -36,13 +37,19 @@ def test_decision_loss_stops_pulling_at_large_logits() -> None:
     assert logits.grad.tolist() == [0.0, 0.0]
 
 
-def of_one_path(form: str, z: Tensor, cost: Tensor, y: int, gain: Tensor) -> Tensor:
-    """The loss of one path at one clock, which it reaches unlocated and leaves for y: what every sensor adds to it."""
-    softplus, one = torch.nn.functional.softplus, torch.nn.functional.one_hot(torch.tensor(y), len(z))
+def of_one_path(form: str, z: Tensor, cost: Tensor, covers: Tensor, gain: Tensor) -> Tensor:
+    """The loss of one path at one clock, which it reaches unlocated and leaves for a cell that the sensors `covers` do.
+
+    What seeing it there gains is the gain of each sensor that sees it while none of the others does.
+    """
+    softplus = torch.nn.functional.softplus
+    others = torch.stack([(covers & (z > 0) & (torch.arange(len(z)) != s)).any() for s in range(len(z))])
+    one = (covers & ~others).float()
     if form == "decision":
-        return (cost * softplus(z)).sum() + gain.clamp(min=0) * softplus(-z[y]) + (-gain).clamp(min=0) * softplus(z[y])
+        plus, minus = gain.clamp(min=0), (-gain).clamp(min=0)
+        return (cost * softplus(z) + one * (plus * softplus(-z) + minus * softplus(z))).sum()
     if form == "poisson":
-        return (cost * z.exp()).sum() - gain * z[y]
+        return (cost * z.exp()).sum() - gain * (one * z).sum()
     on = z.sigmoid()  # the surrogate has the same slope where the old policy is this one
     entropy = -(on * on.log() + (1 - on) * (1 - on).log())
     return (-on * (one * gain - cost) - 0.3 * entropy).sum()
@@ -55,6 +62,7 @@ def written_out(
     m, last, g = world.num_cells, world.num_choices, loss.discount
     cost, safe = world.cost / world.reward, 1.0 - world.safe_cost / world.reward
     price = torch.as_tensor(cost, dtype=torch.float32)
+    covers = torch.as_tensor(world.covered(np.eye(world.total_sensors, dtype=bool)))  # [S, M]
     actor, clocked_actor = loss.actor(), loss.clocked_actor()
     value = [*loss.critic().flatten(), torch.tensor(0.0)]
     clocked = [*loss.clocked_critic().squeeze(-1), torch.zeros(last + 1)]
@@ -68,7 +76,7 @@ def written_out(
         if n == last:
             return safe + g * value[y].detach()
         chosen = on[path[0], n]
-        after = 1.0 + g * value[y].detach() if chosen[y] else g * follow(path, n + 1)
+        after = 1.0 + g * value[y].detach() if (chosen & covers[:, y]).any() else g * follow(path, n + 1)
         return after - float((chosen.numpy() * cost).sum())
 
     total = {name: torch.tensor(0.0) for name in ("actor", "critic", "clocked_actor", "clocked_critic")}
@@ -83,11 +91,11 @@ def written_out(
                 aim = safe + g * u[y][0]
             else:
                 chosen = clocked_actor[x, n] > 0
-                aim = 1.0 + g * u[y][0] if chosen[y] else g * u[y][n + 1]
+                aim = 1.0 + g * u[y][0] if (chosen & covers[:, y]).any() else g * u[y][n + 1]
                 aim = aim - float((chosen.numpy() * cost).sum())
                 gain = 1.0 + g * (u[y][0] - u[y][n + 1]).detach()
                 total["clocked_actor"] = total["clocked_actor"] + of_one_path(
-                    "decision", clocked_actor[x, n], price, y, gain
+                    "decision", clocked_actor[x, n], price, covers[:, y], gain
                 )
             total["clocked_critic"] = total["clocked_critic"] + (u[x][n] - aim.detach()).square()
         for n in range(last):
@@ -96,8 +104,8 @@ def written_out(
                 break
             trust = (1 - blend) * (u[y][0] - u[y][n + 1]) + blend * (value[y] - follow(path, n + 1))
             gain = (1.0 + g * trust).detach()
-            total["actor"] = total["actor"] + of_one_path(form, actor[x, n], price, y, gain)
-            if on[x, n, y]:
+            total["actor"] = total["actor"] + of_one_path(form, actor[x, n], price, covers[:, y], gain)
+            if (on[x, n] & covers[:, y]).any():
                 break
     return total
 
@@ -105,19 +113,25 @@ def written_out(
 SETTINGS = [("decision", t_max, blend) for t_max in (0, 1, 2) for blend in (0.0, 0.6, 1.0)]
 
 
+@pytest.mark.parametrize("footprints", [False, True])
 @pytest.mark.parametrize(("form", "t_max", "blend"), [*SETTINGS, *((form, 2, 0.6) for form in FORMS)])
-def test_summed_up_losses_are_those_of_every_path_apart(form: str, t_max: int, blend: float) -> None:
+def test_summed_up_losses_are_those_of_every_path_apart(form: str, t_max: int, blend: float, footprints: bool) -> None:
     """Gradients agree with autograd through the formulas; clocks are weighed apart, so each is compared by direction.
 
     Targets do not carry the constant part of a squared error, hence gradients and not values.
     """
-    world = replace(small_world(t_max=t_max), cost=np.linspace(0.1, 0.5, 9), reward=2.0)
+    coverage = discs((3, 3), np.array([(0, 0), (0, 1), (1, 0), (1, 2), (2, 1)]), 1) if footprints else None
+    count = 5 if footprints else 9
+    world = replace(small_world(t_max=t_max), cost=np.linspace(0.1, 0.5, count), reward=2.0, coverage=coverage)
     rng = torch.Generator().manual_seed(1)
     loss = HindsightLoss(world.task, FORMS[form](), reach=2, hidden=6, discount=0.7, generator=rng)
     cells = torch.randint(10, (t_max + 3, 60), generator=rng)
     cells[0] %= 9
     cells = torch.where((cells == 9).cummax(0).values, 9, cells)
-    on = torch.rand(9, t_max + 1, 9, generator=rng) < 0.3
+    on = torch.rand(9, t_max + 1, count, generator=rng) < 0.3
+    if footprints:  # some sensors on, so that others see no more than these do
+        loss.actor.bias.data += torch.tensor([2.0, 0.0, 1.5, 0.0, 2.0])
+        loss.clocked_actor.bias.data += torch.tensor([0.0, 2.0, 0.0, 2.0, 1.5])
     summed, apart = loss(cells, on, blend), written_out(loss, world, cells, on, blend, form)
     for name in ("critic", "clocked_critic"):
         ours, theirs = (gradient(part[name], getattr(loss, name)) for part in (summed, apart))

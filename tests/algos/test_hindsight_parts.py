@@ -12,6 +12,7 @@ from torch import Tensor
 from tests.algos.hindsight import FORMS
 from tests.helpers import algorithm, small_world
 from trackmdp.algos.hindsight_loss import HindsightLoss
+from trackmdp.world.coverage import discs
 from trackmdp.world.kernels import random_walk
 from trackmdp.world.model import World
 
@@ -53,7 +54,7 @@ def gradients(
         steps = [(cells + (step > 1) * torch.randint(2, (300,), generator=rng)).clamp(max=m) for step in range(t + 3)]
         cells = torch.stack(steps)
         cells = torch.where((cells == m).cummax(0).values, m, cells)
-        on = torch.rand(m, t + 1, loss.view.width, generator=rng) < 0.3
+        on = torch.rand(m, t + 1, loss.sensors.width, generator=rng) < 0.3
         losses = loss(cells, on, 0.6)
         torch.stack(list(losses.values())).sum().backward()
     grads = [weight.grad for weight in loss.parameters() if weight.grad is not None]
@@ -74,6 +75,18 @@ def test_losses_and_gradients_do_not_depend_on_the_parts(form: str, per_part: in
     for ours, theirs in zip(parts, whole, strict=True):
         torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(same[0], scale[0])
+
+
+def test_parts_of_footprints_are_the_whole() -> None:
+    places = np.stack(np.divmod(np.arange(0, 25, 2), 5), axis=1)
+    world = replace(far_world(), cost=np.linspace(0.1, 0.5, 13), coverage=discs((5, 5), places, 1))
+    one, whole, scale = gradients(world, "decision", 1, 10**6)
+    few, parts, same = gradients(world, "decision", 1, 2 * 3 * 25 * 4)  # at most four sensors see a cell
+    assert (scale[1], same[1]) == (1, 13)
+    for name, loss in one.items():
+        torch.testing.assert_close(few[name], loss)
+    for ours, theirs in zip(parts, whole, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
 
 
 def test_cells_that_share_weights_may_come_in_different_parts() -> None:

@@ -102,5 +102,7 @@ def test_a_safe_action_that_misses_is_not_learned(name: str) -> None:
 def test_what_counts_paths_is_refused() -> None:
     with pytest.raises(UserError, match=r"algo\.surrogate=sampled: expected all_action"):
         algorithm("ppo_per_sensor", replace(small_world(), detection=0.5), "algo.surrogate=sampled")
+    with pytest.raises(UserError, match=r"algo\.surrogate=sampled: expected all_action"):
+        algorithm("ppo_per_sensor", replace(small_world(), coverage=np.ones((9, 9))), "algo.surrogate=sampled")
     with pytest.raises(UserError, match=r"algo\.share_cells=true: sensors of different p_d"):
         algorithm("hindsight", replace(small_world(), detection=np.linspace(0.5, 1, 9)), "algo.share_cells=true")

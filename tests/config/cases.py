@@ -17,7 +17,7 @@ REFUSED = {("evaluate", f"log={name}") for name in ("csv", "tensorboard", "wandb
     (command, "kernel=tracks") for command in ("evaluate", "solve", "verify", "benchmark")
 }
 REFUSED |= {(command, "sensor=false_alarm") for command in ("train", "solve", "verify", "benchmark")}
-REFUSED |= {(command, "sensor=footprint") for command in ("verify", "train")}
+REFUSED |= {("verify", "sensor=footprint")}
 MODES = [name for name, schema in GROUPS["kernel"].items() if schema.hides]
 REFUSED |= {(command, f"kernel={name}") for command in ("train", "benchmark") for name in MODES}
 """Choices that a command's group offers and its rules refuse."""

@@ -1,4 +1,4 @@
-"""Learning with sensors that have footprints: joint credit, from Python and the command line, resumed and logged."""
+"""Learning with sensors that have footprints, from Python and the command line, resumed and logged."""
 
 from __future__ import annotations
 
@@ -19,16 +19,38 @@ SHORT = {"total_frames": 2048, "collector.envs": 64, "frames_per_batch": 512, "o
 
 def _world() -> World:
     places = np.array([(0, 0), (0, 2), (2, 0), (2, 2)])
-    return World.of(small_world(), small_world().kernel, coverage=discs((3, 3), places, 1), cost=[0.1, 0.2, 0.3, 0.4])
+    return World.of(small_world(), small_world().kernel, coverage=discs((3, 3), places, 1.5), cost=[0.1, 0.2, 0.3, 0.4])
 
 
-@pytest.mark.parametrize("algo", ["a2c", "ppo", "dqn"])
-def test_joint_credit_learns_sets_of_sensors(algo: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("algo", ["a2c", "ppo", "dqn", "hindsight"])
+def test_sets_of_sensors_are_learned_and_kept(algo: str, tmp_path: Path) -> None:
     run = tm.train(_world(), algo, folder=tmp_path / "run", **SHORT)
     assert run.policy.task.total_sensors == 4
     assert tm.evaluate(_world(), run.policy).aihtr == pytest.approx(run.evaluation.aihtr)
     again = tm.load_run(tmp_path / "run")
     assert (again.policy.dense() == run.policy.dense()).all()
+
+
+LEARNS = {"total_frames": 32_768, "updates": 300, "updates_per_iteration": 100, "batch_size": 2048, "hidden": 32}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("t_max", [0, 2])
+@pytest.mark.parametrize("algo", ["hindsight", "dqn"])
+def test_what_sensors_gain_beside_the_others_leads_to_the_optimum(algo: str, t_max: int) -> None:
+    world = World.of(_world(), small_world(exit_probability=0.02).kernel, t_max=t_max)
+    credit = {} if algo == "hindsight" else {"credit": "per_sensor"}
+    run = tm.train(world, algo, **SHORT | LEARNS | credit)
+    best = tm.solve(world)
+    assert (best.upper - run.evaluation.aihtr) / run.evaluation.expected_length < 0.01
+
+
+def test_hindsight_asks_for_sensors_everywhere_and_does_not_share_them() -> None:
+    holes = World.of(_world(), _world().kernel, coverage=discs((3, 3), np.array([(0, 0)]), 1), cost=0.1)
+    with pytest.raises(UserError, match="no sensor covers cell 2"):
+        tm.train(holes, **SHORT)
+    with pytest.raises(UserError, match=r"algo\.share_cells=true: sensors with footprints"):
+        tm.train(World.of(_world(), _world().kernel, cost=0.1), share_cells=True, **SHORT)
 
 
 @pytest.mark.slow
@@ -57,11 +79,10 @@ def test_a_run_of_other_footprints_is_not_resumed(tmp_path: Path) -> None:
 def test_algorithms_that_know_no_footprints_say_so_before_anything_is_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for algo in ("hindsight", "path_counts"):
-        assert main(["train", "sensor=footprint", f"algo={algo}", f"hydra.run.dir={tmp_path / 'run'}"]) != 0
-        shown = capsys.readouterr().err
-        assert f"algo={algo}: expected one of" in shown
-        assert shown.count("\n") == 1
-        with pytest.raises(UserError, match="expected one of"):
-            tm.train(_world(), algo)
+    assert main(["train", "sensor=footprint", "algo=path_counts", f"hydra.run.dir={tmp_path / 'run'}"]) != 0
+    shown = capsys.readouterr().err
+    assert "algo=path_counts: expected one of" in shown
+    assert shown.count("\n") == 1
+    with pytest.raises(UserError, match="expected one of"):
+        tm.train(_world(), "path_counts")
     assert not (tmp_path / "run").exists()

@@ -7,6 +7,8 @@ two others do not.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -32,11 +34,14 @@ class SensorCredit:
     """Statistics of replayed paths for every sensor at every row (x, n) of the policy's table.
 
     Attributes:
-        entry: int64 `[T+1, B]`, for each path and clock the place in `[M, T+1, K]` of the sensor the target moved to.
-        gain: `[T+1, B]`, what having that sensor on gains; 0 where the path did not get to the clock unlocated.
+        entry: int64 `[T+1, B]`, for each path and clock the place in `[M, T+1, C]` of the cell the target moved to.
+        gain: `[T+1, B]`, what seeing it there gains; 0 where the path did not get to the clock unlocated.
         arrivals: `[M, T+1]`, paths at each row.
         price: `[M, T+1, K]`, what having a sensor on costs on all of them.
         rows: the located cells that these tables are of, where they are a part of all M.
+        of_sensors: what sensors gain `[M, T+1, K]` where it gains `[M, T+1, C]` to see the cells; the same where each
+            sensor has a cell of its own.
+        cells: C, where it is not K.
     """
 
     entry: Tensor
@@ -44,14 +49,18 @@ class SensorCredit:
     arrivals: Tensor
     price: Tensor
     rows: slice = field(default_factory=lambda: slice(None))
+    of_sensors: Callable[[Tensor], Tensor] = lambda gain: gain
+    cells: int | None = None
 
     @cached_property
-    def _sums(self) -> Tensor:
-        size = self.price.numel()
+    def _sums(self) -> tuple[Tensor, Tensor]:
+        shape = (*self.arrivals.shape, self.cells or self.price.shape[-1])
+        size = math.prod(shape)
         # One scatter for both signs: with 32 entries, a gain of -.5 at entry 30 adds .5 to place 30 + 32 = 62, the
         # second half.
         negative = self.entry + size * (self.gain < 0)
-        return scatter_add(self.gain.abs(), negative, 2 * size).view(2, *self.price.shape)
+        plus, minus = scatter_add(self.gain.abs(), negative, 2 * size).view(2, *shape)
+        return self.of_sensors(plus), self.of_sensors(minus)
 
     @property
     def plus(self) -> Tensor:

@@ -50,13 +50,13 @@ def counted_world(task: Task, start: Tensor, end: Tensor, *, share_cells: bool) 
 def exchanged_sets(
     task: Task, start: Tensor, end: Tensor, sets: sparse.csr_array, *, share_cells: bool, anew: bool = True
 ) -> sparse.csr_array:
-    """`[M (t_max + 1), M]`, what exchange on the counts makes of learned `sets`.
+    """`[M (t_max + 1), S]`, what exchange on the counts makes of learned `sets`.
 
     Args:
         task: grid, rewards and costs.
         start: `[K]`, the cell before each sensed move.
         end: `[K]`, the cell after it, M for outside.
-        sets: `[M (t_max + 1), M]`.
+        sets: `[M (t_max + 1), S]`.
         share_cells: see `counted_world`.
         anew: whether to start from `search` as well: from one start alone, regrets of .003 were left.
     """

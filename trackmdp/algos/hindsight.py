@@ -90,6 +90,11 @@ class Hindsight:
             raise UserError("algo.share_cells=true: sensors of different prices, expected one price for all")
         if cfg.share_cells and (task.detection != task.detection[0]).any():
             raise UserError("algo.share_cells=true: sensors of different p_d, expected one for all")
+        if cfg.share_cells and task.coverage is not None:
+            raise UserError("algo.share_cells=true: sensors with footprints, expected one in each cell")
+        if task.coverage is not None and not task.coverage.degree.all():  # the path of a target there is not known
+            cell = int(task.coverage.degree.argmin())
+            raise UserError(f"sensor: no sensor covers cell {cell}, expected all covered; learned_kernel needs no such")
         if not task.safe:  # what follows a safe action that missed is on no path that was seen
             raise UserError(f"sensor.p_s={task.safe_detection.min():g}: expected 1, for this algo learns no other")
         self.actor = Policy.none(task)
@@ -250,13 +255,13 @@ class _Learner:
         return torch.cat([self.ema(rows) > 0 for rows in self.loss.slices()])
 
     def sets(self, task: Task) -> sparse.csr_array:
-        """`[M * (T+1), M]` bool, the policy's table."""
-        cells = self.loss.view.cells
-        on = self._on() & (cells < task.num_cells).unsqueeze(1)
-        # Entry (x, n, k) is sensor cells[x, k] in row x (T+1) + n of the table; `nonzero` lists them row by row.
+        """`[M * (T+1), S]` bool, the policy's table."""
+        sensors = self.loss.sensors.numbers
+        on = self._on() & (sensors < task.total_sensors).unsqueeze(1)
+        # Entry (x, n, k) is sensor sensors[x, k] in row x (T+1) + n of the table; `nonzero` lists them row by row.
         start, n, local = on.nonzero(as_tuple=True)
-        row, column = (start * task.num_choices + n).cpu().numpy(), cells[start, local].cpu().numpy()
-        shape = (task.num_cells * task.num_choices, task.num_cells)
+        row, column = (start * task.num_choices + n).cpu().numpy(), sensors[start, local].cpu().numpy()
+        shape = (task.num_cells * task.num_choices, task.total_sensors)
         return sparse.csr_array((np.ones(len(row), dtype=bool), (row, column)), shape=shape)
 
     def state_dict(self) -> dict[str, Any]:

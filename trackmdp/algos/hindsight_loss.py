@@ -11,6 +11,7 @@ from torch.nn.functional import pad
 
 from trackmdp.algos.actor_loss import ActorLoss, SensorCredit, decision_loss
 from trackmdp.algos.gains import chain_returns, clocked_advantage, sensing_gain
+from trackmdp.algos.in_view import SensorsInView
 from trackmdp.algos.tables import gather, scatter_add
 from trackmdp.policies.chain_table import CellClockNet
 from trackmdp.world.model import Task
@@ -86,11 +87,13 @@ class HindsightLoss(nn.Module):
         max_entries: int = 2**62,
     ) -> None:
         super().__init__()
-        # Shapes below: M cells, T + 1 = t_max + 1 clocks, B paths, K sensors of a window around the located cell.
+        # Shapes below: M cells, T + 1 = t_max + 1 clocks, B paths, C cells of a window around the located cell, and K
+        # sensors that may see them, one in each where none has a footprint.
         m, choices, device = task.num_cells, task.num_choices, generator.device
         self.reach, self._window = reach, task.window
         # One move takes the target to a cell that is near; t_max + 1 of them, to one in view.
         self.near, self.view = Window.reaching(task, reach, device), _in_view(task, choices * reach, device)
+        self.nearby, self.sensors = SensorsInView(task, self.near), SensorsInView(task, self.view)
         # The border looks alike from two cells where it is equally far, or out of reach until the safe action.
         # What to sense is then learned once for both; values stay each cell's own.
         groups = Window(task, choices * reach, device).groups() if share_cells else None
@@ -100,21 +103,22 @@ class HindsightLoss(nn.Module):
                 m, clocks, hidden=hidden, outputs=outputs, bias=bias, generator=generator, groups=groups
             )
 
-        def decisions(seen: Window) -> CellClockNet:
+        def decisions(seen: Window, sensors: SensorsInView) -> CellClockNet:
             # Where the window is the whole grid an output stands for a cell, and cannot be shared.
-            return net(choices, seen.width, -1.0, groups if seen.is_local else None)
+            return net(choices, sensors.width, -1.0, groups if seen.is_local else None)
 
         # Bias -1 starts all sensors off (z > 0 is on). U has T + 2 clocks: also n = T + 1, where the safe action is
         # forced.
-        self.actor, self.critic = decisions(self.view), net(1, 1, 0.0)
-        self.clocked_actor, self.clocked_critic = decisions(self.near), net(choices + 1, 1, 0.0)
-        actor_loss.allocate((m, choices, self.view.width), device)
+        self.actor, self.critic = decisions(self.view, self.sensors), net(1, 1, 0.0)
+        self.clocked_actor, self.clocked_critic = decisions(self.near, self.nearby), net(choices + 1, 1, 0.0)
+        actor_loss.allocate((m, choices, self.sensors.width), device)
         self.actor_loss = actor_loss
         # What the forced step earns, in units of r: (r - D) / r.
         self.discount, self.safe = discount, 1.0 - task.safe_cost / task.reward
-        self._cells_at_once = max(1, max_entries // (choices * self.view.width))
+        self._cells_at_once = max(1, max_entries // (choices * self.sensors.entries))
         cost = torch.as_tensor(task.cost / task.reward, dtype=torch.float32, device=device)
-        # [M + 1]: cell M, outside the grid, costs nothing, so that windows cut off by the border need no mask here.
+        # [S + 1]: the last one, which there is none of, costs nothing, so that windows cut off by the border need no
+        # mask here.
         self.register_buffer("cost", pad(cost, (0, 1)))
         # p_d, known to the learner like the prices; 0 outside, and no state: it is the task's, not the training's.
         detection = torch.as_tensor(task.detection, dtype=torch.float32, device=device)
@@ -211,7 +215,7 @@ class HindsightLoss(nn.Module):
         # on reports p_d of the moves to its cell; what it misses goes on like what is not sensed.
         seen = moved if self._perfect else moved * self._detection[nearby].unsqueeze(1)
         gain = seen * sensing_gain(advantage[:, nearby].transpose(0, 1), reward=1.0, discount=self.discount)
-        chosen, cost = logits.detach() > 0, self.cost[nearby].unsqueeze(1)
+        chosen, cost = logits.detach() > 0, self.cost[self.nearby.numbers[rows]].unsqueeze(1)
         if self._window is not None and self._window < self.reach:
             # Sensors outside the window cannot be chosen: they neither gain nor cost, nor are they learned about.
             allowed = self._choosable(nearby, rows).unsqueeze(1)
@@ -221,16 +225,18 @@ class HindsightLoss(nn.Module):
         # U(x, n) = sum_j P_xj gamma U(j, n + 1), if nothing is sensed; each sensor on adds its gain, which turns gamma
         # U(j, n + 1) into r + gamma U(j, 0), and takes its cost away. At n = T + 1 all are located: r - D + gamma U(j,
         # 0).
-        free = following[:, 1:] + (gain * chosen).sum(-1) - stays * (chosen * cost).sum(-1)
+        found = (gain * self.nearby.seen(chosen, rows)).sum(-1)
+        free = following[:, 1:] + found - stays * (chosen * cost).sum(-1)
         target = torch.cat([free, following[:, :1] + self.safe * stays], dim=1) / visits.clamp(min=1)
         # All moves to a cell have the same gain, so its sign says whether it is part of G⁺ or G⁻; the price is c for
         # every move that stays in the grid.
-        loss = decision_loss(logits, gain.clamp(min=0), gain.clamp(max=0).neg(), stays.unsqueeze(-1) * cost)
+        plus, minus = (self.nearby.gains(each, chosen, rows) for each in (gain.clamp(min=0), gain.clamp(max=0).neg()))
+        loss = decision_loss(logits, plus, minus, stays.unsqueeze(-1) * cost)
         return loss.sum((0, 2)), target
 
     def _replay(self, cells: Tensor, on: Tensor, advantage: Tensor, value: Tensor, blend: float) -> _Replayed:
         """From whole paths: the policy's chain is followed from their first cell until it detects or is forced."""
-        m, choices, k = on.shape
+        m, choices, k = len(on), on.shape[1], self.view.width
         # [B], [T + 2, B] and [T + 1, B]: the free choices are for the first T + 1 moves, the last one is the forced
         # step.
         start, moves, end = cells[0], cells[1:], cells[1:-1]
@@ -241,7 +247,8 @@ class HindsightLoss(nn.Module):
         # Where the target has left the grid or the view, `entry` is that of some other sensor.
         seen = end < m if self._window is None else self.view.contains(start.expand_as(end), end)
         # [T + 1, B], the probability of a report; 0 or 1 with sensors that never miss.
-        reports, inside = (gather(on, entry) & seen).float(), moves < m
+        found = torch.cat([self.sensors.seen(on[rows], rows) for rows in self.slices()])
+        reports, inside = (gather(found, entry) & seen).float(), moves < m
         detects = None if self._perfect else gather(self._detection, end)
         reports = reports if detects is None else reports * detects
         located = gather(pad(value, (0, 1)), moves)
@@ -274,18 +281,21 @@ class HindsightLoss(nn.Module):
 
     def _set_cost(self, on: Tensor, rows: slice) -> Tensor:
         """C(A) `[rows, T+1]` of the sets `on` of the cells `rows`."""
-        return (on * self.cost[self.view.cells[rows]].unsqueeze(1)).sum(-1)
+        return (on * self.cost[self.sensors.numbers[rows]].unsqueeze(1)).sum(-1)
 
     def _own(self, replayed: _Replayed, rows: slice, chosen: slice | Tensor) -> Tensor:
         """`[T+1]`, the actor's losses per clock, on the `chosen` paths, those from the cells `rows`."""
         logits = self.actor(rows)
-        count, choices, k = logits.shape
+        count, choices, _ = logits.shape
         first = (rows.start or 0) * choices
-        row, entry, alive, gain = replayed.of(chosen, first, first * k)
+        row, entry, alive, gain = replayed.of(chosen, first, first * self.view.width)
         # Paths that reach each (x, n); every sensor on costs c on each of them, the one the target moves to included.
         arrivals = scatter_add(alive, row, count * choices).view(count, choices)
-        price = arrivals.unsqueeze(-1) * self.cost[self.view.cells[rows]].unsqueeze(1)
-        credit = SensorCredit(entry, gain, arrivals, price, rows)
+        price = arrivals.unsqueeze(-1) * self.cost[self.sensors.numbers[rows]].unsqueeze(1)
+        on = logits.detach() > 0
+        credit = SensorCredit(
+            entry, gain, arrivals, price, rows, lambda sums: self.sensors.gains(sums, on, rows), self.view.width
+        )
         return self.actor_loss(logits, credit).sum((0, 2))
 
     def _weights(self, which: int, count: Tensor, gain: Tensor) -> Tensor:

@@ -21,7 +21,7 @@ from trackmdp.policies.explore import RenewedTable
 from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
-from trackmdp.solvers import exchange, search
+from trackmdp.solvers import exchange
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.kernel_estimate import KernelEstimate, ObservedPaths
 from trackmdp.solvers.partition import plan_by_blocks
@@ -96,8 +96,6 @@ class LearnedKernel:
         By blocks, the halo is that of the reach believed.
         """
         world = self._world(kernel)
-        if world.coverage is not None:  # exchange is of cells, not of sensors that cover several
-            return search.solve(world)
         if self.cfg.block is None:
             return exchange.solve(world) if start is None else exchange.improve(world, PolicyTable(self.task, start))
         return plan_by_blocks(world, exchange.solve, self.cfg.block)

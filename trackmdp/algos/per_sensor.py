@@ -28,8 +28,9 @@ class PerSensorPPO(Hindsight):
     cfg: PpoPerSensorConfig
 
     def __init__(self, task: Task, cfg: PpoPerSensorConfig, **run: Any) -> None:
-        if cfg.surrogate == "sampled" and not task.perfect:  # it counts paths, which then have weights
-            raise UserError("algo.surrogate=sampled: expected all_action where sensors miss")
+        # It counts paths, which have weights where sensors miss, and each of which one sensor sees.
+        if cfg.surrogate == "sampled" and not (task.perfect and task.coverage is None):
+            raise UserError("algo.surrogate=sampled: expected all_action where sensors miss or have footprints")
         super().__init__(task, cfg, **run)
 
     def _actor_loss(self) -> ActorLoss:

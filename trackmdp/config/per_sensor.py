@@ -28,6 +28,7 @@ class PerSensorConfig(AlgoConfig):
     """
 
     credit: ClassVar[str | None] = "per_sensor"
+    knows_footprints: ClassVar[bool] = True
     effort: ClassVar[float] = 1.0
     collect: str = option(
         "all sensors on; or mixed with the policy learned so far, which costs less and shows less",

@@ -64,13 +64,19 @@ FLIPPED = _candidates()
 
 def solve(world: World) -> PolicyTable:
     """The policy of `search`, improved by exchange."""
-    return improve(world, search.solve(world))
+    found = search.solve(world)
+    return improve(world, found) if world.coverage is None else found
 
 
 def improve(world: World, policy: PolicyTable) -> PolicyTable:
-    """What exchange makes of a deterministic `policy`; no cell's value is lower."""
+    """What exchange makes of a deterministic `policy`; no cell's value is lower.
+
+    Exchange is of cells, one sensor in each: sets of sensors with footprints ascend, by `search`.
+    """
     layers = reachable_layers(world, world.num_choices)
-    return policy_table(world, layers, exchanged(world, layers, layer_sets(layers, policy)))
+    sets = layer_sets(layers, policy)
+    better = exchanged(world, layers, sets) if world.coverage is None else search.ascended(world, layers, sets)
+    return policy_table(world, layers, better)
 
 
 def exchanged(

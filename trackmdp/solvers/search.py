@@ -23,7 +23,7 @@ from trackmdp.solvers.layers import Layer, layer_sets, policy_table, reachable_l
 from trackmdp.solvers.renewal import RenewalSystem, forced_worth, per_row
 from trackmdp.world.model import Array, BoolArray, World
 
-__all__ = ["InnerProblem", "located_value", "solve"]
+__all__ = ["InnerProblem", "ascended", "located_value", "solve"]
 
 DIRECT_SEARCH = 1_500
 """Cells up to which the systems of a search are factorised: above, the value before is so near that iterating is
@@ -151,10 +151,10 @@ def follow_credit(
         sets = problem.ascend(sets, located, sweeps=sweeps, optimism=1.0 - step / steps, credit=credit)
         # each step of the homotopy moves few sets, so that the value before is a good guess
         value = located_value(world, layers, sets, value)
-    return _improve(world, layers, sets, value)
+    return ascended(world, layers, sets, value)
 
 
-def _improve(
+def ascended(
     world: World, layers: list[Layer], sets: list[BoolArray], value: Array | None = None, *, sweeps: int = 10
 ) -> list[BoolArray]:
     """Policy iteration by ascent, until the mean value no longer grows; `value` `[M]`: that of `sets`, where known."""
