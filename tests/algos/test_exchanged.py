@@ -12,10 +12,13 @@ from tests.algos.hindsight import SHORT, assert_same, batches, learn, policy
 from tests.helpers import algorithm, small_world
 from trackmdp.algos import exchanged
 from trackmdp.algos.exchanged import counted_world, exchanged_sets
+from trackmdp.algos.segments import SensedPaths
 from trackmdp.policies.policy import Policy
 from trackmdp.solvers import optimal
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import regret_per_step
+from trackmdp.solvers.path_exchange import choose_plan, parted
+from trackmdp.solvers.recorded import replay
 from trackmdp.training.train import train
 from trackmdp.world.make import make_world
 from trackmdp.world.model import World
@@ -50,9 +53,9 @@ def test_the_nets_are_what_they_are_without_it() -> None:
     assert values[1].mean() > values[0].mean() + 1.0
 
 
-@pytest.mark.parametrize("collects", ["all_on", "mixed"])
-def test_a_loaded_learner_has_the_exchanged_policy(collects: str) -> None:
-    world = spreading_world()
+@pytest.mark.parametrize(("collects", "markov"), [("all_on", True), ("mixed", True), ("all_on", False)])
+def test_a_loaded_learner_has_the_exchanged_policy(collects: str, markov: bool) -> None:
+    world = spreading_world() if markov else remembering_world()
     words = (*SHORT, f"algo.collect={collects}")
     learner = learn(world, batches(world), *words)
     file = io.BytesIO()
@@ -76,10 +79,36 @@ def test_a_mixture_collects_with_the_exchanged_policy() -> None:
     assert learner.policy.bits.sum() == torch.as_tensor(np.packbits(Policy(world, expected).dense(), axis=-1)).sum()
 
 
-def test_motion_with_memory_is_not_counted() -> None:
-    world = World.of(spreading_world(), spreading_world().kernel, markov=False)
-    learner = learn(world, batches(world), *SHORT)
-    assert np.array_equal(policy(learner, world).dense(), Policy(world, learner._learner.sets(world)).dense())
+def remembering_world() -> World:
+    return World.of(spreading_world(), spreading_world().kernel, markov=False)
+
+
+def test_motion_with_memory_is_exchanged_on_whole_paths() -> None:
+    """A quarter of the recordings, kept from the nets, say that the plan for the others is better than theirs."""
+    world = remembering_world()
+    data = batches(world, 64)
+    off, on = (learn(world, data, *SHORT, "algo.buffer_size=20000", f"algo.exchange={on}") for on in (False, True))
+    assert np.array_equal(policy(off, world).dense(), Policy(world, off._learner.sets(world)).dense())
+    values = [evaluate(world, policy(each, world)).aihtr for each in (off, on)]
+    assert values[1] > values[0] + 1.0
+    tracks, learned = on._buffer.tracks(), Policy(world, on._learner.sets(world))
+    kept, judging = parted(tracks, on._buffer.judge)
+    chosen = choose_plan(world.task, kept, judge=judging, learned=learned, discount=0.8).policy
+    assert (
+        replay(world.task, judging, chosen).totals[:, 0].sum() > replay(world.task, judging, learned).totals[:, 0].sum()
+    )
+
+
+def test_learned_sets_stay_where_nothing_else_is_better_on_what_judges() -> None:
+    """The optimum is learned; no plan for few paths is better on many others."""
+    world = remembering_world()
+    best = optimal.solve(world).policy
+    few, many = (SensedPaths(25) for _ in range(2))
+    for paths, batch in zip((few, many), (batches(world, 4), batches(world, 64, seed=1)), strict=True):
+        for each in batch:
+            paths.extend(each)
+    found = choose_plan(world.task, few.tracks(), judge=many.tracks(), learned=best, discount=0.9).policy
+    assert found is best
 
 
 def test_plans_too_large_to_be_exchanged_are_left_as_learned(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -48,7 +48,9 @@ def test_segments_count_by_all_their_reports() -> None:
     """From 0: 0 1 1 (2 · 2), 0 2 1 (4 · 2), 0 1 M (2): 4 to 8 to 2 of 14."""
     rng, weights = torch.Generator().manual_seed(0), report_weights(TASK, torch.device("cpu"))
     buffer = SegmentBuffer(3, 2, 100, rng, weights)
-    buffer.load_state_dict({"segments": torch.tensor([[0, 1, 1], [0, 2, 1], [0, 1, 3]]).T, "tail": {}})
+    cells = torch.tensor([[0, 1, 1], [0, 2, 1], [0, 1, 3]])
+    steps = torch.stack([cells[:, :-1], cells[:, 1:], 1 * (cells[:, 1:] == 3)])
+    buffer.load_state_dict({"judge": None, "paths": {"steps": steps}})
     paths = buffer.paths(42_000, 2)
     mine = paths[:, paths[0] == 0]
     count = [int((torch.tensor(path) == mine[1:].T).all(1).sum()) for path in ([1, 1], [2, 1], [1, 3])]

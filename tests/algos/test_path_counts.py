@@ -13,7 +13,8 @@ from tests.helpers import collect, train_config
 from tests.solvers.test_path_counts import SWEEP, walks
 from tests.tracks import by_hand, recorded, write
 from tests.typed import refused
-from trackmdp.algos.path_counts import PathCounts, SensedPaths
+from trackmdp.algos.path_counts import PathCounts
+from trackmdp.algos.segments import SensedPaths
 from trackmdp.app.cli import main
 from trackmdp.policies.policy import Policy
 from trackmdp.solvers.recorded import replay
@@ -54,7 +55,7 @@ def test_a_path_ends_where_the_target_is_missed() -> None:
     """It leaps out of the window of one cell, and is located by force: what it did in between is not known."""
     task = recorded(by_hand([0, 1, 2, 0, 1, 2, 5]), t_max=0, window=1)
     paths = SensedPaths(9)
-    paths.extend(collect(task, Policy.all_on(task), 1, 6))
+    paths.extend(collect(task, learner(task).policy, 1, 6))
     tracks = paths.tracks()
     assert [tuple(part) for part in np.split(tracks.cells, tracks.first[1:-1])] == [(0, 1, 2), (1, 2, 5)]
 

@@ -12,6 +12,7 @@ import torch
 from tests.algos.hindsight import SHORT, SOLVES, assert_it_learns, assert_same, batches, learn, policy
 from tests.helpers import algorithm, hop_world, small_world
 from trackmdp.config import GROUPS, PerSensorConfig
+from trackmdp.world.model import World
 
 PER_SENSOR = [name for name, schema in GROUPS["algo"].items() if issubclass(schema, PerSensorConfig)]
 VARIANTS = [
@@ -52,10 +53,10 @@ def test_the_unit_of_reward_does_not_matter(name: str) -> None:
     assert np.array_equal(one, other)
 
 
-@pytest.mark.parametrize("name", PER_SENSOR)
-def test_reads_nothing_that_was_not_sensed(name: str) -> None:
+@pytest.mark.parametrize(("name", "markov"), [*((name, True) for name in PER_SENSOR), ("hindsight", False)])
+def test_reads_nothing_that_was_not_sensed(name: str, markov: bool) -> None:
     """Positions after steps that did not sense everything, and the reward, may be anything."""
-    world = small_world()
+    world = World.of(small_world(), small_world().kernel, markov=markov)
     rng = torch.Generator().manual_seed(0)
     data = batches(world)
     for batch in data:

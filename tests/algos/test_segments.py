@@ -13,9 +13,11 @@ from hypothesis import strategies as st
 
 from tests.helpers import algorithm, collect, small_world
 from tests.tracks import by_hand, drawn, recorded
-from trackmdp.algos.segments import SegmentBuffer
+from trackmdp.algos.segments import SegmentBuffer, SensedPaths
 from trackmdp.policies.policy import Policy, as_policy
+from trackmdp.solvers.path_exchange import parted
 from trackmdp.solvers.recorded import replay
+from trackmdp.world.tracks import Tracks
 
 M = 9
 SETTING = recorded(drawn(small_world(exit_probability=0.2).kernel, 300))
@@ -26,7 +28,7 @@ def buffer(steps: int = 3, capacity: int = 10_000, seed: int = 0) -> SegmentBuff
 
 
 def segments(made: SegmentBuffer) -> list[tuple[int, ...]]:
-    return sorted(map(tuple, made.state_dict()["segments"].T.tolist()))
+    return sorted(map(tuple, made.segments().T.tolist()))
 
 
 def frames(*tracks: list[int], exits: bool = True, envs: int = 1, time: int = 12, max_steps: int | None = None) -> Any:
@@ -38,9 +40,10 @@ def frames(*tracks: list[int], exits: bool = True, envs: int = 1, time: int = 12
 def test_segments_are_those_of_the_track_by_hand() -> None:
     made = buffer()
     made.extend(frames([0, 1, 2, 3], time=4))
-    assert segments(made) == [(0, 1, 2, 3), (1, 2, 3, 9)]
+    once = [(0, 1, 2, 3), (1, 2, 3, 9), (2, 3, 9, 9), (3, 9, 9, 9)]
+    assert segments(made) == once
     made.extend(frames([0, 1, 2, 3], time=4))  # the same row has begun the track anew
-    assert segments(made) == [(0, 1, 2, 3)] * 2 + [(1, 2, 3, 9)] * 2 + [(2, 3, 9, 9), (3, 9, 9, 9)]
+    assert segments(made) == sorted(once * 2)
 
 
 def test_a_recording_that_stops_ends_its_segments() -> None:
@@ -109,6 +112,39 @@ def test_nothing_is_read_that_was_not_sensed() -> None:
     other.extend(poisoned)
     assert segments(clean) == segments(other)
     assert len(clean) > 100
+
+
+def test_a_recording_has_one_name_however_often_it_is_followed() -> None:
+    """Two recordings, in turn, and at the end a third; where the frames stop, a path is cut off."""
+    made = SensedPaths(M)
+    made.extend(frames([0, 1, 2, 3], [4, 5], time=40))
+    tracks = made.tracks()
+    pieces = [tuple(piece) for piece in np.split(tracks.cells, tracks.first[1:-1])]
+    named = set(zip(pieces, tracks.names.tolist(), strict=True))
+    assert len(tracks) > 8
+    assert {piece for piece, _ in named} >= {(0, 1, 2, 3), (4, 5)}
+    assert len(named) == len(set(pieces)) == len(set(tracks.names.tolist()))
+
+
+def test_what_judges_is_not_learned_from() -> None:
+    batch = collect(SETTING, Policy.all_on(SETTING), 16, 40)
+    whole, learned = buffer(), SegmentBuffer(M, 3, 10_000, torch.Generator().manual_seed(0), judge=1)
+    for made in (whole, learned):
+        made.extend(batch)
+    left, judging = parted(learned.tracks(), 1)
+    cut = [segments_of(part) for part in (left, judging)]
+    assert segments(learned) == cut[0]
+    assert segments(whole) == sorted(cut[0] + cut[1])
+    assert len(cut[1]) > 50
+
+
+def segments_of(tracks: Tracks) -> list[tuple[int, ...]]:
+    """All runs of four cells, after an exit filled with M."""
+    found = []
+    for begin, end, exits in zip(tracks.first[:-1], tracks.first[1:], tracks.exits, strict=True):
+        line = [*tracks.cells[begin:end].tolist(), *[M] * (3 * bool(exits))]
+        found += [tuple(line[i : i + 4]) for i in range(len(line) - 3)]
+    return sorted(found)
 
 
 def test_paths_start_everywhere_and_are_whole_segments() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from tests.tracks import by_hand, recorded
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.path_counts import Paths, plan_keys
-from trackmdp.solvers.path_exchange import _on_paths, _parted, choose_plan, exchanged_keys
+from trackmdp.solvers.path_exchange import _followed, choose_plan, exchanged_keys, parted
 from trackmdp.solvers.recorded import replay
 from trackmdp.world.tracks import Recorded, Tracks
 
@@ -27,29 +28,41 @@ def line_walks(seed: int, count: int = 12) -> Tracks:
     return by_hand(*tracks, exits=False)
 
 
+def repeated(tracks: Tracks, times: list[int]) -> Tracks:
+    """Each of the tracks so many times, all of one name for each."""
+    pieces = [list(piece) for piece in np.split(tracks.cells, tracks.first[1:-1])]
+    copies = [piece for piece, count in zip(pieces, times, strict=True) for _ in range(count)]
+    return replace(by_hand(*copies, exits=False), names=np.repeat(tracks.names, times))
+
+
 def earned(paths: Paths, plan: np.ndarray, states: np.ndarray, value: np.ndarray, discount: float) -> float:
     """What a plan `[2, M]` earns after the states of a key up to the next detection, and `value` from there on."""
     task, total = paths.task, 0.0
     for state in states:
+        gained = 0.0
         for n in range(3):
             if not paths.inside[n, state]:
                 break
             forced, cell = n == 2, paths.cells[n, state]
-            total -= discount**n * (task.safe_cost if forced else task.cost @ plan[n])
+            gained -= discount**n * (task.safe_cost if forced else task.cost @ plan[n])
             if forced or plan[n, cell]:
-                total += discount**n * (task.reward + discount * value[paths.following[n, state]])
+                gained += discount**n * (task.reward + discount * value[paths.following[n, state]])
                 break
+        total += paths.times[state] * gained
     return total
 
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("first", [False, True])
 def test_a_round_finds_the_best_plan_of_each_key(seed: int, first: bool) -> None:
-    """t_max = 1 on two cells: 16 plans for either, what follows a detection being that of the policy before."""
-    tracks = line_walks(seed)
+    """t_max = 1 on two cells: 16 plans for either, what follows a detection being that of the policy before.
+
+    Four of the paths are there three times.
+    """
+    tracks = repeated(line_walks(seed), [3] * 4 + [1] * 8)
     task = Recorded(tracks, (1, 2), validation=tracks, held_out=tracks, cost=0.4, safe_cost=0.6, t_max=1)
     paths, policy = Paths(task, tracks), PolicyTable.from_dense(task, np.full((2, 2, 2), first))
-    followed = paths.follow(*_on_paths(paths, policy), 0.9)
+    followed = _followed(paths, policy, 0.9)
     found = exchanged_keys(paths, policy, followed, 0.9, 1).dense()
     plans = np.array(list(itertools.product([False, True], repeat=4))).reshape(16, 2, 2)
     for key in range(2):
@@ -58,25 +71,31 @@ def test_a_round_finds_the_best_plan_of_each_key(seed: int, first: bool) -> None
         assert earned(paths, found[key], states, followed.value, 0.9) == pytest.approx(best)
 
 
+def test_equal_paths_are_followed_once_and_count_as_often_as_they_are_there() -> None:
+    tracks = repeated(line_walks(1), [5, 2, *[1] * 10])
+    task = recorded(tracks)
+    paths, policy = Paths(task, tracks), PolicyTable.from_dense(task, np.random.default_rng(0).random((9, 2, 9)) < 0.5)
+    assert paths.states == Paths(task, line_walks(1)).states
+    assert paths.copies == pytest.approx(17 / len({tuple(each) for each in np.split(tracks.cells, tracks.first[1:-1])}))
+    total = replay(task, tracks, policy).totals[:, 0].sum()
+    assert _followed(paths, policy, 0.9).reward == pytest.approx(total)
+
+
 def test_rare_keys_keep_their_plans() -> None:
     task = recorded(line_walks(1), memory="displacement", clip=1)
     paths, policy = Paths(task, task.tracks), PolicyTable.from_dense(task, np.zeros((90, 2, 9), dtype=bool))
-    followed = paths.follow(*_on_paths(paths, policy), 0.9)
+    followed = _followed(paths, policy, 0.9)
     assert exchanged_keys(paths, policy, followed, 0.9, 10**6) is policy
     assert exchanged_keys(paths, policy, followed, 0.9, 1).dense().any()
 
 
-def test_a_recording_that_was_followed_twice_is_in_one_part() -> None:
+def test_no_recording_learns_and_judges() -> None:
     tracks = line_walks(2, count=40)
-    cells = np.split(tracks.cells, tracks.first[1:-1])
-    twice = by_hand(*(list(each) for each in [*cells, *cells]), exits=False)
-    task = recorded(twice)
-    learned, judged = _parted(task, twice)
-    assert learned is not None
-    assert judged is not None
-    counts = {tuple(each) for each in np.split(judged.cells, judged.first[1:-1])}
-    assert 0 < len(judged) < 40
-    assert len(judged) == sum(2 for each in cells if tuple(each) in counts)
+    named = replace(tracks, names=np.arange(40) // 2)
+    learned, judged = parted(named, 3)
+    assert len(judged) == 10
+    assert sorted([*learned.names, *judged.names]) == named.names.tolist()
+    assert not set(learned.names) & set(judged.names)
 
 
 def test_the_choice_is_the_one_that_earns_most_where_it_is_judged() -> None:
@@ -92,7 +111,7 @@ def test_the_choice_is_the_one_that_earns_most_where_it_is_judged() -> None:
 
 
 def test_where_all_paths_are_one_there_is_nothing_to_choose_by() -> None:
-    tracks = by_hand(*[[0, 1, 2, 1]] * 8, exits=False)
+    tracks = replace(by_hand(*[[0, 1, 2, 1]] * 8, exits=False), names=np.zeros(8, dtype=np.int64))
     task = recorded(tracks)
-    found = choose_plan(task, tracks, judge=None, discount=0.9, rounds=5)
+    found = choose_plan(task, tracks, discount=0.9, rounds=5)
     assert (found.policy.dense() == plan_keys(task, tracks, prior=10.0, discount=0.9, rounds=5).policy.dense()).all()

@@ -3,8 +3,8 @@
 Sensing never moves the target. With all sensors on, every path shows what any policy would have found and missed
 on it. Nothing else is read: neither the kernel nor a position that was not sensed. The clocked actor
 and critic only lend credit: they say what a detection is worth while the actor's own chains are still poor. At the end
-the learned sets are exchanged on the counted moves (`algos/exchanged.py`), which gets past what no change of one set
-improves.
+the learned sets are exchanged, which gets past what no change of one set improves: on the counted moves
+(`algos/exchanged.py`), or where those do not combine on whole paths (`solvers/path_exchange.py`).
 """
 
 from __future__ import annotations
@@ -30,7 +30,9 @@ from trackmdp.config.per_sensor import PerSensorConfig
 from trackmdp.errors import UserError
 from trackmdp.policies.explore import Exploring
 from trackmdp.policies.policy import Policy
+from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import generator
+from trackmdp.solvers.path_exchange import choose_plan
 from trackmdp.world.model import Task
 from trackmdp.world.windows import Window
 
@@ -79,7 +81,9 @@ class Hindsight:
         # Updates not done beside the collecting are done after it, updates_per_iteration at a time, rounded up.
         self.iterations = iterations + max(0, -(-(self.updates - alongside) // cfg.updates_per_iteration))
         self._generator = generator(seed, "hindsight", device=device)
-        self._buffer = _buffer(task, cfg.buffer_size, self._generator)
+        # Whether another policy is better is judged on recordings that nothing was learned from.
+        judges = cfg.exchange and task.perfect and not self._mixed
+        self._buffer = _buffer(task, cfg.buffer_size, self._generator, seed if judges else None)
         window = Window.of(task, device)
         # [M, K], the sensors of each window that the border cuts off.
         self._outside = window.cells == task.num_cells if window.is_local else None
@@ -153,22 +157,29 @@ class Hindsight:
 
     def _renew_policy(self, learner: _Learner) -> None:
         """Rebuild the evaluated policy, and with `collect=mixed` the collecting one, from the averaged actor."""
-        sets = learner.sets(self.task)
-        if self._exchanges():
-            moves, last = self._buffer.moves(), self._update == self.updates
-            sets = exchanged_sets(self.task, *moves, sets, share_cells=self.cfg.share_cells, anew=last)
-        self.actor = Policy(self.task, sets)
+        self.actor = Policy(self.task, self._exchanged(learner.sets(self.task)))
         if isinstance(self.policy, Exploring):
             self.policy.renew(self.actor)
             self.policy.explore.fill_(self.cfg.explore.at(self._iteration / self._collecting))
 
-    def _exchanges(self) -> bool:
-        """Whether the policy of this iteration is the learned one after exchange: the last, and those that collect.
+    def _exchanged(self, sets: sparse.csr_array) -> sparse.csr_array:
+        """The learned sets after exchange, at the end and, of moves, for a mixture that collects.
 
-        Moves out of a cell are counted whatever came before, which only says how the target moves if that is Markov.
+        Moves out of a cell are counted whatever came before, which only says how the target moves if that is Markov;
+        else whole paths are followed.
         """
+        task, cfg, last = self.task, self.cfg, self._update == self.updates
         acts = self._mixed and self._iteration < self._collecting
-        return self.cfg.exchange and self.task.markov and (acts or self._update == self.updates)
+        if not cfg.exchange or not (last or acts):
+            return sets
+        if isinstance(self._buffer, MoveBuffer):
+            return exchanged_sets(task, *self._buffer.moves(), sets, share_cells=cfg.share_cells, anew=last)
+        if self._buffer.judge is None:
+            return sets
+        paths, judge = self._buffer.tracks(), self._buffer.judge
+        found = choose_plan(task, paths, learned=PolicyTable(task, sets), discount=cfg.gamma, seed=judge).policy.sets
+        assert found is not None
+        return found
 
     def _make_learner(self, reach: int) -> _Learner:
         loss = HindsightLoss(
@@ -199,12 +210,12 @@ class Hindsight:
         return self._seen
 
 
-def _buffer(task: Task, capacity: int, rng: torch.Generator) -> MoveBuffer | SegmentBuffer:
+def _buffer(task: Task, capacity: int, rng: torch.Generator, judge: int | None) -> MoveBuffer | SegmentBuffer:
     """Paths put together from moves where the next one depends on the cell alone, else only those that were sensed."""
     weights = report_weights(task, rng.device)
     if task.markov:
         return MoveBuffer(task.num_cells, capacity, rng, weights)
-    return SegmentBuffer(task.num_cells, task.t_max + 2, capacity, rng, weights)
+    return SegmentBuffer(task.num_cells, task.t_max + 2, capacity, rng, weights, judge)
 
 
 def _distance(start: Tensor, end: Tensor, task: Task) -> Tensor:

@@ -1,68 +1,168 @@
-"""Replay buffer of whole path segments, for targets whose motion is not Markov in the cell."""
+"""Whole sensed paths, and the replay buffer of their segments, for motion that is not Markov in the cell."""
 
 from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.functional import pad
 
 from trackmdp.algos.paths import CellIndex, cell_dtype, sensed_steps, stratified_starts
+from trackmdp.solvers.path_exchange import parted
+from trackmdp.world.tracks import Tracks, ends_of
 
-__all__ = ["SegmentBuffer"]
+__all__ = ["SegmentBuffer", "SensedPaths"]
+
+_TELLING = 8
+"""Cells at the end of a path that tell which recording it followed: wherever a path began, it ends as its recording."""
+
+
+class SensedPaths:
+    """Whole paths put together from batches, each row continuing the last.
+
+    Only `sensed_steps` are read. A step that is none of them ends the path, and the next one begins another.
+
+    Args:
+        num_cells: M.
+        capacity: sensed steps kept; the oldest go first; None for all.
+    """
+
+    def __init__(self, num_cells: int, capacity: int | None = None) -> None:
+        self.num_cells, self._capacity, self._length = num_cells, capacity, 0
+        # [3, rows, time] each: the cell before the step and the cell after it, M once outside, both -1 where it was not
+        # sensed; and whether an episode ended with it.
+        self._parts: list[Tensor] = []
+
+    def __len__(self) -> int:
+        return self._length
+
+    def extend(self, batch: TensorDictBase) -> None:
+        """Add a collected batch `[B, time]` or `[workers, B, time]`."""
+        batch = batch.reshape(-1, batch.shape[-1])
+        whole, end = sensed_steps(batch, self.num_cells)
+        cells = (torch.where(whole, cell, -1) for cell in (batch["last_cell"], end))
+        part = torch.stack([*cells, batch["next", "done"].squeeze(-1)]).to("cpu", cell_dtype(self.num_cells))
+        if self._parts and not _goes_on(self._parts[-1], part):
+            self._parts[-1][2, :, -1] = 1
+        self._parts.append(part)
+        self._length += int(whole.sum())
+        if self._capacity is not None and self._length > self._capacity:
+            self._forget(self._capacity)
+
+    def _forget(self, capacity: int) -> None:
+        """Drop the oldest steps, of all rows at once, until no more than `capacity` are left."""
+        steps = torch.cat(self._parts, dim=2)
+        later = (steps[0] >= 0).sum(0).flip(0).cumsum(0)
+        columns = int((later <= capacity).sum())
+        self._parts = [steps[:, :, steps.shape[2] - columns :].clone()]
+        self._length = int(later[columns - 1]) if columns else 0
+
+    def steps(self) -> Tensor:
+        """`[2, K]` int64, the cells before and after all sensed steps; M after an exit."""
+        before, after, _ = torch.cat(self._parts, dim=2).long()
+        return torch.stack([before[before >= 0], after[before >= 0]])
+
+    def tracks(self) -> Tracks:
+        """All paths so far, those that still go on among them; they count as recordings that stop.
+
+        Paths that end alike have one name: they are taken to follow one recording.
+        """
+        start, end, done = torch.cat(self._parts, dim=2).numpy().astype(np.int64)
+        # A path begins where the step before was not sensed, or ended an episode.
+        begins = np.ones(start.shape, dtype=bool)
+        begins[:, 1:] = (start[:, :-1] < 0) | (done[:, :-1] > 0)
+        kept = start >= 0
+        start, end, begin = start[kept], end[kept], np.flatnonzero(begins[kept])
+        # Steps 3>4 4>M (exit) and 7>8 become the cells 3 4 M 7 8: the first cell of each path, then where it went.
+        cells = np.insert(end, begin, start[begin])
+        inside = cells < self.num_cells
+        path = np.cumsum(np.insert(np.zeros(len(end), dtype=np.int64), begin, 1)) - 1
+        exits = np.zeros(len(begin), dtype=bool)
+        exits[path[~inside]] = True
+        cells, first = cells[inside], ends_of(np.bincount(path[inside], minlength=len(begin)))
+        back = first[1:, None] - 1 - np.arange(_TELLING)
+        ending = np.where(back >= first[:-1, None], cells[np.maximum(back, 0)], -1)
+        names = np.unique(ending, axis=0, return_inverse=True)[1].ravel()
+        return Tracks(cells, first, exits, names)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """The steps of all batches, end to end."""
+        return {"steps": torch.cat(self._parts, dim=2)} if self._parts else {}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Continue from a `state_dict`."""
+        self._parts = [part.cpu() for part in state.values()]
+        self._length = sum(int((part[0] >= 0).sum()) for part in self._parts)
+
+
+def _goes_on(before: Tensor, after: Tensor) -> bool:
+    """Whether every row continues that of the batch before; not so where workers deliver in any order."""
+    _, end, done = before[:, :, -1]
+    start = after[0, :, 0]
+    # Only rows where both steps were sensed and the episode went on can be compared; the others prove nothing.
+    return bool(((end == start) | (end < 0) | (start < 0) | (done > 0)).all())
 
 
 class SegmentBuffer:
     """Replay buffer of path segments: a located cell and the cells sensed in the `steps` steps after it, M for outside.
 
-    Unlike `MoveBuffer` it never puts a path together from moves of different ones. A segment begins at every fully
-    sensed step that is followed by enough others; which these are says nothing about where the target went.
+    Unlike `MoveBuffer` it never puts a path together from moves of different ones. A segment begins at every sensed
+    step that is followed by enough others, or by the exit; which these are says nothing about where the target went.
 
     Args:
         num_cells: M.
         steps: steps of a segment.
-        capacity: segments kept; the oldest go first.
-        generator: draws the paths; the buffer lives on its device.
+        capacity: sensed steps kept; the oldest go first.
+        generator: draws the paths; the index lives on its device.
         weights: `[M + 1]`, by which each step to a cell multiplies what a segment counts; None: all count alike. See
             `report_weights`.
+        judge: seed by which recordings are kept from the segments, to judge what is learned by; None: none is.
     """
 
     def __init__(
-        self, num_cells: int, steps: int, capacity: int, generator: torch.Generator, weights: Tensor | None = None
+        self,
+        num_cells: int,
+        steps: int,
+        capacity: int,
+        generator: torch.Generator,
+        weights: Tensor | None = None,
+        judge: int | None = None,
     ) -> None:
-        self.num_cells, self.steps, self._capacity, self._generator = num_cells, steps, capacity, generator
-        self._weights = weights
-        # Oldest first.
-        self._segments = torch.empty(steps + 1, 0, dtype=cell_dtype(num_cells), device=generator.device)
-        self._tail: dict[str, Tensor] = {}
+        self.num_cells, self.steps, self._generator, self._weights = num_cells, steps, generator, weights
+        self.judge = judge
+        self._paths = SensedPaths(num_cells, capacity)
         self._index: tuple[Tensor, CellIndex] | None = None
 
     def __len__(self) -> int:
-        return self._segments.shape[1]
+        return len(self._paths)
 
     def extend(self, batch: TensorDictBase) -> None:
-        """Add the segments of a collected batch `[B, time]` or `[workers, B, time]`.
-
-        Each row continues that of the batch before, so that segments may reach over the border between the two.
-        """
-        rows = _frames(batch.reshape(-1, batch.shape[-1]), self.num_cells)
-        frames = {key: value.to(self._segments.device) for key, value in rows.items()}
-        if self._tail and _goes_on(self._tail, frames):
-            # Segments that began in the last steps - 1 frames of the batch before, and could not be completed there,
-            # are now.
-            frames = {key: torch.cat([self._tail[key], frames[key]], dim=1) for key in frames}
-        fresh = _segments(frames, self.steps, self.num_cells)
-        self._segments = torch.cat([self._segments, fresh], dim=1)[:, -self._capacity :].contiguous()
-        # The frames at which a segment may begin that this batch is too short for.
-        begin = max(0, frames["start"].shape[1] - self.steps + 1)
-        self._tail = {key: value[:, begin:].clone() for key, value in frames.items()}
+        """Add a collected batch, see `SensedPaths`."""
+        self._paths.extend(batch)
         self._index = None
 
     def moves(self) -> tuple[Tensor, Tensor]:
-        """Cells before and after every move of every segment, int64 `[steps * K]` each; M after an exit."""
-        return self._segments[:-1].long().flatten(), self._segments[1:].long().flatten()
+        """Cells before and after every sensed step, int64 `[K]` each; M after an exit."""
+        start, end = self._paths.steps().to(self._generator.device)
+        return start, end
+
+    def tracks(self) -> Tracks:
+        """All paths as a whole, those that judge among them."""
+        return self._paths.tracks()
+
+    def segments(self) -> Tensor:
+        """`[steps + 1, K]`, in the order of the paths."""
+        tracks = self.tracks() if self.judge is None else parted(self.tracks(), self.judge)[0]
+        place, lengths = np.arange(len(tracks.cells)), tracks.lengths
+        last, cells = np.repeat(tracks.first[1:] - 1, lengths), []
+        for step in range(self.steps + 1):
+            gone = place + step > last
+            cells.append(np.where(gone, self.num_cells, np.roll(tracks.cells, -step)))
+        whole = ~gone | np.repeat(tracks.exits, lengths)
+        return torch.as_tensor(np.stack(cells)[:, whole]).to(self._generator.device, cell_dtype(self.num_cells))
 
     def paths(self, count: int, steps: int) -> Tensor:
         """`[steps + 1, count]` int64 cells of `count` paths, M from the exit on; every cell starts equally many.
@@ -82,62 +182,20 @@ class SegmentBuffer:
 
         One more, of M alone, stands for the cells in which no segment begins.
         """
-        m = self.num_cells
-        start, end = self._segments[:2].long()
+        m, segments = self.num_cells, self.segments()
+        start, end = segments[:2].long()
         # Sorted by (start, end): with M = 4, the move 2 -> 3 has the key 2 * 5 + 3 = 13, and an exit from 2 the key 14.
         order = (start * (m + 1) + end).argsort(stable=True)
-        segments = self._segments.index_select(1, order)
+        segments = segments.index_select(1, order)
         weights = None if self._weights is None else self._weights[segments[1:].long()].prod(0)
         return pad(segments, (0, 1), value=m), CellIndex.of(start, m, weights)
 
     def state_dict(self) -> dict[str, Any]:
-        """The segments, and the end of the last batch; the generator is its owner's to save."""
-        return {"segments": self._segments, "tail": dict(self._tail)}
+        """The paths, and which of them judge; the generator is its owner's to save."""
+        return {"judge": self.judge, "paths": self._paths.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`."""
-        self._segments = state["segments"].to(self._segments)
-        self._tail = {key: value.to(self._segments.device) for key, value in state["tail"].items()}
+        self.judge = state["judge"]
+        self._paths.load_state_dict(state["paths"])
         self._index = None
-
-
-def _frames(batch: TensorDictBase, num_cells: int) -> dict[str, Tensor]:
-    """`[B, time]` of a collected batch: the cells around each step, whether it was sensed, whether it ended."""
-    whole, end = sensed_steps(batch, num_cells)
-    return {
-        "start": batch["last_cell"].to(cell_dtype(num_cells)),
-        "end": end.to(cell_dtype(num_cells)),
-        "whole": whole,
-        "done": batch["next", "done"].squeeze(-1),
-    }
-
-
-def _goes_on(before: dict[str, Tensor], frames: dict[str, Tensor]) -> bool:
-    """Whether every row continues that of the batch before; not so where workers deliver in any order."""
-    if not before["end"].shape[1] or len(before["end"]) != len(frames["start"]):
-        return False
-    # Only rows where both frames were sensed and the episode went on can be compared; the others prove nothing.
-    same = before["end"][:, -1] == frames["start"][:, 0]
-    known = before["whole"][:, -1] & frames["whole"][:, 0] & ~before["done"][:, -1]
-    return bool((same | ~known).all())
-
-
-def _segments(frames: dict[str, Tensor], steps: int, num_cells: int) -> Tensor:
-    """`[steps + 1, K]`, the segments that are complete: fully sensed to their end or to the exit."""
-    # 5 frames and segments of 3 steps: they may begin at frames 0, 1 and 2.
-    count = frames["start"].shape[1] - steps + 1
-    if count < 1:
-        return frames["start"].new_empty(steps + 1, 0)
-    cells = [frames["start"][:, :count]]
-    complete = torch.ones_like(frames["whole"][:, :count])
-    gone = ~complete
-    for step in range(steps):
-        end, whole, done = (frames[key][:, step : step + count] for key in ("end", "whole", "done"))
-        # Once the target is gone, M fills the rest, and the frames there, of the next episode, are not asked about.
-        complete = complete & (whole | gone)
-        cells.append(torch.where(gone, num_cells, end))
-        gone = gone | (end == num_cells)
-        if step < steps - 1:
-            # Done without an exit is a truncation: what follows belongs to another episode.
-            complete = complete & (gone | ~done)
-    return torch.stack(cells)[:, complete]

@@ -58,7 +58,8 @@ class PerSensorConfig(AlgoConfig):
     )
     exchange: bool = option(
         "at the end, change learned sets jointly where the sensed moves, counted, say that it pays (with collect=mixed "
-        "in the policy that collects, too); not with kernel.markov=false"
+        "in the policy that collects, too); with kernel.markov=false and collect=all_on, where a quarter of the "
+        "recordings, kept from learning, says so"
     )
     max_entries: int = option(
         "entries (located cell, misses, sensor) of the losses' tables at once; larger ones are gone through in parts",
@@ -84,13 +85,13 @@ class PerSensorConfig(AlgoConfig):
     def needs(self, task: Sizes, root: Any) -> dict[str, int]:
         """The moves kept, with what sorting them takes; the paths of one update; the networks.
 
-        A move is two cells of 16 bits. Where moves of different paths do not combine (`markov`), whole paths of
-        t_max + 3 cells are kept a second time, sorted.
+        A move is two cells of 16 bits. Where moves of different paths do not combine (`markov`), a third number says
+        which go on, paths of t_max + 3 cells are kept as well, and what is worked out of whole paths by exchange.
         """
         moves = min(self.buffer_size, root.collector.total_frames)
-        cells = 2 if task.markov else 2 * (task.t_max + 3)
+        cells, numbers = (2, 5) if task.markov else (task.t_max + 6, 8 + self.exchange * (task.t_max + 2) * 12)
         return {
-            "algo.buffer_size": moves * (cells * BYTES["int16"] + 5 * BYTES["int64"]),
+            "algo.buffer_size": moves * (cells * BYTES["int16"] + numbers * BYTES["int64"]),
             # Each of the t_max + 3 cells of a path, and about five numbers that are gathered for it.
             "algo.batch_size": self.batch_size * (task.t_max + 3) * 6 * BYTES["int64"],
             "algo.hidden": networks(task, self.hidden),

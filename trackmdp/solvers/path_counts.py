@@ -66,11 +66,11 @@ def plan_paths(paths: Paths, *, prior: float, discount: float, rounds: int) -> P
     task = paths.task
     # The first round is myopic: a detection is worth r, and nothing follows from it.
     gain = np.full((task.num_choices, paths.states), task.reward)
-    best = _Counted(paths, gain, np.ones(paths.states), prior)
+    best = _Counted(paths, gain, paths.times, prior)
     value = paths.follow(best.hits, best.spent, discount)
     kept = 0
     for _ in range(rounds):
-        weight = np.where(value.visited, 1.0, _UNVISITED)
+        weight = np.where(value.visited, 1.0, _UNVISITED) * paths.times
         tried = _Counted(paths, value.gain, weight, prior)
         after = paths.follow(tried.hits, tried.spent, discount)
         if after.reward <= value.reward:
@@ -100,10 +100,15 @@ class Paths:
     """All states (point, key) of the paths, and where the target is 1 ... t_max + 2 steps later.
 
     S states, T + 2 steps (`[T+2, S]` arrays), K displacements in view.
+
+    Attributes:
+        times: `[S]`, how often the state's path is among the tracks: those that are equal are worked on as one.
+        copies: tracks for each that differs.
     """
 
     def __init__(self, task: Task, tracks: Tracks) -> None:
         self.task = task
+        tracks, times = _different(tracks)
         events = Events.of(tracks, task.keys)
         at = np.flatnonzero(events.possible)
         self.states, self.key = len(at), events.key[at]
@@ -118,6 +123,8 @@ class Paths:
         follow = [np.where(self.inside[n], events.follow(at, n), 0) for n in steps]
         self.following = np.stack([number[each] for each in follow])
         self.first = number[events.first]
+        self.times = np.repeat(times, np.diff(events.line.first))[point].astype(np.float64)
+        self.copies = float(times.mean())
         self.seen, self.of_seen = np.unique(self.key, return_inverse=True)
         self._measure()
 
@@ -172,7 +179,7 @@ class Paths:
         visited = self._visited(onward[0], factor[0] > 0)
         missed = earned + factor * value[onward]  # [T+2, S], W_n
         gain = task.reward + discount * (value[self.following[:-1]] - missed[1:])
-        return AlongPaths(float(plain[visited].sum()), visited, gain, value)
+        return AlongPaths(float(plain[visited] @ self.times[visited]), visited, gain, value)
 
     def _visited(self, onward: IndexArray, goes_on: BoolArray) -> BoolArray:
         visited = np.zeros(self.states, dtype=bool)
@@ -181,6 +188,17 @@ class Paths:
             visited[at] = True
             at = onward[at[goes_on[at]]]
         return visited
+
+
+def _different(tracks: Tracks) -> tuple[Tracks, IndexArray]:
+    """The tracks that differ in where they lead, `[K]` of them, and how often each is there."""
+    number: dict[tuple[bytes, bool], int] = {}
+    pieces = zip(np.split(tracks.cells, tracks.first[1:-1]), tracks.exits.tolist(), strict=True)
+    each = [number.setdefault((cells.tobytes(), leaves), len(number)) for cells, leaves in pieces]
+    _, first, times = np.unique(each, return_index=True, return_counts=True)
+    chosen = np.zeros(len(tracks), dtype=bool)
+    chosen[first] = True
+    return tracks.select(chosen), times
 
 
 def _totals(earned: Array, factor: Array, onward: IndexArray) -> Array:

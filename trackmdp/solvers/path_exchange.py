@@ -13,80 +13,95 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.policies.table import PolicyTable
+from trackmdp.seeding import derive
 from trackmdp.solvers.keyed_exchange import Chains, ChainStep, exchange_chains
 from trackmdp.solvers.path_counts import AlongPaths, Paths, Planned, plan_paths
 from trackmdp.solvers.renewal import IndexArray, per_row
-from trackmdp.world.model import Array, BoolArray, Task
-from trackmdp.world.tracks import Tracks
+from trackmdp.world.model import Task
+from trackmdp.world.tracks import Tracks, draw_parts
 
-__all__ = ["choose_plan", "exchanged_keys"]
+__all__ = ["choose_plan", "exchanged_keys", "parted"]
 
 PRIORS = (3.0, 10.0, 30.0)
 """Weights of what keys share that are tried."""
+_UNJUDGED = 10.0
+"""The weight that is taken where there are no paths to judge by."""
 _LEAST = 100
-"""Detections of a key from which its plan is searched by exchange: plans of rarer keys would follow chance."""
-_ROUNDS = 4
-_JUDGED = 4
-"""One path in so many judges, where no others are there for it."""
+"""Detections of a key, equal paths taken as one, from which its plan is searched: those of rarer keys follow chance."""
+_ROUNDS = 8
+_JUDGED = 0.25
+"""Share of the recordings that judge, where no others are there for it."""
 
 _OUT_OF_VIEW = 1e18
 """Price of a sensor beyond the window: none is worth it, and times no mass it is still nothing."""
 
 
-def choose_plan(task: Task, tracks: Tracks, *, judge: Tracks | None, discount: float, rounds: int) -> Planned:
+def choose_plan(
+    task: Task,
+    tracks: Tracks,
+    *,
+    judge: Tracks | None = None,
+    learned: PolicyTable | None = None,
+    discount: float,
+    rounds: int = 8,
+    seed: int = 0,
+) -> Planned:
     """A plan with the weight of what keys share, and with exchange or not, as paths say that were not counted.
 
     Args:
         task: prices, limits and memory.
         tracks: the paths; what was chosen is planned again on all of them.
-        judge: paths to choose by; None for a part of `tracks`, which then does not count until all is chosen.
+        judge: paths to choose by; None for those that `parted` draws from `tracks`, which do not count until all is
+            chosen.
+        learned: a policy to begin with as well, which knows nothing of the paths that judge.
         discount: γ of the credit.
         rounds: of policy iteration at most.
+        seed: of the draw, where there is one.
     """
-    whole = Paths(task, tracks)
-    learned, judged = (whole, judge) if judge is not None else _parted(task, tracks)
-    if learned is None or judged is None or not len(judged):  # nothing to choose by
-        return plan_paths(whole, prior=PRIORS[1], discount=discount, rounds=rounds)
-    paths = Paths(task, judged)
+    counted, judge = parted(tracks, seed) if judge is None else (tracks, judge)
 
-    def score(plan: Planned) -> float:
-        return paths.follow(*_on_paths(paths, plan.policy), discount).reward
+    def plan(paths: Paths, prior: float | None) -> Planned:
+        if prior is None:
+            assert learned is not None
+            return Planned(learned, _followed(paths, learned, discount).reward, len(paths.seen), rounds=0)
+        return plan_paths(paths, prior=prior, discount=discount, rounds=rounds)
 
-    plans = [plan_paths(learned, prior=prior, discount=discount, rounds=rounds) for prior in PRIORS]
-    scores = [score(plan) for plan in plans]
+    if not len(judge):  # nothing to choose by
+        return plan(Paths(task, tracks), None if learned else _UNJUDGED)
+    paths, judged = Paths(task, counted), Paths(task, judge)
+    # A recording that was followed ten times is no more evidence than once.
+    priors = [*(prior * paths.copies for prior in PRIORS), *([None] if learned else [])]
+    plans = [plan(paths, prior) for prior in priors]
+    scores = [_followed(judged, each.policy, discount).reward for each in plans]
     best = int(np.argmax(scores))
-    other = _searched(learned, plans[best], discount)
-    exchange = score(other) > scores[best]
-    if learned is whole:
-        return other if exchange else plans[best]
-    final = plan_paths(whole, prior=PRIORS[best], discount=discount, rounds=rounds)
+    searched = _searched(paths, plans[best], discount)
+    exchange = _followed(judged, searched.policy, discount).reward > scores[best]
+    if counted is tracks:
+        return searched if exchange else plans[best]
+    final = plan(whole := Paths(task, tracks), priors[best])
     return _searched(whole, final, discount) if exchange else final
 
 
-def _parted(task: Task, tracks: Tracks) -> tuple[Paths | None, Tracks | None]:
-    """Paths to count on and paths to judge by; a recorded path that was followed several times is in one part alone."""
-    # Wherever a path began, it ends as its recording does: the last cells say which one it was.
-    last, code = tracks.first[1:] - 1, np.zeros(len(tracks), dtype=np.uint64)
-    for back in range(8):
-        at = np.maximum(last - back, tracks.first[:-1])
-        code = (
-            code * np.uint64(6364136223846793005) + tracks.cells[at].astype(np.uint64) + np.uint64(1442695040888963407)
-        )
-    judged: BoolArray = (code >> np.uint64(33)) % np.uint64(_JUDGED) == 0
-    if judged.all() or not judged.any():
-        return None, None
-    return Paths(task, tracks.select(~judged)), tracks.select(judged)
+def parted(tracks: Tracks, seed: int) -> tuple[Tracks, Tracks]:
+    """Paths to learn from and paths to judge by, a quarter of the names; no recording is in both."""
+    count = round(len(np.unique(tracks.names)) * _JUDGED)
+    judge, rest = draw_parts(tracks, [count], derive(seed, "judge"))
+    return (rest, judge) if count else (tracks, judge)
 
 
 def _searched(paths: Paths, plan: Planned, discount: float) -> Planned:
-    """Rounds of exchange from `plan`, as long as the paths earn more."""
-    followed = paths.follow(*_on_paths(paths, plan.policy), discount)
+    """Rounds of exchange from `plan`; after one that the paths earn no more by, of keys that come twice as often."""
+    followed, least = _followed(paths, plan.policy, discount), _LEAST
     for _ in range(_ROUNDS):
-        policy = exchanged_keys(paths, plan.policy, followed, discount, _LEAST)
-        followed = paths.follow(*_on_paths(paths, policy), discount)
-        if followed.reward <= plan.reward:
+        policy = exchanged_keys(paths, plan.policy, followed, discount, least)
+        if policy is plan.policy:  # no key comes so often
             break
-        plan = replace(plan, policy=policy, reward=followed.reward, rounds=plan.rounds + 1)
+        tried = _followed(paths, policy, discount)
+        if tried.reward > plan.reward:
+            plan = replace(plan, policy=policy, reward=tried.reward, rounds=plan.rounds + 1)
+            followed = tried
+        else:
+            least *= 2
     return plan
 
 
@@ -131,7 +146,7 @@ def _trees(paths: Paths, followed: AlongPaths, keys: IndexArray, discount: float
     number[keys] = np.arange(len(keys))
     at = np.flatnonzero(followed.visited & (number[paths.of_seen] >= 0))
     row = number[paths.of_seen[at]]
-    count = np.bincount(row, minlength=len(keys)).astype(np.float64)
+    count = per_row(row, paths.times[at], len(keys))
     entry, mass, steps, owners = row, count, [], []
     for n in range(task.num_choices):
         there = paths.inside[n, at]
@@ -139,7 +154,8 @@ def _trees(paths: Paths, followed: AlongPaths, keys: IndexArray, discount: float
         cell = paths.cells[n, at]
         # Entries stay in order of their rows: a code begins with the entry before, and that with its row.
         codes, now = np.unique(entry * m + cell, return_inverse=True)
-        before, arrived = codes // m, np.bincount(now, minlength=len(codes)).astype(np.float64)
+        times = paths.times[at]
+        before, arrived = codes // m, per_row(now, times, len(codes))
         # A miss costs a factor γ, as in `Paths.follow`: the move after it carries it.
         weight = arrived / mass[before] * (discount if n else 1.0)
         moves = sparse.csr_array((weight, (before, np.arange(len(codes)))), shape=(len(mass), len(codes)))
@@ -150,21 +166,21 @@ def _trees(paths: Paths, followed: AlongPaths, keys: IndexArray, discount: float
         price = np.zeros(len(owner))
         price[group[now]] = np.minimum(paths.price[n, at], _OUT_OF_VIEW)
         steps.append(
-            ChainStep(rows, moves, per_row(now, worth, len(codes)) / arrived, np.ones(len(codes)), group, price)
+            ChainStep(rows, moves, per_row(now, times * worth, len(codes)) / arrived, np.ones(len(codes)), group, price)
         )
         owners.append(owner)
         entry, mass = now, arrived
     forced = task.reward + discount * followed.value[paths.following[-1, at]] - task.safe_cost
-    missed = discount * per_row(entry, paths.inside[-1, at] * forced, len(mass)) / mass
+    missed = discount * per_row(entry, paths.times[at] * paths.inside[-1, at] * forced, len(mass)) / mass
     return Chains(np.arange(len(keys)), count, steps, missed), owners
 
 
-def _on_paths(paths: Paths, policy: PolicyTable) -> tuple[BoolArray, Array]:
-    """`[T+1, S]` whether a policy's plans sense the target, and what its sets cost."""
+def _followed(paths: Paths, policy: PolicyTable, discount: float) -> AlongPaths:
+    """What a policy earns on the paths: of each state, whether its plan senses the target, and what its sets cost."""
     shape = (paths.task.num_choices, paths.states)
     hits, spent = np.zeros(shape, dtype=bool), np.zeros(shape)
     for n in range(paths.task.num_choices):
         there = np.flatnonzero(paths.inside[n])
         hits[n, there] = policy.on(n, paths.key[there], paths.cells[n, there]) > 0
         spent[n] = policy.spent(n, paths.task.cost)[paths.key]
-    return hits, spent
+    return paths.follow(hits, spent, discount)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -18,7 +18,7 @@ from trackmdp.world.files import read_columns
 from trackmdp.world.model import Array, BoolArray, Size, Task, World, grid_size
 from trackmdp.world.modes import HiddenWorld
 
-__all__ = ["Indices", "Problem", "Recorded", "Tracks", "check_tracks", "ends_of", "read_tracks", "split"]
+__all__ = ["Indices", "Problem", "Recorded", "Tracks", "check_tracks", "draw_parts", "ends_of", "read_tracks", "split"]
 
 Indices: TypeAlias = npt.NDArray[np.int64]
 
@@ -229,21 +229,26 @@ def split(tracks: Tracks, held_out: float, validation: float, seed: int) -> tupl
     Raises:
         UserError: one of the three parts is empty.
     """
-    names, of_name = np.unique(tracks.names, return_inverse=True)
-    last, middle = round(held_out * len(names)), round(validation * len(names))
-    counts = {"judge on": last, "choose by": middle, "learn from": len(names) - last - middle}
+    number = len(np.unique(tracks.names))
+    last, middle = round(held_out * number), round(validation * number)
+    counts = {"judge on": last, "choose by": middle, "learn from": number - last - middle}
     for words, count in counts.items():
         if count < 1:
             raise UserError(
-                f"kernel.held_out={held_out}, kernel.validation={validation}: leave, of {len(names)} tracks, none to "
+                f"kernel.held_out={held_out}, kernel.validation={validation}: leave, of {number} tracks, none to "
                 f"{words}; expected at least one for each"
             )
-    # Example: of 10 names, shares .2 and .1, the permutation 7 2 9 0 ... holds 7 and 2 out, and 9 is the validation.
-    part = np.zeros(len(names), dtype=np.int64)
-    order = np.random.default_rng(derive(seed, "held_out")).permutation(len(names))
-    part[order[:last]], part[order[last : last + middle]] = 2, 1
-    learned, chosen, judged = (tracks.select(part[of_name] == each) for each in range(3))
+    judged, chosen, learned = draw_parts(tracks, [last, middle], derive(seed, "held_out"))
     return learned, chosen, judged
+
+
+def draw_parts(tracks: Tracks, counts: Sequence[int], seed: int) -> list[Tracks]:
+    """Parts of so many names each, drawn, and the rest; tracks of one name are in one part."""
+    names, of_name = np.unique(tracks.names, return_inverse=True)
+    # Example: of 10 names, with counts 2 and 1, the permutation 7 2 9 0 ... puts 7 and 2 into part 0 and 9 into part 1.
+    part = np.full(len(names), len(counts))
+    part[np.random.default_rng(seed).permutation(len(names))[: sum(counts)]] = np.repeat(np.arange(len(counts)), counts)
+    return [tracks.select(part[of_name] == each) for each in range(len(counts) + 1)]
 
 
 def ends_of(lengths: Indices) -> Indices:
