@@ -12,6 +12,8 @@ A sensor that is on misses a share 1 - p_d(j) of its mass. Sensing j is then wor
 (1 - p_d) m_j R_{h-1}(j) - c_j sum(m), and what is left of m after the set is the mass missed even with every sensor on,
 (1 - p_d) m, plus p_d m of the cells left unsensed: all said above holds for these two parts together.
 
+Where `delayed` has tables, complete sets are bounded by positions revealed one move late as well.
+
 The loss against revealing at once is superadditive, so what two cells lose when both are left bounds what any set
 of undecided cells takes away (`Tree._least_loss`).
 
@@ -24,17 +26,19 @@ from __future__ import annotations
 import heapq
 import itertools
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy import sparse
 
-from trackmdp.solvers.joint import Joint, Next
+from trackmdp.solvers.choices import Choices, Frontier, LeftOut, Origin, sets_left_out
+from trackmdp.solvers.delayed import Delayed
+from trackmdp.solvers.joint import Joint
 from trackmdp.solvers.layers import within_window
 from trackmdp.solvers.renewal import IndexArray, per_row, row_index
 from trackmdp.world.model import Array, BoolArray, World
 
-__all__ = ["LeftOut", "Tree"]
+__all__ = ["Tree"]
 
 # Choices under one heap entry: enough of them for array arithmetic to pay, and not so many that poor ones are expanded
 # along with the best one, which gives the batch its place in the heap.
@@ -45,105 +49,6 @@ ENOUGH = 1024
 FORBIDDEN = 1e30
 MOST_PAIRED = 10
 """Cells of one state up to which every pair is looked at for a better bound."""
-
-
-@dataclass(frozen=True)
-class _Frontier:
-    """B info states whose next set is to be chosen, with the K cells (padded) where leaving might pay.
-
-    Attributes:
-        start: `[B]`, the problem (located cell) they belong to.
-        sets_left: sets still to be chosen, the next one included.
-        relaxed: `[B]`, earned so far plus the bound on the rest with every cell at its better choice.
-        cells, mass, regret: `[B, K]`; `mass` is what sensing locates, `regret` what it costs against the bound on
-            leaving.
-        missed: `[B, M]`, mass that all sensors together would miss; None where no sensor misses.
-        count: `[B]`, cells that are not padding.
-        rest: `[B, K + 1]`, least that the cells from the k-th on take away from `relaxed`.
-        after: where the target goes on to from `cells`; None where that is not looked at.
-        origin: the choices these states came from; none at the start.
-    """
-
-    start: IndexArray
-    sets_left: int
-    relaxed: Array
-    cells: IndexArray
-    mass: Array
-    regret: Array
-    count: IndexArray
-    rest: Array
-    missed: sparse.csr_array | None
-    after: Next | None
-    origin: _Origin | None
-
-
-@dataclass(frozen=True)
-class _Choices:
-    """P partial choices of the next set: the first `decided` cells of each state are left (`left`) or sensed.
-
-    `relaxed` `[P]` has the undecided cells at their better choice; `lost` is what those left lose together.
-    """
-
-    frontier: _Frontier
-    decided: int
-    state: IndexArray
-    left: BoolArray
-    relaxed: Array
-    lost: Array
-    bound: Array
-
-    def pick(self, kept: IndexArray | BoolArray) -> _Choices:
-        numbers = (part[kept] for part in (self.relaxed, self.lost, self.bound))
-        return _Choices(self.frontier, self.decided, self.state[kept], self.left[kept], *numbers)
-
-    @property
-    def start(self) -> IndexArray:
-        return self.frontier.start[self.state]
-
-
-@dataclass(frozen=True)
-class _Origin:
-    """The complete choices that B states came from: state s is row `place[s]` of `batches[batch[s]]`."""
-
-    batches: list[_Choices]
-    batch: IndexArray
-    place: IndexArray
-
-    @classmethod
-    def of(cls, batches: list[_Choices]) -> _Origin:
-        """One state per choice, in order: batches of 2 and 3 rows have batch 0 0 1 1 1 and place 0 1 0 1 2."""
-        sizes = [len(each.state) for each in batches]
-        return cls(batches, np.repeat(np.arange(len(sizes)), sizes), np.concatenate([np.arange(n) for n in sizes]))
-
-    def pick(self, kept: IndexArray) -> _Origin:
-        return _Origin(self.batches, self.batch[kept], self.place[kept])
-
-
-@dataclass(frozen=True)
-class LeftOut:
-    """Cells left unsensed at one step, of the problems that have a better plan.
-
-    Attributes:
-        keys: sorted x · M + j of each problem x and cell j.
-        num_cells: M.
-    """
-
-    keys: IndexArray
-    num_cells: int
-
-    @classmethod
-    def of(cls, cells: dict[int, IndexArray], world: World) -> LeftOut:
-        """From the cells of each problem."""
-        keys = [x * world.num_cells + left.astype(np.int64) for x, left in cells.items()]
-        return cls(np.sort(np.concatenate([np.zeros(0, dtype=np.int64), *keys])), world.num_cells)
-
-    def has(self, rows: IndexArray, cells: IndexArray) -> BoolArray:
-        """`[E]` whether problem `rows` leaves `cells` out."""
-        # With M = 16 and the keys 37, 41 (cells 5 and 9 of problem 2), (2, 9) gives 41: found at place 1; (2, 6) gives
-        # 38: place 1 as well, another key. `minimum` is for keys beyond the last one, whose place is the length.
-        wanted = rows * self.num_cells + cells
-        place = np.minimum(np.searchsorted(self.keys, wanted), max(len(self.keys) - 1, 0))
-        return self.keys[place] == wanted if len(self.keys) else np.zeros(len(wanted), dtype=bool)
 
 
 class Tree:
@@ -164,6 +69,7 @@ class Tree:
         mass: sparse.csr_array | None = None,
         *,
         windowed: bool = True,
+        delayed: Delayed | None = None,
     ) -> None:
         """Start with nothing chosen.
 
@@ -175,28 +81,30 @@ class Tree:
             slack: plans better than the best known by less than this are not looked for.
             mass: `[B, M]`, where the undetected target may be, one problem per row; without it, B = M and row x is e_x.
             windowed: whether the task's window around the located cell of each problem limits its sets.
+            delayed: bounds on complete sets, at least as tight as those of `revealed`.
         """
-        self._windowed = windowed
+        self._windowed, self._delayed = windowed, delayed
         self._world, self._detected, self._revealed, self._slack = world, detected, revealed, slack
         self._joint = Joint(world, detected, revealed)
         self.best = lower.copy()
         self.nodes = 0
         # Problem -> cells left unsensed at each step, for the problems with a better plan than `lower`.
         self._leaves: dict[int, list[IndexArray]] = {}
-        self._heap: list[tuple[float, int, _Choices]] = []
+        self._heap: list[tuple[float, int, Choices]] = []
         # Sets left -> complete choices that wait until there are enough of them: arrays of a few rows are slow.
-        self._complete: dict[int, list[_Choices]] = {}
+        self._complete: dict[int, list[Choices]] = {}
         self._ticket = itertools.count()
         # Nothing is earned yet, all H sets are to be chosen, and no batch came before.
         start = sparse.eye_array(world.num_cells, format="csr") if mass is None else mass
-        self._open(np.arange(len(lower)), np.zeros(len(lower)), start, len(revealed), None)
+        most = np.full(len(lower), np.inf) if delayed is None else start @ delayed.revealed[len(revealed)]
+        self._open(np.arange(len(lower)), np.zeros(len(lower)), start, len(revealed), most, None)
 
     @property
     def closed(self) -> bool:
         """Whether no choice is open."""
         return not self._heap and not self._complete
 
-    def _open_choices(self) -> Iterator[_Choices]:
+    def _open_choices(self) -> Iterator[Choices]:
         for _, _, choices in self._heap:
             yield choices
         for batches in self._complete.values():
@@ -223,7 +131,7 @@ class Tree:
             np.maximum.at(rate, choices.start, choices.bound - value[choices.start] - self._paid(choices, paid, known))
         return rate
 
-    def _paid(self, choices: _Choices, paid: Array, known: dict[int, Array]) -> Array:
+    def _paid(self, choices: Choices, paid: Array, known: dict[int, Array]) -> Array:
         """`[P]` sum_t z_t · paid; `known`: that of the states of each frontier, by its id."""
         frontier = choices.frontier
         before = known.get(id(frontier))
@@ -254,10 +162,14 @@ class Tree:
         """`[B]` which problems have a better plan than they started from, and what it leaves unsensed at each step."""
         better = np.zeros(len(self.best), dtype=bool)
         better[list(self._leaves)] = True
-        steps = range(len(self._revealed))
-        return better, [LeftOut.of({x: plan[t] for x, plan in self._leaves.items()}, self._world) for t in steps]
+        found = []
+        for t in range(len(self._revealed)):
+            cells = [plan[t] for plan in self._leaves.values()]
+            rows = np.repeat(np.array(list(self._leaves), dtype=np.int64), [len(left) for left in cells])
+            found.append(LeftOut.of(rows, np.concatenate([[], *cells]).astype(np.int64), self._world.num_cells))
+        return better, found
 
-    def _decide(self, choices: _Choices) -> None:
+    def _decide(self, choices: Choices) -> None:
         """Branch on the next undecided cell of every choice; complete choices go on to the next step."""
         # what was worth looking at when it was pushed may not be so any more: the best plans have become better since
         choices = choices.pick(self._hopeful(choices.start, choices.bound))
@@ -285,9 +197,9 @@ class Tree:
         ):
             apart = relaxed - lost - frontier.rest[split.state, k + 1]
             bound = np.minimum(split.bound, np.minimum(apart, together - (paid - least[:, 0])))
-            self._push(_Choices(frontier, k + 1, split.state, cells, relaxed, lost, bound))
+            self._push(Choices(frontier, k + 1, split.state, cells, relaxed, lost, bound))
 
-    def _losses(self, choices: _Choices) -> tuple[Array, Array]:
+    def _losses(self, choices: Choices) -> tuple[Array, Array]:
         """`[P]` what the cells left lose together, `[P, K - k]` what each undecided one adds if it is left as well."""
         frontier, k = choices.frontier, choices.decided
         lost, added = choices.lost.copy(), np.zeros((len(choices.state), frontier.cells.shape[1] - k))
@@ -303,7 +215,7 @@ class Tree:
         lost[some], added[some] = self._joint.losses(*of, *at, k)
         return lost, added
 
-    def _joint_loss(self, choices: _Choices, left: BoolArray) -> Array:
+    def _joint_loss(self, choices: Choices, left: BoolArray) -> Array:
         """`[P]` lower bound on what leaving the cells `left` unsensed loses against revealing the position at once."""
         return self._loss(self._left_mass(choices, left), choices.frontier.sets_left - 1)
 
@@ -314,7 +226,7 @@ class Tree:
         # on to different cells, two sensors are paid for .4 of mass in place of one each for .2.
         return np.maximum(mass @ self._revealed[sets_left] - self._one_more_set(mass, sets_left)[0], 0.0)
 
-    def _least_loss(self, frontier: _Frontier) -> Array:
+    def _least_loss(self, frontier: Frontier) -> Array:
         """`[B, K + 1]` lower bound on what the cells from the k-th on take away from `relaxed`, however decided.
 
         A cell sensed costs its regret. Two or more cells left unsensed lose, F being sublinear, at least the sum over
@@ -344,7 +256,7 @@ class Tree:
             rest[:, k] = np.minimum(several, regret.sum(axis=1) - regret.max(axis=1))
         return rest
 
-    def _pair_loss(self, frontier: _Frontier, state: IndexArray, a: IndexArray, b: IndexArray) -> Array:
+    def _pair_loss(self, frontier: Frontier, state: IndexArray, a: IndexArray, b: IndexArray) -> Array:
         cells = np.stack([frontier.cells[state, a], frontier.cells[state, b]], axis=1)
         masses = np.stack([frontier.mass[state, a], frontier.mass[state, b]], axis=1)
         # CSR rows of exactly two entries each: row p is entries 2p and 2p + 1.
@@ -352,12 +264,8 @@ class Tree:
         mass = sparse.csr_array((masses.ravel(), cells.ravel(), pointer), shape=(len(state), self._world.num_cells))
         return self._loss(mass, frontier.sets_left - 1)
 
-    def _left_mass(self, choices: _Choices, left: BoolArray) -> sparse.csr_array:
-        # Choice p of state s = choices.state[p] leaves the cells at the places where left[p] is True: with cells[s] =
-        # (4, 7, 9) and left[p] = (1, 0, 1), row p of the result has the mass of cells 4 and 9.
-        row, place = np.nonzero(left)
-        state = choices.state[row]
-        cells, mass = choices.frontier.cells[state, place], choices.frontier.mass[state, place]
+    def _left_mass(self, choices: Choices, left: BoolArray) -> sparse.csr_array:
+        _, cells, mass = replace(choices, left=left).left_cells()
         pointer = np.concatenate([[0], np.cumsum(left.sum(axis=1))])
         unsensed = sparse.csr_array((mass, cells, pointer), shape=(len(left), self._world.num_cells))
         missed = choices.frontier.missed
@@ -381,7 +289,7 @@ class Tree:
         leave = moved.data * missed
         return per_row(rows, np.maximum(sense, leave), mass.shape[0]), moved, sense, leave
 
-    def _advance(self, batches: list[_Choices]) -> None:
+    def _advance(self, batches: list[Choices]) -> None:
         """The sets of these choices are complete: go on to the next step, or value the chain if there is none."""
         batches = [each.pick(self._hopeful(each.start, each.bound)) for each in batches]
         if not any(len(each.state) for each in batches):
@@ -390,13 +298,32 @@ class Tree:
         mass = sparse.csr_array(sparse.vstack([self._left_mass(each, each.left) for each in batches], format="csr"))
         earned = np.concatenate([each.relaxed for each in batches]) - mass @ self._revealed[sets_left]
         # `relaxed` counted the cells left at their revealed worth; that is taken out and the rest searched for anew
+        most = np.concatenate([each.bound for each in batches])
+        if self._delayed is not None and sets_left > 1:
+            most = np.minimum(most, earned + np.concatenate([self._left_worth(each) for each in batches]))
         start = np.concatenate([each.start for each in batches])
-        self._open(start, earned, mass, sets_left, _Origin.of(batches))
+        self._open(start, earned, mass, sets_left, most, Origin.of(batches))
+
+    def _left_worth(self, choices: Choices) -> Array:
+        """`[P]` upper bound of what complete `choices` leave undetected."""
+        assert self._delayed is not None
+        row, cells, _ = choices.left_cells()
+        left, before = LeftOut.of(row, cells, self._world.num_cells), choices.frontier.before[choices.state]
+        return self._delayed.worth(before, left, choices.frontier.sets_left - 1)
 
     def _open(
-        self, start: IndexArray, earned: Array, mass: sparse.csr_array, sets_left: int, origin: _Origin | None
+        self,
+        start: IndexArray,
+        earned: Array,
+        mass: sparse.csr_array,
+        sets_left: int,
+        most: Array,
+        origin: Origin | None,
     ) -> None:
-        """Put the info states with undetected `mass` on the heap, or close them where one set is left."""
+        """Put the info states with undetected `mass` on the heap, or close them where one set is left.
+
+        `most` `[P]` bounds what a plan that goes on from them is worth, what is `earned` included.
+        """
         _, moved, sense, leave = self._one_more_set(mass, sets_left)
         rows = row_index(moved)
         sense = self._within(start[rows], moved.indices, sense)
@@ -405,30 +332,22 @@ class Tree:
             # `leave` is m_j R_0(j) here, and R_0 is exact, unlike the bounds R_1 ... used further up.
             self._record(start, relaxed, moved, leave > sense, origin)
             return
-        kept = np.flatnonzero(self._hopeful(start, relaxed))
+        kept = np.flatnonzero(self._hopeful(start, np.minimum(relaxed, most)))
         if not len(kept):
             return
         detects = self._world.detects(moved.indices)
         found = sparse.csr_array((moved.data * detects, moved.indices, moved.indptr), shape=moved.shape)
-        frontier = _frontier(start, sets_left, relaxed, found, leave - sense, kept, origin)
+        frontier = Frontier.of(start, sets_left, relaxed, mass, found, leave - sense, kept, origin)
         if not self._world.perfect:
             frontier = replace(frontier, missed=sparse.csr_array((moved - found)[kept]))
         present = np.arange(frontier.cells.shape[1]) < frontier.count[:, None]
         after = self._joint.next(frontier.cells, present) if self._world.perfect else None
         frontier = replace(frontier, rest=self._least_loss(frontier), after=after)
-        first = _Choices(
-            frontier,
-            0,
-            np.arange(len(kept)),
-            np.zeros(frontier.cells.shape, dtype=bool),
-            frontier.relaxed,
-            np.zeros(len(kept)),
-            frontier.relaxed - frontier.rest[:, 0],
-        )
+        first = Choices.undecided(frontier, frontier.relaxed - frontier.rest[:, 0])
         if frontier.missed is not None:  # what the missed mass loses is lost whatever is chosen
             lost = self._joint_loss(first, first.left)
             first = replace(first, lost=lost, bound=first.bound - lost)
-        self._push(first)
+        self._push(replace(first, bound=np.minimum(first.bound, most[kept])))
 
     def _within(self, start: IndexArray, cells: IndexArray, sense: Array) -> Array:
         """`sense` `[E]`, replaced by a large negative number where the sensor lies outside the window.
@@ -439,7 +358,7 @@ class Tree:
         return sense if allowed is None else np.where(allowed, sense, -FORBIDDEN)
 
     def _record(
-        self, start: IndexArray, worth: Array, moved: sparse.csr_array, left: BoolArray, origin: _Origin | None
+        self, start: IndexArray, worth: Array, moved: sparse.csr_array, left: BoolArray, origin: Origin | None
     ) -> None:
         # best first, so that of many plans for one problem all but the first are passed over
         order = np.argsort(-worth, kind="stable")
@@ -449,62 +368,20 @@ class Tree:
                 continue
             self.best[x] = worth[place]
             last = slice(moved.indptr[place], moved.indptr[place + 1])
-            self._leaves[x] = [*_sets_left_out(origin, int(place)), moved.indices[last][left[last]]]
+            self._leaves[x] = [*sets_left_out(origin, int(place)), moved.indices[last][left[last]]]
 
     def _hopeful(self, start: IndexArray, bound: Array) -> BoolArray:
         hopeful: BoolArray = bound > self.best[start] + self._slack
         return hopeful
 
-    def _push(self, choices: _Choices) -> None:
+    def _push(self, choices: Choices) -> None:
         choices = choices.pick(self._hopeful(choices.start, choices.bound))
         excess = choices.bound - self.best[choices.start]
         # Sorted by bound - best, not by bound: problems differ in value, and a choice matters by what it may still
         # gain.
         order = np.argsort(-excess, kind="stable")
         # A heap of batches, each under its best excess. Of equal ones the batch pushed last comes first, which goes
-        # deeper; the ticket also keeps two runs in the same order, and heapq from comparing `_Choices`.
+        # deeper; the ticket also keeps two runs in the same order, and heapq from comparing `Choices`.
         for first in range(0, len(order), LARGEST_BATCH):
             part = order[first : first + LARGEST_BATCH]
             heapq.heappush(self._heap, (-float(excess[part[0]]), -next(self._ticket), choices.pick(part)))
-
-
-def _frontier(
-    start: IndexArray,
-    sets_left: int,
-    relaxed: Array,
-    moved: sparse.csr_array,
-    regret: Array,
-    kept: IndexArray,
-    origin: _Origin | None,
-) -> _Frontier:
-    """The states `kept`, with the entries of `moved` whose `regret` is positive, the likeliest first."""
-    # The entries of `moved` are a ragged table: row s has count[s] of them. They are set into rectangles [B, K]; the
-    # column of an entry is its number among those of its row: rows (0, 0, 2) have columns (0, 1, 0).
-    # place[s] is the row of state s in the new batch, -1 for one that is not kept.
-    place = np.full(len(start), -1)
-    place[kept] = np.arange(len(kept))
-    rows = place[row_index(moved)]
-    entry = np.flatnonzero((regret > 0) & (rows >= 0))
-    # a cell whose regret is not positive is sensed in every choice, and is not decided on
-    entry = entry[np.lexsort((-moved.data[entry], rows[entry]))]
-    count = np.bincount(rows[entry], minlength=len(kept))
-    column = np.arange(len(entry)) - np.repeat(np.cumsum(count) - count, count)
-    shape = (len(kept), int(count.max(initial=0)))
-    cells, mass, loss = np.zeros(shape, dtype=np.intp), np.zeros(shape), np.zeros(shape)
-    cells[rows[entry], column] = moved.indices[entry]
-    mass[rows[entry], column] = moved.data[entry]
-    loss[rows[entry], column] = regret[entry]
-    source = None if origin is None else origin.pick(kept)
-    none = np.zeros((len(kept), shape[1] + 1))
-    return _Frontier(start[kept], sets_left, relaxed[kept], cells, mass, loss, count, none, None, None, source)
-
-
-def _sets_left_out(origin: _Origin | None, state: int) -> list[IndexArray]:
-    """The cells left unsensed at each step so far, found by going back from batch to batch."""
-    steps: list[IndexArray] = []
-    while origin is not None:
-        choices, row = origin.batches[origin.batch[state]], origin.place[state]
-        frontier, state = choices.frontier, int(choices.state[row])
-        steps.insert(0, frontier.cells[state][choices.left[row]])
-        origin = frontier.origin
-    return steps

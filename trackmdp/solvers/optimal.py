@@ -22,6 +22,7 @@ from trackmdp.seeding import derive
 from trackmdp.solvers import clocked
 from trackmdp.solvers.bounds import exact_clocked_table
 from trackmdp.solvers.branch import Tree
+from trackmdp.solvers.delayed import Delayed
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.exchange import exchanged
@@ -310,10 +311,11 @@ class _Run:
         slack = 0.5 * self.gap_allowed / self.ground.longest
         problem = InnerProblem.of(self.world, self.ground.layers, self.value)
         # R_1, R_2, ...: what 1, 2, ... more sets are worth from a known position, each from those before
-        revealed = [problem.missed]
-        for length in range(1, self.world.num_choices):
+        delayed = Delayed.of(self.world, problem.detected, problem.missed, self.world.num_choices)
+        revealed = [problem.missed] if delayed is None else delayed.revealed[:-1]
+        for length in range(len(revealed), self.world.num_choices):
             revealed.append(self.revealed(problem, revealed, length, patience, slack))
-        tree = Tree(self.world, problem.detected, revealed, self.value, slack)
+        tree = Tree(self.world, problem.detected, revealed, self.value, slack, delayed=delayed)
         try:
             self.explore(tree, patience)
         finally:  # what was found and proved is kept when the user interrupts as well

@@ -20,6 +20,7 @@ from trackmdp.machine import free_bytes, gib, parse_bytes
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import clocked
 from trackmdp.solvers.branch import Tree
+from trackmdp.solvers.delayed import Delayed
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.exchange import exchange, revealed
 from trackmdp.solvers.known import next_table
@@ -212,9 +213,10 @@ def _closed(region: _Region, slack: float, run: Callable[[Tree], None]) -> tuple
     open_ = np.flatnonzero(region.own & (most > slack))
     if not len(open_):
         return region.sets, most
+    delayed = Delayed.of(problem.world, problem.detected, problem.missed, problem.length)
     # R_1, R_2, ...: what 1, 2, ... more sets are worth from a known position, each from those before
-    known = [problem.missed]
-    for length in range(1, problem.length):
+    known = [problem.missed] if delayed is None else delayed.revealed[:-1]
+    for length in range(len(known), problem.length):
         inner = InnerProblem(problem.world, region.layers[: length + 1], problem.detected, problem.missed)
         table = next_table(inner, known, slack)
         run(table)
@@ -227,7 +229,7 @@ def _closed(region: _Region, slack: float, run: Callable[[Tree], None]) -> tuple
     mass.eliminate_zeros()
     lower = np.full(len(located), np.inf)
     lower[open_] = region.value[open_]
-    tree = Tree(problem.world, problem.detected, known, lower, slack, mass)
+    tree = Tree(problem.world, problem.detected, known, lower, slack, mass, delayed=delayed)
     run(tree)
     most[open_] = np.minimum(most, tree.upper() - region.value)[open_]
     return adopted(problem, region.sets, tree) or region.sets, most
