@@ -44,7 +44,7 @@ def test_solution_json_holds_the_certified_optimum(tmp_path: Path, capsys: pytes
     np.testing.assert_allclose(policy.value, solution["value"], atol=1e-9)
     assert solution["bounds"]["clocked"] == pytest.approx(bounds.clocked(world).mean())
     assert solution["seconds"] > 0
-    assert solution["nodes"] > 0
+    assert solution["nodes"] == 0  # positions revealed one move late prove it without a search
     assert "certified: bracket 90.484474" in capsys.readouterr().out
 
 
@@ -107,6 +107,7 @@ def test_ctrl_c_prints_and_saves_the_bracket(tmp_path: Path) -> None:
     solution = read(tmp_path / "a", "solution.json")
     assert solution["interrupted"] is True
     assert solution["certified"] is False
+    assert solution["nodes"] > 0
     assert solution["lower"] < solution["upper"]
 
 
