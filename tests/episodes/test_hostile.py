@@ -69,7 +69,7 @@ def _written(stream: Any, parts: Parts) -> None:
         writer.add_metadata(name, schema.seal(name, parts["m"][name]))
     for name, content in parts["a"].items():
         writer.add_attachment(0, 0, name, "x", content)
-    order = {"/step": 0, "/grid": 1, "/episode": 2}
+    order = {topic: place for place, topic in enumerate(schema.SCHEMAS)}
     every = [(time, order[topic], topic, data) for topic, each in parts["x"].items() for time, data in each]
     for time, _, topic, data in sorted(every, key=lambda message: message[:2]):
         writer.add_message(channels[topic], time, json.dumps(data).encode(), time)

@@ -14,7 +14,8 @@ import pytest
 from tests.typed import refused
 from trackmdp.app.cli import main
 from trackmdp.episodes.episode import Episode, first_difference
-from trackmdp.episodes.messages import decode, grid_messages, row_of, step_messages
+from trackmdp.episodes.grids import grid_messages
+from trackmdp.episodes.messages import decode, row_of, step_messages
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.episodes.recover import recover
 from trackmdp.episodes.simulate import simulate
@@ -123,7 +124,8 @@ def test_a_mode_that_differs_is_named() -> None:
 def test_a_mode_that_there_is_none_of_is_damage(wrong: str) -> None:
     world = headings()
     [episode] = simulate(world, Policy.all_on(world), 1, seed=4).complete()
-    steps, grids = list(step_messages(episode, (3, 3), 1)), list(grid_messages(episode, (3, 3), 0))
+    steps = list(step_messages(episode, (3, 3), 1))
+    grids = [layers["/grid"] for layers in grid_messages(episode, (3, 3), 0)]
     row = json.loads(json.dumps(row_of(episode, 1, 0)))
     assert first_difference(episode, decode(row, steps, grids, (3, 3), 0, 8)) is None
     assert episode.mode is not None

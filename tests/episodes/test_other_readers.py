@@ -12,6 +12,7 @@ import pytest
 from mcap.reader import make_reader
 
 from tests.episodes.logs import recorded, write
+from trackmdp.episodes.schema import SCHEMAS
 
 NODE = shutil.which("node")
 READ = """
@@ -70,7 +71,7 @@ def test_mcap_core_reads_the_whole_file(log: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
     said, episodes = json.loads(done.stdout), recorded(30)
     steps = sum(map(len, episodes))
-    assert said["counts"] == {"/step": steps, "/grid": steps, "/episode": 30}
+    assert said["counts"] == {**dict.fromkeys(SCHEMAS, steps), "/episode": 30}
     assert said["attachments"] == ["config.yaml", "kernel.npy", "cost.npy", "policy-0.npy", "episodes.json"]
     assert said["metadata"] == ["trackmdp.run", "trackmdp.policy.0", "trackmdp.end"]
     assert said["done"] is True
@@ -86,5 +87,5 @@ def test_the_mcap_package_reads_the_whole_file(log: Path) -> None:
             assert message.publish_time == message.log_time
         summary = reader.get_summary()
     steps = sum(map(len, recorded(30)))
-    assert counts == {"/step": steps, "/grid": steps, "/episode": 30}
+    assert counts == {**dict.fromkeys(SCHEMAS, steps), "/episode": 30}
     assert summary and {schema.name for schema in summary.schemas.values()} >= {"foxglove.Grid"}

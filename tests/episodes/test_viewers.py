@@ -15,8 +15,17 @@ import pytest
 from mcap.reader import make_reader
 
 from tests.episodes.logs import policy, recorded, write
+from tests.helpers import limited
+from trackmdp.episodes import grids
+from trackmdp.episodes.episode import first_difference
+from trackmdp.episodes.grids import WHOLE_CELLS
 from trackmdp.episodes.layout import layout
+from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.episodes.schema import SCHEMAS
+from trackmdp.episodes.simulate import simulate
+from trackmdp.policies.policy import Policy
+from trackmdp.world.kernels import random_walk
+from trackmdp.world.make import make_world
 from trackmdp.world.model import World
 
 pytest.importorskip("foxglove", reason="needs the package foxglove-sdk")
@@ -26,6 +35,9 @@ import foxglove.layouts as fl
 from foxglove.messages import Grid
 from google.protobuf import descriptor_pb2, descriptor_pool, json_format, message_factory
 
+WALK = World(
+    random_walk((3, 4), stay=0.4, diagonal=False, exit_probability=0.1, border="clip"), (3, 4), cost=0.2, t_max=1
+)
 WIDE = World(np.full((10, 10), 0.09), (2, 5), cost=0.2, safe_cost=2.0, t_max=2)
 
 
@@ -41,6 +53,37 @@ def messages(log: Path, topic: str) -> list[dict[str, Any]]:
         return [json.loads(message.data) for _, _, message in make_reader(stream).iter_messages(topic)]
 
 
+LAYERS = ("/grid", "/active", "/target")
+
+
+def drawn(said: dict[str, Any], size: tuple[int, int]) -> dict[str, np.ndarray]:
+    """Field -> what a viewer draws in each of our cells; Foxglove's class refuses unknown keys and other types."""
+    time = said["timestamp"]
+    # protobuf's own JSON writes times as text, Foxglove's as seconds and nanoseconds.
+    stamp = datetime.fromtimestamp(time["sec"], UTC).strftime("%Y-%m-%dT%H:%M:%S")
+    made = json_format.ParseDict(said | {"timestamp": f"{stamp}.{time['nsec']:09}Z"}, published()())
+    rows, columns, side = len(made.data) // made.row_stride, made.column_count, made.cell_size.x
+    assert (made.row_stride, made.cell_size.y) == (columns * made.cell_stride, side)
+    kinds = {1: np.dtype("u1"), 7: np.dtype("<f4")}  # foxglove.NumericType
+    cell = np.dtype(
+        {
+            "names": [each.name for each in made.fields],
+            "formats": [kinds[each.type] for each in made.fields],
+            "offsets": [each.offset for each in made.fields],
+            "itemsize": made.cell_stride,
+        }
+    )
+    table = np.frombuffer(made.data, cell).reshape(rows, columns)
+    found = {name: np.zeros(size, table.dtype[name]) for name in cell.names or ()}
+    for row, column in np.ndindex(rows, columns):  # the first row is the lowest; a place in x, y is that of a corner
+        x = made.pose.position.x + side * (column + 0.5)
+        y = made.pose.position.y + side * (row + 0.5)
+        assert side == 1 or (x % 1, y % 1) == (0.5, 0.5)
+        for name, whole in found.items():
+            whole[int(size[0] - y), int(x)] = table[name][row, column]
+    return {name: whole.ravel() for name, whole in found.items()}
+
+
 def published() -> Any:
     """Foxglove's own class of a `foxglove.Grid`."""
     files = descriptor_pb2.FileDescriptorSet.FromString(Grid.get_schema().data)
@@ -50,29 +93,45 @@ def published() -> Any:
     return message_factory.GetMessageClass(pool.FindMessageTypeByName("foxglove.Grid"))
 
 
-def test_every_grid_is_one_of_foxgloves(log: Path) -> None:
-    """No unknown key, every value of its type; and what is read from it is what was logged."""
-    grid, steps = published(), messages(log, "/step")
-    for said, step in zip(messages(log, "/grid"), steps, strict=True):
-        time = said["timestamp"]
-        # protobuf's own JSON writes times as text, Foxglove's as seconds and nanoseconds.
-        stamp = datetime.fromtimestamp(time["sec"], UTC).strftime("%Y-%m-%dT%H:%M:%S")
-        made = json_format.ParseDict(said | {"timestamp": f"{stamp}.{time['nsec']:09}Z"}, grid())
-        rows = len(made.data) // made.row_stride
-        assert (rows, made.column_count, made.row_stride, made.cell_stride) == (2, 5, 5 * made.cell_stride, 10)
-        kinds = {1: np.dtype("u1"), 7: np.dtype("<f4")}  # foxglove.NumericType
-        cell = np.dtype(
-            {
-                "names": [each.name for each in made.fields],
-                "formats": [kinds[each.type] for each in made.fields],
-                "offsets": [each.offset for each in made.fields],
-                "itemsize": made.cell_stride,
-            }
-        )
-        table = np.frombuffer(made.data, cell).reshape(rows, -1)[::-1].ravel()  # the first row is the lowest
-        assert table["belief"].sum() == pytest.approx(0.9, abs=1e-5)
-        assert np.flatnonzero(table["active"]).tolist() == step["active"]
-        assert np.flatnonzero(table["target"]).tolist() == [each for each in [step["target"]] if each >= 0]
+@pytest.mark.parametrize("whole_cells", [WHOLE_CELLS, 9])
+def test_what_is_drawn_is_what_was_logged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole_cells: int) -> None:
+    """All layers over each other, each above the one before; a large grid's belief without the part where it is 0."""
+    monkeypatch.setattr(grids, "WHOLE_CELLS", whole_cells)
+    acting = policy(WALK)
+    episodes = recorded(8, acting=acting, world=WALK)
+    file = write(tmp_path / "a.mcap", episodes, acting=acting, world=WALK)
+    every = [messages(file, topic) for topic in LAYERS]
+    assert [each[0]["pose"]["position"]["z"] for each in every] == [0, 0.01, 0.02]
+    steps = [(episode, t) for episode in episodes for t in range(len(episode))]
+    for (episode, t), *layers in zip(steps, *every, strict=True):
+        shown = {name: cells for layer in layers for name, cells in drawn(layer, WALK.size).items()}
+        assert np.array_equal(shown["belief"], episode.belief[t])  # type: ignore[index]
+        assert np.array_equal(shown["policy"], episode.probability[t])  # type: ignore[index]
+        assert np.array_equal(shown["active"], episode.action[t])
+        assert np.flatnonzero(shown["target"]).tolist() == [each for each in [episode.target[t]] if each < 12]
+    assert {len(each["data"]) for each in every[2]} == {4}  # one byte in base64
+    sizes = {len(each["data"]) for each in every[0]}
+    assert max(sizes) == 128 and (min(sizes) < 128) == (whole_cells < 12)  # 12 cells of 8 bytes in base64
+    with EpisodeReader(file) as reader:
+        assert all(first_difference(a, b) is None for a, b in zip(episodes, reader.episodes(), strict=True))
+
+
+def test_the_messages_of_a_large_grid_are_as_large_as_what_is_known() -> None:
+    """300 x 300 cells of 8 bytes would be 960,000 characters; a target that moves by one cell is within 5 x 5."""
+    world = make_world("random_walk", size=300, cost=0.2, t_max=1, safe_cost=10.0)
+    [episode] = simulate(limited(world, 6), Policy.none(world), 1, seed=0).complete()
+    for layers in grids.grid_messages(episode, world.size, 0):
+        assert len(layers["/grid"]) < 1000
+        assert max(len(text) for text in layers.values()) < 1000
+
+
+@pytest.mark.parametrize("place", [{"x": -1}, {"x": 3}, {"y": -1}, {"y": 2}, {"x": 0.5}, {"x": None}])
+def test_a_grid_that_lies_outside_is_damage(place: dict[str, Any]) -> None:
+    [episode] = recorded(1, acting=policy(WALK), world=WALK)
+    every = [json.loads(layers["/grid"]) for layers in grids.grid_messages(episode, WALK.size, 0)]
+    every[0]["pose"]["position"] |= place
+    with pytest.raises((ValueError, TypeError)):
+        grids.read_grids([json.dumps(each).encode() for each in every], WALK.size)
 
 
 @pytest.mark.parametrize("topic", SCHEMAS)
@@ -109,25 +168,26 @@ def test_every_panel_is_one_of_foxgloves(size: tuple[int, int]) -> None:
     """No unknown setting, every value of its type; every field that colours a map is in the messages."""
     made = layout(size)
     for name, config in made["configById"].items():
-        title = config.pop("foxglovePanelTitle", None)
+        config.pop("foxglovePanelTitle", None)
         check(config, PANELS[name.split("!")[0]], name)
-        if name.startswith("3D!"):
-            assert title == config["topics"]["/grid"]["colorField"]
-            check(config["topics"]["/grid"], fl.BaseRendererGridTopicSettings, name)
+        for layer in config.get("topics", {}).values():
+            check(layer, fl.BaseRendererGridTopicSettings, name)
     shown = re.findall(r'"([^"]+![^"]+)"', json.dumps(made["layout"]))
     assert sorted(shown) == sorted(made["configById"])
-    assert {"3D!belief", "3D!active", "3D!target"} <= set(shown)
 
 
-def test_what_plots_show_is_in_the_messages(log: Path) -> None:
-    text = json.dumps(layout(WIDE.size))
-    paths = set(re.findall(r'"(/[a-z]+)\.([a-z_]+)"', text))
+def test_what_panels_show_is_in_the_messages(log: Path) -> None:
+    made = layout(WIDE.size)
+    paths = set(re.findall(r'"(/[a-z]+)\.([a-z_]+)"', json.dumps(made)))
     assert len(paths) == 5
     for topic, key in paths:
         assert key in messages(log, topic)[0]
-    assert {field["name"] for field in messages(log, "/grid")[0]["fields"]} == set(
-        re.findall(r'"colorField": "(\w+)"', text)
-    )
+    maps = [panel["topics"] for panel in made["configById"].values() if "topics" in panel]
+    assert [panel["/grid"]["colorField"] for panel in maps] == ["belief", "policy"]
+    for topics in maps:
+        assert tuple(topics) == LAYERS
+        for topic, layer in topics.items():
+            assert layer["colorField"] in {field["name"] for field in messages(log, topic)[0]["fields"]}
 
 
 def check(value: Any, kind: Any, place: str) -> None:

@@ -12,6 +12,7 @@ import sys
 import traceback
 
 from trackmdp import __version__
+from trackmdp.app.imports import importing
 from trackmdp.errors import FAILED, INTERRUPTED, USER_MISTAKE, Preempted, RunError, UserError
 
 COMMANDS = {
@@ -101,7 +102,8 @@ def _run(command: str, words: list[str]) -> int:
 
         sys.stdout.write(manual(command, [word for word in words if not word.startswith("-")]))
         return 0
-    from trackmdp.app.launch import launch
+    with importing():
+        from trackmdp.app.launch import launch
 
     return launch(command, words)
 

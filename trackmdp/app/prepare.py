@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from trackmdp.app.imports import importing
 from trackmdp.app.outputs import folder_of
 from trackmdp.config import (
     ROOTS,
@@ -85,7 +86,8 @@ class Prepared:
         """Run the command; returns what it returns."""
         # Not at the top of the file: a command imports torch and TorchRL, which takes seconds, and a mistyped option
         # is refused before.
-        run: Callable[..., Any] = importlib.import_module(f"trackmdp.app.commands.{self.command}").run
+        with importing():
+            run: Callable[..., Any] = importlib.import_module(f"trackmdp.app.commands.{self.command}").run
         if isinstance(self.cfg, WorldConfig):
             return run(self.cfg, self.folder, self.problem)
         return run(self.cfg, self.folder)

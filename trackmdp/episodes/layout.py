@@ -1,4 +1,4 @@
-"""A layout for viewers that take Lichtblick's form: four maps, plots of the step, the state of the target."""
+"""A layout for viewers that take Lichtblick's form: maps in layers, plots of the steps, where targets were located."""
 
 from __future__ import annotations
 
@@ -8,13 +8,12 @@ from typing import Any
 
 from trackmdp.durable import write_text
 
-# A panel colours a grid by one of its fields, so that what is on, what is likely and what is true are one map each.
-_MAPS = ("belief", "active", "target", "policy")
-
 
 def layout(size: tuple[int, int]) -> dict[str, Any]:
     """The layout as plain values, its cameras over a grid of `size` (rows, columns)."""
-    panels: dict[str, Any] = {f"3D!{field}": _map(field, size) for field in _MAPS} | {
+    panels: dict[str, Any] = {
+        "3D!belief": _map("belief", size) | {"foxglovePanelTitle": "belief, sensors on (light), target (dot)"},
+        "3D!policy": _map("policy", size) | {"foxglovePanelTitle": "probability of being sensed, target (dot)"},
         "Plot!misses": _plot("/step.n", "/step.n_active"),
         "Plot!reward": _plot("/step.reward", "/step.ep_return"),
         "StateTransitions!seen": {
@@ -23,21 +22,19 @@ def layout(size: tuple[int, int]) -> dict[str, Any]:
         },
         "RawMessages!episode": {"topicPath": "/episode"},
     }
-    belief, active, target, policy = (f"3D!{field}" for field in _MAPS)
-    maps = _split("row", _split("row", belief, active), _split("row", target, policy))
+    # The cells sensed are what the map of the policy shows.
+    panels["3D!policy"]["topics"]["/active"]["visible"] = False
     plots = _split("column", "Plot!misses", _split("column", "Plot!reward", "StateTransitions!seen"))
-    arrangement = _split("column", maps, _split("row", plots, "RawMessages!episode"))
+    arrangement = _split("column", _split("row", *list(panels)[:2]), _split("row", plots, "RawMessages!episode"))
     return {"configById": panels, "globalVariables": {}, "userNodes": {}, "layout": arrangement}
 
 
-def _map(colour_field: str, size: tuple[int, int]) -> dict[str, Any]:
-    grid = {
-        "visible": True,
-        "colorField": colour_field,
-        "colorMode": "colormap",
-        "colorMap": "turbo",
-        "minValue": 0,
-        "maxValue": 1,
+def _map(field: str, size: tuple[int, int]) -> dict[str, Any]:
+    """A panel of three layers: a field of `/grid`, over it the cells sensed, over those the target."""
+    layers: dict[str, dict[str, Any]] = {
+        "/grid": {"colorField": field, "colorMode": "colormap", "colorMap": "turbo"},
+        "/active": {"colorField": "active", "colorMode": "gradient", "gradient": ["#ffffff00", "#ffffff80"]},
+        "/target": {"colorField": "target", "colorMode": "gradient", "gradient": ["#ff00ff00", "#ff00ffff"]},
     }
     rows, columns = size
     # Cells are squares of side 1 from (0, 0) on, x along the columns; without perspective the distance is the height of
@@ -49,7 +46,8 @@ def _map(colour_field: str, size: tuple[int, int]) -> dict[str, Any]:
         "distance": 1.5 * max(rows, columns),
         "targetOffset": [columns / 2, rows / 2, 0],
     }
-    return {"foxglovePanelTitle": colour_field, "followTf": "grid", "topics": {"/grid": grid}, "cameraState": camera}
+    topics = {name: {"visible": True, "minValue": 0, "maxValue": 1, **layer} for name, layer in layers.items()}
+    return {"followTf": "grid", "topics": topics, "cameraState": camera}
 
 
 def _plot(*paths: str) -> dict[str, Any]:

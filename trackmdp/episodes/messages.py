@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 from collections.abc import Iterator
 from typing import Any
@@ -10,22 +9,11 @@ from typing import Any
 import numpy as np
 
 from trackmdp.episodes.episode import Episode
+from trackmdp.episodes.grids import read_grids
 from trackmdp.episodes.limits import check_steps
 from trackmdp.episodes.schema import time_of
 from trackmdp.errors import UserError
-from trackmdp.world.model import BoolArray
 
-# Ten bytes for each cell, without padding, as `_FIELDS` tells the viewer: belief at 0, policy at 4, active at 8,
-# target at 9. A grid of 100 cells is 1,000 bytes, 1,336 characters in base64.
-_CELL = np.dtype([("belief", "<f4"), ("policy", "<f4"), ("active", "u1"), ("target", "u1")])
-_FLOAT32, _UINT8 = 7, 1  # foxglove.NumericType
-_FIELDS = [
-    {"name": "belief", "offset": 0, "type": _FLOAT32},
-    {"name": "policy", "offset": 4, "type": _FLOAT32},
-    {"name": "active", "offset": 8, "type": _UINT8},
-    {"name": "target", "offset": 9, "type": _UINT8},
-]
-_POSE = {"position": {"x": 0, "y": 0, "z": 0}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}
 _WORDS = ("false", "true")
 
 
@@ -80,32 +68,6 @@ def step_messages(episode: Episode, size: tuple[int, int], t_max: int) -> Iterat
         ).encode()
 
 
-def grid_messages(
-    episode: Episode, size: tuple[int, int], first_tick: int, covered: BoolArray | None = None
-) -> Iterator[bytes]:
-    """The `/grid` messages; the grid is turned upside down, since a viewer's first row is the lowest.
-
-    `covered` `[T, M]` are the cells that the sensors on see; None where each sees its own.
-    """
-    rows, columns = size
-    # One cell more, for targets that exited (cell M): it is written to and dropped.
-    cells = np.zeros((len(episode), rows * columns + 1), _CELL)
-    cells["belief"][:, :-1] = episode.belief
-    cells["policy"][:, :-1] = episode.probability
-    cells["active"][:, :-1] = episode.action if covered is None else covered
-    cells["target"][np.arange(len(episode)), episode.target] = 1
-    turned = np.ascontiguousarray(cells[:, :-1].reshape(-1, rows, columns)[:, ::-1])
-    stride = _CELL.itemsize
-    constant = {"frame_id": "grid", "pose": _POSE, "column_count": columns, "cell_size": {"x": 1, "y": 1}}
-    constant |= {"row_stride": columns * stride, "cell_stride": stride, "fields": _FIELDS}
-    # What is the same in all messages is made once; without its braces, it is put between the time and the data.
-    head = json.dumps(constant, separators=(",", ":")).encode()[1:]
-    for t, grid in enumerate(turned):
-        seconds, rest = divmod(time_of(first_tick + t), 1_000_000_000)
-        stamp = b'{"timestamp":{"sec":%d,"nsec":%d},' % (seconds, rest)
-        yield b'%s%s,"data":"%s"}' % (stamp, head[:-1], base64.b64encode(grid.tobytes()))
-
-
 def decode(
     row: dict[str, Any],
     steps: list[bytes],
@@ -130,9 +92,7 @@ def decode(
     ):
         raise UserError(f"episode={number}: its steps do not fit together")
     check_steps(said, m, modes, sensors)
-    packed = b"".join(base64.b64decode(json.loads(grid)["data"], validate=True) for grid in grids)
-    # frombuffer and reshape refuse a length that does not fit: `count` grids of M cells of ten bytes.
-    cells = np.frombuffer(packed, _CELL).reshape(count, *size)[:, ::-1].reshape(count, m)
+    belief, probability = read_grids(grids, size)
     target = np.array([each["target"] for each in said], dtype=np.int64)
     action = np.zeros((count, m if sensors is None else sensors), dtype=bool)
     for t, each in enumerate(said):
@@ -144,8 +104,8 @@ def decode(
         start=row["start"],
         misses=np.array([each["n"] for each in said], dtype=np.int64),
         action=action,
-        belief=np.ascontiguousarray(cells["belief"]),
-        probability=np.ascontiguousarray(cells["policy"]),
+        belief=belief,
+        probability=probability,
         target=np.where(target < 0, m, target),
         located=np.array([each["obs"] >= 0 for each in said]),
         reward=np.array([each["reward"] for each in said], dtype=np.float32),

@@ -10,7 +10,7 @@ from typing import Any
 
 from trackmdp import __version__
 
-LOG_FORMAT = "1"
+LOG_FORMAT = "2"
 """Version of this layout; a reader refuses any other."""
 
 RUN, POLICY, END = "trackmdp.run", "trackmdp.policy", "trackmdp.end"
@@ -44,6 +44,22 @@ _XYZW = {"type": "object", "properties": {"x": _NUMBER, "y": _NUMBER, "z": _NUMB
 _TIME = {"type": "object", "properties": {"sec": _INTEGER, "nsec": _INTEGER}}
 _FIELD = {"type": "object", "properties": {"name": _STRING, "offset": _INTEGER, "type": _INTEGER}}
 
+
+def _layer(title: str) -> tuple[str, dict[str, Any]]:
+    return "foxglove.Grid", _object(
+        f"{title}; the first row is the lowest",
+        timestamp=_TIME,
+        frame_id=_STRING,
+        pose={"type": "object", "properties": {"position": _XYZ, "orientation": _XYZW}},
+        column_count=_INTEGER,
+        cell_size=_XY,
+        row_stride=_INTEGER,
+        cell_stride=_INTEGER,
+        fields={"type": "array", "items": _FIELD},
+        data={"type": "string", "contentEncoding": "base64"},
+    )
+
+
 SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
     "/step": (
         "trackmdp.Step",
@@ -66,21 +82,9 @@ SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
             last=_BOOLEAN,
         ),
     ),
-    "/grid": (
-        "foxglove.Grid",
-        _object(
-            "belief, policy, active and target of every cell; the first row is the lowest",
-            timestamp=_TIME,
-            frame_id=_STRING,
-            pose={"type": "object", "properties": {"position": _XYZ, "orientation": _XYZW}},
-            column_count=_INTEGER,
-            cell_size=_XY,
-            row_stride=_INTEGER,
-            cell_stride=_INTEGER,
-            fields={"type": "array", "items": _FIELD},
-            data={"type": "string", "contentEncoding": "base64"},
-        ),
-    ),
+    "/grid": _layer("belief and policy of every cell, of large grids of the part where they are not 0"),
+    "/active": _layer("the cells sensed, in the smallest rectangle around them"),
+    "/target": _layer("the true cell of the target"),
     "/episode": (
         "trackmdp.Episode",
         _object(

@@ -20,6 +20,7 @@ from trackmdp.arrays import load_npz
 from trackmdp.durable import create, sync, sync_folder
 from trackmdp.episodes import messages, schema
 from trackmdp.episodes.episode import Episode
+from trackmdp.episodes.grids import grid_messages
 from trackmdp.episodes.limits import policy_file, size_of_grid
 from trackmdp.episodes.schema import time_of
 from trackmdp.policies.policy import Policy
@@ -176,17 +177,17 @@ class EpisodeWriter:
         # the Writer raise within a chunk, which finish() could then no longer write.
         if not (np.isfinite(episode.reward).all() and 0 <= tick < 2**37):
             raise ValueError(f"episode {episode.number}: a reward that is not finite, or a time out of range")
-        add, step, grid = self._writer.add_message, self._channels["/step"], self._channels["/grid"]
+        add, channels = self._writer.add_message, self._channels
         steps = messages.step_messages(episode, self._size, self._t_max)
         covered = None if self._coverage is None else self._coverage.cells(episode.action)
-        grids = messages.grid_messages(episode, self._size, tick, covered)
-        for place, (said, cells) in enumerate(zip(steps, grids, strict=True), start=tick):
+        grids = grid_messages(episode, self._size, tick, covered)
+        for place, (said, layers) in enumerate(zip(steps, grids, strict=True), start=tick):
             # MCAP's sequence number has 32 bits, the log time 64.
             time, sequence = time_of(place), place & 0xFFFFFFFF
-            add(step, time, said, time, sequence)
-            add(grid, time, cells, time, sequence)
+            for topic, text in ({"/step": said} | layers).items():
+                add(channels[topic], time, text, time, sequence)
         text = json.dumps(row, allow_nan=False, separators=(",", ":")).encode()
-        add(self._channels["/episode"], time, text, time, sequence)
+        add(channels["/episode"], time, text, time, sequence)
 
     def flush(self) -> None:
         """Close the chunk and hand it to the operating system: it then survives a kill of this process."""

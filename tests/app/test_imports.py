@@ -1,0 +1,46 @@
+"""Imports without the garbage collector."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Iterator
+
+import pytest
+
+from trackmdp.app.cli import main
+from trackmdp.app.imports import importing
+
+
+@pytest.fixture(autouse=True)
+def thawed() -> Iterator[None]:
+    yield
+    gc.unfreeze()
+    gc.enable()
+
+
+def test_nothing_is_collected_inside_and_what_is_there_stays_out_of_later_collections() -> None:
+    seen: list[str] = []
+    gc.callbacks.append(lambda phase, _: seen.append(phase))
+    try:
+        with importing():
+            kept = [[each] for each in range(200_000)]
+            assert seen == []
+    finally:
+        gc.callbacks.pop()
+    assert gc.get_freeze_count() >= len(kept)
+    assert gc.isenabled()
+
+
+def test_a_failed_import_leaves_the_collector_as_it_was() -> None:
+    with pytest.raises(ImportError), importing():
+        raise ImportError
+    assert gc.isenabled()
+    gc.disable()
+    with importing():
+        pass
+    assert not gc.isenabled()
+
+
+def test_commands_leave_it_on() -> None:
+    assert main(["train", "grid.size=0"]) == 2
+    assert gc.isenabled() and gc.get_freeze_count() > 0

@@ -1,0 +1,115 @@
+"""What viewers draw of a step, one `foxglove.Grid` for each layer: belief and policy, the cells sensed, the target."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from trackmdp.episodes.episode import Episode, Floats
+from trackmdp.episodes.schema import time_of
+from trackmdp.world.model import BoolArray
+
+WHOLE_CELLS = 64 * 64
+"""Cells up to which belief and policy are written whole; of a larger grid, where either is more than 0."""
+
+_CELL = np.dtype([("belief", "<f4"), ("policy", "<f4")])
+_ACTIVE, _TARGET = np.dtype([("active", "u1")]), np.dtype([("target", "u1")])
+_TYPES = {np.dtype("<f4"): 7, np.dtype("u1"): 1}  # foxglove.NumericType
+
+
+def _constant(cell: np.dtype[Any], side: float = 1) -> bytes:
+    """What all messages of a layer of square cells say alike, without the braces."""
+    fields = (cell.fields or {}).items()
+    said = {
+        "frame_id": "grid",
+        "cell_size": {"x": side, "y": side},
+        "cell_stride": cell.itemsize,
+        "fields": [{"name": name, "offset": offset, "type": _TYPES[kind]} for name, (kind, offset, *_) in fields],
+    }
+    return json.dumps(said, separators=(",", ":")).encode()[1:-1]
+
+
+_GRID_SAYS, _ACTIVE_SAYS, _TARGET_SAYS = _constant(_CELL), _constant(_ACTIVE), _constant(_TARGET, side=0.5)
+
+_DOT = np.array([[[1]], [[0]]], np.uint8)
+"""The target's layer, a single cell; 0 once it has exited."""
+
+
+def grid_messages(
+    episode: Episode, size: tuple[int, int], first_tick: int, covered: BoolArray | None = None
+) -> Iterator[dict[str, bytes]]:
+    """Of each step topic -> message, a layer above the other in this order.
+
+    `covered` `[T, M]` are the cells that the sensors on see; None where each sees its own.
+    """
+    rows, columns = size
+    cells = np.zeros((len(episode), rows, columns), _CELL)
+    cells["belief"] = np.asarray(episode.belief).reshape(cells.shape)
+    cells["policy"] = np.asarray(episode.probability).reshape(cells.shape)
+    active = (episode.action if covered is None else covered).reshape(cells.shape)
+    whole = np.broadcast_to(True, cells.shape)
+    used = whole if rows * columns <= WHOLE_CELLS else (cells["belief"] > 0) | (cells["policy"] > 0)
+    sensed = active.view(np.uint8)
+    exited = (episode.target == rows * columns).astype(int).tolist()
+    at = np.stack(np.divmod(episode.target % (rows * columns), columns), axis=1).tolist()
+    boxes = zip(_boxes(used), _boxes(active), at, strict=True)
+    for t, ((top, bottom, left, right), (first, last, start, stop), (row, column)) in enumerate(boxes):
+        seconds, rest = divmod(time_of(first_tick + t), 1_000_000_000)
+        stamp = b'{"timestamp":{"sec":%d,"nsec":%d}' % (seconds, rest)
+        yield {
+            "/grid": _grid(stamp, _GRID_SAYS, cells[t, top:bottom, left:right], left, rows - bottom, 0),
+            "/active": _grid(stamp, _ACTIVE_SAYS, sensed[t, first:last, start:stop], start, rows - last, 0.01),
+            # half as wide as its cell, so that the layers beneath it show: in column 3 from x = 3.25 to 3.75
+            "/target": _grid(stamp, _TARGET_SAYS, _DOT[exited[t]], column + 0.25, rows - row - 0.75, 0.02),
+        }
+
+
+def _boxes(used: BoolArray) -> Iterator[tuple[int, int, int, int]]:
+    """Of each step the smallest (top, bottom, left, right), ends excluded, around what is `used` `[T, R, C]`.
+
+    Where nothing is, the first cell.
+    """
+    ends = []
+    for axis in (2, 1):
+        lines: BoolArray = np.any(used, axis)  # [T, R], then [T, C]
+        some: BoolArray = np.any(lines, 1)
+        # argmax is the place of the first True: lines 0 1 1 0 0 begin at 1 and, 0 0 1 1 0 backwards, end at 5 - 2 = 3
+        ends += [lines.argmax(1), np.where(some, lines.shape[1] - lines[:, ::-1].argmax(1), 1)]
+    return zip(*(each.tolist() for each in ends), strict=True)
+
+
+def _grid(stamp: bytes, says: bytes, cells: npt.NDArray[Any], x: float, y: float, z: float) -> bytes:
+    """The message of `cells` `[R, C]` whose lowest left corner is at (x, y, z)."""
+    columns, stride = cells.shape[1], cells.dtype.itemsize
+    # turned upside down, since a viewer's first row is the lowest
+    data = base64.b64encode(cells[::-1].tobytes())
+    return (
+        b'%s,"pose":{"position":{"x":%g,"y":%g,"z":%g},"orientation":{"x":0,"y":0,"z":0,"w":1}},'
+        b'"column_count":%d,"row_stride":%d,%s,"data":"%s"}'
+    ) % (stamp, x, y, z, columns, columns * stride, says, data)
+
+
+def read_grids(grids: Sequence[bytes], size: tuple[int, int]) -> tuple[Floats, Floats]:
+    """Belief and policy `[T, M]` of the `/grid` messages of an episode.
+
+    Raises:
+        ValueError, KeyError, TypeError: one is none of a grid of `size`.
+    """
+    rows, columns = size
+    # zeros and not one block: memory is taken by what is written to it only, however many steps a log claims
+    belief, policy = (np.zeros((len(grids), rows, columns), np.float32) for _ in range(2))
+    for t, text in enumerate(grids):
+        said = json.loads(text)
+        left, low, width = said["pose"]["position"]["x"], said["pose"]["position"]["y"], said["column_count"]
+        cells = np.frombuffer(base64.b64decode(said["data"], validate=True), _CELL).reshape(-1, width)[::-1]
+        top, bottom = rows - low - len(cells), rows - low
+        if not (0 <= top < bottom <= rows and left >= 0 and left + width <= columns):
+            raise ValueError("a grid that lies outside")
+        belief[t, top:bottom, left : left + width] = cells["belief"]
+        policy[t, top:bottom, left : left + width] = cells["policy"]
+    return belief.reshape(len(grids), -1), policy.reshape(len(grids), -1)
