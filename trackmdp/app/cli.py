@@ -12,8 +12,8 @@ import sys
 import traceback
 
 from trackmdp import __version__
-from trackmdp.app.imports import importing
 from trackmdp.errors import FAILED, INTERRUPTED, USER_MISTAKE, Preempted, RunError, UserError
+from trackmdp.imports import importing
 
 COMMANDS = {
     "train": "learn a sensing policy without the motion model, and evaluate it exactly",

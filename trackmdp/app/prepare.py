@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from trackmdp.app.imports import importing
 from trackmdp.app.outputs import folder_of
 from trackmdp.config import (
     ROOTS,
@@ -30,6 +29,7 @@ from trackmdp.config.ignored import refuse_ignored
 from trackmdp.config.loggers import require_packages
 from trackmdp.config.resume import continued, run_folder
 from trackmdp.errors import UserError
+from trackmdp.imports import importing
 
 if TYPE_CHECKING:
     from trackmdp.world.tracks import Problem

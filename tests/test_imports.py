@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from trackmdp.app.cli import main
-from trackmdp.app.imports import importing
+from trackmdp.imports import importing
 
 
 @pytest.fixture(autouse=True)
