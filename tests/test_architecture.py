@@ -14,7 +14,7 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "trackmdp"
 FILES = sorted(PACKAGE.rglob("*.py"))
 
-BEFORE_ALL = ("errors", "gym", "seeding", "durable", "untrusted", "arrays", "statistics", "machine")
+BEFORE_ALL = ("errors", "imports", "gym", "seeding", "durable", "untrusted", "arrays", "statistics", "machine")
 
 # What each may import: itself, and all before it.
 ARROW = [
