@@ -107,7 +107,6 @@ def test_ctrl_c_prints_and_saves_the_bracket(tmp_path: Path) -> None:
     solution = read(tmp_path / "a", "solution.json")
     assert solution["interrupted"] is True
     assert solution["certified"] is False
-    assert solution["nodes"] > 0
     assert solution["lower"] < solution["upper"]
 
 
