@@ -12,7 +12,6 @@ from trackmdp.algos.learned_kernel import observed_paths
 from trackmdp.policies.policy import Policy
 from trackmdp.solvers import optimal
 from trackmdp.solvers.evaluate import evaluate
-from trackmdp.world.make import make_world
 from trackmdp.world.model import World
 
 
@@ -128,15 +127,6 @@ def test_negligible_moves_are_planned_without_and_leave_the_exit_as_it_is() -> N
     np.testing.assert_allclose(believed[0, [1, 3, 4]], [0.5625, 0.3375, 0.0])
     np.testing.assert_allclose(believed[1, [0, 2, 3, 4]], 0.2)
     np.testing.assert_allclose(believed.sum(axis=1), [0.9, 0.8, *[0.5] * 7])
-
-
-def test_blocks_plan_what_the_whole_grid_does() -> None:
-    world = make_world("random_support", size=12, support_size=3, cost=0.16, window=2, safe_cost=10)
-    whole, rows = learn(world, 2, "algo.samples=2", "algo.negligible=0.02")
-    parts, believed = learn(world, 2, "algo.samples=2", "algo.negligible=0.02", "algo.block=5")
-    assert believed[-1]["believed_aihtr"] == pytest.approx(rows[-1]["believed_aihtr"], abs=0.05)
-    assert believed[-1]["believed_aihtr"] > 0
-    assert parts.actor.sets.nnz == pytest.approx(whole.actor.sets.nnz, rel=0.05)  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize(("cells", "planned"), [(9, 6), (8, 1)])

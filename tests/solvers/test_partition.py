@@ -188,7 +188,7 @@ def test_a_job_that_kills_every_worker_ends_in_one_line(tmp_path: Path) -> None:
 
 
 def test_a_policy_that_draws_cannot_be_put_together() -> None:
-    def half(world: World) -> tm.Policy:
+    def half(number: int, world: World) -> tm.Policy:
         return tm.Policy(world, probability=0.5)
 
     with pytest.raises(UserError, match="does not draw"):

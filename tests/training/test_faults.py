@@ -200,9 +200,9 @@ def test_a_worker_that_is_killed_is_named(
 def test_a_worker_ends_with_the_learner_that_was_killed() -> None:
     code = """
 import multiprocessing, threading
-from trackmdp.training.collect import _end_with_learner
+from trackmdp.solvers.workers import end_with_parent
 def work():
-    threading.Thread(target=_end_with_learner, daemon=True).start()
+    end_with_parent()
     print("ready", flush=True)
     threading.Event().wait()
 worker = multiprocessing.get_context("fork").Process(target=work)

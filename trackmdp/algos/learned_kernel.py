@@ -24,7 +24,6 @@ from trackmdp.seeding import derive
 from trackmdp.solvers import exchange
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.kernel_estimate import KernelEstimate, ObservedPaths
-from trackmdp.solvers.partition import plan_by_blocks
 from trackmdp.solvers.renewal import DIRECT_CELLS
 from trackmdp.solvers.shrinkage import least_worth_planning, without
 from trackmdp.world.model import Task, World
@@ -91,14 +90,9 @@ class LearnedKernel:
         return self._diagnostics()
 
     def _plan(self, kernel: sparse.csr_array, start: sparse.csr_array | None = None) -> PolicyTable:
-        """The plan for the `[M, M + 1]` kernel believed, from the sets `start` where there are any.
-
-        By blocks, the halo is that of the reach believed.
-        """
+        """The plan for the `[M, M + 1]` kernel believed, from the sets `start` where there are any."""
         world = self._world(kernel)
-        if self.cfg.block is None:
-            return exchange.solve(world) if start is None else exchange.improve(world, PolicyTable(self.task, start))
-        return plan_by_blocks(world, exchange.solve, self.cfg.block)
+        return exchange.solve(world) if start is None else exchange.improve(world, PolicyTable(self.task, start))
 
     def _world(self, kernel: sparse.csr_array) -> World:
         """The task with the `[M, M + 1]` kernel believed, but for what is negligible."""

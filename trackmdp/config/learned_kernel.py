@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from trackmdp.config.learning import AlgoConfig
-from trackmdp.config.options import choice, option, refuse
+from trackmdp.config.options import choice, option
 
 
 @choice("algo", "learned_kernel", makes="trackmdp.algos.learned_kernel:LearnedKernel")
@@ -40,19 +40,9 @@ class LearnedKernelConfig(AlgoConfig):
     share_cells: bool | None = option(
         "count moves of all cells as far from each border together; null: where the moves seen do not tell them apart"
     )
-    block: int | None = option(
-        "side of blocks that plan for themselves, for grids too large to be planned at once; null = none",
-        unit="cells",
-        ge=1,
-    )
     rounds: int = option("EM rounds after each batch", ge=1, le=10**6)
     rounds_at_end: int = option("EM rounds after the last batch", ge=1, le=10**6)
     samples: int = option("kernels drawn for the uncertainty reported", ge=2, le=10**4)
-
-    def check(self, key: str, root: Any) -> None:
-        """Blocks are of cells with a sensor in each."""
-        if self.block is not None and root.sensor.covers:
-            raise refuse(f"{key}.block", self.block, f"null with sensor={root.sensor.name}")
 
     def ignored(self, root: Any) -> dict[str, str]:
         """With all sensors on throughout, nothing comes before chosen sets."""

@@ -1,17 +1,19 @@
-"""Schema of planning by blocks."""
+"""Schema of planning and learning by blocks."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any
 
-from trackmdp.config.options import option
+from trackmdp.config.options import listed, option, refuse
 from trackmdp.config.schema import NodeConfig
+
+__all__ = ["PartitionConfig", "SweptPartitionConfig"]
 
 
 @dataclass(kw_only=True)
 class PartitionConfig(NodeConfig):
-    """Blocks of the grid that plan for themselves, each for its own cells; the whole is valued on the whole grid."""
+    """Blocks of the grid that plan or learn alone, for their own cells; the policy is valued on the whole grid."""
 
     block: int | None = option("side of a block; null = the whole grid is one", unit="cells", ge=1)
     halo: int | None = option(
@@ -19,6 +21,38 @@ class PartitionConfig(NodeConfig):
         unit="cells",
         ge=0,
     )
+    workers: int = option(
+        "processes that plan or learn, or with a cluster of our own its cores; on one machine as many as it has cores",
+        unit="processes",
+        ge=1,
+    )
+    cluster: str | None = option(
+        "Ray cluster that works on one large grid, worth it where one machine's cores are not enough; for many runs "
+        "take hydra/launcher=ray. local = one on this machine with so many workers, for tests; null = no Ray",
+        expects="local, auto, or host:port",
+    )
+
+    def check(self, key: str, root: Any) -> None:
+        """Learning by blocks needs a motion that can be cut to a rectangle, and keeps no log but the blocks' own."""
+        if self.block is None or not root.learns:
+            return
+        if not root.kernel.is_motion or root.kernel.hides:
+            raise refuse(f"{key}.block", self.block, f"null with kernel={root.kernel.name}")
+        if [*root.log] not in ([], ["csv"]):
+            raise refuse("log", listed(root.log), f"[csv] with {key}.block: each block has a log of its own")
+        if root.init_from is not None:
+            raise refuse("init_from", root.init_from, f"null with {key}.block")
+
+    def ignored(self, root: Any) -> dict[str, str]:
+        """Without blocks there is nothing to know of, or to share out."""
+        why = f"without partition.block, the whole grid being {'learned' if root.learns else 'planned'} at once"
+        return {name: why for name in vars(self) if name != "block"} if self.block is None else {}
+
+
+@dataclass(kw_only=True)
+class SweptPartitionConfig(PartitionConfig):
+    """Blocks that plan, and the rounds over the whole grid after them."""
+
     sweeps: int | None = option(
         "rounds of exchange over the whole grid after the blocks (solver=optimal), all values known, until none grows; "
         "null = at most 10 with the default halo, none with a halo of its own",
@@ -26,18 +60,3 @@ class PartitionConfig(NodeConfig):
         ge=0,
         le=1000,
     )
-    workers: int = option(
-        "processes that plan, or with a cluster of our own its cores; on one machine as many as it has cores",
-        unit="processes",
-        ge=1,
-    )
-    cluster: str | None = option(
-        "Ray cluster that plans one large grid, worth it where one machine's cores are not enough; for many runs take "
-        "hydra/launcher=ray. local = one on this machine with so many workers, for tests; null = no Ray",
-        expects="local, auto, or host:port",
-    )
-
-    def ignored(self, root: Any) -> dict[str, str]:
-        """Without blocks there is nothing to know of, or to share out."""
-        why = "without partition.block, the whole grid being planned at once"
-        return dict.fromkeys(("halo", "sweeps", "workers", "cluster"), why) if self.block is None else {}

@@ -11,6 +11,7 @@ from trackmdp.errors import UserError
 
 RENAMED: dict[str, str] = {
     "algo.average": "algo.ema_decay",
+    "algo.block": "partition.block",
     "algo.clip": "algo.clip_epsilon",
     "algo.lam": "algo.gae_lambda",
     "algo.lr": "algo.learning_rate",

@@ -21,11 +21,13 @@ CHANGEABLE = (
     "evaluation",
     "log",
     "checkpoint",
+    "partition.workers",
+    "partition.cluster",
     "device",
     "collector.device",
     "quiet",
 )
-"""Options, or groups of them, that may differ when a run is resumed: budget, solving, logging, saving and devices."""
+"""Options, or groups of them, that may differ on resume: budget, solving, logging, saving, workers and devices."""
 
 
 def config_text(cfg: TrainConfig) -> str:

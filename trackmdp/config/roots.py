@@ -10,7 +10,7 @@ from trackmdp.config.baselines import BaselineConfig
 from trackmdp.config.learning import DEVICE, AlgoConfig, CollectorConfig
 from trackmdp.config.loggers import LogConfig
 from trackmdp.config.options import GROUPS, listed, option, refuse
-from trackmdp.config.partition import PartitionConfig
+from trackmdp.config.partition import PartitionConfig, SweptPartitionConfig
 from trackmdp.config.schema import NodeConfig
 from trackmdp.config.world import CostConfig, GridConfig, KernelConfig, SensorConfig, TaskConfig
 from trackmdp.errors import UserError
@@ -90,6 +90,7 @@ class TrainConfig(WorldConfig):
     task: TaskConfig
     algo: AlgoConfig
     collector: CollectorConfig
+    partition: PartitionConfig
     log: dict[str, LogConfig]
     evaluation: EvaluationConfig
     optimal: OptimalBoundConfig
@@ -137,7 +138,7 @@ class SolveConfig(WorldConfig):
 
     task: TaskConfig
     solver: BaselineConfig
-    partition: PartitionConfig
+    partition: SweptPartitionConfig
     verify: bool = option("check the paper's theorems on this world as well")
 
 

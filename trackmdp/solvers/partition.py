@@ -1,4 +1,4 @@
-"""Sub-grids with a hand-off: square blocks of a large grid plan for themselves, and the whole is valued at the end.
+"""Sub-grids with a hand-off: square blocks of a large grid plan or learn alone, and the whole is valued at the end.
 
 Each block sees its own cells and a halo of some cells around them; what lies farther away is the exit. It owns the
 plans of its own cells alone: whoever owns the cell the target was last located in decides, also about sensors beyond
@@ -23,15 +23,16 @@ import numpy as np
 from trackmdp.config.partition import PartitionConfig
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.layers import sensed_csr
 from trackmdp.solvers.renewal import IndexArray, row_index
-from trackmdp.solvers.solution import Solution
 from trackmdp.solvers.workers import run_jobs
 from trackmdp.world.model import World
 
 __all__ = ["Block", "blocks", "cells_of", "default_halo", "narrow_halo", "plan_by_blocks", "reach", "sub_world"]
 
-Planner: TypeAlias = "Callable[[World], PolicyTable]"
+Planner: TypeAlias = "Callable[[int, World], PolicyTable]"
+"""From a block's number and its world to its policy, by planning or by learning."""
 Rectangle: TypeAlias = tuple[range, range]
 """Rows and columns of the grid."""
 
@@ -106,7 +107,7 @@ def plan_by_blocks(
 
     Args:
         world: the whole grid.
-        plan: gives the deterministic policy of a block, and must not depend on a clock.
+        plan: finds the deterministic policy of a block, whatever the clock says; pickled where there are workers.
         block: side of the blocks.
         halo: cells around its own that a block knows of; None: `default_halo`.
         workers: processes that plan; see `run_jobs`.
@@ -122,19 +123,19 @@ def plan_by_blocks(
     return PolicyTable(world, sensed_csr(world, sensed))
 
 
-def narrow_halo(world: World, partition: PartitionConfig, solution: Solution) -> str | None:
+def narrow_halo(world: World, partition: PartitionConfig, upper: float, found: Evaluation) -> str | None:
     """What to say of a halo that may lose something: the most it can have lost; None of one that is wide enough."""
     wide = default_halo(world)
     if partition.block is None or partition.halo is None or partition.halo >= wide:
         return None
-    lost = max(solution.upper - solution.lower + solution.evaluation.error, 0.0) / solution.evaluation.expected_length
+    lost = max(upper - found.aihtr + found.error, 0.0) / found.expected_length
     return (
         f"partition.halo={partition.halo}: below {wide} = R (T_max + 2), so blocks do not see all that they decide on; "
         f"at most {lost:.4f} per step is lost"
     )
 
 
-class _Jobs(Sequence[list[tuple[World, Block]]]):
+class _Jobs(Sequence[list[tuple[int, World, Block]]]):
     """Some blocks in a row each, with their worlds, made when asked for: no worker needs the rest of the grid."""
 
     def __init__(self, world: World, parts: Sequence[Block]) -> None:
@@ -147,8 +148,8 @@ class _Jobs(Sequence[list[tuple[World, Block]]]):
     def __getitem__(self, number: Any) -> Any:
         if not 0 <= number < len(self):
             raise IndexError(number)
-        parts = self._parts[self._ends[number] : self._ends[number + 1]]
-        return [(sub_world(self._world, each.seen), each) for each in parts]
+        mine = range(self._ends[number], self._ends[number + 1])
+        return [(each, sub_world(self._world, self._parts[each].seen), self._parts[each]) for each in mine]
 
 
 @dataclass(frozen=True)
@@ -158,14 +159,14 @@ class _PlanJob:
     plan: Planner
     columns: int
 
-    def __call__(self, job: Sequence[tuple[World, Block]]) -> list[tuple[IndexArray, IndexArray]]:
+    def __call__(self, job: Sequence[tuple[int, World, Block]]) -> list[tuple[IndexArray, IndexArray]]:
         found = [self._block(*each) for each in job]
         return [_joined([part[n] for part in found]) for n in range(len(found[0]))]
 
-    def _block(self, world: World, block: Block) -> list[tuple[IndexArray, IndexArray]]:
-        table = self.plan(world)
+    def _block(self, number: int, world: World, block: Block) -> list[tuple[IndexArray, IndexArray]]:
+        table = self.plan(number, world)
         if not table.deterministic:
-            raise UserError("partition.block: expected a solver whose policy does not draw")
+            raise UserError("partition.block: expected a policy that does not draw")
         # A single probability of 0 or 1 for all sensors says nothing about the world beyond the halo.
         sets = table.sets if table.sets is not None else PolicyTable.from_dense(world, table.dense()).sets
         assert sets is not None

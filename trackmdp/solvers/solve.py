@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from trackmdp.config.baselines import BaselineConfig
 from trackmdp.config.compose import compose, default, given
-from trackmdp.config.partition import PartitionConfig
+from trackmdp.config.partition import SweptPartitionConfig
 from trackmdp.config.registry import make, maker
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
@@ -80,7 +80,7 @@ def solve(
     blocks = given({f"partition.{name}": value for name, value in of_blocks.items()})
     cfg = compose("solve", named | own | blocks)
     solution = run_solver(world, cfg.solver, on_progress, cfg.partition)
-    if isinstance(world, World) and (said := narrow_halo(world, cfg.partition, solution)):
+    if isinstance(world, World) and (said := narrow_halo(world, cfg.partition, solution.upper, solution.evaluation)):
         warnings.warn(said, stacklevel=2)
     return solution
 
@@ -89,7 +89,7 @@ def run_solver(
     world: Modelled,
     choice: BaselineConfig,
     on_progress: Callable[[SearchProgress], None] | None = None,
-    partition: PartitionConfig | None = None,
+    partition: SweptPartitionConfig | None = None,
 ) -> Solution:
     """What the solver of a config finds; a policy without a proof is bracketed by the clocked bound."""
     if isinstance(world, HiddenWorld):
@@ -124,7 +124,7 @@ class _Planner:
 
     choice: BaselineConfig
 
-    def __call__(self, world: World) -> PolicyTable:
+    def __call__(self, number: int, world: World) -> PolicyTable:  # noqa: ARG002
         return run_solver(world, self.choice).table
 
 

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import logging
 import multiprocessing
+import os
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from typing import Any, TypeVar
 
 from trackmdp.errors import UserError, require
 
-__all__ = ["run_jobs"]
+__all__ = ["end_with_parent", "run_jobs"]
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -47,16 +50,32 @@ def _in_processes(work: Callable[[Job], Result], jobs: Sequence[Job], workers: i
     for _ in range(_ATTEMPTS):
         left = [number for number in range(len(jobs)) if number not in results]
         # Spawned, not forked: a fork copies locks that another thread of this process may hold.
-        with ProcessPoolExecutor(min(workers, len(left)), multiprocessing.get_context("spawn")) as pool:
+        spawning = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(min(workers, len(left)), spawning, end_with_parent) as pool:
             futures = {number: pool.submit(work, jobs[number]) for number in left}
-            for number, future in futures.items():
-                try:
-                    results[number] = future.result()
-                except BrokenProcessPool:  # a worker died: what it and the others had not finished is done again
-                    continue
+            try:
+                for number, future in futures.items():
+                    # a worker died: what it and the others had not finished is done again
+                    with suppress(BrokenProcessPool):
+                        results[number] = future.result()
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)  # what was not begun is not begun any more
+                raise
         if len(results) == len(jobs):
             return [results[number] for number in range(len(jobs))]
     raise UserError(f"partition.workers={workers}: workers died {_ATTEMPTS} times, expected enough memory for each")
+
+
+def end_with_parent() -> None:
+    """End this process with the one that spawned it, which cannot tell it to end when it is killed."""
+
+    def wait() -> None:
+        parent = multiprocessing.parent_process()
+        if parent is not None:
+            parent.join()
+            os._exit(1)  # not sys.exit, which would end this thread alone
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 def _on_ray(work: Callable[[Job], Result], jobs: Sequence[Job], workers: int, cluster: str) -> list[Result]:

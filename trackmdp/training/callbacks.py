@@ -23,20 +23,31 @@ Row = Mapping[str, float | int | None]
 """Figures of one iteration by their names, as `metrics.csv` has them; None for what was not measured."""
 
 
-class Training(Protocol):
-    """What a callback may read of the run: the trainer, `trackmdp.training.trainer.Trainer`, which describes each."""
+class Learning(Protocol):
+    """A run that learns, of the whole grid or by blocks; it is described there, in `trainer` and `blocks`."""
 
     problem: Problem
     config: TrainConfig
     folder: Path | None
     console: Console
-    device: torch.device
-    algorithm: Algorithm
-    collector: BaseCollector
     evaluator: Evaluator
     callbacks: list[Callback]
     start: Position
     position: Position
+
+    def run(self) -> Score:
+        """Learn to the end; the score of the last policy."""
+
+    def policy(self) -> Policy:
+        """The policy as it is now."""
+
+
+class Training(Learning, Protocol):
+    """What a callback may read of the run: the trainer, `trackmdp.training.trainer.Trainer`, which describes each."""
+
+    device: torch.device
+    algorithm: Algorithm
+    collector: BaseCollector
     collecting: float
     score: Score
     error: BaseException | None
@@ -47,9 +58,6 @@ class Training(Protocol):
 
     def due(self, every: int) -> bool:
         """Whether this iteration is a multiple of `every`, or the last one."""
-
-    def policy(self) -> Policy:
-        """The policy as it is now."""
 
 
 class Callback:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 import signal
-import threading
 from functools import partial
 from typing import Any
 
@@ -15,6 +12,7 @@ from torchrl.collectors import BaseCollector, Collector, MultiAsyncCollector, Mu
 
 from trackmdp.config.learning import CollectorConfig, RayWorkersConfig, WorkersConfig
 from trackmdp.seeding import derive
+from trackmdp.solvers.workers import end_with_parent
 from trackmdp.training.devices import make_device
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.tracks import Problem
@@ -137,17 +135,9 @@ def _worker_env(world: Problem, worker: str, env: dict[str, Any]) -> TrackEnv:
     # for an answer of theirs while it should save. It tells them to end, and kills those that do not.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
-    threading.Thread(target=_end_with_learner, daemon=True).start()
+    end_with_parent()
     torch.manual_seed(derive(env["seed"], "torch", worker))
     return TrackEnv(world, stream=f"world-{worker}", **env)
-
-
-def _end_with_learner() -> None:
-    """Wait for the end of the process that learns, and end this one: killed, it cannot tell its workers to end."""
-    learner = multiprocessing.parent_process()
-    if learner is not None:
-        learner.join()
-        os._exit(1)  # not sys.exit, which would end this thread alone
 
 
 def _remote_env(world: Problem, worker: str, env: dict[str, Any], threads: int) -> TrackEnv:

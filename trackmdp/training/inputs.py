@@ -15,6 +15,7 @@ from trackmdp.config.resume import config_text
 from trackmdp.durable import write_bytes, write_text
 from trackmdp.errors import UserError
 from trackmdp.untrusted import parse_json, read_bytes
+from trackmdp.world.model import Array
 from trackmdp.world.recording import recording_bytes
 from trackmdp.world.tracks import Problem, Recorded
 
@@ -22,6 +23,11 @@ RECORDING = "recording.npz"
 """The tracks of a run that was begun in Python, which may have been read from any file, or from none."""
 FOOTPRINTS = "footprints.npz"
 """The cells that each sensor covers, where that is not its own cell alone."""
+
+
+def short(values: Array) -> float | list[float]:
+    """One number where all cells have the same, else one for each: as an option has it."""
+    return float(values[0]) if (values == values[0]).all() else values.tolist()
 
 
 def write_inputs(config: TrainConfig, problem: Problem, folder: Path, *, resumed: bool) -> None:

@@ -18,10 +18,9 @@ from trackmdp.policies.saved import load_policy
 from trackmdp.solvers import optimal
 from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.solution import Solution
-from trackmdp.training.callbacks import Callback, Row, Training
+from trackmdp.training.callbacks import Callback, Learning, Row, Training
 from trackmdp.training.sealing import check_files, read_summary, write_summary
 from trackmdp.training.summary import summarize
-from trackmdp.training.trainer import Trainer
 from trackmdp.untrusted import decoded, read_text
 from trackmdp.world.model import Array, World
 from trackmdp.world.tracks import Recorded
@@ -63,11 +62,11 @@ class _Rows(Callback):
             self.columns.setdefault(key, []).append(value)
 
 
-def complete(trainer: Trainer) -> Run:
+def complete(trainer: Learning) -> Run:
     """Train to the end, solve for the optimum where the config asks for it, and write `policy.npz` and `summary.json`.
 
     Raises:
-        UserError, Preempted, RunError: see `Trainer.run`.
+        UserError, Preempted, RunError: see `trainer.Trainer.run`.
     """
     began, used = time.monotonic(), time.process_time()
     rows = _Rows()
@@ -94,7 +93,7 @@ def complete(trainer: Trainer) -> Run:
     return Run(policy, final, metrics or rows.columns, summary, trainer.folder, solution)
 
 
-def _solve(trainer: Trainer, learned: Policy) -> Solution | None:
+def _solve(trainer: Learning, learned: Policy) -> Solution | None:
     """The certified optimum, where it is asked for; there is none for episodes truncated by `grid.max_steps`.
 
     The search also starts from what was learned: a policy that learning has found is known, and counts as such.

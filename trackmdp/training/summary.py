@@ -10,7 +10,7 @@ from trackmdp import __version__
 from trackmdp.config.resume import config_digest
 from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.solution import Solution
-from trackmdp.training.callbacks import Training
+from trackmdp.training.callbacks import Learning
 from trackmdp.training.evaluator import Score, figures, while_collecting
 from trackmdp.training.machine import machine
 
@@ -18,7 +18,7 @@ _PACKAGES = ("torch", "torchrl", "tensordict", "hydra-core", "numpy", "scipy")
 
 
 def summarize(
-    trainer: Training, final: Evaluation, score: Score, solution: Solution | None, times: dict[str, float]
+    trainer: Learning, final: Evaluation, score: Score, solution: Solution | None, times: dict[str, float]
 ) -> dict[str, Any]:
     """The figures of a run that has ended; on recorded tracks there are no bounds, no Q_MDP and no regret.
 

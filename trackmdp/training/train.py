@@ -14,14 +14,14 @@ from trackmdp.config.compose import compose
 from trackmdp.config.loggers import require_packages
 from trackmdp.errors import UserError
 from trackmdp.seeding import preserved_global_rng
+from trackmdp.training.blocks import make_trainer
 from trackmdp.training.callbacks import Callback
 from trackmdp.training.display import make_console
-from trackmdp.training.inputs import FOOTPRINTS, RECORDING
+from trackmdp.training.inputs import FOOTPRINTS, RECORDING, short
 from trackmdp.training.lock import locked
 from trackmdp.training.run import Run, complete
-from trackmdp.training.trainer import Trainer
 from trackmdp.world.make import sensor_words
-from trackmdp.world.model import Array, World
+from trackmdp.world.model import World
 from trackmdp.world.modes import HiddenWorld
 from trackmdp.world.tracks import Problem
 
@@ -68,7 +68,7 @@ def train(
             raise UserError(f"folder={folder}: holds a run already; resume it by resume='auto', or choose another one")
     with locked(place, "folder") if place else nullcontext(), preserved_global_rng():
         console = make_console(quiet=not progress)
-        return complete(Trainer(problem, config, folder=place, callbacks=callbacks, console=console))
+        return complete(make_trainer(problem, config, folder=place, callbacks=callbacks, console=console))
 
 
 def _flat(given: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -82,11 +82,6 @@ def _flat(given: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any
             yield key, value
 
 
-def _short(values: Array) -> float | list[float]:
-    """One number where all cells have the same, else one for each."""
-    return float(values[0]) if (values == values[0]).all() else values.tolist()
-
-
 def _described(problem: Problem, folder: Path | None) -> dict[str, Any]:
     """The options that a problem made in Python is described by: what is in memory counts, and the folder keeps it."""
     price = problem.cost
@@ -97,12 +92,12 @@ def _described(problem: Problem, folder: Path | None) -> dict[str, Any]:
         "grid.window": problem.window,
         "task.memory": problem.memory,
         "cost.reward": problem.reward,
-        "cost.sensor": _short(price),
+        "cost.sensor": short(price),
         # null means the sum of all prices: that is what most problems have, up to the rounding of a sum in another
         # order.
         "cost.safe": None if np.isclose(problem.safe_cost, price.sum(), rtol=1e-15) else problem.safe_cost,
     }
-    given |= sensor_words(_short(problem.detection), _short(problem.safe_detection))
+    given |= sensor_words(short(problem.detection), short(problem.safe_detection))
     if problem.coverage is not None:
         given |= {"sensor": "footprint", "sensor.path": str((folder or Path()).absolute() / FOOTPRINTS)}
     if problem.memory != "cell":

@@ -48,7 +48,8 @@ def run(cfg: SolveConfig, folder: Path, problem: Problem | None = None) -> float
     arrays = write_sets(folder, solution.table, value=solution.value, upper_value=solution.bound)
     write_json(folder / "solution.json", _report(cfg, solution, bound) | arrays)
     _show(console, cfg, world, solution, bound, folder)
-    if isinstance(world, World) and (said := narrow_halo(world, cfg.partition, solution)):
+    found = solution.evaluation
+    if isinstance(world, World) and (said := narrow_halo(world, cfg.partition, solution.upper, found)):
         console.print(f"warning: {said}")
     # After the results are written: the command still ends with the status of an interruption.
     if solution.interrupted:

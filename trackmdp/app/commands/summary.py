@@ -5,12 +5,12 @@ from __future__ import annotations
 from rich.console import Console
 
 from trackmdp.policies.policy import Policy
+from trackmdp.training.callbacks import Learning
 from trackmdp.training.display import table
 from trackmdp.training.run import Run
-from trackmdp.training.trainer import Trainer
 
 
-def show_summary(console: Console, trainer: Trainer, run: Run) -> None:
+def show_summary(console: Console, trainer: Learning, run: Run) -> None:
     """The learned policy beside Q_MDP, all sensors on, and the optimum where it was solved for."""
     evaluator, solution = trainer.evaluator, run.solution
     policies = {f"learned ({trainer.config.algo.name})": run.evaluation}

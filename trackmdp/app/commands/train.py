@@ -9,10 +9,10 @@ from trackmdp.app.commands.summary import show_summary
 from trackmdp.config import TrainConfig
 from trackmdp.config.resume import finished
 from trackmdp.errors import RunError
+from trackmdp.training.blocks import make_trainer
 from trackmdp.training.display import make_console
 from trackmdp.training.lock import locked
 from trackmdp.training.run import complete
-from trackmdp.training.trainer import Trainer
 from trackmdp.world.make import make_problem
 from trackmdp.world.tracks import Problem
 
@@ -50,7 +50,7 @@ def _run(cfg: TrainConfig, folder: Path, problem: Problem | None) -> float:
         return reached
     problem = problem or make_problem(cfg)
     show_loaded(console, problem)
-    trainer = Trainer(problem, cfg, folder=folder, console=console)
+    trainer = make_trainer(problem, cfg, folder=folder, console=console)
     done = complete(trainer)
     if done.summary["held_out"] is None:
         show_summary(console, trainer, done)

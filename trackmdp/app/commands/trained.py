@@ -8,10 +8,12 @@ from pathlib import Path
 import torch
 
 from trackmdp.config import load_run_config
+from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy, actor_table
 from trackmdp.training import checkpoint
 from trackmdp.training.inputs import check_inputs
 from trackmdp.training.make import make_algorithm
+from trackmdp.training.run import load_run
 from trackmdp.training.state import load_learned
 from trackmdp.world.make import make_problem
 from trackmdp.world.tracks import Problem
@@ -27,13 +29,20 @@ class Trained:
 
 
 def trained(run: str, device: torch.device, *, best: bool = False) -> Trained:
-    """The policy of the newest checkpoint of the run in the folder `run`, or of the best one.
+    """The policy of the newest checkpoint of the run in the folder `run`, or of the best one; by blocks, the run's own.
 
     Raises:
         UserError: that is no run, or the checkpoint is missing, damaged or another run's.
     """
     cfg, folder = load_run_config(run), Path(run)
     world = make_problem(cfg)
+    if cfg.partition.block is not None:
+        if best:
+            raise UserError(
+                f"checkpoint=best: expected newest for run={run}, whose blocks have checkpoints of their own"
+            )
+        check_inputs(world, folder)
+        return Trained(world, load_run(folder).policy, f"{cfg.algo.name}, by blocks")
     algorithm = make_algorithm(cfg, world, device)
     file = folder / "checkpoints" / checkpoint.BEST if best else checkpoint.newest(folder)
     load_learned(algorithm, cfg, file, device)

@@ -1,0 +1,168 @@
+"""Learning by blocks: what each block learns, what is put together of it, and runs that were cut."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import trackmdp as tm
+from trackmdp.app.cli import main
+from trackmdp.errors import UserError
+from trackmdp.solvers.evaluate import evaluate
+from trackmdp.training.callbacks import Callback
+from trackmdp.training.saving import Checkpoints
+from trackmdp.world.model import World
+
+SMALL: dict[str, Any] = {
+    "optimal.enabled": False,
+    "algo.samples": 2,
+    "algo.plan_every": 100,
+    "evaluation.every": 100,
+    "collector.envs": 50,
+    "collector.frames_per_batch": 300,
+    "collector.total_frames": 6000,
+    "checkpoint.every": 600,
+    "partition.block": 5,
+    "partition.halo": 1,
+}
+
+
+def world(**options: Any) -> World:
+    given = {"size": 8, "support_size": 3, "radius": 1, "cost": 0.16, "t_max": 1, "safe_cost": 8.0, "window": 2}
+    return tm.make_world("random_support", **given | options)
+
+
+def learned(folder: Path | None = None, algo: str = "learned_kernel", **options: Any) -> tm.Run:
+    return tm.train(world(), algo, folder=folder, **SMALL | options)
+
+
+@pytest.fixture(scope="module")
+def uncut(tmp_path_factory: pytest.TempPathFactory) -> tm.Run:
+    return learned(tmp_path_factory.mktemp("uncut"))
+
+
+def policies(folder: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(folder)): file.read_bytes() for file in sorted(folder.rglob("policy.npz"))}
+
+
+@pytest.mark.slow
+def test_blocks_learn_what_the_whole_grid_would(tmp_path: Path) -> None:
+    wide = {"collector.total_frames": 60_000, "partition.block": 4, "partition.halo": None}
+    run = learned(tmp_path, **wide)
+    # of the whole grid, not the mean of the blocks
+    assert run.evaluation.aihtr == pytest.approx(evaluate(world(), run.policy).aihtr, abs=1e-9)
+    assert run.summary["regret_per_step"] < 0.02
+    assert run.summary["bounds"]["clocked"] == pytest.approx(tm.solve(world()).upper)
+    narrow = learned(**wide | {"partition.halo": 0})
+    assert narrow.summary["regret_per_step"] > run.summary["regret_per_step"] + 0.05
+
+
+def test_frames_are_shared_out_by_what_blocks_see(uncut: tm.Run) -> None:
+    assert uncut.folder is not None
+    places = [uncut.folder / "blocks" / f"{number:05d}" for number in range(4)]
+    # of 8 x 8 cells with side 5 and halo 1: 6 x 6, 6 x 4, 4 x 6 and 4 x 4 cells, 100 in all
+    assert [tuple(np.load(place / "kernel.npz")["shape"]) for place in places] == [(n, n) for n in (36, 24, 24, 16)]
+    ends = [json.loads((place / "summary.json").read_text()) for place in places]
+    assert [end["frames"] for end in ends] == [2400, 1500, 1500, 1200]  # 2160, 1440, 1440 and 960, in whole batches
+    assert uncut.summary["frames"] == 6600
+    earned = uncut.summary["while_collecting"]["reward_per_frame"]
+    assert earned == pytest.approx(
+        sum(end["frames"] * end["while_collecting"]["reward_per_frame"] for end in ends) / 6600
+    )
+    assert len({end["seed"] for end in ends}) == 4
+
+
+def test_a_cut_run_ends_as_if_it_had_not_been(uncut: tm.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    save, saved = Checkpoints.save, []
+
+    def noted(self: Checkpoints, trainer: Any) -> None:
+        save(self, trainer)
+        saved.append((trainer.folder.name, trainer.position.frames))
+        if saved == [("00000", 600 * n) for n in (1, 2, 3, 4)] + [("00001", 600)]:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Checkpoints, "save", noted)
+    with pytest.raises(KeyboardInterrupt):
+        learned(tmp_path)
+    assert list(policies(tmp_path)) == ["blocks/00000/policy.npz"]
+    done = (tmp_path / "blocks" / "00000" / "summary.json").stat().st_mtime_ns
+    saved.clear()
+    learned(tmp_path, resume="auto")
+    # what was finished is not learned again, and what was cut goes on from its checkpoint
+    assert done == (tmp_path / "blocks" / "00000" / "summary.json").stat().st_mtime_ns
+    assert saved[:2] == [("00001", 1200), ("00001", 1500)]
+    assert {name for name, _ in saved} == {"00001", "00002", "00003"}
+    assert uncut.folder is not None
+    assert policies(tmp_path) == policies(uncut.folder)
+    assert len(policies(tmp_path)) == 5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cluster", [None, "local"])
+def test_the_result_does_not_depend_on_the_workers(uncut: tm.Run, tmp_path: Path, cluster: str | None) -> None:
+    if cluster:
+        pytest.importorskip("ray")
+    learned(tmp_path, **{"partition.workers": 2, "partition.cluster": cluster})
+    assert uncut.folder is not None
+    assert policies(tmp_path) == policies(uncut.folder)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("algo", "words"),
+    [("hindsight", {}), ("a2c", {"envs": 50}), ("ppo", {"minibatches": 5}), ("dqn", {"credit": "per_sensor"})],
+)
+def test_every_learner_learns_by_blocks(algo: str, words: dict[str, Any]) -> None:
+    options = {name: value for name, value in SMALL.items() if "samples" not in name and "plan" not in name} | words
+    kept = [tm.train(world(), algo, **options).evaluation.value for _ in range(2)]
+    assert np.array_equal(*kept)
+    assert kept[0].mean() > evaluate(world(), tm.Policy.none(world())).aihtr
+
+
+@pytest.mark.slow
+def test_a_run_by_blocks_is_evaluated_and_exported(
+    uncut: tm.Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["evaluate", f"run={uncut.folder}", "episodes=0", f"hydra.run.dir={tmp_path}"]) == 0
+    assert json.loads((tmp_path / "evaluation.json").read_text())["exact"]["aihtr"] == uncut.evaluation.aihtr
+    words = ["export", f"run={uncut.folder}", "format=sets", f"hydra.run.dir={tmp_path}"]
+    assert main(words) == 0
+    assert json.loads((tmp_path / "sets.json").read_text()) == uncut.policy.as_lists()
+    capsys.readouterr()
+    assert main([*words, "checkpoint=best"]) == 2
+    assert "checkpoint=best: expected newest for run=" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ({"log": ["mcap"]}, r"log=\[mcap\]: expected \[csv\] with partition.block"),
+        ({"init_from": "elsewhere"}, "init_from=.*: expected null with partition.block"),
+        ({"callbacks": [Callback()]}, "callbacks: expected none"),
+        ({"partition.block": None, "partition.halo": 1}, "partition.halo=1: without effect without partition.block"),
+        ({"partition.sweeps": 1}, "partition.sweeps: unknown option"),
+        ({"algo.block": 5}, "algo.block: renamed, expected partition.block"),
+    ],
+)
+def test_what_does_not_go_together_with_blocks_is_refused(words: dict[str, Any], said: str) -> None:
+    with pytest.raises(UserError, match=said):
+        learned(**words)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["kernel=tracks", "kernel.path=tests/data/city.csv"], "partition.block=4: expected null with kernel=tracks"),
+        (["kernel=heading", "algo=ppo"], "partition.block=4: expected null with kernel=heading"),
+        (["sensor=footprint", "algo=ppo"], "partition.block=4: expected null with sensor=footprint"),
+    ],
+)
+def test_worlds_that_are_not_cut_to_blocks_are_refused(
+    words: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["train", *words, "partition.block=4"]) == 2
+    assert said in capsys.readouterr().err

@@ -1,0 +1,173 @@
+"""Learning by blocks: each block is a run of its own, in a folder of its own, and the whole grid values what they find.
+
+A block collects and learns in its own cells and its halo, where whoever leaves them has exited (`solvers/partition`).
+Its targets start in all of these cells alike, so that every block gets its share of the frames. What was finished is
+not learned again on resume, and a block that was interrupted goes on from its own checkpoint.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from rich.console import Console
+
+from trackmdp.config import TrainConfig
+from trackmdp.config.partition import PartitionConfig
+from trackmdp.config.resume import finished
+from trackmdp.config.world import MissConfig, PaperCostConfig, PerfectSensorConfig, TableConfig
+from trackmdp.errors import UserError
+from trackmdp.policies.policy import Policy
+from trackmdp.seeding import derive, preserved_global_rng
+from trackmdp.solvers.partition import blocks, default_halo, narrow_halo, plan_by_blocks
+from trackmdp.training.callbacks import Callback, Learning
+from trackmdp.training.display import make_console
+from trackmdp.training.evaluator import Evaluator, Score
+from trackmdp.training.held_out import make_evaluator
+from trackmdp.training.inputs import short, write_inputs
+from trackmdp.training.run import complete, load_run
+from trackmdp.training.sealing import read_summary
+from trackmdp.training.state import Position
+from trackmdp.training.trainer import Trainer
+from trackmdp.world.model import World
+from trackmdp.world.tracks import Problem
+
+__all__ = ["BlockTrainer", "make_trainer"]
+
+
+def make_trainer(
+    problem: Problem,
+    config: TrainConfig,
+    *,
+    folder: Path | None = None,
+    callbacks: Sequence[Callback] = (),
+    console: Console | None = None,
+) -> Learning:
+    """The trainer of the whole grid, or of its blocks where `partition.block` is set; arguments as for `Trainer`.
+
+    Raises:
+        UserError: callbacks are given for blocks, or as `Trainer` raises it.
+    """
+    if config.partition.block is None:
+        return Trainer(problem, config, folder=folder, callbacks=callbacks, console=console)
+    if callbacks:
+        raise UserError("callbacks: expected none with partition.block, whose blocks may learn in other processes")
+    assert isinstance(problem, World)  # the config refuses all others
+    return BlockTrainer(problem, config, folder=folder, console=console)
+
+
+class BlockTrainer:
+    """A training run by blocks, begun anew or resumed.
+
+    Args:
+        problem: the world. Learners are given the tasks of their blocks alone.
+        config: the checked config of `trackmdp train`.
+        folder: where the whole is written, and each block's run to `blocks/NUMBER`; None to keep nothing.
+        console: where progress is shown; None for nowhere.
+
+    Attributes:
+        position: after `run`, the frames of all blocks and what they have earned there.
+    """
+
+    problem: Problem
+    evaluator: Evaluator
+
+    def __init__(
+        self, problem: World, config: TrainConfig, *, folder: Path | None = None, console: Console | None = None
+    ) -> None:
+        self.problem = self._world = problem
+        self.config, self.folder = config, folder
+        self.console = console or Console(quiet=True)
+        self.callbacks: list[Callback] = []
+        self.start, self.position = Position(), Position()
+
+    def policy(self) -> Policy:
+        """The policy put together from all blocks, once `run` has ended."""
+        return self._policy
+
+    def run(self) -> Score:
+        """Learn all blocks to the end; returns the score of their policy on the whole grid.
+
+        Raises:
+            UserError, Preempted, RunError: as `Trainer.run` of a block.
+        """
+        world, cfg, began = self._world, self.config.partition, time.monotonic()
+        halo, side = default_halo(world) if cfg.halo is None else cfg.halo, cfg.block
+        assert side is not None
+        parts = blocks(world.size, side, halo)
+        with ExitStack() as opened:
+            place = self.folder or Path(opened.enter_context(TemporaryDirectory()))
+            if self.folder is not None:
+                write_inputs(self.config, world, place, resumed=(place / "config.yaml").is_file())
+            seen = sum(len(part.seen[0]) * len(part.seen[1]) for part in parts)
+            learner = _BlockLearner(self.config, place / "blocks", len(parts), seen)
+            table = plan_by_blocks(world, learner, side, halo, workers=cfg.workers, cluster=cfg.cluster)
+            ends = [read_summary(learner.place(number)) for number in range(len(parts))]
+        self._policy, self.evaluator = Policy.from_table(table), make_evaluator(world)
+        earned = sum(end["frames"] * end["while_collecting"]["reward_per_frame"] for end in ends)
+        self.position = Position(0, sum(end["frames"] for end in ends), time.monotonic() - began, earned)
+        score = self.evaluator.score(self._policy)
+        if said := narrow_halo(world, cfg, self.evaluator.upper, score.evaluation):
+            self.console.print(f"warning: {said}")
+        return score
+
+
+@dataclass(frozen=True)
+class _BlockLearner:
+    """Learns the policy of a block; picklable, to be sent to workers.
+
+    Attributes:
+        config: of the whole run.
+        folder: where each block has a folder; on a cluster, one that all workers share.
+        count: blocks there are.
+        cells: that they see, halos included: the frames of the run are shared out by these.
+    """
+
+    config: TrainConfig
+    folder: Path
+    count: int
+    cells: int
+
+    def __call__(self, number: int, world: World) -> Policy:
+        folder, console = self.place(number), make_console(self.config.quiet)
+        folder.mkdir(parents=True, exist_ok=True)
+        config = self._config(number, world, folder)
+        before = finished(config, folder) is not None
+        if not before:
+            # One of an older config, such as a smaller budget, must not be taken for this one.
+            (folder / "summary.json").unlink(missing_ok=True)
+            with preserved_global_rng():
+                complete(Trainer(world, config, folder=folder))
+        run = load_run(folder)
+        how = "finished before" if before else f"{run.summary['wall_seconds']:.1f} s"
+        console.print(f"block {number + 1} of {self.count}: AIHTR {run.evaluation.aihtr:,.2f} in it, {how}")
+        return run.policy
+
+    def place(self, number: int) -> Path:
+        """The folder of a block."""
+        return self.folder / f"{number:05d}"
+
+    def _config(self, number: int, world: World, folder: Path) -> TrainConfig:
+        """The config of a block's own run, in which its world is described by numbers and a table."""
+        cfg = self.config
+        share = -(-cfg.collector.total_frames * world.num_cells // self.cells)
+        certain = world.perfect and world.safe
+        return replace(
+            cfg,
+            seed=derive(cfg.seed, "block", number),
+            grid=replace(cfg.grid, size=list(world.size)),
+            kernel=TableConfig(path=str(folder / "kernel.npz")),
+            cost=PaperCostConfig(reward=world.reward, sensor=short(world.cost), safe=world.safe_cost),
+            sensor=PerfectSensorConfig()
+            if certain
+            else MissConfig(p_d=short(world.detection), p_s=short(world.safe_detection)),
+            collector=replace(cfg.collector, total_frames=max(share, cfg.collector.frames_per_batch)),
+            optimal=replace(cfg.optimal, enabled=False),
+            partition=PartitionConfig(block=None, halo=None, workers=1, cluster=None),
+            resume="auto",
+            quiet=True,
+        )
