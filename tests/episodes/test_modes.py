@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import pytest
 from tests.typed import refused
 from trackmdp.app.cli import main
 from trackmdp.episodes.episode import Episode, first_difference
+from trackmdp.episodes.frame import mode_words
 from trackmdp.episodes.grids import grid_messages
 from trackmdp.episodes.messages import decode, row_of, step_messages
 from trackmdp.episodes.reader import EpisodeReader
@@ -60,6 +62,46 @@ def test_the_belief_is_that_of_cell_and_mode(more: dict[str, Any]) -> None:
     for episode in simulate(world, policy, 5, seed=2).complete():
         assert episode.belief is not None
         assert episode.belief == pytest.approx(np.array(bayes(world, episode)), abs=1e-6)
+
+
+def test_a_mode_is_told_by_its_mean_step() -> None:
+    """Mode 0 goes one cell to the right, from two of three cells; 1 stays; 2 goes up a row in half its steps."""
+    moves = np.zeros((2, 3, 3, 2, 3, 3))  # row, column, mode before and after
+    for column in range(3):
+        for row, before in np.ndindex(2, 3):
+            moves[row, column, before, row, min(column + 1, 2), 0] = 0.3
+            moves[row, column, before, row, column, 1] = 0.3
+            moves[row, column, before, 0, column, 2] = 0.3
+    world = HiddenWorld(moves.reshape(18, 18), (2, 3), modes=3, cost=0.1, t_max=1)
+    assert world.drift == pytest.approx(np.array([[0, 2 / 3], [0, 0], [-1 / 2, 0]]))
+    assert [mode_words(world, mode) for mode in range(3)] == [
+        "mode 0 → 0.7 cells a step",
+        "mode 1",
+        "mode 2 ↑ 0.5 cells a step",
+    ]
+    assert [mode_words(headings(), mode)[7] for mode in range(8)] == list("→↗↑↖←↙↓↘")
+
+
+def test_replay_and_page_show_the_mode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    logged(tmp_path, "baseline=all_on").close()
+    log = f"file={tmp_path}/episodes.mcap"
+    assert main(["replay", log, "episode=0", f"html={tmp_path}/a.html"]) == 0
+    capsys.readouterr()
+    assert main(["replay", log, "episode=0"]) == 0
+    said = [line for line in capsys.readouterr().out.splitlines() if line.startswith("step ")]
+    with EpisodeReader(tmp_path / "episodes.mcap") as reader:
+        episode, world = reader.read(0), reader.world()
+    assert isinstance(world, HiddenWorld)
+    assert episode.mode is not None
+    assert [mode_words(world, mode) in line for line, mode in zip(said, episode.mode[:-1], strict=False)] == [True] * (
+        len(episode) - 1
+    )
+    assert "mode" not in said[-1]  # it has left
+    found = re.search(r'<script id="data" type="application/json">(.*?)</script>', (tmp_path / "a.html").read_text())
+    assert found
+    data = json.loads(found[1])
+    assert data["mode"] == episode.mode.tolist()
+    assert data["drift"] == pytest.approx(world.drift, abs=5e-4)
 
 
 def logged(folder: Path, *words: str) -> EpisodeReader:

@@ -45,6 +45,7 @@ def test_a_page_holds_the_episode_to_the_digit(reader: EpisodeReader) -> None:
     assert data["reward"] == episode.reward.tolist()
     assert data["total"] == episode.returns.tolist()
     assert data["n"] == episode.misses.tolist()
+    assert "mode" not in data  # these targets have none
     assert data["bound"] == pytest.approx(bounds.clocked(WORLD)[episode.start])
     shares = dict(zip(data["belief"][0][::2], data["belief"][0][1::2], strict=True))  # type: ignore[index]
     assert shares[int(episode.belief[0].argmax())] == pytest.approx(1e4 * episode.belief[0].max(), abs=0.5)

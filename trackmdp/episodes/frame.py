@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from trackmdp.episodes.episode import Episode
 from trackmdp.world.model import Task
+from trackmdp.world.modes import HiddenWorld
 from trackmdp.world.render import around
 
 WIDE, STEP = 37, 9
@@ -13,6 +16,9 @@ WIDE, STEP = 37, 9
 once: it stays where it is while the target does not leave 9 x 9 cells."""
 FOUND, MISSED, ON = "●", "○", "▪"
 _SHADES = " ·░▒▓"
+_ARROWS = "→↗↑↖←↙↓↘"
+_STILL = 0.05
+"""Mean cells a step below which a mode has no direction."""
 LEGEND = f"{FOUND} target, located   {MISSED} target, missed   {ON} sensor on   ·░▒▓ where it was expected"
 
 
@@ -30,8 +36,17 @@ def where(cell: int, columns: int) -> str:
     return f"row {cell // columns + 1}, column {cell % columns + 1}"
 
 
+def mode_words(world: HiddenWorld, mode: int) -> str:
+    """A mode in words: its number, as in the log, and how it moves on average."""
+    down, across = world.drift[mode]
+    speed = math.hypot(down, across)
+    # Up is to smaller rows; eighths of a turn from the right, turning left.
+    eighth = round(math.atan2(-down, across) / (math.pi / 4)) % 8
+    return f"mode {mode}" + (f" {_ARROWS[eighth]} {speed:.1f} cells a step" if speed > _STILL else "")
+
+
 def sentence(episode: Episode, t: int, task: Task) -> str:
-    """A step in one line."""
+    """A step in one line; with the target's mode, where `task` is a world of targets that have one."""
     state = outcome(episode, t, task)
     words = {
         "exited": "the target has left the grid",
@@ -40,8 +55,11 @@ def sentence(episode: Episode, t: int, task: Task) -> str:
         "missed": f"target missed in {where(int(episode.target[t]), task.columns)}",
     }
     on = "" if state == "forced" else f"{int(episode.action[t].sum())} sensors on, "
+    mode = ""
+    if isinstance(task, HiddenWorld) and episode.mode is not None and episode.mode[t] >= 0:
+        mode = f" in {mode_words(task, int(episode.mode[t]))}"
     return (
-        f"step {t + 1} of {len(episode)}: {words[state]}; {on}{int(episode.misses[t])} misses before; "
+        f"step {t + 1} of {len(episode)}: {words[state]}{mode}; {on}{int(episode.misses[t])} misses before; "
         f"reward {episode.reward[t]:.2f}, total {episode.returns[t]:.2f}"
     )
 

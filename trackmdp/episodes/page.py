@@ -58,7 +58,10 @@ def _content(reader: EpisodeReader, episode: Episode) -> dict[str, Any]:
     if max(world.size) > WIDE:
         about += f"; of the grid, the {min(world.rows, WIDE)} x {min(world.columns, WIDE)} cells around the target"
     assert episode.belief is not None  # a logged episode has it
-    return {
+    modes = {}
+    if isinstance(world, HiddenWorld) and episode.mode is not None:
+        modes = {"mode": episode.mode[shown].tolist(), "drift": world.drift.round(3).tolist()}
+    return modes | {
         "rows": world.rows,
         "columns": world.columns,
         "wide": WIDE,

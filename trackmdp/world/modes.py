@@ -98,6 +98,15 @@ class HiddenWorld(Task):
         return self.num_cells * self.modes
 
     @cached_property
+    def drift(self) -> Array:
+        """`[H, 2]` mean rows and columns of a step in each mode, over all cells alike: what a mode looks like."""
+        moves = self.kernel.tocoo()
+        before, (cell, mode) = moves.row // self.modes, np.divmod(moves.col, self.modes)
+        steps = (cell // self.columns - before // self.columns, cell % self.columns - before % self.columns)
+        weight = np.maximum(np.bincount(mode, moves.data, self.modes), 1e-300)
+        return np.stack([np.bincount(mode, moves.data * step, self.modes) / weight for step in steps], axis=1)
+
+    @cached_property
     def stay_probability(self) -> Array:
         """`[M · H]` probability of still being in the grid after one step."""
         return pairwise_row_sums(self.kernel)

@@ -45,7 +45,7 @@ def run(cfg: ReplayConfig, folder: Path) -> None:  # noqa: ARG001  what is writt
         if cfg.episode is None:
             _list(console, reader)
         else:
-            play(console, reader.read(cfg.episode), reader.world().task, cfg.speed)
+            play(console, reader.read(cfg.episode), reader.world(), cfg.speed)
 
 
 def _recover(console: Console, file: Path) -> Path:
