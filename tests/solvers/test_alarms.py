@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -11,9 +12,10 @@ import pytest
 
 from tests.helpers import random_kernel, small_world
 from trackmdp.app.cli import main
+from trackmdp.episodes.filtered import _posterior, simulate_filter
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers import bounds
+from trackmdp.solvers import bounds, clocked
 from trackmdp.solvers.alarms import believed
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.world.model import Array, World
@@ -75,6 +77,79 @@ def _played(world: World, table: np.ndarray, p_f: float, episodes: int, rng: np.
     return total
 
 
+def _best(world: World, p_f: float, after: Array, belief: Array, n: int) -> float:
+    """What the best tree of reports earns from an unnormalised belief, n steps after the safe action.
+
+    Every set, every outcome of its sensors, and the best that can follow it; `after` is what follows the next safe
+    action, which alone confirms.
+    """
+    moved = belief @ world.kernel.toarray()
+    if n == world.num_choices:
+        return float(moved @ (world.reward + after) - world.safe_cost * moved.sum())
+    worths = []
+    for chosen in itertools.product([False, True], repeat=world.num_cells):
+        on = np.flatnonzero(chosen)
+        worth = world.reward * (moved * world.detection)[on].sum() - world.cost[on].sum() * moved.sum()
+        for told in itertools.product([0, 1], repeat=len(on)):
+            chance = np.full((len(on), world.num_cells), p_f)
+            chance[np.arange(len(on)), on] = world.detection[on]
+            likely = np.where(np.array(told, dtype=bool)[:, None], chance, 1 - chance).prod(axis=0)
+            worth += _best(world, p_f, after, moved * likely, n + 1)
+        worths.append(worth)
+    return max(worths)
+
+
+@pytest.mark.parametrize(("seed", "t_max"), [(2, 0), (2, 1), (3, 1)])
+def test_the_bound_holds_for_the_best_trees_of_reports(seed: int, t_max: int) -> None:
+    """Two cells, whose optimum is found by value iteration; the more false alarms, the less it is worth."""
+    rng = np.random.default_rng(seed)
+    world = World(random_kernel(rng, 2, 0.4), (1, 2), cost=0.25, t_max=t_max, detection=0.9, safe_cost=0.4)
+    bound, best = bounds.valid(world), []
+    for p_f in (0.0, 0.1, 0.3):
+        value = np.zeros(2)
+        for _ in range(20):
+            value = np.array([_best(world, p_f, value, start, 0) for start in np.eye(2)])
+        assert (value <= bound + 1e-9).all()
+        best.append(value.mean())
+    assert (np.diff(best) <= 1e-9).all()
+    # With a single free choice before the safe action nothing is left to be learned from a report.
+    assert (best[0] > best[-1] + 1e-3) == (t_max > 0)
+    played = simulate_filter(world, 0.1, 2000).intervals(np.arange(2000))["aihtr"]
+    assert played.low is not None
+    assert played.low <= bound.mean()
+
+
+def test_the_filter_without_false_alarms_is_the_clocked_policy() -> None:
+    """Then a report is certain, and what is left of the belief after a miss is what the policy takes it for."""
+    world = replace(small_world(4, exit_probability=0.05), detection=np.full(16, 0.9))
+    exact, played = evaluate(world, clocked.solve(world)), simulate_filter(world, 0.0, 4000)
+    error = played.totals[:, 0].std() / 4000**0.5
+    assert abs(played.totals[:, 0].mean() - exact.aihtr) <= 3 * error
+    found = played.intervals(np.arange(4000))
+    assert found["accuracy"].mean == pytest.approx(exact.accuracy, abs=0.006)
+    assert found["sensors_per_step"].mean == pytest.approx(exact.sensors_per_step, abs=0.1)
+    assert played.watched.sum() == played.totals[:, 3].sum()
+    again = simulate_filter(world, 0.0, 4000)
+    assert (again.totals == played.totals).all()
+
+
+def test_a_report_is_weighed_against_the_others_silence() -> None:
+    """Sensors 0 and 1 are on, 1 reports: at 0 missed and falsely reported, .2 · .1; at 1 .9 · .8; at 2 .9 · .1."""
+    world = World(np.eye(3) * 0.5, (1, 3), cost=0.1, t_max=0, detection=0.8)
+    on, told = np.array([[True, True, False]]), np.array([[False, True, False]])
+    found = _posterior(world, np.array([[0.25, 0.15, 0.1]]), on, told, 0.1)
+    likely = np.array([0.25 * 0.2 * 0.1, 0.15 * 0.9 * 0.8, 0.1 * 0.9 * 0.1])
+    assert found[0] == pytest.approx(likely / likely.sum())
+
+
+def test_only_what_is_certain_is_declared() -> None:
+    """The target stays, two cells; p_f = .5 and p_d = .6 never tell with 90 %: r comes from the safe action alone."""
+    world = World(np.diag([0.7, 0.7]), (1, 2), cost=0.01, t_max=1, detection=0.6, safe_cost=0.1)
+    sure, bold = (simulate_filter(world, 0.5, 500, certainty=certainty) for certainty in (1.1, 0.5))
+    assert (sure.totals[:, 2] == sure.totals[:, 4]).all()
+    assert bold.totals[:, 2].sum() > sure.totals[:, 2].sum()
+
+
 def test_a_large_system_is_iterated_to_the_same_value(monkeypatch: pytest.MonkeyPatch) -> None:
     world = small_world(4)
     policy = PolicyTable.from_dense(world, np.random.default_rng(0).random((16, 2, 16)) < 0.3)
@@ -100,10 +175,14 @@ def test_what_has_no_exact_value_is_refused() -> None:
 
 
 def test_the_command_values_a_baseline_and_a_trained_policy(tmp_path: Path) -> None:
-    words = ["sensor=false_alarm", "sensor.p_f=.02", "quiet=true"]
+    words = ["sensor=false_alarm", "sensor.p_f=.02", "quiet=true", "episodes=50"]
     assert main(["evaluate", "baseline=clocked", "grid.size=4", *words, f"hydra.run.dir={tmp_path / 'a'}"]) == 0
     told = json.loads((tmp_path / "a" / "evaluation.json").read_text())
     assert told["exact"]["aihtr"] < told["without_false_alarms"]["aihtr"] <= told["bounds"]["valid"] + 1e-9
+    filtered = told["filter"]
+    assert filtered["aihtr"]["low"] < told["bounds"]["valid"]
+    ratio = filtered["aihtr"]["mean"] / filtered["reward_per_step"]["mean"]
+    assert ratio == pytest.approx(told["exact"]["expected_length"])
     learn = [
         "algo=hindsight",
         "algo.updates=2",
@@ -114,8 +193,9 @@ def test_the_command_values_a_baseline_and_a_trained_policy(tmp_path: Path) -> N
         "algo.envs=32",
     ]
     assert main(["train", *learn, "quiet=true", f"hydra.run.dir={tmp_path / 'b'}"]) == 0
-    assert main(["evaluate", f"run={tmp_path / 'b'}", *words, f"hydra.run.dir={tmp_path / 'c'}"]) == 0
-    assert json.loads((tmp_path / "c" / "evaluation.json").read_text())["p_f"] == 0.02
+    assert main(["evaluate", f"run={tmp_path / 'b'}", *words, "episodes=0", f"hydra.run.dir={tmp_path / 'c'}"]) == 0
+    told = json.loads((tmp_path / "c" / "evaluation.json").read_text())
+    assert (told["p_f"], told["filter"]) == (0.02, None)
 
 
 @pytest.mark.parametrize(

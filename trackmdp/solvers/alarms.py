@@ -39,7 +39,9 @@ def believed(world: Problem, policy: PolicyTable, false_alarm: float) -> Evaluat
         UserError: there is no motion model, p_f is no probability below 1, the grid has more than 144 cells, episodes
             are truncated, the safe action may miss, or the policy draws its sets.
     """
-    world = _checked(world, policy, false_alarm)
+    world = check_alarms(world, false_alarm)
+    if not policy.deterministic:
+        raise UserError(f"false_alarm={false_alarm}: expected a policy that does not draw its sets")
     m = world.num_cells
     believes = np.repeat(np.arange(m), m)
     # [M², M]: row b M + z is the pair at the last report, column y where the target is, nothing reported since.
@@ -67,7 +69,12 @@ def believed(world: Problem, policy: PolicyTable, false_alarm: float) -> Evaluat
     return pooled(start[:, :5], start[:, 5], error)
 
 
-def _checked(world: Problem, policy: PolicyTable, false_alarm: float) -> World:
+def check_alarms(world: Problem, false_alarm: float) -> World:
+    """Return `world` if policies can be valued in it with false alarms.
+
+    Raises:
+        UserError: see `believed`.
+    """
     if not isinstance(world, World):
         raise UserError(f"false_alarm={false_alarm}: needs a motion model; recorded tracks have none")
     if not 0.0 <= false_alarm < 1.0:
@@ -78,8 +85,6 @@ def _checked(world: Problem, policy: PolicyTable, false_alarm: float) -> World:
         raise UserError(f"false_alarm={false_alarm}: expected whole episodes, and a safe action that always locates")
     if world.coverage is not None:
         raise UserError(f"false_alarm={false_alarm}: expected sensors that each cover one cell")
-    if not policy.deterministic:
-        raise UserError(f"false_alarm={false_alarm}: expected a policy that does not draw its sets")
     return world
 
 

@@ -49,7 +49,7 @@ def run(cfg: EvaluateConfig, folder: Path, problem: Problem | None = None) -> fl
         return playback.run(cfg, folder, console, problem)
     world, policy, subject = _trained(cfg, device) if cfg.run else _baseline(cfg, problem)
     if isinstance(cfg.sensor, FalseAlarmConfig):
-        return alarms.run(world, cfg.sensor, policy, subject, folder, console)
+        return alarms.run(cfg, world, policy, subject, folder, console)
     # Recorded tracks have no kernel, hence no exact value and no bound: figures come from the held-out tracks.
     if isinstance(world, Recorded):
         return held_out.run(world, policy, subject, folder, console, cfg.seed)
