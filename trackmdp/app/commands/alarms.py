@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from trackmdp.app.commands.held_out import shown
+from trackmdp.app.commands.held_out import with_interval
 from trackmdp.config import EvaluateConfig, FalseAlarmConfig
 from trackmdp.durable import write_json
 from trackmdp.episodes.filtered import simulate_filter
@@ -64,7 +64,9 @@ def run(cfg: EvaluateConfig, problem: Problem, policy: Policy, subject: str, fol
     told, plain = figures(alarmed), figures(silent)
     rows = []
     for key, label in names.items():
-        rows.append([label, f"{told[key]:,.4f}", f"{plain[key]:,.4f}", shown(filtered[key], 4) if wanted else ""])
+        rows.append(
+            [label, f"{told[key]:,.4f}", f"{plain[key]:,.4f}", with_interval(filtered[key], 4) if wanted else ""]
+        )
     heads = ["figure", f"p_f = {sensor.p_f:g}, exact", "p_f = 0", f"Bayes filter, {wanted} episodes, 95 %"]
     console.print(table(f"{subject}, each report taken for the truth", heads, rows))
     console.print(

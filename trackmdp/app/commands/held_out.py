@@ -61,10 +61,10 @@ def show_held_out(console: Console, subject: str, report: dict[str, Any]) -> Non
     rows = [
         [
             subject if name == "policy" else name,
-            shown(figures["aihtr"], 2),
-            shown(figures["reward_per_step"], 4),
-            shown(figures["accuracy"], 2, 100.0, " %"),
-            shown(figures["sensors_per_step"], 2),
+            with_interval(figures["aihtr"], 2),
+            with_interval(figures["reward_per_step"], 4),
+            with_interval(figures["accuracy"], 2, 100.0, " %"),
+            with_interval(figures["sensors_per_step"], 2),
         ]
         for name, figures in report["figures"].items()
     ]
@@ -72,7 +72,7 @@ def show_held_out(console: Console, subject: str, report: dict[str, Any]) -> Non
     console.print(table(title, ["policy", "AIHTR", "reward per step", "accuracy", "sensors per step"], rows))
 
 
-def shown(interval: dict[str, float | None], digits: int, scale: float = 1.0, unit: str = "") -> str:
+def with_interval(interval: dict[str, float | None], digits: int, scale: float = 1.0, unit: str = "") -> str:
     """A mean with its interval in brackets."""
     known = [interval[key] for key in ("mean", "low", "high")]
     mean, low, high = ("–" if value is None else f"{scale * value:,.{digits}f}" for value in known)
