@@ -168,10 +168,14 @@ def test_every_panel_is_one_of_foxgloves(size: tuple[int, int]) -> None:
     """No unknown setting, every value of its type; every field that colours a map is in the messages."""
     made = layout(size)
     for name, config in made["configById"].items():
-        config.pop("foxglovePanelTitle", None)
+        titles = {config.pop(f"{viewer}PanelTitle", None) for viewer in ("foxglove", "lichtblick")}
+        assert (None in titles) != ("topics" in config) and len(titles) == 1
         check(config, PANELS[name.split("!")[0]], name)
         for layer in config.get("topics", {}).values():
             check(layer, fl.BaseRendererGridTopicSettings, name)
+    # Lichtblick stays blank without a speed, and draws no line at any other time
+    assert made["playbackConfig"] == {"speed": 0.2}
+    assert set(re.findall(r'"timestampMethod": "(\w+)"', json.dumps(made))) == {"receiveTime"}
     shown = re.findall(r'"([^"]+![^"]+)"', json.dumps(made["layout"]))
     assert sorted(shown) == sorted(made["configById"])
 

@@ -12,21 +12,20 @@ from trackmdp.durable import write_text
 def layout(size: tuple[int, int]) -> dict[str, Any]:
     """The layout as plain values, its cameras over a grid of `size` (rows, columns)."""
     panels: dict[str, Any] = {
-        "3D!belief": _map("belief", size) | {"foxglovePanelTitle": "belief, sensors on (light), target (dot)"},
-        "3D!policy": _map("policy", size) | {"foxglovePanelTitle": "probability of being sensed, target (dot)"},
+        "3D!belief": _map("belief", size) | _title("belief, sensors on (light), target (dot)"),
+        "3D!policy": _map("policy", size) | _title("probability of being sensed, target (dot)"),
         "Plot!misses": _plot("/step.n", "/step.n_active"),
         "Plot!reward": _plot("/step.reward", "/step.ep_return"),
-        "StateTransitions!seen": {
-            "isSynced": True,
-            "paths": [{"value": "/step.obs", "timestampMethod": "publishTime"}],
-        },
+        "StateTransitions!seen": {"isSynced": True, "paths": [_path("/step.obs")]},
         "RawMessages!episode": {"topicPath": "/episode"},
     }
     # The cells sensed are what the map of the policy shows.
     panels["3D!policy"]["topics"]["/active"]["visible"] = False
     plots = _split("column", "Plot!misses", _split("column", "Plot!reward", "StateTransitions!seen"))
     arrangement = _split("column", _split("row", *list(panels)[:2]), _split("row", plots, "RawMessages!episode"))
-    return {"configById": panels, "globalVariables": {}, "userNodes": {}, "layout": arrangement}
+    # Lichtblick shows nothing of a layout without a speed; a step takes 0.1 s of the log, here half a second.
+    playback = {"playbackConfig": {"speed": 0.2}}
+    return {"configById": panels, "globalVariables": {}, "userNodes": {}, "layout": arrangement, **playback}
 
 
 def _map(field: str, size: tuple[int, int]) -> dict[str, Any]:
@@ -50,9 +49,22 @@ def _map(field: str, size: tuple[int, int]) -> dict[str, Any]:
     return {"followTf": "grid", "topics": topics, "cameraState": camera}
 
 
+def _title(text: str) -> dict[str, str]:
+    return {f"{viewer}PanelTitle": text for viewer in ("foxglove", "lichtblick")}
+
+
 def _plot(*paths: str) -> dict[str, Any]:
-    lines = [{"value": path, "enabled": True, "timestampMethod": "publishTime"} for path in paths]
-    return {"paths": lines, "xAxisVal": "timestamp", "isSynced": True, "showLegend": True}
+    return {
+        "paths": [_path(path) | {"enabled": True} for path in paths],
+        "xAxisVal": "timestamp",
+        "isSynced": True,
+        "showLegend": True,
+    }
+
+
+def _path(path: str) -> dict[str, Any]:
+    # Of the times that Foxglove knows, Lichtblick draws lines for this one only.
+    return {"value": path, "timestampMethod": "receiveTime"}
 
 
 def _split(direction: str, first: Any, second: Any) -> dict[str, Any]:
