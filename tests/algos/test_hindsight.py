@@ -50,7 +50,8 @@ def test_learns_once_the_frames_are_in() -> None:
     ("words", "t_max", "expected"),
     [
         ((), 2, 100),
-        ((), 3, 800),  # 400 rows
+        ((), 3, 100),
+        ((), 4, 800),  # 500 rows
         (("algo.exchange=false",), 2, 500),
         (("algo.collect=mixed",), 2, 500),
         (("algo.updates=7",), 2, 7),

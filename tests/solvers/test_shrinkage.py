@@ -64,6 +64,16 @@ def test_what_is_new_by_hand() -> None:
     np.testing.assert_allclose(new, [stands_for.sum() / (1 + stands_for.sum()), 1.0])
 
 
+def test_a_cell_that_was_always_left_alike_may_be_left_otherwise() -> None:
+    """Ten times each; what is new after ten moves is the mean of both cells, and of a third, left 20 times, less."""
+    probability, moves = np.array([0.1, 0.1, 0.8, 1.0, 1.0]), np.array([10.0, 10, 10, 10, 20])
+    new, _ = unseen(np.array([0, 0, 0, 1, 2]), probability, moves, 3)
+    stood_for = np.array([0.1, 0.1, 0.8]) / (1 - np.array([0.9, 0.9, 0.2]) ** 10)
+    ten, twenty = (stood_for @ np.array([0.9, 0.9, 0.2]) ** number / 3 for number in (10, 20))
+    np.testing.assert_allclose(new, [ten / (1 + ten), ten / (1 + ten), twenty / (1 + twenty)], rtol=1e-6)
+    assert new[1] > 2 * new[2] > 0.02
+
+
 @settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.integers(0, 30))
 def test_rows_are_probabilities_and_no_seen_move_is_lost(seed: int, most: int) -> None:

@@ -42,21 +42,23 @@ _MOST_CELLS_OF_NETS = 4_096
 """Above, embeddings of each (cell, clock) take time and memory that tables do not. At N = 32 tables end .007 per step
 below the optimum where nets end .002 below, and both .002 after the exchange."""
 _LOSSES = ("clocked_actor", "clocked_critic", "actor", "critic")
-_BEFORE_EXCHANGE = 100
-"""Updates of a small problem whose sets are exchanged in the end. On 10 x 10 cells (seed 100, not one of any table) the
-exchanged policies after 1, 20, 60, 100 and 500 of them were the same, or of the same regret to .0001; after one update
-alone exchange took longer than the updates that it replaced. Larger problems were not tried."""
+_BEFORE_EXCHANGE, _MOST_ROWS = 100, 400
+"""Updates of a problem of so many rows whose sets are exchanged in the end. On 10 x 10 cells (seed 100, not one of any
+table) the exchanged policies after 1, 20, 60, 100 and 500 of them were the same, or of the same regret to .0001; after
+one update alone exchange took longer than the updates that it replaced. At t_max 3 so were those after 100 and 800, in
+4 CPU seconds in place of 15 to 20. Larger problems were not tried."""
 
 
 def budget(task: Task, cfg: PerSensorConfig) -> tuple[int, int]:
     """Updates and hidden units: as configured, else by the number of rows (x, n) that the actor has to get right."""
-    few = task.num_cells * task.num_choices <= 300
+    rows = task.num_cells * task.num_choices
+    few = rows <= 300
     alone = round(cfg.effort * (500 if few else 800))
     # A mixture acts on the nets from early on; misses and windows were not tried either. What has so few rows is never
     # too large to be exchanged.
     exchanged = cfg.exchange and task.markov and task.perfect and task.window is None and cfg.collect == "all_on"
     hidden = 128 if few else 256 if task.num_cells <= _MOST_CELLS_OF_NETS else 0
-    updates = cfg.updates or (_BEFORE_EXCHANGE if few and exchanged else alone)
+    updates = cfg.updates or (_BEFORE_EXCHANGE if exchanged and rows <= _MOST_ROWS else alone)
     return updates, hidden if cfg.hidden is None else cfg.hidden
 
 

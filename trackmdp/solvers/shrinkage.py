@@ -6,12 +6,15 @@ distributions for all moves of the grid, whose weights make all counts together 
 Robbins 1956, Efron 2010), even ones where there are few. The posterior mean of p shrinks towards what moves of that
 size mostly are: where all have .15 or .21, towards these two; where they differ in every way, hardly at all.
 
-A move of probability p was seen with probability s = 1 - (1 - p)^n. So each move seen stands for (1 - s) / s moves that
-were not, of p each (Horvitz & Thompson 1952): their sum is the probability of a move that is new, from this cell. It is
-divided among the cells not yet reached as the displacements of the moves that account for it, in the whole grid.
+A move of probability p was seen with probability s = 1 - (1 - p)^n. So each move seen stands for 1 / s moves of the
+grid, seen or not, of p each (Horvitz & Thompson 1952), of which n moves out of a cell leave the share (1 - p)^n unseen:
+what is left of all, over the cells, is the probability of a move that is new after n. The cell's own moves alone would
+say that one left nine times, always alike, is never left otherwise. What is new is divided among the cells not yet
+reached as the displacements of the moves that account for it, in the whole grid.
 
-With k = 1 twice and k = 8 of n = 10 from one cell, and those shares taken as the truth, the two stand for .1 · .349 /
-.651 = .054 each: a new move is made with probability .107 / 1.107 = .097.
+With k = 1 twice and k = 8 of n = 10 from the only cell, and those shares taken as the truth, the two stand for .1 /
+.651 = .154 each, of which .054 is not seen: a new move is made with probability .107 / 1.107 = .097. With a second cell
+that was left ten times, always alike, it is .054 / 1.054 = .051 for both.
 """
 
 from __future__ import annotations
@@ -102,12 +105,20 @@ def unseen(rows: IndexArray, probability: Array, moves: Array, cells: int) -> tu
         `[M]` the probability that the next move from a cell is one not seen from there, 1 where none was; `[E]` the
         probability of unseen moves that each one seen stands for.
     """
-    seen = -np.expm1(moves * np.log1p(-np.minimum(probability, 1.0 - 1e-12)))
-    stands_for = probability * (1.0 - seen) / seen
-    missing = per_row(rows, stands_for, cells)
+    not_made = np.log1p(-np.minimum(probability, 1.0 - 1e-12))
+    mass = probability / -np.expm1(moves * not_made)
+    # Moves whose p differ by less than 3 % are taken together: some hundred, instead of up to M Z.
+    place = np.unique(np.round(32.0 * np.log(probability)), return_inverse=True)[1]
+    together = np.bincount(place, mass)
+    exponent = np.bincount(place, mass * not_made) / together
+    out = np.zeros(cells)
+    out[rows] = moves
+    number, back = np.unique(out[out > 0], return_inverse=True)
+    missing = np.exp(number[:, None] * exponent) @ together / max(1, len(back))
     # What was seen has the odds 1 to `missing` of what was not.
-    left = np.bincount(rows, minlength=cells) > 0
-    return np.where(left, missing / (1.0 + missing), 1.0), stands_for
+    new = np.ones(cells)
+    new[out > 0] = (missing / (1.0 + missing))[back]
+    return new, mass * np.exp(moves * not_made)
 
 
 def least_worth_planning(task: Task) -> float:
