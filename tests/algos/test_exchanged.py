@@ -32,7 +32,7 @@ def spreading_world(size: int = 5, t_max: int = 1) -> World:
 def test_the_counted_world_is_the_share_of_each_move() -> None:
     """On 3 x 3 cells, 1,000 times: from 0 twice to 1, once to 3 and once out; cell 8 was never left."""
     start, end = (torch.tensor(cells * 1000) for cells in ([0, 0, 0, 0, 1, 3], [1, 1, 3, 9, 0, 9]))
-    kernel = counted_world(small_world(3).task, start, end, share_cells=False).kernel.toarray()
+    kernel = counted_world(small_world(3).task, start, end).kernel.toarray()
     everywhere = 2000.5 / 6001
     leave = (1000 + everywhere) / 4001  # the exit probability of all cells counts as one move
     np.testing.assert_allclose(kernel[0], [0, (1 - leave) * 2 / 3, 0, (1 - leave) / 3, 0, 0, 0, 0, 0], atol=1e-3)
@@ -47,7 +47,7 @@ def test_the_nets_are_what_they_are_without_it() -> None:
     assert_same(on.state_dict(), off.state_dict())
     learned = Policy(world, off._learner.sets(world))
     assert np.array_equal(policy(off, world).dense(), learned.dense())
-    counts = counted_world(world.task, *on._buffer.moves(), share_cells=False)
+    counts = counted_world(world.task, *on._buffer.moves())
     values = [evaluate(counts, policy(each, world)).value for each in (off, on)]
     assert (values[1] >= values[0] - 1e-9).all()
     assert values[1].mean() > values[0].mean() + 1.0
@@ -73,7 +73,7 @@ def test_a_mixture_collects_with_the_exchanged_policy() -> None:
     for batch in batches(world)[:8]:
         learner.step(batch)
     learned = Policy(world, learner._learner.sets(world))
-    expected = exchanged_sets(world.task, *learner._buffer.moves(), learned.sets, share_cells=False, anew=False)
+    expected = exchanged_sets(world.task, *learner._buffer.moves(), learned.sets, anew=False)
     assert np.array_equal(policy(learner, world).dense(), Policy(world, expected).dense())
     assert (expected != learned.sets).nnz > 0
     assert learner.policy.bits.sum() == torch.as_tensor(np.packbits(Policy(world, expected).dense(), axis=-1)).sum()
@@ -120,7 +120,7 @@ def test_plans_too_large_to_be_exchanged_are_left_as_learned(monkeypatch: pytest
     sets = Policy.from_dense(world, np.zeros((25, 2, 25), dtype=bool)).sets
     for limit, left in ((750, False), (749, True)):
         monkeypatch.setattr(exchanged, "MOST_MOVES", limit)
-        found = exchanged_sets(world.task, *moves, sets, share_cells=False)
+        found = exchanged_sets(world.task, *moves, sets)
         assert (found is sets) == left
 
 
@@ -129,7 +129,7 @@ def test_reports_that_are_missed_more_often_count_for_more() -> None:
     world = small_world(3)
     task = World.of(world, world.kernel, detection=np.where(np.arange(9) == 1, 0.5, 1.0)).task
     start, end = torch.tensor([0] * 6), torch.tensor([1] * 2 + [3] * 4)
-    kernel = counted_world(task, start, end, share_cells=False).kernel.toarray()
+    kernel = counted_world(task, start, end).kernel.toarray()
     assert kernel[0, 1] == pytest.approx(kernel[0, 3])
     assert kernel[0, 1] > 0.4
 

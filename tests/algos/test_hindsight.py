@@ -93,7 +93,8 @@ def test_where_the_target_moves_alike_few_frames_are_enough() -> None:
     words = ("algo.updates=150", "algo.updates_per_iteration=150", "algo.batch_size=4096", "algo.hidden=32")
     words += ("algo.exchange=false",)  # it finds the optimum with either
     learners = [
-        learn(alone, data, "algo.total_frames=12032", f"algo.share_cells={shared}", *words) for shared in (False, True)
+        learn(alone, data, "algo.total_frames=12032", f"algo.share_cells={shared}", *words)
+        for shared in ("none", "all")
     ]
     regrets = [regret_per_step(upper, evaluate(alone, policy(learner, alone))) for learner in learners]
     assert regrets[1] < 0.5 * regrets[0]

@@ -158,7 +158,15 @@ def test_what_to_sense_is_shared_only_where_it_can_be() -> None:
 
     def shares(world: World) -> bool:
         rng = torch.Generator().manual_seed(0)
-        loss = HindsightLoss(world.task, Decision(), reach=1, hidden=4, discount=0.8, generator=rng, share_cells=True)
+        loss = HindsightLoss(
+            world.task,
+            Decision(),
+            reach=1,
+            hidden=4,
+            discount=0.8,
+            generator=rng,
+            classes=np.zeros(world.num_cells, dtype=int),
+        )
         assert loss.critic.groups is loss.clocked_critic.groups is None
         return loss.actor.groups is not None and loss.clocked_actor.groups is not None
 

@@ -42,7 +42,7 @@ def gradients(
         hidden=2,
         discount=0.7,
         generator=rng,
-        share_cells=share_cells,
+        classes=np.zeros(m, dtype=int) if share_cells else None,
         max_entries=max_entries,
     )
     optimizer = torch.optim.SGD(loss.parameters(), lr=0.1)

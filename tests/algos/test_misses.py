@@ -106,5 +106,5 @@ def test_what_counts_paths_is_refused() -> None:
         algorithm("ppo_per_sensor", replace(small_world(), detection=0.5), "algo.surrogate=sampled")
     with pytest.raises(UserError, match=r"algo\.surrogate=sampled: expected all_action"):
         algorithm("ppo_per_sensor", replace(small_world(), coverage=np.ones((9, 9))), "algo.surrogate=sampled")
-    with pytest.raises(UserError, match=r"algo\.share_cells=true: sensors of different p_d"):
-        algorithm("hindsight", replace(small_world(), detection=np.linspace(0.5, 1, 9)), "algo.share_cells=true")
+    with pytest.raises(UserError, match=r"algo\.share_cells=all: sensors of different p_d"):
+        algorithm("hindsight", replace(small_world(), detection=np.linspace(0.5, 1, 9)), "algo.share_cells=all")

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+import torch
 from scipy import sparse
 
-from trackmdp.solvers.alike import AlikeCells
+from trackmdp.app.cli import main
+from trackmdp.errors import UserError
+from trackmdp.solvers.alike import AlikeCells, cell_classes
 from trackmdp.solvers.kernel_estimate import KernelEstimate
 from trackmdp.world.make import make_world
 from trackmdp.world.model import Array
+from trackmdp.world.windows import Window
 
 
 def counts_of(kernel: Array, moves: int, seed: int = 0) -> sparse.csr_array:
@@ -68,3 +74,58 @@ def test_a_drawn_kernel_has_a_way_out_though_no_exit_was_seen() -> None:
     estimate.add_moves(moves, np.roll(np.arange(9), 1)[moves])
     for seed in range(5):
         assert estimate.sample(np.random.default_rng(seed)).toarray()[:, 9].min() >= 1e-9
+
+
+def test_what_share_cells_says(tmp_path: Path) -> None:
+    assert cell_classes(None, (2, 3)) is None
+    assert cell_classes("none", (2, 3)) is None
+    assert (cell_classes("all", (2, 3)) == np.zeros(6)).all()
+    file, table = str(tmp_path / "map.npy"), np.array([[5, 5, 1], [5, 1, 1]])
+    for given in (table, table.ravel(), table.astype(np.uint8)):
+        np.save(file, given)
+        assert (cell_classes(file, (2, 3)) == table.ravel()).all()
+    for given, shape in ((table.T, "3 x 2"), (table.ravel()[:5], "5"), (table + 0.5, "2 x 3")):
+        np.save(file, given)
+        with pytest.raises(UserError, match=rf"expected 6 or 2 x 3 whole numbers, .*, got float64 {shape}$"):
+            cell_classes(file, (2, 3))
+
+
+def test_cells_of_different_classes_share_nothing() -> None:
+    """The upper half goes right, the lower half left: pooled by class the estimate is the motion, pooled at all not."""
+    right, left = np.diag(np.full(99, 0.9), 1), np.diag(np.full(99, 0.9), -1)
+    kernel = np.vstack([right[:50], left[50:]])
+    kernel[9::10, :] = kernel[::10, :] = 0  # who comes to the left or right border exits
+    classes = np.repeat([7, 3], 50)
+    errors = []
+    for given in (classes, None):
+        estimate = KernelEstimate(10, weight=0.1, exit_weight=1.0, share_cells=True, classes=given)
+        estimate.direct = estimate.counts = counts_of(kernel, 30)
+        errors.append(np.abs(estimate.mean()[:, :-1].toarray() - kernel)[33].max())
+    assert errors[0] < 0.03
+    assert errors[1] > 0.3
+
+
+def test_decisions_are_shared_where_all_classes_around_are_the_same() -> None:
+    """On a line of 9 cells, classes 0 0 0 0 0 1 1 1 1 and a window of 1: 1, 2, 3 are alike, and so are 6 and 7."""
+    groups = Window((1, 9), 1).groups(torch.tensor([0, 0, 0, 0, 0, 1, 1, 1, 1])).tolist()
+    assert [groups.count(groups[cell]) for cell in range(9)] == [1, 3, 3, 3, 1, 1, 2, 2, 1]
+    assert groups[1] == groups[2] == groups[3] != groups[6] == groups[7]
+    window = Window((5, 6), 1)
+    assert (window.groups(torch.full((30,), 4)) == window.groups()).all()
+
+
+@pytest.mark.parametrize("algo", ["hindsight", "learned_kernel"])
+def test_other_words_and_wrong_maps_are_refused(algo: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    np.save(tmp_path / "map.npy", np.zeros((3, 4)))
+    words = ["train", f"algo={algo}", "grid.size=4", f"hydra.run.dir={tmp_path / 'run'}"]
+    for given, said in (
+        ("true", "expected all (formerly true), none (formerly false), or a path to a .npy"),
+        ("false", "expected all (formerly true), none (formerly false)"),
+        (tmp_path / "map.npy", "expected 16 or 4 x 4 whole numbers, the class of each cell, got float64 3 x 4"),
+        (tmp_path / "none.npy", "no such file"),
+    ):
+        assert main([*words, f"algo.share_cells={given}"]) == 2
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1
+        assert said in error
+    assert not (tmp_path / "run").exists()

@@ -101,6 +101,19 @@ def test_a_cut_run_ends_as_if_it_had_not_been(uncut: tm.Run, tmp_path: Path, mon
     assert len(policies(tmp_path)) == 5
 
 
+def test_blocks_have_their_part_of_a_map(tmp_path: Path) -> None:
+    classes = np.arange(64).reshape(8, 8) // 16
+    np.save(tmp_path / "map.npy", classes)
+    given = {"algo.share_cells": tmp_path / "map.npy", "collector.total_frames": 600}
+    learned(tmp_path / "run", **given)
+    kept = [np.load(tmp_path / "run" / "blocks" / f"{number:05d}" / "classes.npy") for number in range(4)]
+    assert (kept[1] == classes[:6, 4:].ravel()).all()
+    assert (kept[2] == classes[4:, :6].ravel()).all()
+    np.save(tmp_path / "map.npy", classes + 1)
+    with pytest.raises(UserError, match=r"classes.npy: not the classes that algo.share_cells has now"):
+        learned(tmp_path / "run", resume="auto", **given)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("cluster", [None, "local"])
 def test_the_result_does_not_depend_on_the_workers(uncut: tm.Run, tmp_path: Path, cluster: str | None) -> None:

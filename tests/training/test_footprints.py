@@ -49,8 +49,8 @@ def test_hindsight_asks_for_sensors_everywhere_and_does_not_share_them() -> None
     holes = World.of(_world(), _world().kernel, coverage=discs((3, 3), np.array([(0, 0)]), 1), cost=0.1)
     with pytest.raises(UserError, match="no sensor covers cell 2"):
         tm.train(holes, **SHORT)
-    with pytest.raises(UserError, match=r"algo\.share_cells=true: sensors with footprints"):
-        tm.train(World.of(_world(), _world().kernel, cost=0.1), share_cells=True, **SHORT)
+    with pytest.raises(UserError, match=r"algo\.share_cells=all: sensors with footprints"):
+        tm.train(World.of(_world(), _world().kernel, cost=0.1), share_cells="all", **SHORT)
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import exchange
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.kernel_estimate import KernelEstimate
+from trackmdp.solvers.renewal import IndexArray
 from trackmdp.solvers.shrinkage import least_worth_planning, without
 from trackmdp.world.model import Task, World
 
@@ -25,18 +26,20 @@ MOST_MOVES = 20_000_000
 """Moves of all plans together (some 40 bytes each) up to which sets are exchanged."""
 
 
-def counted_world(task: Task, start: Tensor, end: Tensor, *, share_cells: bool) -> World:
+def counted_world(task: Task, start: Tensor, end: Tensor, *, classes: IndexArray | None = None) -> World:
     """The task with the motion that was counted.
 
     Args:
         task: grid, rewards and costs.
         start: `[K]`, the cell before each sensed move.
         end: `[K]`, the cell after it, M for outside.
-        share_cells: the target moves alike from all cells away from the border; False: judge by the counts whether it
-            does, cells at the same distance from the borders together.
+        classes: `[M]`, cells of one class, away from the border, are those from which the target moves alike; None:
+            judge by the counts which are, cells at the same distance from the borders together.
     """
     # `believed` has a prior of its own in place of `weight`.
-    estimate = KernelEstimate(task.size, weight=1.0, exit_weight=EXIT_WEIGHT, share_cells=share_cells or None)
+    estimate = KernelEstimate(
+        task.size, weight=1.0, exit_weight=EXIT_WEIGHT, share_cells=classes is not None or None, classes=classes
+    )
     estimate.add_moves(start.cpu().numpy(), end.cpu().numpy())
     if not task.perfect:
         # Of the moves to a cell the share p_d is known (`report_weights`): each counts for 1 / p_d.
@@ -48,7 +51,13 @@ def counted_world(task: Task, start: Tensor, end: Tensor, *, share_cells: bool) 
 
 
 def exchanged_sets(
-    task: Task, start: Tensor, end: Tensor, sets: sparse.csr_array, *, share_cells: bool, anew: bool = True
+    task: Task,
+    start: Tensor,
+    end: Tensor,
+    sets: sparse.csr_array,
+    *,
+    classes: IndexArray | None = None,
+    anew: bool = True,
 ) -> sparse.csr_array:
     """`[M (t_max + 1), S]`, what exchange on the counts makes of learned `sets`.
 
@@ -57,10 +66,10 @@ def exchanged_sets(
         start: `[K]`, the cell before each sensed move.
         end: `[K]`, the cell after it, M for outside.
         sets: `[M (t_max + 1), S]`.
-        share_cells: see `counted_world`.
+        classes: see `counted_world`.
         anew: whether to start from `search` as well: from one start alone, regrets of .003 were left.
     """
-    world = counted_world(task, start, end, share_cells=share_cells)
+    world = counted_world(task, start, end, classes=classes)
     if _moves_of_plans(world) > MOST_MOVES:
         return sets
     found = [exchange.improve(world, PolicyTable(task, sets)), *([exchange.solve(world)] if anew else [])]

@@ -32,7 +32,9 @@ from trackmdp.policies.explore import Exploring
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import generator
+from trackmdp.solvers.alike import cell_classes
 from trackmdp.solvers.path_exchange import choose_plan
+from trackmdp.solvers.renewal import IndexArray
 from trackmdp.world.model import Task
 from trackmdp.world.windows import Window
 
@@ -91,13 +93,7 @@ class Hindsight:
         self._outside = window.cells == task.num_cells if window.is_local else None
         self._learner: _Learner | None = None
         self._seen: int | None = None
-        # Cells that share weights share decisions, which with different prices are not the same.
-        if cfg.share_cells and (task.cost != task.cost[0]).any():
-            raise UserError("algo.share_cells=true: sensors of different prices, expected one price for all")
-        if cfg.share_cells and (task.detection != task.detection[0]).any():
-            raise UserError("algo.share_cells=true: sensors of different p_d, expected one for all")
-        if cfg.share_cells and task.coverage is not None:
-            raise UserError("algo.share_cells=true: sensors with footprints, expected one in each cell")
+        self._classes = _classes(task, cfg)
         if task.coverage is not None and not task.coverage.degree.all():  # the path of a target there is not known
             cell = int(task.coverage.degree.argmin())
             raise UserError(f"sensor: no sensor covers cell {cell}, expected all covered; learned_kernel needs no such")
@@ -175,7 +171,7 @@ class Hindsight:
         if not cfg.exchange or not (last or acts):
             return sets
         if isinstance(self._buffer, MoveBuffer):
-            return exchanged_sets(task, *self._buffer.moves(), sets, share_cells=cfg.share_cells, anew=last)
+            return exchanged_sets(task, *self._buffer.moves(), sets, classes=self._classes, anew=last)
         if self._buffer.judge is None:
             return sets
         paths, judge = self._buffer.tracks(), self._buffer.judge
@@ -191,7 +187,7 @@ class Hindsight:
             hidden=self.hidden,
             discount=self.cfg.gamma,
             generator=self._generator,
-            share_cells=self.cfg.share_cells,
+            classes=self._classes,
             max_entries=self.cfg.max_entries,
         )
         return _Learner(loss, self.cfg.ema_decay)
@@ -218,6 +214,22 @@ def _buffer(task: Task, capacity: int, rng: torch.Generator, judge: int | None) 
     if task.markov:
         return MoveBuffer(task.num_cells, capacity, rng, weights)
     return SegmentBuffer(task.num_cells, task.t_max + 2, capacity, rng, weights, judge)
+
+
+def _classes(task: Task, cfg: PerSensorConfig) -> IndexArray | None:
+    """`[M]`, the class of each cell, or None; cells that share weights share decisions, so their sensors are alike."""
+    classes = cell_classes(cfg.share_cells, task.size)
+    if classes is None:
+        return None
+    alike = (
+        ((task.cost == task.cost[0]).all(), "sensors of different prices, expected one price for all"),
+        ((task.detection == task.detection[0]).all(), "sensors of different p_d, expected one for all"),
+        (task.coverage is None, "sensors with footprints, expected one in each cell"),
+    )
+    for fine, said in alike:
+        if not fine:
+            raise UserError(f"algo.share_cells={cfg.share_cells}: {said}")
+    return classes
 
 
 def _distance(start: Tensor, end: Tensor, task: Task) -> Tensor:

@@ -14,6 +14,7 @@ from trackmdp.algos.gains import chain_returns, clocked_advantage, sensing_gain
 from trackmdp.algos.in_view import SensorsInView
 from trackmdp.algos.tables import gather, scatter_add
 from trackmdp.policies.chain_table import CellClockNet
+from trackmdp.solvers.renewal import IndexArray
 from trackmdp.world.model import Task
 from trackmdp.world.windows import Window
 
@@ -65,7 +66,8 @@ class HindsightLoss(nn.Module):
         hidden: hidden units of each net.
         discount: γ of the credit.
         generator: draws the initial weights.
-        share_cells: the target moves alike from all cells away from the border.
+        classes: `[M]`, cells of one class, away from the border, are those from which the target moves alike; None: no
+            two cells share what is learned.
         max_entries: entries (x, n, sensor) of a table at most, where that leaves one cell; what has more is gone
             through in parts, a few cells at a time. The losses are the same, up to rounding.
     """
@@ -83,7 +85,7 @@ class HindsightLoss(nn.Module):
         hidden: int,
         discount: float,
         generator: torch.Generator,
-        share_cells: bool = False,
+        classes: IndexArray | None = None,
         max_entries: int = 2**62,
     ) -> None:
         super().__init__()
@@ -94,9 +96,14 @@ class HindsightLoss(nn.Module):
         # One move takes the target to a cell that is near; t_max + 1 of them, to one in view.
         self.near, self.view = Window.reaching(task, reach, device), _in_view(task, choices * reach, device)
         self.nearby, self.sensors = SensorsInView(task, self.near), SensorsInView(task, self.view)
-        # The border looks alike from two cells where it is equally far, or out of reach until the safe action.
+        # The border looks alike from two cells where it is equally far, or out of reach until the safe action; and so
+        # must all classes of cells do that the target may come to before it.
         # What to sense is then learned once for both; values stay each cell's own.
-        groups = Window(task, choices * reach, device).groups() if share_cells else None
+        groups = (
+            Window(task, choices * reach, device).groups(torch.as_tensor(classes, device=device))
+            if classes is not None
+            else None
+        )
 
         def net(clocks: int, outputs: int, bias: float, groups: Tensor | None = None) -> CellClockNet:
             return CellClockNet(

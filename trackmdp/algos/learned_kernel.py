@@ -22,6 +22,7 @@ from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
 from trackmdp.solvers import exchange
+from trackmdp.solvers.alike import cell_classes
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.kernel_estimate import KernelEstimate, ObservedPaths
 from trackmdp.solvers.renewal import DIRECT_CELLS
@@ -55,7 +56,8 @@ class LearnedKernel:
             weight=cfg.prior,
             exit_weight=cfg.exit_prior,
             detection=detection,
-            share_cells=cfg.share_cells,
+            share_cells=None if cfg.share_cells is None else cfg.share_cells != "none",
+            classes=cell_classes(cfg.share_cells, task.size),
         )
         self._least = least_worth_planning(task) if cfg.negligible is None else cfg.negligible
         self._rng = np.random.default_rng(derive(seed, "learned_kernel"))

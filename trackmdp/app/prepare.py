@@ -175,6 +175,10 @@ def _reads_files(cfg: WorldConfig) -> bool:
 
 
 def _check_files(cfg: CommandConfig, words: Sequence[str]) -> None:
+    if isinstance(cfg, TrainConfig) and getattr(cfg.algo, "share_cells", None) not in (None, "all", "none"):
+        from trackmdp.solvers.alike import cell_classes  # imports scipy, as a world does
+
+        cell_classes(cfg.algo.share_cells, cfg.grid.sides)  # type: ignore[attr-defined]
     if isinstance(cfg, EvaluateConfig) and cfg.run is not None:
         for word in words:
             # `kernel@kernel=drift` and `kernel.radius=2` both are about the kernel.

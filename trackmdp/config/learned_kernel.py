@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from trackmdp.config.learning import AlgoConfig
+from trackmdp.config.learning import AlgoConfig, check_classes
 from trackmdp.config.options import choice, option
 
 
@@ -37,12 +37,20 @@ class LearnedKernelConfig(AlgoConfig):
         ge=0,
         lt=1,
     )
-    share_cells: bool | None = option(
-        "count moves of all cells as far from each border together; null: where the moves seen do not tell them apart"
+    share_cells: str | None = option(
+        "count moves of all cells, or of those of one class, together that are as far from each border; null: of all "
+        "cells where the moves seen do not tell them apart",
+        expects="all, none, or a path to a .npy, .npz or .csv file of the class of each cell",
+        path=True,
+        words=("all", "none"),
     )
     rounds: int = option("EM rounds after each batch", ge=1, le=10**6)
     rounds_at_end: int = option("EM rounds after the last batch", ge=1, le=10**6)
     samples: int = option("kernels drawn for the uncertainty reported", ge=2, le=10**4)
+
+    def check(self, key: str, root: Any) -> None:
+        """The file of the classes is a table."""
+        check_classes(f"{key}.share_cells", self.share_cells)
 
     def ignored(self, root: Any) -> dict[str, str]:
         """With all sensors on throughout, nothing comes before chosen sets."""

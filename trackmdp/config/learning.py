@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar
 
 from trackmdp.config.options import choice, option, refuse
@@ -237,6 +238,13 @@ class RayWorkersConfig(WorkersConfig):
     address: str | None = option("cluster to join; null = start one on this machine", expects="auto, or host:port")
     cpus_per_worker: float = option("cores of each worker", unit="cores", gt=0)
     gpus_per_worker: float = option("GPUs of each worker", unit="GPUs", ge=0)
+
+
+def check_classes(key: str, given: str | None) -> None:
+    """Refuse what is neither a word of `share_cells` nor the name of a table, such as the former true and false."""
+    if given not in ("all", "none", None) and Path(given).suffix not in (".npy", ".npz", ".csv"):
+        expected = "all (formerly true), none (formerly false), or a path to a .npy, .npz or .csv file"
+        raise refuse(key, given, expected)
 
 
 def state_bytes(task: Sizes) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from trackmdp.config.learning import AlgoConfig, ScheduleConfig, networks
+from trackmdp.config.learning import AlgoConfig, ScheduleConfig, check_classes, networks
 from trackmdp.config.options import SELECTORS, Selector, choice, option, refuse
 from trackmdp.config.schema import BYTES, Sizes
 
@@ -52,9 +52,12 @@ class PerSensorConfig(AlgoConfig):
         le=4096,
     )
     buffer_size: int = option("path segments kept for replay", unit="segments", ge=1)
-    share_cells: bool = option(
-        "assume that the target moves alike from all cells away from the border, and learn one policy for them all; "
-        "with one price for all sensors"
+    share_cells: str = option(
+        "assume that the target moves alike from all cells, or from those of one class, and learn one policy for those "
+        "whose surroundings are alike; with one price for all sensors",
+        expects="all, none, or a path to a .npy, .npz or .csv file of the class of each cell",
+        path=True,
+        words=("all", "none"),
     )
     exchange: bool = option(
         "at the end, change learned sets jointly where the sensed moves, counted, say that it pays (with collect=mixed "
@@ -69,6 +72,7 @@ class PerSensorConfig(AlgoConfig):
 
     def check(self, key: str, root: Any) -> None:
         """`explore` is a probability; where whole paths are learned from, episodes have room for one."""
+        check_classes(f"{key}.share_cells", self.share_cells)
         for end in ("start", "end"):
             if (probability := getattr(self.explore, end)) > 1:
                 raise refuse(f"{key}.explore.{end}", probability, "a number from 0 to 1, a probability")

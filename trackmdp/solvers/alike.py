@@ -5,35 +5,64 @@ from __future__ import annotations
 import numpy as np
 from scipy import sparse
 
-from trackmdp.solvers.renewal import per_row, row_index
+from trackmdp.errors import UserError
+from trackmdp.solvers.renewal import IndexArray, per_row, row_index
+from trackmdp.world.files import read_numbers
 from trackmdp.world.model import BoolArray
 
-__all__ = ["AlikeCells"]
+__all__ = ["AlikeCells", "cell_classes"]
 
 DEVIATIONS = 4.0
 """Standard deviations by which a test of homogeneity has to be exceeded for a group of cells to be split up."""
 
 
+def cell_classes(share: str | None, size: tuple[int, int]) -> IndexArray | None:
+    """`[M]`, the class of each cell, as `algo.share_cells` says; None where no two cells are said to be alike.
+
+    Raises:
+        UserError: its file does not hold one whole number for each cell of a grid of `size`.
+    """
+    if share is None or share == "none":
+        return None
+    if share == "all":
+        return np.zeros(size[0] * size[1], dtype=np.int64)
+    given = read_numbers("algo.share_cells", share, name="classes")
+    if given.shape not in ((size[0] * size[1],), size) or (given != np.round(given)).any():
+        expected = f"{size[0] * size[1]} or {size[0]} x {size[1]} whole numbers, the class of each cell"
+        shape = " x ".join(map(str, given.shape))
+        raise UserError(f"algo.share_cells={share}: expected {expected}, got {given.dtype} {shape}")
+    return given.ravel().astype(np.int64)
+
+
 class AlikeCells:
-    """Groups of cells that are equally far from each border, or farther than the target moves.
+    """Groups of cells of one class that are equally far from each border, or farther than the target moves.
 
     Args:
         size: (rows, columns) of the grid.
         reach: rows or columns that the target moves in one step, at most.
         counts: `[M, M + 1]`, moves seen out of each cell: groups whose cells they tell apart are split up.
+        classes: `[M]`, the class of each cell; None: they are all of one.
 
     Attributes:
         groups: `[M]`, the group of each cell.
         first: `[G]`, the first cell of each group.
     """
 
-    def __init__(self, size: tuple[int, int], reach: int, counts: sparse.csr_array | None = None) -> None:
+    def __init__(
+        self,
+        size: tuple[int, int],
+        reach: int,
+        counts: sparse.csr_array | None = None,
+        classes: IndexArray | None = None,
+    ) -> None:
         self.rows, self.columns = size
         row, column = np.divmod(np.arange(self.rows * self.columns), self.columns)
         # Distances to the four borders, up to the reach. On 5 x 5 cells with reach 1, the 9 inner cells are of one
         # group, the 3 cells between two corners of another one for each border, and each corner is alone.
         margins = np.stack([row, self.rows - 1 - row, column, self.columns - 1 - column], axis=1)
-        _, first, groups = np.unique(np.minimum(margins, reach), axis=0, return_index=True, return_inverse=True)
+        margins = np.minimum(margins, reach)
+        told = margins if classes is None else np.column_stack([margins, classes])
+        _, first, groups = np.unique(told, axis=0, return_index=True, return_inverse=True)
         self.first, self.groups = first, groups.ravel()
         if counts is not None:
             apart = self._told_apart(counts)[self.groups]

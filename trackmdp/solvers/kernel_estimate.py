@@ -72,6 +72,7 @@ class KernelEstimate:
         detection: `[M]`, p_d of each cell's sensor; None where no sensor misses.
         share_cells: whether the target moves alike from all cells away from the border, so that what is seen in one of
             them counts for all; None for where the moves seen do not say otherwise.
+        classes: `[M]`, the class of each cell, those of one class being alike; None: all are of one.
 
     Attributes:
         direct: `[M, M + 1]`, moves seen at once.
@@ -86,10 +87,11 @@ class KernelEstimate:
         exit_weight: float,
         detection: Array | None = None,
         share_cells: bool | None = False,
+        classes: IndexArray | None = None,
     ) -> None:
         self._detection = detection
         self.rows, self.columns = grid_size(size)
-        self.weight, self.exit_weight, self.share_cells = weight, exit_weight, share_cells
+        self.weight, self.exit_weight, self.share_cells, self._classes = weight, exit_weight, share_cells, classes
         self.num_cells = self.rows * self.columns
         self.direct = sparse.csr_array((self.num_cells, self.num_cells + 1))
         self.counts = self.direct
@@ -197,7 +199,7 @@ class KernelEstimate:
 
     def _alike(self) -> AlikeCells:
         judged = self.counts if self.share_cells is None else None
-        return AlikeCells((self.rows, self.columns), self._farthest(self.counts[:, :-1]), judged)
+        return AlikeCells((self.rows, self.columns), self._farthest(self.counts[:, :-1]), judged, self._classes)
 
     @property
     def visits(self) -> Array:

@@ -17,18 +17,21 @@ from tempfile import TemporaryDirectory
 from rich.console import Console
 
 from trackmdp.config import TrainConfig
+from trackmdp.config.learning import AlgoConfig
 from trackmdp.config.partition import PartitionConfig
 from trackmdp.config.resume import finished
 from trackmdp.config.world import MissConfig, PaperCostConfig, PerfectSensorConfig, TableConfig
+from trackmdp.durable import write_bytes
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.seeding import derive, preserved_global_rng
-from trackmdp.solvers.partition import blocks, default_halo, narrow_halo, plan_by_blocks
+from trackmdp.solvers.alike import cell_classes
+from trackmdp.solvers.partition import Block, blocks, default_halo, narrow_halo, plan_by_blocks
 from trackmdp.training.callbacks import Callback, Learning
 from trackmdp.training.display import make_console
 from trackmdp.training.evaluator import Evaluator, Score
 from trackmdp.training.held_out import make_evaluator
-from trackmdp.training.inputs import short, write_inputs
+from trackmdp.training.inputs import CLASSES, npy_bytes, short, write_inputs
 from trackmdp.training.run import complete, load_run
 from trackmdp.training.sealing import read_summary
 from trackmdp.training.state import Position
@@ -103,8 +106,7 @@ class BlockTrainer:
             place = self.folder or Path(opened.enter_context(TemporaryDirectory()))
             if self.folder is not None:
                 write_inputs(self.config, world, place, resumed=(place / "config.yaml").is_file())
-            seen = sum(len(part.seen[0]) * len(part.seen[1]) for part in parts)
-            learner = _BlockLearner(self.config, place / "blocks", len(parts), seen)
+            learner = _BlockLearner(self.config, place / "blocks", parts)
             table = plan_by_blocks(world, learner, side, halo, workers=cfg.workers, cluster=cfg.cluster)
             ends = [read_summary(learner.place(number)) for number in range(len(parts))]
         self._policy, self.evaluator = Policy.from_table(table), make_evaluator(world)
@@ -123,14 +125,12 @@ class _BlockLearner:
     Attributes:
         config: of the whole run.
         folder: where each block has a folder; on a cluster, one that all workers share.
-        count: blocks there are.
-        cells: that they see, halos included: the frames of the run are shared out by these.
+        parts: all blocks.
     """
 
     config: TrainConfig
     folder: Path
-    count: int
-    cells: int
+    parts: list[Block]
 
     def __call__(self, number: int, world: World) -> Policy:
         folder, console = self.place(number), make_console(self.config.quiet)
@@ -144,7 +144,7 @@ class _BlockLearner:
                 complete(Trainer(world, config, folder=folder))
         run = load_run(folder)
         how = "finished before" if before else f"{run.summary['wall_seconds']:.1f} s"
-        console.print(f"block {number + 1} of {self.count}: AIHTR {run.evaluation.aihtr:,.2f} in it, {how}")
+        console.print(f"block {number + 1} of {len(self.parts)}: AIHTR {run.evaluation.aihtr:,.2f} in it, {how}")
         return run.policy
 
     def place(self, number: int) -> Path:
@@ -153,8 +153,9 @@ class _BlockLearner:
 
     def _config(self, number: int, world: World, folder: Path) -> TrainConfig:
         """The config of a block's own run, in which its world is described by numbers and a table."""
-        cfg = self.config
-        share = -(-cfg.collector.total_frames * world.num_cells // self.cells)
+        cfg, seen = self.config, sum(len(part.seen[0]) * len(part.seen[1]) for part in self.parts)
+        # The frames of the run are shared out by the cells that blocks see, halos included.
+        share = -(-cfg.collector.total_frames * world.num_cells // seen)
         certain = world.perfect and world.safe
         return replace(
             cfg,
@@ -165,9 +166,22 @@ class _BlockLearner:
             sensor=PerfectSensorConfig()
             if certain
             else MissConfig(p_d=short(world.detection), p_s=short(world.safe_detection)),
+            algo=self._algo(number, folder),
             collector=replace(cfg.collector, total_frames=max(share, cfg.collector.frames_per_batch)),
             optimal=replace(cfg.optimal, enabled=False),
             partition=PartitionConfig(block=None, halo=None, workers=1, cluster=None),
             resume="auto",
             quiet=True,
         )
+
+    def _algo(self, number: int, folder: Path) -> AlgoConfig:
+        """The algorithm, with the block's part of the classes of cells where a file holds those of the whole grid."""
+        algo, size = self.config.algo, self.config.grid.sides
+        named = getattr(algo, "share_cells", None)
+        if named in (None, "all", "none"):
+            return algo
+        classes, (rows, columns) = cell_classes(named, size), self.parts[number].seen
+        assert classes is not None
+        part = classes.reshape(size)[rows.start : rows.stop, columns.start : columns.stop]
+        write_bytes(folder / CLASSES, npy_bytes(part.ravel()))
+        return replace(algo, share_cells=str(folder / CLASSES))  # type: ignore[call-arg]

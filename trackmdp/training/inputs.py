@@ -14,6 +14,7 @@ from trackmdp.config import TrainConfig
 from trackmdp.config.resume import config_text
 from trackmdp.durable import write_bytes, write_text
 from trackmdp.errors import UserError
+from trackmdp.solvers.alike import cell_classes
 from trackmdp.untrusted import parse_json, read_bytes
 from trackmdp.world.model import Array
 from trackmdp.world.recording import recording_bytes
@@ -23,6 +24,8 @@ RECORDING = "recording.npz"
 """The tracks of a run that was begun in Python, which may have been read from any file, or from none."""
 FOOTPRINTS = "footprints.npz"
 """The cells that each sensor covers, where that is not its own cell alone."""
+CLASSES = "classes.npy"
+"""The class of each cell, where a file says which cells are alike (`algo.share_cells`)."""
 
 
 def short(values: Array) -> float | list[float]:
@@ -31,15 +34,21 @@ def short(values: Array) -> float | list[float]:
 
 
 def write_inputs(config: TrainConfig, problem: Problem, folder: Path, *, resumed: bool) -> None:
-    """Write the kernel, or which tracks these are, and the config; tracks that are in no file, too.
+    """Write the kernel, or which tracks these are, the classes of cells and the config; tracks in no file, too.
 
     Raises:
-        UserError: the run that is resumed was begun with another kernel, or with other tracks.
+        UserError: the run that is resumed was begun with another kernel, other tracks or other classes.
     """
     file, content = folder / _name(problem), _content(problem)
     # Before anything is written: a run that is refused must keep the inputs that its results belong to.
     if resumed:
         check_inputs(problem, folder)
+    classes = cell_classes(getattr(config.algo, "share_cells", None), problem.size)
+    if classes is not None and classes.any():
+        file_of_classes = folder / CLASSES
+        if resumed and read_bytes(file_of_classes, most=LARGE) != npy_bytes(classes):
+            raise UserError(f"{file_of_classes}: not the classes that algo.share_cells has now; they cannot change")
+        write_bytes(file_of_classes, npy_bytes(classes))
     # The config last: with it the folder is that of a run, and all that it names must be there. What was checked stays:
     # only the process that read the positions can say what it left out of them.
     if not resumed:
@@ -50,6 +59,13 @@ def write_inputs(config: TrainConfig, problem: Problem, folder: Path, *, resumed
     if isinstance(problem, Recorded) and getattr(config.kernel, "path", None) == str(own) and not resumed:
         write_bytes(own, recording_bytes(problem))
     write_text(folder / "config.yaml", config_text(config))
+
+
+def npy_bytes(array: np.ndarray) -> bytes:
+    """A .npy file."""
+    buffer = io.BytesIO()
+    np.save(buffer, array)
+    return buffer.getvalue()
 
 
 def check_inputs(problem: Problem, folder: Path) -> None:

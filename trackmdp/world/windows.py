@@ -178,8 +178,14 @@ class Window(nn.Module):
         start = torch.arange(m, device=on.device)
         return self.to_global(start[:, None].expand(m, choices), on)
 
-    def groups(self) -> Tensor:
-        """`[M]` int64 group of each cell: equal where the distances to the four borders agree up to the radius."""
+    def groups(self, classes: Tensor | None = None) -> Tensor:
+        """`[M]` int64 group of each cell: equal where the distances to the four borders agree up to the radius.
+
+        With int64 `classes` `[M]` of the cells, also where each cell of the window is of the same class.
+        """
+        if classes is not None and (classes != classes[0]).any():
+            known = torch.cat([torch.unique(classes, return_inverse=True)[1], classes.new_tensor([-1])])
+            return torch.unique(known[self.cells], dim=0, return_inverse=True)[1]
         row, column = self._row[:-1], self._column[:-1]
         # Distances to the four borders, up to the radius: all cells farther inside are of one group.
         margins = torch.stack([row, self.rows - 1 - row, column, self.columns - 1 - column], dim=1)
