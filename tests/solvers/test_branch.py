@@ -21,15 +21,19 @@ from trackmdp.solvers.solution import SearchProgress
 from trackmdp.world.model import World
 
 
+def _to_the_end(tree: Tree) -> None:
+    tree.run(lambda _: True)
+
+
 def _tree() -> tuple[Tree, np.ndarray, np.ndarray]:
     """The renewals of the policy that the homotopy finds at Z = 5, c = 0.22, t_max = 2: some can be improved."""
     world = paper_world(5, 0.22, 2)
     value = evaluate(world, search.solve(world)).value
     problem = InnerProblem.of(world, reachable_layers(world, 3), value)
-    known = tables(world, problem.detected, problem.missed, 2, slack=1e-9, go_on=lambda _: True)
+    known = tables(world, problem.detected, problem.missed, 2, slack=1e-9, run=_to_the_end)
     tree = Tree(world, problem.detected, known, value, 1e-9)
     closed = Tree(world, problem.detected, known, value, 1e-9)
-    closed.run(lambda _: True)
+    _to_the_end(closed)
     return tree, value, closed.best
 
 
@@ -114,7 +118,7 @@ def test_what_is_paid_on_the_way_covers_what_any_plan_gains() -> None:
         world = random_tiny_world(rng)
         value = evaluate(world, PolicyTable.none(world)).value
         problem = InnerProblem.of(world, reachable_layers(world, world.num_choices), value)
-        known = tables(world, problem.detected, problem.missed, world.t_max, slack=1e-9, go_on=lambda _: True)
+        known = tables(world, problem.detected, problem.missed, world.t_max, slack=1e-9, run=_to_the_end)
         tree = Tree(world, problem.detected, known, value, 1e-9)
         tree.run(lambda tree, most=nodes: tree.nodes < most)
         paid = payment(tree, value)

@@ -143,7 +143,7 @@ def _tower_lemma(world: World, solution: Solution) -> Iterator[Check]:
     # `[E_n]`: joint probability of being there after n misses; it begins with 1 in each located cell.
     later, mass, first = problem.undetected(sets), np.ones(world.num_cells), -np.inf
     second, closed = -np.inf, True
-    known = tables(world, problem.detected, problem.missed, world.t_max, slack=SLACK, go_on=_go_on, layers=layers)
+    known = tables(world, problem.detected, problem.missed, world.t_max, slack=SLACK, run=_run, layers=layers)
     for n, layer in enumerate(layers[1:]):
         mass = (mass @ layer.moves) * (1.0 - sets[n] * world.detects(layer.cells))
         missed = mass > 0
@@ -179,7 +179,7 @@ def _one_cell_less(
     going_on = per_row(row, mass[entry] * later[entry], len(others))
     # `tree.best` is at least where it begins: begun at `going_on` itself, a loss would never show.
     tree = Tree(problem.world, problem.detected, known, going_on - SEARCHED, SLACK, left, windowed=False)
-    tree.run(_go_on)
+    _run(tree)
     return float((going_on - tree.best).max()), tree.closed
 
 
@@ -313,5 +313,5 @@ def _order(world: World, solution: Solution) -> Iterator[Check]:
     yield _row("order", statement, (solution.value - printed).max(), expected=False, note=note)
 
 
-def _go_on(tree: Tree) -> bool:
-    return tree.nodes < MOST_NODES
+def _run(tree: Tree) -> None:
+    tree.run(lambda tree: tree.nodes < MOST_NODES)

@@ -72,7 +72,7 @@ def known_positions(world: World, value: Array) -> list[Array]:
     # r + V(j) for a detection; after the last free choice, R_0(x) = sum_j P_xj (r - D + V(j)).
     detected = world.reward + value
     forced = forced_worth(world, detected)
-    known = tables(world, detected, forced, world.t_max, slack=1e-9, go_on=_go_on)
+    known = tables(world, detected, forced, world.t_max, slack=1e-9, run=_run)
     # `tables` counts sets left (R_0 first), here misses: after n + 1 misses there are t_max - n sets left.
     return known[::-1]
 
@@ -154,5 +154,5 @@ def _visits(world: World, policy: PolicyTable) -> Array:
     return accumulate(sparse.csr_array(located.T), start, world.size)[: world.num_cells]
 
 
-def _go_on(tree: Tree) -> bool:
-    return tree.nodes < MOST_NODES
+def _run(tree: Tree) -> None:
+    tree.run(lambda tree: tree.nodes < MOST_NODES)

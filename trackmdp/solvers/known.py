@@ -43,10 +43,11 @@ def tables(
     length: int,
     *,
     slack: float,
-    go_on: Callable[[Tree], bool],
+    run: Callable[[Tree], None],
     layers: list[Layer] | None = None,
+    known: list[Array] | None = None,
 ) -> list[Array]:
-    """R_0 ... R_length, each `[M]`; upper bounds where `go_on` ends a search early.
+    """R_0 ... R_length, each `[M]`; upper bounds where `run` ends a search early.
 
     Args:
         world: the problem.
@@ -54,14 +55,15 @@ def tables(
         missed: `[M]`, R_0.
         length: sets of the last table.
         slack: worth that may be missed.
-        go_on: asked now and then whether to look further.
+        run: runs the tree of one table, to its end or not.
         layers: possible positions, where they are known already.
+        known: R_0, R_1, ..., as far as they are known already.
     """
     # R_h needs h layers only, the first ones of those that are there
     layers = reachable_layers(world, length) if layers is None else layers
-    known = [missed]
-    for sets in range(1, length + 1):
+    known = [missed] if known is None else known[: length + 1]
+    for sets in range(len(known), length + 1):
         tree = next_table(InnerProblem(world, layers[: sets + 1], detected, missed), known, slack)
-        tree.run(go_on)
+        run(tree)
         known.append(tree.upper())
     return known

@@ -67,7 +67,7 @@ def _first_set(problem: InnerProblem, layers: list[Layer], mass: Array) -> BoolA
     here = sparse.csr_array((mass, (origin.rows, origin.cells)), shape=(world.num_cells, world.num_cells))
     here.eliminate_zeros()
     tree = Tree(world, problem.detected, known, problem.worth(sets, mass), SLACK, here)
-    tree.run(_go_on)
+    _run(tree)
     better, left = tree.improvements()
     if not better.any():
         return sets[0]
@@ -82,10 +82,10 @@ def _known(problem: InnerProblem, layers: list[Layer]) -> list[Array]:
         problem.missed,
         problem.length - 1,
         slack=SLACK,
-        go_on=_go_on,
+        run=_run,
         layers=layers,
     )
 
 
-def _go_on(tree: Tree) -> bool:
-    return tree.nodes < MOST_NODES
+def _run(tree: Tree) -> None:
+    tree.run(lambda tree: tree.nodes < MOST_NODES)

@@ -26,7 +26,7 @@ from trackmdp.solvers.delayed import Delayed
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.exchange import exchanged
-from trackmdp.solvers.known import next_table
+from trackmdp.solvers.known import tables
 from trackmdp.solvers.layers import Layer, layer_sets, policy_table, reachable_layers
 from trackmdp.solvers.regions import adopted, improved, proved, region_side
 from trackmdp.solvers.renewal import RenewalSystem, expected_steps, row_index
@@ -310,11 +310,14 @@ class _Run:
         # `longest` expected steps has at most as many renewals.
         slack = 0.5 * self.gap_allowed / self.ground.longest
         problem = InnerProblem.of(self.world, self.ground.layers, self.value)
-        # R_1, R_2, ...: what 1, 2, ... more sets are worth from a known position, each from those before
-        delayed = Delayed.of(self.world, problem.detected, problem.missed, self.world.num_choices)
-        revealed = [problem.missed] if delayed is None else delayed.revealed[:-1]
-        for length in range(len(revealed), self.world.num_choices):
-            revealed.append(self.revealed(problem, revealed, length, patience, slack))
+        given = self.world, problem.detected, problem.missed
+        delayed = Delayed.of(*given, problem.length)
+
+        def run(tree: Tree) -> None:
+            self.budget.run(tree, lambda tree: tree.nodes < patience)
+
+        revealed = None if delayed is None else delayed.revealed
+        revealed = tables(*given, self.world.t_max, slack=slack, run=run, layers=self.ground.layers, known=revealed)
         tree = Tree(self.world, problem.detected, revealed, self.value, slack, delayed=delayed)
         try:
             self.explore(tree, patience)
@@ -374,13 +377,6 @@ class _Run:
         # The clocked bound and all that earlier rounds proved hold as well: the least of them is kept, cell by cell.
         met = self.ground.paths.upper(paid, self.ground.longest)
         self.bound = np.minimum(self.bound, self.value + met)
-
-    def revealed(self, problem: InnerProblem, known: list[Array], length: int, patience: int, slack: float) -> Array:
-        """`[M]` upper bound of what `length` more sets can earn with the target known to be in each cell."""
-        inner = InnerProblem(self.world, self.ground.layers[: length + 1], problem.detected, problem.missed)
-        tree = next_table(inner, known, slack)
-        self.budget.run(tree, lambda tree: tree.nodes < patience)
-        return tree.upper()
 
     def solution(self, interrupted: bool) -> Solution:
         bound, certified = np.maximum(self.bound, self.value), self.certified

@@ -23,7 +23,7 @@ from trackmdp.solvers.branch import Tree
 from trackmdp.solvers.delayed import Delayed
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.exchange import exchange, revealed
-from trackmdp.solvers.known import next_table
+from trackmdp.solvers.known import tables
 from trackmdp.solvers.layers import Layer, reachable_layers, sensed_csr
 from trackmdp.solvers.partition import Block, blocks, cells_of, reach, sub_world
 from trackmdp.solvers.prediction import followed
@@ -213,14 +213,10 @@ def _closed(region: _Region, slack: float, run: Callable[[Tree], None]) -> tuple
     open_ = np.flatnonzero(region.own & (most > slack))
     if not len(open_):
         return region.sets, most
-    delayed = Delayed.of(problem.world, problem.detected, problem.missed, problem.length)
-    # R_1, R_2, ...: what 1, 2, ... more sets are worth from a known position, each from those before
-    known = [problem.missed] if delayed is None else delayed.revealed[:-1]
-    for length in range(len(known), problem.length):
-        inner = InnerProblem(problem.world, region.layers[: length + 1], problem.detected, problem.missed)
-        table = next_table(inner, known, slack)
-        run(table)
-        known.append(table.upper())
+    given = problem.world, problem.detected, problem.missed
+    delayed = Delayed.of(*given, problem.length)
+    known = None if delayed is None else delayed.revealed
+    known = tables(*given, problem.length - 1, slack=slack, run=run, layers=region.layers, known=known)
     # One problem per cell, so that the window of problem x is that around cell x; those that are closed have no mass,
     # and nothing is better than what they have.
     start = np.zeros(len(located))

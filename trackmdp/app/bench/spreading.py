@@ -19,10 +19,12 @@ Maker: TypeAlias = Callable[[], World]
 
 ALGOS = ("hindsight", "learned_kernel")
 PROVED = (
-    # What is certified at T_max 2, and by how much it is not at T_max 5 on grids of 10, 20 and 30.
+    # What is certified at T_max 2, at T_max 3 and, on grids of 10, 20 and 30, at T_max 5; then what stays open.
     *((name, 10, 2) for name in ("drift .7 c .16", "drift .7 c .22", "drift .7 c .3")),
     *((name, 10, 2) for name in ("walk c .1", "walk c .2", "walk c .3", "walk c .4", "support c .4", "far jumps")),
+    ("walk c .3", 10, 3),
     *(("support c .22", size, 5) for size in (10, 20, 30)),
+    *(("diagonal c .3", 10, 2), ("20 successors c .08", 10, 2), ("drift .7 c .3", 10, 3)),
 )
 
 
