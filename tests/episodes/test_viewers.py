@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from base64 import b64encode
 from dataclasses import fields, is_dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -125,13 +126,16 @@ def test_the_messages_of_a_large_grid_are_as_large_as_what_is_known() -> None:
         assert max(len(text) for text in layers.values()) < 1000
 
 
-@pytest.mark.parametrize("place", [{"x": -1}, {"x": 3}, {"y": -1}, {"y": 2}, {"x": 0.5}, {"x": None}])
+@pytest.mark.parametrize("place", [{"x": -1}, {"x": 4}, {"y": -1}, {"y": 2}, {"x": 0.5}, {"x": None}])
 def test_a_grid_that_lies_outside_is_damage(place: dict[str, Any]) -> None:
     [episode] = recorded(1, acting=policy(WALK), world=WALK)
     every = [json.loads(layers["/grid"]) for layers in grids.grid_messages(episode, WALK.size, 0)]
     every[0]["pose"]["position"] |= place
-    with pytest.raises((ValueError, TypeError)):
-        grids.read_grids([json.dumps(each).encode() for each in every], WALK.size)
+    # a single column fits into an empty slice as well
+    every[1] |= {"column_count": 1, "data": b64encode(bytes(24)).decode(), "pose": every[0]["pose"]}
+    for wrong in every[:2]:
+        with pytest.raises((ValueError, TypeError)):
+            grids.read_grids([json.dumps(wrong).encode()], WALK.size)
 
 
 @pytest.mark.parametrize("topic", SCHEMAS)
