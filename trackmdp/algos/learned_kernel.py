@@ -15,7 +15,7 @@ import torch
 from scipy import sparse
 from tensordict import TensorDictBase
 
-from trackmdp.config.learned_kernel import LearnedKernelConfig
+from trackmdp.config.counting import LearnedKernelConfig
 from trackmdp.errors import UserError
 from trackmdp.policies.explore import RenewedTable
 from trackmdp.policies.policy import Policy, as_policy

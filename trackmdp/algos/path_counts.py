@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from trackmdp.algos.learned_kernel import policy_tensors, tensors_policy
 from trackmdp.algos.segments import SensedPaths
-from trackmdp.config.path_counts import PathCountsConfig
+from trackmdp.config.counting import PathCountsConfig
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.solvers.path_counts import plan_keys

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from hydra import compose, initialize_config_dir
@@ -23,8 +22,8 @@ from trackmdp.app.sources import searched
 from trackmdp.app.sweep.schema import PLUGINS
 from trackmdp.config import GROUPS, ROOTS, conf_dir
 from trackmdp.config.registry import plugin_folders
-from trackmdp.config.resolvers import register_resolvers
 from trackmdp.config.untrusted import names_code
+from trackmdp.config.values import register_resolvers
 from trackmdp.errors import UserError
 
 _LOGGING = {"class": {"logging.StreamHandler", "logging.FileHandler", "logging.NullHandler"}}
@@ -103,9 +102,7 @@ class Composer:
         self._opened.enter_context(initialize_config_dir(main, job_name="trackmdp", version_base="1.3"))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         # In this order: closing restores what was initialised before, and Hydra's state is a global of the process.
         self._opened.close()
         GlobalHydra.instance().clear()

@@ -6,16 +6,14 @@ import inspect
 import json
 import textwrap
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any
-
-from omegaconf import OmegaConf
 
 from trackmdp.app.sweep.schema import PLUGINS
 from trackmdp.config import GROUPS, ROOTS, SELECTORS, Option, options
 from trackmdp.config.options import listed, several
 from trackmdp.config.refusals import refuse_renamed, unknown_choice
-from trackmdp.config.registry import conf_dir, conf_file, load_plugins
+from trackmdp.config.registry import load_plugins
+from trackmdp.config.values import choice_values, read_values
 from trackmdp.errors import UserError
 
 EXAMPLES = {
@@ -63,7 +61,7 @@ def manual(command: str, words: Sequence[str] = ()) -> str:
     load_plugins()
     typed = _choices(command, words)
     # The YAML files are read as they stand: composing would need a choice for every group, and the help is about all.
-    values = _read(Path(conf_dir()) / f"{command}.yaml")
+    values = read_values(command)
     blocks = [f"usage: trackmdp {command} [option=value ...] [group=choice ...]", *_wrapped(_about(ROOTS[command])), ""]
     if typed:
         chosen = " ".join(f"{group}={name}" for group, name in typed.items())
@@ -159,15 +157,10 @@ def _choice(group: str, name: str, typed: dict[str, str]) -> Iterator[str]:
     """One choice of a group with its options; a selector that was typed says which of the group's it stands for."""
     if group in SELECTORS:
         return
-    yield from ("", *_wrapped(f"  {group}={name}: {_about(_schema(group, name, typed))}"))
     values = _values(group, name, typed)
-    yield from _entries(_schema(group, name, typed), values, _prefix(group, name))
-
-
-def _schema(group: str, name: str, typed: dict[str, str]) -> type[Any]:
-    members = _members(group)
-    picked = next((f"{name}_{value}" for key, value in typed.items() if key in SELECTORS), name)
-    return members.get(picked, members[name])
+    schema = _members(group)[values["name"]]
+    yield from ("", *_wrapped(f"  {group}={name}: {_about(schema)}"))
+    yield from _entries(schema, values, _prefix(group, name))
 
 
 def _example(command: str, chosen: str, group: str, name: str) -> Iterator[str]:
@@ -197,7 +190,7 @@ def _read_selectors(group: str, name: str, typed: dict[str, str]) -> Iterator[st
     if group in SELECTORS:
         return
     # A choice reads a selector where its defaults interpolate it.
-    source = str(_read(conf_file(f"{group}/{name}")).get("defaults"))
+    source = str(read_values(f"{group}/{name}").get("defaults"))
     read = {key: typed.get(key, next(iter(item.choices))) for key, item in SELECTORS.items() if f"${{{key}}}" in source}
     yield from _selectors(group, read)
 
@@ -235,21 +228,9 @@ def _wrapped(text: str) -> list[str]:
 
 
 def _values(group: str, name: str, typed: dict[str, str]) -> dict[str, Any]:
-    """The values of one choice; a file that only points to another group's is followed."""
-    values = _read(conf_file(f"{group}/{name}"))
-    for entry in values.get("defaults", []):
-        if isinstance(entry, dict):
-            (target, choice), *_ = entry.items()
-            for selector, item in SELECTORS.items():
-                choice = choice.replace(f"${{{selector}}}", typed.get(selector, next(iter(item.choices))))
-            values |= _values(target.strip("/").split("@")[0], choice, typed)
-    return {key: value for key, value in values.items() if key != "defaults"}
-
-
-def _read(file: Path) -> dict[str, Any]:
-    plain = OmegaConf.to_container(OmegaConf.load(file))
-    assert isinstance(plain, dict)
-    return {str(key): value for key, value in plain.items()}
+    """The values of one choice, with the name under which its schema is registered."""
+    first = {key: next(iter(selector.choices)) for key, selector in SELECTORS.items()}
+    return choice_values(group, name, first | typed)
 
 
 def _about(schema: type[Any]) -> str:

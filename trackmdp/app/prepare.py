@@ -25,7 +25,7 @@ from trackmdp.config import (
     from_hydra,
     load_run_config,
 )
-from trackmdp.config.ignored import refuse_ignored
+from trackmdp.config.checks import refuse_ignored
 from trackmdp.config.loggers import require_packages
 from trackmdp.config.resume import continued, run_folder
 from trackmdp.errors import UserError

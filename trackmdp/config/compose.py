@@ -12,8 +12,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from trackmdp.config.checks import absolute_paths, validate
-from trackmdp.config.ignored import refuse_ignored
+from trackmdp.config.checks import absolute_paths, refuse_ignored, validate
 from trackmdp.config.options import GROUPS, SELECTORS, Option, optional, options, refuse, several
 from trackmdp.config.refusals import refuse_renamed, unknown_choice, unknown_option
 from trackmdp.config.roots import ROOTS

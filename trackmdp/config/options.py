@@ -41,7 +41,20 @@ class Selector:
 
 @dataclass(frozen=True)
 class Option:
-    """Help, unit and allowed values of one field; `kind` is its type, `nullable` whether null is allowed."""
+    """Help, unit and allowed values of one field.
+
+    Attributes:
+        help: what it is, in a few words.
+        unit: unit of the value, shown in brackets.
+        ge, gt, le, lt: limits of the value.
+        choices: the words allowed, for a text.
+        expects: says in words what is allowed where type and range cannot.
+        pattern: regular expression that a text must match as a whole.
+        path: a text is a path, relative to where the command is typed.
+        words: texts that are no path although others are.
+        pair: a whole number, or a list of two; the field's type is ``Any``, as OmegaConf has no such union.
+        kind: its type, and `nullable` whether null is allowed: `options` reads both off the field's annotation.
+    """
 
     help: str
     unit: str = ""
@@ -117,39 +130,9 @@ class Option:
         return " ".join([kind, " and ".join(limits)]).strip()
 
 
-def option(
-    help: str,
-    *,
-    unit: str = "",
-    ge: float | None = None,
-    gt: float | None = None,
-    le: float | None = None,
-    lt: float | None = None,
-    choices: tuple[str, ...] = (),
-    expects: str = "",
-    pattern: str = "",
-    path: bool = False,
-    words: tuple[str, ...] = (),
-    pair: bool = False,
-) -> Any:
-    """A dataclass field without a default, described for `--help` and for `validate`.
-
-    Args:
-        help: what it is, in a few words.
-        unit: unit of the value, shown in brackets.
-        ge: smallest value allowed (`gt`: value it must exceed).
-        gt: see `ge`.
-        le: largest value allowed (`lt`: value it must stay below).
-        lt: see `le`.
-        choices: the words allowed, for a text.
-        expects: says in words what is allowed where type and range cannot.
-        pattern: regular expression that a text must match as a whole.
-        path: a text is a path, relative to where the command is typed.
-        words: texts that are no path although others are.
-        pair: a whole number, or a list of two; the field's type is ``Any``, as OmegaConf has no such union.
-    """
-    described = Option(help, unit, ge, gt, le, lt, choices, expects, pattern, path, words, pair)
-    return dataclasses.field(metadata={"option": described})
+def option(help: str, **described: Any) -> Any:
+    """A dataclass field without a default, described as an `Option` for `--help` and for `validate`."""
+    return dataclasses.field(metadata={"option": Option(help, **described)})
 
 
 def options(schema: type[Any]) -> dict[str, Option | type[Any]]:

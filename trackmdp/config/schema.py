@@ -67,7 +67,7 @@ class NodeConfig:
     def ignored(self, root: Any) -> dict[str, str]:
         """Options of this node without effect on this config, and why: ``{"alpha": "with algo.prioritized..."}``.
 
-        They are refused where they were typed (`trackmdp.config.ignored`).
+        They are refused where they were typed (`trackmdp.config.checks`).
         """
         return {}
 

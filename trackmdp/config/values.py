@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,6 @@ from omegaconf.errors import OmegaConfBaseException
 from trackmdp.config.options import GROUPS, Option, leaves, options, refuse
 from trackmdp.config.refusals import unknown_option
 from trackmdp.config.registry import conf_file
-from trackmdp.config.resolvers import register_resolvers
 from trackmdp.errors import UserError
 
 
@@ -96,3 +96,29 @@ def _load(file: Path, stamp: int) -> dict[str, Any]:  # noqa: ARG001  (the stamp
     # YAML keys may be numbers; dataclass fields are named by texts.
     assert isinstance(plain, dict), file
     return {str(key): value for key, value in plain.items()}
+
+
+def register_resolvers() -> None:
+    """Register `${first:a,b}` and `${per_cell:count,size}`, or `${per_cell:count,size,least}`."""
+    # replace=True: resolvers are global to the process, and a second composing would otherwise fail on the first name.
+    OmegaConf.register_new_resolver("first", _first_given, replace=True)
+    OmegaConf.register_new_resolver("per_cell", _per_cell, replace=True)
+
+
+def _first_given(*values: Any) -> Any:
+    """The first value that is not null."""
+    return next((value for value in values if value is not None), None)
+
+
+def _per_cell(count: float, size: Any, least: int = 0) -> int:
+    """`count` for each cell of a grid of N x N cells, or of [rows, columns]; `least` in all.
+
+    A fraction gives a whole number of `least`: .2 for each of 100 x 100 cells in thousands are 2000, of 110 x 110 3000.
+    """
+    sides = (size, size) if isinstance(size, int) else size
+    if not isinstance(sides, Sequence) or not all(isinstance(side, int) for side in sides):
+        return max(math.ceil(count), least)  # such a size is refused when its own option is checked
+    if isinstance(count, int):
+        return max(count * math.prod(sides), least)
+    # Rounded before it is rounded up: .2 · M / 1000 and M / 5000 have to agree, whatever the last bit.
+    return max(math.ceil(round(count * math.prod(sides) / least, 9)), 1) * least

@@ -7,9 +7,10 @@ acts writes its action out over all S sensors.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from functools import partial
 
 import numpy as np
 import torch
@@ -47,95 +48,62 @@ class States:
     step: int
 
 
-class Choice(Protocol):
-    """What was decided in B states."""
+@dataclass(frozen=True)
+class Choice:
+    """What was decided in B states.
 
-    @property
-    def count(self) -> Tensor:
-        """`[B]` int64, sensors on."""
-        ...
+    Attributes:
+        count: `[B]` int64, sensors on.
+        spent: `[B]` float32, their price.
+        sensed: whether a sensor that is on sees a cell, `[B]` bool of cells `[B]`.
+        action: `[B, S]` bool; None where it follows from the state, and need not be kept.
+    """
 
-    @property
-    def spent(self) -> Tensor:
-        """`[B]` float32, their price."""
-        ...
-
-    @property
-    def action(self) -> Tensor | None:
-        """`[B, S]` bool; None where it follows from the state, and need not be kept."""
-        ...
-
-    def sensed(self, cell: Tensor) -> Tensor:
-        """`[B]` bool, whether a sensor that is on sees `cell` `[B]`."""
-        ...
+    count: Tensor
+    spent: Tensor
+    sensed: Callable[[Tensor], Tensor]
+    action: Tensor | None = None
 
 
-class Actor(Protocol):
-    """Anything that acts."""
+class Actor(ABC):
+    """Anything that acts.
 
-    @property
-    def policy(self) -> Policy | None:
-        """From which a step's action and its probabilities follow, where it is a `Policy`."""
-        ...
+    Attributes:
+        policy: from which a step's action and its probabilities follow, where it is a `Policy`.
+        num_draws: uniform draws that one decision takes from the episode's own generator.
+        most_rows: episodes it can be asked for at a time.
+    """
 
-    @property
-    def num_draws(self) -> int:
-        """Uniform draws that one decision takes from the episode's own generator."""
-        ...
+    policy: Policy | None = None
+    num_draws: int = 0
+    most_rows: int = _MOST_ROWS
 
-    @property
-    def most_rows(self) -> int:
-        """Episodes it can be asked for at a time."""
-        ...
-
+    @abstractmethod
     def decide(self, states: States, draws: Tensor) -> Choice:
         """The decisions in `states`; `draws` is `[B, num_draws]`, uniform in [0, 1)."""
-        ...
 
 
-@dataclass(frozen=True)
-class _Rows:
-    """Rows of a table."""
+class _Writing(Actor):
+    """Writes its actions out over all sensors."""
 
-    table: Callable[[Tensor, Tensor], Tensor]
-    row: Tensor
-    count: Tensor
-    spent: Tensor
-    action: ClassVar[Tensor | None] = None
+    def __init__(self, task: Task, costs: Costs) -> None:
+        self._costs, self._window, self._sight = costs, Window.of(task), Sight(task, everywhere=True)
 
-    def sensed(self, cell: Tensor) -> Tensor:
-        return self.table(self.row, cell)
+    @abstractmethod
+    def _action(self, states: States, draws: Tensor) -> Tensor:
+        """`[B, S]` sensors on."""
 
-
-@dataclass(frozen=True)
-class _Same:
-    """All sensors, or none, in every state."""
-
-    seen: Tensor
-    count: Tensor
-    spent: Tensor
-    action: ClassVar[Tensor | None] = None
-
-    def sensed(self, cell: Tensor) -> Tensor:
-        return self.seen[cell]
+    def decide(self, states: States, draws: Tensor) -> Choice:
+        """See `Actor`."""
+        action = self._action(states, draws)
+        spent = self._costs.price_of(action)
+        return Choice(action.sum(-1), spent, lambda cell: self._sight.sees(action, cell, cell), action)
 
 
-class _Written:
-    """Actions written out over all sensors."""
-
-    def __init__(self, action: Tensor, costs: Costs, sight: Sight) -> None:
-        self.action: Tensor | None = action
-        self._on, self._sight = action, sight
-        self.count, self.spent = action.sum(-1), costs.price_of(action)
-
-    def sensed(self, cell: Tensor) -> Tensor:
-        return self._sight.sees(self._on, cell, cell)
-
-
-class Following:
+class Following(Actor):
     """A deterministic policy with a table."""
 
-    num_draws, most_rows = 0, _MOST_ROWS
+    policy: Policy
 
     def __init__(self, policy: Policy, costs: Costs) -> None:
         assert policy.sets is not None
@@ -148,13 +116,11 @@ class Following:
     def decide(self, states: States, draws: Tensor) -> Choice:  # noqa: ARG002
         """See `Actor`."""
         row = self.policy.row(states.key, states.misses)
-        return _Rows(self._table.entry, row, self._count[row], self._spent[row])
+        return Choice(self._count[row], self._spent[row], partial(self._table.entry, row))
 
 
-class Uniform:
+class Uniform(Actor):
     """All sensors on, or none."""
-
-    num_draws, most_rows = 0, _MOST_ROWS
 
     def __init__(self, policy: Policy, costs: Costs) -> None:
         self.policy = policy
@@ -169,60 +135,56 @@ class Uniform:
         """See `Actor`."""
         b = len(states.row)
         # expand repeats one number B times without memory of its own.
-        return _Same(self._seen, self._count.expand(b), self._spent.expand(b))
+        return Choice(self._count.expand(b), self._spent.expand(b), self._seen.__getitem__)
 
 
-class Drawing:
+class Drawing(_Writing):
     """A policy that draws its sets."""
 
+    policy: Policy
+
     def __init__(self, policy: Policy, costs: Costs) -> None:
-        self.policy, self._costs, self.num_draws = policy, costs, policy.num_draws
-        self._sight = Sight(policy.task, everywhere=True)
+        super().__init__(policy.task, costs)
+        self.policy, self.num_draws = policy, policy.num_draws
         self.most_rows = max(1, min(256, _DRAWS // policy.num_draws))
 
-    def decide(self, states: States, draws: Tensor) -> Choice:
-        """See `Actor`."""
-        return _Written(self.policy.act(states.key, states.misses, draws), self._costs, self._sight)
+    def _action(self, states: States, draws: Tensor) -> Tensor:
+        return self.policy.act(states.key, states.misses, draws)
 
 
-class Issuing:
+class Issuing(_Writing):
     """Recorded actions, one a step."""
 
-    num_draws, most_rows, policy = 0, 256, None
+    most_rows = 256
 
     def __init__(self, playback: Playback, costs: Costs) -> None:
-        self._playback, self._costs, self._window = playback, costs, Window.of(playback.task)
-        self._sight = Sight(playback.task, everywhere=True)
+        super().__init__(playback.task, costs)
+        self._playback = playback
 
-    def decide(self, states: States, draws: Tensor) -> Choice:  # noqa: ARG002
-        """See `Actor`."""
+    def _action(self, states: States, draws: Tensor) -> Tensor:  # noqa: ARG002
         action = self._playback.at(states.step).expand(len(states.row), -1).contiguous()
         if self._window.is_local:  # what lies outside the window cannot be chosen
             action = self._window.to_global(states.last_cell, self._window.to_local(states.last_cell, action))
-        return _Written(action, self._costs, self._sight)
+        return action
 
 
-class Asking:
+class Asking(_Writing):
     """A function or module that draws from a source of its own, asked at every step."""
 
-    num_draws, policy = 0, None
-
     def __init__(self, task: Task, rule: Rule, costs: Costs) -> None:
-        self._rule, self._costs, self._window = rule, costs, Window.of(task)
-        self._sight = Sight(task, everywhere=True)
-        self._slots = torch.arange(task.num_choices)
+        super().__init__(task, costs)
+        self._rule, self._slots = rule, torch.arange(task.num_choices)
         self.most_rows = max(1, min(_MOST_ROWS, _HISTORY // (task.num_choices * task.num_sensors)))
         self._history = torch.zeros(self.most_rows, task.num_choices, task.num_sensors, dtype=torch.bool)
 
-    def decide(self, states: States, draws: Tensor) -> Choice:  # noqa: ARG002
-        """See `Actor`."""
+    def _action(self, states: States, draws: Tensor) -> Tensor:  # noqa: ARG002
         # Slot s holds the action at s misses; what stands in slot n and later is left from an earlier row of misses.
         filled = self._slots < states.misses.unsqueeze(1)
         history = self._history[states.row] & filled.unsqueeze(-1)
         with acting():
             action = self._rule(states.last_cell, states.misses, history)
         self._history[states.row, states.misses.clamp_max(len(self._slots) - 1)] = action
-        return _Written(self._window.to_global(states.last_cell, action), self._costs, self._sight)
+        return self._window.to_global(states.last_cell, action)
 
 
 def actor_of(task: Task, policy: PolicyLike | Playback, costs: Costs) -> Actor:

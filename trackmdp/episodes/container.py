@@ -9,12 +9,24 @@ from __future__ import annotations
 import struct
 import zlib
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    Header,
+    Metadata,
+    MetadataIndex,
+)
 
 from trackmdp import untrusted
 from trackmdp.errors import UserError
@@ -41,31 +53,6 @@ class Damaged(Exception):
     """A checksum or a structure that is not as it should be; the message says where."""
 
 
-class Body:
-    """A record's content, read from front to back."""
-
-    def __init__(self, data: bytes) -> None:
-        self.data, self.place = data, 0
-
-    def numbers(self, layout: str) -> tuple[int, ...]:
-        """Little-endian numbers of a `struct` layout."""
-        values = struct.unpack_from(f"<{layout}", self.data, self.place)  # "<": MCAP is little-endian throughout
-        self.place += struct.calcsize(f"<{layout}")
-        return values
-
-    def sized(self, layout: str = "I") -> bytes:
-        """Bytes after their length."""
-        (length,) = self.numbers(layout)
-        if length > len(self.data) - self.place:
-            raise Damaged("a length that leads out of its record")
-        self.place += length
-        return self.data[self.place - length : self.place]
-
-    def text(self) -> str:
-        """A string."""
-        return self.sized().decode("utf-8")
-
-
 @dataclass(frozen=True)
 class Message:
     """One message."""
@@ -73,19 +60,6 @@ class Message:
     topic: str
     log_time: int
     data: bytes
-
-
-@dataclass(frozen=True)
-class Chunk:
-    """Where a chunk lies, and what it must be, by the summary."""
-
-    begin: int
-    end: int
-    offset: int
-    length: int
-    compression: str
-    compressed: int
-    size: int
 
 
 class Container:
@@ -112,8 +86,8 @@ class Container:
         opcode, body = next(records(self.stream, len(MAGIC)), (0, b""))
         if opcode != HEADER:
             raise Damaged("its first record is not the header")
-        header = Body(body)
-        return header.text(), header.text()
+        header = _parsed(Header, body)
+        return header.profile, header.library
 
     def _summary(self) -> None:
         """Read the index of chunks, attachments and metadata; its checksum covers the footer as well."""
@@ -143,29 +117,24 @@ class Container:
 
     def _index(self, summary: bytes) -> None:
         self.channels: dict[int, str] = {}
-        self.chunks: list[Chunk] = []
+        self.chunks: list[ChunkIndex] = []
         self.attachments: dict[str, tuple[int, int]] = {}
         self.metadata: dict[str, tuple[int, int]] = {}
         for opcode, data in _split(summary):
-            body = Body(data)
             if opcode == CHUNK_INDEX:
-                self.chunks.append(_chunk_of(body))
+                self.chunks.append(_parsed(ChunkIndex, data))
             elif opcode == CHANNEL:
-                # CHANNEL: id u16, schema u16, topic, encoding, metadata; the last two are not needed.
-                number, _ = body.numbers("HH")
-                self.channels[number] = body.text()
+                channel = _parsed(Channel, data)
+                self.channels[channel.id] = channel.topic
             elif opcode == ATTACHMENT_INDEX:
-                # ATTACHMENT_INDEX: offset, length, log time, creation time, size of the data (u64 each), name, media
-                # type.
-                offset, length, *_ = body.numbers("QQQQQ")
-                self.attachments[body.text()] = offset, length
+                attachment = _parsed(AttachmentIndex, data)
+                self.attachments[attachment.name] = attachment.offset, attachment.length
             elif opcode == METADATA_INDEX:
-                # METADATA_INDEX: offset and length of the record (u64 each), name.
-                offset, length = body.numbers("QQ")
-                self.metadata[body.text()] = offset, length
+                metadata = _parsed(MetadataIndex, data)
+                self.metadata[metadata.name] = metadata.offset, metadata.length
         # Sorted for the bisection in `chunks_between`; a log's own order is the same.
-        self.chunks.sort(key=lambda chunk: chunk.begin)
-        self._ends = [chunk.end for chunk in self.chunks]
+        self.chunks.sort(key=lambda chunk: chunk.message_start_time)
+        self._ends = [chunk.message_end_time for chunk in self.chunks]
 
     def _record(self, opcode: int, offset: int, length: int) -> bytes:
         """The content of the record that the summary says is there."""
@@ -198,23 +167,26 @@ class Container:
             raise Damaged(f"metadata {name}")
         return content
 
-    def chunks_between(self, begin: int, end: int) -> list[Chunk]:
+    def chunks_between(self, begin: int, end: int) -> list[ChunkIndex]:
         """The chunks with messages from log time `begin` to `end`, in their order; logs are in order of time."""
         # Chunks follow each other in time, so that the first one that ends at `begin` or later is found by bisection.
         found = []
         for chunk in self.chunks[bisect_left(self._ends, begin) :]:
-            if chunk.begin > end:
+            if chunk.message_start_time > end:
                 break
             found.append(chunk)
         return found
 
-    def messages(self, chunk: Chunk) -> list[Message]:
+    def messages(self, chunk: ChunkIndex) -> list[Message]:
         """All messages of a chunk, its checksum checked."""
-        body = self._record(CHUNK, chunk.offset, chunk.length)
-        said, content = unpacked(body)
+        found, content = unpacked(self._record(CHUNK, chunk.chunk_start_offset, chunk.chunk_length))
         # A chunk's checksum covers its content alone; its head is held against the summary, which has its own.
-        if said != (chunk.begin, chunk.end, chunk.size, chunk.compression, chunk.compressed):
-            raise Damaged(f"the chunk at byte {chunk.offset}")
+        same = ("message_start_time", "message_end_time", "uncompressed_size", "compression")
+        if (
+            any(getattr(found, name) != getattr(chunk, name) for name in same)
+            or len(found.data) != chunk.compressed_size
+        ):
+            raise Damaged(f"the chunk at byte {chunk.chunk_start_offset}")
         # A copy, since a chunk may repeat the definitions of channels, which are added to what is handed over.
         return list(messages_of(content, dict(self.channels)))
 
@@ -292,69 +264,48 @@ def _split(data: bytes) -> Iterator[tuple[int, bytes]]:
         yield opcode, data[place - size : place]
 
 
-def _chunk_of(body: Body) -> Chunk:
-    # CHUNK_INDEX: first and last log time, offset, length (u64 each), a map channel -> offset of its message index
-    # (u32 bytes of it), length of these indexes u64, compression, compressed and uncompressed size (u64 each).
-    begin, end, offset, length = body.numbers("QQQQ")
-    body.sized()
-    body.numbers("Q")
-    compression = body.text()
-    return Chunk(begin, end, offset, length, compression, *body.numbers("QQ"))
+def _parsed(kind: Any, data: bytes) -> Any:
+    """The record of a kind of `mcap.records` from its content.
+
+    That reads fewer bytes where a length leads out of the content: what is parsed here is covered by a checksum, or
+    compared with something that is.
+    """
+    return kind.read(ReadDataStream(BytesIO(data)))
 
 
 def attachment_of(data: bytes) -> tuple[str, bytes]:
-    """Name and content of an attachment record."""
-    # ATTACHMENT: log time and creation time (u64 each), name, media type, data (u64 and bytes), CRC-32 of all before
-    # itself (u32).
+    """Name and content of an attachment record, which ends in a CRC-32 of all before it."""
     if zlib.crc32(data[:-4]) != int.from_bytes(data[-4:], "little"):
         raise Damaged("the checksum of an attachment")
-    body = Body(data)
-    body.numbers("QQ")
-    name, _ = body.text(), body.text()
-    return name, body.sized("Q")
+    found = _parsed(Attachment, data)
+    return found.name, found.data
 
 
 def metadata_of(data: bytes) -> tuple[str, dict[str, str]]:
     """Name and content of a metadata record."""
-    body = Body(data)
-    # METADATA: name, and a map: u32 bytes of it, then key and value, key and value, ...
-    name, pairs = body.text(), Body(body.sized())
-    content = {}
-    while pairs.place < len(pairs.data):
-        key = pairs.text()
-        content[key] = pairs.text()
-    return name, content
+    found = _parsed(Metadata, data)
+    return found.name, found.metadata
 
 
-def unpacked(data: bytes) -> tuple[tuple[int, int, int, str, int], bytes]:
-    """What a chunk record says of itself, and its content, the checksum checked.
+def unpacked(data: bytes) -> tuple[Chunk, bytes]:
+    """A chunk record, and its content.
 
     Raises:
         Damaged: the checksum is missing or wrong, or the compression cannot be undone.
     """
-    body = Body(data)
-    # CHUNK: first and last log time, uncompressed size (u64 each), CRC-32 of the uncompressed content (u32),
-    # compression, compressed content (u64 and bytes).
-    begin, end, size, checksum = body.numbers("QQQI")
-    compression = body.text()
-    packed = body.sized("Q")
+    chunk: Chunk = _parsed(Chunk, data)
+    size = chunk.uncompressed_size
     # Before decompressing: zstd packs zeros by 30,000 to one.
     if size > _CHUNK_LIMIT:
         raise Damaged(f"a chunk of {size} bytes")
     try:
-        content = _UNPACK[compression](packed, size)
+        content = _UNPACK[chunk.compression](chunk.data, size)
     except (KeyError, zstandard.ZstdError, MemoryError) as error:
-        raise Damaged(f"a chunk that cannot be decompressed ({compression or 'none'})") from error
+        raise Damaged(f"a chunk that cannot be decompressed ({chunk.compression or 'none'})") from error
     # A checksum of 0 means that none was written; our logs always have one.
-    if len(content) != size or zlib.crc32(content) != checksum or checksum == 0:
+    if len(content) != size or zlib.crc32(content) != chunk.uncompressed_crc or chunk.uncompressed_crc == 0:
         raise Damaged("the checksum of a chunk")
-    return (begin, end, size, compression, len(packed)), content
-
-
-_UNPACK = {
-    "": lambda packed, size: packed,
-    "zstd": lambda packed, size: _unzstd(packed, size),
-}
+    return chunk, content
 
 
 def _unzstd(packed: bytes, size: int) -> bytes:
@@ -365,6 +316,9 @@ def _unzstd(packed: bytes, size: int) -> bytes:
     if zstandard.frame_content_size(packed) not in (-1, size):
         raise Damaged("a chunk whose frame has another size")
     return zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
+
+
+_UNPACK: dict[str, Callable[[bytes, int], bytes]] = {"": lambda packed, _: packed, "zstd": _unzstd}
 
 
 def messages_of(content: bytes, channels: dict[int, str]) -> Iterator[Message]:
@@ -378,6 +332,5 @@ def messages_of(content: bytes, channels: dict[int, str]) -> Iterator[Message]:
                 raise Damaged(f"a message of an unknown channel {number}")
             yield Message(channels[number], log_time, data[22:])
         elif opcode == CHANNEL:
-            body = Body(data)
-            number, _ = body.numbers("HH")
-            channels[number] = body.text()
+            channel = _parsed(Channel, data)
+            channels[channel.id] = channel.topic

@@ -9,7 +9,6 @@ from bisect import bisect_left
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
-from types import TracebackType
 from typing import Any, TypeVar
 
 import numpy as np
@@ -97,9 +96,7 @@ class EpisodeReader:
     def __enter__(self) -> EpisodeReader:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -161,8 +158,8 @@ class EpisodeReader:
         """The messages from one log time to another; the chunk read last is kept, for the episode after."""
         found = []
         for chunk in self._container.chunks_between(begin, end):
-            if self._held[0] != chunk.offset:
-                self._held = chunk.offset, self._container.messages(chunk)
+            if self._held[0] != chunk.chunk_start_offset:
+                self._held = chunk.chunk_start_offset, self._container.messages(chunk)
             found += [message for message in self._held[1] if begin <= message.log_time <= end]
         return found
 

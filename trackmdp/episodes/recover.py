@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import re
-import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -167,7 +166,9 @@ def _whole(stream: Any, found: _Found, damaged: list[str]) -> Iterator[tuple[str
                     yield message.topic, message.log_time, message.data
         except StopIteration:
             return
-        except (Damaged, struct.error, ValueError, IndexError) as error:
+        except OSError:  # of the disk, which is no damage of the log
+            raise
+        except Exception as error:  # whatever a record's content raises, the next may be whole
             damaged.append(reason(error))
 
 

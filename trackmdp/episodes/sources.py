@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -15,35 +15,35 @@ from trackmdp.world.motion import Motion
 from trackmdp.world.tracks import Problem, Recorded
 
 
-class Source(Protocol):
-    """The targets of a problem; a place, int64, is the full state of a target."""
+class Source(ABC):
+    """The targets of a problem; a place, int64, is the full state of a target, by default its cell."""
 
+    @abstractmethod
     def start(self, generators: Sequence[torch.Generator]) -> Tensor:
         """`[B]` places in which the targets start, one draw from each generator."""
-        ...
 
+    @abstractmethod
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """`[count]` float64 draws, one for each of an episode's next moves."""
-        ...
 
+    @abstractmethod
     def move(self, place: Tensor, draws: Tensor) -> Tensor:
         """`[B]` places after one move."""
-        ...
 
     def cell(self, place: Tensor) -> Tensor:
         """`[B]` cells; M for a target that has exited."""
-        ...
+        return place
 
-    def mode(self, place: Tensor) -> Tensor | None:
+    def mode(self, place: Tensor) -> Tensor | None:  # noqa: ARG002
         """`[B]` modes, -1 for a target that has exited; None where targets have none."""
-        ...
+        return None
 
     def stops(self, place: Tensor) -> Tensor:
         """`[B]` bool, whether the recording stops here with the target still in the grid."""
-        ...
+        return torch.zeros_like(place, dtype=torch.bool)
 
 
-class _Sampled:
+class _Sampled(Source):
     """Targets that move as the kernel says, from a uniform start; a place is a cell."""
 
     def __init__(self, world: Modelled) -> None:
@@ -57,15 +57,6 @@ class _Sampled:
 
     def move(self, place: Tensor, draws: Tensor) -> Tensor:
         return self._motion.move(place, draws)
-
-    def cell(self, place: Tensor) -> Tensor:
-        return place
-
-    def mode(self, place: Tensor) -> Tensor | None:  # noqa: ARG002
-        return None
-
-    def stops(self, place: Tensor) -> Tensor:
-        return torch.zeros_like(place, dtype=torch.bool)
 
 
 class _Hidden(_Sampled):
@@ -82,7 +73,7 @@ class _Hidden(_Sampled):
         return torch.where(place < self._states, place % self._modes, -1)
 
 
-class _Replayed:
+class _Replayed(Source):
     """Targets that go along held-out tracks, drawn with replacement, from their first cell on.
 
     A place is an index into the cells of all tracks end to end, each track that exits being closed by cell M.
@@ -108,9 +99,6 @@ class _Replayed:
 
     def cell(self, place: Tensor) -> Tensor:
         return self._line[place]
-
-    def mode(self, place: Tensor) -> Tensor | None:  # noqa: ARG002
-        return None
 
     def stops(self, place: Tensor) -> Tensor:
         return self._stops[place]

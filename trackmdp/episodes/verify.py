@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import groupby
 
@@ -28,9 +28,7 @@ class Verified:
     difference: str | None
 
 
-def verify(
-    reader: EpisodeReader, *, numbers: list[int] | None = None, on_progress: Callable[[int], None] | None = None
-) -> Verified:
+def verify(reader: EpisodeReader, *, numbers: list[int] | None = None) -> Verified:
     """Re-simulate the episodes `numbers` (all, with every byte of the file, if None) up to the first difference.
 
     Raises:
@@ -50,8 +48,6 @@ def verify(
                 if difference := first_difference(logged, again, belief_tolerance=tolerance):
                     return Verified(done, steps, f"episode {number}, {difference}")
                 done, steps = done + 1, steps + len(logged)
-            if on_progress:
-                on_progress(done)
     return Verified(done, steps, None)
 
 

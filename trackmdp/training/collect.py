@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -13,7 +14,7 @@ from torchrl.collectors import BaseCollector, Collector, MultiAsyncCollector, Mu
 from trackmdp.config.learning import CollectorConfig, RayWorkersConfig, WorkersConfig
 from trackmdp.seeding import derive
 from trackmdp.solvers.workers import end_with_parent
-from trackmdp.training.devices import make_device
+from trackmdp.training.machine import make_device
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.tracks import Problem
 
@@ -44,7 +45,8 @@ def single(
     return Collector(TrackEnv(problem, **env), policy, track_traj_ids=False, **once, **common)
 
 
-def multi_sync(
+def _in_workers(
+    kind: Callable[..., BaseCollector],
     problem: Problem,
     policy: TensorDictModuleBase,
     cfg: WorkersConfig,
@@ -53,23 +55,18 @@ def multi_sync(
     device: torch.device,
     done: int = 0,
 ) -> BaseCollector:
-    """A collector in worker processes, every batch from all of them; arguments as for `single`."""
-    workers = _workers(problem, cfg, _env_options(cfg, seed), done)
-    return MultiSyncCollector(workers, policy, **_threads(cfg), **_common(cfg, device, done))
+    """A collector of TorchRL's `kind` in worker processes; arguments as for `single`."""
+    env = _env_options(cfg, seed)
+    # A resumed run's workers have streams of their own (`done`), not the first ones again.
+    workers = [partial(_worker_env, problem, f"{worker}-{done}", env) for worker in range(cfg.workers)]
+    threads = {"num_threads": torch.get_num_threads(), "num_sub_threads": cfg.threads}
+    return kind(workers, policy, **threads, **_common(cfg, device, done))
 
 
-def multi_async(
-    problem: Problem,
-    policy: TensorDictModuleBase,
-    cfg: WorkersConfig,
-    *,
-    seed: int,
-    device: torch.device,
-    done: int = 0,
-) -> BaseCollector:
-    """A collector in worker processes, every batch from the one that has it ready; arguments as for `single`."""
-    workers = _workers(problem, cfg, _env_options(cfg, seed), done)
-    return MultiAsyncCollector(workers, policy, **_threads(cfg), **_common(cfg, device, done))
+multi_sync = partial(_in_workers, MultiSyncCollector)
+"""Every batch is collected by all of the workers."""
+multi_async = partial(_in_workers, MultiAsyncCollector)
+"""Every batch is collected by the worker that has it ready."""
 
 
 def ray(
@@ -89,8 +86,6 @@ def ray(
     from trackmdp.training import on_ray
 
     env = _env_options(cfg, seed)
-    # `done` in the name of the stream: a resumed run, whose workers start new episodes, must not collect the first
-    # ones again.
     workers = [partial(_remote_env, problem, f"{worker}-{done}", env, cfg.threads) for worker in range(cfg.workers)]
     return on_ray.make_ray_collector(workers, policy, cfg, _common(cfg, device, done))
 
@@ -118,15 +113,6 @@ def _common(cfg: CollectorConfig, device: torch.device, done: int) -> dict[str, 
         "storing_device": device,
         "trust_policy": True,  # a policy without parameters (all sensors on) lives on any device
     }
-
-
-def _threads(cfg: WorkersConfig) -> dict[str, int]:
-    return {"num_threads": torch.get_num_threads(), "num_sub_threads": cfg.threads}
-
-
-def _workers(problem: Problem, cfg: WorkersConfig, env: dict[str, Any], done: int) -> list[partial[TrackEnv]]:
-    """Makers of the workers' environments; a resumed run's have streams of their own, not the first ones again."""
-    return [partial(_worker_env, problem, f"{worker}-{done}", env) for worker in range(cfg.workers)]
 
 
 def _worker_env(world: Problem, worker: str, env: dict[str, Any]) -> TrackEnv:

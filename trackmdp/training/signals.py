@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Self
 
 _HEARD = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
@@ -34,9 +34,7 @@ class Signals:
             self._before = {number: signal.signal(number, self._note) for number in _HEARD}
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         for number, handler in self._before.items():
             signal.signal(number, handler)
 

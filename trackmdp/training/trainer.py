@@ -20,11 +20,11 @@ from trackmdp.policies.policy import Policy, actor_table
 from trackmdp.seeding import seed_global
 from trackmdp.training import memory
 from trackmdp.training.callbacks import Callback, Row
-from trackmdp.training.devices import make_device
 from trackmdp.training.display import Display
 from trackmdp.training.evaluator import Score, while_collecting
 from trackmdp.training.held_out import make_evaluator
 from trackmdp.training.inputs import write_inputs
+from trackmdp.training.machine import make_device
 from trackmdp.training.make import make_algorithm, make_collector, make_loggers
 from trackmdp.training.saving import Checkpoints
 from trackmdp.training.signals import Signals

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from trackmdp.app.bench.machine import rate
+from trackmdp.app.bench.process import rate
 from trackmdp.config import BenchmarkConfig, to_yaml
 from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.reader import EpisodeReader

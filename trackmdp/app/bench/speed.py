@@ -11,7 +11,7 @@ from hydra import compose
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 
-from trackmdp.app.bench.machine import rate
+from trackmdp.app.bench.process import rate
 from trackmdp.config import GROUPS, BenchmarkConfig, TrainConfig, from_hydra
 from trackmdp.policies.actor_critic import make_actor
 from trackmdp.policies.fixed import RandomSubset

@@ -11,9 +11,8 @@ import torch
 from trackmdp.app.bench import handoff, log, memory, peers, size, speed, spreading
 from trackmdp.config import BenchmarkConfig
 from trackmdp.durable import write_json
-from trackmdp.training.devices import make_device
 from trackmdp.training.display import make_console, table
-from trackmdp.training.machine import machine
+from trackmdp.training.machine import machine, make_device
 from trackmdp.world.make import build_world
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Problem

@@ -23,10 +23,10 @@ from trackmdp.policies.saved import sets_name, write_sets
 from trackmdp.reports.picture import draw_picture
 from trackmdp.solvers import estimator
 from trackmdp.solvers.solve import baseline_policy
-from trackmdp.training.devices import make_device
 from trackmdp.training.display import make_console, table
 from trackmdp.training.evaluator import Evaluator, Score, figures
 from trackmdp.training.held_out import make_evaluator
+from trackmdp.training.machine import make_device
 from trackmdp.training.sealing import SUMMARY, check_files, read_summary
 from trackmdp.untrusted import decoded
 from trackmdp.world.make import make_problem

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from rich.console import Console
+
 from trackmdp.app.commands.held_out import show_held_out, show_loaded
-from trackmdp.app.commands.summary import show_summary
 from trackmdp.config import TrainConfig
 from trackmdp.config.resume import finished
 from trackmdp.errors import RunError
+from trackmdp.policies.policy import Policy
 from trackmdp.training.blocks import make_trainer
-from trackmdp.training.display import make_console
+from trackmdp.training.callbacks import Learning
+from trackmdp.training.display import make_console, table
 from trackmdp.training.lock import locked
-from trackmdp.training.run import complete
+from trackmdp.training.run import Run, complete
 from trackmdp.world.make import make_problem
 from trackmdp.world.tracks import Problem
 
@@ -53,7 +56,7 @@ def _run(cfg: TrainConfig, folder: Path, problem: Problem | None) -> float:
     trainer = make_trainer(problem, cfg, folder=folder, console=console)
     done = complete(trainer)
     if done.summary["held_out"] is None:
-        show_summary(console, trainer, done)
+        _show_summary(console, trainer, done)
     else:
         show_held_out(console, f"learned ({cfg.algo.name})", done.summary["held_out"])
     console.print(f"{done.summary['wall_seconds']:.1f} s; results in {folder}")
@@ -71,3 +74,23 @@ def _finished(cfg: TrainConfig, folder: Path) -> float | None:
         (folder / "summary.json").unlink(missing_ok=True)
         return None
     return float(summary["policy"]["aihtr"])
+
+
+def _show_summary(console: Console, trainer: Learning, run: Run) -> None:
+    """The learned policy beside Q_MDP, all sensors on, and the optimum where it was solved for."""
+    evaluator, solution = trainer.evaluator, run.solution
+    policies = {f"learned ({trainer.config.algo.name})": run.evaluation}
+    if evaluator.qmdp is not None:
+        policies["Q_MDP"] = evaluator.qmdp
+    policies["all on"] = evaluator.evaluate(Policy.all_on(evaluator.world))
+    if solution is not None:
+        policies["optimum" if solution.certified else "best known"] = solution.evaluation
+    rows = [
+        [name, f"{e.aihtr:,.3f}", f"{100 * e.accuracy:.2f} %", f"{e.sensors_per_step:.2f}"]
+        for name, e in policies.items()
+    ]
+    rows.append(["upper bound", f"{evaluator.upper:,.3f}", "", ""])
+    console.print(table("exact values", ["policy", "AIHTR", "accuracy", "sensors per step"], rows))
+    console.print(trainer.evaluator.score(run.policy).regret)
+    if solution is not None and solution.timed_out:
+        console.print(f"optimum: {solution.ended}")

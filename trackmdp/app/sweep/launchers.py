@@ -10,16 +10,21 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 from trackmdp.app.sweep.job import Launch, run_job
 from trackmdp.app.sweep.plan import Job
 from trackmdp.app.sweep.process import context_for
 from trackmdp.app.sweep.schema import BasicConfig, JoblibConfig, LauncherConfig, RayConfig, SubmititConfig
 from trackmdp.config import TrainConfig
-from trackmdp.errors import require
+from trackmdp.errors import UserError, require
+from trackmdp.training.signals import kept_sigterm
 
 # Each names the threads of one library (OpenMP, OpenBLAS, MKL), which by default take all cores, in every run at once.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+_STORE = 100 * 2**20
+"""Bytes for the objects of a Ray cluster started here; the runs hand over none."""
 
 
 def make_launcher(cfg: LauncherConfig) -> Launch:
@@ -46,9 +51,7 @@ def _parallel(cfg: LauncherConfig) -> Launch:
         return cluster.launcher(cfg)
     assert isinstance(cfg, RayConfig)
     require("ray", "ray", option)
-    from trackmdp.app.sweep import ray_cluster
-
-    return partial(ray_cluster.launch_on_ray, cfg)
+    return partial(_on_ray, cfg)
 
 
 @contextmanager
@@ -81,3 +84,37 @@ def _joblib(cfg: JoblibConfig, jobs: Sequence[Job]) -> None:
     # Threads: joblib's own processes (loky) give up the whole sweep when one of them is killed. `batch_size=1`: a
     # thread that took several runs at once would hold them back from threads that are idle.
     Parallel(n_jobs=at_once, backend="threading", batch_size=1)(delayed(run_job)(job) for job in jobs)
+
+
+def _on_ray(cfg: RayConfig, jobs: Sequence[Job]) -> None:
+    """Run `jobs` as tasks of a Ray cluster, which is left, or ended where it was started here.
+
+    Raises:
+        UserError: there is no such cluster.
+    """
+    import ray
+
+    with kept_sigterm():  # which asks the sweep to stop
+        _join(cfg, ray)
+    try:
+        # No retries by Ray: a run that was killed for lack of memory would be again; the sweep launches what is left
+        # itself.
+        task = ray.remote(num_cpus=cfg.cpus_per_run, num_gpus=cfg.gpus_per_run, max_retries=0)(run_job)
+        left = [task.remote(job) for job in jobs]
+        while left:  # what failed stands in the folders; a task whose worker died has left nothing there
+            _, left = ray.wait(left, num_returns=1)
+    finally:
+        ray.shutdown()
+
+
+def _join(cfg: RayConfig, ray: Any) -> None:
+    quiet: dict[str, Any] = {"logging_level": "error", "include_dashboard": False}
+    if cfg.address is None:
+        ray.init(num_cpus=cfg.num_cpus, object_store_memory=_STORE, **quiet)
+        return
+    try:
+        # Nothing about memory: Ray refuses `object_store_memory` and `num_cpus` for a cluster that runs already.
+        ray.init(address=cfg.address, logging_level="error")
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        reason = " ".join(str(error).split())
+        raise UserError(f"hydra.launcher.address={cfg.address}: expected a Ray cluster ({reason})") from error

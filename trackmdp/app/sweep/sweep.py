@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Self
 
 from rich.console import Console
@@ -140,11 +140,9 @@ class _Stop(Signals):
         self._file.unlink(missing_ok=True)
         return super().__enter__()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        super().__exit__(kind, error, traceback)
-        if kind is None:  # else jobs elsewhere may still be about to look
+    def __exit__(self, *raised: object) -> None:
+        super().__exit__(*raised)
+        if raised[0] is None:  # else jobs elsewhere may still be about to look
             self._file.unlink(missing_ok=True)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
