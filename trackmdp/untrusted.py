@@ -15,8 +15,9 @@ import re
 import stat
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from io import BufferedReader
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from trackmdp.errors import UserError
 
@@ -36,7 +37,7 @@ _KINDS = {
 }
 
 
-def opened(file: Path, *, most: int, source: str = "", links: bool = False) -> BinaryIO:
+def opened(file: Path, *, most: int, source: str = "", links: bool = False) -> BufferedReader:
     """An ordinary file of at most `most` bytes, open for reading.
 
     Args:
@@ -140,6 +141,14 @@ def read_object(file: Path, *, most: int = SMALL, source: str = "") -> dict[str,
     if not isinstance(content, dict):
         raise UserError(f"{source or file}: expected a JSON object")
     return content
+
+
+def known_object(file: Path, *, most: int = SMALL) -> dict[str, Any]:
+    """The JSON object in a file; empty where there is none."""
+    try:
+        return read_object(file, most=most)
+    except UserError:
+        return {}
 
 
 def parse_json(text: str | bytes, source: str) -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -62,7 +62,16 @@ def _run_once(compose: Composer) -> int:
 def _run_in_hydra(cfg: DictConfig, ready: Prepared) -> None:
     """Run under Hydra's own settings: logging, environment variables, current folder, the folder `.hydra`."""
     configure_log(cfg.hydra.hydra_logging, cfg.hydra.verbose)
-    task = _Task(replace(ready, folder=ready.folder.absolute()))  # hydra.job.chdir moves the current folder
+    ready = replace(ready, folder=ready.folder.absolute())  # hydra.job.chdir moves the current folder
+    raised: list[Exception] = []
+
+    def task(_: DictConfig) -> Any:
+        try:
+            return ready.run()
+        # Kept, since Hydra would add lines of its own. KeyboardInterrupt and `Preempted` pass through it as they are.
+        except Exception as error:
+            raised.append(error)
+
     loader = GlobalHydra.instance().config_loader()
     # Hydra's public call below its command line: it makes `.hydra`, changes folder and sets the environment, as a user
     # of Hydra expects, without its own parsing of sys.argv and its handling of errors.
@@ -74,24 +83,8 @@ def _run_in_hydra(cfg: DictConfig, ready: Prepared) -> None:
         hydra_context=HydraContext(loader, _NoCallbacks()),  # type: ignore[arg-type]
     )
     # Only now, after Hydra has restored the environment and the current folder.
-    if task.raised is not None:
-        raise task.raised
-
-
-@dataclass
-class _Task:
-    """What Hydra calls to run the command; it keeps what the command raises, since Hydra would add lines of its own."""
-
-    ready: Prepared
-    raised: Exception | None = None
-
-    def __call__(self, _: DictConfig) -> Any:
-        try:
-            return self.ready.run()
-        # KeyboardInterrupt and `Preempted` are no `Exception`: they pass through Hydra as they are.
-        except Exception as error:
-            self.raised = error
-            return None
+    if raised:
+        raise raised[0]
 
 
 class _NoCallbacks:

@@ -11,7 +11,7 @@ from typing import Any
 from trackmdp.config.checks import validate
 from trackmdp.config.options import SELECTORS, listed
 from trackmdp.config.roots import TrainConfig
-from trackmdp.config.tree import load_run_config, to_yaml
+from trackmdp.config.tree import load_run_config, to_dict, to_yaml
 from trackmdp.errors import UserError
 from trackmdp.untrusted import read_object, unsealed
 
@@ -28,6 +28,18 @@ CHANGEABLE = (
     "quiet",
 )
 """Options, or groups of them, that may differ on resume: budget, solving, logging, saving, workers and devices."""
+
+
+def fixed_options(cfg: TrainConfig) -> dict[str, Any]:
+    """The options by which two runs differ: all but those that may change when a run is resumed."""
+    plain = to_dict(cfg)
+    for key in (*CHANGEABLE, "resume"):
+        *parents, last = key.split(".")
+        node = plain
+        for name in parents:
+            node = node[name]
+        node.pop(last)
+    return plain
 
 
 def config_text(cfg: TrainConfig) -> str:

@@ -12,7 +12,8 @@ from trackmdp.config.loggers import LogConfig
 from trackmdp.config.options import GROUPS, listed, option, refuse
 from trackmdp.config.partition import PartitionConfig, SweptPartitionConfig
 from trackmdp.config.schema import NodeConfig
-from trackmdp.config.world import CostConfig, GridConfig, KernelConfig, SensorConfig, TaskConfig
+from trackmdp.config.sensing import CostConfig, SensorConfig
+from trackmdp.config.world import GridConfig, KernelConfig, TaskConfig
 from trackmdp.errors import UserError
 
 

@@ -96,10 +96,7 @@ def load_config(file: Path, root: type[C]) -> C:
     """
     if not file.exists():
         raise UserError(f"{file}: no such file")
-    # Not resolved: every value of a saved config is plain, and `${oc.env:NAME}` in a foreign one must stay a text.
-    plain = OmegaConf.to_container(parse_yaml(read_text(file, most=MAX_BYTES), str(file)))
-    if not isinstance(plain, Mapping):
-        raise UserError(f"{file}: not a config (expected a mapping)")
+    plain = _mapping(read_text(file, most=MAX_BYTES), str(file))
     try:
         typed: C = build_config(plain, root)
         validate(typed)
@@ -114,14 +111,20 @@ def world_of(text: str | bytes) -> WorldConfig:
     Raises:
         UserError: it does not describe one.
     """
-    plain = OmegaConf.to_container(parse_yaml(text, "config.yaml"))
-    if not isinstance(plain, Mapping):
-        raise UserError("config.yaml: not a config (expected a mapping)")
-    known = options(WorldConfig)
+    plain, known = _mapping(text, "config.yaml"), options(WorldConfig)
     # The other keys belong to the command, and each command has its own.
     typed: WorldConfig = build_config({key: value for key, value in plain.items() if key in known}, WorldConfig)
     validate(typed)
     return typed
+
+
+def _mapping(text: str | bytes, source: str) -> Mapping[Any, Any]:
+    """The mapping in the text of a config."""
+    # Not resolved: every value of a saved config is plain, and `${oc.env:NAME}` in a foreign one must stay a text.
+    plain = OmegaConf.to_container(parse_yaml(text, source))
+    if not isinstance(plain, Mapping):
+        raise UserError(f"{source}: not a config (expected a mapping)")
+    return plain
 
 
 def load_run_config(folder: str | Path) -> TrainConfig:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -45,7 +46,7 @@ class EpisodeLog:
     ) -> None:
         self._world, self._seed, self._tell = world, seed, tell
         self._writer: EpisodeWriter | None = None
-        try:
+        with self._over_at_failure():
             self.file, self.episodes = folder / "episodes.mcap", 0
             if policies is not None:
                 self._take_over(policies)
@@ -55,8 +56,6 @@ class EpisodeLog:
                 self._writer = EpisodeWriter(self.file, world, facts=facts, config=config)
             if layout:
                 write_layout(folder / "episodes.layout.json", world.size)
-        except OSError as error:
-            self._stop(error)
 
     def _take_over(self, policies: int) -> None:
         """Resume the log of an earlier process, which was killed (`.part`) or ended in order."""
@@ -85,43 +84,40 @@ class EpisodeLog:
         """Log simulated episodes; `facts` is what the log says of their policy, such as its `label`."""
         if self._writer is None:
             return
-        try:
+        with self._over_at_failure():
             policy = self._writer.add_policy(facts, episodes.policy)
             for episode in episodes.complete():
                 self._writer.add(replace(episode, number=self.episodes, policy=policy))
                 self.episodes += 1
             self._writer.flush()
-        except OSError as error:
-            self._stop(error)
 
     def sync(self) -> None:
         """Put what has been recorded on the disk."""
-        if self._writer is None:
-            return
-        try:
-            self._writer.sync()
-        except OSError as error:
-            self._stop(error)
+        if self._writer is not None:
+            with self._over_at_failure():
+                self._writer.sync()
 
     def close(self) -> bool:
         """Finish the file, unless logging is over already; returns whether the file is whole."""
-        if self._writer is None:
-            return False
-        try:
-            self._writer.finish()
-        except OSError as error:
-            self._stop(error)
-            return False
-        self._writer = None
-        return True
-
-    def _stop(self, error: OSError) -> None:
-        part = self.file.with_name(f"{self.file.name}.part")
-        reason = (error.strerror or "cannot be written").lower()
-        self._tell(f"{part}: {reason}; no more episodes are logged")
+        whole = False
         if self._writer is not None:
-            self._writer.abandon()
-            self._writer = None
+            with self._over_at_failure():
+                self._writer.finish()
+                self._writer, whole = None, True
+        return whole
+
+    @contextmanager
+    def _over_at_failure(self) -> Iterator[None]:
+        """Where the file fails, say so, and let logging be over."""
+        try:
+            yield
+        except OSError as error:
+            part = self.file.with_name(f"{self.file.name}.part")
+            reason = (error.strerror or "cannot be written").lower()
+            self._tell(f"{part}: {reason}; no more episodes are logged")
+            if self._writer is not None:
+                self._writer.abandon()
+                self._writer = None
 
 
 def free_name(file: Path) -> Path:

@@ -15,9 +15,9 @@ from omegaconf import OmegaConf
 from trackmdp.config.untrusted import MAX_BYTES, parse_yaml
 from trackmdp.errors import UserError
 from trackmdp.reports.results import FIGURES, Anomaly, CurvePoint, FinishedRun
-from trackmdp.training.folders import FAILED_FILE, read_run_json, run_of
+from trackmdp.training.folders import FAILED_FILE, run_of
 from trackmdp.training.sealing import SUMMARY, check_files, read_summary
-from trackmdp.untrusted import decoded, printable, read_text
+from trackmdp.untrusted import decoded, known_object, printable, read_text
 
 __all__ = ["flatten", "plain_config", "read_curve", "read_run"]
 
@@ -35,7 +35,7 @@ def read_run(folder: Path, name: str) -> tuple[FinishedRun, Mapping[str, Any]] |
     """A run and its summary, or why there is none."""
     place = folder / name
     if (place / FAILED_FILE).is_file():
-        reason = read_run_json(place / FAILED_FILE).get("reason", "no reason given")
+        reason = known_object(place / FAILED_FILE).get("reason", "no reason given")
         return Anomaly(name, f"failed: {printable(str(reason))}")
     if not place.is_dir() or not (place / "config.yaml").is_file():
         return Anomaly(name, "not started")

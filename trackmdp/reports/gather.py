@@ -27,9 +27,9 @@ from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.keyed import averaged
 from trackmdp.solvers.keyed_search import cell_bound
 from trackmdp.solvers.renewal import DIRECT_CELLS
-from trackmdp.training.folders import FAILED_FILE, PLAN, read_run_json
+from trackmdp.training.folders import FAILED_FILE, PLAN
 from trackmdp.training.sealing import SUMMARY, check_files, read_summary
-from trackmdp.untrusted import printable
+from trackmdp.untrusted import known_object, printable
 from trackmdp.world.checks import canonical_kernel
 from trackmdp.world.make import build_world, of_task
 from trackmdp.world.modes import HiddenWorld
@@ -82,7 +82,7 @@ def gather_runs(folder: Path) -> Results:
 
 def planned(folder: Path) -> Mapping[str, Any] | None:
     """The content of `sweep.json`, where there is a readable one."""
-    plan = read_run_json(folder / PLAN)
+    plan = known_object(folder / PLAN)
     return plan if isinstance(plan.get("jobs"), list) else None
 
 

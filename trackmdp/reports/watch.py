@@ -17,8 +17,8 @@ from rich.text import Text
 
 from trackmdp.errors import UserError
 from trackmdp.reports.gather import planned, run_folders
-from trackmdp.training.folders import read_run_json, run_of
-from trackmdp.untrusted import decoded, opened, printable
+from trackmdp.training.folders import run_of
+from trackmdp.untrusted import decoded, known_object, opened, printable
 
 __all__ = ["Status", "statuses", "watch"]
 
@@ -109,7 +109,7 @@ def _going(sweep: Path, found: Sequence[Status]) -> bool:
 
 
 def _status(place: Path, name: str) -> Status:
-    found, plan = run_of(place), read_run_json(place / "plan.json")
+    found, plan = run_of(place), known_object(place / "plan.json")
     if found.state == FAILED:
         return Status(name, FAILED, reason=found.reason)
     # The run is being written while it is read: a file may be missing, or of the moment before.

@@ -12,7 +12,7 @@ import re
 import stat
 import sys
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any, BinaryIO, cast
 
@@ -105,37 +105,37 @@ def load(file: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
         if not isinstance(state, dict) or type(state.get("format")) is not int or state["format"] != CHECKPOINT_FORMAT:
             raise UserError(f"{file}: not the state of a run")
         # A tensor whose size goes beyond its own member of the archive would show the bytes that follow in the file.
-        if sum(_storages(state).values()) != stored:
+        if _stored(_tensors(state)) != stored:
             raise ValueError("tensors that reach beyond what is stored of them")
-        _take_out(state)
+        # The small ones are copied out of the file's pages, so that at most a large one keeps the file open.
+        for tensor in _tensors(state):
+            if tensor.nbytes <= _SMALL:
+                # `.data`, so that the tensor object in its place in the nested state is changed, not a copy of it.
+                tensor.data = tensor.clone()
     return state
 
 
-def _storages(value: Any) -> dict[int, int]:
-    """Address -> bytes of each storage; as pages of a file, torch takes the length that a tensor claims for its own."""
+def _tensors(value: Any) -> Iterator[torch.Tensor]:
+    """The tensors of a nested state."""
     if isinstance(value, torch.Tensor):
-        # Copied into a real weight, its imaginary part would be lost with no more than a warning.
-        if value.is_complex():
-            raise ValueError("complex numbers")
-        storage = value.untyped_storage()
-        # By address, since tensors may share a storage (views); an empty storage has no address of its own.
-        return {storage.data_ptr(): storage.nbytes()} if storage.nbytes() else {}
-    found: dict[int, int] = {}
-    if isinstance(value, (Mapping, list, tuple)):
-        for part in value.values() if isinstance(value, Mapping) else value:
-            found |= _storages(part)
-    return found
-
-
-def _take_out(value: Any) -> None:
-    """Copy the small tensors out of the file's pages, so that at most a large one keeps the file open."""
-    if isinstance(value, torch.Tensor):
-        if value.nbytes <= _SMALL:
-            # `.data`, so that the tensor object in its place in the nested state is changed, not a copy of it.
-            value.data = value.clone()
+        yield value
     elif isinstance(value, (Mapping, list, tuple)):
         for part in value.values() if isinstance(value, Mapping) else value:
-            _take_out(part)
+            yield from _tensors(part)
+
+
+def _stored(tensors: Iterable[torch.Tensor]) -> int:
+    """Bytes of all storages; as pages of a file, torch takes the length that a tensor claims for its own."""
+    sizes: dict[int, int] = {}
+    for tensor in tensors:
+        # Copied into a real weight, its imaginary part would be lost with no more than a warning.
+        if tensor.is_complex():
+            raise ValueError("complex numbers")
+        storage = tensor.untyped_storage()
+        # By address, since tensors may share a storage (views); an empty storage has no address of its own.
+        if storage.nbytes():
+            sizes[storage.data_ptr()] = storage.nbytes()
+    return sum(sizes.values())
 
 
 class _Hashed:

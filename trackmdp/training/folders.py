@@ -11,7 +11,7 @@ from trackmdp.durable import write_json
 from trackmdp.errors import UserError
 from trackmdp.training.lock import is_locked
 from trackmdp.training.sealing import read_summary
-from trackmdp.untrusted import read_object
+from trackmdp.untrusted import known_object
 
 PLAN, FAILED_FILE, DONE = "sweep.json", "failed.json", "done.json"
 """Files: of a sweep; of a run that failed, of a run of another command than `train` that ended."""
@@ -48,7 +48,7 @@ def read_plan(sweep: Path) -> dict[str, Any]:
     Raises:
         UserError: the folder is not that of a sweep.
     """
-    content = read_run_json(sweep / PLAN)
+    content = known_object(sweep / PLAN)
     jobs = content.get("jobs")
     whole = isinstance(jobs, list) and all(
         isinstance(job, dict) and isinstance(job.get("folder"), str) and isinstance(job.get("overrides"), list)
@@ -75,7 +75,7 @@ def run_of(folder: Path, overrides: tuple[str, ...] = ()) -> RunState:
         return RunState(folder, overrides, "running")
     if result := _result(folder):
         return RunState(folder, overrides, "done", "", result)
-    if failed := read_run_json(folder / FAILED_FILE):
+    if failed := known_object(folder / FAILED_FILE):
         return RunState(folder, overrides, "failed", str(failed.get("reason", "")))
     return RunState(folder, overrides, "cut" if (folder / "config.yaml").is_file() else "waiting")
 
@@ -85,12 +85,4 @@ def _result(folder: Path) -> dict[str, Any]:
     try:
         return read_summary(folder)
     except UserError:
-        return read_run_json(folder / DONE)
-
-
-def read_run_json(file: Path) -> dict[str, Any]:
-    """The content of a file that is whole or absent; empty where it is absent or no object."""
-    try:
-        return read_object(file)
-    except UserError:
-        return {}
+        return known_object(folder / DONE)

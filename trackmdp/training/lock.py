@@ -13,11 +13,10 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
 
 from trackmdp.durable import UNSUPPORTED, create, reopen, say_lacking
 from trackmdp.errors import UserError
-from trackmdp.untrusted import opened, read_object
+from trackmdp.untrusted import known_object, opened
 
 _TRIES, _BETWEEN = 5, 0.05
 _LOCK, _OWNER = ".lock", ".lock.owner"
@@ -104,7 +103,7 @@ def _owned(folder: Path, key: str) -> Iterator[None]:
     with suppress(FileExistsError), create(file) as stream:
         stream.write(json.dumps({"token": token, "host": socket.gethostname(), "pid": os.getpid()}).encode())
     time.sleep(_SETTLE)
-    if _said(file).get("token") != token:
+    if known_object(file).get("token") != token:
         raise UserError(f"{key}={folder}: another process is running in this folder{_who(file)}")
     over = threading.Event()
     # A daemon thread: it must not keep a process alive whose main thread has ended.
@@ -116,7 +115,7 @@ def _owned(folder: Path, key: str) -> Iterator[None]:
         over.set()
         beat.join()
         # Only our own: a host that was suspended for a minute may find that another has taken the folder over.
-        if _said(file).get("token") == token:
+        if known_object(file).get("token") == token:
             file.unlink(missing_ok=True)
 
 
@@ -132,7 +131,7 @@ def _is_alive(file: Path) -> bool:
     On this host the process is asked for. Elsewhere the file's age counts, by the clock of its own file system: that of
     this host may be off.
     """
-    said = _said(file)
+    said = known_object(file)
     if not said:
         return False
     if said.get("host") == socket.gethostname() and isinstance(said.get("pid"), int):
@@ -160,13 +159,6 @@ def _runs(pid: int) -> bool:
     return True
 
 
-def _said(file: Path) -> dict[str, Any]:
-    try:
-        return read_object(file, most=2**12)
-    except UserError:
-        return {}
-
-
 def _who(file: Path) -> str:
-    said = _said(file)
+    said = known_object(file)
     return f" (process {said.get('pid')} on {said.get('host')})" if said else ""

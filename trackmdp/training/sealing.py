@@ -50,8 +50,5 @@ def check_files(folder: Path, summary: Mapping[str, Any], *names: str) -> None:
 
 
 def _digest(file: Path) -> str:
-    digest = hashlib.sha256()
     with opened(file, most=_LARGEST) as stream:
-        while piece := stream.read(2**20):
-            digest.update(piece)
-    return digest.hexdigest()
+        return hashlib.file_digest(stream, "sha256").hexdigest()

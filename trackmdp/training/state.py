@@ -14,8 +14,8 @@ import torch
 from torchrl.collectors import BaseCollector, Collector
 
 from trackmdp.algos.common import Algorithm
-from trackmdp.config import TrainConfig, to_dict
-from trackmdp.config.resume import CHANGEABLE
+from trackmdp.config import TrainConfig
+from trackmdp.config.resume import fixed_options
 from trackmdp.errors import UserError
 from trackmdp.training import checkpoint
 from trackmdp.training.collect import collector_state, load_collector_state
@@ -40,16 +40,8 @@ class Position:
 
 def identity(cfg: TrainConfig) -> str:
     """SHA-256 of all options that must not change when a run is resumed."""
-    plain = to_dict(cfg)
-    # What may change is taken out; repr of the rest writes floats with all digits, so that equal hashes mean equal
-    # options.
-    for key in (*CHANGEABLE, "resume"):
-        *parents, last = key.split(".")
-        node = plain
-        for name in parents:
-            node = node[name]
-        node.pop(last)
-    return hashlib.sha256(repr(plain).encode()).hexdigest()
+    # repr writes floats with all digits, so that equal hashes mean equal options.
+    return hashlib.sha256(repr(fixed_options(cfg)).encode()).hexdigest()
 
 
 def capture(

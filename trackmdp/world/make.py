@@ -14,7 +14,7 @@ from trackmdp.config import WorldConfig
 from trackmdp.config.compose import compose, default, given
 from trackmdp.config.options import GROUPS, options, refuse
 from trackmdp.config.registry import make, maker
-from trackmdp.config.world import LARGEST
+from trackmdp.config.sensing import LARGEST
 from trackmdp.world.checks import canonical_kernel, check_kernel
 from trackmdp.world.files import per_cell
 from trackmdp.world.model import Size, World, grid_size

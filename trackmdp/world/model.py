@@ -11,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from trackmdp.config.world import LARGEST, MEMORIES
+from trackmdp.config.sensing import LARGEST
+from trackmdp.config.world import MEMORIES
 from trackmdp.errors import UserError
 from trackmdp.world.checks import canonical_kernel, check_kernel
 from trackmdp.world.coverage import Coverage

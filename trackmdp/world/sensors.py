@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from trackmdp.config.world import lattice
+from trackmdp.config.sensing import lattice
 from trackmdp.errors import UserError
 from trackmdp.world.coverage import Coverage, discs
 from trackmdp.world.files import per_cell, read_matrix

@@ -49,7 +49,7 @@ def reachable(chains: BoolArray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("form", ["onnx", pytest.param("torch_export", marks=pytest.mark.slow)])
 def test_a_program_without_this_package_gets_the_same_sets(form: str, run: Path, tmp_path: Path) -> None:
     assert main(["export", f"run={run}", f"format={form}", f"hydra.run.dir={tmp_path}"]) == 0
-    chains = trained(str(run), torch.device("cpu")).policy.dense()
+    chains = trained(str(run), torch.device("cpu"))[1].dense()
     assert len(np.unique(chains.reshape(-1, chains.shape[2]), axis=0)) > 3
     cells, steps, actions = reachable(chains)
     np.savez(tmp_path / "states.npz", cells=cells, steps=steps)
@@ -66,14 +66,14 @@ def test_a_program_without_this_package_gets_the_same_sets(form: str, run: Path,
 def test_sets_are_lists_of_cells(run: Path) -> None:
     assert main(["export", f"run={run}", "format=sets", "quiet=true"]) == 0
     written = json.loads((run / "sets.json").read_text(encoding="utf-8"))
-    chains = trained(str(run), torch.device("cpu")).policy.dense()
+    chains = trained(str(run), torch.device("cpu"))[1].dense()
     assert written["t_max"] == 2
     assert written["sets"]["4"] == [np.flatnonzero(on).tolist() for on in chains[4]]
 
 
 def test_the_best_checkpoint_is_one_that_is_kept_beside_the_newest(run: Path, tmp_path: Path) -> None:
     assert main(["export", f"run={run}", "format=sets", "checkpoint=best", f"hydra.run.dir={tmp_path}"]) == 0
-    best = trained(str(run), torch.device("cpu"), best=True).policy.dense()
+    best = trained(str(run), torch.device("cpu"), best=True)[1].dense()
     written = json.loads((tmp_path / "sets.json").read_text(encoding="utf-8"))
     assert written["sets"]["0"] == [np.flatnonzero(on).tolist() for on in best[0]]
 

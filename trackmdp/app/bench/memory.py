@@ -26,5 +26,5 @@ def memory(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator
         train = train_config(words)
         # What the check before a run adds up, without Python and torch, which `peak_mib` includes.
         expected = sum(needs(train, build_world(train).task).values())
-        peak = timed_training(*words, f"threads={cfg.threads}", f"device={device}").usage.peak_mib
-        yield {"part": "memory", "algo": algo, "N": size, "expected_mib": expected / 2**20, "peak_mib": peak}
+        _, usage = timed_training(*words, f"threads={cfg.threads}", f"device={device}")
+        yield {"part": "memory", "algo": algo, "N": size, "expected_mib": expected / 2**20, "peak_mib": usage.peak_mib}

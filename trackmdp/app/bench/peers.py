@@ -92,9 +92,9 @@ def _scripts(cfg: BenchmarkConfig) -> list[tuple[Path, str]]:
 def _ours(cfg: BenchmarkConfig, seed: int, device: torch.device) -> Learned:
     # `evaluation.every=1` gives the curve its points; solving for the optimum is not learning, and is left out.
     own = [f"seed={seed}", f"threads={cfg.threads}", f"device={device}", "evaluation.every=1", "optimal.enabled=false"]
-    run = timed_training(*typed("grid", "kernel", "cost", "sensor"), *own)
-    points = [(float(row["seconds"]), int(row["frames"]), float(row["regret_per_step"])) for row in run.curve]
-    return Learned("trackmdp hindsight", seed, _from_start(points, run.usage), run.usage)
+    rows, usage = timed_training(*typed("grid", "kernel", "cost", "sensor"), *own)
+    points = [(float(row["seconds"]), int(row["frames"]), float(row["regret_per_step"])) for row in rows]
+    return Learned("trackmdp hindsight", seed, _from_start(points, usage), usage)
 
 
 def _peer(

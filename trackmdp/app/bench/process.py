@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from hydra.core.hydra_config import HydraConfig
@@ -47,15 +46,6 @@ class Usage:
     peak_mib: float
 
 
-@dataclass(frozen=True)
-class TimedTraining:
-    """A training run: its `summary.json`, the rows of `metrics.csv` that were judged, and what it took."""
-
-    summary: dict[str, Any]
-    curve: list[dict[str, str]]
-    usage: Usage
-
-
 def measured(*words: str, script: str | None = None, python: str = sys.executable, quiet: bool = False) -> Usage:
     """Run `trackmdp words...`, or `python script words...`, in a process of its own.
 
@@ -79,15 +69,13 @@ def measured(*words: str, script: str | None = None, python: str = sys.executabl
         return Usage(wall, **json.loads(report.read_text()))
 
 
-def timed_training(*words: str) -> TimedTraining:
-    """Run `trackmdp train words...` in a process of its own."""
+def timed_training(*words: str) -> tuple[list[dict[str, str]], Usage]:
+    """Run `trackmdp train words...` in a process of its own: the rows of `metrics.csv` with a regret, what it took."""
     with tempfile.TemporaryDirectory() as folder:
         usage = measured("train", *words, "quiet=true", f"hydra.run.dir={folder}/run")
-        summary = json.loads(Path(folder, "run", "summary.json").read_text())
         with Path(folder, "run", "metrics.csv").open() as stream:
             # Rows between two evaluations have no regret.
-            curve = [row for row in csv.DictReader(stream) if row["regret_per_step"]]
-    return TimedTraining(summary, curve, usage)
+            return [row for row in csv.DictReader(stream) if row["regret_per_step"]], usage
 
 
 def typed(*keys: str) -> list[str]:

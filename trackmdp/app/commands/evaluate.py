@@ -47,7 +47,7 @@ def run(cfg: EvaluateConfig, folder: Path, problem: Problem | None = None) -> fl
     device = make_device(cfg.device)
     if cfg.run is None and isinstance(cfg.baseline, PlaybackConfig) and not isinstance(cfg.sensor, FalseAlarmConfig):
         return playback.run(cfg, folder, console, problem)
-    world, policy, subject = _trained(cfg, device) if cfg.run else _baseline(cfg, problem)
+    world, policy, subject = trained(cfg.run, device) if cfg.run else _baseline(cfg, problem)
     if isinstance(cfg.sensor, FalseAlarmConfig):
         return alarms.run(cfg, world, policy, subject, folder, console)
     # Recorded tracks have no kernel, hence no exact value and no bound: figures come from the held-out tracks.
@@ -101,12 +101,6 @@ def _log_episodes(
     log.add(episodes, {"label": subject})
     if log.close():
         console.print(f"{log.episodes} episodes in {log.file}", markup=False)
-
-
-def _trained(cfg: EvaluateConfig, device: torch.device) -> tuple[Problem, Policy, str]:
-    assert cfg.run is not None
-    found = trained(cfg.run, device)
-    return found.world, found.policy, found.subject
 
 
 def _proved(run: str) -> dict[str, Any] | None:

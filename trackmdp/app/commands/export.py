@@ -39,11 +39,11 @@ def run(cfg: ExportConfig, folder: Path) -> None:
     Raises:
         UserError: there is no such run, or a package that `cfg.format` needs is missing.
     """
-    found = trained(cfg.run, torch.device("cpu"), best=cfg.checkpoint == "best")
-    task, file = found.world.task, folder / FILES[cfg.format]
+    world, policy, subject = trained(cfg.run, torch.device("cpu"), best=cfg.checkpoint == "best")
+    task, file = world.task, folder / FILES[cfg.format]
     about = {
         "trackmdp": __version__,
-        "policy": found.subject,
+        "policy": subject,
         "grid_size": str(task.rows),
         "t_max": str(task.t_max),
     }
@@ -51,11 +51,11 @@ def run(cfg: ExportConfig, folder: Path) -> None:
         about |= {"memory": task.memory, "clip": str(task.clip), "classes": str(task.keys.num_classes)}
     if cfg.format == "sets":
         file = folder / sets_name(task)
-        write_sets(folder, found.policy)
+        write_sets(folder, policy)
     else:
         forms: dict[str, Callable[[Policy, dict[str, str]], bytes]] = {"torch_export": to_torch, "onnx": to_onnx}
-        write_bytes(file, forms[cfg.format](found.policy, about))
-    make_console(cfg.quiet).print(f"{found.subject} -> {file}")
+        write_bytes(file, forms[cfg.format](policy, about))
+    make_console(cfg.quiet).print(f"{subject} -> {file}")
 
 
 def to_torch(policy: Policy, about: dict[str, str]) -> bytes:

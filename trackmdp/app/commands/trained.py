@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -19,17 +18,10 @@ from trackmdp.world.make import make_problem
 from trackmdp.world.tracks import Problem
 
 
-@dataclass(frozen=True)
-class Trained:
-    """The policy of a run, where it was learned, and the checkpoint it is from."""
+def trained(run: str, device: torch.device, *, best: bool = False) -> tuple[Problem, Policy, str]:
+    """Where a run learned, the policy of its newest checkpoint, or of the best one, and what to call it.
 
-    world: Problem
-    policy: Policy
-    subject: str
-
-
-def trained(run: str, device: torch.device, *, best: bool = False) -> Trained:
-    """The policy of the newest checkpoint of the run in the folder `run`, or of the best one; by blocks, the run's own.
+    Of a run by blocks it is the run's own.
 
     Raises:
         UserError: that is no run, or the checkpoint is missing, damaged or another run's.
@@ -42,10 +34,10 @@ def trained(run: str, device: torch.device, *, best: bool = False) -> Trained:
                 f"checkpoint=best: expected newest for run={run}, whose blocks have checkpoints of their own"
             )
         check_inputs(world, folder)
-        return Trained(world, load_run(folder).policy, f"{cfg.algo.name}, by blocks")
+        return world, load_run(folder).policy, f"{cfg.algo.name}, by blocks"
     algorithm = make_algorithm(cfg, world, device)
     file = folder / "checkpoints" / checkpoint.BEST if best else checkpoint.newest(folder)
     load_learned(algorithm, cfg, file, device)
     check_inputs(world, folder)
     policy = actor_table(world.task, algorithm.actor, device=device)
-    return Trained(world, policy, f"{cfg.algo.name}, {file.name}")
+    return world, policy, f"{cfg.algo.name}, {file.name}"

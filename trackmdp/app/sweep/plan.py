@@ -20,7 +20,7 @@ from omegaconf import DictConfig
 
 from trackmdp.app.prepare import typed_config
 from trackmdp.config import CommandConfig, TrainConfig, to_dict
-from trackmdp.config.resume import CHANGEABLE
+from trackmdp.config.resume import fixed_options
 from trackmdp.errors import UserError
 
 _MOST = 100_000
@@ -186,17 +186,10 @@ def _digest(*told: Any) -> str:
 
 def _identity(cfg: CommandConfig | None) -> dict[str, Any]:
     """The options by which two configs count as different runs; empty for a config that was refused."""
-    if cfg is None:
-        return {}
-    plain = to_dict(cfg)
     # A default of what may change when a run is resumed does not make another run; typed, it does, as one of the words.
-    for key in (*CHANGEABLE, "resume") if isinstance(cfg, TrainConfig) else ("quiet",):
-        *parents, last = key.split(".")
-        node = plain
-        for name in parents:
-            node = node[name]
-        node.pop(last)
-    return plain
+    if isinstance(cfg, TrainConfig):
+        return fixed_options(cfg)
+    return {} if cfg is None else {key: value for key, value in to_dict(cfg).items() if key != "quiet"}
 
 
 def _resumable(cfg: CommandConfig) -> CommandConfig:

@@ -14,8 +14,8 @@ from trackmdp.app.prepare import shown
 from trackmdp.durable import write_text
 from trackmdp.errors import FAILED, USER_MISTAKE
 from trackmdp.training.display import table
-from trackmdp.training.folders import FAILED_FILE, RunState, read_run_json
-from trackmdp.untrusted import no_formula
+from trackmdp.training.folders import FAILED_FILE, RunState
+from trackmdp.untrusted import known_object, no_formula
 
 TABLE = "runs.csv"
 
@@ -71,7 +71,7 @@ def status_of(runs: Sequence[RunState]) -> int:
     """The exit status: 0 if all is done, 2 if only mistakes of the user failed, else 1."""
     if all(run.state == "done" for run in runs):
         return 0
-    statuses = [read_run_json(run.folder / FAILED_FILE).get("status") for run in runs if run.state == "failed"]
+    statuses = [known_object(run.folder / FAILED_FILE).get("status") for run in runs if run.state == "failed"]
     # A run that is neither done nor failed is nobody's mistake, and 2 would tell a script not to try again.
     unfinished = any(run.state not in ("done", "failed") for run in runs)
     return FAILED if unfinished or any(status != USER_MISTAKE for status in statuses) else USER_MISTAKE

@@ -1,0 +1,202 @@
+"""Schema of what sensing costs, and what it shows of the target."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+from trackmdp.config.options import GROUPS, Option, choice, listed, option, refuse
+from trackmdp.config.schema import ChoiceConfig
+from trackmdp.config.world import GridConfig
+from trackmdp.errors import UserError
+
+LARGEST = 1e15
+"""Of a price or a reward: sums of them over cells and steps, and squares of those in a loss, stay far from overflow."""
+
+
+@dataclass(kw_only=True)
+class CostConfig(ChoiceConfig):
+    """Base of the group `cost`: what sensing earns and costs.
+
+    What a choice makes is called with the grid's size and the choice's options, and returns r, c `[M]` and D.
+    """
+
+
+@choice("cost", "paper", makes="trackmdp.world.make:paper_cost")
+@dataclass(kw_only=True)
+class PaperCostConfig(CostConfig):
+    """The paper's rewards: r for a detection, c per sensor switched on, D for the safe action."""
+
+    reward: float = option("r, earned by a detection", unit="reward", ge=1 / LARGEST, le=LARGEST)
+    sensor: Any = option(
+        "c, price of one sensor switched on for one step, for all sensors or for each",
+        unit="reward per sensor-step",
+        expects="a number from 0 to 1e15, a list of one per sensor, or a path to a .npy or .csv file of one per sensor",
+        path=True,
+    )
+    safe: float | None = option(
+        "D, price of the safe action; null = the sum of all sensors' prices", unit="reward", ge=0, le=LARGEST
+    )
+
+    def check(self, key: str, root: Any) -> None:
+        """One price for all sensors, or one for each; a file is read later."""
+        price = Option("", ge=0, le=LARGEST, kind=float)
+        count, each = root.sensor.count(root.grid), "sensor" if root.sensor.covers else "cell"
+        _check_per_cell(f"{key}.sensor", self.sensor, count, price, "number from 0 to 1e15", each)
+
+
+@dataclass(kw_only=True)
+class SensorConfig(ChoiceConfig):
+    """Base of the group `sensor`: what a sensor that is on sees of the target in its cell.
+
+    What a choice makes is called with the grid's size and the choice's options, and returns arguments of `Task`.
+    """
+
+    covers: ClassVar[bool] = False
+    """Whether a sensor covers a set of cells, so that there need not be one in each cell."""
+
+    def count(self, grid: GridConfig) -> int | None:
+        """S, how many sensors there are; None where only a file tells."""
+        return grid.num_cells
+
+
+@choice("sensor", "perfect", makes="trackmdp.world.sensors:perfect")
+@dataclass(kw_only=True)
+class PerfectSensorConfig(SensorConfig):
+    """The paper's sensors: one that is on always locates the target in its cell."""
+
+
+def _chance(help: str) -> Any:
+    """An option of a probability above 0, for all cells or for each."""
+    expects = "a number above 0, at most 1, a list of one per cell, or a path to a .npy or .csv file of one per cell"
+    return option(help, expects=expects, path=True)
+
+
+@choice("sensor", "miss", makes="trackmdp.world.sensors:miss")
+@dataclass(kw_only=True)
+class MissConfig(SensorConfig):
+    """Sensors that miss: one that is on reports the target in its cell with probability p_d, and never another cell."""
+
+    p_d: Any = _chance(
+        "p_d, probability that a sensor that is on reports the target in its cell, for all cells or for each"
+    )
+    p_s: Any = _chance(
+        "p_s, the same of the safe action; below 1 it is repeated, at its full price, until it locates the target"
+    )
+
+    def check(self, key: str, root: Any) -> None:
+        """One probability for all cells, or one for each; a file is read later."""
+        _check_chance(f"{key}.p_d", self.p_d, root.grid)
+        _check_chance(f"{key}.p_s", self.p_s, root.grid)
+
+
+@choice("sensor", "false_alarm", makes="trackmdp.world.sensors:false_alarm")
+@dataclass(kw_only=True)
+class FalseAlarmConfig(SensorConfig):
+    """For evaluate alone: sensors that also report targets that are not there; a policy believes each report."""
+
+    p_d: Any = _chance(
+        "p_d, probability that a sensor that is on reports the target in its cell, for all cells or for each"
+    )
+    p_f: float = option(
+        "p_f, probability that a sensor that is on reports in a step in which the target is not there", ge=0, lt=1
+    )
+
+    def check(self, key: str, root: Any) -> None:
+        """Robustness of a policy made without them, and nothing else."""
+        if not hasattr(root, "baseline"):
+            raise refuse(
+                key, self.name, "perfect or miss; policies are evaluated with false alarms, never made for them"
+            )
+        if root.log:
+            raise refuse("log", listed(root.log), f"[] with {key}={self.name}, where nothing is simulated")
+        _check_chance(f"{key}.p_d", self.p_d, root.grid)
+
+
+@choice("sensor", "footprint", makes="trackmdp.world.sensors:footprint")
+@dataclass(kw_only=True)
+class FootprintConfig(SensorConfig):
+    """Wide sensors: each covers several cells, and if on it always locates the target in any of them, never misses."""
+
+    covers: ClassVar[bool] = True
+    radius: float = option(
+        "how far from its own cell the centres of the cells are that a sensor covers", unit="cells", ge=0
+    )
+    spacing: int = option("rows and columns from one sensor to the next, on a lattice", unit="cells", ge=1)
+    path: str | None = option(
+        "file in place of the lattice: a row per sensor, 1 in the column of each cell that it covers",
+        expects="a path to a .npz (scipy.sparse.save_npz or an array), .npy or .csv file",
+        path=True,
+    )
+
+    def count(self, grid: GridConfig) -> int | None:
+        """As many as the lattice has places."""
+        rows, columns = (len(lattice(side, self.spacing)) for side in grid.sides)
+        return None if self.path is not None else rows * columns
+
+    def check(self, key: str, root: Any) -> None:
+        """What footprints do not go together with."""
+        if self.path is not None and Path(self.path).suffix not in (".npz", ".npy", ".csv"):
+            raise refuse(f"{key}.path", self.path, "a path to a .npz, .npy or .csv file")
+        if root.grid.window is not None:
+            raise refuse("grid.window", root.grid.window, f"null with {key}={self.name}, whose sensors lie at no cell")
+        self._check_solver(key, root)
+        if root.kernel.hides:
+            raise refuse("kernel", root.kernel.name, f"a kernel without a hidden mode with {key}={self.name}")
+        if getattr(root, "task", None) is not None and root.task.memory != "cell":
+            raise refuse("task.memory", root.task.memory, f"cell with {key}={self.name}")
+
+    def _check_solver(self, key: str, root: Any) -> None:
+        """What plans and proves for sensors of one cell alone."""
+        for group in ("solver", "baseline"):
+            planner = getattr(root, group, None)
+            if planner is not None and not planner.knows_footprints:
+                known = [name for name, schema in GROUPS[group].items() if schema.knows_footprints]
+                raise refuse(group, planner.name, f"one of {', '.join(known)} with {key}={self.name}")
+        if root.learns and not root.algo.knows_footprints:
+            known = [name for name, schema in GROUPS["algo"].items() if schema.knows_footprints]
+            raise refuse("algo", root.algo.name, f"one of {', '.join(known)} with {key}={self.name}")
+        if getattr(root, "verify", False):
+            raise refuse("verify", True, f"false with {key}={self.name}: the theorems are on sensors of one cell")
+        if (partition := getattr(root, "partition", None)) is not None and partition.block is not None:
+            raise refuse("partition.block", partition.block, f"null with {key}={self.name}")
+
+    def ignored(self, root: Any) -> dict[str, str]:
+        """A file holds the footprints themselves."""
+        why = f"with sensor.path={self.path}"
+        return {} if self.path is None else {"radius": why, "spacing": why}
+
+
+def lattice(side: int, spacing: int) -> range:
+    """Rows, or columns, of a lattice on `side` of them; with a spacing of 3, 0 3 6 9 of 10, and 1 4 7 of 9."""
+    return range((side - 1) % spacing // 2, side, spacing)
+
+
+def _check_chance(key: str, value: Any, grid: GridConfig) -> None:
+    number = Option("", gt=0, le=1, kind=float)
+    _check_per_cell(key, value, grid.num_cells, number, "number above 0, at most 1")
+
+
+def _check_per_cell(
+    key: str, value: Any, count: int | None, number: Option, allowed: str, each_of: str = "cell"
+) -> None:
+    """Refuse what is neither one number for all cells or sensors, nor a list of one for each, nor the name of a table.
+
+    Such options are declared Any, since OmegaConf has no union of number, list and text; so values are checked here.
+
+    Raises:
+        UserError: it is something else.
+    """
+    if isinstance(value, list):
+        if count is not None and len(value) != count:
+            raise UserError(f"{key}: {len(value)} values, expected one number or {count} (one per {each_of})")
+        for index, each in enumerate(value):
+            if each is None or not number.allows(each):
+                raise refuse(f"{key}[{index}]", each, f"a {allowed}")
+        return
+    fine = Path(value).suffix in (".npy", ".csv") if isinstance(value, str) else number.allows(value)
+    if value is None or not fine:
+        several = "" if count is None else f" of {count} of them"
+        expected = f"a {allowed}, a list{several} (one per {each_of}), or a path to a .npy or .csv file"
+        raise refuse(key, value, expected)
