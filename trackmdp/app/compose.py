@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
@@ -21,12 +21,11 @@ from trackmdp.app.diagnose import diagnose
 from trackmdp.app.sources import searched
 from trackmdp.app.sweep.schema import PLUGINS
 from trackmdp.config import GROUPS, ROOTS, conf_dir
-from trackmdp.config.registry import plugin_folders
-from trackmdp.config.untrusted import names_code
+from trackmdp.config.registry import load_plugins
+from trackmdp.config.untrusted import entries, names_code
 from trackmdp.config.values import register_resolvers
 from trackmdp.errors import UserError
 
-_LOGGING = {"class": {"logging.StreamHandler", "logging.FileHandler", "logging.NullHandler"}}
 _LOG_FILE = "${hydra.runtime.output_dir}/${hydra.job.name}.log"
 """The one log file that Hydra's own logging configs write."""
 
@@ -42,7 +41,7 @@ _HYDRAS_OWN = {
 def register() -> None:
     """Make every schema known to Hydra as `base_<name>`, for the `defaults` lists in `conf/`."""
     register_resolvers()
-    plugin_folders()  # installed packages add their choices to `GROUPS`
+    load_plugins()  # installed packages add their choices to `GROUPS`
     store = ConfigStore.instance()
     for command, root in ROOTS.items():
         # A config typed by a dataclass is what makes Hydra refuse an unknown key or a wrong type while it composes.
@@ -96,7 +95,7 @@ class Composer:
         # Plugins of this package's are loaded by it, and their folders are searched as soon as Hydra is initialised.
         register()
         main = str(self._main) if self._main else conf_dir()
-        self._opened.enter_context(searched(self._users, plugin_folders(), main_is_users=self._main is not None))
+        self._opened.enter_context(searched(self._users, load_plugins(), main_is_users=self._main is not None))
         # Without `version_base` Hydra warns, and behaves as its version 1.1. An absolute folder works for a clone, an
         # editable install and a wheel; a relative one works for a clone alone.
         self._opened.enter_context(initialize_config_dir(main, job_name="trackmdp", version_base="1.3"))
@@ -182,26 +181,15 @@ def _check_logging(hydra: DictConfig, name: str) -> None:
     known = {"none", "default", "stdout", "disabled", "colorlog", None}
     if hydra.runtime.choices.get(f"hydra/{name}") not in known:
         raise UserError(f"hydra/{name}: expected one of none, default, stdout, disabled, colorlog")
-    for path, value in _entries(plain, f"hydra.{name}."):
-        key = path.rpartition(".")[2]
+    for place, key, value in entries(plain, f"hydra.{name}."):
         allowed = {
-            "class": value in _LOGGING["class"],
+            "class": value in ("logging.StreamHandler", "logging.FileHandler", "logging.NullHandler"),
             "()": value == "colorlog.ColoredFormatter",
             # The name of the job is part of the file's name, and could lead out of the run's folder.
             "filename": value == _LOG_FILE and "/" not in str(hydra.job.name),
         }.get(key, not str(value).startswith(("ext://", "cfg://")) or value in ("ext://sys.stdout", "ext://sys.stderr"))
         if not allowed:
-            raise UserError(f"{path}: a config names no code to call and no file to log to")
-
-
-def _entries(plain: Any, prefix: str) -> Iterable[tuple[str, Any]]:
-    """Dotted key and value of every leaf."""
-    items = plain.items() if isinstance(plain, dict) else enumerate(plain)
-    for key, value in items:
-        if isinstance(value, (dict, list)):
-            yield from _entries(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
+            raise UserError(f"{place}: a config names no code to call and no file to log to")
 
 
 def _is_search_path(word: str) -> bool:

@@ -89,11 +89,6 @@ def load_plugins() -> tuple[Path, ...]:
     return tuple(folders)
 
 
-def plugin_folders() -> tuple[Path, ...]:
-    """The `conf/` folders of the installed plugins."""
-    return load_plugins()
-
-
 def conf_dir() -> str:
     """The folder of the YAML files: `$TRACKMDP_CONF`, a clone's `conf/`, or the copy inside the wheel.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import yaml  # type: ignore[import-untyped]  # a dependency of OmegaConf
@@ -41,19 +42,18 @@ def parse_yaml(text: str | bytes, source: str) -> DictConfig | ListConfig:
     return config
 
 
-def names_code(plain: Any, prefix: str = "") -> str:
+def names_code(plain: Any) -> str:
     """The dotted key of the first entry that names what is called; `""` where none does."""
-    if isinstance(plain, list):
-        plain = {str(place): item for place, item in enumerate(plain)}
-    if not isinstance(plain, dict):
-        return ""
-    for key, value in plain.items():
-        # `_target_: os.system` is what hydra.utils.instantiate calls, `(): ...` what logging.config.dictConfig calls.
-        if key in _CODE:
-            return f"{prefix}{key}"
-        if found := names_code(value, f"{prefix}{key}."):
-            return found
-    return ""
+    # `_target_: os.system` is what hydra.utils.instantiate calls, `(): ...` what logging.config.dictConfig calls.
+    return next((place for place, key, _ in entries(plain) if key in _CODE), "")
+
+
+def entries(plain: Any, prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Dotted place, key and value of every entry of a plain config, the outer ones before those within them."""
+    within = plain.items() if isinstance(plain, dict) else enumerate(plain) if isinstance(plain, list) else ()
+    for key, value in within:
+        yield f"{prefix}{key}", key, value
+        yield from entries(value, f"{prefix}{key}.")
 
 
 def _check_size(text: str) -> None:
