@@ -10,7 +10,8 @@ from typing import Any
 from hydra import compose, initialize_config_dir
 
 from trackmdp.app.compose import register
-from trackmdp.config import GROUPS, ROOTS, Option, conf_dir, from_hydra, options
+from trackmdp.config import GROUPS, ROOTS, Option, conf_dir, options
+from trackmdp.config.compose import from_hydra
 from trackmdp.config.options import several
 
 REFUSED = {("evaluate", f"log={name}") for name in ("csv", "tensorboard", "wandb", "mlflow")} | {

@@ -46,7 +46,8 @@ def make_folder(key: str, folder: Path) -> list[Path]:
         UserError: it cannot be made or written to. Nothing is left behind then.
     """
     # Noted before anything is made, so that exactly these are taken away again.
-    made = _missing(folder)
+    path = folder.absolute()
+    made = [each for each in (path, *path.parents) if not each.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         # A folder that was there already may be read-only: mkdir does not complain, the first file would.
@@ -56,12 +57,6 @@ def make_folder(key: str, folder: Path) -> list[Path]:
         remove_if_empty(made)
         raise UserError(f"{key}={folder}: expected a folder that can be written to ({error.strerror})") from error
     return made
-
-
-def _missing(folder: Path) -> list[Path]:
-    """`folder` and those above it that do not exist yet, the innermost first."""
-    path = folder.absolute()
-    return [each for each in (path, *path.parents) if not each.exists()]
 
 
 def remove_if_empty(folders: Iterable[Path]) -> None:

@@ -22,10 +22,10 @@ from trackmdp.config import (
     ReportConfig,
     TrainConfig,
     WorldConfig,
-    from_hydra,
     load_run_config,
 )
 from trackmdp.config.checks import refuse_ignored
+from trackmdp.config.compose import from_hydra
 from trackmdp.config.loggers import require_packages
 from trackmdp.config.resume import continued, run_folder
 from trackmdp.errors import UserError

@@ -25,7 +25,7 @@ from trackmdp.config.roots import (
 )
 from trackmdp.config.schema import ChoiceConfig, NodeConfig, Sizes
 from trackmdp.config.sensing import CostConfig, FalseAlarmConfig, PaperCostConfig, SensorConfig
-from trackmdp.config.tree import from_hydra, load_config, load_run_config, to_dict, to_yaml, world_of
+from trackmdp.config.tree import load_config, load_run_config, to_dict, to_yaml, world_of
 from trackmdp.config.world import KernelConfig, TableConfig
 
 load_plugins()  # at the end: they import the names above

@@ -1,4 +1,4 @@
-"""A typed config from the files of `conf/`, without Hydra: where the Python functions take their defaults from.
+"""A typed config from the files of `conf/`: by Hydra, or without it, where the Python functions take their defaults.
 
 Of Hydra's defaults lists it reads what the files of this package and of its plugins use: a schema (``base_ppo``), a
 choice (``kernel: drift``), and another group's file in the same place (``/baseline@_here_: qmdp``), whose name may
@@ -10,14 +10,19 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+from omegaconf import DictConfig, OmegaConf
 
 from trackmdp.config.checks import absolute_paths, refuse_ignored, validate
 from trackmdp.config.options import GROUPS, SELECTORS, Option, optional, options, refuse, several
 from trackmdp.config.refusals import refuse_renamed, unknown_choice, unknown_option
-from trackmdp.config.roots import ROOTS
+from trackmdp.config.roots import ROOTS, CommandConfig
 from trackmdp.config.tree import build_config
 from trackmdp.config.values import choice_values, read_values, resolved
+from trackmdp.errors import UserError
+
+C = TypeVar("C", bound=CommandConfig)
 
 
 def compose(command: str, overrides: Mapping[str, Any] | None = None, *, folder: Path | None = None) -> Any:
@@ -48,10 +53,47 @@ def compose(command: str, overrides: Mapping[str, Any] | None = None, *, folder:
     for key, value in typed.items():
         if key not in chosen:
             _put(values, key, value, known)
+    cfg = _typed(values, known, schema, folder or Path.cwd())
+    refuse_ignored(cfg, typed, chosen)
+    return cfg
+
+
+def from_hydra(cfg: DictConfig, root: type[C], folder: Path) -> C:
+    """The typed, checked config of what Hydra composed; relative paths are resolved against `folder`.
+
+    Raises:
+        UserError: an unknown key (even one added with `+`), a missing value, a wrong type, or a broken rule.
+    """
+    values: Any = OmegaConf.to_container(cfg, resolve=False)
+    _name_choices(values, cfg, root)
+    typed: C = _typed(values, dict(_known(root, values)), root, folder)
+    return typed
+
+
+def _name_choices(values: dict[str, Any], cfg: DictConfig, schema: type[Any]) -> None:
+    """Put the name of each choice beside its values, as its schema says, which is the type of Hydra's node."""
+    for key, value in values.items():
+        if not isinstance(value, dict):
+            continue
+        node = cfg._get_node(key)
+        assert isinstance(node, DictConfig)
+        if several(schema, key):
+            for name in value:
+                # An entry that no file of the group made, such as that of `+log.mcap.every=2`.
+                if OmegaConf.get_type(node, name) is not GROUPS[key].get(name):
+                    raise UserError(f"{key}.{name}: not chosen, expected {key}=[NAME,...] with it among the names")
+            continue
+        kind: Any = OmegaConf.get_type(node)
+        _name_choices(value, node, kind)
+        if hasattr(kind, "name"):
+            value["name"] = kind.name
+
+
+def _typed(values: dict[str, Any], known: Mapping[str, Option], schema: type[Any], folder: Path) -> Any:
+    """The checked dataclasses of the values, their interpolations resolved."""
     cfg = build_config(resolved(values, known), schema)
     validate(cfg)
-    refuse_ignored(cfg, typed, chosen)
-    absolute_paths(cfg, folder or Path.cwd())
+    absolute_paths(cfg, folder)
     return cfg
 
 

@@ -1,4 +1,4 @@
-"""From a Hydra config to typed dataclasses, to a plain `config.yaml`, and back."""
+"""From typed dataclasses to a plain `config.yaml`, and back."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf import OmegaConf
 
-from trackmdp.config.checks import absolute_paths, validate
+from trackmdp.config.checks import validate
 from trackmdp.config.options import GROUPS, Option, as_float, options, several
 from trackmdp.config.refusals import suggestion, unknown_choice
 from trackmdp.config.roots import CommandConfig, TrainConfig, WorldConfig
@@ -20,49 +19,6 @@ from trackmdp.errors import UserError
 from trackmdp.untrusted import read_text
 
 C = TypeVar("C", bound=CommandConfig)
-
-
-def from_hydra(cfg: DictConfig, root: type[C], folder: Path) -> C:
-    """The typed, checked config; relative paths are resolved against `folder`.
-
-    Raises:
-        UserError: an unknown key (even one added with `+`), a missing value, a wrong type, or a broken rule.
-    """
-    try:
-        # Sorted, since missing_keys is a set: the same mistake must always give the same message.
-        for key in sorted(OmegaConf.missing_keys(cfg)):
-            raise UserError(f"{key}: missing, expected {_expected(cfg, root, key)}")
-        # to_object makes the dataclasses; a key added with `+sead=3` is accepted by OmegaConf and becomes an attribute
-        # of them, which is why the next line walks over all attributes.
-        typed = OmegaConf.to_object(cfg)
-        refuse_unknown(typed, root)
-    except OmegaConfBaseException as error:
-        raise UserError(_first_line(error)) from error
-    assert isinstance(typed, root)
-    validate(typed)
-    absolute_paths(typed, folder)
-    return typed
-
-
-def refuse_unknown(cfg: Any, schema: type[Any], prefix: str = "") -> None:
-    """Raise a `UserError` for a key the schema does not have, naming the known ones."""
-    known = options(schema)
-    # vars, not fields: what does not belong to the schema is in the former alone.
-    for name, value in vars(cfg).items():
-        if name not in known:
-            raise UserError(f"{prefix}{name}: unknown key{suggestion(name, known)}")
-        if dataclasses.is_dataclass(value):
-            refuse_unknown(value, type(value), f"{prefix}{name}.")
-        elif several(schema, name):
-            _refuse_not_chosen(name, value, prefix)
-
-
-def _refuse_not_chosen(group: str, chosen: Mapping[str, Any], prefix: str) -> None:
-    """Refuse an entry of a group of several that no file of the group made, such as that of ``+log.mcap.every=2``."""
-    for name, node in chosen.items():
-        if type(node) is not GROUPS[group].get(name):
-            raise UserError(f"{prefix}{group}.{name}: not chosen, expected {group}=[NAME,...] with it among the names")
-        refuse_unknown(node, type(node), f"{prefix}{group}.{name}.")
 
 
 def to_dict(cfg: Any) -> dict[str, Any]:
@@ -189,19 +145,3 @@ def _build_one(plain: Any, group: str, name: Any, prefix: str) -> Any:
     if not isinstance(plain, Mapping):
         raise UserError(f"{prefix}{name}={plain}: expected a mapping")
     return build_config(plain, GROUPS[group][name], f"{prefix}{name}.")
-
-
-def _expected(cfg: DictConfig, schema: type[Any], key: str) -> str:
-    """What the option `key` of a config must be."""
-    *parents, last = key.split(".")
-    for name in parents:
-        cfg = cfg[name]
-        # The type of a choice is known to the node alone: the field says only `KernelConfig`.
-        schema = OmegaConf.get_type(cfg) or schema
-    described = options(schema)[last]
-    return described.expected if isinstance(described, Option) else f"{key}=NAME"
-
-
-def _first_line(error: Exception) -> str:
-    text = str(error).strip()
-    return text.splitlines()[0] if text else type(error).__name__

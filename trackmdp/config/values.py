@@ -67,12 +67,14 @@ def choice_values(group: str, name: str, chosen: Mapping[str, Any]) -> dict[str,
 def resolved(values: dict[str, Any], known: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """The values with every ``${...}`` replaced by what it stands for; `prefix` goes before a key in messages."""
     register_resolvers()
-    config = OmegaConf.create(values)
-    # Looked for before resolving, which would leave `???` in place; sorted, since a set names another key at
-    # each call.
-    for key in sorted(OmegaConf.missing_keys(config)):
-        raise UserError(f"{prefix}{key}: missing, expected {known[key].expected}")
     try:
+        config = OmegaConf.create(values)
+        # Looked for before resolving, which would leave `???` in place; sorted, since a set names another key at
+        # each call.
+        for key in sorted(OmegaConf.missing_keys(config)):
+            raise UserError(
+                f"{prefix}{key}: missing, expected {known[key].expected if key in known else f'{key}=NAME'}"
+            )
         # Resolved last: `${algo.total_frames}` in the collector must stand for the value that was given,
         # not for the default.
         plain: Any = OmegaConf.to_container(config, resolve=True)

@@ -8,7 +8,7 @@ import time
 from typing import Any
 
 from rich.console import Console, RenderableType
-from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.status import Status
 from rich.table import Table
 from rich.text import Text
@@ -39,11 +39,6 @@ class _Console(Console):
         return super().status(Text(printable(status)) if isinstance(status, str) else status, **options)
 
 
-class _Figures(ProgressColumn):
-    def render(self, task: Task) -> Text:
-        return Text(str(task.fields["figures"]))
-
-
 class Display(Callback):
     """Shows how far the run is and the figures of its last evaluation.
 
@@ -64,7 +59,13 @@ class Display(Callback):
             # What is left of the line after title, figures and time: a line that wraps scrolls at each refresh.
             room = self._console.width - len(self._title) - _FIGURES_WIDTH
             bar = [BarColumn(min(40, room))] if room > 3 else []
-            columns = (TextColumn("{task.description}"), *bar, _Figures(), TextColumn("left"), TimeRemainingColumn())
+            columns = (
+                TextColumn("{task.description}"),
+                *bar,
+                TextColumn("{task.fields[figures]}"),
+                TextColumn("left"),
+                TimeRemainingColumn(),
+            )
             self._bar = Progress(*columns, console=self._console)
             self._bar.start()
             done, total = self._first.iteration, trainer.iterations

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 
 from trackmdp.app.bench.process import timed_training
-from trackmdp.app.bench.speed import train_config
 from trackmdp.config import BenchmarkConfig
+from trackmdp.config.compose import compose
 from trackmdp.training.memory import needs
 from trackmdp.world.make import build_world
 from trackmdp.world.model import World
@@ -22,8 +22,8 @@ def memory(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator
     """One row per algorithm and grid size: peak of the whole process, Python and torch included, of 300 k frames."""
     for algo, size in itertools.product(cfg.algos, SIZES):
         # Without the solver: its memory is not what `needs` expects of training.
-        words = [f"algo={algo}", f"grid.size={size}", f"collector.total_frames={FRAMES}", "optimal.enabled=false"]
-        train = train_config(words)
+        options = {"algo": algo, "grid.size": size, "collector.total_frames": FRAMES, "optimal.enabled": False}
+        train, words = compose("train", options), [f"{key}={value}" for key, value in options.items()]
         # What the check before a run adds up, without Python and torch, which `peak_mib` includes.
         expected = sum(needs(train, build_world(train).task).values())
         _, usage = timed_training(*words, f"threads={cfg.threads}", f"device={device}")

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from typing import Any
 
 import torch
-from hydra import compose
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 
 from trackmdp.app.bench.process import rate
-from trackmdp.config import GROUPS, BenchmarkConfig, TrainConfig, from_hydra
+from trackmdp.config import GROUPS, BenchmarkConfig
+from trackmdp.config.compose import compose
 from trackmdp.policies.actor_critic import make_actor
 from trackmdp.policies.fixed import RandomSubset
 from trackmdp.policies.policy import Policy
@@ -85,7 +84,7 @@ def train_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> lis
     """
     rows = []
     for name in GROUPS["algo"]:
-        train = train_config([f"algo={name}", f"seed={cfg.seed}", f"threads={cfg.threads}"])
+        train = compose("train", {"algo": name, "seed": cfg.seed, "threads": cfg.threads})
         # Every algorithm in the world of this benchmark, with its own options as shipped.
         train.grid, train.kernel, train.cost = cfg.grid, cfg.kernel, cfg.cost
         algorithm = make_algorithm(train, world, device)
@@ -102,8 +101,3 @@ def train_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> lis
         figures = {"per_second": frames / spent, "cpu_us_each": 1e6 * used / frames}
         rows.append({"part": "train", "algo": name, "whole": done == algorithm.iterations, **figures})
     return rows
-
-
-def train_config(overrides: list[str]) -> TrainConfig:
-    """The config that `trackmdp train` would run with these overrides."""
-    return from_hydra(compose("train", overrides=overrides), TrainConfig, Path.cwd())
