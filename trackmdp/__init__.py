@@ -56,15 +56,9 @@ if TYPE_CHECKING:  # the same once more, for type checkers and editors; `X as X`
     from trackmdp.training.run import load_run as load_run
     from trackmdp.training.train import train as train
     from trackmdp.world.env import TrackEnv as TrackEnv
-    from trackmdp.world.make import (
-        load_tracks as load_tracks,
-    )
-    from trackmdp.world.make import (
-        make_hidden_world as make_hidden_world,
-    )
-    from trackmdp.world.make import (
-        make_world as make_world,
-    )
+    from trackmdp.world.make import load_tracks as load_tracks
+    from trackmdp.world.make import make_hidden_world as make_hidden_world
+    from trackmdp.world.make import make_world as make_world
     from trackmdp.world.model import World as World
     from trackmdp.world.modes import HiddenWorld as HiddenWorld
     from trackmdp.world.observation import ObservationVector as ObservationVector

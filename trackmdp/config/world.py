@@ -186,7 +186,7 @@ class TracksConfig(KernelConfig):
     )
     origin: list[float] | None = option(
         "positions: corner of the grid with the least coordinates, [x, y] or [lon, lat]; null = the middles of grid "
-        "and positions agree",
+        "and positions agree"
     )
     crs: str | None = option(
         "positions as lat, lon: projection to metres; null = the UTM zone where they lie",

@@ -17,16 +17,7 @@ from typing import Any, BinaryIO
 
 import zstandard
 from mcap.data_stream import ReadDataStream
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Channel,
-    Chunk,
-    ChunkIndex,
-    Header,
-    Metadata,
-    MetadataIndex,
-)
+from mcap.records import Attachment, AttachmentIndex, Channel, Chunk, ChunkIndex, Header, Metadata, MetadataIndex
 
 from trackmdp import untrusted
 from trackmdp.errors import UserError

@@ -48,12 +48,7 @@ def bounds_table(study: Study, pairs: Mapping[tuple[int, float], str]) -> Table:
         row: list[Cell] = [support_size, cost, run.figure("qmdp_aihtr"), best, upper, proved]
         rows.append([*row, run.figure("bound_clocked"), run.figure("bound_valid"), printed, below])
     columns = [Column("Z"), Column("c", 2), Column("Q_MDP", 3), Column("optimum, attained", 4)]
-    columns += [
-        Column("optimum, at most", 4),
-        Column("proved"),
-        Column("clocked bound", 3),
-        Column("valid bound", 3),
-    ]
+    columns += [Column("optimum, at most", 4), Column("proved"), Column("clocked bound", 3), Column("valid bound", 3)]
     columns += [Column("printed bound", 3), Column("printed bound is exceeded")]
     return Table("bounds", "AIHTR: Q_MDP, the proved bracket of the optimum, and the bounds, exactly", columns, rows)
 

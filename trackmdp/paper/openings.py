@@ -11,16 +11,7 @@ from typing import Any
 from trackmdp.durable import write_text
 from trackmdp.errors import UserError
 from trackmdp.paper import critique
-from trackmdp.paper.calibration import (
-    BORDER,
-    T_MAX,
-    Candidate,
-    Setting,
-    Spread,
-    candidates,
-    chosen,
-    sensitivity,
-)
+from trackmdp.paper.calibration import BORDER, T_MAX, Candidate, Setting, Spread, candidates, chosen, sensitivity
 from trackmdp.paper.theorems import Check
 from trackmdp.paper.worlds import SUPPORTS
 

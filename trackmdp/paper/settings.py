@@ -108,12 +108,7 @@ def sensitivity_figures(settings: Sequence[Setting]) -> list[Figure]:
 
 
 def _ranges(
-    name: str,
-    label: str,
-    settings: Sequence[Setting],
-    of: Callable[[Setting], Spread],
-    *,
-    printed: bool = False,
+    name: str, label: str, settings: Sequence[Setting], of: Callable[[Setting], Spread], *, printed: bool = False
 ) -> Figure:
     rows = list(dict.fromkeys((s.border, s.t_max) for s in settings))
 

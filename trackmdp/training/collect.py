@@ -20,13 +20,7 @@ from trackmdp.world.tracks import Problem
 
 
 def single(
-    problem: Problem,
-    policy: TensorDictModuleBase,
-    cfg: CollectorConfig,
-    *,
-    seed: int,
-    device: torch.device,
-    done: int = 0,
+    problem: Problem, policy: TensorDictModuleBase, cfg: CollectorConfig, *, seed: int, device: torch.device, done: int
 ) -> BaseCollector:
     """A collector of batches `[B, time]` in this process; its frames are env steps.
 
@@ -70,13 +64,7 @@ multi_async = partial(_in_workers, MultiAsyncCollector)
 
 
 def ray(
-    problem: Problem,
-    policy: TensorDictModuleBase,
-    cfg: RayWorkersConfig,
-    *,
-    seed: int,
-    device: torch.device,
-    done: int = 0,
+    problem: Problem, policy: TensorDictModuleBase, cfg: RayWorkersConfig, *, seed: int, device: torch.device, done: int
 ) -> BaseCollector:
     """A collector in the workers of a Ray cluster; arguments as for `single`.
 

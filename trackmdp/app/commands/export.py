@@ -41,12 +41,7 @@ def run(cfg: ExportConfig, folder: Path) -> None:
     """
     world, policy, subject = trained(cfg.run, torch.device("cpu"), best=cfg.checkpoint == "best")
     task, file = world.task, folder / FILES[cfg.format]
-    about = {
-        "trackmdp": __version__,
-        "policy": subject,
-        "grid_size": str(task.rows),
-        "t_max": str(task.t_max),
-    }
+    about = {"trackmdp": __version__, "policy": subject, "grid_size": str(task.rows), "t_max": str(task.t_max)}
     if task.keyed:
         about |= {"memory": task.memory, "clip": str(task.clip), "classes": str(task.keys.num_classes)}
     if cfg.format == "sets":

@@ -19,14 +19,7 @@ from trackmdp.world.gridding import said
 from trackmdp.world.tracks import Problem, Recorded
 
 
-def run(
-    world: Recorded,
-    policy: Policy,
-    subject: str,
-    folder: Path,
-    console: Console,
-    seed: int,
-) -> float:
+def run(world: Recorded, policy: Policy, subject: str, folder: Path, console: Console, seed: int) -> float:
     """Write `evaluation.json`, `sets.json`, `picture.txt` and `tracks.html` to `folder`.
 
     Returns:

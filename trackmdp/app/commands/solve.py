@@ -79,12 +79,7 @@ def _report(cfg: SolveConfig, solution: Solution, bound: dict[str, float]) -> di
 
 
 def _show(
-    console: Console,
-    cfg: SolveConfig,
-    world: Modelled,
-    solution: Solution,
-    bound: dict[str, float],
-    folder: Path,
+    console: Console, cfg: SolveConfig, world: Modelled, solution: Solution, bound: dict[str, float], folder: Path
 ) -> None:
     found = {cfg.solver.name: solution.evaluation}
     # Where it senses little it is a matter of minutes on a large grid; `evaluate baseline=qmdp` values it there.
