@@ -7,9 +7,9 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from types import FrameType
-from typing import Self
+from typing import Any, Self
 
 _HEARD = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
 _ONE = 2.0
@@ -64,11 +64,16 @@ class Signals:
 
 
 @contextmanager
-def kept_sigterm() -> Iterator[None]:
-    """Restore the handler of SIGTERM at the end, whatever the body installs (Ray installs one when it starts)."""
-    # Ray installs a handler of its own, which exits: the run would end without its checkpoint.
-    before = signal.getsignal(signal.SIGTERM)
+def handled(handler: Any, *numbers: signal.Signals) -> Iterator[None]:
+    """Let `handler` hear signals inside; afterwards those that did before, whatever the body installs meanwhile."""
+    before = {number: signal.signal(number, handler) for number in numbers}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, former in before.items():
+            signal.signal(number, former)
+
+
+def kept_sigterm() -> AbstractContextManager[None]:
+    """Around a start of Ray, which installs a handler that exits: the run would end without its checkpoint."""
+    return handled(signal.getsignal(signal.SIGTERM), signal.SIGTERM)

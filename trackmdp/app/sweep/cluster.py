@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from trackmdp.app.sweep.job import Launch, fail, run_job, stop_signal
 from trackmdp.app.sweep.plan import Job
 from trackmdp.app.sweep.schema import SubmititConfig, SubmititLocalConfig, SubmititSlurmConfig
 from trackmdp.errors import FAILED, UserError
+from trackmdp.training.signals import handled
 
 SUBMISSIONS = ".submissions"
 """Folder, in that of the sweep, of what the scheduler is given and says."""
@@ -78,7 +78,8 @@ def _local(cfg: SubmititLocalConfig, jobs: Sequence[Job]) -> None:
             time.sleep(_POLL)
         if stop_signal(job.sweep):
             break
-        with _ignoring_ctrl_c():
+        # A process started here ignores Ctrl-C: the sweep receives it and stops them in order.
+        with handled(signal.SIG_IGN, signal.SIGINT):
             running.append(executor.submit(Submission(), job))
     _wait(running)
 
@@ -116,13 +117,3 @@ def _wait(submitted: Sequence[Any]) -> None:
             left[0].done(force_check=True)
             asked = time.monotonic()
         time.sleep(_POLL)
-
-
-@contextmanager
-def _ignoring_ctrl_c() -> Iterator[None]:
-    """Processes started inside ignore Ctrl-C: the sweep receives it and stops them in order."""
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)

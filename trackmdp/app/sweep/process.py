@@ -18,6 +18,7 @@ from typing import Any
 from trackmdp.app.prepare import announce, check
 from trackmdp.app.sweep.plan import Job
 from trackmdp.errors import FAILED, USER_MISTAKE, Preempted, RunError, UserError
+from trackmdp.training.signals import handled
 
 OUTPUT = "output.txt"
 """File in a run's folder for what it says, where several runs would say it at once."""
@@ -117,12 +118,8 @@ def context_for(command: str) -> Any:
     # Python sets signal handlers from the main thread alone; hence "call it first in the main thread".
     ignored = _TERMINATING if threading.current_thread() is threading.main_thread() else ()
     # SIG_IGN is inherited by the process that is started inside, and a handler of Python's would not be.
-    before = {number: signal.signal(number, signal.SIG_IGN) for number in ignored}
-    try:
+    with handled(signal.SIG_IGN, *ignored):
         forkserver.ensure_running()
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
     return context
 
 
