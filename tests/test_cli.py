@@ -1,52 +1,27 @@
-"""The command line as a user types it: bad input, help, sweeps, interrupts."""
+"""The command line as a user types it: bad input, sweeps, interrupts."""
 
 from __future__ import annotations
 
-import importlib
-import itertools
-import logging
 import os
 import re
 import signal
 import subprocess
 import sys
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from tests.config.cases import composed, of_command
-from tests.typed import refused, stub
+from tests.config.cases import composed
+from tests.typed import ENVIRONMENT, ROOT, refused, stub, typed
 from trackmdp.app.cli import COMMANDS, main
-from trackmdp.app.manual import EXAMPLES
-from trackmdp.config import GROUPS, ROOTS, SELECTORS, options
-from trackmdp.config.world import KernelConfig
+from trackmdp.config import GROUPS, ROOTS, options
 from trackmdp.errors import Preempted, RunError, UserError
 
-ROOT = Path(__file__).parents[1]
+pytestmark = pytest.mark.usefixtures("empty_folder")
+
 LONG = "a" * 300  # longer than a name may be
-ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
-
-
-@pytest.fixture(autouse=True)
-def empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    folder = tmp_path / "here"
-    folder.mkdir()
-    monkeypatch.chdir(folder)
-    return folder
-
-
-def typed(*words: str, **kwargs: Any) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "trackmdp.app.cli", *words],
-        capture_output=True,
-        text=True,
-        env=ENVIRONMENT,
-        check=False,
-        **kwargs,
-    )
 
 
 @pytest.mark.parametrize("group", GROUPS)
@@ -216,221 +191,6 @@ def test_a_sweep_with_a_wrong_type_or_choice_starts_nothing(capsys: pytest.Captu
     assert refused(capsys, "train", "-m", "quiet=true", "algo=ppo,sac").startswith("algo=sac: expected one of ")
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_help_names_every_option_with_range_unit_and_default(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([command, "--help"]) == 0
-    text = capsys.readouterr().out
-    flat = " ".join(text.split())
-    for key, item in of_command(command):
-        assert f" {key}=" in text, key
-        assert f"{item.help}; {item.expected}" in flat, key
-    for group in set(options(ROOTS[command])) & set(GROUPS):
-        for name in GROUPS[group]:
-            assert f"  {group}={name}: " in text
-    for name, selector in SELECTORS.items():
-        offered = selector.group in options(ROOTS[command])
-        assert all((f" {name}={choice}: {about}" in flat) == offered for choice, about in selector.choices.items())
-    assert max(map(len, text.splitlines())) < 80
-    assert [text.count(f"  {line}\n") for line in EXAMPLES[command]] == [1] * len(EXAMPLES[command])
-    assert text.index("Examples") < text.index("Options")
-
-
-@pytest.mark.parametrize(
-    ("words", "shown", "hidden"),
-    [
-        (["algo=ppo"], "algo.clip_epsilon=0.2", ["algo.blend", "kernel.", "algo.buffer_size"]),
-        (["algo=ppo", "credit=per_sensor"], "algo.surrogate=all_action", ["algo.gae_lambda", "  kernel."]),
-        (["kernel=drift", "seed=3"], "kernel.persistence=", ["kernel.stay", "algo."]),
-        (["hydra/launcher=submitit_slurm"], "hydra.launcher.partition=null", ["n_jobs", "algo."]),
-    ],
-)
-def test_help_of_a_choice_shows_what_it_reads(
-    words: list[str], shown: str, hidden: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["train", *words, "--help"]) == 0
-    text = capsys.readouterr().out
-    assert f"  {shown}" in text
-    assert not any(word in text for word in hidden)
-    assert max(map(len, text.splitlines())) < 80
-    assert text.index("Examples\n  trackmdp train ") < text.index(shown)
-    assert refused(capsys, "train", "algo=sac", "--help").startswith("algo=sac: expected one of ")
-
-
-def test_choices_of_an_installed_package_are_offered(tmp_path: Path) -> None:
-    site, inherited = tmp_path / "site", "".join(f"{key}: false\n" for key in options(KernelConfig))
-    files = {
-        "levy-1.dist-info/METADATA": "Metadata-Version: 2.1\nName: levy\nVersion: 1\n",
-        "levy-1.dist-info/entry_points.txt": "[trackmdp.plugins]\nlevy = trackmdp_levy\n",
-        "trackmdp_levy/__init__.py": """
-from dataclasses import dataclass
-from trackmdp.config.options import choice, option
-from trackmdp.config.world import KernelConfig
-
-@choice("kernel", "levy", makes="trackmdp_levy.flight:levy")
-@dataclass(kw_only=True)
-class LevyConfig(KernelConfig):
-    \"\"\"Long jumps now and then.\"\"\"
-
-    alpha: float = option("exponent of the jumps", gt=0)
-""",
-        "trackmdp_levy/conf/kernel/levy.yaml": "defaults: [base_levy]\nalpha: 1.5\n" + inherited,
-    }
-    for name, text in files.items():
-        (site / name).parent.mkdir(parents=True, exist_ok=True)
-        (site / name).write_text(text)
-    env = ENVIRONMENT | {"PYTHONPATH": f"{ROOT}{os.pathsep}{site}"}
-    command = [sys.executable, "-m", "trackmdp.app.cli", "train", "kernel=levy"]
-    for words, shown in ((["--help"], "  kernel.alpha=1.5 "), (["-c", "job", "-p", "kernel"], "alpha: 1.5\n")):
-        result = subprocess.run([*command, *words], capture_output=True, text=True, env=env, check=False)
-        assert (result.returncode, result.stderr) == (0, "")
-        assert shown in result.stdout
-
-
-def test_examples_of_the_help_can_be_typed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    for lines in EXAMPLES.values():
-        for line in lines:
-            main([word for word in line.split()[1:] if word != "-m" and "," not in word] + ["--cfg", "job"])
-            assert capsys.readouterr().err == "", line
-
-
-def test_help_shows_the_values_of_conf(capsys: pytest.CaptureFixture[str]) -> None:
-    main(["train", "-h"])
-    text = capsys.readouterr().out
-    for expected in (
-        "grid.size=10 ",
-        "grid.max_steps=null ",
-        "kernel.low_probability=0.15 ",
-        "quiet=false ",
-        "seed=0 ",
-    ):
-        assert f" {expected}" in text
-    assert "cost.sensor=0.16 " in text
-    assert "(default: random_support)" in " ".join(text.split())
-
-
-def test_overview_and_unknown_commands(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([]) == main(["--help"]) == 0
-    text = capsys.readouterr().out
-    assert all(f"  {command} " in text for command in COMMANDS)
-    assert main(["trian"]) == 2
-    assert capsys.readouterr().err.startswith("trackmdp: unknown command 'trian': expected one of train, ")
-
-
-@pytest.mark.parametrize("words", [["-c", "job", "-p", "grid"], ["--info", "searchpath"], ["--hydra-help"]])
-def test_questions_to_hydra_run_nothing(words: list[str], empty_folder: Path) -> None:
-    result = typed("train", *words)
-    assert (result.returncode, result.stderr) == (0, "")
-    assert result.stdout
-    assert not list(empty_folder.iterdir())
-
-
-def test_a_config_folder_of_ones_own_adds_choices(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "mine/kernel").mkdir(parents=True)
-    (tmp_path / "mine/kernel/slow.yaml").write_text("defaults: [random_walk]\nstay: 0.9\n")
-    (tmp_path / "mine/kernel/typo.yaml").write_text("defaults: [random_walk]\nstai: 0.9\n")
-    calls = []
-    stub(monkeypatch, "train", lambda cfg, folder: calls.append(cfg))
-    assert main(["train", "--config-dir", "../mine", "kernel=slow", "hydra.run.dir=../out"]) == 0
-    assert (calls[0].kernel.name, calls[0].kernel.stay) == ("random_walk", 0.9)
-    capsys.readouterr()
-    assert "stai" in refused(capsys, "train", "--config-dir", "../mine", "kernel=typo")
-
-
-EVIL = "{_target_: os.mkdir, path: mark}"
-
-
-@pytest.mark.parametrize(
-    ("file", "text", "words", "message"),
-    [
-        (
-            "experiment/a",
-            f"hydra: {{callbacks: {{x: {EVIL}}}}}",
-            "experiment=a",
-            "hydra.callbacks.x._target_: a config",
-        ),
-        ("experiment/a", "hydra: {callbacks: {x: {path: mark}}}", "experiment=a", "sets hydra.callbacks"),
-        ("experiment/a", "hydra: {job: {env_set: {PYTHONPATH: x}}}", "experiment=a", "sets hydra.job.env_set"),
-        ("experiment/a", "seed: !!python/object/apply:os.mkdir [mark]", "experiment=a", "not a config"),
-        ("experiment/a", "seed: &a [*a]", "experiment=a", "not a config (alias *a"),
-        ("experiment/a", f"seed: {'[' * 3000}{']' * 3000}", "experiment=a", "deeper than 50 levels"),
-        ("experiment/a", "- 1", "experiment=a", "expected a mapping"),
-        ("experiment/a", "x: " + "y" * 2**20, "experiment=a", "expected at most 1,048,576"),
-        ("algo/a", f"defaults: [hindsight]\nx: {EVIL}", "algo=a", "x._target_: a config is data"),
-        ("mine", "defaults: [base_train]\nhydra: {searchpath: ['pkg://os']}", "--config-name mine", "sets hydra.sea"),
-        ("hydra/job_logging/a", "root: {level: 1}\nfilters: {x: {(): os.mkdir}}", "hydra/job_logging=a", "x.(): a con"),
-        ("hydra/job_logging/a", "root: {level: INFO}", "hydra/job_logging=a", "expected one of none, default"),
-        ("hydra/launcher/a", f"x: {EVIL}", "hydra/launcher=a", "x._target_: a config is data"),
-        ("hydra/launcher/a", "x: 1", "hydra/launcher=a", "hydra/launcher: expected one of basic, joblib"),
-    ],
-)
-def test_a_config_of_the_users_is_data(
-    file: str, text: str, words: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "mine" / f"{file}.yaml"
-    path.parent.mkdir(parents=True)
-    path.write_text(f"# @package _global_\n{text}\n" if "experiment" in file else f"{text}\n")
-    for flag in ("--config-dir ../mine", "hydra.searchpath=[../mine]"):
-        assert message in refused(capsys, "train", *flag.split(), *words.split())
-
-
-def test_aliases_that_unfold_to_too_much_are_refused_at_once(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "mine/experiment").mkdir(parents=True)
-    names = "abcdefghij"
-    lines = ["a: &a [x,x,x,x,x,x,x,x,x]"]
-    lines += [f"{c}: &{c} [{','.join([f'*{p}'] * 9)}]" for p, c in itertools.pairwise(names)]
-    (tmp_path / "mine/experiment/a.yaml").write_text("\n".join(lines))
-    assert "more than 100,000 values" in refused(capsys, "train", "--config-dir", "../mine", "experiment=a")
-
-
-@pytest.mark.parametrize("words", [["seed=3"], ["kernel=table", "kernel.path=../k.npy"]])
-def test_a_command_composes_once_checks_once_and_builds_one_world(
-    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    np.save(tmp_path / "k.npy", np.full((100, 100), 0.009))
-    counts = Counter[str]()
-
-    def spy(module: str, name: str) -> None:
-        owner = importlib.import_module(module)
-        inner = getattr(owner, name)
-
-        def counted(*args: Any, **kwargs: Any) -> Any:
-            counts[name] += 1
-            return inner(*args, **kwargs)
-
-        monkeypatch.setattr(owner, name, counted)
-
-    module = importlib.import_module("trackmdp.app.commands.train")
-    spy("trackmdp.app.compose", "compose")
-    spy("trackmdp.config.tree", "validate")
-    spy("trackmdp.world.make", "make_problem")
-    spy(module.__name__, "make_problem")
-    monkeypatch.setattr(module, "Trainer", lambda problem, cfg, **_: (_ for _ in ()).throw(RunError("far enough")))
-    assert main(["train", *words]) == 1
-    assert counts == {"compose": 1, "validate": 1, "make_problem": 1}
-
-
-def test_hydras_own_settings_still_hold(monkeypatch: pytest.MonkeyPatch, empty_folder: Path) -> None:
-    seen: list[Any] = []
-    stub(monkeypatch, "train", lambda cfg, folder: seen.append((Path.cwd(), folder, os.environ.get("X_Y"))))
-    words = ["hydra.job.chdir=true", "hydra.output_subdir=.hydra", "+hydra.job.env_set.X_Y=1", "hydra.run.dir=r"]
-    root = logging.getLogger()
-    before = (root.level, list(root.handlers))
-    try:
-        assert main(["train", "quiet=true", "seed=${grid.size}", "hydra/job_logging=default", *words]) == 0
-    finally:
-        for handler in set(root.handlers) - set(before[1]):
-            handler.close()
-        root.level, root.handlers[:] = before
-    assert seen == [(empty_folder / "r", empty_folder / "r", "1")]
-    assert "X_Y" not in os.environ
-    assert sorted(path.name for path in Path("r/.hydra").iterdir()) == ["config.yaml", "hydra.yaml", "overrides.yaml"]
-    assert (empty_folder / "r/trackmdp.log").is_file()
-
-
 def test_what_a_terminal_would_obey_is_spelled_out(capsys: pytest.CaptureFixture[str]) -> None:
     assert "\\x1b[31mred" in refused(capsys, "evaluate", "run='\x1b[31mred'")
 
@@ -456,21 +216,6 @@ def test_scripts_are_the_commands() -> None:
         )
         assert result.returncode == 2
         assert result.stderr.startswith(f"trackmdp {command}: quiet=perhaps: expected true or false")
-
-
-def test_help_and_first_line_import_nothing_heavy() -> None:
-    code = """
-import sys
-from trackmdp.app.cli import main
-import trackmdp.app.prepare
-def say(line):
-    sys.exit(str(sorted({"torch", "torchrl", "scipy"} & set(sys.modules))))
-trackmdp.app.prepare.say = say
-main(["train", "--help"])
-main(["train"])
-"""
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=ENVIRONMENT, check=False)
-    assert result.stderr == "[]\n"
 
 
 def test_ctrl_c_ends_in_one_line_and_130(empty_folder: Path) -> None:

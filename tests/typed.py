@@ -1,7 +1,9 @@
-"""Commands as a user types them, run in this process."""
+"""Commands as a user types them, run in this process or in one of their own, in an empty folder."""
 
 from __future__ import annotations
 
+import os
+import subprocess
 import sys
 import types
 from collections.abc import Callable
@@ -11,6 +13,9 @@ from typing import Any
 import pytest
 
 from trackmdp.app.cli import main
+
+ROOT = Path(__file__).parents[1]
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
 
 
 def stub(monkeypatch: pytest.MonkeyPatch, command: str, run: Callable[[Any, Path], Any]) -> None:
@@ -30,3 +35,14 @@ def refused(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     prefix = f"trackmdp {words[0]}: "
     assert lines[0].startswith(prefix)
     return lines[0].removeprefix(prefix)
+
+
+def typed(*words: str, **kwargs: Any) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "trackmdp.app.cli", *words],
+        capture_output=True,
+        text=True,
+        env=ENVIRONMENT,
+        check=False,
+        **kwargs,
+    )

@@ -1,0 +1,134 @@
+"""Help: every option, what a choice reads, examples that can be typed."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.config.cases import of_command
+from tests.typed import ENVIRONMENT, ROOT, refused
+from trackmdp.app.cli import COMMANDS, main
+from trackmdp.app.manual import EXAMPLES
+from trackmdp.config import GROUPS, ROOTS, SELECTORS, options
+from trackmdp.config.world import KernelConfig
+
+pytestmark = pytest.mark.usefixtures("empty_folder")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_names_every_option_with_range_unit_and_default(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([command, "--help"]) == 0
+    text = capsys.readouterr().out
+    flat = " ".join(text.split())
+    for key, item in of_command(command):
+        assert f" {key}=" in text, key
+        assert f"{item.help}; {item.expected}" in flat, key
+    for group in set(options(ROOTS[command])) & set(GROUPS):
+        for name in GROUPS[group]:
+            assert f"  {group}={name}: " in text
+    for name, selector in SELECTORS.items():
+        offered = selector.group in options(ROOTS[command])
+        assert all((f" {name}={choice}: {about}" in flat) == offered for choice, about in selector.choices.items())
+    assert max(map(len, text.splitlines())) < 80
+    assert [text.count(f"  {line}\n") for line in EXAMPLES[command]] == [1] * len(EXAMPLES[command])
+    assert text.index("Examples") < text.index("Options")
+
+
+@pytest.mark.parametrize(
+    ("words", "shown", "hidden"),
+    [
+        (["algo=ppo"], "algo.clip_epsilon=0.2", ["algo.blend", "kernel.", "algo.buffer_size"]),
+        (["algo=ppo", "credit=per_sensor"], "algo.surrogate=all_action", ["algo.gae_lambda", "  kernel."]),
+        (["kernel=drift", "seed=3"], "kernel.persistence=", ["kernel.stay", "algo."]),
+        (["hydra/launcher=submitit_slurm"], "hydra.launcher.partition=null", ["n_jobs", "algo."]),
+    ],
+)
+def test_help_of_a_choice_shows_what_it_reads(
+    words: list[str], shown: str, hidden: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["train", *words, "--help"]) == 0
+    text = capsys.readouterr().out
+    assert f"  {shown}" in text
+    assert not any(word in text for word in hidden)
+    assert max(map(len, text.splitlines())) < 80
+    assert text.index("Examples\n  trackmdp train ") < text.index(shown)
+    assert refused(capsys, "train", "algo=sac", "--help").startswith("algo=sac: expected one of ")
+
+
+def test_choices_of_an_installed_package_are_offered(tmp_path: Path) -> None:
+    site, inherited = tmp_path / "site", "".join(f"{key}: false\n" for key in options(KernelConfig))
+    files = {
+        "levy-1.dist-info/METADATA": "Metadata-Version: 2.1\nName: levy\nVersion: 1\n",
+        "levy-1.dist-info/entry_points.txt": "[trackmdp.plugins]\nlevy = trackmdp_levy\n",
+        "trackmdp_levy/__init__.py": """
+from dataclasses import dataclass
+from trackmdp.config.options import choice, option
+from trackmdp.config.world import KernelConfig
+
+@choice("kernel", "levy", makes="trackmdp_levy.flight:levy")
+@dataclass(kw_only=True)
+class LevyConfig(KernelConfig):
+    \"\"\"Long jumps now and then.\"\"\"
+
+    alpha: float = option("exponent of the jumps", gt=0)
+""",
+        "trackmdp_levy/conf/kernel/levy.yaml": "defaults: [base_levy]\nalpha: 1.5\n" + inherited,
+    }
+    for name, text in files.items():
+        (site / name).parent.mkdir(parents=True, exist_ok=True)
+        (site / name).write_text(text)
+    env = ENVIRONMENT | {"PYTHONPATH": f"{ROOT}{os.pathsep}{site}"}
+    command = [sys.executable, "-m", "trackmdp.app.cli", "train", "kernel=levy"]
+    for words, shown in ((["--help"], "  kernel.alpha=1.5 "), (["-c", "job", "-p", "kernel"], "alpha: 1.5\n")):
+        result = subprocess.run([*command, *words], capture_output=True, text=True, env=env, check=False)
+        assert (result.returncode, result.stderr) == (0, "")
+        assert shown in result.stdout
+
+
+def test_examples_of_the_help_can_be_typed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    for lines in EXAMPLES.values():
+        for line in lines:
+            main([word for word in line.split()[1:] if word != "-m" and "," not in word] + ["--cfg", "job"])
+            assert capsys.readouterr().err == "", line
+
+
+def test_help_shows_the_values_of_conf(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["train", "-h"])
+    text = capsys.readouterr().out
+    for expected in (
+        "grid.size=10 ",
+        "grid.max_steps=null ",
+        "kernel.low_probability=0.15 ",
+        "quiet=false ",
+        "seed=0 ",
+    ):
+        assert f" {expected}" in text
+    assert "cost.sensor=0.16 " in text
+    assert "(default: random_support)" in " ".join(text.split())
+
+
+def test_overview_and_unknown_commands(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == main(["--help"]) == 0
+    text = capsys.readouterr().out
+    assert all(f"  {command} " in text for command in COMMANDS)
+    assert main(["trian"]) == 2
+    assert capsys.readouterr().err.startswith("trackmdp: unknown command 'trian': expected one of train, ")
+
+
+def test_help_and_first_line_import_nothing_heavy() -> None:
+    code = """
+import sys
+from trackmdp.app.cli import main
+import trackmdp.app.prepare
+def say(line):
+    sys.exit(str(sorted({"torch", "torchrl", "scipy"} & set(sys.modules))))
+trackmdp.app.prepare.say = say
+main(["train", "--help"])
+main(["train"])
+"""
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=ENVIRONMENT, check=False)
+    assert result.stderr == "[]\n"
