@@ -20,7 +20,8 @@ from trackmdp.config import TrainConfig
 from trackmdp.config.learning import AlgoConfig
 from trackmdp.config.partition import PartitionConfig
 from trackmdp.config.resume import finished
-from trackmdp.config.world import MissConfig, PaperCostConfig, PerfectSensorConfig, TableConfig
+from trackmdp.config.sensing import MissConfig, PaperCostConfig, PerfectSensorConfig
+from trackmdp.config.world import TableConfig
 from trackmdp.durable import write_bytes
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
