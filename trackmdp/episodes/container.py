@@ -77,8 +77,8 @@ class Container:
         opcode, body = next(records(self.stream, len(MAGIC)), (0, b""))
         if opcode != HEADER:
             raise Damaged("its first record is not the header")
-        header = _parsed(Header, body)
-        return header.profile, header.library
+        header = vars(_parsed(Header, body))
+        return header["profile"], header["library"]
 
     def _summary(self) -> None:
         """Read the index of chunks, attachments and metadata; its checksum covers the footer as well."""
