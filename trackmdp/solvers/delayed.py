@@ -34,7 +34,8 @@ from trackmdp.world.model import Array, World
 __all__ = ["Delayed"]
 
 STEPS = 6
-"""Subgradient steps. Forty closed 2 % more of what the first one left, on walks and random supports."""
+"""Subgradient steps. On a walk (c = .3, T_max 3) the tables by themselves leave .059 per step open after one of them,
+.056 after six and .055 after forty, of the .19 of the clocked bound."""
 MOST_NUMBERS = 2**18
 """Numbers in one array, 2 MB."""
 WIDEST, MOST_WORK = 8, 2e8
