@@ -93,7 +93,6 @@ def _tables(task: Task, window: Window) -> dict[str, IndexArray]:
     numbers = np.full((task.num_cells, width), task.total_sensors)
     numbers[covering.rows, number] = covering.sensors
     by_cell = sparse.csr_array(covering.covers.T)
-    by_cell = sparse.csr_array(covering.covers.T)
     return {
         "numbers": numbers,
         "_of_cell": _lists(by_cell, (rows, local), number, cells.shape, width),
