@@ -166,6 +166,7 @@ RULES = [
     ("train", "cost.sensor=1e16", "cost.sensor=1e+16: expected a number from 0 to 1e15"),
     ("train", "cost.reward=5e-324", "cost.reward=5e-324: expected a number from 1e-15 to 1e+15"),
     ("train", "cost.safe=1e308", "cost.safe=1e+308: expected a number from 0 to 1e+15"),
+    ("train", "algo=a2c algo.entropy.end=1e308", "algo.entropy.end=1e+308: expected a number from 0 to 1e+06"),
     ("train", "cost.sensor=prices.txt", "cost.sensor=prices.txt: expected a number from 0 to 1e15"),
     ("train", "algo=ppo collector.envs=100", "collector.frames_per_batch=4096: expected a multiple of 100"),
     ("train", "algo=ppo collector.total_frames=4095", "collector.total_frames=4095: expected at least"),

@@ -20,8 +20,8 @@ DEVICE = r"auto|cpu|cuda(:\d+)?"
 class ScheduleConfig(NodeConfig):
     """A number that is `start` up to the fraction `begin` of the run, `end` from `until`, and linear between."""
 
-    start: float = option("value at the start", ge=0)
-    end: float = option("value at the end", ge=0)
+    start: float = option("value at the start", ge=0, le=1e6)
+    end: float = option("value at the end", ge=0, le=1e6)
     begin: float = option("where the change begins", unit="fraction of the run", ge=0, le=1)
     until: float = option("where the change ends, not before begin", unit="fraction of the run", ge=0, le=1)
 
