@@ -127,7 +127,12 @@ def test_the_result_does_not_depend_on_the_workers(uncut: tm.Run, tmp_path: Path
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("algo", "words"),
-    [("hindsight", {}), ("a2c", {"envs": 50}), ("ppo", {"minibatches": 5}), ("dqn", {"credit": "per_sensor"})],
+    [
+        ("hindsight", {"updates": 20, "hidden": 8}),
+        ("a2c", {"envs": 50}),
+        ("ppo", {"minibatches": 5}),
+        ("dqn", {"credit": "per_sensor", "updates": 20, "hidden": 8}),
+    ],
 )
 def test_every_learner_learns_by_blocks(algo: str, words: dict[str, Any]) -> None:
     options = {name: value for name, value in SMALL.items() if "samples" not in name and "plan" not in name} | words
