@@ -17,7 +17,7 @@ from tests.helpers import small_world
 from trackmdp.algos.actor_loss import Decision, decision_loss
 from trackmdp.algos.hindsight_loss import HindsightLoss
 from trackmdp.world.coverage import discs
-from trackmdp.world.model import World
+from trackmdp.world.model import Task, World
 
 
 @given(st.floats(-5, 5), st.floats(0, 3), st.floats(0, 3), st.floats(0.01, 2))
@@ -56,13 +56,14 @@ def of_one_path(form: str, z: Tensor, cost: Tensor, covers: Tensor, gain: Tensor
 
 
 def written_out(
-    loss: HindsightLoss, world: World, cells: Tensor, on: Tensor, blend: float, form: str
+    loss: HindsightLoss, world: Task, cells: Tensor, on: Tensor, blend: float, form: str
 ) -> dict[str, Tensor]:
     """The losses one path, clock and sensor at a time, as the theory writes them (whole grid, no normalisation)."""
-    m, last, g = world.num_cells, world.num_choices, loss.discount
+    m, last, g = world.num_keys, world.num_choices, loss.discount
     cost, safe = world.cost / world.reward, 1.0 - world.safe_cost / world.reward
     price = torch.as_tensor(cost, dtype=torch.float32)
-    covers = torch.as_tensor(world.covered(np.eye(world.total_sensors, dtype=bool)))  # [S, M]
+    covers = torch.as_tensor(world.covered(np.eye(world.total_sensors, dtype=bool)))  # [S, cells]
+    covers = covers.repeat_interleave(world.keys.num_classes, dim=1)
     actor, clocked_actor = loss.actor(), loss.clocked_actor()
     value = [*loss.critic().flatten(), torch.tensor(0.0)]
     clocked = [*loss.clocked_critic().squeeze(-1), torch.zeros(last + 1)]
@@ -113,23 +114,25 @@ def written_out(
 SETTINGS = [("decision", t_max, blend) for t_max in (0, 1, 2) for blend in (0.0, 0.6, 1.0)]
 
 
-@pytest.mark.parametrize("footprints", [False, True])
+@pytest.mark.parametrize("kind", ["one each", "footprints", "modes told"])
 @pytest.mark.parametrize(("form", "t_max", "blend"), [*SETTINGS, *((form, 2, 0.6) for form in FORMS)])
-def test_summed_up_losses_are_those_of_every_path_apart(form: str, t_max: int, blend: float, footprints: bool) -> None:
+def test_summed_up_losses_are_those_of_every_path_apart(form: str, t_max: int, blend: float, kind: str) -> None:
     """Gradients agree with autograd through the formulas; clocks are weighed apart, so each is compared by direction.
 
     Targets do not carry the constant part of a squared error, hence gradients and not values.
     """
-    coverage = discs((3, 3), np.array([(0, 0), (0, 1), (1, 0), (1, 2), (2, 1)]), 1) if footprints else None
-    count = 5 if footprints else 9
-    world = replace(small_world(t_max=t_max), cost=np.linspace(0.1, 0.5, count), reward=2.0, coverage=coverage)
+    coverage = discs((3, 3), np.array([(0, 0), (0, 1), (1, 0), (1, 2), (2, 1)]), 1) if kind == "footprints" else None
+    count = 9 if coverage is None else 5
+    world = replace(small_world(t_max=t_max), cost=np.linspace(0.1, 0.5, count), reward=2.0, coverage=coverage).task
+    world = replace(world, revealed=2) if kind == "modes told" else world
+    outside = world.num_keys
     rng = torch.Generator().manual_seed(1)
     loss = HindsightLoss(world.task, FORMS[form](), reach=2, hidden=6, discount=0.7, generator=rng)
-    cells = torch.randint(10, (t_max + 3, 60), generator=rng)
-    cells[0] %= 9
-    cells = torch.where((cells == 9).cummax(0).values, 9, cells)
-    on = torch.rand(9, t_max + 1, count, generator=rng) < 0.3
-    if footprints:  # some sensors on, so that others see no more than these do
+    cells = torch.randint(outside + 1, (t_max + 3, 60), generator=rng)
+    cells[0] %= outside
+    cells = torch.where((cells == outside).cummax(0).values, outside, cells)
+    on = torch.rand(outside, t_max + 1, count, generator=rng) < 0.3
+    if coverage is not None:  # some sensors on, so that others see no more than these do
         loss.actor.bias.data += torch.tensor([2.0, 0.0, 1.5, 0.0, 2.0])
         loss.clocked_actor.bias.data += torch.tensor([0.0, 2.0, 0.0, 2.0, 1.5])
     summed, apart = loss(cells, on, blend), written_out(loss, world, cells, on, blend, form)

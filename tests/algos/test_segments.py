@@ -11,7 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.helpers import algorithm, collect, small_world
+from tests.helpers import algorithm, collect, headings, small_world
 from tests.tracks import by_hand, drawn, recorded
 from trackmdp.algos.segments import SegmentBuffer, SensedPaths
 from trackmdp.policies.policy import Policy, as_policy
@@ -64,6 +64,27 @@ def test_batches_in_pieces_give_what_they_give_in_one(cut: int) -> None:
         pieces.extend(part)
     assert segments(pieces) == segments(whole)
     assert len(whole) > 500
+
+
+@pytest.mark.parametrize("memory", ["displacement", "two_displacements"])
+def test_segments_of_keys_are_those_of_the_environment(memory: str) -> None:
+    """With all sensors on, step by step; a part of a batch makes the same."""
+    world = headings(memory=memory)
+    batch = collect(world, Policy.all_on(world), 8, 30)
+    made = SegmentBuffer(9, 2, 10_000, torch.Generator(), keys=world.keys)
+    for part in batch.split(7, dim=1):
+        made.extend(part)
+    key, after, done = batch["key"], batch["next", "key"], batch["next", "done"].squeeze(-1)
+    after = torch.where(done, world.num_keys, after)
+    seen = []
+    for row in range(8):
+        for t in range(30):
+            if done[row, t]:
+                seen.append((int(key[row, t]), world.num_keys, world.num_keys))
+            elif t < 29:
+                seen.append((int(key[row, t]), int(key[row, t + 1]), int(after[row, t + 1])))
+    assert segments(made) == sorted(seen)
+    assert len({first for first, *_ in seen}) > 40
 
 
 def test_rows_of_workers_are_rows() -> None:

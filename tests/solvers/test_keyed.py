@@ -17,8 +17,9 @@ from trackmdp.policies.policy import Policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.bounds import clocked
 from trackmdp.solvers.evaluate import evaluate
-from trackmdp.solvers.keyed import averaged
-from trackmdp.solvers.keyed_search import mode_bound, solve_keys
+from trackmdp.solvers.keyed import KeyedPairs, averaged
+from trackmdp.solvers.keyed_proof import told_bound
+from trackmdp.solvers.keyed_search import cell_bound, mode_bound, solve_keys
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.model import World
 from trackmdp.world.modes import HiddenWorld, heading_kernel
@@ -102,7 +103,21 @@ def test_the_best_keyed_policy_of_a_tiny_world(more: dict[str, Any], occurring: 
         table[occurring, 0] = choice
         best = max(best, evaluate(world, PolicyTable.from_dense(world, table)).aihtr)
     assert found.lower == pytest.approx(best)
-    assert best <= found.upper
+    assert best <= found.upper + 1e-12
+    assert found.certified == ("revealed" in more)
+
+
+@pytest.mark.parametrize("t_max", [0, 1])
+def test_plans_that_can_be_improved_are_bounded_from_above(t_max: int) -> None:
+    """The bound from V of a policy that senses nothing is above the optimum, and no better than the clocked one."""
+    world = headings(t_max=t_max, revealed=8, safe_cost=0.5)
+    pairs, best = KeyedPairs(world), solve_keys(world)
+    value = pairs.value(pairs.sets(PolicyTable.none(world)))[0]
+    bound = told_bound(pairs, value)
+    assert bound is not None
+    assert (bound >= pairs.value(pairs.sets(best.table))[0]).all()
+    assert bound.mean() > best.lower + 0.1
+    assert best.certified
 
 
 def test_values_by_hand_where_the_mode_is_told() -> None:
@@ -123,14 +138,15 @@ def test_values_by_hand_where_the_mode_is_told() -> None:
 def test_a_told_heading_leaves_little_to_lose(keep: float, cost: float, loss: float) -> None:
     """Per step to the bound that knows the heading at all times, on 6 x 6: at most what the prototype found."""
     kernel, modes = heading_kernel(6, keep=keep, go=0.9, exit_probability=0.01)
-    found = solve_keys(HiddenWorld(kernel, 6, modes=modes, cost=cost, t_max=1, revealed=8))
-    lost = (found.upper - found.lower) / found.evaluation.expected_length
+    found = solve_keys(world := HiddenWorld(kernel, 6, modes=modes, cost=cost, t_max=1, revealed=8))
+    lost = (cell_bound(world).mean() - found.lower) / found.evaluation.expected_length
     assert 0.8 * loss < lost < loss + 0.001
+    assert found.certified
 
 
 def test_a_told_mode_is_worth_more_than_any_memory() -> None:
     told, remembered = solve_keys(headings(revealed=8)), solve_keys(headings(memory="displacement_gap"))
-    assert remembered.lower < told.lower < told.upper
+    assert remembered.lower < told.lower <= told.upper < remembered.upper
     # Whoever is told may still remember the displacement alone, and is worth what that is.
     again = evaluate(headings(revealed=8), remembered.table)
     assert again.aihtr == pytest.approx(remembered.lower)

@@ -41,6 +41,9 @@ RECIPES = {
 RECIPES["hindsight-tables"] = [*RECIPES["hindsight"], "algo.hidden=0", "grid.window=1"]
 # Policies that know more at a detection than the cell.
 RECIPES["ppo-told"] = [*RECIPES["ppo"], "kernel=heading", "kernel.reveals=true"]
+RECIPES["hindsight-told"] = [*RECIPES["hindsight"], "kernel=heading", "kernel.reveals=true"]
+RECIPES["hindsight-memory"] = [*RECIPES["hindsight"], "kernel=heading", "task.memory=displacement"]
+RECIPES["learned-told"] = ["algo=learned_kernel", "kernel=heading", "kernel.reveals=true"]
 RECIPES["dqn-memory"] = [*RECIPES["dqn"], "kernel=heading", "task.memory=displacement"]
 RECIPES |= {f"{name}-miss": [*RECIPES[name], "sensor=miss", "sensor.p_d=.8"] for name in ("hindsight", "ppo")}
 SMALL = ["grid.size=3", "optimal.enabled=false", "evaluation.every=4", "collector.total_frames=61440"]

@@ -14,9 +14,11 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import exchange
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.kernel_estimate import KernelEstimate
+from trackmdp.solvers.keyed_search import solve_keys
 from trackmdp.solvers.renewal import IndexArray
 from trackmdp.solvers.shrinkage import least_worth_planning, without
-from trackmdp.world.model import Task, World
+from trackmdp.world.model import Task
+from trackmdp.world.modes import HiddenWorld, Modelled, with_motion
 
 __all__ = ["counted_world", "exchanged_sets"]
 
@@ -26,28 +28,29 @@ MOST_MOVES = 20_000_000
 """Moves of all plans together (some 40 bytes each) up to which sets are exchanged."""
 
 
-def counted_world(task: Task, start: Tensor, end: Tensor, *, classes: IndexArray | None = None) -> World:
+def counted_world(task: Task, start: Tensor, end: Tensor, *, classes: IndexArray | None = None) -> Modelled:
     """The task with the motion that was counted.
 
     Args:
         task: grid, rewards and costs.
-        start: `[K]`, the cell before each sensed move.
-        end: `[K]`, the cell after it, M for outside.
+        start: `[K]`, the cell before each sensed move, or the key.
+        end: `[K]`, the one after it, M for outside.
         classes: `[M]`, cells of one class, away from the border, are those from which the target moves alike; None:
-            judge by the counts which are, cells at the same distance from the borders together.
+            judge by the counts which are, cells at the same distance from the borders together. Not read where a
+            detection tells the mode.
     """
     # `believed` has a prior of its own in place of `weight`.
+    modes, alike = task.keys.num_classes, False if task.keyed else classes is not None or None
     estimate = KernelEstimate(
-        task.size, weight=1.0, exit_weight=EXIT_WEIGHT, share_cells=classes is not None or None, classes=classes
+        task.size, weight=1.0, exit_weight=EXIT_WEIGHT, share_cells=alike, classes=classes, modes=modes
     )
     estimate.add_moves(start.cpu().numpy(), end.cpu().numpy())
     if not task.perfect:
         # Of the moves to a cell the share p_d is known (`report_weights`): each counts for 1 / p_d.
         counts = estimate.counts
-        counts.data /= np.append(task.detection, 1.0)[counts.indices]
+        counts.data /= np.append(np.repeat(task.detection, modes), 1.0)[counts.indices]
     least = least_worth_planning(task)
-    kernel = without(sparse.csr_array(estimate.believed(least)[:, :-1]), least)
-    return World.of(task, kernel, max_steps=None)
+    return with_motion(task, without(sparse.csr_array(estimate.believed(least)[:, :-1]), least))
 
 
 def exchanged_sets(
@@ -59,19 +62,23 @@ def exchanged_sets(
     classes: IndexArray | None = None,
     anew: bool = True,
 ) -> sparse.csr_array:
-    """`[M (t_max + 1), S]`, what exchange on the counts makes of learned `sets`.
+    """`[keys (t_max + 1), S]`, what exchange on the counts makes of learned `sets`.
 
     Args:
         task: grid, rewards and costs.
-        start: `[K]`, the cell before each sensed move.
-        end: `[K]`, the cell after it, M for outside.
-        sets: `[M (t_max + 1), S]`.
+        start: `[K]`, the cell before each sensed move, or the key.
+        end: `[K]`, the one after it, M for outside.
+        sets: `[keys (t_max + 1), S]`.
         classes: see `counted_world`.
         anew: whether to start from `search` as well: from one start alone, regrets of .003 were left.
     """
     world = counted_world(task, start, end, classes=classes)
     if _moves_of_plans(world) > MOST_MOVES:
         return sets
+    if isinstance(world, HiddenWorld):
+        best = solve_keys(world, start=PolicyTable(task, sets)).table.sets
+        assert best is not None
+        return best
     found = [exchange.improve(world, PolicyTable(task, sets)), *([exchange.solve(world)] if anew else [])]
     worth = [evaluate(world, policy).aihtr for policy in found]
     best = found[int(np.argmax(worth))].sets
@@ -79,9 +86,9 @@ def exchanged_sets(
     return best
 
 
-def _moves_of_plans(world: World) -> float:
+def _moves_of_plans(world: Modelled) -> float:
     """No fewer than the moves out of all positions that plans of t_max + 1 sets pass through."""
-    successors = int(np.diff(world.kernel.indptr).max())
+    states, successors = world.num_keys, int(np.diff(world.kernel.indptr).max())
     # After t moves from one cell the target is in one of at most Z^t cells, or of M.
-    positions = sum(min(successors**t, world.num_cells) for t in range(world.num_choices))
-    return world.num_cells * successors * positions
+    positions = sum(min(successors**t, states) for t in range(world.num_choices))
+    return states * successors * positions

@@ -25,6 +25,7 @@ from trackmdp.algos.exchanged import exchanged_sets
 from trackmdp.algos.hindsight_loss import HindsightLoss
 from trackmdp.algos.moves import MoveBuffer
 from trackmdp.algos.paths import report_weights
+from trackmdp.algos.replay import Replay
 from trackmdp.algos.segments import SegmentBuffer
 from trackmdp.config.per_sensor import PerSensorConfig
 from trackmdp.errors import UserError
@@ -53,13 +54,13 @@ one update alone exchange took longer than the updates that it replaced. At t_ma
 
 def budget(task: Task, cfg: PerSensorConfig) -> tuple[int, int]:
     """Updates and hidden units: as configured, else by the number of rows (x, n) that the actor has to get right."""
-    rows = task.num_cells * task.num_choices
+    rows = task.num_keys * task.num_choices
     few = rows <= 300
     alone = round(cfg.effort * (500 if few else 800))
     # A mixture acts on the nets from early on; misses and windows were not tried either. What has so few rows is never
     # too large to be exchanged.
     exchanged = cfg.exchange and task.markov and task.perfect and task.window is None and cfg.collect == "all_on"
-    hidden = 128 if few else 256 if task.num_cells <= _MOST_CELLS_OF_NETS else 0
+    hidden = 128 if few else 256 if task.num_keys <= _MOST_CELLS_OF_NETS else 0
     updates = cfg.updates or (_BEFORE_EXCHANGE if exchanged and rows <= _MOST_ROWS else alone)
     return updates, hidden if cfg.hidden is None else cfg.hidden
 
@@ -99,6 +100,8 @@ class Hindsight:
             raise UserError(f"sensor: no sensor covers cell {cell}, expected all covered; learned_kernel needs no such")
         if not task.safe:  # what follows a safe action that missed is on no path that was seen
             raise UserError(f"sensor.p_s={task.safe_detection.min():g}: expected 1, for this algo learns no other")
+        if task.order and not task.perfect:  # its keys are those of paths on which nothing was missed
+            raise UserError(f"task.memory={task.memory}: expected sensors that never miss with this algo")
         self.actor = Policy.none(task)
         self.policy = Exploring(task, device) if self._mixed else Policy.all_on(task)
 
@@ -120,14 +123,19 @@ class Hindsight:
             for _ in range(min(cfg.updates_per_iteration, self.updates - self._update)):
                 progress = self._update / self.updates
                 learner.loss.actor_loss.prepare(self._update, progress)
-                # Located cell, T + 1 free choices, and the forced step: t_max + 2 moves, [T + 3, B] cells.
-                cells = self._buffer.paths(cfg.batch_size, self.task.t_max + 2)
+                cells = self._paths()
                 cells = _within(cells, learner.loss.reach, self.task) if farther else cells
                 averages.add(**learner.update(cells, cfg.learning_rate.at(progress), cfg.blend.at(progress)))
                 self._update += 1
             self._renew_policy(learner)
         losses = averages.means() or dict.fromkeys(_LOSSES, math.nan)
         return {"moves": len(self._buffer), "updates": self._update} | {f"loss_{k}": v for k, v in losses.items()}
+
+    def _paths(self) -> Tensor:
+        """`[T+3, B]` cells: located, T + 1 free choices, the forced step; whole paths where more is remembered."""
+        if isinstance(self._buffer, SegmentBuffer) and self.task.order:
+            return self._buffer.sample(self.cfg.batch_size)
+        return self._buffer.paths(self.cfg.batch_size, self.task.t_max + 2)
 
     def state_dict(self) -> dict[str, Any]:
         """Counters, generator, moves, and once they exist the nets with all that trains them."""
@@ -211,9 +219,9 @@ class Hindsight:
 def _buffer(task: Task, capacity: int, rng: torch.Generator, judge: int | None) -> MoveBuffer | SegmentBuffer:
     """Paths put together from moves where the next one depends on the cell alone, else only those that were sensed."""
     weights = report_weights(task, rng.device)
-    if task.markov:
-        return MoveBuffer(task.num_cells, capacity, rng, weights)
-    return SegmentBuffer(task.num_cells, task.t_max + 2, capacity, rng, weights, judge)
+    if task.markov and not task.order:
+        return MoveBuffer(task.num_keys, capacity, rng, weights)
+    return SegmentBuffer(task.num_cells, Replay.steps(task.keys), capacity, rng, weights, judge, task.keys)
 
 
 def _classes(task: Task, cfg: PerSensorConfig) -> IndexArray | None:
@@ -234,7 +242,7 @@ def _classes(task: Task, cfg: PerSensorConfig) -> IndexArray | None:
 
 def _distance(start: Tensor, end: Tensor, task: Task) -> Tensor:
     """How far moves go, in rows or in columns; 0 where they end outside, in M."""
-    columns = task.columns
+    columns, (start, end) = task.columns, (task.keys.cell(each) for each in (start, end))
     moved = torch.maximum((start // columns - end // columns).abs(), (start % columns - end % columns).abs())
     return moved.masked_fill_(end == task.num_cells, 0)
 
@@ -243,7 +251,7 @@ def _within(cells: Tensor, reach: int, task: Task) -> Tensor:
     """Paths `[steps + 1, B]` on which the target is outside, M, from its first move of more than `reach` on."""
     # cummax keeps the flag up from the first such move on: 0 1 0 becomes 0 1 1.
     gone = (_distance(cells[:-1], cells[1:], task) > reach).cummax(0).values
-    return torch.cat([cells[:1], cells[1:].masked_fill(gone, task.num_cells)])
+    return torch.cat([cells[:1], cells[1:].masked_fill(gone, task.num_keys)])
 
 
 class _Learner:
@@ -280,14 +288,16 @@ class _Learner:
         return torch.cat([self.ema(rows) > 0 for rows in self.loss.slices()])
 
     def sets(self, task: Task) -> sparse.csr_array:
-        """`[M * (T+1), S]` bool, the policy's table."""
+        """`[keys * (T+1), S]` bool, the policy's table."""
         sensors = self.loss.sensors.numbers
-        on = self._on() & (sensors < task.total_sensors).unsqueeze(1)
-        # Entry (x, n, k) is sensor sensors[x, k] in row x (T+1) + n of the table; `nonzero` lists them row by row.
-        start, n, local = on.nonzero(as_tuple=True)
-        row, column = (start * task.num_choices + n).cpu().numpy(), sensors[start, local].cpu().numpy()
-        shape = (task.num_cells * task.num_choices, task.total_sensors)
-        return sparse.csr_array((np.ones(len(row), dtype=bool), (row, column)), shape=shape)
+        # Entry (key, n, k) is sensor sensors[x, k], x the key's cell, in row key (T+1) + n of the table; `nonzero`
+        # lists them row by row.
+        key, n, local = self._on().nonzero(as_tuple=True)
+        column = sensors[task.keys.cell(key), local]
+        there = column < task.total_sensors
+        place = ((key * task.num_choices + n)[there].cpu().numpy(), column[there].cpu().numpy())
+        shape = (task.num_keys * task.num_choices, task.total_sensors)
+        return sparse.csr_array((np.ones(len(place[0]), dtype=bool), place), shape=shape)
 
     def state_dict(self) -> dict[str, Any]:
         return {

@@ -12,6 +12,7 @@ from torch.nn.functional import pad
 from trackmdp.algos.actor_loss import ActorLoss, SensorCredit, decision_loss
 from trackmdp.algos.gains import chain_returns, clocked_advantage, sensing_gain
 from trackmdp.algos.in_view import SensorsInView
+from trackmdp.algos.replay import Replay
 from trackmdp.algos.tables import gather, scatter_add
 from trackmdp.policies.chain_table import CellClockNet
 from trackmdp.solvers.renewal import IndexArray
@@ -59,6 +60,9 @@ class HindsightLoss(nn.Module):
     Rewards and costs are in units of r. Rows are deduplicated: located cells and clocks can be enumerated, so each net
     is run once on every (x, n), and a batch of any size enters as sums over its paths.
 
+    Where a policy knows more at a detection than the cell, its keys stand for located cells, M being their number; a
+    key is cell · H + class, and the windows around it are those of its cell.
+
     Args:
         task: grid, rewards and costs.
         actor_loss: of the actor; the clocked actor always has the decision loss.
@@ -91,23 +95,28 @@ class HindsightLoss(nn.Module):
         super().__init__()
         # Shapes below: M cells, T + 1 = t_max + 1 clocks, B paths, C cells of a window around the located cell, and K
         # sensors that may see them, one in each where none has a footprint.
-        m, choices, device = task.num_cells, task.num_choices, generator.device
-        self.reach, self._window = reach, task.window
+        m, choices, device = task.num_keys, task.num_choices, generator.device
+        self.reach, self._window, self._keys, self._classes = reach, task.window, task.keys, task.keys.num_classes
         # One move takes the target to a cell that is near; t_max + 1 of them, to one in view.
         self.near, self.view = Window.reaching(task, reach, device), _in_view(task, choices * reach, device)
         self.nearby, self.sensors = SensorsInView(task, self.near), SensorsInView(task, self.view)
         # The border looks alike from two cells where it is equally far, or out of reach until the safe action; and so
         # must all classes of cells do that the target may come to before it.
         # What to sense is then learned once for both; values stay each cell's own.
-        groups = (
-            Window(task, choices * reach, device).groups(torch.as_tensor(classes, device=device))
-            if classes is not None
-            else None
-        )
+        groups = None
+        if classes is not None:
+            groups = self._groups(Window(task, choices * reach, device), torch.as_tensor(classes, device=device))
 
         def net(clocks: int, outputs: int, bias: float, groups: Tensor | None = None) -> CellClockNet:
             return CellClockNet(
-                m, clocks, hidden=hidden, outputs=outputs, bias=bias, generator=generator, groups=groups
+                m,
+                clocks,
+                hidden=hidden,
+                outputs=outputs,
+                bias=bias,
+                generator=generator,
+                groups=groups,
+                classes=self._classes,
             )
 
         def decisions(seen: Window, sensors: SensorsInView) -> CellClockNet:
@@ -122,17 +131,23 @@ class HindsightLoss(nn.Module):
         self.actor_loss = actor_loss
         # What the forced step earns, in units of r: (r - D) / r.
         self.discount, self.safe = discount, 1.0 - task.safe_cost / task.reward
-        self._cells_at_once = max(1, max_entries // (choices * self.sensors.entries))
+        entries = max(self.sensors.entries, self.near.width * self._classes)
+        self._keys_at_once = max(1, max_entries // (choices * entries))
         cost = torch.as_tensor(task.cost / task.reward, dtype=torch.float32, device=device)
         # [S + 1]: the last one, which there is none of, costs nothing, so that windows cut off by the border need no
         # mask here.
         self.register_buffer("cost", pad(cost, (0, 1)))
         # p_d, known to the learner like the prices; 0 outside, and no state: it is the task's, not the training's.
-        detection = torch.as_tensor(task.detection, dtype=torch.float32, device=device)
+        detection = torch.as_tensor(task.detection, dtype=torch.float32, device=device).repeat_interleave(self._classes)
         self._perfect, self._detection = task.perfect, pad(detection, (0, 1))
         self.register_buffer("clocks", torch.arange(choices, device=device).unsqueeze(-1))
         # Row 0 for the clocked actor, row 1 for the actor.
         self.register_buffer("gain_scale", torch.ones(2, choices, device=device))
+
+    def _groups(self, window: Window, alike: Tensor) -> Tensor:
+        """`[M]` the groups of located cells, or of keys: those of their cells and of one class."""
+        groups, classes = window.groups(alike).unsqueeze(1), torch.arange(self._classes, device=self.view.cells.device)
+        return (groups * self._classes + classes).flatten()
 
     def forward(self, cells: Tensor, on: Tensor, blend: float) -> dict[str, Tensor]:
         """The losses, each under the name of the net that it trains: those of all `parts` added up."""
@@ -147,19 +162,22 @@ class HindsightLoss(nn.Module):
         The parts share no graph: the caller may call `backward` on each and free it before asking for the next one.
 
         Args:
-            cells: int64 `[T+3, B]`, paths: the located cell, then the cells sensed next, M once outside.
+            cells: int64 `[T+3, B]`, paths: the located cell, then the cells sensed next, M once outside; longer ones
+                where a policy remembers detections (`replay`).
             on: bool `[M, T+1, K]`, the sensors that the replayed policy switches on, as the actor's outputs.
             blend: λ of the gain.
         """
+        replay = Replay(self._keys, self.view, on) if self._keys.order else None
+        cells, own = replay.begin(cells) if replay else (cells, cells)
         clocked, value = self.clocked_critic().squeeze(-1), self.critic().view(-1)
         # U(x, T+1) holds r - D for certain; the net learns the rest.
         clocked = torch.cat([clocked[:, :-1], clocked[:, -1:] + self.safe], dim=1)
         # [T + 1, M + 1], nothing gained by sensing what has exited. Detached: decisions do not train the values.
         advantage = pad(clocked_advantage(clocked.detach()), (0, 1))
-        replayed = self._replay(cells, on, advantage, value.detach(), blend)
+        plans = self._replay(replay, cells, own, on, advantage, value.detach(), blend)
         weights = (
             self._weights(0, *self._first_gains(cells[1], advantage)),
-            self._weights(1, replayed.alive.sum(1), replayed.gain.abs().sum(1)),
+            self._weights(1, plans.alive.sum(1), plans.gain.abs().sum(1)),
         )
         # [M + 1, T + 2], U = 0 once exited.
         known, targets = pad(clocked.detach(), (0, 0, 0, 1)), []
@@ -167,23 +185,23 @@ class HindsightLoss(nn.Module):
         for rows in slices:
             chosen = self._paths_from(cells[0], rows)
             loss, target = self._clocked(cells[:2, chosen], rows, advantage, known)
-            own = self._own(replayed, rows, chosen)
+            actor_loss = self._own(plans, rows, chosen if own is cells else self._paths_from(own[0], rows))
             targets.append(target)
             # The actor's rows are those of the policy's own plans, the clocked actor's every (x, n) that a move was
             # seen from.
-            losses = {"actor": (own * weights[1]).sum(), "clocked_actor": (loss * weights[0]).sum()}
+            losses = {"actor": (actor_loss * weights[1]).sum(), "clocked_actor": (loss * weights[0]).sum()}
             if rows is slices[-1]:
-                visits = torch.bincount(cells[0], minlength=len(value))
+                visits, begun = (torch.bincount(paths[0], minlength=len(value)) for paths in (own, cells))
                 # The squared error per cell times its number of paths is, up to a constant, the sum over paths of (V -
                 # return)^2.
-                losses["critic"] = _squared_error(value, replayed.target, visits) / cells.shape[1]
-                error = _squared_error(clocked, torch.cat(targets), visits.unsqueeze(-1))
+                losses["critic"] = _squared_error(value, plans.target, visits) / cells.shape[1]
+                error = _squared_error(clocked, torch.cat(targets), begun.unsqueeze(-1))
                 losses["clocked_critic"] = error / cells.shape[1]
             yield losses
 
     def slices(self) -> list[slice]:
         """The located cells, as many at once as `max_entries` allows."""
-        m, step = self.view.num_cells, self._cells_at_once
+        m, step = self._keys.num_keys, self._keys_at_once
         return [slice(begin, begin + step) for begin in range(0, m, step)] if step < m else [slice(None)]
 
     def _paths_from(self, start: Tensor, rows: slice) -> slice | Tensor:
@@ -206,62 +224,94 @@ class HindsightLoss(nn.Module):
         Returns:
             The clocked actor's losses summed per clock, `[T+1]`, and the clocked critic's targets `[rows, T+2]`.
         """
-        near, m = self.near, self.near.num_cells
-        nearby, logits = near.cells[rows], self.clocked_actor(rows)
+        near, m, h = self.near, self._keys.num_keys, self._classes
+        nearby, logits = self._of_keys(near.cells, rows), self.clocked_actor(rows)
         count, k = nearby.shape
+        # [x, C H], the keys in those cells; M outside the grid.
+        ends = (nearby.unsqueeze(-1) * h + torch.arange(h, device=nearby.device)).flatten(1).clamp_max(m)
         start, end = moves
         first = rows.start or 0
-        # Flat place in [rows, K] of a move: with K = 9, from cell 7 to its local sensor 5 is 7 * 9 + 5 = 68; where the
-        # slice begins at cell 4, 68 - 36 = 32. Exits have weight 0, wherever `index` puts them.
-        place = start * k + near.index(start, end) - first * k
-        moved = scatter_add((end < m).float(), place, count * k).view(count, 1, k)
-        # moved [x, 1, K] counts moves by their end; stays [x, 1] those that stay in the grid, visits [x, 1] all. Their
-        # quotients are the empirical kernel: moved / visits for P_xj, stays / visits for P_in(x).
+        # Flat place in [rows, C H] of a move: with C = 9, H = 1, from cell 7 to its local cell 5 is 7 * 9 + 5 = 68;
+        # where the slice begins at cell 4, 68 - 36 = 32. Exits have weight 0, wherever `index` puts them.
+        place = (start * k + near.index(start // h, end // h) - first * k) * h + end % h
+        moved = scatter_add((end < m).float(), place, count * k * h).view(count, 1, k * h)
+        # moved [x, 1, C H] counts moves by their end; stays [x, 1] those that stay in the grid, visits [x, 1] all.
+        # Their quotients are the empirical kernel: moved / visits for P_xj, stays / visits for P_in(x).
         stays, visits = moved.sum(-1), torch.bincount(start - first, minlength=count).unsqueeze(-1)
-        # advantage[:, nearby] is [T + 1, x, K]: transposed to the layout [x, T + 1, K] of the logits. A sensor that is
-        # on reports p_d of the moves to its cell; what it misses goes on like what is not sensed.
-        seen = moved if self._perfect else moved * self._detection[nearby].unsqueeze(1)
-        gain = seen * sensing_gain(advantage[:, nearby].transpose(0, 1), reward=1.0, discount=self.discount)
-        chosen, cost = logits.detach() > 0, self.cost[self.nearby.numbers[rows]].unsqueeze(1)
+        # advantage[:, ends] is [T + 1, x, C H]: transposed to the layout [x, T + 1, C H]. A sensor that is on reports
+        # p_d of the moves to its cell; what it misses goes on like what is not sensed.
+        seen = moved if self._perfect else moved * self._detection[ends].unsqueeze(1)
+        gain = seen * sensing_gain(advantage[:, ends].transpose(0, 1), reward=1.0, discount=self.discount)
+        # All moves to a key have the same gain, so its sign says whether it is part of its cell's G⁺ or G⁻.
+        plus, minus = (part.unflatten(-1, (k, h)).sum(-1) for part in (gain.clamp(min=0), gain.clamp(max=0).neg()))
+        chosen, cost = logits.detach() > 0, self.cost[self._of_keys(self.nearby.numbers, rows)].unsqueeze(1)
         if self._window is not None and self._window < self.reach:
             # Sensors outside the window cannot be chosen: they neither gain nor cost, nor are they learned about.
             allowed = self._choosable(nearby, rows).unsqueeze(1)
-            chosen, gain, cost = chosen & allowed, gain * allowed, cost * allowed
-        # [x, 1, K] @ [x, K, T + 2]: gamma sum_j moved_j U(j, n), for all n by one product.
-        following = self.discount * torch.bmm(moved, known[nearby]).squeeze(1)
+            chosen, plus, minus, cost = chosen & allowed, plus * allowed, minus * allowed, cost * allowed
+        # [x, 1, C H] @ [x, C H, T + 2]: gamma sum_j moved_j U(j, n), for all n by one product.
+        following = self.discount * torch.bmm(moved, known[ends]).squeeze(1)
         # U(x, n) = sum_j P_xj gamma U(j, n + 1), if nothing is sensed; each sensor on adds its gain, which turns gamma
         # U(j, n + 1) into r + gamma U(j, 0), and takes its cost away. At n = T + 1 all are located: r - D + gamma U(j,
         # 0).
-        found = (gain * self.nearby.seen(chosen, rows)).sum(-1)
+        found = ((plus - minus) * self.nearby.seen(chosen, rows)).sum(-1)
         free = following[:, 1:] + found - stays * (chosen * cost).sum(-1)
         target = torch.cat([free, following[:, :1] + self.safe * stays], dim=1) / visits.clamp(min=1)
-        # All moves to a cell have the same gain, so its sign says whether it is part of G⁺ or G⁻; the price is c for
-        # every move that stays in the grid.
-        plus, minus = (self.nearby.gains(each, chosen, rows) for each in (gain.clamp(min=0), gain.clamp(max=0).neg()))
+        # The price is c for every move that stays in the grid.
+        plus, minus = (self.nearby.gains(each, chosen, rows) for each in (plus, minus))
         loss = decision_loss(logits, plus, minus, stays.unsqueeze(-1) * cost)
         return loss.sum((0, 2)), target
 
-    def _replay(self, cells: Tensor, on: Tensor, advantage: Tensor, value: Tensor, blend: float) -> _Replayed:
-        """From whole paths: the policy's chain is followed from their first cell until it detects or is forced."""
+    def _of_keys(self, table: Tensor, rows: slice) -> Tensor:
+        """`[rows, K]`, the rows of a table `[cells, K]` for located cells, or for the cells of keys."""
+        if self._classes == 1:
+            return table[rows]
+        return table[torch.arange(self._keys.num_keys, device=table.device)[rows] // self._classes]
+
+    def _replay(
+        self,
+        replay: Replay | None,
+        cells: Tensor,
+        own: Tensor,
+        on: Tensor,
+        advantage: Tensor,
+        value: Tensor,
+        blend: float,
+    ) -> _Replayed:
+        """From whole paths: the policy's chain is followed from their first cell until it detects or is forced.
+
+        Args:
+            replay: of a policy that remembers detections.
+            cells: the paths.
+            own: `[T+3, B]`, the key that the policy has at first, and those of a first detection at each later step.
+            on: the policy.
+            advantage: of detecting, the position being revealed after every action.
+            value: V.
+            blend: λ.
+        """
         m, choices, k = len(on), on.shape[1], self.view.width
         # [B], [T + 2, B] and [T + 1, B]: the free choices are for the first T + 1 moves, the last one is the forced
         # step.
-        start, moves, end = cells[0], cells[1:], cells[1:-1]
+        start, moves = own[0], cells[1 : choices + 2]
+        end = moves[:-1]
+        located_in, there = start // self._classes, end // self._classes
         # clocks [T + 1, 1] broadcasts over paths. With M = K = 4 and T = 1: located in 3, n = 1 is row 7, and the
         # target moving to 2 makes entry 7 * 4 + 2 = 30.
         row = start * choices + self.clocks
-        entry = row * k + self.view.index(start, end)
+        entry = row * k + self.view.index(located_in, there)
         # Where the target has left the grid or the view, `entry` is that of some other sensor.
-        seen = end < m if self._window is None else self.view.contains(start.expand_as(end), end)
+        seen = end < m if self._window is None else self.view.contains(located_in.expand_as(end), there)
         # [T + 1, B], the probability of a report; 0 or 1 with sensors that never miss.
         found = torch.cat([self.sensors.seen(on[rows], rows) for rows in self.slices()])
         reports, inside = (gather(found, entry) & seen).float(), moves < m
         detects = None if self._perfect else gather(self._detection, end)
         reports = reports if detects is None else reports * detects
-        located = gather(pad(value, (0, 1)), moves)
         # Set costs are computed once per (x, n) and looked up by the paths, however many there are.
-        spent = gather(torch.cat([self._set_cost(on[rows], rows) for rows in self.slices()]), row)
-        discount, safe_cost = self.discount, 1.0 - self.safe
+        prices = torch.cat([self._set_cost(on[rows], rows) for rows in self.slices()])
+        spent, discount, safe_cost = gather(prices, row), self.discount, 1.0 - self.safe
+        located = gather(pad(value, (0, 1)), own[1:])
+        if replay:
+            located = replay.worth(cells, own, prices, value, safe=self.safe, discount=discount)
         returns = chain_returns(reports, inside, spent, located, reward=1.0, safe_cost=safe_cost, discount=discount)
         # advantage is [T + 1, M + 1]: entry (n, y) is n (M + 1) + y.
         clocked = gather(advantage, self.clocks * (m + 1) + end)
@@ -282,13 +332,13 @@ class HindsightLoss(nn.Module):
     def _choosable(self, nearby: Tensor, rows: slice) -> Tensor:
         """`[rows, K]` bool, which of the sensors `nearby` `[rows, K]` of the cells `rows` can be chosen."""
         near = self.near
-        start = torch.arange(near.num_cells, device=nearby.device)[rows]
+        start = torch.arange(self._keys.num_keys, device=nearby.device)[rows] // self._classes
         window = Window((near.rows, near.columns), self._window, nearby.device)
         return window.contains(start[:, None].expand_as(nearby), nearby)
 
     def _set_cost(self, on: Tensor, rows: slice) -> Tensor:
         """C(A) `[rows, T+1]` of the sets `on` of the cells `rows`."""
-        return (on * self.cost[self.sensors.numbers[rows]].unsqueeze(1)).sum(-1)
+        return (on * self.cost[self._of_keys(self.sensors.numbers, rows)].unsqueeze(1)).sum(-1)
 
     def _own(self, replayed: _Replayed, rows: slice, chosen: slice | Tensor) -> Tensor:
         """`[T+1]`, the actor's losses per clock, on the `chosen` paths, those from the cells `rows`."""
@@ -298,7 +348,7 @@ class HindsightLoss(nn.Module):
         row, entry, alive, gain = replayed.of(chosen, first, first * self.view.width)
         # Paths that reach each (x, n); every sensor on costs c on each of them, the one the target moves to included.
         arrivals = scatter_add(alive, row, count * choices).view(count, choices)
-        price = arrivals.unsqueeze(-1) * self.cost[self.sensors.numbers[rows]].unsqueeze(1)
+        price = arrivals.unsqueeze(-1) * self.cost[self._of_keys(self.sensors.numbers, rows)].unsqueeze(1)
         on = logits.detach() > 0
         credit = SensorCredit(
             entry, gain, arrivals, price, rows, lambda sums: self.sensors.gains(sums, on, rows), self.view.width

@@ -15,6 +15,7 @@ import torch
 from scipy import sparse
 from tensordict import TensorDictBase
 
+from trackmdp.algos.paths import known_as
 from trackmdp.config.counting import LearnedKernelConfig
 from trackmdp.errors import UserError
 from trackmdp.policies.explore import RenewedTable
@@ -25,9 +26,11 @@ from trackmdp.solvers import exchange
 from trackmdp.solvers.alike import cell_classes
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.kernel_estimate import KernelEstimate, ObservedPaths
+from trackmdp.solvers.keyed_search import solve_keys
 from trackmdp.solvers.renewal import DIRECT_CELLS
 from trackmdp.solvers.shrinkage import least_worth_planning, without
-from trackmdp.world.model import Task, World
+from trackmdp.world.model import Task
+from trackmdp.world.modes import HiddenWorld, Modelled, with_motion
 from trackmdp.world.windows import Window
 
 __all__ = ["LearnedKernel", "observed_paths", "policy_tensors", "tensors_policy"]
@@ -56,8 +59,9 @@ class LearnedKernel:
             weight=cfg.prior,
             exit_weight=cfg.exit_prior,
             detection=detection,
-            share_cells=None if cfg.share_cells is None else cfg.share_cells != "none",
+            share_cells=False if task.keyed else None if cfg.share_cells is None else cfg.share_cells != "none",
             classes=cell_classes(cfg.share_cells, task.size),
+            modes=task.keys.num_classes,
         )
         self._least = least_worth_planning(task) if cfg.negligible is None else cfg.negligible
         self._rng = np.random.default_rng(derive(seed, "learned_kernel"))
@@ -94,12 +98,14 @@ class LearnedKernel:
     def _plan(self, kernel: sparse.csr_array, start: sparse.csr_array | None = None) -> PolicyTable:
         """The plan for the `[M, M + 1]` kernel believed, from the sets `start` where there are any."""
         world = self._world(kernel)
+        if isinstance(world, HiddenWorld):
+            return solve_keys(world, start=None if start is None else PolicyTable(self.task, start)).table
         return exchange.solve(world) if start is None else exchange.improve(world, PolicyTable(self.task, start))
 
-    def _world(self, kernel: sparse.csr_array) -> World:
+    def _world(self, kernel: sparse.csr_array) -> Modelled:
         """The task with the `[M, M + 1]` kernel believed, but for what is negligible."""
         # Plans on several moves grow with a power of the number of moves, most of which the prior may have added.
-        return World.of(self.task, without(sparse.csr_array(kernel[:, :-1]), self._least), max_steps=None)
+        return with_motion(self.task, without(sparse.csr_array(kernel[:, :-1]), self._least))
 
     def _diagnostics(self) -> dict[str, float]:
         """What the last plan is believed to be worth, how sure that is, and what learning has cost so far."""
@@ -138,16 +144,19 @@ class LearnedKernel:
 def observed_paths(batch: TensorDictBase, task: Task) -> ObservedPaths:
     """The paths that end in a collected batch `[B, time]`: from a detection to the next one or to the exit.
 
+    Where a detection tells the mode they are of keys, and a sensor sees all those of its cell.
+
     Read is only what the tracker saw: where and when it located the target, its own sets, and that the target left.
     """
     after = batch["next"]
     exited = after["terminated"].squeeze(-1)
     ended = exited | (after["steps_since_detection"] == 0)
-    start, misses = (batch[key][ended] for key in ("last_cell", "steps_since_detection"))
-    end = torch.where(exited, task.num_cells, after["last_cell"])[ended]
+    cell, misses = (batch[key][ended] for key in ("last_cell", "steps_since_detection"))
+    name = known_as(batch)
+    start, end = batch[name][ended], torch.where(exited, task.num_keys, after[name])[ended]
     if not misses.any():  # as with all sensors on: no set is read, so that the histories, most of a batch, stay unread
         rows = np.zeros(len(start) * task.num_choices + 1, dtype=np.int64)
-        sensed = sparse.csr_array((rows[:0] > 0, rows[:0], rows), shape=(len(rows) - 1, task.num_cells))
+        sensed = sparse.csr_array((rows[:0] > 0, rows[:0], rows), shape=(len(rows) - 1, task.num_keys))
         return ObservedPaths(start.cpu().numpy(), misses.cpu().numpy(), sensed, end.cpu().numpy())
     # Of the step that ended the path: its history holds the sets of all misses since the detection, wherever the batch
     # began.
@@ -159,11 +168,13 @@ def observed_paths(batch: TensorDictBase, task: Task) -> ObservedPaths:
         sensed = task.coverage.seen(sparse.csr_array((np.ones(len(place[0]), dtype=bool), place), shape=shape))
         return ObservedPaths(start.cpu().numpy(), misses.cpu().numpy(), sensed, end.cpu().numpy())
     # Sensors are numbered within the window of the located cell; those outside the grid sense nothing.
-    cell = sensor if task.window is None else Window.of(task, history.device).around(start)[path, sensor]
-    row, inside = path * history.shape[1] + miss, cell < task.num_cells
-    places = (row[inside].cpu().numpy(), cell[inside].cpu().numpy())
+    there = sensor if task.window is None else Window.of(task, history.device).around(cell)[path, sensor]
+    row, inside = path * history.shape[1] + miss, there < task.num_cells
+    places = (row[inside].cpu().numpy(), there[inside].cpu().numpy())
     shape = (len(start) * history.shape[1], task.num_cells)
     sensed = sparse.csr_array((np.ones(len(places[0]), dtype=bool), places), shape=shape)
+    if task.keyed:
+        sensed = sparse.kron(sensed, np.ones((1, task.keys.num_classes), dtype=bool), format="csr")
     return ObservedPaths(start.cpu().numpy(), misses.cpu().numpy(), sensed, end.cpu().numpy())
 
 

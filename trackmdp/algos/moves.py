@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from trackmdp.algos.paths import CellIndex, cell_dtype, sensed_steps, stratified_starts
+from trackmdp.algos.paths import CellIndex, cell_dtype, known_as, sensed_steps, stratified_starts
 
 __all__ = ["MoveBuffer", "sensed_moves"]
 
@@ -101,5 +101,6 @@ def sensed_moves(batch: TensorDictBase, num_cells: int) -> tuple[Tensor, Tensor]
     Returns:
         Two int64 `[K]`; an end of M stands for outside.
     """
-    whole, end = sensed_steps(batch, num_cells)
-    return batch["last_cell"][whole], end[whole]
+    name = known_as(batch)
+    whole, end = sensed_steps(batch, num_cells, name)
+    return batch[name][whole], end[whole]

@@ -1,4 +1,8 @@
-"""What the buffers of sensed paths share: which steps count, and how paths are drawn from each cell alike."""
+"""What the buffers of sensed paths share: which steps count, and how paths are drawn from each cell alike.
+
+Where a policy knows more at a detection than the cell, paths are of keys: with all sensors on, a key says where the
+target is and what is known of how it came there. All that is said of cells and M holds for keys and their number.
+"""
 
 from __future__ import annotations
 
@@ -56,14 +60,15 @@ class CellIndex(NamedTuple):
 
 
 def report_weights(task: Task, device: torch.device) -> Tensor | None:
-    """`[M + 1]` 1 / p_d of a path's step to each cell, 1 for the exit; None where no sensor misses.
+    """`[M + 1]` 1 / p_d of a path's step to each cell (or key), 1 for the exit; None where no sensor misses.
 
     A path is known only where it was reported at every step, with probability Π p_d(x_k): weighted by the inverse of
     that, those known stand for all (Horvitz and Thompson 1952).
     """
     if task.perfect:
         return None
-    return pad(1.0 / torch.as_tensor(task.detection, device=device), (0, 1), value=1.0)
+    weights = (1.0 / torch.as_tensor(task.detection, device=device)).repeat_interleave(task.keys.num_classes)
+    return pad(weights, (0, 1), value=1.0)
 
 
 def stratified_starts(count: int, steps: int, num_cells: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -82,8 +87,13 @@ def stratified_starts(count: int, steps: int, num_cells: int, generator: torch.G
     return (order + offset) % m, draws
 
 
-def sensed_steps(batch: TensorDictBase, num_cells: int) -> tuple[Tensor, Tensor]:
-    """Which steps of a collected batch `[B, time]` count, and the cell after each of those, M for outside.
+def known_as(batch: TensorDictBase) -> str:
+    """The name of what a detection leaves in a collected batch: `key` where there is one, else `last_cell`."""
+    return "key" if "key" in batch.keys() else "last_cell"  # noqa: SIM118 (no dict)
+
+
+def sensed_steps(batch: TensorDictBase, num_cells: int, name: str = "last_cell") -> tuple[Tensor, Tensor]:
+    """Which steps of a collected batch `[B, time]` count, and the cell (or `key`) after each of those, M for outside.
 
     Fully sensed steps of a located target count. Read is only what the tracker saw: where it located the target, and
     that it left the grid. Steps that did not sense every cell are passed over, also where they detected: to keep the
@@ -95,4 +105,4 @@ def sensed_steps(batch: TensorDictBase, num_cells: int) -> tuple[Tensor, Tensor]
     # `all(-1)` is decided before the move, so that steps are not selected by where the target goes; with all M sensors
     # on, a step ends located or exited.
     whole = batch["action"].all(-1) & (batch["steps_since_detection"] == 0) & located
-    return whole, torch.where(exited, num_cells, after["last_cell"])
+    return whole, torch.where(exited, num_cells, after[name])

@@ -12,6 +12,7 @@ from torch.nn.functional import pad
 
 from trackmdp.algos.paths import CellIndex, cell_dtype, sensed_steps, stratified_starts
 from trackmdp.solvers.path_exchange import parted
+from trackmdp.world.memory import KeySpace
 from trackmdp.world.tracks import Tracks, ends_of
 
 __all__ = ["SegmentBuffer", "SensedPaths"]
@@ -120,6 +121,8 @@ class SegmentBuffer:
         weights: `[M + 1]`, by which each step to a cell multiplies what a segment counts; None: all count alike. See
             `report_weights`.
         judge: seed by which recordings are kept from the segments, to judge what is learned by; None: none is.
+        keys: of policies that remember detections, to which segments are then of the keys with all sensors on; None, or
+            with a memory of the cell alone, they are of cells.
     """
 
     def __init__(
@@ -130,9 +133,11 @@ class SegmentBuffer:
         generator: torch.Generator,
         weights: Tensor | None = None,
         judge: int | None = None,
+        keys: KeySpace | None = None,
     ) -> None:
         self.num_cells, self.steps, self._generator, self._weights = num_cells, steps, generator, weights
-        self.judge = judge
+        self.judge, self._keys = judge, keys if keys and keys.order else None
+        self._outside = self._keys.num_keys if self._keys else num_cells
         self._paths = SensedPaths(num_cells, capacity)
         self._index: tuple[Tensor, CellIndex] | None = None
 
@@ -145,8 +150,8 @@ class SegmentBuffer:
         self._index = None
 
     def moves(self) -> tuple[Tensor, Tensor]:
-        """Cells before and after every sensed step, int64 `[K]` each; M after an exit."""
-        start, end = self._paths.steps().to(self._generator.device)
+        """Cells, or keys of them, before and after every sensed step, int64 `[K]` each; M after an exit."""
+        start, end = self._paths.steps().to(self._generator.device) * (self._outside // self.num_cells)
         return start, end
 
     def tracks(self) -> Tracks:
@@ -157,12 +162,25 @@ class SegmentBuffer:
         """`[steps + 1, K]`, in the order of the paths."""
         tracks = self.tracks() if self.judge is None else parted(self.tracks(), self.judge)[0]
         place, lengths = np.arange(len(tracks.cells)), tracks.lengths
-        last, cells = np.repeat(tracks.first[1:] - 1, lengths), []
+        first, last = (np.repeat(ends, lengths) for ends in (tracks.first[:-1], tracks.first[1:] - 1))
+        line, cells = tracks.cells, []
+        if self._keys:
+            # A key depends on the last detections alone: it is that of a path which began so many steps before.
+            line = self._keys.start(tracks.cells[np.maximum(place - self._keys.order, first)])
+            for back in range(self._keys.order - 1, -1, -1):
+                following = self._keys.next(line, 0, tracks.cells[np.maximum(place - back, 0)])
+                line = np.where(place - back > first, following, line)
         for step in range(self.steps + 1):
             gone = place + step > last
-            cells.append(np.where(gone, self.num_cells, np.roll(tracks.cells, -step)))
+            cells.append(np.where(gone, self._outside, np.roll(line, -step)))
         whole = ~gone | np.repeat(tracks.exits, lengths)
-        return torch.as_tensor(np.stack(cells)[:, whole]).to(self._generator.device, cell_dtype(self.num_cells))
+        return torch.as_tensor(np.stack(cells)[:, whole]).to(self._generator.device, cell_dtype(self._outside))
+
+    def sample(self, count: int) -> Tensor:
+        """`[steps + 1, count]` int64, segments drawn as they are, each as likely as any other."""
+        segments, _ = self._index = self._index or self._sort()
+        drawn = torch.randint(segments.shape[1] - 1, (count,), generator=self._generator, device=segments.device)
+        return segments.index_select(1, drawn).long()
 
     def paths(self, count: int, steps: int) -> Tensor:
         """`[steps + 1, count]` int64 cells of `count` paths, M from the exit on; every cell starts equally many.
@@ -182,7 +200,7 @@ class SegmentBuffer:
 
         One more, of M alone, stands for the cells in which no segment begins.
         """
-        m, segments = self.num_cells, self.segments()
+        m, segments = self._outside, self.segments()
         start, end = segments[:2].long()
         # Sorted by (start, end): with M = 4, the move 2 -> 3 has the key 2 * 5 + 3 = 13, and an exit from 2 the key 14.
         order = (start * (m + 1) + end).argsort(stable=True)

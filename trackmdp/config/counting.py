@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from trackmdp.config.learning import AlgoConfig, check_classes
-from trackmdp.config.options import choice, option
+from trackmdp.config.options import choice, option, refuse
 from trackmdp.config.schema import BYTES, Sizes
 
 
@@ -16,6 +16,7 @@ class LearnedKernelConfig(AlgoConfig):
     """Estimate the motion from detections, then plan with the estimate; no networks."""
 
     credit: ClassVar[str | None] = None
+    told: ClassVar[bool] = True
     knows_footprints: ClassVar[bool] = True
     sensing: str = option("all sensors on, or sets chosen by posterior sampling", choices=("all", "chosen"))
     warm_up: int = option("with chosen sets: env steps with all sensors on before them", unit="frames", ge=0)
@@ -50,8 +51,10 @@ class LearnedKernelConfig(AlgoConfig):
     samples: int = option("kernels drawn for the uncertainty reported", ge=2, le=10**4)
 
     def check(self, key: str, root: Any) -> None:
-        """The file of the classes is a table."""
+        """The file of the classes is a table; where a detection tells the mode, cells do not move alike."""
         check_classes(f"{key}.share_cells", self.share_cells)
+        if root.kernel.hides and self.share_cells not in (None, "none"):
+            raise refuse(f"{key}.share_cells", self.share_cells, "none or null with kernel.reveals=true")
 
     def ignored(self, root: Any) -> dict[str, str]:
         """With all sensors on throughout, nothing comes before chosen sets."""

@@ -29,6 +29,8 @@ class PerSensorConfig(AlgoConfig):
 
     credit: ClassVar[str | None] = "per_sensor"
     knows_footprints: ClassVar[bool] = True
+    remembers: ClassVar[bool] = True
+    told: ClassVar[bool] = True
     effort: ClassVar[float] = 1.0
     collect: str = option(
         "all sensors on; or mixed with the policy learned so far, which costs less and shows less",
@@ -81,6 +83,16 @@ class PerSensorConfig(AlgoConfig):
         if not (getattr(kernel, "markov", True) or kernel.min_length) and limit is not None and limit < path:
             expected = f"at least grid.t_max + 2 = {path} with kernel.markov=false, a whole path of a policy"
             raise refuse("grid.max_steps", limit, expected)
+        if root.task.memory != "cell":
+            self._check_memory(key, root)
+
+    def _check_memory(self, key: str, root: Any) -> None:
+        """A policy that remembers detections is replayed on paths that were sensed from end to end."""
+        remembered = f"task.memory={root.task.memory}"
+        if self.collect != "all_on":
+            raise refuse(f"{key}.collect", self.collect, f"all_on with {remembered}")
+        if root.sensor.name != "perfect":
+            raise refuse("sensor", root.sensor.name, f"perfect with algo={self.name} and {remembered}")
 
     def ignored(self, root: Any) -> dict[str, str]:
         """All sensors on leave nothing to explore."""
@@ -90,14 +102,17 @@ class PerSensorConfig(AlgoConfig):
         """The moves kept, with what sorting them takes; the paths of one update; the networks.
 
         A move is two cells of 16 bits. Where moves of different paths do not combine (`markov`), a third number says
-        which go on, paths of t_max + 3 cells are kept as well, and what is worked out of whole paths by exchange.
+        which go on, paths of t_max + 3 cells, longer ones where a policy remembers detections, are kept as well, and
+        what is worked out of whole paths by exchange, for each detection that may be on them.
         """
+        length = task.t_max + 3 + (2 * (task.order + 2) * (task.t_max + 2) - 2 if task.order else 0)
         moves = min(self.buffer_size, root.collector.total_frames)
-        cells, numbers = (2, 5) if task.markov else (task.t_max + 6, 8 + self.exchange * (task.t_max + 2) * 12)
+        whole, events = self.exchange * (task.t_max + 2) * 12, (task.t_max + 3) ** task.order
+        cells, numbers = (2, 5) if task.markov and not task.order else (length + 3, 8 + whole * events)
         return {
             "algo.buffer_size": moves * (cells * BYTES["int16"] + numbers * BYTES["int64"]),
-            # Each of the t_max + 3 cells of a path, and about five numbers that are gathered for it.
-            "algo.batch_size": self.batch_size * (task.t_max + 3) * 6 * BYTES["int64"],
+            # Each cell of a path, and about five numbers that are gathered for it.
+            "algo.batch_size": self.batch_size * length * 6 * BYTES["int64"],
             "algo.hidden": networks(task, self.hidden),
         }
 

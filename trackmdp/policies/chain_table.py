@@ -18,8 +18,11 @@ class CellClockNet(nn.Module):
     A hidden layer's decoder learns from all rows what belongs together; a table of outputs has a number for each row
     and output, and takes a hundredth of the time.
 
+    With `classes` a cell has as many rows, numbered cell · C + class as keys are (`KeySpace`). Then cell and class have
+    each an embedding of their own with the clock, beside that of the key: keys that are seldom seen are known by these.
+
     Args:
-        num_cells: M.
+        num_cells: M; with classes M · C.
         num_clocks: values the clock takes, 0 ... num_clocks - 1.
         hidden: hidden units; 0: a table.
         outputs: numbers per row.
@@ -27,6 +30,7 @@ class CellClockNet(nn.Module):
         generator: draws the initial weights, on its device.
         groups: int64 `[M]`, the group of each cell, numbered from 0; cells of one group share all weights. None: each
             cell is its own.
+        classes: C.
     """
 
     groups: Tensor | None
@@ -41,6 +45,7 @@ class CellClockNet(nn.Module):
         bias: float,
         generator: torch.Generator,
         groups: Tensor | None = None,
+        classes: int = 1,
     ) -> None:
         super().__init__()
         self.register_buffer("groups", groups, persistent=False)
@@ -63,12 +68,17 @@ class CellClockNet(nn.Module):
         # Std 1 / sqrt(H) keeps the outputs' size independent of the width.
         self.weight = normal(hidden, outputs, std=hidden**-0.5)
         self.bias = nn.Parameter(torch.full((outputs,), bias, device=generator.device))
+        if classes > 1:
+            self.located = normal(num_cells // classes, 1, num_clocks, hidden, std=0.3)
+            self.known = normal(classes, num_clocks, hidden, std=0.3)
 
     def forward(self, cells: slice = slice(None)) -> Tensor:
         """`[M, num_clocks, outputs]`, the outputs of every row, or of the rows of some `cells` alone."""
         if hasattr(self, "table"):
             return self.table[cells] if self.groups is None else self.table[self.groups[cells]]
         embedding = self.cell + self.clock + self.pair
+        if hasattr(self, "known"):
+            embedding = embedding + (self.located + self.known).flatten(0, 1)
         # With groups the embedding has a row per group and not per cell; the wanted cells are picked at the end.
         if self.groups is None and cells != slice(None):
             embedding = embedding[cells]

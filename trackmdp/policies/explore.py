@@ -25,8 +25,8 @@ class RenewedTable(TensorDictModuleBase):
     """Acts as a deterministic policy that is replaced from time to time.
 
     The table is a buffer of fixed shape, for collectors hand buffers on to their worker processes; so it holds a bit
-    for every entry and not the entries stored, which change in number. There are M (t_max+1) K entries, in the local
-    numbers of the window where the task has one.
+    for every entry and not the entries stored, which change in number. There are M (t_max+1) K entries, with keys in
+    place of the M cells where there are any, in the local numbers of the window where the task has one.
 
     Args:
         task: what it acts in.
@@ -34,17 +34,17 @@ class RenewedTable(TensorDictModuleBase):
         on: whether all sensors are on at first, or none.
     """
 
-    in_keys: ClassVar = ["last_cell", "steps_since_detection"]
     out_keys: ClassVar = ["action"]
     bits: Tensor
     _place: Tensor
 
     def __init__(self, task: Task, device: torch.device | str = "cpu", *, on: bool = False) -> None:
         super().__init__()
-        self.num_choices, self.num_sensors = task.num_choices, task.num_sensors
+        self.num_choices, self.num_sensors, self.keys = task.num_choices, task.num_sensors, task.keys
+        self.in_keys = ["key" if task.keyed else "last_cell", "steps_since_detection"]
         self.window = Window.of(task, device)
-        # Row x (t_max + 1) + n, as in `PolicyTable`; 8 sensors per byte: 10 x 10 cells take 13 bytes a row.
-        shape = (task.num_cells * task.num_choices, -(-task.num_sensors // 8))
+        # Row key (t_max + 1) + n, as in `PolicyTable`; 8 sensors per byte: 10 x 10 cells take 13 bytes a row.
+        shape = (task.num_keys * task.num_choices, -(-task.num_sensors // 8))
         self.register_buffer("bits", torch.full(shape, 255 * on, dtype=torch.uint8, device=device))
         # numpy.packbits puts the first of eight entries into the highest bit.
         self.register_buffer("_place", torch.arange(7, -1, -1, device=device), persistent=False)
@@ -62,16 +62,17 @@ class RenewedTable(TensorDictModuleBase):
             return sets.toarray()
         on = np.zeros((sets.shape[0], self.window.width), dtype=bool)
         row = np.repeat(np.arange(sets.shape[0]), np.diff(sets.indptr))
-        start, cell = torch.as_tensor((begin + row) // self.num_choices), torch.as_tensor(sets.indices).long()
+        start = torch.as_tensor(self.keys.cell((begin + row) // self.num_choices))
+        cell = torch.as_tensor(sets.indices).long()
         # A policy of this task has no sensor outside the window, so that each has a local number below K.
         on[row, self.window.find(start.to(self.bits.device), cell.to(self.bits.device)).cpu().numpy()] = True
         return on
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action` `[*B, K]`, local to `last_cell` where the task has a window."""
-        cell, n = tensordict["last_cell"], tensordict["steps_since_detection"]
+        key, n = (tensordict[name] for name in self.in_keys)
         # n = t_max + 1 has no row of its own: the safe action replaces whatever is written there.
-        packed = self.bits[cell * self.num_choices + n.clamp_max(self.num_choices - 1)]
+        packed = self.bits[key * self.num_choices + n.clamp_max(self.num_choices - 1)]
         # [*B, bytes, 1] >> [8] = [*B, bytes, 8], flattened to bits in the order of the sensors; the padding is cut off.
         chosen = ((packed.unsqueeze(-1) >> self._place) & 1).flatten(-2)[..., : self.num_sensors].bool()
         return tensordict.set("action", chosen)

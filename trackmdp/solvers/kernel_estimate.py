@@ -67,6 +67,8 @@ class KernelEstimate:
 
     Args:
         size: (rows, columns), or one number for a square.
+        modes: H, where moves are between states cell · H + mode, which then stand for the cells in
+            all that follows: as if the grid had H times as many columns, but displacements are those of one class.
         weight: the prior counts as much as this many moves.
         exit_weight: the pooled exit probability counts as much as this many moves.
         detection: `[M]`, p_d of each cell's sensor; None where no sensor misses.
@@ -88,9 +90,11 @@ class KernelEstimate:
         detection: Array | None = None,
         share_cells: bool | None = False,
         classes: IndexArray | None = None,
+        modes: int = 1,
     ) -> None:
-        self._detection = detection
+        self._detection, self._modes = None if detection is None else np.repeat(detection, modes), modes
         self.rows, self.columns = grid_size(size)
+        self.columns *= modes
         self.weight, self.exit_weight, self.share_cells, self._classes = weight, exit_weight, share_cells, classes
         self.num_cells = self.rows * self.columns
         self.direct = sparse.csr_array((self.num_cells, self.num_cells + 1))
@@ -261,9 +265,11 @@ class KernelEstimate:
         width = 2 * self.columns
         shift = (end // self.columns - start // self.columns + self.rows) * width
         shift = shift + end % self.columns - start % self.columns + self.columns
-        shifts, place = np.unique(shift, return_inverse=True)
+        # With modes the shift says as well from which one: (cell, up) moves otherwise than (cell, left).
+        shifts, place = np.unique(shift * self._modes + start % self._modes, return_inverse=True)
         each = np.bincount(place, weights=share, minlength=len(shifts)).astype(np.float64)
-        typical = self._put_down(shifts // width - self.rows, shifts % width - self.columns, each)
+        shift, begin = np.divmod(shifts, self._modes)
+        typical = self._put_down(shift // width - self.rows, shift % width - self.columns, each, begin)
         total = typical.sum(axis=1)
         without = np.flatnonzero(total <= 0)
         if len(without):
@@ -281,11 +287,15 @@ class KernelEstimate:
         near = self._put_down(rows, columns, np.ones(len(rows)))
         return sparse.csr_array(sparse.diags_array(1.0 / near.sum(axis=1)) @ near)
 
-    def _put_down(self, rows: IndexArray, columns: IndexArray, weight: Array) -> sparse.csr_array:
-        """`[M, M]` displacements `[S]` from every cell, those that leave the grid left out."""
+    def _put_down(
+        self, rows: IndexArray, columns: IndexArray, weight: Array, begin: IndexArray | None = None
+    ) -> sparse.csr_array:
+        """`[M, M]` displacements `[S]` from every cell, or those of class `begin` `[S]`, but for ends outside."""
         cells = np.arange(self.num_cells)
         row, column = cells[:, None] // self.columns + rows, cells[:, None] % self.columns + columns
         inside = (row >= 0) & (row < self.rows) & (column >= 0) & (column < self.columns)
+        if begin is not None:
+            inside &= cells[:, None] % self._modes == begin
         # [M, S] in row-major order, as `end` below lists its entries.
         start, which = np.nonzero(inside)
         end = (row * self.columns + column)[inside]

@@ -171,6 +171,11 @@ class KeyedPairs:
             later.insert(0, self.layers[n].moves @ worth - spent[n][self.rows[n]] * self.stay[n])
         return later
 
+    def sets(self, policy: PolicyTable) -> list[BoolArray]:
+        """A deterministic policy as a bool for each group, per step."""
+        of_groups = (np.divmod(groups, self.world.num_cells) for groups in self.groups)
+        return [policy.on(n, key, cell) > 0 for n, (key, cell) in enumerate(of_groups)]
+
     def table(self, sets: list[BoolArray]) -> PolicyTable:
         """The policy of sets."""
         world, parts = self.world, []

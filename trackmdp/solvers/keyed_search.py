@@ -6,8 +6,10 @@ import time
 
 import numpy as np
 
+from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.keyed import KeyedPairs, evaluate_keys
 from trackmdp.solvers.keyed_exchange import exchanged_pairs
+from trackmdp.solvers.keyed_proof import told_bound
 from trackmdp.solvers.renewal import accumulate, check_length, per_row, row_index
 from trackmdp.solvers.solution import Solution
 from trackmdp.world.model import Array
@@ -57,16 +59,17 @@ def _of_cells(world: HiddenWorld, bound: Array) -> Array:
     return mean
 
 
-def solve_keys(world: HiddenWorld, *, steps: int = 12, rounds: int = 20) -> Solution:
+def solve_keys(world: HiddenWorld, *, start: PolicyTable | None = None, steps: int = 12, rounds: int = 20) -> Solution:
     """A policy over keys by the homotopy from the bound's credit to the exact one, then by exchange.
 
     Args:
         world: whose `memory` says what a key is.
+        start: a policy of the same keys that the one found is no worse than; None: no sensor on.
         steps: of the homotopy.
         rounds: of exchange at most; one is kept only if the exact AIHTR rises.
     """
     began, pairs, bound = time.monotonic(), KeyedPairs(world), mode_bound(world)
-    best = [np.zeros(len(groups), dtype=bool) for groups in pairs.groups]
+    best = pairs.sets(PolicyTable.none(world) if start is None else start)
     value, visits, aihtr = pairs.value(best)
     now = (best, value, visits, aihtr)
     for step in range(-1, steps + 1):
@@ -83,5 +86,8 @@ def solve_keys(world: HiddenWorld, *, steps: int = 12, rounds: int = 20) -> Solu
     table = pairs.table(best)
     upper = _of_cells(world, bound)
     evaluation = evaluate_keys(world, table)
+    if world.revealed > 1 and (proved := told_bound(pairs, value)) is not None:
+        proved = proved.reshape(world.num_cells, -1).mean(axis=1)
+        upper = np.maximum(np.minimum(upper, proved), evaluation.value)  # not below what is attained, by rounding
     certified = float(upper.mean()) - evaluation.aihtr <= 1e-6 * max(1.0, abs(evaluation.aihtr))
     return Solution(table, evaluation, upper, certified, time.monotonic() - began, nodes=0, interrupted=False)

@@ -49,8 +49,8 @@ class Task:
             until it locates the target.
         coverage: the cells that each of the S sensors covers, where that is not its own cell alone; the constructor
             takes a table or sparse matrix `[S, M]` of 0 and 1. None: S = M, sensor s covers cell s.
-        markov: whether the next move depends on the target's cell alone, so that a learner may put paths together from
-            moves seen on different ones.
+        markov: whether the next move depends on what a detection tells alone, the cell or, where it does, cell and
+            mode, so that a learner may put paths together from moves seen on different ones.
         memory: what a policy remembers at a detection, one of `trackmdp.config.world.MEMORIES`; see `KeySpace`.
         clip: rows and columns up to which remembered displacements are told apart.
         revealed: modes of the target that a detection tells apart; 1 where it tells the cell alone.

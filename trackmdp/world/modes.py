@@ -53,7 +53,8 @@ class HiddenWorld(Task):
     def __init__(
         self, kernel: sparse.sparray | npt.NDArray[np.generic], size: Size, *, modes: int, **of_task: Any
     ) -> None:
-        super().__init__(size, **(of_task | {"markov": False}))
+        # Where a detection tells the mode, what comes next depends on what it tells alone.
+        super().__init__(size, **(of_task | {"markov": of_task.get("revealed", 1) == modes}))
         if not self.safe:
             raise UserError("kernel: with a hidden mode the safe action must not miss")
         if self.revealed not in (1, modes):
@@ -114,6 +115,13 @@ class HiddenWorld(Task):
 
 Modelled: TypeAlias = World | HiddenWorld
 """A task with a motion model."""
+
+
+def with_motion(task: Task, kernel: sparse.csr_array) -> Modelled:
+    """The world of a task with a kernel on its cells, or on (cell, mode) where a detection tells the mode."""
+    if task.revealed > 1:
+        return HiddenWorld(kernel, modes=task.revealed, **task.given)
+    return World.of(task, kernel, max_steps=None)
 
 
 def check_revealed(problem: Task, told: int) -> None:
