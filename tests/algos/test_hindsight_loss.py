@@ -43,8 +43,9 @@ def of_one_path(form: str, z: Tensor, cost: Tensor, covers: Tensor, gain: Tensor
     What seeing it there gains is the gain of each sensor that sees it while none of the others does.
     """
     softplus = torch.nn.functional.softplus
-    others = torch.stack([(covers & (z > 0) & (torch.arange(len(z)) != s)).any() for s in range(len(z))])
-    one = (covers & ~others).float()
+    on = (z > 0).float() if form in ("decision", "poisson") else z.detach().sigmoid()
+    missed = [(1 - on * covers)[torch.arange(len(z)) != s].prod() for s in range(len(z))]
+    one = covers * torch.stack(missed)
     if form == "decision":
         plus, minus = gain.clamp(min=0), (-gain).clamp(min=0)
         return (cost * softplus(z) + one * (plus * softplus(-z) + minus * softplus(z))).sum()

@@ -112,6 +112,14 @@ class ActorLoss(nn.Module):
     def prepare(self, update: int, progress: float) -> None:
         """Set what changes in the course of a run, before update number `update`."""
 
+    def acting(self, logits: Tensor) -> Tensor:
+        """`[M, T+1, K]`, the sensors on, or with what probability: what the gain of one with footprint stands beside.
+
+        Of a loss that is least at log(gain / price) z is no probability; two sensors of the same cells would both be on
+        at half the gain.
+        """
+        return logits > 0
+
     def forward(self, logits: Tensor, credit: SensorCredit) -> Tensor:
         """`[M, T+1, K]` losses of `logits` z `[M, T+1, K]`."""
         raise NotImplementedError
@@ -150,9 +158,14 @@ class PolicyGradient(ActorLoss):
         held = _PULL * beyond.square() - self._entropy * entropy
         return credit.arrivals.unsqueeze(-1) * held - self.objective(logits, credit)
 
+    def acting(self, logits: Tensor) -> Tensor:
+        """σ(z): each sensor's gain is then the exact slope of the expected value of a set, footprints or not."""
+        return logits.sigmoid()
+
     def objective(self, logits: Tensor, credit: SensorCredit) -> Tensor:
         """What the policy gains, to be maximised."""
-        # The expected value of a set is Σ_j σ(z_j) Δ_j: gains add over sensors, and no set need be drawn.
+        # The expected value of a set is Σ_j σ(z_j) Δ_j: gains add over sensors, and no set need be drawn. With
+        # footprints Δ_j depends on the others, held fixed here, and the slope is the same.
         return logits.sigmoid() * credit.advantage
 
 

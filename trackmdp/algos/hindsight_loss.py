@@ -349,10 +349,12 @@ class HindsightLoss(nn.Module):
         # Paths that reach each (x, n); every sensor on costs c on each of them, the one the target moves to included.
         arrivals = scatter_add(alive, row, count * choices).view(count, choices)
         price = arrivals.unsqueeze(-1) * self.cost[self._of_keys(self.sensors.numbers, rows)].unsqueeze(1)
-        on = logits.detach() > 0
-        credit = SensorCredit(
-            entry, gain, arrivals, price, rows, lambda sums: self.sensors.gains(sums, on, rows), self.view.width
-        )
+
+        def of_sensors(gain: Tensor) -> Tensor:
+            on = self.actor_loss.acting(logits.detach()) if self.sensors.shared else logits
+            return self.sensors.gains(gain, on, rows)
+
+        credit = SensorCredit(entry, gain, arrivals, price, rows, of_sensors, self.view.width)
         return self.actor_loss(logits, credit).sum((0, 2))
 
     def _weights(self, which: int, count: Tensor, gain: Tensor) -> Tensor:

@@ -1,9 +1,10 @@
-"""The sensors that may see the target from a located cell on, and what each of them gains given those that are on.
+"""The sensors that may see the target from a located cell on, and what each of them gains beside the others.
 
 A set of sensors earns what it gains to see the target in each cell that it covers. With one sensor in each cell that
-sum falls apart, and a cell's gain is its sensor's. With footprints sensors share cells: to switch one more on gains
-what none of the others sees, and to leave one off loses what it alone sees. A set from which no such change gains is a
-local optimum of the weighted coverage (`solvers/cover.py`), which the learned sets settle in.
+sum falls apart, and a cell's gain is its sensor's. With footprints sensors share cells: a sensor gains what none of the
+others sees. Sets from which no change of one sensor gains are local optima of the weighted coverage
+(`solvers/cover.py`). Where the others are on with probabilities, it gains the expectation of that, the slope of the
+multilinear extension of coverage (Calinescu et al. 2011), whose maxima are sets.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ class SensorsInView(nn.Module):
     Attributes:
         numbers: `[M, K]` int64, the sensors; S, which there is none of, where a located cell has fewer than K.
         width: K.
+        shared: whether sensors have footprints; without, a window's cells are its sensors.
         entries: numbers that `seen` and `gains` gather for each set.
     """
 
@@ -45,9 +47,9 @@ class SensorsInView(nn.Module):
 
     def __init__(self, task: Task, window: Window) -> None:
         super().__init__()
-        self._shared = task.coverage is not None
+        self.shared = task.coverage is not None
         tables = {"numbers": window.cells}
-        if self._shared:
+        if self.shared:
             device = window.cells.device
             tables = {name: torch.as_tensor(table, device=device) for name, table in _tables(task, window).items()}
         for name, table in tables.items():
@@ -57,22 +59,23 @@ class SensorsInView(nn.Module):
 
     def seen(self, on: Tensor, rows: slice) -> Tensor:
         """`[R, T+1, C]` bool, which cells the sets `on` `[R, T+1, K]` of the located cells `rows` see."""
-        return self._sums(on, self._of_cell[rows]) > 0 if self._shared else on
+        return self._sums(on, self._of_cell[rows]) > 0 if self.shared else on
 
     def gains(self, gain: Tensor, on: Tensor, rows: slice) -> Tensor:
-        """`[R, T+1, K]`, what each sensor gains more on than off, the others being as in `on`.
+        """`[R, T+1, K]`, what each sensor gains more on than off beside the others.
 
         Args:
             gain: `[R, T+1, C]`, what it gains to see the target in each cell of the windows.
-            on: bool `[R, T+1, K]`.
+            on: `[R, T+1, K]`, with what probability each sensor is on, independently of the others; or bool.
             rows: located cells.
         """
-        if not self._shared:
+        if not self.shared:
             return gain
-        times = self._sums(on, self._of_cell[rows])
-        # A sensor that is off would see what none sees yet; one that is on alone sees what is seen once.
-        added, kept = (self._sums(gain * (times == seen), self._of_sensor[rows]) for seen in (0, 1))
-        return torch.where(on, kept, added)
+        # A cell that no other sensor sees: Π (1 - p) over all of its sensors, less the sensor's own factor, which is
+        # the same in all of its cells. Of p = 1 as much is left as a float tells from 1.
+        off = torch.log1p(-on.float().clamp(max=1.0 - 2.0**-23))
+        unseen = self._sums(off, self._of_cell[rows]).exp()
+        return self._sums(gain * unseen, self._of_sensor[rows]) / off.exp()
 
     @staticmethod
     def _sums(values: Tensor, places: Tensor) -> Tensor:
