@@ -10,11 +10,14 @@ import torch
 
 from tests.algos.hindsight import SOLVES, batches, learn, policy
 from tests.helpers import algorithm, small_world
+from trackmdp.algos.actor_loss import Decision
 from trackmdp.algos.gains import chain_returns
+from trackmdp.algos.hindsight_loss import HindsightLoss
 from trackmdp.algos.learned_kernel import observed_paths
 from trackmdp.algos.moves import MoveBuffer
 from trackmdp.algos.paths import report_weights
 from trackmdp.algos.segments import SegmentBuffer
+from trackmdp.episodes.simulate import simulate
 from trackmdp.errors import UserError
 from trackmdp.solvers import optimal
 from trackmdp.solvers.evaluate import evaluate
@@ -95,10 +98,66 @@ def test_misses_are_censored_moves() -> None:
     assert 3 * errors[0] < errors[1]
 
 
-@pytest.mark.parametrize("name", ["hindsight", "learned_kernel"])
-def test_a_safe_action_that_misses_is_not_learned(name: str) -> None:
-    with pytest.raises(UserError, match=r"sensor\.p_s=0\.5: expected 1"):
-        algorithm(name, replace(small_world(), safe_detection=0.5))
+def test_a_safe_action_that_misses_is_repeated() -> None:
+    """One set, off; at the end .25 (1 + .5 · 2) + .75 · .5 · -8 - 5 where it misses to go on at -8."""
+    found = chain_returns(
+        torch.tensor([[0.0]]),
+        torch.ones(2, 1, dtype=torch.bool),
+        torch.tensor([[0.0]]),
+        torch.tensor([[4.0], [2.0]]),
+        reward=1.0,
+        safe_cost=5.0,
+        discount=0.5,
+        repeated=(torch.tensor([0.25]), torch.tensor([-8.0])),
+    )
+    assert found.flatten().tolist() == pytest.approx([0.5 * -7.5, -7.5])
+
+
+@pytest.mark.parametrize("hidden", [0, 8])
+def test_critics_settle_at_the_value_of_what_is_repeated(hidden: int) -> None:
+    """Nothing sensed on one cell, r = 1, D = 2, p_s = .5, exit .1, discount .8: L = .9 (.5 (1 + .8 V) + .4 L - 2)."""
+    task = Task(1, cost=9.0, safe_cost=2.0, t_max=0, safe_detection=0.5)
+    rng = torch.Generator().manual_seed(0)
+    loss = HindsightLoss(task, Decision(), reach=0, hidden=hidden, discount=0.8, generator=rng)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=0.02)
+    cells = torch.tensor([[0, 0, 0]] * 81 + [[0, 0, 1]] * 9 + [[0, 1, 1]] * 10).T
+    off = torch.zeros(1, 1, 1, dtype=torch.bool)
+    for _ in range(1500):
+        optimizer.zero_grad()
+        losses = loss(cells, off, 0.0)
+        (losses["critic"] + losses["clocked_critic"]).backward()
+        optimizer.step()
+    # V = .9 · .8 L, and U is the same: nothing is worth 9.
+    exact = np.linalg.solve([[1.0, -0.72], [-0.36, 1 - 0.36]], [0.0, 0.9 * (0.5 - 2)])
+    forced = torch.tensor([0.0, loss._forced])
+    for net in (loss.critic, loss.clocked_critic):
+        assert (net().flatten() + forced).tolist() == pytest.approx(exact.tolist(), abs=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["hindsight", "a2c_per_sensor", "learned_kernel"])
+def test_policies_with_a_safe_action_that_misses_come_near_the_optimum(name: str) -> None:
+    world = replace(small_world(exit_probability=0.02), safe_cost=0.5, detection=0.8, safe_detection=0.5)
+    words = () if name == "learned_kernel" else (*SOLVES, "algo.buffer_size=20000")
+    learner = learn(world, batches(world, 64), "algo.total_frames=16384", *words, name=name)
+    best, found = optimal.solve(world), policy(learner, world)
+    assert best.certified
+    assert regret_per_step(best.upper, evaluate(world, found)) < 0.02
+    played = simulate(world, found, 1500, seed=1).figures()
+    assert abs(played.aihtr.mean - evaluate(world, found).aihtr) < 3 * played.aihtr.standard_error
+
+
+def test_what_ends_at_a_safe_action_that_may_miss_is_counted_until_then() -> None:
+    """With p_s = .3 most of the time goes by at the last clock; the moves made then are not taken for single ones."""
+    world = replace(small_world(exit_probability=0.1), detection=0.4, safe_detection=0.3)
+    estimate = KernelEstimate(3, weight=1.0, exit_weight=1.0, detection=world.detection)
+    for batch in batches(world, 96):
+        paths = observed_paths(batch, world)
+        assert ((paths.end == 10) == (paths.misses == 2)).all()
+        estimate.add(paths)
+    estimate.fit(40)
+    assert np.abs(estimate.mean().toarray()[:, :-1] - world.kernel.toarray()).mean() < 0.02
+    assert estimate.mean().toarray()[:, -1].mean() == pytest.approx(0.1, abs=0.015)
 
 
 def test_what_counts_paths_is_refused() -> None:

@@ -45,13 +45,21 @@ def clocked_advantage(clocked: Tensor) -> Tensor:
 
 
 def chain_returns(
-    hits: Tensor, inside: Tensor, set_cost: Tensor, value: Tensor, *, reward: float, safe_cost: float, discount: float
+    hits: Tensor,
+    inside: Tensor,
+    set_cost: Tensor,
+    value: Tensor,
+    *,
+    reward: float,
+    safe_cost: float,
+    discount: float,
+    repeated: tuple[Tensor, Tensor] | None = None,
 ) -> Tensor:
     """Return of a chain of sets from each of its steps on, along paths, the target undetected until then.
 
-    Backwards from the safe action: G_{T+1} = r - D + γV(y), G_n = r + γV(y) - c(A_n) if y is in A_n, else
-    γG_{n+1} - c(A_n), where y is the cell the target moves to at that step; 0 once the target has left. A sensor that
-    may miss gives the mean of the two: no report is drawn, and none adds noise.
+    Backwards from the safe action, which locates: G_{T+1} = r - D + γV(y), G_n = r + γV(y) - c(A_n) if y is in A_n,
+    else γG_{n+1} - c(A_n), where y is the cell the target moves to at that step; 0 once the target has left. A sensor
+    that may miss gives the mean of the two: no report is drawn, and none adds noise.
 
     Args:
         hits: `[T+1, B]`, whether A_n contains y, or with what probability the sensor there reports.
@@ -61,14 +69,17 @@ def chain_returns(
         reward: r.
         safe_cost: D.
         discount: γ.
+        repeated: `[B]` each, p_s(y) and L(y), the value of the target being in y where the safe action comes next;
+            what it misses at the last step is worth γL(y). None: it always locates.
 
     Returns:
         `[T+2, B]`.
     """
     found = reward + discount * value
-    # The forced step has no set to pay for and always locates. Each G is 0 where the target has left by then, so that a
+    last = found[-1] if repeated is None else torch.lerp(discount * repeated[1], found[-1], repeated[0])
+    # The forced step has no set to pay for. Each G is 0 where the target has left by then, so that a
     # plan that misses until the exit has paid for its sets in the grid alone.
-    returns = [(found[-1] - safe_cost) * inside[-1]]
+    returns = [(last - safe_cost) * inside[-1]]
     for n in reversed(range(len(hits))):
         outcome = torch.lerp(discount * returns[-1], found[n], hits[n].to(found.dtype)) - set_cost[n]
         returns.append(outcome * inside[n])

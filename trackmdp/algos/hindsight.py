@@ -59,7 +59,8 @@ def budget(task: Task, cfg: PerSensorConfig) -> tuple[int, int]:
     alone = round(cfg.effort * (500 if few else 800))
     # A mixture acts on the nets from early on; misses and windows were not tried either. What has so few rows is never
     # too large to be exchanged.
-    exchanged = cfg.exchange and task.markov and task.perfect and task.window is None and cfg.collect == "all_on"
+    certain = task.perfect and task.safe
+    exchanged = cfg.exchange and task.markov and certain and task.window is None and cfg.collect == "all_on"
     hidden = 128 if few else 256 if task.num_keys <= _MOST_CELLS_OF_NETS else 0
     updates = cfg.updates or (_BEFORE_EXCHANGE if exchanged and rows <= _MOST_ROWS else alone)
     return updates, hidden if cfg.hidden is None else cfg.hidden
@@ -87,7 +88,7 @@ class Hindsight:
         self.iterations = iterations + max(0, -(-(self.updates - alongside) // cfg.updates_per_iteration))
         self._generator = generator(seed, "hindsight", device=device)
         # Whether another policy is better is judged on recordings that nothing was learned from.
-        judges = cfg.exchange and task.perfect and not self._mixed
+        judges = cfg.exchange and task.perfect and task.safe and task.coverage is None and not self._mixed
         self._buffer = _buffer(task, cfg.buffer_size, self._generator, seed if judges else None)
         window = Window.of(task, device)
         # [M, K], the sensors of each window that the border cuts off.
@@ -98,9 +99,7 @@ class Hindsight:
         if task.coverage is not None and not task.coverage.degree.all():  # the path of a target there is not known
             cell = int(task.coverage.degree.argmin())
             raise UserError(f"sensor: no sensor covers cell {cell}, expected all covered; learned_kernel needs no such")
-        if not task.safe:  # what follows a safe action that missed is on no path that was seen
-            raise UserError(f"sensor.p_s={task.safe_detection.min():g}: expected 1, for this algo learns no other")
-        if task.order and not task.perfect:  # its keys are those of paths on which nothing was missed
+        if task.order and not (task.perfect and task.safe):  # its keys are those of paths on which nothing was missed
             raise UserError(f"task.memory={task.memory}: expected sensors that never miss with this algo")
         self.actor = Policy.none(task)
         self.policy = Exploring(task, device) if self._mixed else Policy.all_on(task)

@@ -37,7 +37,8 @@ class _Replayed:
         entry: `[T+1, B]`, the place in `[M, T+1, K]` of the sensor the target moved to.
         alive: `[T+1, B]`, probability that the target was not yet located where it is in the grid, else 0.
         gain: `[T+1, B]`, what having that sensor on gains, times p_d and `alive`.
-        target: `[M]`, mean return of the paths from each cell, the critic's target.
+        target: `[M, 1]`, mean return of the paths from each cell, the critic's target; where the safe action may miss
+            `[M, 2]`, the second that of paths at whose first step it comes.
     """
 
     row: Tensor
@@ -124,22 +125,29 @@ class HindsightLoss(nn.Module):
             return net(choices, sensors.width, -1.0, groups if seen.is_local else None)
 
         # Bias -1 starts all sensors off (z > 0 is on). U has T + 2 clocks: also n = T + 1, where the safe action is
-        # forced.
-        self.actor, self.critic = decisions(self.view, self.sensors), net(1, 1, 0.0)
+        # forced. V has a second one, L, only where that may have to be repeated.
+        self.actor, self.critic = decisions(self.view, self.sensors), net(1 if task.safe else 2, 1, 0.0)
         self.clocked_actor, self.clocked_critic = decisions(self.near, self.nearby), net(choices + 1, 1, 0.0)
         actor_loss.allocate((m, choices, self.sensors.width), device)
         self.actor_loss = actor_loss
-        # What the forced step earns, in units of r: (r - D) / r.
-        self.discount, self.safe = discount, 1.0 - task.safe_cost / task.reward
+        self.discount, self.safe_cost = discount, task.safe_cost / task.reward
+        # What the forced step earns, in units of r: (r - D) / r; or about what all of them do until one locates.
+        safe = float(task.safe_detection.mean())
+        self._forced = (safe - self.safe_cost) / (1.0 - discount * (1.0 - safe))
         entries = max(self.sensors.entries, self.near.width * self._classes)
         self._keys_at_once = max(1, max_entries // (choices * entries))
         cost = torch.as_tensor(task.cost / task.reward, dtype=torch.float32, device=device)
         # [S + 1]: the last one, which there is none of, costs nothing, so that windows cut off by the border need no
         # mask here.
         self.register_buffer("cost", pad(cost, (0, 1)))
-        # p_d, known to the learner like the prices; 0 outside, and no state: it is the task's, not the training's.
-        detection = torch.as_tensor(task.detection, dtype=torch.float32, device=device).repeat_interleave(self._classes)
-        self._perfect, self._detection = task.perfect, pad(detection, (0, 1))
+        # p_d and p_s [M + 1], known to the learner like the prices; 0 outside, and no state: they are the task's, not
+        # the training's.
+        detects, locates = (
+            pad(torch.as_tensor(p, dtype=torch.float32, device=device).repeat_interleave(self._classes), (0, 1))
+            for p in (task.detection, task.safe_detection)
+        )
+        self._perfect, self._detection = task.perfect, detects
+        self._safe_detection = None if task.safe else locates
         self.register_buffer("clocks", torch.arange(choices, device=device).unsqueeze(-1))
         # Row 0 for the clocked actor, row 1 for the actor.
         self.register_buffer("gain_scale", torch.ones(2, choices, device=device))
@@ -169,9 +177,10 @@ class HindsightLoss(nn.Module):
         """
         replay = Replay(self._keys, self.view, on) if self._keys.order else None
         cells, own = replay.begin(cells) if replay else (cells, cells)
-        clocked, value = self.clocked_critic().squeeze(-1), self.critic().view(-1)
+        clocked, value = self.clocked_critic().squeeze(-1), self.critic().squeeze(-1)
         # U(x, T+1) holds r - D for certain; the net learns the rest.
-        clocked = torch.cat([clocked[:, :-1], clocked[:, -1:] + self.safe], dim=1)
+        clocked = torch.cat([clocked[:, :-1], clocked[:, -1:] + self._forced], dim=1)
+        value = torch.cat([value[:, :1], value[:, 1:] + self._forced], dim=1)
         # [T + 1, M + 1], nothing gained by sensing what has exited. Detached: decisions do not train the values.
         advantage = pad(clocked_advantage(clocked.detach()), (0, 1))
         plans = self._replay(replay, cells, own, on, advantage, value.detach(), blend)
@@ -195,8 +204,7 @@ class HindsightLoss(nn.Module):
                 # The squared error per cell times its number of paths is, up to a constant, the sum over paths of (V -
                 # return)^2.
                 losses["critic"] = _squared_error(value, plans.target, visits) / cells.shape[1]
-                error = _squared_error(clocked, torch.cat(targets), begun.unsqueeze(-1))
-                losses["clocked_critic"] = error / cells.shape[1]
+                losses["clocked_critic"] = _squared_error(clocked, torch.cat(targets), begun) / cells.shape[1]
             yield losses
 
     def slices(self) -> list[slice]:
@@ -256,7 +264,14 @@ class HindsightLoss(nn.Module):
         # 0).
         found = ((plus - minus) * self.nearby.seen(chosen, rows)).sum(-1)
         free = following[:, 1:] + found - stays * (chosen * cost).sum(-1)
-        target = torch.cat([free, following[:, :1] + self.safe * stays], dim=1) / visits.clamp(min=1)
+        if self._safe_detection is None:
+            forced = following[:, :1] + (1.0 - self.safe_cost) * stays
+        else:  # what it misses goes on at n = T + 1
+            located = moved.squeeze(1) * self._safe_detection[ends]
+            after = located * (1.0 + self.discount * known[ends, 0])
+            missed = (moved.squeeze(1) - located) * self.discount * known[ends, -1]
+            forced = (after + missed).sum(-1, keepdim=True) - self.safe_cost * stays
+        target = torch.cat([free, forced], dim=1) / visits.clamp(min=1)
         # The price is c for every move that stays in the grid.
         plus, minus = (self.nearby.gains(each, chosen, rows) for each in (plus, minus))
         loss = decision_loss(logits, plus, minus, stays.unsqueeze(-1) * cost)
@@ -308,11 +323,12 @@ class HindsightLoss(nn.Module):
         reports = reports if detects is None else reports * detects
         # Set costs are computed once per (x, n) and looked up by the paths, however many there are.
         prices = torch.cat([self._set_cost(on[rows], rows) for rows in self.slices()])
-        spent, discount, safe_cost = gather(prices, row), self.discount, 1.0 - self.safe
-        located = gather(pad(value, (0, 1)), own[1:])
+        spent, discount = gather(prices, row), self.discount
+        located = gather(pad(value[:, 0], (0, 1)), own[1:])
         if replay:
-            located = replay.worth(cells, own, prices, value, safe=self.safe, discount=discount)
-        returns = chain_returns(reports, inside, spent, located, reward=1.0, safe_cost=safe_cost, discount=discount)
+            located = replay.worth(cells, own, prices, value[:, 0], safe=1.0 - self.safe_cost, discount=discount)
+        terms = {"reward": 1.0, "safe_cost": self.safe_cost, "discount": discount}
+        returns = chain_returns(reports, inside, spent, located, repeated=self._repeated(moves[-1], value), **terms)
         # advantage is [T + 1, M + 1]: entry (n, y) is n (M + 1) + y.
         clocked = gather(advantage, self.clocks * (m + 1) + end)
         # V(y) - G_{n+1}: located at y now, against the plan's return on the rest of this very path. The target's true
@@ -326,8 +342,21 @@ class HindsightLoss(nn.Module):
         visits = torch.bincount(start, minlength=m)
         gain = gain * (alive if self._window is None else alive * seen)
         gain = gain if detects is None else gain * detects
+        totals = [scatter_add(returns[0], start, m)]
+        if self._safe_detection is not None:
+            # No set is before it, so that it is the first step of a path.
+            repeated = self._repeated(moves[0], value)
+            forced = chain_returns(reports[:0], inside[:1], spent[:0], located[:1], repeated=repeated, **terms)
+            totals.append(scatter_add(forced[0], start, m))
         # Cells without a path get the target 0, and with `visits` 0 no weight in the critic's loss.
-        return _Replayed(row, entry, alive, gain, scatter_add(returns[0], start, m) / visits.clamp(min=1))
+        target = torch.stack(totals, dim=1) / visits.clamp(min=1).unsqueeze(-1)
+        return _Replayed(row, entry, alive, gain, target)
+
+    def _repeated(self, end: Tensor, value: Tensor) -> tuple[Tensor, Tensor] | None:
+        """`[B]` each, p_s of the cells `end`, and L, what follows there if the safe action misses; or None."""
+        if self._safe_detection is None:
+            return None
+        return self._safe_detection[end], pad(value[:, 1], (0, 1))[end]
 
     def _choosable(self, nearby: Tensor, rows: slice) -> Tensor:
         """`[rows, K]` bool, which of the sensors `nearby` `[rows, K]` of the cells `rows` can be chosen."""
@@ -372,4 +401,4 @@ def _in_view(task: Task, radius: int, device: torch.device) -> Window:
 
 
 def _squared_error(values: Tensor, targets: Tensor, visits: Tensor) -> Tensor:
-    return (visits * (values - targets).square()).sum()
+    return (visits.unsqueeze(-1) * (values - targets).square()).sum()

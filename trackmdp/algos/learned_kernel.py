@@ -17,7 +17,6 @@ from tensordict import TensorDictBase
 
 from trackmdp.algos.paths import known_as
 from trackmdp.config.counting import LearnedKernelConfig
-from trackmdp.errors import UserError
 from trackmdp.policies.explore import RenewedTable
 from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.policies.table import PolicyTable
@@ -51,8 +50,6 @@ class LearnedKernel:
         self, task: Task, cfg: LearnedKernelConfig, *, iterations: int, seed: int, device: torch.device
     ) -> None:
         self.task, self.cfg, self.iterations, self.device = task, cfg, iterations, device
-        if not task.safe:  # how often a safe action was repeated is not in what was observed
-            raise UserError(f"sensor.p_s={task.safe_detection.min():g}: expected 1, for this algo learns no other")
         detection = None if task.perfect else task.detection
         self._estimate = KernelEstimate(
             task.size,
@@ -147,6 +144,7 @@ def observed_paths(batch: TensorDictBase, task: Task) -> ObservedPaths:
     Where a detection tells the mode they are of keys, and a sensor sees all those of its cell.
 
     Read is only what the tracker saw: where and when it located the target, its own sets, and that the target left.
+    Where the safe action may miss, paths that come to it end before it.
     """
     after = batch["next"]
     exited = after["terminated"].squeeze(-1)
@@ -154,6 +152,8 @@ def observed_paths(batch: TensorDictBase, task: Task) -> ObservedPaths:
     cell, misses = (batch[key][ended] for key in ("last_cell", "steps_since_detection"))
     name = known_as(batch)
     start, end = batch[name][ended], torch.where(exited, task.num_keys, after[name])[ended]
+    if not task.safe:  # how many safe actions it took is not told: what is known ends with the last set
+        end = torch.where(misses == task.num_choices, task.num_keys + 1, end)
     if not misses.any():  # as with all sensors on: no set is read, so that the histories, most of a batch, stay unread
         rows = np.zeros(len(start) * task.num_choices + 1, dtype=np.int64)
         sensed = sparse.csr_array((rows[:0] > 0, rows[:0], rows), shape=(len(rows) - 1, task.num_keys))

@@ -10,6 +10,7 @@ seen, and those that the prior adds, which puts the displacements seen anywhere 
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,7 +40,8 @@ class ObservedPaths:
         misses: `[K]`, n, how often the target was missed on the way.
         sensed: `[K * (t_max + 1), M]` sparse bool; row `k * (t_max + 1) + t` is the set of the miss t of path k. Rows
             of t >= n are not read.
-        end: `[K]`, where it was located next; M once it had exited.
+        end: `[K]`, where it was located next; M once it had exited; M + 1 where all that is known is that the last
+            miss left it in the grid.
     """
 
     start: IndexArray
@@ -360,8 +362,11 @@ def _expected_moves(
     m = kernel.shape[0]
     moves, backward = sparse.csr_array(kernel[:, :-1]), sparse.csr_array(kernel.T)
     expected = sparse.csr_array(kernel.shape)
-    for n in np.unique(paths.misses):
-        part = np.flatnonzero(paths.misses == n)
+    told = paths.end <= m
+    for n, ends in itertools.product(np.unique(paths.misses), (True, False)):
+        part = np.flatnonzero((paths.misses == n) & (told == ends))
+        if not len(part):
+            continue
         some, each = paths.pick(part), np.arange(len(part))
         # Rows t, t + (t_max + 1), ...: the set of miss t of every path, [paths, M].
         sensed = [some.sensed[t :: some.choices].astype(np.float64) for t in range(n)]
@@ -370,11 +375,12 @@ def _expected_moves(
         forward = [_counted(each, some.start, np.ones(len(part)), (len(part), m))]
         for t in range(n):
             forward.append(_hidden(forward[t] @ moves, sensed[t]))
-        # row `end` of P^T is the likelihood of ending there, by the cell before
-        later = backward[some.end]
+        # row `end` of P^T is the likelihood of ending there, by the cell before; 1 wherever it may be if no end is told
+        later = backward[some.end] if ends else (forward[n] > 0).astype(np.float64)
         weight = copies[part] / np.maximum(forward[n].multiply(later).sum(axis=1), 1e-300)
-        # The last move ends in the known cell, or in the exit, column M: f_n(i) at (i, end), weighted.
-        expected = expected + forward[n].T @ _counted(each, some.end, weight, (len(part), m + 1))
+        if ends:
+            # The last move ends in the known cell, or in the exit, column M: f_n(i) at (i, end), weighted.
+            expected = expected + forward[n].T @ _counted(each, some.end, weight, (len(part), m + 1))
         for t in range(n - 1, -1, -1):
             later = _hidden(later, sensed[t])
             moved = sparse.csr_array(forward[t].T @ (sparse.diags_array(weight) @ later))
