@@ -45,17 +45,22 @@ def test_what_sensors_gain_beside_the_others_leads_to_the_optimum(algo: str, t_m
     assert (best.upper - run.evaluation.aihtr) / run.evaluation.expected_length < 0.01
 
 
-def test_hindsight_asks_for_sensors_everywhere_and_does_not_share_them() -> None:
-    holes = World.of(_world(), _world().kernel, coverage=discs((3, 3), np.array([(0, 0)]), 1), cost=0.1)
-    with pytest.raises(UserError, match="no sensor covers cell 2"):
-        tm.train(holes, **SHORT)
+def test_cells_do_not_share_what_sensors_with_footprints_see() -> None:
     with pytest.raises(UserError, match=r"algo\.share_cells=all: sensors with footprints"):
         tm.train(World.of(_world(), _world().kernel, cost=0.1), share_cells="all", **SHORT)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sensing", ["all", "chosen"])
-def test_the_kernel_is_learned_from_what_footprints_see(sensing: str) -> None:
+@pytest.mark.parametrize(
+    ("algo", "options"),
+    [
+        ("learned_kernel", {"sensing": "all"}),
+        ("learned_kernel", {"sensing": "chosen"}),
+        ("hindsight", {}),
+        ("a2c", {"credit": "per_sensor"}),
+    ],
+)
+def test_moves_to_cells_that_none_covers_are_inferred(algo: str, options: dict[str, str]) -> None:
     """Two cells are covered by no sensor: moves to them are told by what is missed, and by the safe action."""
     kernel = np.full((9, 9), 0.02)
     kernel[np.arange(9), (np.arange(9) + 1) % 9] = 0.78
@@ -63,7 +68,7 @@ def test_the_kernel_is_learned_from_what_footprints_see(sensing: str) -> None:
     world = World(kernel, 3, cost=0.2, t_max=1, safe_cost=1.0, coverage=coverage)
     assert world.coverage is not None
     assert (world.coverage.degree == 0).sum() == 2
-    run = tm.train(world, "learned_kernel", sensing=sensing, total_frames=20_480, **{"optimal.enabled": False})
+    run = tm.train(world, algo, total_frames=20_480, **{"optimal.enabled": False}, **options)
     best = tm.solve(world)
     regret = (best.lower - run.evaluation.aihtr) / run.evaluation.expected_length
     assert regret < 0.004

@@ -28,7 +28,9 @@ MOST_MOVES = 20_000_000
 """Moves of all plans together (some 40 bytes each) up to which sets are exchanged."""
 
 
-def counted_world(task: Task, start: Tensor, end: Tensor, *, classes: IndexArray | None = None) -> Modelled:
+def counted_world(
+    task: Task, start: Tensor, end: Tensor, *, classes: IndexArray | None = None, count: Tensor | None = None
+) -> Modelled:
     """The task with the motion that was counted.
 
     Args:
@@ -38,13 +40,14 @@ def counted_world(task: Task, start: Tensor, end: Tensor, *, classes: IndexArray
         classes: `[M]`, cells of one class, away from the border, are those from which the target moves alike; None:
             judge by the counts which are, cells at the same distance from the borders together. Not read where a
             detection tells the mode.
+        count: `[K]`, how many each move stands for; None: one.
     """
     # `believed` has a prior of its own in place of `weight`.
     modes, alike = task.keys.num_classes, False if task.keyed else classes is not None or None
     estimate = KernelEstimate(
         task.size, weight=1.0, exit_weight=EXIT_WEIGHT, share_cells=alike, classes=classes, modes=modes
     )
-    estimate.add_moves(start.cpu().numpy(), end.cpu().numpy())
+    estimate.add_moves(start.cpu().numpy(), end.cpu().numpy(), None if count is None else count.cpu().numpy())
     if not task.perfect:
         # Of the moves to a cell the share p_d is known (`report_weights`): each counts for 1 / p_d.
         counts = estimate.counts
@@ -61,6 +64,7 @@ def exchanged_sets(
     *,
     classes: IndexArray | None = None,
     anew: bool = True,
+    count: Tensor | None = None,
 ) -> sparse.csr_array:
     """`[keys (t_max + 1), S]`, what exchange on the counts makes of learned `sets`.
 
@@ -71,8 +75,9 @@ def exchanged_sets(
         sets: `[keys (t_max + 1), S]`.
         classes: see `counted_world`.
         anew: whether to start from `search` as well: from one start alone, regrets of .003 were left.
+        count: see `counted_world`.
     """
-    world = counted_world(task, start, end, classes=classes)
+    world = counted_world(task, start, end, classes=classes, count=count)
     if _moves_of_plans(world) > MOST_MOVES:
         return sets
     if isinstance(world, HiddenWorld):

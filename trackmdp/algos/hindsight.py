@@ -23,6 +23,7 @@ from trackmdp.algos.actor_loss import ActorLoss, Decision
 from trackmdp.algos.common import Averages, set_learning_rate
 from trackmdp.algos.exchanged import exchanged_sets
 from trackmdp.algos.hindsight_loss import HindsightLoss
+from trackmdp.algos.inferred import InferredMoves
 from trackmdp.algos.moves import MoveBuffer
 from trackmdp.algos.paths import report_weights
 from trackmdp.algos.replay import Replay
@@ -96,9 +97,6 @@ class Hindsight:
         self._learner: _Learner | None = None
         self._seen: int | None = None
         self._classes = _classes(task, cfg)
-        if task.coverage is not None and not task.coverage.degree.all():  # the path of a target there is not known
-            cell = int(task.coverage.degree.argmin())
-            raise UserError(f"sensor: no sensor covers cell {cell}, expected all covered; learned_kernel needs no such")
         if task.order and not (task.perfect and task.safe):  # its keys are those of paths on which nothing was missed
             raise UserError(f"task.memory={task.memory}: expected sensors that never miss with this algo")
         self.actor = Policy.none(task)
@@ -178,7 +176,9 @@ class Hindsight:
         if not cfg.exchange or not (last or acts):
             return sets
         if isinstance(self._buffer, MoveBuffer):
-            return exchanged_sets(task, *self._buffer.moves(), sets, classes=self._classes, anew=last)
+            start, end = self._buffer.moves()
+            counts = self._buffer.counts()
+            return exchanged_sets(task, start, end, sets, classes=self._classes, anew=last, count=counts)
         if self._buffer.judge is None:
             return sets
         paths, judge = self._buffer.tracks(), self._buffer.judge
@@ -216,7 +216,16 @@ class Hindsight:
 
 
 def _buffer(task: Task, capacity: int, rng: torch.Generator, judge: int | None) -> MoveBuffer | SegmentBuffer:
-    """Paths put together from moves where the next one depends on the cell alone, else only those that were sensed."""
+    """Paths put together from moves where the next one depends on the cell alone, else only those that were sensed.
+
+    Raises:
+        UserError: only whole paths will do, and no sensor covers some cell.
+    """
+    if task.coverage is not None and not task.coverage.degree.all():
+        if task.markov:
+            return InferredMoves(task, rng)
+        cell = int(task.coverage.degree.argmin())
+        raise UserError(f"sensor: none covers cell {cell}, expected one for each cell with kernel.markov=false")
     weights = report_weights(task, rng.device)
     if task.markov and not task.order:
         return MoveBuffer(task.num_keys, capacity, rng, weights)

@@ -60,6 +60,10 @@ class MoveBuffer:
         start, end = self._appended().long()
         return start, end
 
+    def counts(self) -> Tensor | None:
+        """`[K]`, how many each of `moves` stands for; None: each was seen."""
+        return None
+
     def paths(self, count: int, steps: int) -> Tensor:
         """`[steps + 1, count]` int64 cells of `count` paths, M from the exit on; every cell starts equally many.
 

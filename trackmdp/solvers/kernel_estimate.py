@@ -112,11 +112,16 @@ class KernelEstimate:
         if not at_once.all():
             self._censored.append(paths.pick(np.flatnonzero(~at_once)))
 
-    def add_moves(self, start: IndexArray, end: IndexArray) -> None:
-        """Add moves `[K]` both of whose ends were seen; `end` is M at the exit."""
+    def __len__(self) -> int:
+        """Paths and moves added."""
+        return round(self.direct.sum()) + sum(len(part.start) for part in self._censored)
+
+    def add_moves(self, start: IndexArray, end: IndexArray, count: Array | None = None) -> None:
+        """Add moves `[K]` both of whose ends were seen, each once or `count` `[K]` times; `end` is M at the exit."""
         # Before the first fit the two are one matrix, and stay so; after it, counts wait for the next `fit`.
         unfitted = self.counts is self.direct
-        self.direct = self.direct + _counted(start, end, np.ones(len(start)), self.direct.shape)
+        count = np.ones(len(start)) if count is None else count
+        self.direct = self.direct + _counted(start, end, count, self.direct.shape)
         self.counts = self.direct if unfitted else self.counts
 
     def state(self) -> dict[str, np.ndarray]:
