@@ -153,18 +153,13 @@ SAME_BY_DESIGN = {"run": "trackmdp.app.commands.", "solve": "trackmdp.solvers."}
 
 
 def public_names() -> dict[str, list[str]]:
-    """Public name -> the modules that define it: functions and classes without an underscore, and `__all__`."""
+    """Public name -> the modules that define it: functions and classes without an underscore."""
     found: dict[str, list[str]] = {}
     for file in FILES:
         if file.name == "__init__.py":
             continue
-        names: set[str] = set()
-        for node in ast.parse(file.read_text(encoding="utf-8")).body:
-            if isinstance(node, ast.FunctionDef | ast.ClassDef):
-                names.add(node.name)
-            elif isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
-                names |= set(ast.literal_eval(node.value))
-        for name in names:
+        body = ast.parse(file.read_text(encoding="utf-8")).body
+        for name in {node.name for node in body if isinstance(node, ast.FunctionDef | ast.ClassDef)}:
             if not name.startswith("_"):
                 found.setdefault(name, []).append(module_name(file))
     return found

@@ -11,8 +11,6 @@ from trackmdp.algos.on_policy import OnPolicy
 from trackmdp.config.learning import A2cConfig
 from trackmdp.world.model import Task
 
-__all__ = ["A2C"]
-
 
 class A2C(OnPolicy):
     """One gradient step per batch: log-probability of the whole subset times its advantage."""

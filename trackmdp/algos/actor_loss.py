@@ -19,8 +19,6 @@ from torch.nn.functional import logsigmoid, softplus
 from trackmdp.algos.tables import gather, scatter_add
 from trackmdp.config.learning import ScheduleConfig
 
-__all__ = ["ActorLoss", "Decision", "PolicyGradient", "Poisson", "SensorCredit", "Surrogate", "decision_loss"]
-
 # σ(20) differs from 1 by 2e-9: no probability is told from certainty beyond. e^6 = 403: gains up to 403 times the cost
 # are told apart. |z| = 4 is a probability of 1.8 or 98.2 %.
 _LARGEST_LOGIT = 20.0

@@ -11,8 +11,6 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-__all__ = ["Algorithm", "Averages", "clipped_step", "explained_variance", "set_learning_rate"]
-
 
 class Algorithm(Protocol):
     """One learning method. An iteration is one collected batch, if frames are left, and then some learning."""

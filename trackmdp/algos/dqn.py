@@ -23,8 +23,6 @@ from trackmdp.policies.unroll import STATE_KEYS
 from trackmdp.seeding import generator
 from trackmdp.world.model import Task
 
-__all__ = ["DQN", "AdditiveDQNLoss", "n_step"]
-
 
 class AdditiveDQNLoss(LossModule):
     """Squared TD error of an additive Q (`AdditiveQ`).

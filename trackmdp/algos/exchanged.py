@@ -20,8 +20,6 @@ from trackmdp.solvers.shrinkage import least_worth_planning, without
 from trackmdp.world.model import Task
 from trackmdp.world.modes import HiddenWorld, Modelled, with_motion
 
-__all__ = ["counted_world", "exchanged_sets"]
-
 EXIT_WEIGHT = 1.0
 """The exit probability of all cells counts as one move in each, so that no episode is endless on the counts."""
 MOST_MOVES = 20_000_000

@@ -10,8 +10,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-__all__ = ["chain_returns", "clocked_advantage", "sensing_gain"]
-
 
 def sensing_gain(
     clocked: Tensor, own: Tensor | None = None, *, reward: float, discount: float, blend: float = 0.0

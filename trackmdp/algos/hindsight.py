@@ -40,8 +40,6 @@ from trackmdp.solvers.renewal import IndexArray
 from trackmdp.world.model import Task
 from trackmdp.world.windows import Window
 
-__all__ = ["Hindsight", "budget"]
-
 _MOST_CELLS_OF_NETS = 4_096
 """Above, embeddings of each (cell, clock) take time and memory that tables do not. At N = 32 tables end .007 per step
 below the optimum where nets end .002 below, and both .002 after the exchange."""

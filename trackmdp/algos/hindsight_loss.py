@@ -19,8 +19,6 @@ from trackmdp.solvers.renewal import IndexArray
 from trackmdp.world.model import Task
 from trackmdp.world.windows import Window
 
-__all__ = ["HindsightLoss"]
-
 # Weights of the clocks (`_weights`): the running mean gain moves a tenth of the way at each update; a clock with fewer
 # than 20 rows, or a mean gain under .2 r, is not magnified any further, or a handful of rows would rule the step.
 _GAIN_SCALE_RATE = 0.1

@@ -20,8 +20,6 @@ from trackmdp.solvers.renewal import IndexArray, row_index
 from trackmdp.world.model import Task
 from trackmdp.world.windows import Window
 
-__all__ = ["SensorsInView"]
-
 
 class SensorsInView(nn.Module):
     """The sensors that cover cells of a window, from each located cell in numbers of their own.

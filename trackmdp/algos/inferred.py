@@ -18,8 +18,6 @@ from trackmdp.solvers.kernel_estimate import KernelEstimate
 from trackmdp.solvers.renewal import row_index
 from trackmdp.world.model import Task
 
-__all__ = ["InferredMoves"]
-
 _ROUNDS = 20
 """Rounds of expectation-maximisation, always from the moves seen at once: what a run learns from does not depend on
 when it was asked."""

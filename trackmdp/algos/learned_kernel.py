@@ -32,8 +32,6 @@ from trackmdp.world.model import Task
 from trackmdp.world.modes import HiddenWorld, Modelled, with_motion
 from trackmdp.world.windows import Window
 
-__all__ = ["LearnedKernel", "observed_paths", "policy_tensors", "tensors_policy"]
-
 
 class LearnedKernel:
     """Plans anew after every batch; `actor` is the plan for the posterior mean.

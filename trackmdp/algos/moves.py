@@ -8,8 +8,6 @@ from torch import Tensor
 
 from trackmdp.algos.paths import CellIndex, cell_dtype, known_as, sensed_steps, stratified_starts
 
-__all__ = ["MoveBuffer", "sensed_moves"]
-
 
 class MoveBuffer:
     """Replay buffer of moves from a located cell to the cell sensed next, or to M, outside.

@@ -16,8 +16,6 @@ from trackmdp.config.learning import ActorCriticConfig
 from trackmdp.policies.actor_critic import make_actor, make_critic
 from trackmdp.world.model import Task
 
-__all__ = ["OnPolicy"]
-
 _KEPT = ("action", "action_log_prob", "advantage", "value_target")
 
 

@@ -17,8 +17,6 @@ from trackmdp.solvers.path_counts import plan_keys
 from trackmdp.solvers.path_exchange import choose_plan
 from trackmdp.world.model import Task
 
-__all__ = ["PathCounts"]
-
 
 class PathCounts:
     """Collects with all sensors on and plans anew after every batch, from all paths so far.

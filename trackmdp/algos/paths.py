@@ -15,8 +15,6 @@ from torch.nn.functional import pad
 
 from trackmdp.world.model import Task
 
-__all__ = ["CellIndex", "cell_dtype", "report_weights", "sensed_steps", "stratified_starts"]
-
 
 def cell_dtype(num_cells: int) -> torch.dtype:
     """The smallest integers that hold all cells and M: 16 bits on grids of up to 181 x 181 cells."""

@@ -10,8 +10,6 @@ from trackmdp.config.per_sensor import A2cPerSensorConfig, PpoPerSensorConfig
 from trackmdp.errors import UserError
 from trackmdp.world.model import Task
 
-__all__ = ["PerSensorA2C", "PerSensorDQN", "PerSensorPPO"]
-
 
 class PerSensorA2C(Hindsight):
     """The policy gradient over both actions of every sensor."""

@@ -14,8 +14,6 @@ from trackmdp.config.learning import PpoConfig
 from trackmdp.seeding import generator
 from trackmdp.world.model import Task
 
-__all__ = ["PPO"]
-
 
 class PPO(OnPolicy):
     """Each batch is passed over `epochs` times in `minibatches` parts, the probability ratio clipped.

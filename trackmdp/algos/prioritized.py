@@ -13,8 +13,6 @@ from torch import Tensor
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.storages import Storage
 
-__all__ = ["PrioritizedSampler"]
-
 # An item of priority 0 would never be drawn again.
 _SMALLEST = 1e-8
 

@@ -15,8 +15,6 @@ from trackmdp.solvers.path_exchange import parted
 from trackmdp.world.memory import KeySpace
 from trackmdp.world.tracks import Tracks, ends_of
 
-__all__ = ["SegmentBuffer", "SensedPaths"]
-
 _TELLING = 8
 """Cells at the end of a path that tell which recording it followed: wherever a path began, it ends as its recording."""
 

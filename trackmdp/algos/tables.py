@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from torch import Tensor
 
-__all__ = ["gather", "scatter_add"]
-
 
 def gather(table: Tensor, index: Tensor) -> Tensor:
     """`table.flatten()[index]`, the fastest way."""

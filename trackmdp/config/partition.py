@@ -8,8 +8,6 @@ from typing import Any
 from trackmdp.config.options import listed, option, refuse
 from trackmdp.config.schema import NodeConfig
 
-__all__ = ["PartitionConfig", "SweptPartitionConfig"]
-
 
 @dataclass(kw_only=True)
 class PartitionConfig(NodeConfig):

@@ -15,8 +15,6 @@ from trackmdp.policies.unroll import state_keys
 from trackmdp.world.model import Task
 from trackmdp.world.windows import Window
 
-__all__ = ["SubsetDistribution", "make_actor", "make_critic"]
-
 # A logit whose sigmoid is 0 in float32: no draw from [0, 1) is below it, and log-probability and entropy are 0.
 _NEVER = -200.0
 

@@ -9,8 +9,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-__all__ = ["CellClockNet"]
-
 
 class CellClockNet(nn.Module):
     """One hidden layer over embeddings of the cell, of the clock and of the pair, added up; or a plain table.

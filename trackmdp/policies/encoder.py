@@ -7,8 +7,6 @@ from torch import Tensor, nn
 
 from trackmdp.world.model import Task
 
-__all__ = ["RelativeBias", "StateEncoder", "StateNetwork"]
-
 _PAIRS = 2**16  # of cells, once for each class of keys, whose displacements are kept; 16 x 16 cells have as many
 
 

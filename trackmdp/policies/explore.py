@@ -16,8 +16,6 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.world.model import Task
 from trackmdp.world.windows import Window
 
-__all__ = ["Exploring", "RenewedTable"]
-
 _ROWS_AT_ONCE = 2**12
 
 

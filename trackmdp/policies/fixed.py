@@ -8,8 +8,6 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-__all__ = ["RandomSubset"]
-
 
 class RandomSubset(TensorDictModuleBase):
     """Each sensor on with probability 1/2, from its own generator; what benchmarks drive the environment with."""

@@ -9,8 +9,6 @@ from torch import Tensor
 from trackmdp.world.model import Task
 from trackmdp.world.windows import Window
 
-__all__ = ["DenseTable", "SparseTable", "WindowTable"]
-
 
 class DenseTable:
     """All rows as a dense tensor: one indexing operation per batch, memory for every entry.

@@ -8,8 +8,6 @@ from torch import Tensor
 from trackmdp.errors import UserError
 from trackmdp.world.model import BoolArray, Task
 
-__all__ = ["Playback"]
-
 
 class Playback:
     """An open-loop policy: the action depends on the step of the episode alone.

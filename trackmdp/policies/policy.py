@@ -40,8 +40,6 @@ from trackmdp.policies.unroll import (
 from trackmdp.world.model import Array, Task
 from trackmdp.world.windows import Window
 
-__all__ = ["Policy", "PolicyLike", "actor_table", "as_policy", "looked_up", "rule_of"]
-
 PolicyLike: TypeAlias = "PolicyTable | TensorDictModuleBase | Callable[..., Any]"
 """A policy or its table, a TensorDict module, or a function as `Policy.from_function` takes it."""
 

@@ -15,8 +15,6 @@ from trackmdp.policies.unroll import state_keys
 from trackmdp.world.model import Task
 from trackmdp.world.windows import Window
 
-__all__ = ["AdditiveQ", "EpsilonFlip", "joint_value", "make_qvalue"]
-
 _ALL_ON = 0.5  # sensors start a little above zero: what can be left out is learned, not what must be found
 
 

@@ -22,8 +22,6 @@ from trackmdp.untrusted import decoded, opened, read_object
 from trackmdp.world.coverage import Coverage
 from trackmdp.world.model import Array, Task
 
-__all__ = ["LISTED_CELLS", "load_policy", "read_sets", "save_policy", "sets_name", "write_sets"]
-
 LISTED_CELLS = 20_000
 """Cells up to which sets and values are written as JSON."""
 

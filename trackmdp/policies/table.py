@@ -16,8 +16,6 @@ from trackmdp.errors import UserError
 from trackmdp.world.checks import short_indices
 from trackmdp.world.model import Array, BoolArray, Task
 
-__all__ = ["PolicyTable"]
-
 
 class PolicyTable:
     """Which sensors are on n misses after the target was located: one open-loop plan for each key (`world/memory.py`).

@@ -24,20 +24,6 @@ from trackmdp.seeding import preserved_global_rng
 from trackmdp.world.model import Task
 from trackmdp.world.windows import Window
 
-__all__ = [
-    "DrawsError",
-    "Rule",
-    "STATE_KEYS",
-    "acting",
-    "draws",
-    "function_rule",
-    "known_task",
-    "mixture",
-    "module_rule",
-    "state_keys",
-    "unrolled",
-]
-
 STATE_KEYS = ("last_cell", "steps_since_detection", "action_history")
 
 Rule: TypeAlias = Callable[..., Tensor]

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Canvas
 
-__all__ = ["FLOOR", "Panel", "against_cost", "axis_break", "panels", "regret_against_cost", "slug"]
-
 # A policy may attain the bound itself, and zero has no logarithm: such a regret is drawn here.
 FLOOR = 1e-5
 """Smallest regret drawn on a logarithmic axis."""

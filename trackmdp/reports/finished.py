@@ -19,8 +19,6 @@ from trackmdp.training.folders import FAILED_FILE, run_of
 from trackmdp.training.sealing import SUMMARY, check_files, read_summary
 from trackmdp.untrusted import decoded, known_object, printable, read_text
 
-__all__ = ["flatten", "plain_config", "read_curve", "read_run"]
-
 MOST_POINTS = 16
 """Points kept of a learning curve: evenly spaced in the logarithm of the iteration."""
 

@@ -34,8 +34,6 @@ from trackmdp.world.checks import canonical_kernel
 from trackmdp.world.make import build_world, of_task
 from trackmdp.world.modes import HiddenWorld
 
-__all__ = ["gather_runs", "planned", "run_folders"]
-
 _LONGEST = 4096
 """Characters of the longest path of a plan that is looked at."""
 

@@ -10,8 +10,6 @@ from typing import Any
 
 from trackmdp.reports.results import FinishedRun
 
-__all__ = ["Study", "study", "world_key"]
-
 # The order of legends and tables, the same in every report; an algorithm that is not listed comes after these.
 ORDER = ("a2c", "hindsight", "ppo", "dqn", "learned_kernel")
 SHORT = {"kernel.support_size": "Z", "cost.sensor": "c", "grid.size": "N", "grid.t_max": "T_max"}

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Canvas
 
-__all__ = ["Scene", "idea_figure", "scenes"]
-
 BELIEF, TARGET = "#0072b2", "#d55e01"
 _MARGIN = 1
 """Cells shown around all that happens."""

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Canvas
 
-__all__ = ["label_lines", "spread"]
-
 _TOUCHING = 0.012
 """Parts of the height of the axes: lines are some 2 points wide, of 200; closer ones are seen as one."""
 _LINE_HEIGHT = 1.25 * TEXT

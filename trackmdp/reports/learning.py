@@ -21,8 +21,6 @@ from trackmdp.world.model import Array
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
-__all__ = ["curves", "profiles", "value_at"]
-
 
 def curves(study: Study, points: Mapping[str, Sequence[CurvePoint]], by: str) -> Figure | None:
     """Regret per step while learning, over all worlds, against `frames` or `seconds`."""

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Canvas
 
-__all__ = ["MOST_MAP_CELLS", "binned", "policy_map", "value_map"]
-
 # 20 x 20: with tiles of four to six cells each, more would not be seen on a page.
 MOST_MAP_CELLS = 400
 """Cells of a grid whose sets are still drawn, one tile around each located cell."""

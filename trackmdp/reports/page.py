@@ -17,8 +17,6 @@ from trackmdp.reports.style import Figure
 from trackmdp.reports.tables import Table
 from trackmdp.world.model import grid_size
 
-__all__ = ["Folded", "Part", "Report", "Section", "build"]
-
 # All of them would be dozens of figures; the policies that are not drawn are in `policies.npz`.
 MAPPED = 2
 """Methods and worlds whose policies are drawn on the page."""

@@ -10,8 +10,6 @@ from trackmdp.episodes.episode import Episode
 from trackmdp.world.model import BoolArray, Task
 from trackmdp.world.render import PICTURE_LEGEND, around, text_rows
 
-__all__ = ["draw_picture"]
-
 MARGIN = "   "
 WIDE = 21
 """Rows and columns of a grid that are drawn at most."""

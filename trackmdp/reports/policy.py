@@ -17,8 +17,6 @@ from trackmdp.errors import UserError
 from trackmdp.policies.saved import load_policy
 from trackmdp.world.model import Array
 
-__all__ = ["POLICY_FILE", "Sensed", "arrays", "pack_all", "read", "unpack_all"]
-
 POLICY_FILE = "policy.npz"
 
 

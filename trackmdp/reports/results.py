@@ -24,19 +24,6 @@ from trackmdp.reports.policy import Sensed, arrays, pack_all, unpack_all
 from trackmdp.untrusted import decoded, read_bytes, read_object, read_text, sealed, unsealed
 from trackmdp.world.model import Array
 
-__all__ = [
-    "FIGURES",
-    "RESULTS_FORMAT",
-    "MotionTable",
-    "CurvePoint",
-    "Anomaly",
-    "Results",
-    "FinishedRun",
-    "is_stored",
-    "load_results",
-    "save_results",
-]
-
 # Counted up when a file changes its meaning: results of another format are then not taken for stored results.
 RESULTS_FORMAT = "trackmdp results 3"
 MANIFEST, FILES = "manifest.json", ("runs.csv", "curves.csv", "policies.npz", "worlds.npz")

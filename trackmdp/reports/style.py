@@ -18,22 +18,6 @@ if TYPE_CHECKING:  # an extra, and a second to import
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Canvas
 
-__all__ = [
-    "INK",
-    "LINE",
-    "PAGE",
-    "PALETTE",
-    "TEXT",
-    "Figure",
-    "Look",
-    "Say",
-    "draw_figure",
-    "legend",
-    "looks_of",
-    "require_matplotlib",
-    "tidy",
-]
-
 Say: TypeAlias = Callable[[str], None]
 """Receives short progress messages."""
 

@@ -13,16 +13,6 @@ from trackmdp.reports.results import Anomaly, FinishedRun
 from trackmdp.reports.tables import Cell, Column, Table
 from trackmdp.statistics import MeanInterval, iqm, mean_over_groups
 
-__all__ = [
-    "estimate_cells",
-    "estimate_columns",
-    "groups_table",
-    "methods_table",
-    "missing_table",
-    "runs_table",
-    "shortened",
-]
-
 OPEN = 5e-5
 """Bracket per step from which a regret is shown as a range."""
 TIMES = [Column("wall", 1, "s"), Column("CPU", 1, "s")]

@@ -12,8 +12,6 @@ from typing import Any, TypeAlias
 
 from trackmdp.untrusted import no_formula, printable
 
-__all__ = ["Cell", "Column", "Table"]
-
 Cell: TypeAlias = "float | int | str | bool | None"
 
 LONG = 60

@@ -20,8 +20,6 @@ from trackmdp.reports.gather import planned, run_folders
 from trackmdp.training.folders import run_of
 from trackmdp.untrusted import decoded, known_object, opened, printable
 
-__all__ = ["Status", "statuses", "watch"]
-
 WAITING, RUNNING, CUT, FAILED, DONE = "waiting", "running", "cut", "failed", "done"
 # A table of metrics may be large, and is looked at every few seconds for every run; its end is enough.
 TAIL = 4096

@@ -18,8 +18,6 @@ from trackmdp.solvers.renewal import IndexArray, RenewalSystem, per_row, row_ind
 from trackmdp.world.model import Array, World
 from trackmdp.world.tracks import Problem
 
-__all__ = ["believed"]
-
 _MOST_CELLS = 144
 """Of a grid with false alarms: M² pairs are unknown."""
 _DIRECT = 2_000  # pairs; those of four coordinates fill the factors of a larger system (N = 12: 90 s in place of 5)

@@ -10,8 +10,6 @@ from trackmdp.solvers.renewal import IndexArray, per_row, row_index
 from trackmdp.world.files import read_numbers
 from trackmdp.world.model import BoolArray
 
-__all__ = ["AlikeCells", "cell_classes"]
-
 DEVIATIONS = 4.0
 """Standard deviations by which a test of homogeneity has to be exceeded for a group of cells to be split up."""
 

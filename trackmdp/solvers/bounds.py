@@ -12,8 +12,6 @@ from trackmdp.solvers.cover import Cover, Covering
 from trackmdp.solvers.renewal import RenewalSystem, accumulate, expected_steps, per_row, row_index
 from trackmdp.world.model import Array, BoolArray, World
 
-__all__ = ["ClockedBound", "clocked", "clocked_table", "exact_clocked_table", "paper", "valid"]
-
 
 @dataclass(frozen=True)
 class ClockedBound:

@@ -38,8 +38,6 @@ from trackmdp.solvers.layers import within_window
 from trackmdp.solvers.renewal import IndexArray, per_row, row_index
 from trackmdp.world.model import Array, BoolArray, World
 
-__all__ = ["Tree"]
-
 # Choices under one heap entry: enough of them for array arithmetic to pay, and not so many that poor ones are expanded
 # along with the best one, which gives the batch its place in the heap.
 LARGEST_BATCH = 4096

@@ -11,8 +11,6 @@ from trackmdp.solvers.joint import Next
 from trackmdp.solvers.renewal import IndexArray, row_index
 from trackmdp.world.model import Array, BoolArray
 
-__all__ = ["Choices", "Frontier", "LeftOut", "Origin", "sets_left_out"]
-
 
 @dataclass(frozen=True)
 class Frontier:

@@ -8,8 +8,6 @@ from trackmdp.solvers.cover import Offer
 from trackmdp.solvers.prediction import Prediction, unroll
 from trackmdp.world.model import World
 
-__all__ = ["solve"]
-
 
 def solve(world: World) -> PolicyTable:
     """The policy that senses j iff p_d m_j (r + U(j, 0) - U(j, n + 1)) > c_j sum(m), m the predicted undetected mass.

@@ -25,8 +25,6 @@ from scipy import sparse
 from trackmdp.solvers.renewal import IndexArray, per_row
 from trackmdp.world.model import Array, BoolArray, Task
 
-__all__ = ["TIE", "Chosen", "Cover", "Covering", "Offer", "best_sets"]
-
 TIE = 1e-12
 """Relative slack of a threshold: gains equal to a price but for rounding are sensed, the same way each time."""
 _PROVED = 1e-9

@@ -31,8 +31,6 @@ from trackmdp.solvers.choices import LeftOut
 from trackmdp.solvers.renewal import IndexArray, per_row, row_index
 from trackmdp.world.model import Array, World
 
-__all__ = ["Delayed"]
-
 STEPS = 6
 """Subgradient steps. On a walk (c = .3, T_max 3) the tables by themselves leave .059 per step open after one of them,
 .056 after six and .055 after forty, of the .19 of the clocked bound."""

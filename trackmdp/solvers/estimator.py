@@ -22,8 +22,6 @@ from trackmdp.solvers.prediction import renewal
 from trackmdp.solvers.renewal import IndexArray, accumulate, forced_worth, per_row
 from trackmdp.world.model import Array, BoolArray, World
 
-__all__ = ["EstimatorAccuracy", "PositionEstimate", "accuracy", "known_positions", "positions"]
-
 MOST_NODES = 100_000
 """Choices looked at per table; where it ends early, W is an upper bound, and the exact form is exact all the same."""
 

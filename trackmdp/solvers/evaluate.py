@@ -27,8 +27,6 @@ from trackmdp.world.tracks import Problem
 if TYPE_CHECKING:  # torch is loaded where something that acts is asked for its sets
     from trackmdp.policies.policy import PolicyLike
 
-__all__ = ["evaluate"]
-
 
 def evaluate(
     problem: Problem,

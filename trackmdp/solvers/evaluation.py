@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 from trackmdp.world.model import Array
 
-__all__ = ["Evaluation", "pooled", "regret_per_step", "summed_up"]
-
 
 @dataclass(frozen=True)
 class Evaluation:

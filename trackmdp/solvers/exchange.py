@@ -28,19 +28,6 @@ from trackmdp.solvers.renewal import IndexArray, per_row, row_index
 from trackmdp.solvers.search import InnerProblem, located_value
 from trackmdp.world.model import Array, BoolArray, World
 
-__all__ = [
-    "FLIPPED",
-    "SINGLES",
-    "PlansPart",
-    "exchange",
-    "exchanged",
-    "improve",
-    "ranked",
-    "revealed",
-    "solve",
-    "summing",
-]
-
 MOST_NUMBERS = 2**17
 """Numbers in one array of a part, 1 MB: larger parts leave the caches, and took twice the time."""
 SINGLES, PAIRED = 12, 7

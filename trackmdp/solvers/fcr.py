@@ -14,8 +14,6 @@ from trackmdp.solvers.layers import sensed_csr, within_window
 from trackmdp.solvers.prediction import predict
 from trackmdp.world.model import World
 
-__all__ = ["solve"]
-
 
 def solve(world: World, *, in_grid: bool = False) -> PolicyTable:
     """Sense j at n misses iff p_d(j) (e_x P^(n+1))_j r >= c_j: the prediction takes no notice of the misses.

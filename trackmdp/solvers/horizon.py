@@ -13,8 +13,6 @@ from trackmdp.solvers.evaluation import Evaluation, pooled
 from trackmdp.solvers.prediction import renewal
 from trackmdp.world.model import World
 
-__all__ = ["truncated_value"]
-
 
 def truncated_value(world: World, policy: PolicyTable, max_steps: int) -> Evaluation:
     """The figures of `evaluate` for episodes of at most `max_steps` steps.

@@ -29,8 +29,6 @@ import numpy as np
 from trackmdp.solvers.renewal import IndexArray
 from trackmdp.world.model import Array, BoolArray, World
 
-__all__ = ["Joint", "Next"]
-
 MOST_ENTRIES = 1 << 15
 """Entries b_ji handled at once: what is a quarter of a megabyte stays in the cache."""
 WIDEST = 1 << 13

@@ -21,8 +21,6 @@ from trackmdp.solvers.renewal import IndexArray, per_row, row_index
 from trackmdp.solvers.shrinkage import posterior_mean, unseen
 from trackmdp.world.model import Array, grid_size
 
-__all__ = ["KernelEstimate", "ObservedPaths"]
-
 OPEN = 0.01
 """Weight, in the first round's kernel, of moves that were not seen yet."""
 LEAST_EXIT = 1e-9

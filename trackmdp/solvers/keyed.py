@@ -22,8 +22,6 @@ from trackmdp.solvers.renewal import IndexArray, RenewalSystem, check_length, pe
 from trackmdp.world.model import Array, BoolArray, World
 from trackmdp.world.modes import HiddenWorld
 
-__all__ = ["KeyedPairs", "averaged", "evaluate_keys"]
-
 _DIRECT = 1_000
 """Pairs up to which systems are factorised: each leads to all cells in reach, so that the factors soon fill up."""
 

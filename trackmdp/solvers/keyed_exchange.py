@@ -23,8 +23,6 @@ from trackmdp.solvers.layers import reachable
 from trackmdp.solvers.renewal import IndexArray, per_row, row_index
 from trackmdp.world.model import Array, BoolArray
 
-__all__ = ["Chains", "ChainStep", "exchange_chains", "exchanged_pairs"]
-
 _SEEN = 1e-12
 """Keys with fewer visits an episode keep their plans: nothing is gained by them."""
 

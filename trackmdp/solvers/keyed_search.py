@@ -15,8 +15,6 @@ from trackmdp.solvers.solution import Solution
 from trackmdp.world.model import Array
 from trackmdp.world.modes import HiddenWorld
 
-__all__ = ["cell_bound", "mode_bound", "solve_keys"]
-
 _SETTLED = 1e-10  # of the bound: it is approached from above, so that stopping anywhere is valid
 
 

@@ -12,8 +12,6 @@ from trackmdp.solvers.layers import Layer, reachable_layers
 from trackmdp.solvers.search import InnerProblem
 from trackmdp.world.model import Array, BoolArray, World
 
-__all__ = ["first_guess", "next_table", "tables"]
-
 
 def first_guess(problem: InnerProblem, known: list[Array], mass: Array) -> list[BoolArray]:
     """Sets found by a homotopy from the credit r + V - R, `known` being R_0 ... R_{H-1}; see `search`."""

@@ -27,8 +27,6 @@ from trackmdp.solvers.renewal import IndexArray, row_index
 from trackmdp.world.checks import short_indices
 from trackmdp.world.model import Array, BoolArray, Task, World
 
-__all__ = ["Layer", "layer_sets", "policy_table", "reachable", "reachable_layers", "sensed_csr", "within_window"]
-
 
 @dataclass(frozen=True)
 class Layer:

@@ -17,8 +17,6 @@ from trackmdp.solvers.layers import Layer, policy_table, reachable_layers
 from trackmdp.solvers.search import InnerProblem
 from trackmdp.world.model import Array, BoolArray, World
 
-__all__ = ["Tail", "solve"]
-
 Tail: TypeAlias = Literal["qmdp", "clocked"]
 
 SLACK = 1e-9

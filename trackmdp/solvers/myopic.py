@@ -10,8 +10,6 @@ from trackmdp.solvers.cover import Offer
 from trackmdp.solvers.prediction import Prediction, unroll
 from trackmdp.world.model import World
 
-__all__ = ["solve"]
-
 
 def solve(world: World, *, threshold: float | None = None) -> PolicyTable:
     """Sense j iff the probability that it reports the target, given the misses so far, is at least `threshold`.

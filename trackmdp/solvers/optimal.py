@@ -34,8 +34,6 @@ from trackmdp.solvers.search import InnerProblem, follow_credit
 from trackmdp.solvers.solution import SearchProgress, Solution
 from trackmdp.world.model import Array, BoolArray, World
 
-__all__ = ["payment", "solve"]
-
 ROUNDING = 1e-10
 """Relative gap that is not told from rounding, whatever the tolerance."""
 FIRST_NODES = 100_000

@@ -29,8 +29,6 @@ from trackmdp.solvers.renewal import IndexArray, row_index
 from trackmdp.solvers.workers import run_jobs
 from trackmdp.world.model import World
 
-__all__ = ["Block", "blocks", "cells_of", "default_halo", "narrow_halo", "plan_by_blocks", "reach", "sub_world"]
-
 Planner: TypeAlias = "Callable[[int, World], PolicyTable]"
 """From a block's number and its world to its policy, by planning or by learning."""
 Rectangle: TypeAlias = tuple[range, range]

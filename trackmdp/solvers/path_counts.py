@@ -21,8 +21,6 @@ from trackmdp.solvers.renewal import IndexArray, per_row
 from trackmdp.world.model import Array, BoolArray, Task
 from trackmdp.world.tracks import Tracks
 
-__all__ = ["AlongPaths", "Paths", "Planned", "plan_keys", "plan_paths"]
-
 _UNVISITED = 0.01
 """Weight of a state that the policy does not get to on its path: it shows what follows a key that is rare, but not as
 the policy itself comes by the key."""

@@ -20,8 +20,6 @@ from trackmdp.solvers.renewal import IndexArray, per_row
 from trackmdp.world.model import Task
 from trackmdp.world.tracks import Tracks, draw_parts
 
-__all__ = ["choose_plan", "exchanged_keys", "parted"]
-
 PRIORS = (3.0, 10.0, 30.0)
 """Weights of what keys share that are tried."""
 _UNJUDGED = 10.0

@@ -16,8 +16,6 @@ from trackmdp.errors import UserError
 from trackmdp.solvers.renewal import accumulate
 from trackmdp.world.model import Array, BoolArray, World
 
-__all__ = ["BeliefSolution", "FiniteMdp", "solve"]
-
 DIGITS = 12
 """Beliefs that agree to this many digits are one."""
 

@@ -16,8 +16,6 @@ from trackmdp.solvers.layers import sensed_csr, within_window
 from trackmdp.solvers.renewal import IndexArray, per_row, row_index
 from trackmdp.world.model import Array, World
 
-__all__ = ["Prediction", "followed", "predict", "renewal", "unroll"]
-
 
 @dataclass(frozen=True)
 class Prediction:

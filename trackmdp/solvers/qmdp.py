@@ -7,8 +7,6 @@ from trackmdp.solvers.cover import Offer
 from trackmdp.solvers.prediction import Prediction, unroll
 from trackmdp.world.model import World
 
-__all__ = ["solve"]
-
 
 def solve(world: World, *, in_grid: bool = False) -> PolicyTable:
     """Q_MDP, eq. qmdp_policy: sense j iff p_d(j) p_j >= c_j / r.

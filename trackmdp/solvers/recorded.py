@@ -17,8 +17,6 @@ from trackmdp.world.memory import KeySpace
 from trackmdp.world.model import Array, BoolArray, Task
 from trackmdp.world.tracks import Recorded, Tracks
 
-__all__ = ["Events", "ReplayedTracks", "evaluate_recorded", "replay"]
-
 
 @dataclass(frozen=True)
 class Events:

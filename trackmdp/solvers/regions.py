@@ -31,8 +31,6 @@ from trackmdp.solvers.renewal import DIRECT_CELLS, IndexArray, forced_worth
 from trackmdp.solvers.search import InnerProblem
 from trackmdp.world.model import Array, BoolArray, World
 
-__all__ = ["adopted", "improved", "proved", "region_side", "settled"]
-
 ROOM, SMALLEST, LARGEST = 2**28, 32, 128
 """Bytes of a region, and its located cells in each direction, unless there is less memory. Wider ones have a smaller
 share of halo, 13 % at 128 cells, R = 2 and T_max = 1; in narrow ones most of the work is for the halo."""

@@ -21,17 +21,6 @@ from trackmdp.errors import UserError
 from trackmdp.world.checks import short_indices
 from trackmdp.world.model import Array, World
 
-__all__ = [
-    "DIRECT_CELLS",
-    "IndexArray",
-    "RenewalSystem",
-    "accumulate",
-    "expected_steps",
-    "forced_worth",
-    "per_row",
-    "row_index",
-]
-
 IndexArray: TypeAlias = npt.NDArray[np.integer[Any]]
 
 DIRECT_CELLS = 20_000

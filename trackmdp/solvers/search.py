@@ -23,8 +23,6 @@ from trackmdp.solvers.layers import Layer, layer_sets, policy_table, reachable_l
 from trackmdp.solvers.renewal import RenewalSystem, forced_worth, per_row
 from trackmdp.world.model import Array, BoolArray, World
 
-__all__ = ["InnerProblem", "ascended", "located_value", "solve"]
-
 DIRECT_SEARCH = 1_500
 """Cells up to which the systems of a search are factorised: above, the value before is so near that iterating is
 faster. What the search ends at is valued by `evaluate`, by its own rule."""

@@ -28,8 +28,6 @@ from scipy.special import betaln
 from trackmdp.solvers.renewal import IndexArray, per_row, row_index
 from trackmdp.world.model import Array, Task
 
-__all__ = ["least_worth_planning", "posterior_mean", "unseen", "without"]
-
 PRECISIONS = (30.0, 300.0, 3000.0)
 """a + b of the Beta(a, b) of the mixture: what stands for broad and for narrow groups of probabilities."""
 ROUNDS = 50

@@ -17,8 +17,6 @@ from trackmdp.world.model import Array, World
 if TYPE_CHECKING:  # torch is loaded where a policy is to act
     from trackmdp.policies.policy import Policy
 
-__all__ = ["SearchProgress", "Solution", "bracketed"]
-
 
 @dataclass(frozen=True)
 class Solution:

@@ -27,9 +27,6 @@ from trackmdp.world.tracks import Problem
 if TYPE_CHECKING:  # torch is loaded where a policy is to act
     from trackmdp.policies.policy import Policy
 
-__all__ = ["baseline_policy", "run_solver", "solve"]
-
-
 _SWEEPS = 10
 """Rounds over the whole grid after the blocks, at most: two or three change anything."""
 

@@ -14,8 +14,6 @@ from typing import Any, TypeVar
 
 from trackmdp.errors import UserError, require
 
-__all__ = ["end_with_parent", "run_jobs"]
-
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 

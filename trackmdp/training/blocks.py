@@ -40,8 +40,6 @@ from trackmdp.training.trainer import Trainer
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Problem
 
-__all__ = ["BlockTrainer", "make_trainer"]
-
 
 def make_trainer(
     problem: Problem,

@@ -7,8 +7,6 @@ import torch
 from scipy import sparse
 from torch import Tensor
 
-__all__ = ["BeliefFilter"]
-
 
 class BeliefFilter:
     """Belief over the cells of a target known to be in the grid: `[B, M]` float64 rows that sum to 1.

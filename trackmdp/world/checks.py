@@ -12,8 +12,6 @@ from scipy.sparse.csgraph import breadth_first_order
 from trackmdp.errors import UserError
 from trackmdp.world.rows import pairwise_row_sums
 
-__all__ = ["canonical_kernel", "check_kernel", "short_indices"]
-
 
 def canonical_kernel(kernel: Any, source: str = "kernel") -> sparse.csr_array:
     """A table, sparse or dense, as a CSR matrix of float64 with sorted indices, no duplicates and no explicit zeros.

@@ -10,8 +10,6 @@ from torch import Tensor
 from trackmdp.world.model import Array, Task
 from trackmdp.world.windows import Window
 
-__all__ = ["Costs"]
-
 
 class Costs:
     """The reward of a step from r, c and D, on one device.

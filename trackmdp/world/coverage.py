@@ -23,8 +23,6 @@ from scipy import sparse
 
 from trackmdp.errors import UserError
 
-__all__ = ["Coverage", "discs"]
-
 
 @dataclass(frozen=True, eq=False)
 class Coverage:

@@ -10,8 +10,6 @@ from weakref import WeakValueDictionary
 import torch
 from torch import Tensor, library
 
-__all__ = ["Draw"]
-
 _DRAWS: WeakValueDictionary[int, Draw] = WeakValueDictionary()
 """Number -> what draws: a graph can hold a number, but no generator."""
 

@@ -22,8 +22,6 @@ from trackmdp.world.targets import make_targets
 from trackmdp.world.tracks import Problem
 from trackmdp.world.windows import Window
 
-__all__ = ["TrackEnv"]
-
 _FLAGS = ("done", "terminated", "truncated")
 
 

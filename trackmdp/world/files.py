@@ -19,8 +19,6 @@ from trackmdp.errors import UserError
 from trackmdp.untrusted import decoded, opened
 from trackmdp.world.model import Array, BoolArray, Size, grid_size
 
-__all__ = ["column_names", "csr_of", "first_line", "per_cell", "read_columns", "read_matrix", "read_numbers"]
-
 _LONGEST_TEXT, _LONGEST_HEAD = 2**30, 2**16
 """Bytes of the longest .csv file, a recording of some eighty million steps, and of its first line."""
 

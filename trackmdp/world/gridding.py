@@ -14,8 +14,6 @@ from trackmdp.world.model import Array
 from trackmdp.world.positions import Positions
 from trackmdp.world.tracks import Tracks, ends_of
 
-__all__ = ["Gridding", "said", "to_tracks"]
-
 _WIDEST = 12.0
 """Degrees of longitude that one UTM zone, six degrees wide, is stretched over at most."""
 

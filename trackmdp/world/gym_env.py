@@ -18,8 +18,6 @@ from trackmdp.world.env import TrackEnv
 from trackmdp.world.make import make_world
 from trackmdp.world.tracks import Problem
 
-__all__ = ["TrackGym", "TrackVector"]
-
 Observation: TypeAlias = dict[str, Any]
 _MODES = {"ansi": "text", "rgb_array": "rgb_array"}
 

@@ -19,8 +19,6 @@ from trackmdp.world.files import read_matrix
 from trackmdp.world.model import Array, BoolArray, Size, grid_size
 from trackmdp.world.rows import pairwise_row_sums
 
-__all__ = ["Border", "random_support", "random_walk", "drift", "load_table"]
-
 Border: TypeAlias = Literal["renormalize", "inside", "clip", "exit"]
 
 _Offsets: TypeAlias = npt.NDArray[np.int64]

@@ -23,17 +23,6 @@ from trackmdp.world.recording import read_recording
 from trackmdp.world.track_files import read_track_file
 from trackmdp.world.tracks import Problem, Recorded, split
 
-__all__ = [
-    "build_world",
-    "load_tracks",
-    "make_hidden_world",
-    "make_problem",
-    "make_world",
-    "of_task",
-    "paper_cost",
-    "recorded",
-]
-
 
 def make_world(
     kernel: str = default("kernel"),

@@ -14,8 +14,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["KeySpace"]
-
 
 @dataclass(frozen=True)
 class KeySpace:

@@ -19,8 +19,6 @@ from trackmdp.world.coverage import Coverage
 from trackmdp.world.memory import KeySpace
 from trackmdp.world.rows import pairwise_row_sums
 
-__all__ = ["Array", "BoolArray", "Size", "Task", "World", "grid_size"]
-
 Array: TypeAlias = npt.NDArray[np.float64]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 

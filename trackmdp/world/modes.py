@@ -23,8 +23,6 @@ from trackmdp.world.checks import canonical_kernel, check_kernel
 from trackmdp.world.model import Array, Size, Task, World, grid_size
 from trackmdp.world.rows import pairwise_row_sums
 
-__all__ = ["HiddenWorld", "Modelled", "check_revealed", "heading_kernel", "turning_back"]
-
 _HEADINGS = np.array([(0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1), (1, 0), (1, 1)])
 """Rows and columns of a step; 0 is to the right, and each of the eight turns left by 45 degrees."""
 

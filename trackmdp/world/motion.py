@@ -10,8 +10,6 @@ from torch import Tensor
 
 from trackmdp.errors import UserError
 
-__all__ = ["Motion"]
-
 _RESOLUTION = 2**40
 """Draws are multiples of 2^-40; no successor is more or less likely than in the kernel by more than that."""
 

@@ -9,8 +9,6 @@ from torch.nn.functional import one_hot
 from torchrl.data import Bounded, Composite
 from torchrl.envs.transforms import ObservationTransform
 
-__all__ = ["ObservationVector"]
-
 _KEYS = ("last_cell", "steps_since_detection", "action_history")
 
 

@@ -13,8 +13,6 @@ from trackmdp.errors import UserError
 from trackmdp.untrusted import parse_json
 from trackmdp.world.positions import ALIASES, IGNORED, NO_IDENTITY, Positions, table_of
 
-__all__ = ["geojson", "gpx", "mot", "sumo"]
-
 _PER_POINT = ("times", "coordTimes", "timestamps")
 """Properties of a line that hold one time for each of its points, as converters of GPX write them."""
 

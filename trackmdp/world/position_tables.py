@@ -8,8 +8,6 @@ from typing import Any, BinaryIO
 from trackmdp.world.files import first_line
 from trackmdp.world.positions import ALIASES, LONGEST, Positions, table_of
 
-__all__ = ["position_table"]
-
 
 def position_table(stream: BinaryIO) -> Positions:
     """A table of CSV or Parquet."""

@@ -14,8 +14,6 @@ import numpy as np
 
 from trackmdp.world.model import Array
 
-__all__ = ["ALIASES", "IGNORED", "LONGEST", "NO_IDENTITY", "Positions", "table_of"]
-
 LONGEST = 2**30
 """Bytes of the longest file, and of the longest unfolded table of a Parquet file."""
 

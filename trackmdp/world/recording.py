@@ -12,8 +12,6 @@ from trackmdp.arrays import LARGE, load_npz
 from trackmdp.untrusted import decoded, opened
 from trackmdp.world.tracks import Recorded, Tracks
 
-__all__ = ["recording_bytes", "read_recording"]
-
 _PARTS = ("tracks", "validation", "held_out")
 _KINDS = {"cells": "i", "first": "i", "exits": "b", "names": "i"}
 """Array of `Tracks` -> kind of its numbers."""

@@ -12,8 +12,6 @@ from trackmdp.config.registry import make
 from trackmdp.world.checks import canonical_kernel, check_kernel
 from trackmdp.world.model import Array, Size, grid_size
 
-__all__ = ["regimes", "switching"]
-
 
 def regimes(size: Size, *, stay: float | list[float], regimes: list[dict[str, Any]]) -> tuple[sparse.csr_array, int]:
     """The regime is kept with `stay`, else any other is as likely; then the target moves by the new one's kernel.

@@ -9,8 +9,6 @@ import numpy.typing as npt
 
 from trackmdp.world.model import BoolArray
 
-__all__ = ["PICTURE_LEGEND", "around", "pixels", "text_rows"]
-
 FOUND, MISSED, ON, OFF = "●", "○", "▪", "·"
 PICTURE_LEGEND = f"{FOUND} target, detected   {MISSED} target, missed   {ON} sensor on   {OFF} sensor off"
 

@@ -12,8 +12,6 @@ from trackmdp.seeding import generator
 from trackmdp.world.draws import Draw
 from trackmdp.world.model import Task
 
-__all__ = ["Reports"]
-
 
 class Reports:
     """The reports of a task's sensors; nothing is drawn where none of them can miss.

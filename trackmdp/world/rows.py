@@ -8,8 +8,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-__all__ = ["pairwise_row_sums"]
-
 _LEAF = 128  # numpy adds up to so many numbers in one leaf of its summation tree
 _LANES = 3  # log2 of the 8 interleaved partial sums of a leaf
 

@@ -12,8 +12,6 @@ from trackmdp.world.coverage import Coverage, discs
 from trackmdp.world.files import per_cell, read_matrix
 from trackmdp.world.model import Array, Size, grid_size
 
-__all__ = ["false_alarm", "footprint", "miss", "perfect"]
-
 
 def perfect(size: Size) -> dict[str, Any]:  # noqa: ARG001
     """No sensor misses, which is what a `Task` takes for granted."""

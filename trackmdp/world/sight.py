@@ -8,8 +8,6 @@ from torch import Tensor, nn
 from trackmdp.world.model import Task
 from trackmdp.world.windows import Window
 
-__all__ = ["Sight"]
-
 
 class Sight:
     """What a task's sensors see, on one device.

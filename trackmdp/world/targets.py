@@ -16,8 +16,6 @@ from trackmdp.world.modes import HiddenWorld, Modelled
 from trackmdp.world.motion import Motion
 from trackmdp.world.tracks import Problem, Recorded, Tracks
 
-__all__ = ["RecordedTargets", "SampledTargets", "Targets", "make_targets"]
-
 
 class Targets(Protocol):
     """A batch of targets. Their positions are in the environment's state; this object holds only the generators."""

@@ -16,8 +16,6 @@ from trackmdp.world.position_tables import position_table
 from trackmdp.world.positions import ALIASES, LONGEST, Positions
 from trackmdp.world.tracks import Tracks, check_tracks, read_tracks
 
-__all__ = ["read_positions", "read_track_file"]
-
 _FORMATS = {
     ".npz": "cells",
     ".parquet": "points",

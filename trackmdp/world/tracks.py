@@ -18,8 +18,6 @@ from trackmdp.world.files import read_columns
 from trackmdp.world.model import Array, BoolArray, Size, Task, World, grid_size
 from trackmdp.world.modes import HiddenWorld
 
-__all__ = ["Indices", "Problem", "Recorded", "Tracks", "check_tracks", "draw_parts", "ends_of", "read_tracks", "split"]
-
 Indices: TypeAlias = npt.NDArray[np.int64]
 
 _COLUMNS = (

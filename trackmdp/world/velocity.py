@@ -19,8 +19,6 @@ from scipy.special import ndtr
 from trackmdp.world.model import Array, Size
 from trackmdp.world.modes import turning_back
 
-__all__ = ["constant_velocity", "coordinated_turn", "dithered", "steps_of"]
-
 _TAIL = 4.0
 """Standard deviations at which the noise ends, on either side: 6e-5 of a normal law, and its mean stays exact."""
 

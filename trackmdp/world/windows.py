@@ -18,8 +18,6 @@ from torch import Tensor, nn
 
 from trackmdp.world.model import Size, Task, grid_size
 
-__all__ = ["Window"]
-
 
 class Window(nn.Module):
     """Local and global numbers of the sensors around each located cell.
