@@ -129,6 +129,6 @@ def test_a_command_composes_once_checks_once_and_builds_one_world(
     spy("trackmdp.config.compose", "validate")
     spy("trackmdp.world.make", "make_problem")
     spy(module.__name__, "make_problem")
-    monkeypatch.setattr(module, "Trainer", lambda problem, cfg, **_: (_ for _ in ()).throw(RunError("far enough")))
+    monkeypatch.setattr(module, "make_trainer", lambda problem, cfg, **_: (_ for _ in ()).throw(RunError("far enough")))
     assert main(["train", *words]) == 1
     assert counts == {"compose": 1, "validate": 1, "make_problem": 1}

@@ -49,7 +49,7 @@ def regions(file: Path) -> list[tuple[int, int, int]]:
 
 
 def test_300_flipped_bits_are_reported_or_lie_outside_all_data(log: Path, tmp_path: Path) -> None:
-    """Half of them anywhere, half in metadata, attachments, header, footer and indexes.
+    """Half of them anywhere, half in metadata, attachments, header, footer and indexes, each kind as often.
 
     The reader passes over a flip only in a message index, which it does not use, and in the record that ends the data
     section; verifying the file reports those as well.
@@ -57,8 +57,11 @@ def test_300_flipped_bits_are_reported_or_lie_outside_all_data(log: Path, tmp_pa
     content, rng = log.read_bytes(), random.Random(0)
     expected, flipped = everything(log), tmp_path / "flipped.mcap"
     small = [region for region in regions(log) if region[0] != container.CHUNK]
+    kinds = sorted({opcode for opcode, _, _ in small})
     places = [rng.randrange(len(content)) for _ in range(150)]
-    places += [rng.randrange(first, end) for _, first, end in rng.choices(small, k=150)]
+    for kind in rng.choices(kinds, k=150):
+        _, first, end = rng.choice([region for region in small if region[0] == kind])
+        places.append(rng.randrange(first, end))
     silent = []
     for place in places:
         damaged = bytearray(content)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import zstandard
-from mcap.data_stream import ReadDataStream
+from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.records import Attachment, AttachmentIndex, Channel, Chunk, ChunkIndex, Header, Metadata, MetadataIndex
 
 from trackmdp import untrusted
@@ -77,7 +77,7 @@ class Container:
         opcode, body = next(records(self.stream, len(MAGIC)), (0, b""))
         if opcode != HEADER:
             raise Damaged("its first record is not the header")
-        header = vars(_parsed(Header, body))
+        header = vars(_unchecked(Header, body))
         return header["profile"], header["library"]
 
     def _summary(self) -> None:
@@ -259,9 +259,21 @@ def _parsed(kind: Any, data: bytes) -> Any:
     """The record of a kind of `mcap.records` from its content.
 
     That reads fewer bytes where a length leads out of the content: what is parsed here is covered by a checksum, or
-    compared with something that is.
+    compared with something that is; else see `_unchecked`.
     """
     return kind.read(ReadDataStream(BytesIO(data)))
+
+
+def _unchecked(kind: Any, data: bytes) -> Any:
+    """A record that no checksum covers: only what is written again alike is what was written.
+
+    A length that is a little wrong is read all the same by `_parsed`.
+    """
+    found, builder = _parsed(kind, data), RecordBuilder()
+    found.write(builder)
+    if builder.end()[9:] != data:
+        raise Damaged(f"the record {kind.__name__}")
+    return found
 
 
 def attachment_of(data: bytes) -> tuple[str, bytes]:
@@ -274,7 +286,7 @@ def attachment_of(data: bytes) -> tuple[str, bytes]:
 
 def metadata_of(data: bytes) -> tuple[str, dict[str, str]]:
     """Name and content of a metadata record."""
-    found = _parsed(Metadata, data)
+    found = _unchecked(Metadata, data)
     return found.name, found.metadata
 
 
