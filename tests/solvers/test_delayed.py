@@ -70,13 +70,15 @@ def test_no_plan_beats_the_tables_and_what_is_exact_is() -> None:
     assert closed > 200
 
 
-def test_mass_from_several_cells_is_worth_no_more_than_each_by_itself() -> None:
+@pytest.mark.parametrize("closed", [False, True], ids=["some on", "all on"])
+def test_mass_from_several_cells_is_worth_no_more_than_each_by_itself(closed: bool) -> None:
     rng = np.random.default_rng(1)
     for world, detected, missed in _worlds(12, seed=2):
         tables = Delayed.of(world, detected, missed, 3)
         assert tables is not None
         m = world.num_cells
         before, on = rng.random((5, m)) * (rng.random((5, m)) < 0.7), rng.random((5, m)) < 0.5
+        on |= closed
         rows, cells = np.nonzero(~on)
         bound = tables.worth(sparse.csr_array(before), LeftOut.of(rows, cells, m), 2)
         moved = before @ world.kernel.toarray()

@@ -156,12 +156,12 @@ class LeftOut:
         return cls(np.sort(rows.astype(np.int64) * num_cells + cells), num_cells)
 
     def has(self, rows: IndexArray, cells: IndexArray) -> BoolArray:
-        """`[E]` whether problem `rows` leaves `cells` out."""
+        """Whether problem `rows` leaves `cells` out, in the shape that the two have together."""
         # With M = 16 and the keys 37, 41 (cells 5 and 9 of problem 2), (2, 9) gives 41: found at place 1; (2, 6) gives
         # 38: place 1 as well, another key. `minimum` is for keys beyond the last one, whose place is the length.
         wanted = rows * self.num_cells + cells
         place = np.minimum(np.searchsorted(self.keys, wanted), max(len(self.keys) - 1, 0))
-        return self.keys[place] == wanted if len(self.keys) else np.zeros(len(wanted), dtype=bool)
+        return self.keys[place] == wanted if len(self.keys) else np.zeros(wanted.shape, dtype=bool)
 
 
 def sets_left_out(origin: Origin | None, state: int) -> list[IndexArray]:
