@@ -62,15 +62,11 @@ def test_training_and_solving_touch_no_hydra_and_no_file(tmp_path: Path, monkeyp
 
 def test_a_mistyped_option_is_answered_before_torch_is_loaded() -> None:
     code = """
-import time
-start = time.process_time()
 from trackmdp.app.cli import main
 assert main(["train", "sead=1"]) == 2
-found = ["torch" in sys.modules, time.process_time() - start]
+found = [name for name in ("torch", "tensordict", "torchrl", "scipy", "matplotlib", "pandas") if name in sys.modules]
 """
-    heavy, seconds = after(code)
-    assert not heavy
-    assert seconds < 1.0
+    assert not after(code)
 
 
 @pytest.mark.parametrize("name", tm.__all__)

@@ -83,6 +83,7 @@ def remembering_world() -> World:
     return World.of(spreading_world(), spreading_world().kernel, markov=False)
 
 
+@pytest.mark.slow
 def test_motion_with_memory_is_exchanged_on_whole_paths() -> None:
     """A quarter of the recordings, kept from the nets, say that the plan for the others is better than theirs."""
     world = remembering_world()

@@ -96,6 +96,7 @@ def test_the_first_frames_of_a_mixture_decide_how_far_the_nets_see() -> None:
     assert all(torch.equal(mine, theirs) for mine, theirs in parts)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("collects", ["all_on", "mixed"])
 def test_a_window_that_holds_every_move_costs_nothing(collects: str) -> None:
     """Moves of one cell and t_max = 0: sensors farther away are of no use, so that the window changes no optimum."""

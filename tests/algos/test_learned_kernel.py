@@ -59,6 +59,7 @@ def test_chosen_sets_cost_less() -> None:
     assert not (learner.policy.bits == 255).all()
 
 
+@pytest.mark.slow
 def test_its_uncertainty_shrinks_and_covers_the_truth() -> None:
     world = small_world(3)
     learner, rows = learn(world, 12, "algo.samples=50", "algo.plan_every=1")

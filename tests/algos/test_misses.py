@@ -113,6 +113,7 @@ def test_a_safe_action_that_misses_is_repeated() -> None:
     assert found.flatten().tolist() == pytest.approx([0.5 * -7.5, -7.5])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hidden", [0, 8])
 def test_critics_settle_at_the_value_of_what_is_repeated(hidden: int) -> None:
     """Nothing sensed on one cell, r = 1, D = 2, p_s = .5, exit .1, discount .8: L = .9 (.5 (1 + .8 V) + .4 L - 2)."""

@@ -60,6 +60,7 @@ def test_the_printed_numbers_are_those_of_table_two() -> None:
     assert [PRINTED_TMDP[z, 0.18] for z in (5, 4, 3)] == [94.94, 95.56, 92.06]
 
 
+@pytest.mark.slow
 def test_the_sensitivity_is_the_range_over_the_draws() -> None:
     settings = list(sensitivity(draws=[0, 1, 2]))
     assert len({(s.border, s.t_max, s.support_size, s.cost) for s in settings}) == len(settings) == 4 * 3 * 12

@@ -111,6 +111,7 @@ def test_sets_that_never_show_some_moves_still_tell_them() -> None:
     np.testing.assert_allclose(estimate.mean().toarray()[:, :4], KERNEL, atol=0.03)
 
 
+@pytest.mark.slow
 def test_samples_spread_around_the_mean_as_counts_allow() -> None:
     estimate = KernelEstimate(2, weight=1e-6, exit_weight=1e-6)
     estimate.add(paths_of([(0, [], 1)] * 30 + [(0, [], 2)] * 60 + [(0, [], 4)] * 10))

@@ -74,6 +74,7 @@ def test_with_the_default_halo_blocks_lose_nothing_and_without_one_they_do(cost:
     assert lost <= stated + 5e-5
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:partition.halo=0")
 def test_sweeps_over_the_whole_grid_mend_what_blocks_cannot(monkeypatch: pytest.MonkeyPatch) -> None:
     world = tm.make_world("random_support", size=12, support_size=5, radius=1, cost=0.22, t_max=1, safe_cost=8)

@@ -113,6 +113,7 @@ def test_the_mean_over_many_tracks_is_the_exact_value() -> None:
     np.testing.assert_allclose(ours.value, exact.value, atol=0.2)
 
 
+@pytest.mark.slow
 def test_intervals_cover_the_exact_value_19_times_of_20() -> None:
     world = small_world(t_max=1)
     chains = np.random.default_rng(1).random((9, 2, 9)) < 0.3

@@ -77,6 +77,7 @@ def test_with_a_window_only_sensors_in_it_are_chosen(solver: str, seed: int) -> 
     assert (solution.value <= bounds.clocked(world) + 1e-9).all()
 
 
+@pytest.mark.slow
 @settings(max_examples=8)
 @given(seed=st.integers(0, 2**31))
 def test_the_optimum_with_a_window_is_that_of_all_plans_within_it(seed: int) -> None:

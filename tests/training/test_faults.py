@@ -242,6 +242,7 @@ class Held(Callback):
         self.bytes.append(sum(found.nbytes for found in gc.get_objects() if issubclass(type(found), torch.Tensor)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("algo", ["ppo", "dqn"])
 def test_a_longer_run_holds_no_more_files_and_tensors(algo: str, tmp_path: Path) -> None:
     held = Held()

@@ -40,6 +40,7 @@ def test_verify_says_what_has_no_case(here: Path) -> None:
     assert (here / "s/verification.json").is_file()
 
 
+@pytest.mark.slow
 def test_a_sweep_over_memories_is_reported(here: Path) -> None:
     """Of the policy that remembers the cell there are maps, of the other none; nothing is missing."""
     for memory in ("cell", "displacement"):

@@ -100,6 +100,7 @@ def test_a_run_is_found_again_whatever_else_the_line_asks_for(tmp_path: Path) ->
     assert names[1].startswith("seed_4-")
 
 
+@pytest.mark.slow
 def test_a_config_that_changed_behind_the_words_is_another_run() -> None:
     words = ["seed=0,1"]
     assert planned([], *words, more=["grid.size=5"]) != planned([], *words, more=["grid.size=6"])

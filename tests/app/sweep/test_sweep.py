@@ -248,6 +248,7 @@ sys.exit(str((status, sorted({{"torch", "torchrl", "scipy"}} & set(sys.modules))
     assert result.stderr == "(0, [])\n"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
 def test_runs_outlive_their_fork_server(here: Path) -> None:
     more = ["collector.total_frames=200_000", "seed=0,1", "hydra.sweep.dir=all"]

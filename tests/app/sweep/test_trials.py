@@ -73,6 +73,7 @@ def test_a_finished_training_run_is_not_run_again_by_the_study(here: Path) -> No
     assert all((folder / "summary.json").stat().st_mtime_ns == time for folder, time in before.items())
 
 
+@pytest.mark.slow
 def test_a_failed_trial_is_told_and_tried_again_by_the_next_call(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(cfg: Any, folder: Path) -> float:
         if cfg.algo.hidden == 8:
