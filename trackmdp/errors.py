@@ -32,8 +32,11 @@ class Preempted(BaseException):
     """
 
     def __init__(self, signal: int) -> None:
-        super().__init__(f"stopped by signal {signal}")
+        super().__init__(signal)  # the arguments alone go through a pickle, from a worker to whom it works for
         self.signal = signal
+
+    def __str__(self) -> str:
+        return f"stopped by signal {self.signal}"
 
 
 def adding(extra: str) -> str:

@@ -14,11 +14,12 @@ from scipy import sparse
 import trackmdp as tm
 from trackmdp.app.cli import main
 from trackmdp.config.compose import compose
-from trackmdp.errors import UserError
+from trackmdp.errors import Preempted, UserError
 from trackmdp.solvers import regions
 from trackmdp.solvers.partition import Block, blocks, default_halo, plan_by_blocks, reach, sub_world
 from trackmdp.solvers.solve import run_solver
 from trackmdp.solvers.workers import run_jobs
+from trackmdp.training.signals import Signals, handled
 from trackmdp.world.model import World
 
 
@@ -181,6 +182,36 @@ def test_what_a_killed_worker_had_is_done_again(tmp_path: Path, cluster: str | N
     assert (tmp_path / "killed").exists()
     with pytest.raises(UserError, match="nine"):
         run_jobs(Dies(tmp_path), [9], workers=2, cluster=cluster)
+
+
+@dataclass(frozen=True)
+class Saves:
+    """As a learner does, hears the signal, saves and ends; the first job tells whoever began it."""
+
+    folder: Path
+
+    def __call__(self, number: int) -> None:
+        with Signals() as signals:
+            (self.folder / f"{number} begun").touch()
+            if number == 0:
+                os.kill(os.getppid(), signal.SIGUSR1)
+            while not signals.heard():
+                pass
+            (self.folder / f"{number} saved").touch()
+            raise Preempted(signals.received)
+
+
+@pytest.mark.slow
+def test_a_signal_ends_all_workers_and_none_begins_another_job(tmp_path: Path) -> None:
+    def end(number: int, frame: object) -> None:
+        raise Preempted(number)
+
+    with handled(end, signal.SIGUSR1), pytest.raises(Preempted) as told:
+        run_jobs(Saves(tmp_path), range(6), workers=2)
+    assert told.value.signal == signal.SIGUSR1
+    # the other worker may have been told before it began
+    left = {file.name for file in tmp_path.iterdir()}
+    assert left in ({"0 begun", "0 saved"}, {"0 begun", "0 saved", "1 begun", "1 saved"})
 
 
 def test_a_job_that_kills_every_worker_ends_in_one_line(tmp_path: Path) -> None:

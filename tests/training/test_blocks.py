@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,10 @@ import pytest
 
 import trackmdp as tm
 from trackmdp.app.cli import main
-from trackmdp.errors import UserError
+from trackmdp.errors import Preempted, UserError
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.training.callbacks import Callback
+from trackmdp.training.lock import locked
 from trackmdp.training.saving import Checkpoints
 from trackmdp.world.model import World
 
@@ -112,6 +114,49 @@ def test_blocks_have_their_part_of_a_map(tmp_path: Path) -> None:
     np.save(tmp_path / "map.npy", classes + 1)
     with pytest.raises(UserError, match=r"classes.npy: not the classes that algo.share_cells has now"):
         learned(tmp_path / "run", resume="auto", **given)
+
+
+@pytest.mark.parametrize("name", ["blocks", "blocks/00000"])
+def test_blocks_are_not_written_through_a_link(tmp_path: Path, name: str) -> None:
+    outside, link = tmp_path / "outside", tmp_path / "run" / name
+    outside.mkdir()
+    link.parent.mkdir(parents=True)
+    link.symlink_to(outside)
+    with pytest.raises(UserError, match=f"{name}: a link or a file, expected a folder of the run's own"):
+        learned(tmp_path / "run")
+    assert not list(outside.iterdir())
+
+
+def test_another_config_leaves_a_run_as_it_was(uncut: tm.Run) -> None:
+    assert uncut.folder is not None
+    before = {file: file.read_bytes() for file in uncut.folder.rglob("*") if file.is_file()}
+    with pytest.raises(UserError, match="holds a run with another config"):
+        learned(uncut.folder, resume="auto", seed=1)
+    assert before == {file: file.read_bytes() for file in uncut.folder.rglob("*") if file.is_file()}
+
+
+def test_a_block_that_runs_elsewhere_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "blocks" / "00000").mkdir(parents=True)
+    with locked(tmp_path / "blocks" / "00000"), pytest.raises(UserError, match="00000: another process is running"):
+        learned(tmp_path)
+
+
+@pytest.mark.parametrize("end", [{}, {"frames": 600, "while_collecting": {"reward_per_frame": None}}])
+def test_a_block_that_tells_no_frames_is_refused(uncut: tm.Run, end: dict[str, Any], monkeypatch: Any) -> None:
+    monkeypatch.setattr("trackmdp.training.blocks.read_summary", lambda folder: end)
+    with pytest.raises(UserError, match="blocks: not the runs of blocks"):
+        learned(uncut.folder, resume="auto")
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGUSR1])
+def test_a_signal_between_two_blocks_ends_the_run(
+    number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = signal.getsignal(number)
+    monkeypatch.setattr("trackmdp.training.blocks.finished", lambda cfg, folder: signal.raise_signal(number))
+    with pytest.raises(Preempted, match=f"stopped by signal {int(number)}"):
+        learned(tmp_path)
+    assert signal.getsignal(number) == before
 
 
 @pytest.mark.slow

@@ -163,6 +163,7 @@ class _PlanJob:
 
     def _block(self, number: int, world: World, block: Block) -> list[tuple[IndexArray, IndexArray]]:
         table = self.plan(number, world)
+        table.check_fits(world)
         if not table.deterministic:
             raise UserError("partition.block: expected a policy that does not draw")
         # A single probability of 0 or 1 for all sensors says nothing about the world beyond the halo.

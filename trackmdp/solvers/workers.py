@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import os
+import signal
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -12,7 +13,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from typing import Any, TypeVar
 
-from trackmdp.errors import UserError, require
+from trackmdp.errors import Preempted, UserError, require
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -49,19 +50,42 @@ def _in_processes(work: Callable[[Job], Result], jobs: Sequence[Job], workers: i
         left = [number for number in range(len(jobs)) if number not in results]
         # Spawned, not forked: a fork copies locks that another thread of this process may hold.
         spawning = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(min(workers, len(left)), spawning, end_with_parent) as pool:
-            futures = {number: pool.submit(work, jobs[number]) for number in left}
+        with ProcessPoolExecutor(min(workers, len(left)), spawning, _begin) as pool:
+            futures = {number: pool.submit(_done, work, jobs[number]) for number in left}
             try:
                 for number, future in futures.items():
                     # a worker died: what it and the others had not finished is done again
                     with suppress(BrokenProcessPool):
                         results[number] = future.result()
             except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)  # what was not begun is not begun any more
+                for worker in list(pool._processes.values()):
+                    worker.terminate()  # SIGTERM: who learns saves what there is, and is waited for
+                pool.shutdown(cancel_futures=True)  # what was not begun is not begun any more
                 raise
         if len(results) == len(jobs):
             return [results[number] for number in range(len(jobs))]
     raise UserError(f"partition.workers={workers}: workers died {_ATTEMPTS} times, expected enough memory for each")
+
+
+_ended: list[Preempted] = []
+"""In a worker: the signal that ended its last job."""
+
+
+def _begin() -> None:
+    # Ctrl-C goes to the whole group of processes; the parent hears it, and ends its workers.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
+
+
+def _done(work: Callable[[Job], Result], job: Job) -> Result:
+    """`work` of `job` in a worker, to which the pool hands one job more than it can take back."""
+    if _ended:
+        raise _ended[0]
+    try:
+        return work(job)
+    except Preempted as error:
+        _ended.append(error)
+        raise
 
 
 def end_with_parent() -> None:

@@ -13,17 +13,18 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import FrameType
 
 from rich.console import Console
 
-from trackmdp.config import TrainConfig
+from trackmdp.config import TrainConfig, load_run_config
 from trackmdp.config.learning import AlgoConfig
 from trackmdp.config.partition import PartitionConfig
 from trackmdp.config.resume import finished
 from trackmdp.config.sensing import MissConfig, PaperCostConfig, PerfectSensorConfig
 from trackmdp.config.world import TableConfig
-from trackmdp.durable import write_bytes
-from trackmdp.errors import UserError
+from trackmdp.durable import own_folder, write_bytes
+from trackmdp.errors import Preempted, UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.seeding import derive, preserved_global_rng
 from trackmdp.solvers.alike import cell_classes
@@ -33,10 +34,13 @@ from trackmdp.training.display import make_console
 from trackmdp.training.evaluator import Evaluator, Score
 from trackmdp.training.held_out import make_evaluator
 from trackmdp.training.inputs import CLASSES, npy_bytes, short, write_inputs
+from trackmdp.training.lock import locked
 from trackmdp.training.run import complete, load_run
 from trackmdp.training.sealing import read_summary
-from trackmdp.training.state import Position
+from trackmdp.training.signals import HEARD, handled
+from trackmdp.training.state import Position, identity
 from trackmdp.training.trainer import Trainer
+from trackmdp.untrusted import decoded
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Problem
 
@@ -104,17 +108,39 @@ class BlockTrainer:
         with ExitStack() as opened:
             place = self.folder or Path(opened.enter_context(TemporaryDirectory()))
             if self.folder is not None:
-                write_inputs(self.config, world, place, resumed=(place / "config.yaml").is_file())
+                write_inputs(self.config, world, place, resumed=_resumed(self.config, place))
+            own_folder(place / "blocks")
+            # A block hears signals while it learns; here they end what is between two blocks, and all workers.
+            opened.enter_context(handled(_stop, *HEARD))
             learner = _BlockLearner(self.config, place / "blocks", parts)
             table = plan_by_blocks(world, learner, side, halo, workers=cfg.workers, cluster=cfg.cluster)
-            ends = [read_summary(learner.place(number)) for number in range(len(parts))]
+            with decoded(str(place / "blocks"), "the runs of blocks"):
+                ends = [read_summary(learner.place(number)) for number in range(len(parts))]
+                earned = sum(end["frames"] * end["while_collecting"]["reward_per_frame"] for end in ends)
+                frames = sum(end["frames"] for end in ends)
         self._policy, self.evaluator = Policy.from_table(table), make_evaluator(world)
-        earned = sum(end["frames"] * end["while_collecting"]["reward_per_frame"] for end in ends)
-        self.position = Position(0, sum(end["frames"] for end in ends), time.monotonic() - began, earned)
+        self.position = Position(0, frames, time.monotonic() - began, earned)
         score = self.evaluator.score(self._policy)
         if said := narrow_halo(world, cfg, self.evaluator.upper, score.evaluation):
             self.console.print(f"warning: {said}")
         return score
+
+
+def _stop(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
+    raise Preempted(number)
+
+
+def _resumed(config: TrainConfig, folder: Path) -> bool:
+    """Whether the folder holds this run already.
+
+    Raises:
+        UserError: it holds another one, whose results are then still as they were.
+    """
+    if not (folder / "config.yaml").is_file():
+        return False
+    if identity(load_run_config(folder)) != identity(config):
+        raise UserError(f"{folder}: holds a run with another config, which cannot change on resume")
+    return True
 
 
 @dataclass(frozen=True)
@@ -133,14 +159,16 @@ class _BlockLearner:
 
     def __call__(self, number: int, world: World) -> Policy:
         folder, console = self.place(number), make_console(self.config.quiet)
-        folder.mkdir(parents=True, exist_ok=True)
-        config = self._config(number, world, folder)
-        before = finished(config, folder) is not None
-        if not before:
-            # One of an older config, such as a smaller budget, must not be taken for this one.
-            (folder / "summary.json").unlink(missing_ok=True)
-            with preserved_global_rng():
-                complete(Trainer(world, config, folder=folder))
+        own_folder(folder)
+        # The lock of the whole run does not cover it: a block's run may be resumed by itself.
+        with locked(folder):
+            config = self._config(number, world, folder)
+            before = finished(config, folder) is not None
+            if not before:
+                # One of an older config, such as a smaller budget, must not be taken for this one.
+                (folder / "summary.json").unlink(missing_ok=True)
+                with preserved_global_rng():
+                    complete(Trainer(world, config, folder=folder))
         run = load_run(folder)
         how = "finished before" if before else f"{run.summary['wall_seconds']:.1f} s"
         console.print(f"block {number + 1} of {len(self.parts)}: AIHTR {run.evaluation.aihtr:,.2f} in it, {how}")

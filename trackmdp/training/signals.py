@@ -6,12 +6,13 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from types import FrameType
 from typing import Any, Self
 
-_HEARD = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
+HEARD = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
+"""Signals that ask a run to stop."""
 _ONE = 2.0
 """Seconds in which two count as one: `timeout` and some schedulers signal the process, and then its group once more."""
 
@@ -28,10 +29,7 @@ class Signals:
         self._first: dict[signal.Signals, float] = {}
 
     def __enter__(self) -> Self:
-        self._before = {}
-        # Python allows signal.signal in the main thread alone; `train` called from another one runs without.
-        if threading.current_thread() is threading.main_thread():
-            self._before = {number: signal.signal(number, self._note) for number in _HEARD}
+        self._before = _installed(self._note, HEARD)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -63,10 +61,21 @@ class Signals:
             os.kill(os.getpid(), number)
 
 
+def _installed(handler: Any, numbers: Iterable[signal.Signals]) -> dict[signal.Signals, Any]:
+    """Let `handler` hear signals; returns those that did before."""
+    # Python allows signal.signal in the main thread alone; `train` called from another one runs without.
+    if threading.current_thread() is not threading.main_thread():
+        return {}
+    return {number: signal.signal(number, handler) for number in numbers}
+
+
 @contextmanager
 def handled(handler: Any, *numbers: signal.Signals) -> Iterator[None]:
-    """Let `handler` hear signals inside; afterwards those that did before, whatever the body installs meanwhile."""
-    before = {number: signal.signal(number, handler) for number in numbers}
+    """Let `handler` hear signals inside; afterwards those that did before, whatever the body installs meanwhile.
+
+    Outside the main thread nothing is changed.
+    """
+    before = _installed(handler, numbers)
     try:
         yield
     finally:
