@@ -84,7 +84,13 @@ def test_what_share_cells_says(tmp_path: Path) -> None:
     for given in (table, table.ravel(), table.astype(np.uint8)):
         np.save(file, given)
         assert (cell_classes(file, (2, 3)) == table.ravel()).all()
-    for given, shape in ((table.T, "3 x 2"), (table.ravel()[:5], "5"), (table + 0.5, "2 x 3")):
+    for given, shape in (
+        (table.T, "3 x 2"),
+        (table.ravel()[:5], "5"),
+        (table + 0.5, "2 x 3"),
+        (table * np.inf, "2 x 3"),
+        (table * 1e300, "2 x 3"),
+    ):
         np.save(file, given)
         with pytest.raises(UserError, match=rf"expected 6 or 2 x 3 whole numbers, .*, got float64 {shape}$"):
             cell_classes(file, (2, 3))

@@ -48,6 +48,7 @@ def test_discs_on_a_lattice() -> None:
     sizes = np.diff(found.matrix.indptr).reshape(5, 5)
     assert (sizes[2, 2], sizes[0, 0]) == (13, 6)
     assert footprint(4, radius=0.0, spacing=1, path=None)["coverage"] is None
+    assert footprint((4, 5), radius=1e308, spacing=2, path=None)["coverage"].matrix.nnz == 6 * 20
 
 
 def test_steps_by_hand() -> None:

@@ -25,7 +25,9 @@ def cell_classes(share: str | None, size: tuple[int, int]) -> IndexArray | None:
     if share == "all":
         return np.zeros(size[0] * size[1], dtype=np.int64)
     given = read_numbers("algo.share_cells", share, name="classes")
-    if given.shape not in ((size[0] * size[1],), size) or (given != np.round(given)).any():
+    # Up to 2^53 a float is the whole number that was written; beyond 2^63 two classes would become one.
+    whole = (given == np.round(given)) & (np.abs(given) < 2**53)
+    if given.shape not in ((size[0] * size[1],), size) or not whole.all():
         expected = f"{size[0] * size[1]} or {size[0]} x {size[1]} whole numbers, the class of each cell"
         shape = " x ".join(map(str, given.shape))
         raise UserError(f"algo.share_cells={share}: expected {expected}, got {given.dtype} {shape}")

@@ -121,7 +121,9 @@ def discs(size: tuple[int, int], positions: npt.NDArray[np.int64], radius: float
         radius: in cells; 0 is the sensor's own cell, 2 a disc of 13 cells.
     """
     rows, columns = size
-    reach = np.arange(-int(radius), int(radius) + 1)
+    radius = min(radius, rows + columns)  # a larger one sees no more of the grid, and its square may be no number
+    far = int(min(radius, max(rows, columns)))
+    reach = np.arange(-far, far + 1)
     down, across = (each.ravel() for each in np.meshgrid(reach, reach, indexing="ij"))
     near = down**2 + across**2 <= radius**2
     # [S, offsets] each: every sensor's disc, and which of its cells lie in the grid.
