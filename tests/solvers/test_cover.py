@@ -15,9 +15,12 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import bounds, clocked, fcr, lookahead, myopic, optimal, qmdp
 from trackmdp.solvers.cover import Covering
 from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers.layers import policy_table, reachable_layers
 from trackmdp.solvers.recorded import replay
 from trackmdp.solvers.renewal import row_index
+from trackmdp.solvers.search import InnerProblem
 from trackmdp.solvers.solve import solve
+from trackmdp.solvers.two_sets import best_plans
 from trackmdp.world.coverage import Coverage
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Tracks
@@ -96,9 +99,22 @@ def test_bounds_and_planners_against_all_chains(seed: int) -> None:
     solution = optimal.solve(world)
     assert solution.value == pytest.approx(best, abs=1e-7)
     assert (solution.bound >= best - 1e-8).all()
+    assert solution.certified
     if world.t_max == 0:  # one set from each cell: the bound that reveals the cell is the optimum
-        assert solution.certified
         assert exact.value == pytest.approx(best, abs=1e-7)
+    else:
+        _all_plans_are_looked_at(world, best)
+
+
+def _all_plans_are_looked_at(world: World, best: np.ndarray) -> None:
+    """From sensing nothing, the plans found for the optimum's values are those of the optimum."""
+    layers = reachable_layers(world, 2)
+    problem, looked = InnerProblem.of(world, layers, best), []
+    found = best_plans(problem, problem.none_sensed(), 1e-9, lambda plans: looked.append(plans) is None)
+    assert found is not None
+    assert found[0] == pytest.approx(best, abs=1e-7)
+    assert evaluate(world, policy_table(world, layers, found[1])).value == pytest.approx(best, abs=1e-7)
+    assert best_plans(problem, problem.none_sensed(), 1e-9, lambda _: False) is None or not looked
 
 
 def test_values_are_those_of_stepping_through_the_chains() -> None:

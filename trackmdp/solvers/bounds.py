@@ -80,6 +80,13 @@ def _free(world: World, gain: Array, charge: Array) -> Array:
     return per_row(rows, np.maximum(gain - world.cost[cells] * charge[rows], 0.0), world.num_cells)
 
 
+def one_set(world: World, detected: Array, missed: Array) -> Array:
+    """`[M]` the most that one set is worth from a known position: r + V (`detected`, `[M]`), or else `missed` `[M]`."""
+    gain = world.kernel.data * world.detects(world.kernel.indices) * (detected - missed)[world.kernel.indices]
+    most: Array = world.kernel @ missed + _free(world, gain, world.stay_probability)
+    return most
+
+
 @lru_cache(maxsize=1)
 def _covering(world: World) -> Covering | None:
     """Which sensors see the target after one move from a known position; None where each covers its own cell."""

@@ -32,6 +32,7 @@ from trackmdp.solvers.regions import adopted, improved, proved, region_side
 from trackmdp.solvers.renewal import RenewalSystem, expected_steps, row_index
 from trackmdp.solvers.search import InnerProblem, follow_credit
 from trackmdp.solvers.solution import SearchProgress, Solution
+from trackmdp.solvers.two_sets import best_plans
 from trackmdp.world.model import Array, BoolArray, World
 
 ROUNDING = 1e-10
@@ -67,8 +68,8 @@ def solve(
     The budget is work, so that a world has the same bracket on a busy and on an idle machine. Where the clocked policy
     attains the clocked bound, as it does wherever at most one possible cell is ever left unsensed, nothing is
     searched. Ctrl-C ends a search like the budget does: the bracket so far is returned. Where sensors have footprints
-    there is no tree: the bracket is that of policy iteration, with the best set at each step, and of the clocked bound;
-    it is closed for t_max = 0.
+    there is no tree: up to t_max = 1 all plans are gone through (`two_sets`), above the bracket is that of policy
+    iteration, with the best set at each step, and of the clocked bound.
 
     Args:
         world: the problem with its motion model.
@@ -226,8 +227,8 @@ class _Run:
         self.report()
         patience = FIRST_NODES
         # The tree decides which cells to leave out, one by one, and knows no sensors that cover several.
-        while self.world.coverage is None and self.open():
-            improved = self.round(patience)
+        while self.open():
+            improved = self.round(patience) if self.world.coverage is None else self.covered_round()
             self.report()
             # No better plan: the tree was searched to its end, or the budget is spent.
             if not improved:
@@ -327,6 +328,25 @@ class _Run:
                 improved = self.use(self.found) or improved
                 self.found = None
         return improved
+
+    def covered_round(self) -> bool:
+        """As `round`, by `two_sets`."""
+        layers, slack = self.ground.layers, 0.5 * self.gap_allowed / self.ground.longest
+        if self.world.num_choices != 2:
+            return False
+
+        def looked_at(plans: int) -> bool:
+            self.budget.spent += plans
+            return self.budget.left()
+
+        problem = InnerProblem.of(self.world, layers, self.value)
+        found = best_plans(problem, layer_sets(layers, self.policy), slack, looked_at)
+        if found is None:
+            return False
+        # e(x) = eps_x pays for every plan of x (see the module).
+        short = np.maximum(found[0] - self.value, 0.0)
+        self.bound = np.minimum(self.bound, self.value + self.ground.paths.upper(short, self.ground.longest))
+        return self.use(policy_table(self.world, layers, found[1]))
 
     def adopt(self, tree: Tree) -> bool:
         """Use the better plans that the tree has found; whether the policy is better with them."""
