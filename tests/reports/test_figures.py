@@ -118,6 +118,18 @@ def test_a_map_draws_what_can_happen(results: Results) -> None:
     assert {row[1] for row in drawn.table.rows} == {0}  # no miss can happen, so there is no second set
 
 
+def test_a_map_of_averaged_plans_fills_the_share_of_each_cell() -> None:
+    """From cell 0 the target goes to 0 or 1; cell 1 is sensed on a quarter of the detections, cell 0 never."""
+    shares = sparse.csr_array(np.array([[0.0, 0.25], [0.0, 1.0]]))
+    kernel = sparse.csr_array(np.array([[0.5, 0.4], [0.0, 0.9]]))
+    kept, motion = Sensed(shares, np.zeros(2)), MotionTable(kernel, np.zeros(2), np.zeros(2))
+    figure = maps.policy_map("x", "here", kept, motion, (1, 2))
+    assert [row[2:4] for row in figure.table.rows] == [[0.25, 2], [1.0, 1]]
+    assert "At n = 0: 0.62 cells sensed, 0.88 possible ones left out on average." in figure.text
+    assert "share of the detections" in figure.text
+    assert kept.averaged
+
+
 def test_a_value_map_holds_every_cell(results: Results) -> None:
     name, kept = next(iter(results.policies.items()))
     motion = results.motions["a2c-0.16-0"]

@@ -8,10 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import sparse
 
 from tests.reports.sweeps import VERSIONS, write_curve, write_run, write_sweep
 from trackmdp.durable import write_json
 from trackmdp.errors import UserError
+from trackmdp.policies.saved import save_policy
+from trackmdp.policies.table import PolicyTable
 from trackmdp.reports import policy, results
 from trackmdp.reports.finished import MOST_POINTS
 from trackmdp.reports.gather import gather_runs
@@ -21,6 +24,7 @@ from trackmdp.solvers.evaluate import evaluate
 from trackmdp.training.lock import locked
 from trackmdp.training.sealing import read_summary, write_summary
 from trackmdp.world.make import build_world
+from trackmdp.world.model import Array, Task
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +70,34 @@ def test_one_policy_per_group_is_kept_that_of_the_run_in_the_middle(whole: Path)
     for name, kept in found.policies.items():
         group = [run for run in found.runs if run.name.rsplit("-", 1)[0] == name.rsplit("-", 1)[0]]
         assert kept.value.mean() == pytest.approx(np.median([run.figure("aihtr") for run in group]))
-        assert not (kept.sets != policy.read(whole / name / "policy.npz").sets).nnz
+        assert not (kept.sets != policy.read(whole / name / "policy.npz", _alike).sets).nnz
+
+
+def _alike(table: PolicyTable) -> Array:
+    return np.ones(table.task.num_keys)
+
+
+def test_plans_of_one_cell_are_averaged_by_how_often_each_occurs(tmp_path: Path) -> None:
+    """Two cells and ten classes: after one miss, cell 1 is sensed from cell 0 where the class is 3 or 7."""
+    task = Task((1, 2), cost=0.1, t_max=1, safe_cost=1.0, memory="displacement", clip=1)
+    sets, visits = np.zeros((2, 10, 2, 2), dtype=bool), np.ones((2, 10))
+    sets[0, [3, 7], 1, 1] = True
+    visits[0, 7], visits[1] = 3.0, 5.0
+    table = PolicyTable(task, sparse.csr_array(sets.reshape(40, 2)))
+    save_policy(tmp_path / "policy.npz", table, np.zeros(2))
+    found = policy.read(tmp_path / "policy.npz", lambda _: visits.ravel())
+    for read in (found, policy.unpack_all(policy.pack_all({"a": found}))["a"]):
+        assert read.choices == 2
+        assert read.averaged
+        assert read.on(0).nnz == 0
+        assert read.on(1).toarray() == pytest.approx(np.array([[0.0, 4 / 12], [0.0, 0.0]]))
+
+
+def test_of_sensors_with_footprints_the_cells_that_they_cover_are_kept(tmp_path: Path) -> None:
+    task = Task((1, 3), cost=0.1, t_max=0, safe_cost=1.0, coverage=[[1, 1, 0], [0, 1, 1]])
+    save_policy(tmp_path / "policy.npz", PolicyTable.from_dense(task, np.eye(3, 2, dtype=bool)[:, None]), np.zeros(3))
+    found = policy.read(tmp_path / "policy.npz", _alike)
+    assert found.on(0).toarray().tolist() == [[True, True, False], [False, True, True], [False, False, False]]
 
 
 def test_motion_and_references_are_kept_per_world(whole: Path) -> None:

@@ -17,7 +17,7 @@ from trackmdp.policies.policy import Policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.bounds import clocked
 from trackmdp.solvers.evaluate import evaluate
-from trackmdp.solvers.keyed import KeyedPairs, averaged
+from trackmdp.solvers.keyed import KeyedPairs, averaged, visits_of_keys
 from trackmdp.solvers.keyed_proof import told_bound
 from trackmdp.solvers.keyed_search import cell_bound, mode_bound, solve_keys
 from trackmdp.world.env import TrackEnv
@@ -195,3 +195,14 @@ def test_what_a_hidden_mode_does_not_go_with() -> None:
         headings(window=1)
     with pytest.raises(UserError, match="72 rows"):
         headings(size=4).__class__(headings().kernel, 4, modes=8, cost=0.1, t_max=1)
+
+
+@pytest.mark.parametrize("memory", ["cell", "displacement"])
+def test_keys_are_visited_at_the_start_and_at_each_detection(memory: str) -> None:
+    world = headings(3, t_max=1, memory=memory)
+    policy = random_policy(world, 5)
+    found, visits = evaluate(world, policy), visits_of_keys(world, policy)
+    assert found.detections is not None
+    assert visits.sum() == pytest.approx(1.0 + found.detections.mean())
+    if memory == "displacement":  # nothing came before the start, and something before each detection
+        assert visits[:: world.keys.num_classes] == pytest.approx(1 / 9)

@@ -7,6 +7,7 @@ import json
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from scipy import sparse
 from trackmdp.config import GROUPS, TableConfig, WorldConfig, world_of
 from trackmdp.config.registry import make
 from trackmdp.errors import UserError
+from trackmdp.policies.table import PolicyTable
 from trackmdp.reports import policy
 from trackmdp.reports.finished import plain_config, read_curve, read_run
 from trackmdp.reports.grouping import Study, study, world_key
@@ -24,7 +26,7 @@ from trackmdp.reports.maps import MOST_MAP_CELLS
 from trackmdp.reports.results import Anomaly, FinishedRun, MotionTable, Results
 from trackmdp.solvers import bounds, qmdp
 from trackmdp.solvers.evaluate import evaluate
-from trackmdp.solvers.keyed import averaged
+from trackmdp.solvers.keyed import averaged, visits_of_keys
 from trackmdp.solvers.keyed_search import cell_bound
 from trackmdp.solvers.renewal import DIRECT_CELLS
 from trackmdp.training.folders import FAILED_FILE, PLAN
@@ -32,7 +34,8 @@ from trackmdp.training.sealing import SUMMARY, check_files, read_summary
 from trackmdp.untrusted import known_object, printable
 from trackmdp.world.checks import canonical_kernel
 from trackmdp.world.make import build_world, of_task
-from trackmdp.world.modes import HiddenWorld
+from trackmdp.world.model import Array
+from trackmdp.world.modes import HiddenWorld, Modelled
 
 _LONGEST = 4096
 """Characters of the longest path of a plan that is looked at."""
@@ -167,8 +170,9 @@ def _policies(folder: Path, grouped: Study) -> tuple[dict[str, policy.Sensed], l
     found: dict[str, policy.Sensed] = {}
     anomalies = []
     for runs in grouped.groups.values():
-        # A map has one plan a cell; what remembers more has too many to be drawn.
-        if runs[0].settings.get("task.memory", "cell") != "cell":
+        settings = runs[0].settings
+        # No motion is known that would say how often what is remembered comes about.
+        if settings["kernel.name"] == "tracks" and settings.get("task.memory", "cell") != "cell":
             continue
         # The middle one by AIHTR: the best would flatter the method, and a mean of policies is not a policy.
         ranked = sorted(runs, key=lambda run: (run.figure("aihtr"), run.seed))
@@ -178,7 +182,9 @@ def _policies(folder: Path, grouped: Study) -> tuple[dict[str, policy.Sensed], l
             try:
                 # Against the summary's digest: a policy copied from another run would be drawn under this one's name.
                 check_files(folder / run.name, read_summary(folder / run.name), policy.POLICY_FILE)
-                found[run.name] = policy.read(folder / run.name / policy.POLICY_FILE)
+                place = folder / run.name
+                visits = partial(_visits, place, hides=_hides(run))
+                found[run.name] = policy.read(place / policy.POLICY_FILE, visits)
                 break
             except UserError as error:
                 anomalies.append(Anomaly(run.name, str(error).removeprefix(f"{folder / run.name}/")))
@@ -210,20 +216,30 @@ def _hides(run: FinishedRun) -> bool:
     return schema is not None and schema.hides
 
 
+def _modelled(cfg: WorldConfig, *, hides: bool) -> Modelled:
+    """The world of a run."""
+    if not hides:
+        return build_world(cfg)
+    kernel = canonical_kernel(make(cfg.kernel, cfg.grid.size))
+    return HiddenWorld(kernel, cfg.grid.size, modes=kernel.shape[0] // cfg.grid.num_cells, **of_task(cfg))
+
+
+def _visits(place: Path, table: PolicyTable, *, hides: bool) -> Array:
+    """`[keys]`, see `policy.read`."""
+    return visits_of_keys(_modelled(_world_config(place), hides=hides), table)
+
+
 def _motion(cfg: WorldConfig, *, hides: bool) -> MotionTable:
     """What maps show besides the policy; the motion only where it is drawn, cell by cell."""
-    if hides:
-        kernel = canonical_kernel(make(cfg.kernel, cfg.grid.size))
-        modes = kernel.shape[0] // cfg.grid.num_cells
-        hidden = HiddenWorld(kernel, cfg.grid.size, modes=modes, **of_task(cfg))
-        world, bound = averaged(hidden), cell_bound(hidden)
+    problem = _modelled(cfg, hides=hides)
+    if isinstance(problem, HiddenWorld):
+        world, bound = averaged(problem), cell_bound(problem)
     else:
-        hidden, world = None, build_world(cfg)
-        bound = bounds.clocked(world)
+        world, bound = problem, bounds.clocked(problem)
     m = world.num_cells
     drawn = world.kernel if m <= MOST_MAP_CELLS else sparse.csr_array(world.kernel.shape)
     # Where Q_MDP senses little, its value takes minutes and gigabytes on a large grid.
-    simple = evaluate(hidden or world, qmdp.solve(world)).value if m <= DIRECT_CELLS else np.full(m, np.nan)
+    simple = evaluate(problem, qmdp.solve(world)).value if m <= DIRECT_CELLS else np.full(m, np.nan)
     return MotionTable(drawn, simple, bound)
 
 

@@ -47,7 +47,7 @@ def scenes(policy: Sensed, motion: MotionTable) -> list[Scene]:
 
     Nothing is drawn by chance: the target goes to the likeliest unsensed cell, then to the likeliest sensed one.
     """
-    if policy.choices < 2:
+    if policy.choices < 2 or policy.averaged:
         return []
     kernel, first, second = motion.kernel, policy.on(0), policy.on(1)
     # Rows belong to located cells: the mass that the first set left unsensed, and the same moved once more.

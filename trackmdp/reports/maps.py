@@ -28,6 +28,9 @@ MOST_TILES = 60
 LEVELS = 24
 """Shades of a colour scale."""
 ON, OFF, IDLE = "#0072b2", "#dcebf4", "#d55e01"
+_SIDE = 0.92
+"""Of a cell's square: the gap shows the grid without lines."""
+_AVERAGED = " Plans differ by what is remembered or told: filled areas are shares of the detections in a tile's cell."
 
 
 def policy_map(name: str, where: str, policy: Sensed, motion: MotionTable, size: tuple[int, int]) -> Figure:
@@ -39,45 +42,48 @@ def policy_map(name: str, where: str, policy: Sensed, motion: MotionTable, size:
     if cells > MOST_MAP_CELLS:
         return _intensity_map(name, where, policy, size)
     shown = list(range(min(choices, 2)))
-    # `[n][M, M]`, row x belonging to the target located in x.
+    # `[n][M, M]`, row x belonging to the target located in x; shares of the detections there, or bool.
     chains = [policy.on(n).toarray() for n in range(choices)]
     possible = _possible(chains, motion, len(shown))
 
     def paint(figure: Canvas) -> None:
         # A stored plan has a set for every n; where the miss cannot happen it is arbitrary, and never comes about.
-        drawn = [chains[n] & possible[n].any(axis=1, keepdims=True) for n in shown]
+        drawn = [chains[n] * possible[n].any(axis=1, keepdims=True) for n in shown]
         # One size of tile for all, so that they can be compared: that of the farthest cell drawn.
-        reach = max(_farthest(can | on, size[1]) for can, on in zip(possible, drawn, strict=True))
+        reach = max(_farthest(can | (on > 0), size[1]) for can, on in zip(possible, drawn, strict=True))
         for axes, n in zip(np.atleast_1d(figure.subplots(len(shown), 1)), shown, strict=True):
             _tiles(axes, drawn[n], possible[n], size, max(reach, 1))
             axes.set_title("just located (n = 0)" if n == 0 else "after one miss (n = 1)")
 
     rows: list[list[Cell]] = [
-        [x, n, int((on := chains[n][x]).sum()), int(possible[n][x].sum()), _cells_text(on, size[1])]
+        [x, n, (on := chains[n][x]).sum().item(), int(possible[n][x].sum()), _cells_text(on, size[1])]
         for x in range(cells)
         for n in shown
         # No row where this many misses cannot happen.
         if possible[n][x].any()
     ]
-    columns = [Column("located in cell"), Column("misses n"), Column("sensors on"), Column("possible cells")]
+    sensed = Column("cells sensed", 2 if policy.averaged else 0)
+    columns = [Column("located in cell"), Column("misses n"), sensed, Column("possible cells")]
     title = f"Sets sensed around each located cell, {where}"
-    table = Table(f"sets-{name}", title, [*columns, Column("cells sensed (row.column)")], rows)
+    table = Table(f"sets-{name}", title, [*columns, Column("which (row.column)")], rows)
     reached = [possible[n].any(axis=1) for n in shown]
     mean = [float(chains[n][r].sum(axis=1).mean()) if r.any() else 0.0 for n, r in enumerate(reached)]
     unsensed = [
-        float((possible[n] & ~chains[n])[r].sum(axis=1).mean()) if r.any() else 0.0 for n, r in enumerate(reached)
+        float((possible[n] * (1.0 - chains[n]))[r].sum(axis=1).mean()) if r.any() else 0.0
+        for n, r in enumerate(reached)
     ]
     text = "Each tile is one located cell and its neighbourhood. " + " ".join(
-        f"At n = {n}: {on:.2f} sensors on, {off:.2f} possible cells left out on average."
+        f"At n = {n}: {on:.2f} cells sensed, {off:.2f} possible ones left out on average."
         for n, on, off in zip(shown, mean, unsensed, strict=True)
     )
+    text += _AVERAGED if policy.averaged else ""
     return draw_figure(f"sets-{name}", title, text, table, 0.4 + 3.9 * len(shown), paint)
 
 
 def _intensity_map(name: str, where: str, policy: Sensed, size: tuple[int, int]) -> Figure:
-    """How many sensors are on after no miss and after one, by where the target was located."""
+    """How many cells are sensed after no miss and after one, by where the target was located."""
     shown = range(min(policy.choices, 2))
-    layers = {f"sensors on at n = {n}": np.diff(policy.on(n).indptr).astype(np.float64) for n in shown}
+    layers = {f"cells sensed at n = {n}": policy.on(n).sum(axis=1).astype(np.float64) for n in shown}
     means = {label: binned(number, size) for label, number in layers.items()}
 
     def paint(figure: Canvas) -> None:
@@ -86,7 +92,7 @@ def _intensity_map(name: str, where: str, policy: Sensed, size: tuple[int, int])
         for axes, n in zip(every, shown, strict=True):
             axes.set_title("just located (n = 0)" if n == 0 else "after one miss (n = 1)")
 
-    title = f"Sensors on, by where the target was located, {where}"
+    title = f"Cells sensed, by where the target was located, {where}"
     return draw_figure(
         f"sets-{name}", title, _said(layers, size), _tiles_table(f"sets-{name}", title, means, size), 3.2, paint
     )
@@ -194,7 +200,7 @@ def _rounded(values: Array) -> Array:
     return np.where(np.abs(values) < 1e-9, 0.0, values)
 
 
-def _possible(chains: Sequence[BoolArray], motion: MotionTable, steps: int) -> list[BoolArray]:
+def _possible(chains: Sequence[Array], motion: MotionTable, steps: int) -> list[BoolArray]:
     """`[M, M]` each: where the target may be after n misses and one more move."""
     # `[M, M]` joint mass: row x, the target located in x and moved once. Sensed mass is taken out before the next
     # move: had it been there, it would have been located.
@@ -202,32 +208,36 @@ def _possible(chains: Sequence[BoolArray], motion: MotionTable, steps: int) -> l
     found = []
     for n in range(steps):
         found.append(mass > 0)
-        mass = np.where(chains[n], 0.0, mass) @ motion.kernel
+        mass = (mass * (1.0 - chains[n])) @ motion.kernel
     return found
 
 
-def _tiles(axes: Axes, on: BoolArray, possible: BoolArray, size: tuple[int, int], reach: int) -> None:
+def _tiles(axes: Axes, on: Array, possible: BoolArray, size: tuple[int, int], reach: int) -> None:
     """Draw one tile per located cell.
 
     Args:
         axes: where.
-        on: `[M, M]`, row x: sensors on with the target located in x.
+        on: `[M, M]`, row x: cells sensed with the target located in x, bool or a share.
         possible: `[M, M]`, row x: cells it can be in.
         size: rows and columns of the grid.
         reach: cells shown on each side of the located one.
     """
     rows, columns = size
-    # 2 reach + 1 cells and one between tiles.
+    # 2 reach + 1 cells and one between tiles; squares are (left, top, side).
     side = 2 * reach + 2
-    groups: dict[str, list[tuple[float, float]]] = {ON: [], OFF: [], IDLE: []}
+    groups: dict[str, list[tuple[float, float, float]]] = {OFF: [], ON: [], IDLE: []}
     for x in range(rows * columns):
         row, column = divmod(x, columns)
         # The tile of x begins at (column, row) * side; its centre, x itself, is at + reach, and j is drawn relative to
         # it. In a grid of 10 columns, x = 23 and j = 34: one down, one right.
-        for j in np.flatnonzero(possible[x] | on[x]):
+        for j in np.flatnonzero(possible[x] | (on[x] > 0)):
             down, across = j // columns - row, j % columns - column
-            colour = IDLE if not possible[x, j] else ON if on[x, j] else OFF
-            groups[colour].append((float(column * side + reach + across), float(row * side + reach + down)))
+            left, top, share = column * side + reach + across, row * side + reach + down, on[x, j]
+            for colour, filled in ((OFF, share < 1), (ON, share)) if possible[x, j] else ((IDLE, share),):
+                length = _SIDE * float(filled) ** 0.5  # the area is the share
+                if length:
+                    margin = 0.5 * (_SIDE - length)
+                    groups[colour].append((left + margin, top + margin, length))
     _squares(axes, groups)
     places = (divmod(x, columns) for x in range(rows * columns))
     centres = [(column * side + reach + 0.5, row * side + reach + 0.5) for row, column in places]
@@ -245,18 +255,17 @@ def _tiles(axes: Axes, on: BoolArray, possible: BoolArray, size: tuple[int, int]
         spine.set_color(LINE)
 
 
-def _squares(axes: Axes, groups: dict[str, list[tuple[float, float]]]) -> None:
+def _squares(axes: Axes, groups: dict[str, list[tuple[float, float, float]]]) -> None:
     """All squares of one colour as one path, which keeps the file small."""
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path
 
     codes = [Path.MOVETO, Path.LINETO, Path.LINETO, Path.LINETO, Path.CLOSEPOLY]
-    for colour, corners in groups.items():
-        if not corners:
+    for colour, squares in groups.items():
+        if not squares:
             continue
-        # 0.92 of a cell: the gap shows the grid without lines.
-        points = [[(x, y), (x + 0.92, y), (x + 0.92, y + 0.92), (x, y + 0.92), (x, y)] for x, y in corners]
-        path = Path(np.array(points).reshape(-1, 2), codes * len(corners))
+        points = [[(x, y), (x + s, y), (x + s, y + s), (x, y + s), (x, y)] for x, y, s in squares]
+        path = Path(np.array(points).reshape(-1, 2), codes * len(squares))
         axes.add_patch(PathPatch(path, facecolor=colour, edgecolor="none"))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,8 @@ from scipy import sparse
 from trackmdp.arrays import load_npz
 from trackmdp.errors import UserError
 from trackmdp.policies.saved import load_policy
+from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers.renewal import IndexArray, per_row
 from trackmdp.world.model import Array
 
 POLICY_FILE = "policy.npz"
@@ -25,8 +27,8 @@ class Sensed:
     """What a deterministic policy senses, and what that earns.
 
     Attributes:
-        sets: `[M (t_max + 1), M]` bool, row x (t_max + 1) + n the sensors on at n misses after the target was located
-            in x.
+        sets: `[M (t_max + 1), M]` bool, row x (t_max + 1) + n the cells sensed at n misses after the target was located
+            in x; a share of the detections there, where the policy remembers or is told more than the cell.
         value: `[M]`, expected reward of an episode from each start cell, exactly.
     """
 
@@ -38,8 +40,13 @@ class Sensed:
         """t_max + 1."""
         return int(self.sets.shape[0] // self.sets.shape[1])
 
+    @property
+    def averaged(self) -> bool:
+        """Whether `sets` are shares."""
+        return bool(self.sets.dtype != np.bool_)
+
     def on(self, n: int) -> sparse.csr_array:
-        """`[M, M]` bool, the sensors on at n misses after the target was located in each cell."""
+        """`[M, M]`, the cells sensed at n misses after the target was located in each cell."""
         return self.sets[n :: self.choices]
 
 
@@ -57,7 +64,7 @@ def pack_all(policies: Mapping[str, Sensed]) -> bytes:
     """The bytes of a file with many policies, each under a name."""
     every = list(policies.values())
     # All in one row of arrays, one after the other, as `results` packs motions: a CSR matrix of m rows has m + 1 row
-    # pointers, which begin anew at 0 for each policy. Every entry stored is a sensor on.
+    # pointers, which begin anew at 0 for each policy. Every entry stored is a sensor on, or with `shares` that share.
     packed = {
         "names": np.array(list(policies), dtype=np.str_),
         # `reshape`: no policy at all is still a table of three columns.
@@ -66,6 +73,9 @@ def pack_all(policies: Mapping[str, Sensed]) -> bytes:
         "indptr": np.concatenate([each.sets.indptr for each in every] or [np.zeros(0)]).astype(np.int64),
         "values": np.concatenate([each.value for each in every] or [np.zeros(0)]),
     }
+    if any(each.averaged for each in every):
+        packed["shares"] = np.concatenate([each.sets.data.astype(np.float32) for each in every])
+        packed["averaged"] = np.array([each.averaged for each in every])
     stream = io.BytesIO()
     np.savez_compressed(stream, **packed)  # type: ignore[arg-type]
     return stream.getvalue()
@@ -77,20 +87,29 @@ def unpack_all(content: bytes) -> dict[str, Sensed]:
     Raises:
         Exception: the bytes are something else; call it inside `untrusted.decoded`.
     """
-    names, shapes, indices, indptr, values = arrays(content, "names", "shapes", "indices", "indptr", "values")
+    stored = load_npz(io.BytesIO(content))
+    names, shapes, indices, indptr, values = (stored[key] for key in ("names", "shapes", "indices", "indptr", "values"))
+    shares, averaged = stored.get("shares", np.ones(len(indices))), stored.get("averaged", np.zeros(len(names)))
     found: dict[str, Sensed] = {}
     # The last sum is the end of each stream, not a place to cut.
-    cuts = [np.cumsum(sizes)[:-1] for sizes in (shapes[:, 2], shapes[:, 0] + 1, shapes[:, 1])]
-    parts = zip(*(np.split(each, cut) for each, cut in zip((indices, indptr, values), cuts, strict=True)), strict=True)
-    for name, (rows, columns, nnz), (cells, pointer, value) in zip(names, shapes.tolist(), parts, strict=False):
-        sets = sparse.csr_array((np.ones(nnz, dtype=bool), cells, pointer), shape=(rows, columns))
+    sizes = (shapes[:, 2], shapes[:, 2], shapes[:, 0] + 1, shapes[:, 1])
+    streams = zip((indices, shares, indptr, values), sizes, strict=True)
+    parts = zip(*(np.split(each, np.cumsum(size)[:-1]) for each, size in streams), strict=True)
+    for name, shape, mean, (cells, data, *rest) in zip(names, shapes.tolist(), averaged, parts, strict=False):
+        (rows, columns, _), (pointer, value) = shape, rest
+        sets = sparse.csr_array((data.astype(float if mean else bool), cells, pointer), shape=(rows, columns))
         sets.check_format(full_check=True)  # indices of somebody else's file may lead anywhere
         found[str(name)] = Sensed(sets, value)
     return found
 
 
-def read(file: Path) -> Sensed:
+def read(file: Path, visits: Callable[[PolicyTable], Array]) -> Sensed:
     """Read a policy back.
+
+    Args:
+        file: of a run.
+        visits: `[keys]` of a policy that remembers or is told more than the cell, how often it comes to each key: its
+            plans for one cell are averaged with these weights.
 
     Raises:
         UserError: the file is missing or damaged, or holds something else.
@@ -100,9 +119,26 @@ def read(file: Path) -> Sensed:
         raise UserError(f"{file}: not the policy of a run (it has no values)")
     if not table.deterministic:
         raise UserError("policy: draws its sets at random, so that there is no table of them")
+    task = table.task
     # One probability for all sensors is written out: all of them on, on a grid small enough, or none.
-    shape = (table.task.num_keys * table.task.num_choices, table.task.num_cells)
+    shape = (task.num_keys * task.num_choices, task.total_sensors)
     none = sparse.csr_array(shape, dtype=bool)
     written = none if table.probability == 0.0 else None
     sets = table.sets if table.sets is not None else written
-    return Sensed(sparse.csr_array(table.dense().reshape(shape)) if sets is None else sets, value)
+    sets = sparse.csr_array(table.dense().reshape(shape)) if sets is None else sets
+    sets = sets if task.coverage is None else task.coverage.seen(sets)
+    return Sensed(_averaged(table, sets, visits(table)) if task.keyed else sets, value)
+
+
+def _averaged(policy: PolicyTable, sets: sparse.csr_array, visits: Array) -> sparse.csr_array:
+    """`[M (t_max + 1), M]`, means of `sets` `[keys (t_max + 1), M]` over the keys of each cell."""
+    task = policy.task
+    keys: IndexArray = np.arange(task.num_keys)
+    cells = task.keys.cell(keys)
+    # no cell without visits: episodes start anywhere
+    share = visits / per_row(cells, visits, task.num_cells)[cells]
+    means = sparse.csr_array((share, (cells, keys)), shape=(task.num_cells, task.num_keys))
+    # Row x (t_max + 1) + n of the result is that of the keys at the same n.
+    found = sparse.kron(means, sparse.eye_array(task.num_choices), format="csr") @ sets.astype(np.float64)
+    found.sort_indices()
+    return sparse.csr_array(found)

@@ -198,6 +198,14 @@ def evaluate_keys(world: HiddenWorld, policy: PolicyTable) -> Evaluation:
     return pooled(of_cell[:, :5], of_cell[:, 5], left * float(totals[:, 5].max()))
 
 
+def visits_of_keys(problem: World | HiddenWorld, policy: PolicyTable) -> Array:
+    """`[keys]`, how often an episode's start or a detection leaves each key of a deterministic policy, expected."""
+    hidden = problem if isinstance(problem, HiddenWorld) else HiddenWorld(problem.kernel, modes=1, **problem.given)
+    pairs = KeyedPairs(hidden.but(**{name: getattr(policy.task, name) for name in ("memory", "clip", "revealed")}))
+    visits = pairs.value(pairs.sets(policy))[1]
+    return per_row(pairs.key, visits, pairs.world.num_keys)
+
+
 def _solved(transition: sparse.csr_array, gathered: Array, guess: Array | None = None) -> tuple[Array, float]:
     """The solution of v = gathered + transition v, and its largest residual, 0 where it was factorised."""
     system = RenewalSystem(transition, direct=_DIRECT)
