@@ -1,7 +1,8 @@
 """Pictures of everything that people look at, to be looked at: ``python -m tests.screenshots FOLDER``.
 
-A sweep of four short runs, its report and the page of an episode, each on a desktop, on a phone and in the dark; and
-what the commands print in a terminal of 80 columns. Takes Chromium and the extra `report`; about a minute.
+A sweep of four short runs, its report, the page of an episode and that of recorded tracks, each on a desktop, on a
+phone and in the dark; and what the commands print in a terminal of 80 columns. Takes Chromium and the extras `report`
+and `tracks`; about two minutes.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from rich.text import Text
 from tests.episodes.browser import Browser
 
 VIEWS = {"desktop": (1280, 900, "light"), "phone": (390, 844, "light"), "dark": (1280, 900, "dark")}
-TERMINAL = {"80": (720, 900, "light")}
+TERMINAL = {"80": (800, 300, "light")}  # 80 letters are 770 pixels wide; the page is as high as its text
+CITY = ("kernel.step=5", "kernel.cell=50", "grid.size=[18,15]", "cost.sensor=0.1")
 SHORT = ("algo.total_frames=60_000", "algo.frames_per_batch=10_000")
 
 
@@ -59,20 +61,24 @@ def terminal_page(text: str, file: Path) -> None:
 def main(folder: Path) -> None:
     """Make the pictures in `folder`."""
     folder.mkdir(parents=True, exist_ok=True)
-    sweep, run, episode = folder / "sweep", folder / "run", folder / "episode.html"
-    log = run / "episodes.mcap"
+    sweep, run, episode, tracks = (folder / each for each in ("sweep", "run", "episode.html", "tracks"))
+    city = f"kernel.path={Path(__file__).parent / 'data/city.csv'}"
     commands = {
-        "train": ["train", *SHORT, f"hydra.run.dir={run}", "log=[mcap]"],
+        "train": ["train", "cost.sensor=0.22", f"hydra.run.dir={run}"],
+        "evaluate": ["evaluate", f"run={run}", "log=[mcap]", "episodes=20", f"hydra.run.dir={run}/e"],
+        "tracks": ["evaluate", "baseline=qmdp", "kernel=tracks", city, *CITY, f"hydra.run.dir={tracks}"],
         "sweep": ["train", "-m", "seed=0,1", "cost.sensor=0.16,0.22", *SHORT, f"hydra.sweep.dir={sweep}"],
         "report": ["report", f"sweep={sweep}"],
         "watch": ["report", f"sweep={sweep}", "watch=true"],
         "verify": ["verify", f"hydra.run.dir={folder / 'verify'}"],
         "solve": ["solve", "cost.sensor=0.22", f"hydra.run.dir={folder / 'solve'}"],
-        "replay": ["replay", f"file={log}", f"html={episode}"],
+        "list": ["replay", f"file={run}/e/episodes.mcap"],
+        "replay": ["replay", f"file={run}/e/episodes.mcap", "episode=3", f"html={episode}"],
         "mistake": ["train", "algo.lr=3"],
         "help": ["train", "algo=ppo", "--help"],
+        "commands": ["--help"],
     }
-    pages = {"report": sweep / "report/report.html", "episode": episode}
+    pages = {"report": sweep / "report/report.html", "episode": episode, "tracks": tracks / "tracks.html"}
     for name, words in commands.items():
         terminal_page(in_terminal(words), page := folder / f"terminal-{name}.html")
         pages[f"terminal-{name}"] = page
@@ -81,6 +87,8 @@ def main(folder: Path) -> None:
             for view, (width, height, scheme) in (TERMINAL if "terminal" in name else VIEWS).items():
                 browser.view(width, height, scheme)
                 browser.open(page)
+                if name == "episode":  # at its first miss
+                    browser.ask("show(data.located.findIndex((seen) => !seen))")
                 browser.shoot(folder / f"{name}-{view}.png")
     sys.stdout.write(f"{len(list(folder.glob('*.png')))} pictures in {folder}\n")
 

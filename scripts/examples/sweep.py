@@ -1,21 +1,21 @@
-"""A sweep from Python: prices against T_max, each policy learned blind and held against the proved optimum."""
+"""A sweep by the command line and its report: `python scripts/examples/sweep.py FOLDER` (extra: report)."""
 
 from __future__ import annotations
 
-import trackmdp as tm
+import sys
+from pathlib import Path
+
+from trackmdp.app.cli import main as trackmdp
+
+WORLDS = ("grid.size=6", "kernel.support_size=3,5", "cost.sensor=0.16,0.22", "algo.total_frames=50_000")
 
 
-def main(frames: int = 100_000) -> None:
-    """Print one line per world; regret is per step, to a bound that no policy exceeds."""
-    print("cost   T_max   learned   optimum   regret per step")
-    for cost in (0.1, 0.2):
-        for t_max in (0, 1, 2):
-            world = tm.make_world("random_support", size=6, cost=cost, t_max=t_max)
-            run = tm.train(world, "hindsight", seed=0, total_frames=frames)
-            best = tm.solve(world)
-            regret = (best.upper - run.evaluation.aihtr) / run.evaluation.expected_length
-            print(f"{cost:4.2f} {t_max:7d} {run.evaluation.aihtr:9.3f} {best.upper:9.3f} {regret:14.5f}")
+def main(folder: Path) -> None:
+    """Train in four worlds, each in a process of its own, and print where the page about them is."""
+    trackmdp(["train", "-m", *WORLDS, f"hydra.sweep.dir={folder}", "quiet=true"])
+    trackmdp(["report", f"sweep={folder}", "quiet=true"])
+    print(folder / "report" / "report.html")
 
 
 if __name__ == "__main__":
-    main()
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "multirun/example"))

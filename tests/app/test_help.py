@@ -108,6 +108,7 @@ def test_help_shows_the_values_of_conf(capsys: pytest.CaptureFixture[str]) -> No
     ):
         assert f" {expected}" in text
     assert "cost.sensor=0.16 " in text
+    assert "  algo.entropy: weight of the entropy bonus\n  algo.entropy.start=0.15 " in text
     assert "(default: random_support)" in " ".join(text.split())
 
 
@@ -115,6 +116,7 @@ def test_overview_and_unknown_commands(capsys: pytest.CaptureFixture[str]) -> No
     assert main([]) == main(["--help"]) == 0
     text = capsys.readouterr().out
     assert all(f"  {command} " in text for command in COMMANDS)
+    assert max(map(len, text.splitlines())) < 80
     assert main(["trian"]) == 2
     assert capsys.readouterr().err.startswith("trackmdp: unknown command 'trian': expected one of train, ")
 

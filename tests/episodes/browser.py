@@ -110,6 +110,12 @@ class Browser:
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
 
+    def smallest_letters(self) -> float:
+        """The height of the smallest text of all drawings, in pixels."""
+        scale = "((to) => Math.hypot(to.a, to.b))(text.getScreenCTM())"  # of the drawing, turned text included
+        size = f"parseFloat(getComputedStyle(text).fontSize) * {scale}"
+        return float(self.ask(f"Math.min(...[...document.querySelectorAll('svg text')].map((text) => {size}))"))
+
     def press(self, key: str) -> None:
         """A key, as the keyboard sends it."""
         code = {" ": 32, "ArrowLeft": 37, "ArrowRight": 39, "Home": 36, "End": 35}.get(key, ord(key[0]))

@@ -136,6 +136,7 @@ def test_the_page_in_a_browser(reader: EpisodeReader, tmp_path: Path) -> None:
         assert value("step") >= 3
         browser.ask("document.getElementById('next').click()")
         assert browser.ask("document.documentElement.scrollWidth") <= 360
+        assert browser.smallest_letters() >= 11
         assert browser.ask("getComputedStyle(document.body).backgroundColor") == "rgb(22, 24, 27)"
         browser.shoot(tmp_path / "phone.png")
         browser.view(1000, 760, "light")

@@ -214,6 +214,23 @@ def test_draws_that_depend_on_draws_before_are_refused_and_can_be_simulated() ->
     assert evaluate(once, actor).aihtr == evaluate(once, stochastic(reads_history=False)).aihtr
 
 
+def test_a_recurrent_module_keeps_its_state_in_every_episode() -> None:
+    """It counts its steps and senses everything at every third; at the first it is given None."""
+
+    def turn(cell: torch.Tensor, count: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
+        count = torch.zeros_like(cell) if count is None else count
+        return (count % 3 == 0).unsqueeze(-1).expand(-1, 9), count + 1
+
+    module = TensorDictModule(turn, in_keys=["last_cell", "count"], out_keys=["action", ("next", "count")])
+    world = replace(WORLD, t_max=4)  # never forced: of three steps one detects
+    with pytest.raises(UserError, match="keeps count from step to step, so it has no exact value; simulate it"):
+        evaluate(world, module)
+    for _ in range(2):
+        for episode in simulate(world, module, 40).complete():
+            on = episode.action.sum(axis=1)
+            assert on.tolist() == [9 if t % 3 == 0 else 0 for t in range(len(on))]
+
+
 def test_in_a_window_a_mixture_is_over_its_sensors() -> None:
     world = windowed()
     made = as_policy(world, stochastic(reads_history=False, width=9))
@@ -264,7 +281,7 @@ def sequence(key: str) -> TensorDictModule:
 WRONG: dict[str, tuple[Any, str]] = {
     "numbers": (lambda x, n, h: torch.zeros(len(x), M), r"returned float32 \[9, 9\], expected bool \[9, 9\]"),
     "another width": (lambda x, n, h: torch.zeros(len(x), M + 1, dtype=torch.bool), r"bool \[9, 10\]"),
-    "recurrent": (sequence("hidden"), "reads hidden"),
+    "reads more": (sequence("hidden"), "reads hidden"),
     "reads the target": (sequence("target"), "reads target"),
     "no action": (TensorDictModule(torch.nn.Identity(), in_keys=["last_cell"], out_keys=["a"]), "writes no action"),
     "a number": (3, "got int"),

@@ -133,11 +133,26 @@ def test_a_map_of_averaged_plans_fills_the_share_of_each_cell() -> None:
 def test_a_value_map_holds_every_cell(results: Results) -> None:
     name, kept = next(iter(results.policies.items()))
     motion = results.motions["a2c-0.16-0"]
-    figure = maps.value_map(name, "here", kept, motion, (3, 3))
+    figure = maps.value_map(name, "here", kept, motion, (3, 3), maps.value_scales([(kept, motion)]))
     assert [row[3] for row in figure.table.rows] == kept.value.tolist()
     assert figure.table.rows[5][:3] == [5, 2, 3]
     assert [row[4] for row in figure.table.rows] == pytest.approx(motion.clocked - kept.value)
     assert [row[5] for row in figure.table.rows] == pytest.approx(motion.clocked - motion.qmdp)
+
+
+def test_all_value_maps_of_a_page_have_the_same_scales() -> None:
+    """One policy misses nothing, one 100 everywhere but in one cell, where it misses a million, which is clipped."""
+    bound = np.full(100, 50.0)
+    motion = MotionTable(sparse.csr_array((100, 100)), np.full(100, np.nan), bound)
+    worse = bound - 100.0
+    worse[7] = -1e6
+    every = [Sensed(sparse.csr_array((200, 100), dtype=bool), value) for value in (bound, worse)]
+    scales = maps.value_scales((each, motion) for each in every)
+    assert scales == (maps.Scale("viridis", -50.0, 50.0), maps.Scale("magma_r", pytest.approx(1e-3), 100.0, log=True))
+    drawn = [maps.value_map("x", "here", each, motion, (10, 10), scales).svg.decode() for each in every]
+    one, other = (re.findall(r">(−?\d+|10[⁻⁰¹²³]+)</text>", each) for each in drawn)
+    assert one == other and set(one) >= {"−40", "0", "40", "10⁰", "10²"}
+    assert maps.value_scales([(every[0], motion)])[1] == maps.Scale("magma_r", 1e-5, 1.0, log=True)  # nothing missing
 
 
 def test_a_large_grid_is_drawn_as_means_over_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -161,7 +176,7 @@ def test_a_large_grid_is_drawn_as_means_over_tiles(monkeypatch: pytest.MonkeyPat
     assert [row[4] for row in sets.table.rows] == [1.0] * 6
     assert [row[:3] for row in sets.table.rows][4] == [24, 4, 4]
     assert "n = 0: mean 1.46" in sets.text and "tiles of 3 x 3 cells" in sets.text
-    values = maps.value_map("x", "here", kept, motion, size)
+    values = maps.value_map("x", "here", kept, motion, size, maps.value_scales([(kept, motion)]))
     # Q_MDP was not valued: two layers
     assert [len(row) for row in values.table.rows] == [5] * 6
     assert [row[4] for row in values.table.rows] == pytest.approx([0.5] * 6)
@@ -203,7 +218,7 @@ def test_files_are_named_after_what_they_show() -> None:
 def test_a_map_of_a_rectangle_has_its_rows_and_columns(results: Results) -> None:
     name, kept = next(iter(results.policies.items()))
     motion = results.motions["a2c-0.16-0"]
-    flat = maps.value_map(name, "here", kept, motion, (1, 9))
+    flat = maps.value_map(name, "here", kept, motion, (1, 9), maps.value_scales([(kept, motion)]))
     assert flat
     assert [row[1:3] for row in flat.table.rows] == [[1, column] for column in range(1, 10)]
     assert maps.policy_map(name, "here", kept, motion, (1, 9))

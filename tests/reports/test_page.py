@@ -170,7 +170,7 @@ HEADS = "document.querySelectorAll('#outcome table')[0].tHead.rows[0].cells"
 def test_the_page_in_a_browser(report: Report, browser: Browser, tmp_path: Path) -> None:
     file = tmp_path / "report.html"
     file.write_text(report.html(), encoding="utf-8")
-    for width, scheme, colour in ((390, "dark", "rgb(22, 24, 27)"), (1200, "light", "rgb(255, 255, 255)")):
+    for width, scheme, colour in ((390, "dark", "rgb(22, 24, 27)"), (1280, "light", "rgb(255, 255, 255)")):
         browser.view(width, 844, scheme)
         browser.open(file)
         assert browser.ask("document.documentElement.scrollWidth") <= width
@@ -178,6 +178,7 @@ def test_the_page_in_a_browser(report: Report, browser: Browser, tmp_path: Path)
         assert browser.ask("document.querySelectorAll('svg.chart').length") == len(report.figures)
         narrow = "[...document.querySelectorAll('svg.chart')].every((svg) => svg.getBoundingClientRect().width > 250)"
         assert browser.ask(narrow)
+        assert browser.smallest_letters() >= 11
     assert browser.ask(ROWS) == ["a2c", "hindsight"]
     browser.ask(f"{HEADS}[3].querySelector('button').focus()")
     browser.press(" ")

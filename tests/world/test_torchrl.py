@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.transforms import (
     CatFrames,
@@ -28,6 +29,7 @@ from torchrl.envs.transforms import (
     VecNormV2,
 )
 from torchrl.envs.utils import check_env_specs
+from torchrl.modules import GRUModule
 
 from tests.helpers import limited, small_world
 from tests.tracks import by_hand, recorded
@@ -138,6 +140,26 @@ def stepped(env: EnvBase, actions: torch.Tensor) -> torch.Tensor:
         frame, rows = env.step_and_maybe_reset(rows.set("action", action))
         ends.append(frame["next", "done"])
     return torch.stack(ends)
+
+
+def test_a_recurrent_policy_keeps_its_state() -> None:
+    """The state of a GRU after a step is that before the next one, and 0 where an episode begins."""
+    env = TransformedEnv(TrackEnv(limited(small_world(), 4), 3, seed=1), Compose(ObservationVector(), InitTracker()))
+    gru = GRUModule(
+        input_size=env.observation_spec["observation"].shape[-1],
+        hidden_size=9,
+        in_keys=["observation", "state", "is_init"],
+        out_keys=["features", ("next", "state")],
+    )
+    env.append_transform(gru.make_tensordict_primer())
+    check_env_specs(env)
+    on = TensorDictModule(lambda features: features > 0, ["features"], ["action"])
+    with torch.no_grad():
+        frames = env.rollout(20, TensorDictSequential(gru, on), break_when_any_done=False)
+    after, before = frames["next", "state"][:, :-1], frames["state"][:, 1:]
+    done = frames["next", "done"][:, :-1].squeeze(-1)
+    assert done.any() and (before[done] == 0).all()
+    assert torch.equal(before[~done], after[~done]) and (after[~done] != 0).any()
 
 
 def test_the_vector_is_the_state_in_bits() -> None:

@@ -16,13 +16,13 @@ from trackmdp.errors import FAILED, INTERRUPTED, USER_MISTAKE, Preempted, RunErr
 from trackmdp.imports import importing
 
 COMMANDS = {
-    "train": "learn a sensing policy without the motion model, and evaluate it exactly",
+    "train": "learn a policy without the motion model, and evaluate it exactly",
     "evaluate": "value a trained policy or a baseline, exactly and by simulation",
     "solve": "solve a world with its motion model",
     "verify": "check the paper's theorems on a world",
     "benchmark": "measure speed and quality on this machine",
     "export": "write a learned policy as a file that runs without this package",
-    "replay": "list, play, verify and recover logged episodes, or show one as a web page",
+    "replay": "list, play, verify, recover logged episodes, or show one as a page",
     "report": "make figures, tables and a web page of a sweep, or watch it run",
 }
 

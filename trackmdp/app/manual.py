@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import inspect
 import json
+import re
 import textwrap
 from collections.abc import Iterator, Sequence
+from dataclasses import fields
 from typing import Any
 
 from trackmdp.app.sweep.schema import PLUGINS
@@ -170,7 +172,7 @@ def _example(command: str, chosen: str, group: str, name: str) -> Iterator[str]:
     for key, value in _values(group, name, {}).items():
         if isinstance(options(_members(group)[name]).get(key), Option) and not isinstance(value, (dict, list)):
             # "???" is OmegaConf's mark of a value that must be given.
-            shown = "FILE" if value == "???" else json.dumps(value)
+            shown = "FILE" if value == "???" else json.dumps(value).strip('"')
             # An interpolation is not something to type after a `=`: the shell would take the `$`.
             if "$" not in shown:
                 yield f"  trackmdp {command} {chosen} {_prefix(group, name)}{key}={shown}"
@@ -196,16 +198,23 @@ def _read_selectors(group: str, name: str, typed: dict[str, str]) -> Iterator[st
 
 
 def _entries(schema: type[Any], values: Any, prefix: str) -> Iterator[str]:
+    heads = {each.name: each.metadata["nested"] for each in fields(schema) if "nested" in each.metadata}
     for key, item in options(schema).items():
         value = (values or {}).get(key)
         if isinstance(item, Option):
             yield from _entry(f"{prefix}{key}", item, value)
         else:
+            if key in heads:
+                yield from _wrapped(f"  {prefix}{key}: {heads[key]}")
             yield from _entries(item, value, f"{prefix}{key}.")
 
 
 def _entry(key: str, described: Option, value: Any) -> list[str]:
     shown = "" if value == "???" else json.dumps(value, ensure_ascii=False).strip('"')
+    shown = shown.replace("${.", f"${{{key.rpartition('.')[0]}.")
+    # `${per_cell:1.0,${grid.size},10000}` is shown as <1 a cell, at least 10000>, `${algo.envs}` as <algo.envs>
+    shown = re.sub(r"\$\{per_cell:([0-9]+)(?:\.0)?([0-9.]*),\$\{grid\.size\}", r"${\1\2 a cell", shown)
+    shown = re.sub(r"\$\{([^{}]*)\}", lambda found: f"<{found[1].replace(',', ', at least ')}>", shown)
     return _described(f"{key}={shown}", f"{described.help}; {described.expected}")
 
 

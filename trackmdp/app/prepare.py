@@ -145,7 +145,9 @@ def announce(command: str, cfg: CommandConfig, folder: Path, label: str = "") ->
     rows, columns = cfg.grid.sides
     seed = f", seed {cfg.seed}" if hasattr(cfg, "seed") else ""
     where = f"on a {rows}x{columns} grid, T_max {cfg.grid.t_max}, kernel {cfg.kernel.name}{seed}"
-    say(label + " ".join(f"{command} {what} {where} -> {shown(folder)}".split()))
+    line, to = label + " ".join(f"{command} {what} {where}".split()), f"-> {shown(folder)}"
+    # On two lines rather than broken within a name, at the width that every terminal has.
+    say(f"{line}{' ' if len(line) + len(to) < 80 else chr(10) + '  '}{to}")
 
 
 def shown(folder: Path) -> Path:

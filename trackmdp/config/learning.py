@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from trackmdp.config.options import choice, option, refuse
+from trackmdp.config.options import choice, nested, option, refuse
 from trackmdp.config.schema import BYTES, ChoiceConfig, NodeConfig, Sizes
 
 MOST_FRAMES = 10**12
@@ -14,6 +14,8 @@ MOST_FRAMES = 10**12
 
 DEVICE = r"auto|cpu|cuda(:\d+)?"
 """Names of devices."""
+
+LEARNING_RATE, ENTROPY = "step size of the optimiser", "weight of the entropy bonus"
 
 
 @dataclass(kw_only=True)
@@ -70,8 +72,8 @@ class ActorCriticConfig(AlgoConfig):
     knows_footprints: ClassVar[bool] = True
     gamma: float = option("discount while learning; policies are evaluated undiscounted", ge=0, le=1)
     gae_lambda: float = option("λ of the generalised advantage estimate", ge=0, le=1)
-    learning_rate: ScheduleConfig
-    entropy: ScheduleConfig
+    learning_rate: ScheduleConfig = nested(LEARNING_RATE)
+    entropy: ScheduleConfig = nested(ENTROPY)
     critic_coef: float = option("weight of the value loss", ge=0)
     max_grad_norm: float = option("gradients are clipped to this norm", gt=0)
     hidden: int = option("units of the hidden layer, in the actor and in the critic", unit="units", ge=1, le=4096)
@@ -129,8 +131,8 @@ class DqnConfig(AlgoConfig):
     told: ClassVar[bool] = True
     knows_footprints: ClassVar[bool] = True
     gamma: float = option("discount while learning; policies are evaluated undiscounted", ge=0, le=1)
-    learning_rate: ScheduleConfig
-    epsilon: ScheduleConfig
+    learning_rate: ScheduleConfig = nested(LEARNING_RATE)
+    epsilon: ScheduleConfig = nested("probability that a sensor is switched over at random while collecting")
     n_step: int = option("rewards summed before bootstrapping", unit="steps", ge=1, le=64)
     buffer_size: int = option("transitions kept for replay", unit="frames", ge=1)
     batch_size: int = option("transitions per update", unit="frames", ge=1)

@@ -124,15 +124,25 @@ class Option:
     def _kind_in_range(self) -> str:
         kind = _KINDS.get(self._element.kind if self._element else self.kind, str(self.kind))
         if self.ge is not None and self.le is not None:
-            return f"{kind} from {self.ge:g} to {self.le:g}"
+            return f"{kind} from {_told(self.ge)} to {_told(self.le)}"
         signs = ((">=", self.ge), (">", self.gt), ("<=", self.le), ("<", self.lt))
-        limits = [f"{sign} {limit:g}" for sign, limit in signs if limit is not None]
+        limits = [f"{sign} {_told(limit)}" for sign, limit in signs if limit is not None]
         return " ".join([kind, " and ".join(limits)]).strip()
+
+
+def _told(limit: float) -> str:
+    """A limit as one would type it: 1e6, not 1e+06."""
+    return re.sub(r"e\+0*", "e", f"{limit:g}")
 
 
 def option(help: str, **described: Any) -> Any:
     """A dataclass field without a default, described as an `Option` for `--help` and for `validate`."""
     return dataclasses.field(metadata={"option": Option(help, **described)})
+
+
+def nested(help: str) -> Any:
+    """A dataclass field that is a config of its own, with what `--help` says above its options."""
+    return dataclasses.field(metadata={"nested": help})
 
 
 def options(schema: type[Any]) -> dict[str, Option | type[Any]]:

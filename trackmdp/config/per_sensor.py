@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from trackmdp.config.learning import AlgoConfig, ScheduleConfig, check_classes, networks
-from trackmdp.config.options import SELECTORS, Selector, choice, option, refuse
+from trackmdp.config.learning import ENTROPY, LEARNING_RATE, AlgoConfig, ScheduleConfig, check_classes, networks
+from trackmdp.config.options import SELECTORS, Selector, choice, nested, option, refuse
 from trackmdp.config.schema import BYTES, Sizes
 
 SELECTORS["credit"] = Selector(
@@ -36,10 +36,13 @@ class PerSensorConfig(AlgoConfig):
         "all sensors on; or mixed with the policy learned so far, which costs less and shows less",
         choices=("all_on", "mixed"),
     )
-    explore: ScheduleConfig
+    explore: ScheduleConfig = nested("with collect=mixed, share of the steps in which all sensors are on")
     gamma: float = option("discount inside the credit; policies are evaluated undiscounted", ge=0, lt=1)
-    learning_rate: ScheduleConfig
-    blend: ScheduleConfig
+    learning_rate: ScheduleConfig = nested(LEARNING_RATE)
+    blend: ScheduleConfig = nested(
+        "λ, how much the gain of a detection counts by what the policy itself earns after a miss; the rest by the "
+        "clocked bound, which is optimistic"
+    )
     ema_decay: float = option("decay of the exponential moving average of the actor, which is evaluated", ge=0, lt=1)
     batch_size: int = option("path segments per update", unit="segments", ge=1)
     updates: int | None = option(
@@ -128,7 +131,7 @@ class PolicyGradientConfig(PerSensorConfig):
     """What A2C and PPO with a credit per sensor have in common."""
 
     effort: ClassVar[float] = 1.6
-    entropy: ScheduleConfig
+    entropy: ScheduleConfig = nested(ENTROPY)
 
 
 @choice("algo", "a2c_per_sensor", makes="trackmdp.algos.per_sensor:PerSensorA2C")

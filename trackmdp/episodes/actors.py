@@ -14,11 +14,13 @@ from functools import partial
 
 import numpy as np
 import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from trackmdp.policies.playback import Playback
 from trackmdp.policies.policy import Policy, PolicyLike, as_policy, looked_up, rule_of
-from trackmdp.policies.unroll import DrawsError, Rule, acting
+from trackmdp.policies.unroll import STATE_KEYS, DrawsError, Rule, acting, kept_keys, module_action
 from trackmdp.world.costs import Costs
 from trackmdp.world.model import Task
 from trackmdp.world.sight import Sight
@@ -182,9 +184,33 @@ class Asking(_Writing):
         filled = self._slots < states.misses.unsqueeze(1)
         history = self._history[states.row] & filled.unsqueeze(-1)
         with acting():
-            action = self._rule(states.last_cell, states.misses, history)
+            action = self._ask(states, history)
         self._history[states.row, states.misses.clamp_max(len(self._slots) - 1)] = action
         return self._window.to_global(states.last_cell, action)
+
+    def _ask(self, states: States, history: Tensor) -> Tensor:
+        return self._rule(states.last_cell, states.misses, history)
+
+
+class Remembering(Asking):
+    """A recurrent module; what it keeps from step to step is kept for each episode. At the first step it is None."""
+
+    def __init__(self, task: Task, module: TensorDictModuleBase, costs: Costs) -> None:
+        super().__init__(task, partial(module_action, task, module), costs)
+        self._keys, self._kept = kept_keys(module), dict[str, Tensor]()
+
+    def _ask(self, states: States, history: Tensor) -> Tensor:
+        said = dict(zip(STATE_KEYS, (states.last_cell, states.misses, history), strict=True))
+        batch = TensorDict(said, len(states.row)).set("is_init", torch.full((len(states.row), 1), states.step == 0))
+        if states.step:
+            batch.update({key: value[states.row] for key, value in self._kept.items()})
+        action = self._rule(batch)
+        for key in self._keys:
+            after = batch["next", key]
+            if states.step == 0:
+                self._kept[key] = after.new_zeros(self.most_rows, *after.shape[1:])
+            self._kept[key][states.row] = after
+        return action
 
 
 def actor_of(task: Task, policy: PolicyLike | Playback, costs: Costs) -> Actor:
@@ -198,7 +224,10 @@ def actor_of(task: Task, policy: PolicyLike | Playback, costs: Costs) -> Actor:
     try:
         made = as_policy(task, policy)
     except DrawsError:
-        return Asking(task, rule_of(task.remembering(), policy), costs)  # asked step by step, it is told the cell alone
+        told = task.remembering()  # asked step by step, it is told the cell alone
+        if isinstance(policy, TensorDictModuleBase) and kept_keys(policy):
+            return Remembering(told, policy, costs)
+        return Asking(task, rule_of(told, policy), costs)
     if not made.deterministic:
         return Drawing(made, costs)
     return Uniform(made, costs) if made.sets is None else Following(made, costs)

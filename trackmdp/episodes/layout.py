@@ -14,10 +14,11 @@ def layout(size: tuple[int, int]) -> dict[str, Any]:
     panels: dict[str, Any] = {
         "3D!belief": _map("belief", size) | _title("belief, sensors on (light), target (dot)"),
         "3D!policy": _map("policy", size) | _title("probability of being sensed, target (dot)"),
-        "Plot!misses": _plot("/step.n", "/step.n_active"),
-        "Plot!reward": _plot("/step.reward", "/step.ep_return"),
-        "StateTransitions!seen": {"isSynced": True, "paths": [_path("/step.obs")]},
-        "RawMessages!episode": {"topicPath": "/episode"},
+        "Plot!misses": _plot("/step.n_active", "/step.n") | _title("sensors on (orange), misses before (blue)"),
+        "Plot!reward": _plot("/step.ep_return") | _title("total reward of the episode"),
+        "StateTransitions!seen": {"isSynced": True, "paths": [_path("/step.obs")]}
+        | _title("cell in which the target was located (-1: missed)"),
+        "RawMessages!episode": {"topicPath": "/episode"} | _title("episode"),
     }
     # The cells sensed are what the map of the policy shows.
     panels["3D!policy"]["topics"]["/active"]["visible"] = False
@@ -55,10 +56,14 @@ def _title(text: str) -> dict[str, str]:
 
 def _plot(*paths: str) -> dict[str, Any]:
     return {
-        "paths": [_path(path) | {"enabled": True} for path in paths],
+        # named by their colours in the title: a legend would lie over the lines
+        "paths": [
+            _path(path) | {"enabled": True, "color": colour}
+            for path, colour in zip(paths, ("#d55e00", "#0072b2"), strict=False)
+        ],
         "xAxisVal": "timestamp",
         "isSynced": True,
-        "showLegend": True,
+        "showLegend": False,
     }
 
 

@@ -36,7 +36,7 @@ TAKE_ITS_MODE = "simulate it, or take its mode by Policy.from_module"
 
 
 class DrawsError(UserError):
-    """An exact value was asked of something that draws at random."""
+    """An exact value was asked of something that has none: it draws at random, or keeps a state of its own."""
 
 
 def acting() -> set_exploration_type:
@@ -83,6 +83,8 @@ def module_rule(task: Task, module: TensorDictModuleBase) -> Rule:
     # A table has a row for each state of these keys; one that reads more, its own past say, is no function of them.
     known = state_keys(task)
     others = [str(key) for key in module.in_keys if key not in known]
+    if (kept := kept_keys(module)) and set(others) <= {*kept, "is_init"}:
+        raise DrawsError(f"policy: keeps {', '.join(kept)} from step to step, so it has no exact value; simulate it")
     if others:
         raise UserError(f"policy: the module reads {', '.join(others)}, expected {', '.join(known)} at most")
     if "action" not in module.out_keys:
@@ -90,9 +92,23 @@ def module_rule(task: Task, module: TensorDictModuleBase) -> Rule:
 
     def rule(*state: Tensor) -> Tensor:
         batch = TensorDict(dict(zip(known, state, strict=True)), state[0].shape, device=state[0].device)
-        return _checked(module(batch)["action"], (len(state[0]), task.num_sensors), "the module's action is")
+        return module_action(task, module, batch)
 
     return rule
+
+
+def module_action(task: Task, module: TensorDictModuleBase, batch: TensorDict) -> Tensor:
+    """The action of a module in `batch` `[B]`, to which it writes; bool `[B, K]`.
+
+    Raises:
+        UserError: the action has another form.
+    """
+    return _checked(module(batch)["action"], (len(batch), task.num_sensors), "the module's action is")
+
+
+def kept_keys(module: TensorDictModuleBase) -> list[str]:
+    """What a recurrent module reads that it wrote at the step before, under `next`, as TorchRL's GRU and LSTM do."""
+    return [str(key) for key in module.in_keys if ("next", key) in module.out_keys]
 
 
 def _checked(action: Tensor, shape: tuple[int, int], what: str) -> Tensor:

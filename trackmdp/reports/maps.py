@@ -5,14 +5,15 @@ Of a large grid the number of sensors in place of the sets, and means over squar
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from trackmdp.reports.policy import Sensed
 from trackmdp.reports.results import MotionTable
-from trackmdp.reports.style import INK, LINE, Figure, draw_figure
+from trackmdp.reports.style import INK, LINE, Figure, draw_figure, power
 from trackmdp.reports.tables import Cell, Column, Table
 from trackmdp.world.model import Array, BoolArray
 
@@ -31,6 +32,16 @@ ON, OFF, IDLE = "#0072b2", "#dcebf4", "#d55e01"
 _SIDE = 0.92
 """Of a cell's square: the gap shows the grid without lines."""
 _AVERAGED = " Plans differ by what is remembered or told: filled areas are shares of the detections in a tile's cell."
+
+
+@dataclass(frozen=True)
+class Scale:
+    """A scale of colour: matplotlib's name of its colours, the values at its ends, whether it is logarithmic."""
+
+    colours: str
+    low: float
+    high: float
+    log: bool = False
 
 
 def policy_map(name: str, where: str, policy: Sensed, motion: MotionTable, size: tuple[int, int]) -> Figure:
@@ -88,7 +99,7 @@ def _intensity_map(name: str, where: str, policy: Sensed, size: tuple[int, int])
 
     def paint(figure: Canvas) -> None:
         every = list(np.atleast_1d(figure.subplots(1, len(shown))))
-        _shade(figure, every, list(means.values()), "viridis", low=0.0)
+        _shade(figure, every, list(means.values()), Scale("viridis", 0.0, _ends(list(means.values()))[1]))
         for axes, n in zip(every, shown, strict=True):
             axes.set_title("just located (n = 0)" if n == 0 else "after one miss (n = 1)")
 
@@ -98,26 +109,43 @@ def _intensity_map(name: str, where: str, policy: Sensed, size: tuple[int, int])
     )
 
 
-def value_map(name: str, where: str, policy: Sensed, motion: MotionTable, size: tuple[int, int]) -> Figure:
-    """Exact value per start cell, and what the policy and Q_MDP, where it was valued, miss to the clocked bound."""
-    layers = {
-        "value V(x)": policy.value,
-        # Both against the clocked bound, which is the optimum wherever a policy attains it.
-        "missing to the clocked bound": _rounded(motion.clocked - policy.value),
-    }
+VALUE, MISSING, OF_QMDP = "value V(x)", "missing to the clocked bound", "the same, Q_MDP"
+"""Layers of a value map."""
+
+
+def _layers(policy: Sensed, motion: MotionTable) -> dict[str, Array]:
+    # Both against the clocked bound, which is the optimum wherever a policy attains it.
+    layers = {VALUE: policy.value, MISSING: _rounded(motion.clocked - policy.value)}
     if np.isfinite(motion.qmdp).all():
-        layers["the same, Q_MDP"] = _rounded(motion.clocked - motion.qmdp)
+        layers[OF_QMDP] = _rounded(motion.clocked - motion.qmdp)
+    return layers
+
+
+def value_scales(every: Iterable[tuple[Sensed, MotionTable]]) -> tuple[Scale, Scale]:
+    """The two scales of colour that all value maps of a page share: of values, and of what is missing."""
+    drawn = [_layers(*each) for each in every]
+    low, high = _ends([layers[VALUE] for layers in drawn])
+    most = _ends([values for layers in drawn for name, values in layers.items() if name != VALUE])[1]
+    # A good policy misses a thousandth of what Q_MDP does: powers of ten, from a hundred-thousandth of the most.
+    most = most if most > 0 else 1.0
+    return Scale("viridis", low, high), Scale("magma_r", 1e-5 * most, most, log=True)
+
+
+def value_map(
+    name: str, where: str, policy: Sensed, motion: MotionTable, size: tuple[int, int], scales: tuple[Scale, Scale]
+) -> Figure:
+    """Exact value per start cell, and what the policy and Q_MDP, where it was valued, miss to the clocked bound."""
+    layers = _layers(policy, motion)
     means = {label: binned(values, size) for label, values in layers.items()}
 
     def paint(figure: Canvas) -> None:
         # Two scales of colour: values and what is missing are not to be compared by shade. Bright is good in both, much
-        # in viridis and little in magma_r. What is missing has one scale for both policies.
+        # in viridis and little in magma_r.
         first, *missing = figure.subplots(1, len(means))
         value, *short = means.values()
-        _shade(figure, [first], [value], "viridis")
-        _shade(figure, missing, short, "magma_r", low=0.0)
-        labels = ("value V(x)", "below the bound", "Q_MDP's")
-        for axes, label in zip((first, *missing), labels, strict=False):
+        _shade(figure, [first], [value], scales[0])
+        _shade(figure, missing, short, scales[1])
+        for axes, label in zip((first, *missing), (VALUE, "below the bound", "Q_MDP's"), strict=False):
             axes.set_title(label)
 
     title = f"Value of each start cell, and what is missing of the clocked bound, {where}"
@@ -165,33 +193,41 @@ def _tiles_table(name: str, title: str, means: Mapping[str, Array], size: tuple[
     return Table(name, title, [*columns, *(Column(label, 3) for label in means)], rows)
 
 
-def _shade(
-    figure: Canvas, every: Sequence[Axes], layers: Sequence[Array], colours: str, low: float | None = None
-) -> None:
+def _ends(layers: Sequence[Array]) -> tuple[float, float]:
+    # A single outlying cell would leave one shade to all others: the scale ends at the 2nd and the 98th of a hundred.
+    low, high = np.percentile(np.concatenate([values.ravel() for values in layers]), (2, 98))
+    return float(low), float(high)
+
+
+def _shade(figure: Canvas, every: Sequence[Axes], layers: Sequence[Array], scale: Scale) -> None:
     """Shaded cells of one or more layers, with the scale they share."""
     from matplotlib import colormaps
-    from matplotlib.ticker import MaxNLocator
+    from matplotlib.colors import LogNorm, Normalize
+    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 
-    # A single outlying cell would leave one shade to all others: the scale ends at the 2nd and the 98th of a hundred.
-    second, high = np.percentile(np.concatenate([values.ravel() for values in layers]), (2, 98))
-    low = second if low is None else low
+    # 24 shades: the colour bar is then 24 rectangles in the SVG, and not 256.
+    colours = colormaps[scale.colours].resampled(LEVELS)
+    norm = (LogNorm if scale.log else Normalize)(scale.low, scale.high)
     for axes, values in zip(every, layers, strict=True):
-        # 24 shades: the colour bar is then 24 rectangles in the SVG, and not 256.
-        shade = axes.pcolormesh(values, cmap=colormaps[colours].resampled(LEVELS), vmin=low, vmax=high)
+        # On a logarithmic scale 0 has no place; it is what lies beyond its low end.
+        shade = axes.pcolormesh(np.maximum(values, scale.low), cmap=colours, norm=norm)
         # Row 1 on top, as in the numbering of cells.
         axes.invert_yaxis()
         axes.set_aspect("equal")
         axes.set_xticks([])
         axes.set_yticks([])
     # An arrow at an end of the bar: some cells lie beyond it.
-    beyond = (min(values.min() for values in layers) < low, max(values.max() for values in layers) > high)
+    beyond = (min(values.min() for values in layers) < scale.low, max(values.max() for values in layers) > scale.high)
     ends = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}[beyond]
     bar = figure.colorbar(
         shade, ax=list(every), orientation="horizontal", pad=0.03, fraction=0.07, aspect=12 * len(every), extend=ends
     )
     assert bar.solids is not None
     bar.solids.set_rasterized(False)  # a page takes no pictures
-    bar.locator = MaxNLocator(3)
+    bar.locator = LogLocator(numticks=4) if scale.log else MaxNLocator(3)
+    if scale.log:
+        bar.minorticks_off()
+        bar.formatter = FuncFormatter(power)
     bar.update_ticks()
 
 

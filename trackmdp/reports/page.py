@@ -12,7 +12,8 @@ from typing import Any, TypeAlias, TypeGuard
 
 from trackmdp.reports import figures, idea, learning, maps, summaries
 from trackmdp.reports.grouping import Study, study
-from trackmdp.reports.results import Results
+from trackmdp.reports.policy import Sensed
+from trackmdp.reports.results import MotionTable, Results
 from trackmdp.reports.style import Figure
 from trackmdp.reports.tables import Table
 from trackmdp.world.model import grid_size
@@ -186,32 +187,27 @@ def _idea(results: Results, grouped: Study) -> list[Section]:
 
 def _maps(results: Results, grouped: Study) -> list[Section]:
     """Policies and values in the first and the last world."""
-    sets, values, large = list[Figure](), list[Figure](), False
+    found = list[tuple[str, str, Sensed, MotionTable, tuple[int, int]]]()
     # The last and the first world differ most, since worlds are in the order of Z and c; a dict, as they may be the
     # same.
     for world in dict.fromkeys((grouped.worlds[-1], grouped.worlds[0])):
         motion = next((results.motions[r.name] for r in grouped.in_world(world) if r.name in results.motions), None)
         for method in grouped.methods[:MAPPED]:
             run = next((run for run in grouped.of(world, method) if run.name in results.policies), None)
-            if run is None or motion is None:
-                continue
-            name, policy = figures.slug(f"{method}-{world}"), results.policies[run.name]
-            where = f"{method}, {world}, seed {run.seed} (n = 1)"
-            size = grid_size(run.settings["grid.size"])
-            sets.append(maps.policy_map(name, where, policy, motion, size))
-            values.append(maps.value_map(name, where, policy, motion, size))
-            large = large or len(policy.value) > maps.MOST_MAP_CELLS
-    if not sets:
+            if run is not None and motion is not None:
+                name, where = figures.slug(f"{method}-{world}"), f"{method}, {world}, seed {run.seed} (n = 1)"
+                found.append((name, where, results.policies[run.name], motion, grid_size(run.settings["grid.size"])))
+    if not found:
         return []
+    scales = maps.value_scales((policy, motion) for _, _, policy, motion, _ in found)
     note = (
-        ""
-        if large
-        else (
-            "<p>Dot: where the target was located. Filled: sensor on. Pale: possible cell left out. "
-            "Contrasting: sensor on where the target cannot be. The run is the one in the middle of its seeds.</p>"
-        )
+        "<p>Dot: where the target was located. Filled: sensor on. Pale: possible cell left out. Dot alone: no miss can "
+        "happen there. Contrasting: sensor on where the target cannot be. The run is the one in the middle of its "
+        "seeds.</p>"
     )
-    return [Section("maps", "Policies and values, cell by cell", [values, note, sets])]
+    large = any(len(policy.value) > maps.MOST_MAP_CELLS for _, _, policy, _, _ in found)
+    values, sets = [maps.value_map(*each, scales) for each in found], [maps.policy_map(*each) for each in found]
+    return [Section("maps", "Policies and values, cell by cell", [values, "" if large else note, sets])]
 
 
 def _made(manifest: Any) -> str:

@@ -171,20 +171,20 @@ def tidy(axes: Axes) -> None:
     ):
         # Over more than about two powers of ten the powers alone are labels enough.
         if scale == "log" and high > 50 * low:
-            axis.set_major_formatter(FuncFormatter(_power))
+            axis.set_major_formatter(FuncFormatter(power))
             axis.set_minor_formatter(NullFormatter())
         # Over less there may be one power or none in sight: 2 and 5 are labelled as well, as plain numbers.
         elif scale == "log":
             axis.set_minor_locator(LogLocator(subs=(2, 5)))
             for form in (axis.set_major_formatter, axis.set_minor_formatter):
-                form(StrMethodFormatter("{x:g}"))
+                form(StrMethodFormatter("{x:,.6g}"))
     axes.grid(True, color=LINE, linewidth=0.5)
     axes.set_axisbelow(True)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
 
 
-def _power(value: float, _place: int | None = None) -> str:
+def power(value: float, _place: int | None = None) -> str:
     """A power of ten as text with raised digits, such as 10⁻³."""
     return f"10{f'{math.log10(value):.0f}'.translate(_RAISED)}"
 
@@ -219,6 +219,7 @@ def _settings(name: str) -> Any:
         "axes.labelsize": TEXT,
         "xtick.labelsize": TEXT,
         "ytick.labelsize": TEXT,
+        "xtick.minor.pad": 5.0,  # labels of short and long ticks on one line
         "text.color": INK,
         "axes.labelcolor": INK,
         "axes.edgecolor": INK,

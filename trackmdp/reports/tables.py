@@ -132,7 +132,9 @@ class Table:
         return "" if self._is_text(place) else ' class="n"'
 
     def _is_text(self, place: int) -> bool:
-        return all(isinstance(row[place], (str, bool)) for row in self.rows if row[place] is not None)
+        # a column in which nothing is known stands as its numbers would
+        known = [row[place] for row in self.rows if row[place] is not None]
+        return bool(known) and all(isinstance(value, (str, bool)) for value in known)
 
 
 def _plain(value: Cell) -> Any:

@@ -21,12 +21,11 @@ def check_memory(cfg: TrainConfig, task: Task, device: torch.device) -> str:
     """
     parts, free = needs(cfg, task), available_bytes(device)
     total = sum(parts.values())
+    key = max(parts, key=lambda name: parts[name])
     if total > free:
-        key = max(parts, key=lambda name: parts[name])
         value = getattr(getattr(cfg, key.split(".")[0]), key.split(".")[1])
         raise UserError(f"{key}={value}: needs about {gib(total)}, {gib(free)} are available")
-    shares = ", ".join(f"{key} {gib(size)}" for key, size in parts.items())
-    return f"memory: about {gib(total)} of {gib(free)} ({shares})"
+    return f"memory: about {gib(total)} of {gib(free)}, most by {key}"
 
 
 def needs(cfg: TrainConfig, task: Task) -> dict[str, int]:

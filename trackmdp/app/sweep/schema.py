@@ -68,9 +68,8 @@ class OptunaConfig(SweeperConfig):
 
     n_trials: int = option("runs of the whole study, those of earlier calls among them", unit="runs", ge=1)
     objective: str = option(
-        "what is searched for: the largest AIHTR (of any bound, and of the clock, it knows nothing), or the least "
-        "regret to the bound that each run proves in optimal.nodes; the oracle's choice, made with the motion, and "
-        "with kernel=tracks the validation tracks'",
+        "what is searched for: the largest AIHTR, or the least regret to the bound that each run proves in "
+        "optimal.nodes; both are made out with the motion, or with kernel=tracks on the validation tracks",
         choices=("aihtr", "regret_per_step"),
     )
     sampler: str = option("how the next run is chosen", choices=("tpe", "random"))
@@ -78,7 +77,7 @@ class OptunaConfig(SweeperConfig):
     batch: int = option("runs chosen at once, for launchers that run several", unit="runs", ge=1)
     study: str = option("name of the study in its storage", expects="a name")
     storage: str | None = option(
-        "data base of the study; null = study.db in the sweep's folder", expects="a URL such as sqlite:///studies.db"
+        "database of the study; null = study.db in the sweep's folder", expects="a URL such as sqlite:///studies.db"
     )
 
 
