@@ -66,7 +66,8 @@ def main(folder: Path) -> None:
     commands = {
         "train": ["train", "cost.sensor=0.22", f"hydra.run.dir={run}"],
         "evaluate": ["evaluate", f"run={run}", "log=[mcap]", "episodes=20", f"hydra.run.dir={run}/e"],
-        "tracks": ["evaluate", "baseline=qmdp", "kernel=tracks", city, *CITY, f"hydra.run.dir={tracks}"],
+        "tracks": ["train", "algo=path_counts", "kernel=tracks", city, *CITY, f"hydra.run.dir={tracks}"],
+        "held-out": ["evaluate", f"run={tracks}", f"hydra.run.dir={tracks}/e"],
         "sweep": ["train", "-m", "seed=0,1", "cost.sensor=0.16,0.22", *SHORT, f"hydra.sweep.dir={sweep}"],
         "report": ["report", f"sweep={sweep}"],
         "watch": ["report", f"sweep={sweep}", "watch=true"],
@@ -78,7 +79,7 @@ def main(folder: Path) -> None:
         "help": ["train", "algo=ppo", "--help"],
         "commands": ["--help"],
     }
-    pages = {"report": sweep / "report/report.html", "episode": episode, "tracks": tracks / "tracks.html"}
+    pages = {"report": sweep / "report/report.html", "episode": episode, "tracks": tracks / "e/tracks.html"}
     for name, words in commands.items():
         terminal_page(in_terminal(words), page := folder / f"terminal-{name}.html")
         pages[f"terminal-{name}"] = page

@@ -53,11 +53,11 @@ def calibration_figure(every: Sequence[Candidate]) -> Figure:
             axes.plot([best.deviation], [place], "o", color=INK, markersize=8, markerfacecolor="none")
             # To the left: the chosen one is the leftmost of its band, so that the label meets no other dot.
             label, at = f"seed {best.seed}", (best.deviation, place)
-            axes.annotate(label, at, (-8, 0), textcoords="offset points", ha="right", va="center", fontsize=8)
+            axes.annotate(label, at, (-8, 0), textcoords="offset points", ha="right", va="center")
         # Deviations differ by factors, and the choice is among the smallest.
         axes.set_xscale("log")
         # Room for the labels on the left.
-        axes.margins(x=0.3)
+        axes.margins(x=0.4)
         axes.set_yticks(list(COLOURS), [f"Z = {support_size}" for support_size in COLOURS])
         axes.set_xlabel("largest deviation from the printed accuracy (points)")
         tidy(axes)
