@@ -34,7 +34,6 @@ _HOMES = {
     "evaluate": "trackmdp.solvers.evaluate",
     "load_run": "trackmdp.training.run",
     "load_tracks": "trackmdp.world.make",
-    "make_hidden_world": "trackmdp.world.make",
     "make_world": "trackmdp.world.make",
     "simulate": "trackmdp.episodes.simulate",
     "solve": "trackmdp.solvers.solve",
@@ -57,7 +56,6 @@ if TYPE_CHECKING:  # the same once more, for type checkers and editors; `X as X`
     from trackmdp.training.train import train as train
     from trackmdp.world.env import TrackEnv as TrackEnv
     from trackmdp.world.make import load_tracks as load_tracks
-    from trackmdp.world.make import make_hidden_world as make_hidden_world
     from trackmdp.world.make import make_world as make_world
     from trackmdp.world.model import World as World
     from trackmdp.world.modes import HiddenWorld as HiddenWorld

@@ -10,7 +10,7 @@ import io
 import math
 import os
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -105,3 +105,17 @@ def load_npz(stream: BinaryIO, names: Iterable[str] | None = None) -> dict[str, 
 def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> npt.NDArray[Any]:
     with archive.open(member) as stream:
         return load_npy(stream, member.file_size)
+
+
+def npy_bytes(array: npt.NDArray[Any]) -> bytes:
+    """The content of an `.npy` file."""
+    stream = io.BytesIO()
+    np.save(stream, np.ascontiguousarray(array), allow_pickle=False)
+    return stream.getvalue()
+
+
+def npz_bytes(arrays: Mapping[str, Any]) -> bytes:
+    """The content of an `.npz` file; the same arrays, the same bytes."""
+    stream = io.BytesIO()
+    np.savez_compressed(stream, **arrays)
+    return stream.getvalue()

@@ -120,7 +120,7 @@ def test_recorded_tracks_take_hits_as_probabilities() -> None:
         ({"detection": 1.2}, "detection: cell 0 has 1.2, expected a probability above 0, at most 1"),
         ({"detection": [0.5, 0.0]}, "detection: cell 1 has 0.0, expected a probability above 0"),
         ({"safe_detection": np.nan}, "safe_detection: cell 0 has nan"),
-        ({"detection": [0.5]}, r"detection: expected one number or 2 \(one per cell\), got shape \(1,\)"),
+        ({"detection": [0.5]}, r"detection: 1 values, expected one number or 2 \(one per cell\)"),
     ],
 )
 def test_no_probability_is_refused(given: dict[str, object], told: str) -> None:

@@ -112,7 +112,7 @@ def test_blocks_have_their_part_of_a_map(tmp_path: Path) -> None:
     assert (kept[1] == classes[:6, 4:].ravel()).all()
     assert (kept[2] == classes[4:, :6].ravel()).all()
     np.save(tmp_path / "map.npy", classes + 1)
-    with pytest.raises(UserError, match=r"classes.npy: not the classes that algo.share_cells has now"):
+    with pytest.raises(UserError, match=r"classes.npy: not what the run's config describes now"):
         learned(tmp_path / "run", resume="auto", **given)
 
 

@@ -77,7 +77,7 @@ def test_moves_to_cells_that_none_covers_are_inferred(algo: str, options: dict[s
 def test_a_run_of_other_footprints_is_not_resumed(tmp_path: Path) -> None:
     tm.train(_world(), "a2c", folder=tmp_path, **SHORT)
     other = World.of(_world(), _world().kernel, coverage=np.ones((4, 9)))
-    with pytest.raises(UserError, match="footprints are not those"):
+    with pytest.raises(UserError, match=r"footprints.npz: not what the run's config describes now"):
         tm.train(other, "a2c", folder=tmp_path, resume="auto", **SHORT)
 
 

@@ -181,7 +181,7 @@ def test_a_kernel_that_changed_is_refused(
             train(tmp_path / "run", *world)
     np.save(kernel, np.full((9, 9), 0.05))
     assert main(["train", "resume=auto", f"hydra.run.dir={tmp_path / 'run'}"]) == 2
-    assert "the run's kernel is not the one that its config describes now" in capsys.readouterr().err
+    assert "kernel.npz: not what the run's config describes now" in capsys.readouterr().err
 
 
 def test_events_after_the_checkpoint_are_hidden(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

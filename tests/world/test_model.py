@@ -29,7 +29,7 @@ def test_derived_tables() -> None:
 
 
 def test_shapes_that_do_not_fit_are_refused() -> None:
-    with pytest.raises(UserError, match=r"cost: expected one number or 4 \(one per cell\), got shape \(3,\)"):
+    with pytest.raises(UserError, match=r"cost: 3 values, expected one number or 4 \(one per cell\)"):
         Task(2, cost=np.zeros(3), safe_cost=1.0, t_max=0)
     with pytest.raises(UserError, match=r"kernel: 9 rows, but a 2x2 grid has 4 cells"):
         World(np.eye(9), 2, cost=np.zeros(4), safe_cost=1.0, t_max=0)

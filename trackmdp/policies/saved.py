@@ -6,7 +6,6 @@ enough to be worth writing out: a million cells would be 260 MB.
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +13,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from trackmdp.arrays import LARGE, load_npz
+from trackmdp.arrays import LARGE, load_npz, npz_bytes
 from trackmdp.durable import write_bytes, write_json
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.untrusted import decoded, opened, read_object
 from trackmdp.world.coverage import Coverage
+from trackmdp.world.files import whole_csr
 from trackmdp.world.model import Array, Task
 
 LISTED_CELLS = 20_000
@@ -58,10 +58,7 @@ def save_policy(file: Path, policy: PolicyTable, value: Array | None = None, **m
         content["k"] = np.int64(policy.k)
     if value is not None:
         content["value"] = value
-    content |= more
-    stream = io.BytesIO()
-    np.savez_compressed(stream, **content)
-    write_bytes(file, stream.getvalue())
+    write_bytes(file, npz_bytes(content | more))
 
 
 def load_policy(file: Path) -> tuple[PolicyTable, Array | None]:
@@ -166,7 +163,7 @@ def _task(content: dict[str, npt.NDArray[Any]]) -> Task:
 def _sets(content: dict[str, npt.NDArray[Any]], task: Task) -> sparse.csr_array:
     indices, indptr = content["indices"], content["indptr"]
     data = content.get("data", np.ones(len(indices), dtype=bool))
-    sets = _csr(data, indices, indptr, (task.num_keys * task.num_choices, task.total_sensors))
+    sets = whole_csr(data, indices, indptr, (task.num_keys * task.num_choices, task.total_sensors))
     if not np.isfinite(sets.data).all():
         raise UserError("a probability that is not finite")
     return sets
@@ -183,10 +180,4 @@ def _read_footprints(content: dict[str, npt.NDArray[Any]], cells: int) -> sparse
     if "footprint_cells" not in content:
         return None
     indices, indptr = content["footprint_cells"], content["footprint_begin"]
-    return _csr(np.ones(len(indices), dtype=bool), indices, indptr, (len(indptr) - 1, cells))
-
-
-def _csr(data: Any, indices: Any, indptr: Any, shape: tuple[int, int]) -> sparse.csr_array:
-    matrix = sparse.csr_array((data, indices, indptr), shape=shape)
-    matrix.check_format(full_check=True)  # indices of somebody else's file may lead anywhere
-    return matrix
+    return whole_csr(np.ones(len(indices), dtype=bool), indices, indptr, (len(indptr) - 1, cells))

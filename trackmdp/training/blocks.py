@@ -17,6 +17,7 @@ from types import FrameType
 
 from rich.console import Console
 
+from trackmdp.arrays import npy_bytes
 from trackmdp.config import TrainConfig, load_run_config
 from trackmdp.config.learning import AlgoConfig
 from trackmdp.config.partition import PartitionConfig
@@ -33,7 +34,7 @@ from trackmdp.training.callbacks import Callback, Learning
 from trackmdp.training.display import make_console
 from trackmdp.training.evaluator import Evaluator, Score
 from trackmdp.training.held_out import make_evaluator
-from trackmdp.training.inputs import CLASSES, npy_bytes, short, write_inputs
+from trackmdp.training.inputs import CLASSES, short, write_inputs
 from trackmdp.training.lock import locked
 from trackmdp.training.run import complete, load_run
 from trackmdp.training.sealing import read_summary

@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
-import io
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy import sparse
 
-from trackmdp.arrays import LARGE
+from trackmdp.arrays import LARGE, npy_bytes
 from trackmdp.config import TrainConfig
 from trackmdp.config.resume import config_text
 from trackmdp.durable import write_bytes, write_text
 from trackmdp.errors import UserError
 from trackmdp.solvers.alike import cell_classes
 from trackmdp.untrusted import parse_json, read_bytes
+from trackmdp.world.files import csr_bytes
 from trackmdp.world.model import Array
 from trackmdp.world.recording import recording_bytes
 from trackmdp.world.tracks import Problem, Recorded
 
+KERNEL, TRACKS = "kernel.npz", "tracks.json"
+"""The motion, or how many recorded tracks of which content."""
 RECORDING = "recording.npz"
 """The tracks of a run that was begun in Python, which may have been read from any file, or from none."""
 FOOTPRINTS = "footprints.npz"
@@ -39,80 +43,61 @@ def write_inputs(config: TrainConfig, problem: Problem, folder: Path, *, resumed
     Raises:
         UserError: the run that is resumed was begun with another kernel, other tracks or other classes.
     """
-    file, content = folder / _name(problem), _content(problem)
-    # Before anything is written: a run that is refused must keep the inputs that its results belong to.
-    if resumed:
-        check_inputs(problem, folder)
+    contents = _contents(problem)
     classes = cell_classes(getattr(config.algo, "share_cells", None), problem.size)
     if classes is not None and classes.any():
-        file_of_classes = folder / CLASSES
-        if resumed and read_bytes(file_of_classes, most=LARGE) != npy_bytes(classes):
-            raise UserError(f"{file_of_classes}: not the classes that algo.share_cells has now; they cannot change")
-        write_bytes(file_of_classes, npy_bytes(classes))
-    # The config last: with it the folder is that of a run, and all that it names must be there. What was checked stays:
-    # only the process that read the positions can say what it left out of them.
-    if not resumed:
-        write_bytes(file, content)
-        if problem.coverage is not None:
-            write_bytes(folder / FOOTPRINTS, _saved(problem.coverage.matrix))
+        contents[CLASSES] = npy_bytes(classes)
     own = folder.absolute() / RECORDING
-    if isinstance(problem, Recorded) and getattr(config.kernel, "path", None) == str(own) and not resumed:
-        write_bytes(own, recording_bytes(problem))
+    # Before anything is written: a run that is refused must keep the inputs that its results belong to. And what was
+    # checked stays: only the process that read the positions can say what it left out of them.
+    if resumed:
+        _check(contents, folder)
+    else:
+        if isinstance(problem, Recorded) and getattr(config.kernel, "path", None) == str(own):
+            contents[RECORDING] = recording_bytes(problem)
+        for name, content in contents.items():
+            write_bytes(folder / name, content)
+    # The config last: with it the folder is that of a run, and all that it names must be there.
     write_text(folder / "config.yaml", config_text(config))
-
-
-def npy_bytes(array: np.ndarray) -> bytes:
-    """A .npy file."""
-    buffer = io.BytesIO()
-    np.save(buffer, array)
-    return buffer.getvalue()
 
 
 def check_inputs(problem: Problem, folder: Path) -> None:
     """See that the folder's run learned in this world, or from these tracks.
 
     Raises:
-        UserError: its kernel, or which tracks it names, is missing, damaged or another than that of `problem`.
+        UserError: its kernel, its footprints, or which tracks it names, is missing, damaged or another.
     """
-    file = folder / _name(problem)
-    if not _is_content(problem, read_bytes(file, most=LARGE)):
-        what = "recording" if isinstance(problem, Recorded) else "kernel"
-        raise UserError(f"{file}: the run's {what} is not the one that its config describes now; it cannot change")
-    if problem.coverage is not None:
-        file = folder / FOOTPRINTS
-        if read_bytes(file, most=LARGE) != _saved(problem.coverage.matrix):
-            raise UserError(f"{file}: the run's footprints are not those of its config now; they cannot change")
+    _check(_contents(problem), folder)
 
 
-def _is_content(problem: Problem, stored: bytes) -> bool:
-    """Whether `stored` describes the problem; what was left out of a file of positions does not count."""
-    if not isinstance(problem, Recorded):
-        return stored == _content(problem)
+def _check(contents: Mapping[str, bytes], folder: Path) -> None:
+    for name, content in contents.items():
+        stored = read_bytes(folder / name, most=LARGE)
+        if stored != content and not (name == TRACKS and _counted(stored) == _counted(content)):
+            raise UserError(f"{folder / name}: not what the run's config describes now; a run's inputs cannot change")
+
+
+def _counted(content: bytes) -> Any:
+    """What `tracks.json` says of the tracks; what was left out of a file of positions does not count."""
     try:
-        found = parse_json(stored, "tracks.json")
+        said = parse_json(content, TRACKS)
     except UserError:
-        return False
-    own = json.loads(_content(problem))
-    return isinstance(found, dict) and {**found, "loaded": None} == {**own, "loaded": None}
+        return None
+    return {**said, "loaded": None} if isinstance(said, dict) else None
 
 
-def _name(problem: Problem) -> str:
-    return "tracks.json" if isinstance(problem, Recorded) else "kernel.npz"
-
-
-def _content(problem: Problem) -> bytes:
-    """Of `kernel.npz` or `tracks.json`; the same problem, the same bytes."""
-    if isinstance(problem, Recorded):
-        return _described(problem)
-    return _saved(problem.kernel)
+def _contents(problem: Problem) -> dict[str, bytes]:
+    """Name -> content of the files that describe the problem; the same problem, the same bytes."""
+    contents = {TRACKS: _described(problem)} if isinstance(problem, Recorded) else {KERNEL: _saved(problem.kernel)}
+    if problem.coverage is not None:
+        contents[FOOTPRINTS] = _saved(problem.coverage.matrix)
+    return contents
 
 
 def _saved(matrix: sparse.csr_array) -> bytes:
     """A CSR matrix as SciPy saves it, its indices of one width, whatever its size and whatever is fastest."""
-    buffer = io.BytesIO()
     wide = (matrix.data, matrix.indices.astype(np.int64), matrix.indptr.astype(np.int64))
-    sparse.save_npz(buffer, sparse.csr_array(wide, shape=matrix.shape))
-    return buffer.getvalue()
+    return csr_bytes(sparse.csr_array(wide, shape=matrix.shape))
 
 
 def _described(problem: Recorded) -> bytes:

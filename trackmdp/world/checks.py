@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -40,6 +41,36 @@ def short_indices(matrix: sparse.csr_array) -> sparse.csr_array:
         return matrix
     pointers = (matrix.indices.astype(np.int32, copy=False), matrix.indptr.astype(np.int32, copy=False))
     return sparse.csr_array((matrix.data, *pointers), shape=matrix.shape)
+
+
+def one_each(
+    source: str,
+    given: npt.ArrayLike,
+    count: int,
+    each: str,
+    allowed: Callable[[npt.NDArray[np.float64]], npt.NDArray[np.bool_]],
+    expected: str,
+) -> npt.NDArray[np.float64]:
+    """`[count]` numbers, from one for all or from one for each.
+
+    Args:
+        source: what messages begin with.
+        given: a number, or a list.
+        count: how many there are to be.
+        each: what each is of: a cell, or a sensor.
+        allowed: which of some numbers are in range; a nan is in none.
+        expected: the range in words.
+
+    Raises:
+        UserError: another number of numbers, or one out of range.
+    """
+    values = np.asarray(given, dtype=np.float64)
+    if values.shape not in ((), (count,)):
+        raise UserError(f"{source}: {values.size} values, expected one number or {count} (one per {each})")
+    if not (fine := allowed(values)).all():
+        bad = int(np.flatnonzero(~fine)[0])
+        raise UserError(f"{source}: {each} {bad} has {values.flat[bad]}, expected {expected}")
+    return np.broadcast_to(values, (count,)).copy()
 
 
 def check_kernel(

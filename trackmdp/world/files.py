@@ -17,6 +17,7 @@ from scipy import sparse
 from trackmdp.arrays import LARGE, load_npy, load_npz, size_of
 from trackmdp.errors import UserError
 from trackmdp.untrusted import decoded, opened
+from trackmdp.world.checks import one_each
 from trackmdp.world.model import Array, BoolArray, Size, grid_size
 
 _LONGEST_TEXT, _LONGEST_HEAD = 2**30, 2**16
@@ -32,11 +33,10 @@ def read_numbers(key: str, path: str | Path, *, name: str) -> Array:
     Raises:
         UserError: there is no such file, or it does not hold real numbers; `key` is named as the option at fault.
     """
-    with _opened(f"{key}={path}", Path(path)) as stream:
-        table = _read(f"{key}={path}", Path(path).suffix, stream, name)
-    if not isinstance(table, np.ndarray) or table.dtype.kind not in "biuf":
-        raise UserError(f"{key}={path}: not a table of numbers (but of {getattr(table, 'dtype', type(table))})")
-    return table.astype(np.float64)
+    table = read_matrix(key, path, name=name)
+    if sparse.issparse(table):
+        raise UserError(f"{key}={path}: a sparse matrix, expected a table of numbers")
+    return table
 
 
 def per_cell(
@@ -53,7 +53,7 @@ def per_cell(
         key: the option, for messages.
         given: a number, a list, or a path as in `read_numbers`.
         size: of the grid.
-        allowed: which of the numbers in a file are in range.
+        allowed: which of some numbers are in range.
         expected: the range in words.
         sensors: S, where the numbers are those of sensors that lie at no cell.
 
@@ -61,18 +61,10 @@ def per_cell(
         UserError: a list or file is missing or malformed, holds another number of numbers, or one out of range.
     """
     count, each = (math.prod(grid_size(size)), "cell") if sensors is None else (sensors, "sensor")
-    if not isinstance(given, str):
-        numbers = np.asarray(given, dtype=np.float64)
-        if numbers.shape not in ((), (count,)):
-            raise UserError(f"{key}: {numbers.size} values, expected one number or {count} (one per {each})")
-        return np.broadcast_to(numbers, (count,)).copy()
-    values = read_numbers(key, given, name=key.rpartition(".")[2]).ravel()
-    if values.size != count:
-        raise UserError(f"{key}={given}: {values.size} values, expected {count} (one per {each})")
-    if not (fine := allowed(values)).all():
-        bad = int(np.flatnonzero(~fine)[0])
-        raise UserError(f"{key}={given}: {each} {bad} has {values[bad]}, expected {expected}")
-    return values
+    source, values = key, given
+    if isinstance(given, str):
+        source, values = f"{key}={given}", read_numbers(key, given, name=key.rpartition(".")[2]).ravel()
+    return one_each(source, values, count, each, allowed, expected)
 
 
 def read_matrix(key: str, path: str | Path, *, name: str) -> sparse.csr_array | Array:
@@ -82,12 +74,11 @@ def read_matrix(key: str, path: str | Path, *, name: str) -> sparse.csr_array | 
         UserError: there is no such file, or it holds no real numbers, or no matrix.
     """
     source, file = f"{key}={path}", Path(path)
-    if file.suffix == ".npz":
-        with _opened(source, file) as stream:
-            arrays = load_npz(stream)
-            if set(arrays) >= _CSR:
-                return csr_of(arrays)
-    return read_numbers(key, path, name=name)
+    with _opened(source, file) as stream:
+        table = _read(source, file.suffix, stream, name)
+    if table.dtype.kind not in "biuf":
+        raise UserError(f"{source}: not a table of numbers (but of {table.dtype})")
+    return table.astype(np.float64)
 
 
 def csr_of(arrays: Mapping[str, np.ndarray]) -> sparse.csr_array:
@@ -102,13 +93,30 @@ def csr_of(arrays: Mapping[str, np.ndarray]) -> sparse.csr_array:
     if data.dtype.kind not in "biuf" or any(each.dtype.kind not in "iu" for each in (indices, indptr, shape)):
         raise ValueError("a sparse matrix of other things than numbers")
     rows, columns = (int(side) for side in shape)  # ValueError where there are not two
-    if any(each.ndim != 1 for each in (data, indices, indptr)) or len(indptr) != rows + 1 or len(data) != len(indices):
-        raise ValueError("a sparse matrix whose arrays do not fit together")
-    if indptr[0] != 0 or indptr[-1] != len(data) or (np.diff(indptr.astype(np.int64)) < 0).any():
-        raise ValueError("a sparse matrix whose rows do not follow each other")
-    if len(indices) and not 0 <= indices.min() <= indices.max() < columns:
-        raise ValueError("a sparse matrix with an entry outside")
-    return sparse.csr_array((data.astype(np.float64), indices, indptr), shape=(rows, columns))
+    return whole_csr(data.astype(np.float64), indices, indptr, (rows, columns))
+
+
+def whole_csr(data: Any, indices: Any, indptr: Any, shape: tuple[int, int]) -> sparse.csr_array:
+    """The CSR matrix of arrays from somebody else's file, whose indices may lead anywhere.
+
+    Raises:
+        ValueError: they do not fit together, or lead out of `shape`.
+    """
+    matrix = sparse.csr_array((data, indices, indptr), shape=shape)
+    matrix.check_format(full_check=True)
+    return matrix
+
+
+def csr_bytes(matrix: sparse.csr_array) -> bytes:
+    """A CSR matrix in an .npz, as SciPy saves it."""
+    stream = io.BytesIO()
+    sparse.save_npz(stream, matrix)
+    return stream.getvalue()
+
+
+def csr_in(content: bytes) -> sparse.csr_array:
+    """The CSR matrix in the content of an .npz; errors as of `load_npz` and `csr_of`."""
+    return csr_of(load_npz(io.BytesIO(content)))
 
 
 def read_columns(key: str, path: str | Path) -> dict[str, Array]:
@@ -192,6 +200,8 @@ def _read(source: str, suffix: str, stream: BinaryIO, name: str) -> Any:
         return load_npy(stream, size_of(stream))
     if suffix == ".npz":
         arrays = load_npz(stream)
+        if set(arrays) >= _CSR:
+            return csr_of(arrays)
         if name not in arrays and len(arrays) != 1:
             raise UserError(f"{source}: expected one array or one called '{name}', found {list(arrays)[:9]}")
         return arrays[name if name in arrays else next(iter(arrays))]

@@ -31,21 +31,21 @@ class Gridding:
         cell: side of a cell, metres (of videos pixels).
         step: time from one cell of a track to the next, seconds (of videos frames).
         max_gap: longest time between two reports that is bridged, by a straight line; seconds.
+        shortest: fewest cells of a track.
+        exits: whether a target has left the grid at its last report.
         origin: the corner of the grid with the smallest coordinates, in those of the file; None: the grid's middle is
             that of the positions.
         crs: projected coordinate system for degrees, such as ``EPSG:2056``; None: the UTM zone of the median.
-        shortest: fewest cells of a track.
-        exits: whether a target has left the grid at its last report.
     """
 
     size: tuple[int, int]
     cell: float
     step: float
     max_gap: float
-    origin: tuple[float, float] | None
-    crs: str | None
     shortest: int
     exits: bool
+    origin: tuple[float, float] | None = None
+    crs: str | None = None
 
 
 def to_tracks(positions: Positions, grid: Gridding, source: str) -> tuple[Tracks, dict[str, int]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from inspect import signature
 from pathlib import Path
 from typing import Any
@@ -12,16 +13,28 @@ import numpy.typing as npt
 
 from trackmdp.config import WorldConfig
 from trackmdp.config.compose import compose, default, given
-from trackmdp.config.options import GROUPS, options, refuse
+from trackmdp.config.options import options, refuse
 from trackmdp.config.registry import make, maker
-from trackmdp.config.sensing import LARGEST
 from trackmdp.world.checks import canonical_kernel, check_kernel
 from trackmdp.world.files import per_cell
-from trackmdp.world.model import Size, World, grid_size
-from trackmdp.world.modes import HiddenWorld
+from trackmdp.world.model import Size, World, affordable, grid_size
+from trackmdp.world.modes import HiddenWorld, Modelled
 from trackmdp.world.recording import read_recording
 from trackmdp.world.track_files import read_track_file
 from trackmdp.world.tracks import Problem, Recorded, split
+
+_OF_TASK = {
+    "size": "grid.size",
+    "t_max": "grid.t_max",
+    "max_steps": "grid.max_steps",
+    "window": "grid.window",
+    "cost": "cost.sensor",
+    "safe_cost": "cost.safe",
+    "reward": "cost.reward",
+    "memory": "task.memory",
+    "clip": "task.clip",
+}
+"""Arguments of `make_world` and `load_tracks` -> options of the command line."""
 
 
 def make_world(
@@ -36,15 +49,18 @@ def make_world(
     window: int | None = default("grid.window"),
     detection: npt.ArrayLike | str = 1.0,
     safe_detection: npt.ArrayLike | str = 1.0,
+    memory: str = default("task.memory"),
+    clip: int = default("task.clip"),
     **kernel_options: Any,
-) -> World:
+) -> Modelled:
     """A world with one of the motion kernels; for a table of your own take `World` itself.
 
     The defaults are those of `conf/`, and the checks those of the command line.
 
     Args:
         kernel: name of the kernel, as in ``trackmdp solve kernel=...``: ``random_support``, ``random_walk``, ``drift``,
-            ``table``, or one of an installed plugin.
+            ``table``, or one of an installed plugin; for targets with a mode, such as a heading or a velocity,
+            ``heading``, ``regimes``, ``constant_velocity`` or ``coordinated_turn``.
         size: N of an N x N grid, or (rows, columns).
         t_max: T_max; the controller chooses freely at n = 0 ... t_max.
         cost: c, the price of one sensor for one step; one number, one per cell, or a file.
@@ -54,7 +70,13 @@ def make_world(
         window: W; only sensors up to W rows and columns from the last located cell can be chosen. None: all can.
         detection: p_d, how likely a sensor that is on reports the target in its cell; as `cost`, in (0, 1].
         safe_detection: p_s, the same of the safe action, which is repeated until it locates; as `detection`.
-        **kernel_options: the kernel's own, such as ``support_size=5`` (``trackmdp solve --help`` lists them).
+        memory: what a policy remembers at a detection, as in `load_tracks`; the cell, unless targets have a mode.
+        clip: rows and columns up to which displacements are told apart.
+        **kernel_options: the kernel's own, such as ``support_size=5`` (``trackmdp solve --help`` lists them), or
+            ``reveals=True`` where detections tell the mode.
+
+    Returns:
+        A `World`, or a `HiddenWorld` where targets have a mode.
 
     Raises:
         UserError: a name, a type or a range is wrong, or the kernel breaks a rule.
@@ -62,53 +84,11 @@ def make_world(
     Example:
         >>> make_world("drift", size=5, direction=90).num_cells
         25
-    """
-    of_task = _task_words(size, t_max, cost, safe_cost, reward, max_steps, window, detection, safe_detection)
-    own = {f"kernel.{name}": value for name, value in kernel_options.items()}
-    return build_world(compose("solve", given({"kernel": kernel}) | of_task | own))
-
-
-def make_hidden_world(
-    kernel: str = "heading",
-    *,
-    size: Size = default("grid.size"),
-    t_max: int = default("grid.t_max"),
-    cost: npt.ArrayLike | str = default("cost.sensor"),
-    safe_cost: float | None = default("cost.safe"),
-    reward: float = default("cost.reward"),
-    detection: npt.ArrayLike | str = 1.0,
-    memory: str = default("task.memory"),
-    clip: int = default("task.clip"),
-    **kernel_options: Any,
-) -> HiddenWorld:
-    """A world whose targets have a mode, such as a heading or a velocity; arguments are those of `make_world`.
-
-    Args:
-        kernel: ``heading``, ``regimes``, ``constant_velocity``, ``coordinated_turn``, or one of an installed plugin.
-        size: N of an N x N grid, or (rows, columns).
-        t_max: T_max.
-        cost: c.
-        safe_cost: D.
-        reward: r.
-        detection: p_d.
-        memory: what a policy remembers at a detection, as in `load_tracks`.
-        clip: rows and columns up to which displacements are told apart.
-        **kernel_options: the kernel's own, such as ``keep=0.7``, or ``reveals=True`` where detections tell the mode.
-
-    Raises:
-        UserError: a name, a type or a range is wrong, or the kernel has no modes.
-
-    Example:
-        >>> make_hidden_world("heading", size=4, reveals=True).num_keys
+        >>> make_world("heading", size=4, reveals=True).num_keys
         128
     """
-    of_task = _task_words(size, t_max, cost, safe_cost, reward, None, None, detection, 1.0)
-    known = given({"task.memory": memory, "task.clip": clip})
-    own = {f"kernel.{name}": value for name, value in kernel_options.items()}
-    made = make_problem(compose("solve", {"kernel": kernel} | of_task | known | own))
-    if not isinstance(made, HiddenWorld):
-        hiding = [name for name, schema in GROUPS["kernel"].items() if schema.hides]
-        raise refuse("kernel", kernel, f"one of {', '.join(hiding)}")
+    made = make_problem(compose("solve", given({"kernel": kernel}) | _words(locals(), kernel_options)))
+    assert not isinstance(made, Recorded)  # there is nothing to solve for
     return made
 
 
@@ -156,11 +136,8 @@ def load_tracks(
     Example:
         ``load_tracks("ais.csv", (40, 60), cell=500, step=60, max_gap=600, ends="cut")``
     """
-    of_task = _task_words(size, t_max, cost, safe_cost, reward, max_steps, window, detection, safe_detection)
-    known = given({"task.memory": memory, "task.clip": clip})
-    own = {f"kernel.{name}": value for name, value in track_options.items()}
     # Of the options of `train` only those of the problem matter; the algorithm is one that may remember anything.
-    words = {"kernel": "tracks", "kernel.path": path, "algo": "path_counts"} | of_task | known | own
+    words = {"kernel": "tracks", "kernel.path": path, "algo": "path_counts"} | _words(locals(), track_options)
     made = make_problem(compose("train", words))
     assert isinstance(made, Recorded)
     return made
@@ -261,25 +238,15 @@ def paper_cost(
         UserError: a file of prices is missing or malformed, or does not have one price per sensor.
     """
     allowed = "a number from 0 to 1e15"
-    price = per_cell("cost.sensor", sensor, size, lambda c: (c >= 0) & (c <= LARGEST), allowed, sensors)
+    price = per_cell("cost.sensor", sensor, size, affordable, allowed, sensors)
     return {"reward": reward, "cost": price, "safe_cost": safe}
 
 
-def _task_words(
-    size: Any,
-    t_max: Any,
-    cost: Any,
-    safe_cost: Any,
-    reward: Any,
-    max_steps: Any,
-    window: Any,
-    detection: Any,
-    safe_detection: Any,
-) -> dict[str, Any]:
-    """What was given of a task, by the names of the command line."""
-    grid = {"grid.size": size, "grid.t_max": t_max, "grid.max_steps": max_steps, "grid.window": window}
-    costs = {"cost.sensor": cost, "cost.safe": safe_cost, "cost.reward": reward}
-    return given(grid | costs | sensor_words(detection, safe_detection))
+def _words(arguments: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
+    """What was given to `make_world` or `load_tracks`, and the kernel's own `options`, by the command line's names."""
+    of_task = {option: arguments[name] for name, option in _OF_TASK.items()}
+    own = {f"kernel.{name}": value for name, value in options.items()}
+    return given(of_task | sensor_words(arguments["detection"], arguments["safe_detection"]) | own)
 
 
 def sensor_words(detection: Any, safe_detection: Any) -> dict[str, Any]:

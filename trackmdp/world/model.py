@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import Any, Required, TypeAlias, TypedDict, Unpack
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +14,7 @@ from scipy import sparse
 from trackmdp.config.sensing import LARGEST
 from trackmdp.config.world import MEMORIES
 from trackmdp.errors import UserError
-from trackmdp.world.checks import canonical_kernel, check_kernel
+from trackmdp.world.checks import canonical_kernel, check_kernel, one_each
 from trackmdp.world.coverage import Coverage
 from trackmdp.world.memory import KeySpace
 from trackmdp.world.rows import pairwise_row_sums
@@ -24,6 +24,24 @@ BoolArray: TypeAlias = npt.NDArray[np.bool_]
 
 Size: TypeAlias = int | Sequence[int]
 """Size of a grid as a user gives it: one number for a square, or rows and columns."""
+
+
+class TaskOptions(TypedDict, total=False):
+    """What the constructors of `World`, `HiddenWorld` and `Recorded` hand on to that of `Task`."""
+
+    cost: Required[npt.ArrayLike]
+    t_max: Required[int]
+    safe_cost: float | None
+    reward: float
+    max_steps: int | None
+    window: int | None
+    detection: npt.ArrayLike
+    safe_detection: npt.ArrayLike
+    coverage: Any
+    markov: bool
+    memory: str
+    clip: int
+    revealed: int
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -95,7 +113,8 @@ class Task:
             raise UserError(f"memory={memory}: expected one of {', '.join(MEMORIES)}")
         rows, columns = grid_size(size)
         footprints = Coverage.of(coverage, rows * columns)
-        prices = _prices(cost, rows * columns, footprints)
+        count, each = (rows * columns, "cell") if footprints is None else (footprints.num_sensors, "sensor")
+        prices = one_each("cost", cost, count, each, affordable, "a number from 0 to 1e15")
         values = {
             "size": (rows, columns),
             "cost": prices,
@@ -245,41 +264,13 @@ class World(Task):
         self,
         kernel: sparse.sparray | sparse.spmatrix | npt.NDArray[np.generic],
         size: Size,
-        *,
-        cost: npt.ArrayLike,
-        t_max: int,
-        safe_cost: float | None = None,
-        reward: float = 1.0,
-        max_steps: int | None = None,
-        window: int | None = None,
-        detection: npt.ArrayLike = 1.0,
-        safe_detection: npt.ArrayLike = 1.0,
-        coverage: Any = None,
-        markov: bool = True,
-        memory: str = "cell",
-        clip: int = 2,
-        revealed: int = 1,
+        **of_task: Unpack[TaskOptions],
     ) -> None:
-        super().__init__(
-            size,
-            cost=cost,
-            t_max=t_max,
-            safe_cost=safe_cost,
-            reward=reward,
-            max_steps=max_steps,
-            window=window,
-            detection=detection,
-            safe_detection=safe_detection,
-            coverage=coverage,
-            markov=markov,
-            memory=memory,
-            clip=clip,
-            revealed=revealed,
-        )
+        super().__init__(size, **of_task)
         # Checked after it is canonical: duplicates are added up and zeros dropped, so that the checks see what solvers
         # will.
         canonical = canonical_kernel(kernel)
-        check_kernel(canonical, self.size, truncates=max_steps is not None)
+        check_kernel(canonical, self.size, truncates=self.max_steps is not None)
         object.__setattr__(self, "kernel", canonical)
 
     @classmethod
@@ -300,6 +291,11 @@ class World(Task):
         return gain if self.safe else gain - self.reward * (self.kernel @ (1.0 - self.safe_detection))
 
 
+def affordable(prices: Array) -> BoolArray:
+    """Which `prices` are in range; a nan is not."""
+    return (prices >= 0) & (prices <= LARGEST)
+
+
 def grid_size(size: Size) -> tuple[int, int]:
     """(rows, columns) of one number, or of two.
 
@@ -312,27 +308,10 @@ def grid_size(size: Size) -> tuple[int, int]:
     return int(pair[0]), int(pair[1])
 
 
-def _prices(cost: npt.ArrayLike, cells: int, coverage: Coverage | None) -> Array:
-    """`[S]` price of each sensor, from one number for all or from one for each."""
-    prices, each = np.asarray(cost, dtype=np.float64), "cell" if coverage is None else "sensor"
-    count = cells if coverage is None else coverage.num_sensors
-    if prices.shape not in ((), (count,)):
-        raise UserError(f"cost: expected one number or {count} (one per {each}), got shape {prices.shape}")
-    if not (fine := (prices >= 0) & (prices <= LARGEST)).all():
-        bad = int(np.flatnonzero(~fine)[0])
-        raise UserError(f"cost: {each} {bad} costs {prices.flat[bad]}, expected a number from 0 to 1e15")
-    return np.broadcast_to(prices, (count,)).copy()
-
-
 def _probabilities(name: str, given: npt.ArrayLike, cells: int) -> Array:
     """`[M]` probabilities in (0, 1], from one number for all or from one for each."""
-    values = np.asarray(given, dtype=np.float64)
-    if values.shape not in ((), (cells,)):
-        raise UserError(f"{name}: expected one number or {cells} (one per cell), got shape {values.shape}")
-    if not (fine := (values > 0) & (values <= 1)).all():  # a nan is neither
-        bad = int(np.flatnonzero(~fine)[0])
-        raise UserError(f"{name}: cell {bad} has {values.flat[bad]}, expected a probability above 0, at most 1")
-    return np.broadcast_to(values, (cells,)).copy()
+    expected = "a probability above 0, at most 1"
+    return one_each(name, given, cells, "cell", lambda p: np.asarray((p > 0) & (p <= 1)), expected)
 
 
 def _price(name: str, value: float, most: float = LARGEST) -> float:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, Unpack
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +20,7 @@ from scipy import sparse
 
 from trackmdp.errors import UserError
 from trackmdp.world.checks import canonical_kernel, check_kernel
-from trackmdp.world.model import Array, Size, Task, World, grid_size
+from trackmdp.world.model import Array, Size, Task, TaskOptions, World, grid_size
 from trackmdp.world.rows import pairwise_row_sums
 
 _HEADINGS = np.array([(0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1), (1, 0), (1, 1)])
@@ -49,7 +49,12 @@ class HiddenWorld(Task):
     modes: int
 
     def __init__(
-        self, kernel: sparse.sparray | npt.NDArray[np.generic], size: Size, *, modes: int, **of_task: Any
+        self,
+        kernel: sparse.sparray | npt.NDArray[np.generic],
+        size: Size,
+        *,
+        modes: int,
+        **of_task: Unpack[TaskOptions],
     ) -> None:
         # Where a detection tells the mode, what comes next depends on what it tells alone.
         super().__init__(size, **(of_task | {"markov": of_task.get("revealed", 1) == modes}))

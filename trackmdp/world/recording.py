@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from trackmdp.arrays import LARGE, load_npz
+from trackmdp.arrays import LARGE, load_npz, npz_bytes
 from trackmdp.untrusted import decoded, opened
 from trackmdp.world.tracks import Recorded, Tracks
 
@@ -19,10 +18,7 @@ _KINDS = {"cells": "i", "first": "i", "exits": "b", "names": "i"}
 
 def recording_bytes(problem: Recorded) -> bytes:
     """The content of `recording.npz`; the same tracks, the same bytes."""
-    stream = io.BytesIO()
-    arrays = {f"{part}_{name}": getattr(getattr(problem, part), name) for part in _PARTS for name in _KINDS}
-    np.savez_compressed(stream, **arrays)
-    return stream.getvalue()
+    return npz_bytes({f"{part}_{name}": getattr(getattr(problem, part), name) for part in _PARTS for name in _KINDS})
 
 
 def read_recording(path: str | Path, num_cells: int) -> tuple[Tracks, Tracks, Tracks] | None:

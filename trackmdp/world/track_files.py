@@ -31,6 +31,16 @@ _GAP = 3
 Reader: TypeAlias = Callable[[BinaryIO], Positions]
 
 
+_READERS: dict[str, tuple[str, Sequence[str], Reader]] = {
+    "points": ("a table of positions", ("pandas", "pyarrow"), position_table),
+    "geojson": ("GeoJSON with the times of its points", ("pandas",), geojson),
+    "gpx": ("a GPX track log", ("gpxpy", "defusedxml", "pandas"), gpx),
+    "mot": ("MOT-Challenge text", ("pandas",), mot),
+    "sumo": ("SUMO's fcd-output", ("defusedxml", "pandas"), sumo),
+}
+"""Format -> what a message calls it, the modules it takes, and what reads it."""
+
+
 def read_positions(path: str | Path, kind: str) -> Positions:
     """The positions in a file.
 
@@ -42,7 +52,7 @@ def read_positions(path: str | Path, kind: str) -> Positions:
         UserError: there is no such file, it is too large, not of that form, or without reports.
     """
     source = f"kernel.path={path}"
-    words, needed, reader = _readers()[kind]
+    words, needed, reader = _READERS[kind]
     for module in needed:
         require(module, "tracks", source)
     with opened(Path(path), most=LONGEST, source=source, links=True) as stream, decoded(source, words):
@@ -50,17 +60,6 @@ def read_positions(path: str | Path, kind: str) -> Positions:
     if not len(found.time):
         raise UserError(f"{source}: no positions, expected {words} ({found.read} reports read)")
     return found
-
-
-def _readers() -> dict[str, tuple[str, Sequence[str], Reader]]:
-    """Format -> what a message calls it, the modules it takes, and what reads it."""
-    return {
-        "points": ("a table of positions", ("pandas", "pyarrow"), position_table),
-        "geojson": ("GeoJSON with the times of its points", ("pandas",), geojson),
-        "gpx": ("a GPX track log", ("gpxpy", "defusedxml", "pandas"), gpx),
-        "mot": ("MOT-Challenge text", ("pandas",), mot),
-        "sumo": ("SUMO's fcd-output", ("defusedxml", "pandas"), sumo),
-    }
 
 
 def read_track_file(
@@ -95,16 +94,10 @@ def read_track_file(
     for name, what in (("step", "seconds from one cell to the next"), ("cell", "the side of a cell in metres")):
         if name not in given:
             raise UserError(f"kernel.{name}: missing, expected {what}; {source} holds positions")
-    made = Gridding(
-        size=size,
-        cell=given["cell"],
-        step=given["step"],
-        max_gap=given.get("max_gap", _GAP * given["step"]),
-        origin=None if "origin" not in given else (float(given["origin"][0]), float(given["origin"][1])),
-        crs=given.get("crs"),
-        shortest=shortest,
-        exits=exits,
-    )
+    if "origin" in given:
+        given["origin"] = tuple(map(float, given["origin"]))  # of a list no hash can be taken, by which `_load` keeps
+    own = {"max_gap": _GAP * given["step"]} | given
+    made = Gridding(size=size, shortest=shortest, exits=exits, **own)
     file = Path(path)
     stamp = (file.stat().st_mtime_ns, file.stat().st_size, file.stat().st_ino) if file.is_file() else None
     return _load(path, kind, made, stamp)

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias, Unpack
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,7 @@ import numpy.typing as npt
 from trackmdp.errors import UserError
 from trackmdp.seeding import derive
 from trackmdp.world.files import read_columns
-from trackmdp.world.model import Array, BoolArray, Size, Task, World, grid_size
+from trackmdp.world.model import Array, BoolArray, Size, Task, TaskOptions, World, grid_size
 from trackmdp.world.modes import HiddenWorld
 
 Indices: TypeAlias = npt.NDArray[np.int64]
@@ -110,38 +110,11 @@ class Recorded(Task):
         *,
         validation: Tracks,
         held_out: Tracks,
-        cost: npt.ArrayLike,
-        t_max: int,
-        safe_cost: float | None = None,
-        reward: float = 1.0,
-        max_steps: int | None = None,
-        window: int | None = None,
-        detection: npt.ArrayLike = 1.0,
-        safe_detection: npt.ArrayLike = 1.0,
-        markov: bool = True,
         anywhere: bool = False,
-        memory: str = "cell",
-        clip: int = 2,
-        revealed: int = 1,
-        coverage: Any = None,  # a field of every task: `replace` hands it over
         loaded: Mapping[str, int] | None = None,
+        **of_task: Unpack[TaskOptions],
     ) -> None:
-        super().__init__(
-            size,
-            cost=cost,
-            t_max=t_max,
-            safe_cost=safe_cost,
-            reward=reward,
-            max_steps=max_steps,
-            window=window,
-            detection=detection,
-            safe_detection=safe_detection,
-            markov=markov,
-            memory=memory,
-            clip=clip,
-            coverage=coverage,
-            revealed=revealed,
-        )
+        super().__init__(size, **of_task)
         parts = {"tracks": tracks, "validation": validation, "held_out": held_out}
         own: dict[str, object] = {**parts, "anywhere": anywhere, "loaded": loaded or {}}
         for name, value in own.items():

@@ -209,7 +209,7 @@ def test_a_run_does_not_go_on_with_other_tracks(folder: Path, capsys: pytest.Cap
     write(folder.parent / "tracks.csv", replace(TRACKS, cells=8 - TRACKS.cells))
     capsys.readouterr()
     assert train("a", "resume=auto") == 2
-    assert "tracks.json: the run's recording is not the one that its config describes now" in capsys.readouterr().err
+    assert "tracks.json: not what the run's config describes now" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("ends", ["exit", "cut"])
