@@ -72,7 +72,7 @@ def in_the_environment(setting: Recorded, chains: BoolArray, max_steps: int | No
     env, policy = TrackEnv(limited(setting, max_steps), count), Policy.from_dense(setting, chains)
     state = env.reset()
     totals, running = torch.zeros(6, count), torch.ones(count, dtype=torch.bool)
-    begun = env.snapshot()["rows"]["point"]
+    begun = env.snapshot()["rows"]["place"]
     while running.any():
         state = policy(state)
         following = env.step(state)["next"]

@@ -33,10 +33,11 @@ _HISTORY = 2**24  # entries of the action history of all rows
 
 @dataclass(frozen=True)
 class States:
-    """Where B episodes are before a step.
+    """Where the B episodes that are still running are before a step.
 
     Attributes:
         row: `[B]` which episodes of the batch these are.
+        place: `[B]` of the targets (`world/sources.py`), for the simulator's eyes.
         last_cell: `[B]` cell of the last detection.
         key: `[B]` what the policy remembered there; the cell, where that is all.
         misses: `[B]` n since then.
@@ -44,10 +45,16 @@ class States:
     """
 
     row: Tensor
+    place: Tensor
     last_cell: Tensor
     key: Tensor
     misses: Tensor
     step: int
+
+    def kept(self, rows: Tensor) -> States:
+        """Those of the positions `rows`."""
+        known = (self.row, self.place, self.last_cell, self.key, self.misses)
+        return States(*(part[rows] for part in known), step=self.step)
 
 
 @dataclass(frozen=True)

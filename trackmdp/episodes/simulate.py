@@ -6,20 +6,19 @@ The log, the web page, the picture and the simulated figures of an evaluation ar
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from trackmdp.episodes.actors import Actor, States, actor_of
 from trackmdp.episodes.batch import Episodes, Steps
-from trackmdp.episodes.sources import Source, source_of
 from trackmdp.policies.playback import Playback
 from trackmdp.policies.policy import PolicyLike
 from trackmdp.seeding import derive, preserved_global_rng
 from trackmdp.world.costs import Costs
 from trackmdp.world.modes import check_revealed
 from trackmdp.world.reports import Reports
+from trackmdp.world.sources import Source, held_out_source
 from trackmdp.world.tracks import Problem
 
 _BLOCK = 256  # draws taken from an episode's generator at a time; part of what a seed means, so never to be changed
@@ -54,7 +53,7 @@ def episode_seeds(seed: int, episodes: int, *names: str | int) -> list[int]:
 @torch.no_grad()
 def resimulate(problem: Problem, policy: PolicyLike | Playback, seeds: Sequence[int]) -> Episodes:
     """One episode for each of `seeds`, in their order; each the same whatever the others are. See `simulate`."""
-    costs, reports, source = Costs(problem), Reports(problem), source_of(problem)
+    costs, reports, source = Costs(problem), Reports(problem), held_out_source(problem)
     actor = actor_of(problem.task, policy, costs)
     if actor.policy is not None:
         check_revealed(problem, actor.policy.task.revealed)
@@ -86,7 +85,8 @@ class _Draws:
 
     def starts(self) -> Tensor:
         """`[B]` places; taken before any move."""
-        return self._source.start(self._of_moves)
+        numbers = [torch.randint(self._source.starts, (1,), generator=rng) for rng in self._of_moves]
+        return self._source.begin(torch.cat(numbers))
 
     def at(self, step: int, rows: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
         """Draws of moves `[R]`, choices `[R, per_choice]` and reports `[R]` of the episodes `rows` `[R]` at a step."""
@@ -102,21 +102,6 @@ class _Draws:
                     self._seen[row] = torch.rand(_BLOCK, dtype=torch.float64, generator=self._of_reports[row])
         seen = None if self._seen is None else self._seen[rows, place]
         return self._moves[rows, place], self._choices[rows, place], seen
-
-
-@dataclass(frozen=True)
-class _At:
-    """Where the episodes still running are, `[R]` each."""
-
-    row: Tensor
-    place: Tensor
-    last_cell: Tensor
-    key: Tensor
-    misses: Tensor
-
-    def kept(self, rows: Tensor) -> _At:
-        """Those of the positions `rows`."""
-        return _At(*(part[rows] for part in (self.row, self.place, self.last_cell, self.key, self.misses)))
 
 
 class _Batch:
@@ -138,17 +123,15 @@ class _Batch:
         start, mode = self._source.cell(place), self._source.mode(place)
         self._steps.begin(start, mode)
         key = self._keys.start(start, mode)
-        at = _At(torch.arange(len(start)), place, start, key, torch.zeros_like(start))
-        step = 0
+        at = States(torch.arange(len(start)), place, start, key, torch.zeros_like(start), step=0)
         while len(at.row):
-            at = self._step(at, step)
-            step += 1
+            at = self._step(at)
         return self._steps
 
-    def _step(self, at: _At, step: int) -> _At:
+    def _step(self, at: States) -> States:
         """One step of `TrackEnv`, of the episodes still running; the same order of events, the same arithmetic."""
-        moves, choices, seen = self._draws.at(step, at.row)
-        choice = self._actor.decide(States(at.row, at.last_cell, at.key, at.misses, step), choices)
+        moves, choices, seen = self._draws.at(at.step, at.row)
+        choice = self._actor.decide(at, choices)
         place = self._source.move(at.place, moves)
         target = self._source.cell(place)
         in_grid = target < self._task.num_cells
@@ -159,7 +142,7 @@ class _Batch:
         located = (sensed | forced) & in_grid & self._reports.seen(target, forced, seen)
         reward = self._costs.reward_of(choice.spent, located, forced, in_grid)
         # An exit on the last step allowed is an exit (terminated), not a truncation.
-        truncated = self._truncated(place, step) & in_grid
+        truncated = self._truncated(place, at.step) & in_grid
         mode = self._source.mode(place)
         columns = {"key": at.key} if self._keys.num_classes > 1 else {}
         columns |= {} if mode is None else {"mode": mode}
@@ -173,10 +156,11 @@ class _Batch:
         key = torch.where(located, known, at.key)
         # The clock stands still while the safe action is repeated.
         misses = torch.where(located, 0, (at.misses + 1).clamp_max(self._task.t_max + 1))
-        return _At(at.row, place, last_cell, key, misses).kept(going_on)
+        return States(at.row, place, last_cell, key, misses, at.step + 1).kept(going_on)
 
     def _truncated(self, place: Tensor, step: int) -> Tensor:
         """`[R]` whether this step is the last one allowed, or the last one recorded."""
-        limit = self._task.max_steps
+        if self._task.max_steps is not None and step + 1 >= self._task.max_steps:
+            return torch.ones_like(place, dtype=torch.bool)
         stops = self._source.stops(place)
-        return stops if limit is None or step + 1 < limit else torch.ones_like(stops)
+        return torch.zeros_like(place, dtype=torch.bool) if stops is None else stops

@@ -215,7 +215,7 @@ class TrackEnv(EnvBase):
             ),
         }
         if self._keys:
-            state["key"] = self._keys.start(start, self._mode(state))
+            state["key"] = self._keys.start(start, self._targets.mode(state))
         if self.max_steps:
             state["step_count"] = torch.zeros_like(start)
         return state
@@ -263,7 +263,7 @@ class TrackEnv(EnvBase):
         }
         if self._keys:
             # As with `last_cell`, what is worked out for a target that has exited is thrown away.
-            key = self._keys.next(state["key"], n, target.clamp_max(self.num_cells - 1), self._mode(moved))
+            key = self._keys.next(state["key"], n, target.clamp_max(self.num_cells - 1), self._targets.mode(moved))
             following["key"] = torch.where(located, key, state["key"])
         terminated = ~in_grid.unsqueeze(-1)
         cut = self._targets.cut(moved)
@@ -275,11 +275,6 @@ class TrackEnv(EnvBase):
         # A clone, for `truncated` may be the shared `_no`.
         following |= {"terminated": terminated, "truncated": truncated.clone(), "done": terminated | truncated}
         return following
-
-    def _mode(self, state: Mapping[str, Tensor]) -> Tensor | int:
-        """`[B]` the targets' modes, where a detection tells them; 0 of one that has exited."""
-        assert self._keys is not None
-        return state["state"] % self._keys.modes if self._keys.modes > 1 else 0
 
     def _remember(self, history: Tensor, action: Tensor, n: Tensor, missed: Tensor) -> Tensor:
         """h_{k+1}: `action` in slot n where the target was missed, empty elsewhere; misses are few."""
