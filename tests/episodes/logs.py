@@ -39,7 +39,7 @@ def write(
     max_steps: int | None = None,
     world: World = WORLD,
 ) -> Path:
-    writer = EpisodeWriter(file, limited(world, max_steps), facts={"seed": "0"}, config=CONFIG)
+    writer = EpisodeWriter.of(file, limited(world, max_steps), facts={"seed": "0"}, config=CONFIG)
     writer.add_policy({}, acting or policy(world))
     for episode in episodes:
         writer.add(episode)
@@ -50,7 +50,7 @@ def rewritten(source: Path, target: Path) -> Path:
     """The log read whole and written anew."""
     with EpisodeReader(source) as reader:
         tables = {name: reader.attachment(name) for name in ("config.yaml", "kernel.npy", "cost.npy")}
-        writer = EpisodeWriter.copy(target, reader.run, tables)
+        writer = EpisodeWriter(target, reader.run, tables)
         for number, facts in enumerate(reader.policies):
             plain = {key: value for key, value in facts.items() if key != "table.sha256"}
             writer.copy_policy(plain, reader.policy_table(number))

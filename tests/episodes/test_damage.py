@@ -32,7 +32,7 @@ def everything(file: Path) -> tuple[str, list[Episode]]:
     with EpisodeReader(file) as reader:
         tables = [reader.policy_table(number) for number in range(len(reader.policies))]
         world = reader.world()
-        said = [reader.run, reader.end, reader.rows, reader.policies, reader.attachment("config.yaml").decode()]
+        said = [reader.run.said, reader.end, reader.rows, reader.policies, reader.attachment("config.yaml").decode()]
         said += [table.hex() for table in tables if table is not None]
         said += [world.kernel.toarray().tobytes().hex(), world.cost.tobytes().hex()]
         return json.dumps(said), list(reader.episodes())
@@ -146,7 +146,7 @@ def test_a_damaged_chunk_costs_only_its_own_episodes(log: Path, tmp_path: Path) 
 
 def logging_child(file: Path, episodes: list[Episode], report: int) -> None:
     """Log without end; say after each flush how many episodes it holds."""
-    writer = EpisodeWriter(file, WORLD, facts={}, config=CONFIG)
+    writer = EpisodeWriter.of(file, WORLD, facts={}, config=CONFIG)
     writer.add_policy({}, policy())
     for count, episode in enumerate(episodes, start=1):
         writer.add(episode)

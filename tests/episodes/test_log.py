@@ -54,7 +54,7 @@ def test_a_random_policy_and_cut_episodes_come_back_too(tmp_path: Path) -> None:
     file = write(tmp_path / "a.mcap", episodes, acting=acting, max_steps=6)
     with EpisodeReader(file) as reader:
         assert all(first_difference(a, b) is None for a, b in zip(episodes, reader.episodes(), strict=True))
-        assert (reader.max_steps, reader.policy_table(0), reader.policy(0).k) == (6, None, 3)
+        assert (reader.run.max_steps, reader.policy_table(0), reader.policy(0).k) == (6, None, 3)
         assert verify(reader).difference is None
         assert any(row["truncated"] for row in reader.rows)
         assert reader[0]["step_count"].tolist() == list(range(len(reader.read(0))))
@@ -94,7 +94,7 @@ def test_what_the_log_carries_simulates_again(log: Path) -> None:
         assert (world.size, world.t_max, world.reward, world.safe_cost) == ((4, 4), 2, WORLD.reward, WORLD.safe_cost)
         assert (reader.policy(0).dense() == policy().dense()).all()
         assert reader.attachment("config.yaml").decode() == CONFIG
-        assert schema.versions().items() <= reader.run.items()
+        assert schema.versions().items() <= reader.run.said.items()
         verified = verify(reader)
         assert (verified.episodes, verified.difference) == (30, None)
         assert verified.steps == sum(map(len, recorded(30)))
@@ -115,7 +115,7 @@ def test_rows_say_what_became_of_each_episode(log: Path) -> None:
 
 
 def test_the_name_appears_only_with_the_end(tmp_path: Path) -> None:
-    writer = EpisodeWriter(tmp_path / "a.mcap", WORLD, facts={}, config=CONFIG)
+    writer = EpisodeWriter.of(tmp_path / "a.mcap", WORLD, facts={}, config=CONFIG)
     assert {file.name for file in tmp_path.iterdir()} == {"a.mcap.part"}
     writer.finish()
     assert {file.name for file in tmp_path.iterdir()} == {"a.mcap"}
@@ -126,7 +126,7 @@ def test_the_name_appears_only_with_the_end(tmp_path: Path) -> None:
 def test_a_bad_episode_does_not_spoil_the_file(tmp_path: Path) -> None:
     good, bad = recorded(2)
     bad.reward[0] = np.nan
-    writer = EpisodeWriter(tmp_path / "a.mcap", WORLD, facts={}, config=CONFIG)
+    writer = EpisodeWriter.of(tmp_path / "a.mcap", WORLD, facts={}, config=CONFIG)
     writer.add_policy({}, policy())
     with pytest.raises(ValueError, match="not finite"):
         writer.add(bad)
@@ -136,7 +136,7 @@ def test_a_bad_episode_does_not_spoil_the_file(tmp_path: Path) -> None:
 
 
 def test_another_process_may_not_write(tmp_path: Path) -> None:
-    writer = EpisodeWriter(tmp_path / "a.mcap", WORLD, facts={}, config=CONFIG)
+    writer = EpisodeWriter.of(tmp_path / "a.mcap", WORLD, facts={}, config=CONFIG)
     writer._process += 1
     with pytest.raises(RuntimeError, match="opened by process"):
         writer.add(recorded(1)[0])
@@ -163,7 +163,7 @@ def test_a_log_of_a_rectangle_comes_back(tmp_path: Path) -> None:
     world = World(kernel, (3, 5), cost=0.2, t_max=1)
     episodes = recorded(6, world=world)
     with EpisodeReader(write(tmp_path / "a.mcap", episodes, world=world)) as reader:
-        assert (reader.world().size, reader.run["size"], reader.run["columns"]) == ((3, 5), "3", "5")
+        assert (reader.world().size, reader.run.said["size"], reader.run.said["columns"]) == ((3, 5), "3", "5")
         assert all(first_difference(a, b) is None for a, b in zip(episodes, reader.episodes(), strict=True))
         assert verify(reader).difference is None
         assert '"columns":5' in page(reader, reader.read(0))

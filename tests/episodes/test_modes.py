@@ -17,6 +17,7 @@ from trackmdp.app.cli import main
 from trackmdp.episodes.episode import Episode, first_difference
 from trackmdp.episodes.frame import mode_words
 from trackmdp.episodes.grids import grid_messages
+from trackmdp.episodes.limits import LoggedRun
 from trackmdp.episodes.messages import decode, row_of, step_messages
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.episodes.recover import recover
@@ -166,14 +167,15 @@ def test_a_mode_that_differs_is_named() -> None:
 def test_a_mode_that_there_is_none_of_is_damage(wrong: str) -> None:
     world = headings()
     [episode] = simulate(world, Policy.all_on(world), 1, seed=4).complete()
-    steps = list(step_messages(episode, (3, 3), 1))
+    run = LoggedRun({"size": "3", "modes": "8", "t_max": "1", "reward": "1", "safe_cost": "1", "trackmdp": "0"})
+    steps = list(step_messages(episode, run))
     grids = [layers["/grid"] for layers in grid_messages(episode, (3, 3), 0)]
     row = json.loads(json.dumps(row_of(episode, 1, 0)))
-    assert first_difference(episode, decode(row, steps, grids, (3, 3), 0, 8)) is None
+    assert first_difference(episode, decode(row, steps, grids, run)) is None
     assert episode.mode is not None
     steps[1] = steps[1].replace(f'"mode":{episode.mode[1]}'.encode(), wrong.encode())
     with pytest.raises((ValueError, KeyError)):
-        decode(row, steps, grids, (3, 3), 0, 8)
+        decode(row, steps, grids, run)
 
 
 def test_a_run_is_evaluated_and_its_episodes_logged(tmp_path: Path) -> None:

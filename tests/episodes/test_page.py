@@ -65,10 +65,10 @@ def test_a_page_is_one_small_file_that_asks_for_nothing(tmp_path: Path) -> None:
 
 
 def test_what_a_log_says_cannot_break_out_of_the_page(reader: EpisodeReader) -> None:
-    reader.policies[0]["label"], seed = "</script><b>&", reader.run["seed"]
-    reader.run["seed"] = "</script>"
+    reader.policies[0]["label"], seed = "</script><b>&", reader.run.said["seed"]
+    reader.run.said["seed"] = "</script>"
     text = page(reader, reader.read(0))
-    reader.policies[0]["label"], reader.run["seed"] = "a policy", seed
+    reader.policies[0]["label"], reader.run.said["seed"] = "a policy", seed
     assert text.count("</script>") == 2
     assert "&lt;/script&gt;&lt;b&gt;&amp;" in text
 

@@ -145,7 +145,7 @@ class Episodes(Sequence[Episode]):
             policy=0,
             start=start,
             misses=misses,
-            action=self._action(steps, self._keys(steps, last_cells(start, target, located)), misses),
+            action=self._action(steps, self._keys(steps, last_cells(start, target, located)[:-1]), misses),
             target=target,
             located=located,
             reward=self.reward[steps],

@@ -9,10 +9,9 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from scipy import sparse
-from torch import Tensor
 
 from trackmdp.episodes.episode import Episode, Floats
-from trackmdp.world.belief import BeliefFilter
+from trackmdp.world.belief import BeliefFilter, summed
 from trackmdp.world.model import Task
 from trackmdp.world.modes import HiddenWorld, Modelled
 
@@ -23,7 +22,7 @@ def beliefs(world: Modelled, episodes: Sequence[Episode]) -> list[Floats]:
     A row sums to the probability of no exit. Each is the same to the bit whatever the other episodes are. Targets with
     a mode are followed as (cell, mode), through detections that do not tell it as well.
     """
-    exact, into = BeliefFilter(world.kernel), world.kernel.T.tocsr()
+    exact = BeliefFilter(world.kernel)
     modes = world.modes if isinstance(world, HiddenWorld) else 1
     cell = torch.arange(exact.num_cells) // modes  # of each hidden state
     cells = sparse.csr_array((np.ones(len(cell)), (cell.numpy(), np.arange(len(cell)))))
@@ -44,8 +43,8 @@ def beliefs(world: Modelled, episodes: Sequence[Episode]) -> list[Floats]:
         going_on = lengths[rows] > t
         rows, belief = rows[going_on], belief[going_on]
         step = first[rows] + t
-        predicted = _predict(into, belief)
-        found[step] = (predicted if modes == 1 else _predict(cells, predicted)).float()
+        predicted = exact.predict(belief)
+        found[step] = (predicted if modes == 1 else summed(cells, predicted)).float()
         # An exit ends the episode; its cell M has no belief, and cell 0 stands in, unused.
         at = target[step] * located[step]
         if told:
@@ -69,12 +68,3 @@ def _reported(world: Task, episode: Episode) -> npt.NDArray[Any]:
         return world.covered(episode.action)
     forced = episode.misses > world.t_max
     return np.where(forced[:, None], world.safe_detection, episode.action * world.detection)
-
-
-def _predict(into: sparse.csr_array, belief: Tensor) -> Tensor:
-    """`into` `[Y, X]` times each row of `belief` `[B, X]`, with sums whose order does not depend on B.
-
-    A product of dense matrices may add up in another order for one row than for many, which would make an episode
-    differ in the last bit when it is simulated again alone; a sparse one adds up each result entry by entry.
-    """
-    return torch.from_numpy(np.ascontiguousarray((into @ np.ascontiguousarray(belief.numpy().T)).T))

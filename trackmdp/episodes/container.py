@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 import zlib
 from bisect import bisect_left
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -141,21 +141,21 @@ class Container:
 
     def attachment(self, name: str) -> bytes:
         """The content of the attachment `name`, its checksum checked."""
-        if name not in self.attachments:
-            raise Damaged(f"no attachment {name}")
-        # The name once more, in the record: an index made with two offsets exchanged has a correct checksum as well.
-        found, content = attachment_of(self._record(ATTACHMENT, *self.attachments[name]))
-        if found != name:
-            raise Damaged(f"attachment {name}")
-        return content
+        return self._named("attachment", name, self.attachments, ATTACHMENT, attachment_of)
 
     def tell(self, name: str) -> dict[str, str]:
         """The metadata called `name`; the container has no checksum for it."""
-        if name not in self.metadata:
-            raise Damaged(f"no metadata {name}")
-        found, content = metadata_of(self._record(METADATA, *self.metadata[name]))
+        return self._named("metadata", name, self.metadata, METADATA, metadata_of)
+
+    def _named(
+        self, kind: str, name: str, places: Mapping[str, tuple[int, int]], opcode: int, parsed: Callable[..., Any]
+    ) -> Any:
+        if name not in places:
+            raise Damaged(f"no {kind} {name}")
+        # The name once more, in the record: an index made with two offsets exchanged has a correct checksum as well.
+        found, content = parsed(self._record(opcode, *places[name]))
         if found != name:
-            raise Damaged(f"metadata {name}")
+            raise Damaged(f"{kind} {name}")
         return content
 
     def chunks_between(self, begin: int, end: int) -> list[ChunkIndex]:

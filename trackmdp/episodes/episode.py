@@ -65,7 +65,7 @@ class Episode:
     @cached_property
     def last_cell(self) -> Integers:
         """`[T]` cell of the last detection before the step, x_{l(k)}."""
-        return last_cells(self.start, self.target, self.located)
+        return last_cells(self.start, self.target, self.located)[:-1]
 
     @cached_property
     def observation(self) -> Integers:
@@ -92,69 +92,49 @@ class Episode:
             task: of the world; with a window actions are in its local numbers, as the environment takes them, and with
                 `max_steps` there is a `step_count`.
         """
-        t_max, max_steps = task.t_max, task.max_steps
         action = Window.of(task).to_local(torch.from_numpy(self.last_cell), torch.from_numpy(self.action)).numpy()
-        history = _history(action, self.misses, self.located, t_max)
-        # n after step t is n before step t + 1; behind the last step there is none to look it up in, so it follows
-        # from the outcome.
-        after = np.concatenate([self.misses[1:], [0]])
-        after[-1] = 0 if self.located[-1] or self.terminated else min(self.misses[-1] + 1, t_max + 1)
-        following = {
-            "last_cell": np.where(self.located, self.target, self.last_cell),
-            "steps_since_detection": after,
-            # h after step t is h before step t + 1, as for n.
-            "action_history": np.concatenate([history[1:], self._final_history(history[-1], action[-1], t_max)[None]]),
-            "reward": self.reward[:, None],
-            **_ends(len(self), self.terminated, self.truncated),
+        # The T + 1 states: each but the last is one in which an action was chosen, each but the first what came of it.
+        over = self.located[-1] or self.terminated
+        misses = np.append(self.misses, 0 if over else min(self.misses[-1] + 1, task.t_max + 1))
+        states = {
+            "last_cell": last_cells(self.start, self.target, self.located),
+            "steps_since_detection": misses,
+            "action_history": _history(action, misses, self.located, task.t_max),
         }
-        current = {
-            "last_cell": self.last_cell,
-            "steps_since_detection": self.misses,
-            "action_history": history,
-            "action": action,
-            **_ends(len(self), terminated=False, truncated=False),
-        }
-        if max_steps:
-            current["step_count"] = np.arange(len(self))
-            following["step_count"] = current["step_count"] + 1
-        made = {key: torch.as_tensor(value) for key, value in current.items()}
-        nested = TensorDict({key: torch.as_tensor(value) for key, value in following.items()}, [len(self)])
-        return TensorDict({**made, "next": nested}, [len(self)])
-
-    def _final_history(self, history: BoolArray, action: BoolArray, t_max: int) -> BoolArray:
-        """`[t_max+1, K]` h after the last step, from h and the action before it."""
-        if self.located[-1] or self.terminated:
-            return np.zeros_like(history)
-        kept = history.copy()
-        if self.misses[-1] <= t_max:  # an action that the safe one replaced is none
-            kept[self.misses[-1]] = action
-        return kept
+        if task.max_steps:
+            states["step_count"] = np.arange(len(self) + 1)
+        current = {key: value[:-1] for key, value in states.items()}
+        current |= {"action": action, **_ends(len(self), terminated=False, truncated=False)}
+        following = {key: value[1:] for key, value in states.items()}
+        following |= {"reward": self.reward[:, None], **_ends(len(self), self.terminated, self.truncated)}
+        made, nested = ({key: torch.as_tensor(each) for key, each in part.items()} for part in (current, following))
+        return TensorDict({**made, "next": TensorDict(nested, [len(self)])}, [len(self)])
 
 
 def _history(action: BoolArray, misses: Integers, located: BoolArray, t_max: int) -> BoolArray:
-    """`[T, t_max+1, K]` h before each step: slot s holds the action at s misses, empty from slot n on.
+    """`[T+1, t_max+1, K]` h in each state: slot s holds the action at s misses, empty from slot n on.
 
     That is the action of the s-th step after the last detection, from 0 on; the safe action, however often it is
     repeated, comes behind all slots.
     """
-    # Example: misses 0 1 2 0 (located by the third step), t_max = 2. Before step 2, n = 2: slot 0 is the action of
-    # step 0, slot 1 that of step 1, slot 2 is empty.
+    # Example: misses 0 1 2 0 (located by the third step), t_max = 2. In state 2, n = 2: slot 0 is the action of step 0,
+    # slot 1 that of step 1, slot 2 is empty.
     slots = np.arange(t_max + 1)
-    found = np.where(located, np.arange(len(misses)) + 1, 0)
-    steps = np.concatenate([[0], np.maximum.accumulate(found)[:-1]])[:, None] + slots
+    begin = np.where(located, np.arange(len(located)) + 1, 0)
+    steps = np.concatenate([[0], np.maximum.accumulate(begin)])[:, None] + slots
     filled = slots < misses[:, None]
     # Empty slots point at steps that are not theirs: they read step 0 instead, and the mask clears what they read.
     return action[np.where(filled, steps, 0)] & filled[..., None]
 
 
 def last_cells(start: int, target: Integers, located: BoolArray) -> Integers:
-    """`[T]` cell of the last detection before each step of an episode; see `Episode`.
+    """`[T + 1]` cell of the last detection before each step of an episode, and after the last one.
 
-    With detections at steps 1 and 3 of five, `latest` before each step is -1 -1 1 1 3.
+    With detections at steps 1 and 3 of five, `latest` is -1 -1 1 1 3 3.
     """
     found = np.where(located, np.arange(len(target)), -1)
     # Shifted by one: a detection is known from the next step on.
-    latest = np.concatenate([[-1], np.maximum.accumulate(found)[:-1]])
+    latest = np.concatenate([[-1], np.maximum.accumulate(found)])
     return np.where(latest < 0, start, target[latest])
 
 

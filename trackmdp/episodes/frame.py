@@ -9,12 +9,11 @@ import numpy as np
 from trackmdp.episodes.episode import Episode
 from trackmdp.world.model import Task
 from trackmdp.world.modes import HiddenWorld
-from trackmdp.world.render import around
+from trackmdp.world.render import FOUND, MISSED, ON, around
 
 WIDE, STEP = 37, 9
 """Rows and columns of a grid that are drawn at most, which 80 characters hold, and how far the part drawn moves at
 once: it stays where it is while the target does not leave 9 x 9 cells."""
-FOUND, MISSED, ON = "●", "○", "▪"
 _SHADES = " ·░▒▓"
 _ARROWS = "→↗↑↖←↙↓↘"
 _STILL = 0.05

@@ -9,9 +9,12 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from trackmdp.episodes import schema
+from trackmdp.errors import UserError
+from trackmdp.untrusted import decoded
 
 _MOST = 10**9
 """Steps, episodes, T_max: beyond any log, and small enough to be multiplied without overflow."""
@@ -21,124 +24,117 @@ _FINITE = 1e30
 """A reward is stored as float32, whose largest number is 3.4e38; a sum of many must stay below it."""
 
 
-def modes_of(run: Mapping[str, str]) -> int:
-    """Modes of the targets of a log; 0 where they have none."""
-    return int(run.get("modes") or 0)
+class LoggedRun:
+    """The metadata `trackmdp.run` of a log, once they are seen to describe a world.
 
-
-def check_run(run: Mapping[str, str]) -> None:
-    """See that the metadata `trackmdp.run` describe a world.
-
-    Raises:
-        ValueError: they do not.
-    """
-    _count(run, "size", 1, _LARGEST_GRID)
-    # Of rectangles, of worlds with a window, and of targets with modes and detections that tell them.
-    for name, least in {"columns": 1, "window": 0, "modes": 1, "revealed": 1}.items():
-        if run.get(name):
-            _count(run, name, least, _LARGEST_GRID)
-    if run.get("sensors"):
-        _count(run, "sensors", 1, _LARGEST_GRID**2)
-    _count(run, "t_max", 0, _MOST)
-    if run["max_steps"]:
-        _count(run, "max_steps", 1, _MOST)
-    for name in ("reward", "safe_cost"):
-        if not abs(float(run[name])) < _FINITE:
-            raise ValueError(f"{name} {run[name]}")
-    if not run.get("trackmdp"):
-        raise ValueError("no version of trackmdp")
-
-
-def size_of_grid(run: Mapping[str, str]) -> tuple[int, int]:
-    """(rows, columns) of a log's grid; `columns` is said of rectangles alone."""
-    return int(run["size"]), int(run.get("columns") or run["size"])
-
-
-def tables_of(run: Mapping[str, str]) -> tuple[str, ...]:
-    """The attachments that a log's world and config are read from.
-
-    `sensors.npy` only where sensors may miss, `footprints.npz` only where they cover several cells.
-    """
-    every = ("config.yaml", "kernel.npz" if "kernel.npz.sha256" in run else "kernel.npy", "cost.npy")
-    return (*every, *(name for name in ("sensors.npy", "footprints.npz") if f"{name}.sha256" in run))
-
-
-def sensors_of(run: Mapping[str, str]) -> int:
-    """S, the sensors of a log's world; said of those with footprints alone, else there is one in each cell."""
-    rows, columns = size_of_grid(run)
-    return int(run.get("sensors") or rows * columns)
-
-
-def policy_file(number: int, run: Mapping[str, str]) -> str:
-    """The attachment with the table of a policy: a CSR matrix where the kernel is one."""
-    return f"policy-{number}.{'npz' if 'kernel.npz.sha256' in run else 'npy'}"
-
-
-def check_policy(facts: Mapping[str, str], sensors: int) -> None:
-    """See that the metadata of a policy name its kind and its table.
-
-    Raises:
-        ValueError, KeyError: they do not.
-    """
-    if not re.fullmatch(r"([0-9a-f]{64})?", facts["table.sha256"]):
-        raise ValueError("the digest of a policy's table")
-    if facts["kind"] == "random_k":
-        _count(facts, "k", 0, sensors)
-    if "memory" in facts:
-        _count(facts, "clip", 1, _LARGEST_GRID)
-        _count(facts, "revealed", 1, _LARGEST_GRID)
-
-
-def check_row(row: Any, cells: int, modes: int = 0) -> dict[str, Any]:
-    """An entry of the index of episodes, or the `/episode` message, which is the same.
-
-    Args:
-        row: as it was decoded.
+    Attributes:
+        said: the metadata themselves.
+        size: (rows, columns) of the grid; `columns` is said of rectangles alone.
         cells: M.
-        modes: of the targets, 0 where they have none.
+        sensors: S; said of those with footprints alone, else there is one in each cell.
+        window: W; None for none.
+        modes: of the targets; 0 where they have none.
+        revealed: modes that a detection tells apart.
+        t_max: T_max.
+        max_steps: where episodes are truncated; None for never.
+        reward: r.
+        safe_cost: D.
+        sparse: whether kernel and policies are written as CSR matrices.
+        tables: the attachments that world and config are read from; `sensors.npy` is one where sensors may miss,
+            `footprints.npz` where they cover several cells.
 
     Raises:
-        ValueError, KeyError, TypeError: it is something else.
+        ValueError, KeyError: they describe none.
     """
-    whole = {"episode": _MOST, "policy": _MOST, "start": cells, "length": _MOST, "detections": _MOST, "forced": _MOST}
-    whole |= {"start_mode": modes} if modes else {}
-    for name, limit in whole.items():
-        if type(row[name]) is not int or not 0 <= row[name] < limit:
-            raise ValueError(f"{name} {str(row[name])[:40]} of an episode")
-    if type(row["terminated"]) is not bool or type(row["truncated"]) is not bool:
-        raise ValueError("how an episode ended")
-    if not _is_number(row["return"]):
-        raise ValueError("the return of an episode")
-    _count(row, "seed", 0, 2**64)
-    begin, end = (_count(row, name, schema.time_of(0), 2**63) for name in ("start_time", "end_time"))
-    # The times are used to look up messages, the length to allocate: they must agree before either is.
-    if row["length"] < 1 or end - begin != (row["length"] - 1) * schema.TICK_NS:
-        raise ValueError("the times of an episode are not those of its steps")
-    return dict(row)
 
+    def __init__(self, said: Mapping[str, str]) -> None:
+        def known(name: str, least: int, most: int = _LARGEST_GRID) -> int | None:
+            return _count(said, name, least, most) if said.get(name) else None
 
-def check_steps(steps: Sequence[Any], cells: int, modes: int = 0, sensors: int | None = None) -> None:
-    """See that `/step` messages name cells, sensors and modes that there are, and finite rewards.
+        self.said, rows = dict(said), _count(said, "size", 1, _LARGEST_GRID)
+        self.size = (rows, known("columns", 1) or rows)
+        self.cells = math.prod(self.size)
+        self.sensors = known("sensors", 1, _LARGEST_GRID**2) or self.cells
+        self.window, self.modes, self.revealed = known("window", 0), known("modes", 1) or 0, known("revealed", 1) or 1
+        self.t_max, self.max_steps = _count(said, "t_max", 0, _MOST), known("max_steps", 1, _MOST)
+        self.reward, self.safe_cost = float(said["reward"]), float(said["safe_cost"])
+        if not (abs(self.reward) < _FINITE and abs(self.safe_cost) < _FINITE and said.get("trackmdp")):
+            raise ValueError("a reward or cost that is not finite, or no version of trackmdp")
+        self.sparse = "kernel.npz.sha256" in said
+        every = ("config.yaml", "kernel.npz" if self.sparse else "kernel.npy", "cost.npy")
+        self.tables = (*every, *(name for name in ("sensors.npy", "footprints.npz") if f"{name}.sha256" in said))
 
-    `sensors` None stands for one in each cell.
+    @classmethod
+    def of(cls, file: Path, said: Mapping[str, str]) -> LoggedRun:
+        """What the log `file` says.
 
-    Raises:
-        ValueError, KeyError, TypeError: one does not.
-    """
-    number = cells if sensors is None else sensors
-    rules: dict[str, Callable[[Any], bool]] = {
-        "n": lambda n: type(n) is int and 0 <= n < _MOST,
-        "target": lambda cell: type(cell) is int and -1 <= cell < cells,
-        "obs": lambda cell: type(cell) is int and -1 <= cell < cells,
-        "reward": _is_number,
-        "active": lambda on: type(on) is list and all(type(each) is int and 0 <= each < number for each in on),
-    }
-    if modes:
-        rules["mode"] = lambda mode: type(mode) is int and -1 <= mode < modes
-    for step in steps:
-        for name, holds in rules.items():
-            if not holds(step[name]):
-                raise ValueError(f"{name} {str(step[name])[:40]} of a step")
+        Raises:
+            UserError: it is of another format, or describes no world.
+        """
+        if (found := said.get("format_version")) != schema.LOG_FORMAT:
+            writer = said.get("trackmdp", "unknown")
+            raise UserError(f"file={file}: format {found} (trackmdp {writer}), expected format {schema.LOG_FORMAT}")
+        with decoded(f"file={file}", "a log of trackmdp"):
+            return cls(said)
+
+    def policy_file(self, number: int) -> str:
+        """The attachment with the table of a policy."""
+        return f"policy-{number}.{'npz' if self.sparse else 'npy'}"
+
+    def check_policy(self, facts: Mapping[str, str]) -> None:
+        """See that the metadata of a policy name its kind and its table.
+
+        Raises:
+            ValueError, KeyError: they do not.
+        """
+        if not re.fullmatch(r"([0-9a-f]{64})?", facts["table.sha256"]):
+            raise ValueError("the digest of a policy's table")
+        if facts["kind"] == "random_k":
+            _count(facts, "k", 0, self.sensors)
+        for name in ("clip", "revealed") if "memory" in facts else ():
+            _count(facts, name, 1, _LARGEST_GRID)
+
+    def checked_row(self, row: Any) -> dict[str, Any]:
+        """An entry of the index of episodes, or the `/episode` message, which is the same.
+
+        Raises:
+            ValueError, KeyError, TypeError: it is something else.
+        """
+        whole = dict.fromkeys(("episode", "policy", "length", "detections", "forced"), _MOST) | {"start": self.cells}
+        whole |= {"start_mode": self.modes} if self.modes else {}
+        for name, limit in whole.items():
+            if type(row[name]) is not int or not 0 <= row[name] < limit:
+                raise ValueError(f"{name} {str(row[name])[:40]} of an episode")
+        if type(row["terminated"]) is not bool or type(row["truncated"]) is not bool:
+            raise ValueError("how an episode ended")
+        if not _is_number(row["return"]):
+            raise ValueError("the return of an episode")
+        _count(row, "seed", 0, 2**64)
+        begin, end = (_count(row, name, schema.time_of(0), 2**63) for name in ("start_time", "end_time"))
+        # The times are used to look up messages, the length to allocate: they must agree before either is.
+        if row["length"] < 1 or end - begin != (row["length"] - 1) * schema.TICK_NS:
+            raise ValueError("the times of an episode are not those of its steps")
+        return dict(row)
+
+    def check_steps(self, steps: Sequence[Any]) -> None:
+        """See that `/step` messages name cells, sensors and modes that there are, and finite rewards.
+
+        Raises:
+            ValueError, KeyError, TypeError: one does not.
+        """
+        rules: dict[str, Callable[[Any], bool]] = {
+            "n": lambda n: type(n) is int and 0 <= n < _MOST,
+            "target": lambda cell: type(cell) is int and -1 <= cell < self.cells,
+            "obs": lambda cell: type(cell) is int and -1 <= cell < self.cells,
+            "reward": _is_number,
+            "active": lambda on: type(on) is list and all(type(it) is int and 0 <= it < self.sensors for it in on),
+        }
+        if self.modes:
+            rules["mode"] = lambda mode: type(mode) is int and -1 <= mode < self.modes
+        for step in steps:
+            for name, holds in rules.items():
+                if not holds(step[name]):
+                    raise ValueError(f"{name} {str(step[name])[:40]} of a step")
 
 
 def _count(said: Mapping[str, Any], name: str, least: int, most: int) -> int:

@@ -53,7 +53,7 @@ class EpisodeLog:
             if self._writer is None:
                 self.file = free_name(self.file)
                 facts = {"seed": str(seed)}
-                self._writer = EpisodeWriter(self.file, world, facts=facts, config=config)
+                self._writer = EpisodeWriter.of(self.file, world, facts=facts, config=config)
             if layout:
                 write_layout(folder / "episodes.layout.json", world.size)
 
@@ -72,7 +72,7 @@ class EpisodeLog:
             earlier.replace(written)
             self._tell(f"{written}: not whole; a new log is begun beside it")
             return
-        self._writer, self.episodes = taken
+        self._writer, self.episodes = taken, taken.episodes
         earlier.unlink()
 
     def record(self, policy: PolicyLike, facts: Mapping[str, str], episodes: int, *names: str | int) -> None:

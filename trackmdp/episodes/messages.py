@@ -10,8 +10,8 @@ import numpy as np
 
 from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.grids import read_grids
-from trackmdp.episodes.limits import check_steps
-from trackmdp.episodes.schema import time_of
+from trackmdp.episodes.limits import LoggedRun
+from trackmdp.episodes.schema import tick_of, time_of
 from trackmdp.errors import UserError
 
 _WORDS = ("false", "true")
@@ -38,12 +38,11 @@ def row_of(episode: Episode, t_max: int, first_tick: int) -> dict[str, Any]:
     }
 
 
-def step_messages(episode: Episode, size: tuple[int, int], t_max: int) -> Iterator[bytes]:
+def step_messages(episode: Episode, run: LoggedRun) -> Iterator[bytes]:
     """The `/step` messages."""
-    (rows, columns), last = size, len(episode) - 1
-    cells = rows * columns
+    (rows, columns), last = run.size, len(episode) - 1
     # -1 for no cell: a schema with null is refused by viewers, topic and all.
-    target = np.where(episode.target == cells, -1, episode.target)
+    target = np.where(episode.target == run.cells, -1, episode.target)
     x = np.where(target < 0, -1, target % columns)
     # Cells are numbered from the top left, a plot's y axis points upwards: in 3 rows of 4, cell 5 is at x = 1, y = 1,
     # cell 0 at x = 0, y = 2.
@@ -52,7 +51,7 @@ def step_messages(episode: Episode, size: tuple[int, int], t_max: int) -> Iterat
     # np.nonzero lists (step, sensor) in order of steps: steps 0 0 1 3 with sensors 2 5 4 0. searchsorted finds where
     # steps 1, 2, 3 begin, 2 3 3, and split makes of those [2 5] [4] [] [0].
     active = [",".join(map(str, each.tolist())) for each in np.split(ids, np.searchsorted(steps, range(1, last + 1)))]
-    known = (episode.misses, episode.last_cell, episode.action.sum(1), episode.forced(t_max))
+    known = (episode.misses, episode.last_cell, episode.action.sum(1), episode.forced(run.t_max))
     came = (target, x, y, episode.observation, episode.reward.astype(np.float64), episode.returns)
     # Of targets with a mode, one more entry at the end.
     modes = [""] * len(episode) if episode.mode is None else [f',"mode":{mode}' for mode in episode.mode.tolist()]
@@ -68,33 +67,23 @@ def step_messages(episode: Episode, size: tuple[int, int], t_max: int) -> Iterat
         ).encode()
 
 
-def decode(
-    row: dict[str, Any],
-    steps: list[bytes],
-    grids: list[bytes],
-    size: tuple[int, int],
-    first_tick: int,
-    modes: int,
-    sensors: int | None = None,
-) -> Episode:
-    """The episode that these messages were made from; `modes` of the targets, 0 where they have none.
-
-    `sensors` are S, None where there is one in each cell.
+def decode(row: dict[str, Any], steps: list[bytes], grids: list[bytes], run: LoggedRun) -> Episode:
+    """The episode that these messages of the log `run` were made from.
 
     Raises:
-        UserError: they do not fit together.
+        UserError, ValueError, KeyError, TypeError: they do not fit together.
     """
-    number, count, m = row["episode"], row["length"], size[0] * size[1]
+    number, count = row["episode"], row["length"]
     said = [json.loads(step) for step in steps]
     # Lengths first: what a row claims is no length to count up to.
     if (len(said), len(grids)) != (count, count) or any(
         (each["episode"], each["t"]) != (number, t) for t, each in enumerate(said)
     ):
         raise UserError(f"episode={number}: its steps do not fit together")
-    check_steps(said, m, modes, sensors)
-    belief, probability = read_grids(grids, size)
+    run.check_steps(said)
+    belief, probability = read_grids(grids, run.size)
     target = np.array([each["target"] for each in said], dtype=np.int64)
-    action = np.zeros((count, m if sensors is None else sensors), dtype=bool)
+    action = np.zeros((count, run.sensors), dtype=bool)
     for t, each in enumerate(said):
         action[t, each["active"]] = True
     return Episode(
@@ -106,12 +95,12 @@ def decode(
         action=action,
         belief=belief,
         probability=probability,
-        target=np.where(target < 0, m, target),
+        target=np.where(target < 0, run.cells, target),
         located=np.array([each["obs"] >= 0 for each in said]),
         reward=np.array([each["reward"] for each in said], dtype=np.float32),
         terminated=row["terminated"],
         truncated=row["truncated"],
-        first_tick=first_tick,
-        mode=np.array([each["mode"] for each in said], dtype=np.int64) if modes else None,
-        start_mode=row["start_mode"] if modes else 0,
+        first_tick=tick_of(int(row["start_time"])),
+        mode=np.array([each["mode"] for each in said], dtype=np.int64) if run.modes else None,
+        start_mode=row["start_mode"] if run.modes else 0,
     )

@@ -52,7 +52,7 @@ def _content(reader: EpisodeReader, episode: Episode) -> dict[str, Any]:
     world, shown = reader.world(), slice(0, MOST_STEPS)
     bound = cell_bound(world) if isinstance(world, HiddenWorld) else bounds.clocked(world)
     target = np.where(episode.target == world.num_cells, -1, episode.target)
-    about = f"{world.rows} x {world.columns} grid, {len(episode)} steps, seed {reader.run.get('seed', '')}"
+    about = f"{world.rows} x {world.columns} grid, {len(episode)} steps, seed {reader.run.said.get('seed', '')}"
     if len(episode) > MOST_STEPS:
         about += f"; the first {MOST_STEPS:,} steps are shown"
     if max(world.size) > WIDE:

@@ -4,31 +4,27 @@ from __future__ import annotations
 
 import io
 import json
-import math
 from bisect import bisect_left
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
-from scipy import sparse
 from tensordict import TensorDict
 
-from trackmdp.arrays import load_npy, load_npz
-from trackmdp.episodes import limits, schema
+from trackmdp.arrays import load_npy
+from trackmdp.episodes import schema
 from trackmdp.episodes.container import Container, Damaged, Message
 from trackmdp.episodes.episode import Episode
-from trackmdp.episodes.limits import check_policy, check_row
+from trackmdp.episodes.limits import LoggedRun
 from trackmdp.episodes.messages import decode
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
-from trackmdp.untrusted import decoded, reason
-from trackmdp.world.files import csr_of
-from trackmdp.world.model import Array, BoolArray, World
+from trackmdp.untrusted import reason
+from trackmdp.world.files import csr_in
+from trackmdp.world.model import BoolArray, World
 from trackmdp.world.modes import HiddenWorld, Modelled
-
-R = TypeVar("R")
 
 
 class EpisodeReader:
@@ -60,9 +56,9 @@ class EpisodeReader:
         if container.profile or schema.RUN not in container.metadata:
             kind = f"profile {container.profile!r}" if container.profile else f"it has no metadata {schema.RUN}"
             raise UserError(f"file={file}: not a log of trackmdp ({kind})")
-        self.run = checked_run(file, self._checked(self._told, schema.RUN))
+        self.run = LoggedRun.of(file, self._checked(self._told, schema.RUN))
         # No checksum that is read here covers the header: it is held against the sealed metadata.
-        if container.made_by != f"trackmdp {self.run['trackmdp']}":
+        if container.made_by != f"trackmdp {self.run.said['trackmdp']}":
             raise self._damage("the header")
         if schema.END not in container.metadata:
             # Written last: without it the log was finished by another program, or a part was cut out.
@@ -75,13 +71,11 @@ class EpisodeReader:
 
     def _index(self, index: bytes) -> None:
         """Policies and episodes, held against each other."""
-        cells = math.prod(limits.size_of_grid(self.run))
         # A count that is too large ends at the first name that is missing, before any list has that length.
         self.policies = [self._told(f"{schema.POLICY}.{k}") for k in range(int(self.end["policies"]))]
         for facts in self.policies:
-            check_policy(facts, limits.sensors_of(self.run))
-        modes = limits.modes_of(self.run)
-        self.rows: list[dict[str, Any]] = [check_row(row, cells, modes) for row in json.loads(index)]
+            self.run.check_policy(facts)
+        self.rows: list[dict[str, Any]] = [self.run.checked_row(row) for row in json.loads(index)]
         self._numbers = [row["episode"] for row in self.rows]
         steps = sum(row["length"] for row in self.rows)
         if (str(len(self.rows)), str(steps)) != (self.end["episodes"], self.end["steps"]):
@@ -113,16 +107,6 @@ class EpisodeReader:
         """Episode `number` as a TensorDict `[T]`, keys as in `TrackEnv`."""
         return self.read(number).to_tensordict(self.world())
 
-    @property
-    def t_max(self) -> int:
-        """T_max."""
-        return int(self.run["t_max"])
-
-    @property
-    def max_steps(self) -> int | None:
-        """Where episodes are cut; None for never."""
-        return int(self.run["max_steps"]) if self.run["max_steps"] else None
-
     def episodes(self) -> Iterator[Episode]:
         """All episodes, one after another, with belief and policy."""
         return (self.read(number) for number in self._numbers)
@@ -150,9 +134,7 @@ class EpisodeReader:
         # The index at the end and the message at the episode's own place say the same, or one of them was changed.
         if self._checked(lambda: [json.loads(text) for text in mine["/episode"]]) != [row]:
             raise self._damage(f"episode {number} is not what the index says")
-        size, tick = limits.size_of_grid(self.run), schema.tick_of(begin)
-        counts = limits.modes_of(self.run), limits.sensors_of(self.run)
-        return self._checked(decode, row, mine["/step"], mine["/grid"], size, tick, *counts)
+        return self._checked(decode, row, mine["/step"], mine["/grid"], self.run)
 
     def _between(self, begin: int, end: int) -> list[Message]:
         """The messages from one log time to another; the chunk read last is kept, for the episode after."""
@@ -166,14 +148,14 @@ class EpisodeReader:
     def attachment(self, name: str, sha256: str | None = None) -> bytes:
         """An attachment, its digest checked; that of `trackmdp.run` unless given."""
         content = self._checked(self._container.attachment, name)
-        if schema.digest(content) != (self.run.get(f"{name}.sha256") if sha256 is None else sha256):
+        if schema.digest(content) != (self.run.said.get(f"{name}.sha256") if sha256 is None else sha256):
             raise self._damage(f"attachment {name} is not what was written")
         return content
 
     def policy_table(self, number: int) -> bytes | None:
         """The file of policy `number`; None if it has no table."""
         sha256 = self.policies[number]["table.sha256"]
-        return self.attachment(limits.policy_file(number, self.run), sha256) if sha256 else None
+        return self.attachment(self.run.policy_file(number), sha256) if sha256 else None
 
     def policy(self, number: int) -> Policy:
         """Policy `number`, as it acted.
@@ -189,13 +171,13 @@ class EpisodeReader:
             return Policy.random_k(task, int(facts["k"]))
         if facts["kind"] != "chains" or table is None:
             raise UserError(f"file={self.file}: policy {number} is a {facts['kind']!r}, expected chains or random_k")
-        if limits.policy_file(number, self.run).endswith(".npz"):
-            return Policy(task, self._checked(_matrix, table))
+        if self.run.sparse:
+            return Policy(task, self._checked(csr_in, table))
         return Policy.from_dense(task, self._checked(self._unpacked, table, task.num_keys))
 
     def _unpacked(self, table: bytes, keys: int) -> BoolArray:
-        sensors, bits = limits.sensors_of(self.run), _load(table)
-        if bits.dtype != np.uint8 or bits.shape != (keys, self.t_max + 1, -(-sensors // 8)):
+        sensors, bits = self.run.sensors, _loaded(".npy", table)
+        if bits.dtype != np.uint8 or bits.shape != (keys, self.run.t_max + 1, -(-sensors // 8)):
             raise Damaged("the table of a policy")
         # `[keys, t_max+1, ceil(S/8)]` to `[keys, t_max+1, S]`; `count` drops the bits that fill the last byte.
         return np.unpackbits(bits.astype(np.uint8), axis=-1, count=sensors).astype(bool)
@@ -210,31 +192,26 @@ class EpisodeReader:
     def _world(self) -> Modelled:
         run = self.run
         # Kernel and prices; where sensors may miss `[2, M]`, p_d and p_s; where they have footprints `[S, M]`.
-        names = limits.tables_of(run)[1:]
+        names = run.tables[1:]
         kernel, cost, *more = (_loaded(name, self.attachment(name)) for name in names)
         sensors = dict(zip(names[2:], more, strict=True))
         chances = sensors.get("sensors.npy")
         may_miss = {} if chances is None else dict(zip(("detection", "safe_detection"), chances, strict=True))
-        if "footprints.npz" in sensors and sensors["footprints.npz"].shape[0] != limits.sensors_of(run):
+        if "footprints.npz" in sensors and sensors["footprints.npz"].shape[0] != run.sensors:
             raise Damaged("how many sensors there are")
         of_task: dict[str, Any] = may_miss | {
             "coverage": sensors.get("footprints.npz"),
-            "size": limits.size_of_grid(run),
             "cost": cost,
-            "safe_cost": float(run["safe_cost"]),
-            "t_max": self.t_max,
-            "reward": float(run["reward"]),
-            "max_steps": self.max_steps,
-            "window": int(run["window"]) if run.get("window") else None,
+            **{name: getattr(run, name) for name in ("size", "safe_cost", "t_max", "reward", "max_steps", "window")},
         }
-        if modes := limits.modes_of(run):
-            return HiddenWorld(kernel, modes=modes, revealed=int(run["revealed"]), **of_task)
+        if run.modes:
+            return HiddenWorld(kernel, modes=run.modes, revealed=run.revealed, **of_task)
         return World(kernel, **of_task)
 
     def check_all(self) -> None:
         """Check every byte of the file, those without meaning to this reader included."""
         self._checked(self._container.check_data)
-        for name in limits.tables_of(self.run):
+        for name in self.run.tables:
             self.attachment(name)
         for number in range(len(self.policies)):
             self.policy_table(number)
@@ -258,29 +235,5 @@ class EpisodeReader:
         return UserError(f"file={self.file}: damaged ({what}); recover=true saves what can be read")
 
 
-def checked_run(file: Path, run: dict[str, str]) -> dict[str, str]:
-    """The metadata `trackmdp.run`, if it is of this format.
-
-    Raises:
-        UserError: it is of another.
-    """
-    found = run.get("format_version")
-    if found != schema.LOG_FORMAT:
-        writer = run.get("trackmdp", "unknown")
-        raise UserError(f"file={file}: format {found} (trackmdp {writer}), expected format {schema.LOG_FORMAT}")
-    with decoded(f"file={file}", "a log of trackmdp"):
-        limits.check_run(run)
-    return run
-
-
 def _loaded(name: str, content: bytes) -> Any:
-    return _matrix(content) if name.endswith(".npz") else _load(content)
-
-
-def _matrix(content: bytes) -> sparse.csr_array:
-    """A CSR matrix as SciPy saves it."""
-    return csr_of(load_npz(io.BytesIO(content)))
-
-
-def _load(content: bytes) -> Array:
-    return load_npy(io.BytesIO(content), len(content))
+    return csr_in(content) if name.endswith(".npz") else load_npy(io.BytesIO(content), len(content))

@@ -6,15 +6,14 @@ import json
 import math
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from trackmdp.episodes import container, schema
 from trackmdp.episodes.container import Damaged
-from trackmdp.episodes.limits import check_policy, check_row, modes_of, policy_file, sensors_of, size_of_grid, tables_of
+from trackmdp.episodes.limits import LoggedRun
 from trackmdp.episodes.messages import decode
-from trackmdp.episodes.reader import checked_run
 from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.errors import UserError
 from trackmdp.untrusted import reason
@@ -32,31 +31,40 @@ class Recovered:
     damaged: tuple[str, ...]
 
 
-@dataclass
 class _Found:
-    """What could be read so far."""
+    """What could be read so far.
 
-    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
-    attachments: dict[str, bytes] = field(default_factory=dict)
-    steps: dict[int, bytes] = field(default_factory=dict)
-    grids: dict[int, bytes] = field(default_factory=dict)
-    held: int = 0
+    Attributes:
+        metadata: those whose seal is whole.
+        attachments: their contents by their names.
+        held: topic -> log time -> message, of the episode that is not complete yet.
+    """
+
+    def __init__(self) -> None:
+        self.metadata: dict[str, dict[str, str]] = {}
+        self.attachments: dict[str, bytes] = {}
+        self.held: dict[str, dict[int, bytes]] = {"/step": {}, "/grid": {}}
+        self._bytes = 0
 
     def hold(self, topic: str, time: int, data: bytes) -> None:
-        """Keep a message of the episode that is not complete yet, as long as they are not more than any episode's."""
-        if topic not in ("/step", "/grid"):
+        """Keep a message of the episode, as long as they are not more than any episode's."""
+        if topic not in self.held:
             return
-        self.held += len(data)
+        self._bytes += len(data)
         # A file without a single `/episode` message would otherwise be held whole.
-        if self.held > _MOST_HELD:
+        if self._bytes > _MOST_HELD:
             self.release()
-        (self.steps if topic == "/step" else self.grids)[time] = data
+        self.held[topic][time] = data
 
     def release(self) -> None:
         """Forget the messages."""
-        self.steps.clear()
-        self.grids.clear()
-        self.held = 0
+        self._bytes = 0
+        for messages in self.held.values():
+            messages.clear()
+
+    def between(self, topic: str, begin: int, end: int) -> list[bytes]:
+        """The messages from one log time to another: some of an episode whose own end was lost may stand before."""
+        return [data for time, data in self.held[topic].items() if begin <= time <= end]
 
 
 def recovered_name(file: Path) -> Path:
@@ -75,34 +83,32 @@ def recover(file: Path) -> Recovered:
     if target.exists():
         raise UserError(f"file={file}: {target} already exists")
     damaged: list[str] = []
-    writer, episodes = _rewrite(file, target, damaged)
+    writer = _rewrite(file, target, damaged)
     if writer is None:
         raise UserError(f"file={file}: too damaged, what says how it was recorded is lost ({'; '.join(damaged)})")
-    return Recovered(writer.finish(), episodes, tuple(damaged))
+    return Recovered(writer.finish(), writer.episodes, tuple(damaged))
 
 
-def taken_over(file: Path, target: Path, policies: int) -> tuple[EpisodeWriter, int] | None:
-    """A log that goes on after the first `policies` policies of another, and the number of episodes it holds so far.
+def taken_over(file: Path, target: Path, policies: int) -> EpisodeWriter | None:
+    """A log that goes on after the first `policies` policies of another.
 
     None if they are not all there; `target` is then not left behind.
     """
-    writer, episodes = _rewrite(file, target, [], most=policies)
-    if writer is None:
-        return None
-    if writer.policies < policies:
+    writer = _rewrite(file, target, [], most=policies)
+    if writer is not None and writer.policies < policies:
         writer.abandon()
         writer.part.unlink()
         return None
-    writer.flush()
-    return writer, episodes
+    if writer is not None:
+        writer.flush()
+    return writer
 
 
-def _rewrite(file: Path, target: Path, damaged: list[str], most: float = math.inf) -> tuple[EpisodeWriter | None, int]:
+def _rewrite(file: Path, target: Path, damaged: list[str], most: float = math.inf) -> EpisodeWriter | None:
     """Copy what is whole of the first `most` policies and their episodes."""
     # From front to back, since a log that was cut off has no index: steps and grids are kept until the `/episode`
     # message that closes their episode, which is the last one of it that was written.
-    found, writer, episodes = _Found(), None, 0
-    policies: set[int] = set()
+    found, writer = _Found(), None
     with container.opened_log(file) as stream:
         for topic, time, data in _whole(stream, found, damaged):
             found.hold(topic, time, data)
@@ -112,32 +118,33 @@ def _rewrite(file: Path, target: Path, damaged: list[str], most: float = math.in
             try:
                 if writer is None:
                     raise Damaged("what says how it was recorded")
-                run = found.metadata[schema.RUN]
-                row = check_row(json.loads(data), math.prod(size_of_grid(run)), modes_of(run))
+                row = writer.run.checked_row(json.loads(data))
                 # Episodes of policies recorded after the checkpoint: the resumed run records them again.
                 if row["policy"] >= most:
                     break
-                _policies_up_to(row["policy"], writer, found, policies)
-                episodes += _copy(row, found, writer)
+                _policies_up_to(row["policy"], writer, found)
+                times = int(row["start_time"]), int(row["end_time"])
+                steps, grids = (found.between(topic, *times) for topic in ("/step", "/grid"))
+                writer.add(decode(row, steps, grids, writer.run))
             # A full disk is no damage of the log that is read: it ends the whole copy.
             except OSError:
                 raise
             except Exception as error:  # whatever the content of one episode raises, the next may be whole
-                damaged.append(f"an episode after {episodes} whole ones: {reason(error)}")
+                damaged.append(f"an episode after {writer.episodes if writer else 0} whole ones: {reason(error)}")
             found.release()
         writer = writer or _begin(file, target, found)
     # Steps that no `/episode` message closed: the episode that was being written.
-    if found.steps or schema.END not in found.metadata:
+    if found.held["/step"] or schema.END not in found.metadata:
         damaged.append("the end is missing")
     if writer is not None:
         # Policies recorded after the last whole episode are copied as well: `taken_over` counts them.
         named = (re.fullmatch(rf"{re.escape(schema.POLICY)}\.([0-9]{{1,6}})", name) for name in found.metadata)
         last = max((int(name[1]) for name in named if name), default=-1)
         try:
-            _policies_up_to(int(min(last, most - 1)), writer, found, policies)
+            _policies_up_to(int(min(last, most - 1)), writer, found)
         except (Damaged, ValueError, KeyError) as error:
             damaged.append(reason(error))
-    return writer, episodes
+    return writer
 
 
 def _whole(stream: Any, found: _Found, damaged: list[str]) -> Iterator[tuple[str, int, bytes]]:
@@ -176,39 +183,25 @@ def _begin(file: Path, target: Path, found: _Found) -> EpisodeWriter | None:
     """The new log, if all that it starts with has been found."""
     if schema.RUN not in found.metadata:
         return None
-    run = checked_run(file, found.metadata[schema.RUN])
-    tables = {name: found.attachments.get(name, b"") for name in tables_of(run)}
+    run = LoggedRun.of(file, found.metadata[schema.RUN])
+    tables = {name: found.attachments.get(name, b"") for name in run.tables}
     # Without the kernel and the prices that it names, the log could not be simulated again; a copy would look whole.
-    if any(schema.digest(content) != run.get(f"{name}.sha256") for name, content in tables.items()):
+    if any(schema.digest(content) != run.said.get(f"{name}.sha256") for name, content in tables.items()):
         return None
-    return EpisodeWriter.copy(target, run, tables)
+    return EpisodeWriter(target, run, tables)
 
 
-def _policies_up_to(number: int, writer: EpisodeWriter, found: _Found, done: set[int]) -> None:
+def _policies_up_to(number: int, writer: EpisodeWriter, found: _Found) -> None:
     """Copy the policies up to `number` that have not been copied."""
     # All up to `number`, since a policy's number is its place: leaving out one that has no episode would shift the
     # rest.
-    for each in range(len(done), number + 1):
+    for each in range(writer.policies, number + 1):
         facts = dict(found.metadata.get(f"{schema.POLICY}.{each}", {}))
         if not facts:
             raise Damaged(f"policy {each} is lost")
         writer.flush()  # as when it was recorded, so that a copy has the same bytes
-        check_policy(facts, sensors_of(found.metadata[schema.RUN]))
-        run = found.metadata[schema.RUN]
-        sha256, table = facts.pop("table.sha256"), found.attachments.get(policy_file(each, run))
+        writer.run.check_policy(facts)
+        sha256, table = facts.pop("table.sha256"), found.attachments.get(writer.run.policy_file(each))
         if sha256 and (table is None or schema.digest(table) != sha256):
             raise Damaged(f"policy {each} is lost")
         writer.copy_policy(facts, table if sha256 else None)
-        done.add(each)
-
-
-def _copy(row: dict[str, Any], found: _Found, writer: EpisodeWriter) -> int:
-    """Write the episode that `row` describes, from the steps found since the one before."""
-    begin, end = int(row["start_time"]), int(row["end_time"])
-    # By time: messages of an episode whose own end was lost may stand before it.
-    steps = [data for time, data in found.steps.items() if begin <= time <= end]
-    grids = [data for time, data in found.grids.items() if begin <= time <= end]
-    run = found.metadata[schema.RUN]
-    tick = schema.tick_of(begin)
-    writer.add(decode(row, steps, grids, size_of_grid(run), tick, modes_of(run), sensors_of(run)))
-    return 1

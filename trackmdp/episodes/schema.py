@@ -37,25 +37,31 @@ def _object(title: str, **properties: Any) -> dict[str, Any]:
     return {"title": title, "type": "object", "properties": properties}
 
 
-_NUMBER, _INTEGER, _BOOLEAN, _STRING = ({"type": kind} for kind in ("number", "integer", "boolean", "string"))
-_XY = {"type": "object", "properties": {"x": _NUMBER, "y": _NUMBER}}
-_XYZ = {"type": "object", "properties": {"x": _NUMBER, "y": _NUMBER, "z": _NUMBER}}
-_XYZW = {"type": "object", "properties": {"x": _NUMBER, "y": _NUMBER, "z": _NUMBER, "w": _NUMBER}}
-_TIME = {"type": "object", "properties": {"sec": _INTEGER, "nsec": _INTEGER}}
-_FIELD = {"type": "object", "properties": {"name": _STRING, "offset": _INTEGER, "type": _INTEGER}}
+def _fields(kind: str, names: str) -> dict[str, Any]:
+    """Properties of one type."""
+    return {name: {"type": kind} for name in names.split()}
+
+
+def _inner(kind: str, names: str) -> dict[str, Any]:
+    """A property with properties of one type."""
+    return {"type": "object", "properties": _fields(kind, names)}
+
+
+_INTEGER = {"type": "integer"}
 
 
 def _layer(title: str) -> tuple[str, dict[str, Any]]:
+    place = {"position": _inner("number", "x y z"), "orientation": _inner("number", "x y z w")}
+    field = {"type": "object", "properties": _fields("string", "name") | _fields("integer", "offset type")}
     return "foxglove.Grid", _object(
         f"{title}; the first row is the lowest",
-        timestamp=_TIME,
-        frame_id=_STRING,
-        pose={"type": "object", "properties": {"position": _XYZ, "orientation": _XYZW}},
+        timestamp=_inner("integer", "sec nsec"),
+        **_fields("string", "frame_id"),
+        pose={"type": "object", "properties": place},
         column_count=_INTEGER,
-        cell_size=_XY,
-        row_stride=_INTEGER,
-        cell_stride=_INTEGER,
-        fields={"type": "array", "items": _FIELD},
+        cell_size=_inner("number", "x y"),
+        **_fields("integer", "row_stride cell_stride"),
+        fields={"type": "array", "items": field},
         data={"type": "string", "contentEncoding": "base64"},
     )
 
@@ -65,21 +71,13 @@ SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
         "trackmdp.Step",
         _object(
             "One step: what was known and chosen before the move, what came of it after",
-            episode=_INTEGER,
-            t=_INTEGER,
-            n=_INTEGER,
-            last_cell=_INTEGER,
+            **_fields("integer", "episode t n last_cell"),
             active={"type": "array", "items": _INTEGER},
             n_active=_INTEGER,
-            forced=_BOOLEAN,
-            target=_INTEGER,
-            target_x=_INTEGER,
-            target_y=_INTEGER,
-            obs=_INTEGER,
-            reward=_NUMBER,
-            ep_return=_NUMBER,
-            first=_BOOLEAN,
-            last=_BOOLEAN,
+            forced={"type": "boolean"},
+            **_fields("integer", "target target_x target_y obs"),
+            **_fields("number", "reward ep_return"),
+            **_fields("boolean", "first last"),
         ),
     ),
     "/grid": _layer("belief and policy of every cell, of large grids of the part where they are not 0"),
@@ -90,17 +88,11 @@ SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
         _object(
             "One episode, at the time of its last step",
             episode=_INTEGER,
-            seed=_STRING,
-            policy=_INTEGER,
-            start=_INTEGER,
-            length=_INTEGER,
-            detections=_INTEGER,
-            forced=_INTEGER,
-            terminated=_BOOLEAN,
-            truncated=_BOOLEAN,
-            start_time=_STRING,
-            end_time=_STRING,
-            **{"return": _NUMBER},
+            seed={"type": "string"},
+            **_fields("integer", "policy start length detections forced"),
+            **_fields("boolean", "terminated truncated"),
+            **_fields("string", "start_time end_time"),
+            **_fields("number", "return"),
         ),
     ),
 }

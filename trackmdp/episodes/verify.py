@@ -38,7 +38,7 @@ def verify(reader: EpisodeReader, *, numbers: list[int] | None = None) -> Verifi
         reader.check_all()
     wanted = [row["episode"] for row in reader.rows] if numbers is None else numbers
     # The belief is a sum of products, which another version or processor may add up in another order.
-    tolerance = BELIEF_TOLERANCE if versions_apart(reader.run) else 0.0
+    tolerance = BELIEF_TOLERANCE if versions_apart(reader.run.said) else 0.0
     world, done, steps = reader.world(), 0, 0
     for number_of_policy, group in groupby(wanted, lambda number: reader.row(number)["policy"]):
         policy, mine = reader.policy(number_of_policy), list(group)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import json
-import math
 import os
 import threading
 from collections.abc import Mapping
@@ -12,20 +10,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from mcap.writer import Writer
-from scipy import sparse
 
-from trackmdp.arrays import load_npz
+from trackmdp.arrays import npy_bytes
 from trackmdp.durable import create, sync, sync_folder
 from trackmdp.episodes import messages, schema
 from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.grids import grid_messages
-from trackmdp.episodes.limits import policy_file, size_of_grid
+from trackmdp.episodes.limits import LoggedRun
 from trackmdp.episodes.schema import time_of
 from trackmdp.policies.policy import Policy
 from trackmdp.world.coverage import Coverage
-from trackmdp.world.files import csr_of
+from trackmdp.world.files import csr_bytes, csr_in
 from trackmdp.world.modes import HiddenWorld, Modelled
 
 FLUSH_STEPS = 100
@@ -43,22 +39,23 @@ class EpisodeWriter:
 
     Args:
         file: the log; its folder exists.
-        world: the world of all its episodes; its tables go into the log, so that it can be re-simulated.
-        facts: what else the log says of the run, such as `seed`.
-        config: text of the run's `config.yaml`.
+        run: the metadata `trackmdp.run` that it begins with.
+        tables: the attachments that they name: the world of all its episodes, so that it can be re-simulated.
     """
 
-    def __init__(self, file: Path, world: Modelled, *, facts: Mapping[str, str], config: str) -> None:
-        tables = {
-            "config.yaml": config.encode(),
-            **_kernel(world),
-            "cost.npy": _npy(world.cost),
-        }
+    @classmethod
+    def of(cls, file: Path, world: Modelled, *, facts: Mapping[str, str], config: str) -> EpisodeWriter:
+        """A log of `world`; `facts` is what else it says of the run, such as `seed`, `config` its `config.yaml`.
+
+        Raises:
+            UserError: the world is larger than a log may say.
+        """
+        tables = {"config.yaml": config.encode(), **_kernel(world), "cost.npy": npy_bytes(world.cost)}
         if not (world.perfect and world.safe):
-            tables["sensors.npy"] = _npy(np.stack([world.detection, world.safe_detection]))
+            tables["sensors.npy"] = npy_bytes(np.stack([world.detection, world.safe_detection]))
         if world.coverage is not None:
-            tables["footprints.npz"] = _npz(world.coverage.matrix)
-        run = {
+            tables["footprints.npz"] = csr_bytes(world.coverage.matrix)
+        said = {
             **schema.versions(),
             **facts,
             "format_version": schema.LOG_FORMAT,
@@ -75,35 +72,25 @@ class EpisodeWriter:
             "tick_ns": str(schema.TICK_NS),
             **{f"{name}.sha256": schema.digest(content) for name, content in tables.items()},
         }
-        self._size, self._t_max, self._run = world.size, world.t_max, run
-        self._coverage = world.coverage
-        self._open(file, run, tables)
+        return cls(file, LoggedRun.of(file, said), tables)
 
-    @classmethod
-    def copy(cls, file: Path, run: Mapping[str, str], tables: Mapping[str, bytes]) -> EpisodeWriter:
-        """A log that starts with the metadata `trackmdp.run` and the attachments of another."""
-        writer = cls.__new__(cls)
-        writer._size, writer._t_max, writer._run = size_of_grid(run), int(run["t_max"]), dict(run)
-        footprints = tables.get("footprints.npz")
-        given = None if footprints is None else csr_of(load_npz(io.BytesIO(footprints)))
-        writer._coverage = Coverage.of(given, math.prod(writer._size))
-        writer._open(file, dict(run), dict(tables))
-        return writer
-
-    def _open(self, file: Path, run: dict[str, str], tables: dict[str, bytes]) -> None:
+    def __init__(self, file: Path, run: LoggedRun, tables: Mapping[str, bytes]) -> None:
+        self.run = run
+        footprints = csr_in(tables["footprints.npz"]) if "footprints.npz" in tables else None
+        self._coverage = Coverage.of(footprints, run.cells)
         self.file, self.part = file, file.with_name(f"{file.name}.part")
         self._lock, self._process = threading.Lock(), os.getpid()
         self._rows: list[dict[str, Any]] = []
-        self._policies = self._unflushed = self._tick = 0
+        self.policies = self._unflushed = self._tick = 0
         # Opened here and not by the Writer, which closes a file of its own in finish(), before it could be synced.
         # CRCs over the data section are off by default; `Container.check_data` needs them.
         self._stream = create(self.part)
         self._writer = Writer(self._stream, enable_data_crcs=True)
-        self._writer.start(library=f"trackmdp {run['trackmdp']}")
+        self._writer.start(library=f"trackmdp {run.said['trackmdp']}")
         # Once, and the numbers kept: registering a topic a second time would make a second channel of the same name.
-        more = schema.MODE if "modes" in run else {}
+        more = schema.MODE if run.modes else {}
         self._channels = {topic: self._register(topic, more.get(topic, {})) for topic in schema.SCHEMAS}
-        self._tell(schema.RUN, run)
+        self._tell(schema.RUN, run.said)
         for name, content in tables.items():
             self._attach(name, content)
         # In the file at once: a log that is cut off later can be recovered only with what it starts with.
@@ -117,9 +104,9 @@ class EpisodeWriter:
         return self._writer.register_channel(topic, "json", number)
 
     @property
-    def policies(self) -> int:
-        """How many policies the log holds."""
-        return self._policies
+    def episodes(self) -> int:
+        """How many episodes the log holds."""
+        return len(self._rows)
 
     def add_policy(self, facts: Mapping[str, str], policy: Policy | None) -> int:
         """Add the policy of the episodes that follow; returns its number.
@@ -128,26 +115,21 @@ class EpisodeWriter:
             facts: what the log says of it, for a reader: its `label`.
             policy: from which `replay verify=true` simulates them again; None where there is none.
         """
-        kind, table = _described(policy, sparse="kernel.npz.sha256" in self._run)
+        kind, table = _described(policy, sparse=self.run.sparse)
         if policy is not None and policy.task.keyed:
             kind |= {name: str(getattr(policy.task, name)) for name in ("memory", "clip", "revealed")}
-        with self._lock:
-            return self._add_policy({**facts, **kind}, table)
+        return self.copy_policy({**facts, **kind}, table)
 
     def copy_policy(self, facts: Mapping[str, str], table: bytes | None) -> int:
         """Add a policy as it was read from another log."""
         with self._lock:
-            return self._add_policy(dict(facts), table)
-
-    def _add_policy(self, facts: dict[str, str], table: bytes | None) -> int:
-        number = self._policies
-        facts |= {"table.sha256": schema.digest(table) if table is not None else ""}
-        self._tell(f"{schema.POLICY}.{number}", facts)
-        if table is not None:
-            self._attach(policy_file(number, self._run), table)
-        self._flush()
-        self._policies += 1
-        return number
+            sha256 = schema.digest(table) if table is not None else ""
+            self._tell(f"{schema.POLICY}.{self.policies}", {**facts, "table.sha256": sha256})
+            if table is not None:
+                self._attach(self.run.policy_file(self.policies), table)
+            self._flush()
+            self.policies += 1
+            return self.policies - 1
 
     def add(self, episode: Episode) -> None:
         """Append an episode.
@@ -162,7 +144,7 @@ class EpisodeWriter:
         # read.
         with self._lock:
             tick = self._tick if episode.first_tick is None else episode.first_tick
-            row = messages.row_of(episode, self._t_max, tick)
+            row = messages.row_of(episode, self.run.t_max, tick)
             self._add_messages(episode, tick, row)
             self._rows.append(row)
             self._tick = tick + len(episode) + schema.GAP
@@ -178,9 +160,9 @@ class EpisodeWriter:
         if not (np.isfinite(episode.reward).all() and 0 <= tick < 2**37):
             raise ValueError(f"episode {episode.number}: a reward that is not finite, or a time out of range")
         add, channels = self._writer.add_message, self._channels
-        steps = messages.step_messages(episode, self._size, self._t_max)
+        steps = messages.step_messages(episode, self.run)
         covered = None if self._coverage is None else self._coverage.cells(episode.action)
-        grids = grid_messages(episode, self._size, tick, covered)
+        grids = grid_messages(episode, self.run.size, tick, covered)
         for place, (said, layers) in enumerate(zip(steps, grids, strict=True), start=tick):
             # MCAP's sequence number has 32 bits, the log time 64.
             time, sequence = time_of(place), place & 0xFFFFFFFF
@@ -207,7 +189,7 @@ class EpisodeWriter:
             self._flush()
             self._attach("episodes.json", index)
             steps = sum(row["length"] for row in self._rows)
-            counts = {"episodes": str(len(self._rows)), "steps": str(steps), "policies": str(self._policies)}
+            counts = {"episodes": str(len(self._rows)), "steps": str(steps), "policies": str(self.policies)}
             self._tell(schema.END, {"complete": "true", **counts, "episodes.json.sha256": schema.digest(index)})
             # finish() writes the summary: with it, under its `.part` name, the file is complete. Sync, then rename:
             # whoever sees the final name sees all bytes. A kill before the rename leaves a `.part` that can be
@@ -257,8 +239,8 @@ def _described(policy: Policy | None, *, sparse: bool) -> tuple[dict[str, str], 
     if sparse:
         if policy.sets is None:  # all on or none: as many as there are drawn, or not one, which needs no table
             return {"kind": "random_k", "k": str(round((policy.probability or 0.0) * policy.task.total_sensors))}, None
-        return {"kind": "chains"}, _npz(policy.sets)
-    return {"kind": "chains"}, _npy(np.packbits(policy.dense(), axis=-1))
+        return {"kind": "chains"}, csr_bytes(policy.sets)
+    return {"kind": "chains"}, npy_bytes(np.packbits(policy.dense(), axis=-1))
 
 
 def _kernel(world: Modelled) -> dict[str, bytes]:
@@ -267,17 +249,5 @@ def _kernel(world: Modelled) -> dict[str, bytes]:
     That on a large grid, and of targets with a mode, whose kernel is on (cell, mode).
     """
     if world.num_cells > DENSE_CELLS or isinstance(world, HiddenWorld):
-        return {"kernel.npz": _npz(world.kernel)}
-    return {"kernel.npy": _npy(world.kernel.toarray())}
-
-
-def _npz(matrix: sparse.csr_array) -> bytes:
-    buffer = io.BytesIO()
-    sparse.save_npz(buffer, matrix)
-    return buffer.getvalue()
-
-
-def _npy(table: npt.NDArray[Any]) -> bytes:
-    buffer = io.BytesIO()
-    np.save(buffer, np.ascontiguousarray(table), allow_pickle=False)
-    return buffer.getvalue()
+        return {"kernel.npz": csr_bytes(world.kernel)}
+    return {"kernel.npy": npy_bytes(world.kernel.toarray())}

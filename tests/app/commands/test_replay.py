@@ -27,6 +27,7 @@ from trackmdp.episodes import schema
 from trackmdp.episodes.episode import Episode, first_difference
 from trackmdp.episodes.frame import frame, sentence
 from trackmdp.episodes.layout import layout as layout_of
+from trackmdp.episodes.limits import LoggedRun
 from trackmdp.episodes.log import EpisodeLog
 from trackmdp.episodes.player import Playing
 from trackmdp.episodes.reader import EpisodeReader
@@ -63,7 +64,7 @@ def replay(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, s
 def test_evaluate_logs_as_many_episodes_as_it_simulates(log: Path) -> None:
     with EpisodeReader(log) as reader:
         assert len(reader) == 30
-        assert reader.run["seed"] == "3"
+        assert reader.run.said["seed"] == "3"
         assert world_of(reader.attachment("config.yaml")).grid.size == 4
     layout = json.loads((log.parent / "episodes.layout.json").read_text())
     maps = [panel for panel in layout["configById"].values() if "topics" in panel]
@@ -177,7 +178,7 @@ def changed(log: Path, target: Path, change: Callable[[Episode], Episode], run: 
     """The log with episode 4 changed, all checksums right."""
     with EpisodeReader(log) as reader:
         tables = {name: reader.attachment(name) for name in ("config.yaml", "kernel.npy", "cost.npy")}
-        writer = EpisodeWriter.copy(target, reader.run | (run or {}), tables)
+        writer = EpisodeWriter(target, LoggedRun(reader.run.said | (run or {})), tables)
         facts = {key: value for key, value in reader.policies[0].items() if key != "table.sha256"}
         writer.copy_policy(facts, reader.policy_table(0))
         for episode in reader.episodes():
@@ -223,7 +224,7 @@ def test_verify_names_a_kernel_that_its_config_does_not_describe(
 ) -> None:
     with EpisodeReader(log) as reader:
         config = reader.attachment("config.yaml").decode().replace("exit_probability: 0.05", "exit_probability: 0.06")
-        writer = EpisodeWriter(tmp_path / "a.mcap", reader.world(), facts={}, config=config)
+        writer = EpisodeWriter.of(tmp_path / "a.mcap", reader.world(), facts={}, config=config)
     writer.finish()
     status, _, error = replay(capsys, f"file={tmp_path}/a.mcap", "verify=true")
     assert (status, "kernel from cell 0 to " in error, "the config gives" in error) == (1, True, True)

@@ -52,7 +52,7 @@ def log_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[
 
 
 def _write(file: Path, cfg: BenchmarkConfig, world: World, policy: Policy, episodes: list[Episode]) -> int:
-    writer = EpisodeWriter(file, world, facts={"seed": str(cfg.seed)}, config=to_yaml(cfg))
+    writer = EpisodeWriter.of(file, world, facts={"seed": str(cfg.seed)}, config=to_yaml(cfg))
     writer.add_policy({"label": "benchmark"}, policy)
     for episode in episodes:
         writer.add(episode)

@@ -10,7 +10,6 @@ from rich.console import Console
 from trackmdp.config import EvaluateConfig, PlaybackConfig
 from trackmdp.durable import write_json
 from trackmdp.episodes.episode import Episode
-from trackmdp.episodes.limits import size_of_grid
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.episodes.simulate import resimulate, simulate
 from trackmdp.errors import UserError
@@ -30,7 +29,7 @@ def run(cfg: EvaluateConfig, folder: Path, console: Console, problem: Problem | 
     world = make_problem(cfg) if problem is None else problem
     assert not isinstance(world, Recorded)  # they are refused
     with EpisodeReader(cfg.baseline.file) as reader:
-        recorded = size_of_grid(reader.run)
+        recorded = reader.run.size
         if recorded != world.size:
             raise UserError(
                 f"baseline.file={cfg.baseline.file}: recorded on a grid of size {_size(*recorded)}, "

@@ -9,7 +9,6 @@ from rich.console import Console
 
 from trackmdp.config import ReplayConfig, TableConfig, world_of
 from trackmdp.episodes.layout import write_layout
-from trackmdp.episodes.limits import size_of_grid
 from trackmdp.episodes.page import write_page
 from trackmdp.episodes.player import play
 from trackmdp.episodes.reader import EpisodeReader
@@ -35,7 +34,7 @@ def run(cfg: ReplayConfig, folder: Path) -> None:  # noqa: ARG001  what is writt
         file = _recover(console, file)
     with EpisodeReader(file) as reader:
         # Said at once: other versions of NumPy or torch may draw other numbers, which is not damage.
-        if apart := versions_apart(reader.run):
+        if apart := versions_apart(reader.run.said):
             console.print(f"made by other versions: {apart}", markup=False)
         asked = _exports(console, cfg, reader)
         if cfg.verify:
@@ -63,7 +62,7 @@ def _exports(console: Console, cfg: ReplayConfig, reader: EpisodeReader) -> bool
     writers: list[tuple[str, str | None, Callable[[Path], object]]] = [
         ("html", cfg.html, lambda path: write_page(reader, path, cfg.episode)),
         ("csv", cfg.csv, lambda path: write_tables(reader, path, cfg.episode)),
-        ("layout", cfg.layout, lambda path: write_layout(path, reader.world().size)),
+        ("layout", cfg.layout, lambda path: write_layout(path, reader.run.size)),
     ]
     for key, path, write in writers:
         if path is None:
@@ -85,7 +84,7 @@ def _verify(console: Console, cfg: ReplayConfig, reader: EpisodeReader) -> None:
             verified = verify(reader, numbers=numbers)
         difference = verified.difference
     if difference is not None:
-        apart = versions_apart(reader.run)
+        apart = versions_apart(reader.run.said)
         because = f"; made by other versions: {apart}" if apart else ""
         raise RunError(f"file={cfg.file}: {difference}{because}")
     console.print(f"{verified.episodes} episodes, {verified.steps:,} steps: the same to the bit", markup=False)
@@ -113,9 +112,9 @@ def _kernel_difference(reader: EpisodeReader) -> str | None:
 
 def _list(console: Console, reader: EpisodeReader) -> None:
     steps = sum(row["length"] for row in reader.rows)
-    (rows, columns), seed = size_of_grid(reader.run), reader.run.get("seed", "")
+    (rows, columns), seed = reader.run.size, reader.run.said.get("seed", "")
     grid = f"{rows}x{columns} grid"
-    console.print(f"{len(reader)} episodes, {steps:,} steps on a {grid}, T_max {reader.t_max}, seed {seed}")
+    console.print(f"{len(reader)} episodes, {steps:,} steps on a {grid}, T_max {reader.run.t_max}, seed {seed}")
     entries = [
         [
             str(row["episode"]),
