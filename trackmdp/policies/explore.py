@@ -5,16 +5,14 @@ from __future__ import annotations
 from typing import ClassVar
 
 import numpy as np
-import numpy.typing as npt
 import torch
-from scipy import sparse
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from trackmdp.policies.lookup import in_window
 from trackmdp.policies.table import PolicyTable
 from trackmdp.world.model import Task
-from trackmdp.world.windows import Window
 
 _ROWS_AT_ONCE = 2**12
 
@@ -38,9 +36,8 @@ class RenewedTable(TensorDictModuleBase):
 
     def __init__(self, task: Task, device: torch.device | str = "cpu", *, on: bool = False) -> None:
         super().__init__()
-        self.num_choices, self.num_sensors, self.keys = task.num_choices, task.num_sensors, task.keys
+        self.task = task.task
         self.in_keys = ["key" if task.keyed else "last_cell", "steps_since_detection"]
-        self.window = Window.of(task, device)
         # Row key (t_max + 1) + n, as in `PolicyTable`; 8 sensors per byte: 10 x 10 cells take 13 bytes a row.
         shape = (task.num_keys * task.num_choices, -(-task.num_sensors // 8))
         self.register_buffer("bits", torch.full(shape, 255 * on, dtype=torch.uint8, device=device))
@@ -50,29 +47,18 @@ class RenewedTable(TensorDictModuleBase):
     def renew(self, policy: PolicyTable) -> None:
         """Act as the deterministic `policy` from now on."""
         assert policy.sets is not None
+        sets = in_window(self.task, policy.sets)
         for begin in range(0, len(self.bits), _ROWS_AT_ONCE):
-            rows = self._local(policy.sets[begin : begin + _ROWS_AT_ONCE], begin)
+            rows = sets[begin : begin + _ROWS_AT_ONCE].toarray()
             self.bits[begin : begin + len(rows)].copy_(torch.as_tensor(np.packbits(rows, axis=1)))
-
-    def _local(self, sets: sparse.csr_array, begin: int) -> npt.NDArray[np.bool_]:
-        """`[R, K]`, what rows `begin` and following of a policy's sets `[R, M]` are from their located cells."""
-        if not self.window.is_local:
-            return sets.toarray()
-        on = np.zeros((sets.shape[0], self.window.width), dtype=bool)
-        row = np.repeat(np.arange(sets.shape[0]), np.diff(sets.indptr))
-        start = torch.as_tensor(self.keys.cell((begin + row) // self.num_choices))
-        cell = torch.as_tensor(sets.indices).long()
-        # A policy of this task has no sensor outside the window, so that each has a local number below K.
-        on[row, self.window.find(start.to(self.bits.device), cell.to(self.bits.device)).cpu().numpy()] = True
-        return on
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action` `[*B, K]`, local to `last_cell` where the task has a window."""
         key, n = (tensordict[name] for name in self.in_keys)
         # n = t_max + 1 has no row of its own: the safe action replaces whatever is written there.
-        packed = self.bits[key * self.num_choices + n.clamp_max(self.num_choices - 1)]
+        packed = self.bits[key * self.task.num_choices + n.clamp_max(self.task.t_max)]
         # [*B, bytes, 1] >> [8] = [*B, bytes, 8], flattened to bits in the order of the sensors; the padding is cut off.
-        chosen = ((packed.unsqueeze(-1) >> self._place) & 1).flatten(-2)[..., : self.num_sensors].bool()
+        chosen = ((packed.unsqueeze(-1) >> self._place) & 1).flatten(-2)[..., : self.task.num_sensors].bool()
         return tensordict.set("action", chosen)
 
 

@@ -21,7 +21,7 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from trackmdp.errors import UserError
-from trackmdp.policies.lookup import DenseTable, SparseTable, WindowTable
+from trackmdp.policies.lookup import DenseTable, SparseTable, WindowTable, in_window
 from trackmdp.policies.saved import load_policy, save_policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.policies.unroll import (
@@ -110,9 +110,7 @@ class Policy(TensorDictModuleBase, PolicyTable):
         return cls(task, sparse.csr_array((share, near.indices, near.indptr), shape=near.shape), k=k)
 
     @classmethod
-    def from_function(
-        cls, task: Task, function: Callable[..., Any], *, device: torch.device | str = "cpu", check: bool = True
-    ) -> Policy:
+    def from_function(cls, task: Task, function: Callable[..., Any], *, check: bool = True) -> Policy:
         """The table of `function(last_cell [B], steps_since_detection [B], action_history [B, t_max+1, K])`.
 
         It returns bool `[B, K]`, a tensor or an array, and is called for all M * (t_max + 1) states, a few blocks of
@@ -120,15 +118,14 @@ class Policy(TensorDictModuleBase, PolicyTable):
 
         Args:
             task: grid, costs and limits.
-            function: must not draw.
-            device: where its arguments live.
+            function: must not draw; its arguments live on the CPU.
             check: ask everything twice, to find out whether it draws.
 
         Raises:
             UserError: it draws, or it returns something else.
         """
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            return cls._unrolled(task.remembering(), function_rule(task, function), device, check=check)
+            return cls._unrolled(task.remembering(), function_rule(task, function), "cpu", check=check)
 
     @classmethod
     def from_module(
@@ -233,14 +230,7 @@ class Policy(TensorDictModuleBase, PolicyTable):
         if self._everything and (self._local is None or self._local.device != key.device):
             self._local = WindowTable(self.task, key.device)
         if self._local is None or self._local.device != key.device:
-            row = np.repeat(np.arange(self.sets.shape[0]), np.diff(self.sets.indptr))
-            start = torch.as_tensor(self.task.keys.cell(row // self.task.num_choices))
-            cells = torch.as_tensor(self.sets.indices, dtype=torch.int64)
-            # Local numbers are in the order of the cells they stand for, so that the columns of a row stay in order.
-            local = Window.of(self.task).find(start, cells).numpy()
-            shape = (self.sets.shape[0], self.task.num_sensors)
-            table = sparse.csr_array((self.sets.data, local, self.sets.indptr), shape=shape)
-            self._local = looked_up(table, key.device)
+            self._local = looked_up(in_window(self.task, self.sets), key.device)
         return self._local(self.row(key, steps_since_detection))
 
     # Files.
@@ -259,15 +249,14 @@ class Policy(TensorDictModuleBase, PolicyTable):
         return cls.from_table(load_policy(Path(file))[0])
 
 
-def as_policy(task: Task, policy: PolicyLike, *, device: torch.device | str | None = None) -> Policy:
+def as_policy(task: Task, policy: PolicyLike) -> Policy:
     """Anything that acts as a `Policy`.
 
     A stochastic actor of TorchRL is the mixture that it draws from, unless `set_exploration_type` says otherwise.
 
     Args:
         task: what it acts in.
-        policy: a `Policy`, a TensorDict module, or a function.
-        device: where to ask a module or function; None for where the module's first weight is, or the CPU.
+        policy: a `Policy`, a TensorDict module, which is asked where its first weight is, or a function.
 
     Raises:
         DrawsError: a module or function draws at random with probabilities that are not known, or depend on what it
@@ -275,7 +264,7 @@ def as_policy(task: Task, policy: PolicyLike, *, device: torch.device | str | No
         UserError: it belongs to another grid, or is not of these forms.
     """
     if not isinstance(policy, PolicyTable):
-        where = torch.device(device or _device_of(policy))
+        where = _device_of(policy)
         with acting():
             known = known_task(task, policy)
             chances = mixture(known, policy, where) if isinstance(policy, TensorDictModuleBase) else None

@@ -226,14 +226,13 @@ def _distance(task: Task, start: npt.NDArray[Any], cell: npt.NDArray[Any]) -> np
 def _window_sets(task: Task, probability: float) -> sparse.csr_array:
     """`[keys (t_max + 1), M]`, every sensor of the window around each located cell, with one probability."""
     assert task.window is not None
-    m, reach = task.num_cells, np.arange(-task.window, task.window + 1)
-    row, column = np.divmod(np.arange(m), task.columns)
-    # [M, 2W + 1, 2W + 1] each, rows varying along the second axis and columns along the third.
-    rows = (row[:, None, None] + reach[:, None]).repeat(len(reach), axis=2)
-    columns = (column[:, None, None] + reach).repeat(len(reach), axis=1)
-    inside = (rows >= 0) & (rows < task.rows) & (columns >= 0) & (columns < task.columns)
-    cells, count = (rows * task.columns + columns)[inside], inside.sum(axis=(1, 2))
-    begin = np.concatenate([[0], np.cumsum(count)])
-    data: npt.NDArray[Any] = np.full(len(cells), probability, dtype=np.float64 if probability < 1 else np.bool_)
-    near = short_indices(sparse.csr_array((data, cells, begin), shape=(m, m)))
-    return near[np.repeat(np.arange(m), task.keys.num_classes * task.num_choices)]
+    # A cell is near where its row is and its column is: the Kronecker product of both.
+    reach = (min(task.window, side - 1) for side in task.size)
+    rows, columns = (
+        sum(sparse.eye_array(side, k=k) for k in range(-far, far + 1))
+        for side, far in zip(task.size, reach, strict=True)
+    )
+    near = sparse.kron(rows, columns, format="csr") * probability
+    near.sort_indices()
+    near = short_indices(sparse.csr_array(near, dtype=np.float64 if probability < 1 else np.bool_))
+    return near[np.repeat(np.arange(task.num_cells), task.keys.num_classes * task.num_choices)]

@@ -13,8 +13,8 @@ from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import Evaluation, regret_per_step
 from trackmdp.solvers.keyed import averaged
 from trackmdp.solvers.keyed_search import mode_bound
-from trackmdp.world.model import Task, World
-from trackmdp.world.modes import HiddenWorld
+from trackmdp.world.model import Task
+from trackmdp.world.modes import HiddenWorld, Modelled
 
 _PER_CELL = ("value", "steps", "detections", "sensors", "safe_actions")
 
@@ -87,41 +87,31 @@ class Evaluator(ABC):
 class ExactEvaluator(Evaluator):
     """Evaluates with the motion model.
 
+    Where targets have a mode the bound knows it at all times, and Q_MDP plans with cells alone.
+
     Args:
         world: the task and the motion. The paper's bound knows no `max_steps` and is None where the world has one.
     """
 
-    world: World
+    world: Modelled
     qmdp: Evaluation
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: Modelled) -> None:
         self.world = world
-        paper = None if world.max_steps is not None else float(bounds.paper(world).mean())
-        self.upper = float(bounds.clocked(world).mean())
-        self.bounds = {"paper": paper, "valid": float(bounds.valid(world).mean()), "clocked": self.upper}
-        self.qmdp = evaluate(world, qmdp.solve(world))
-        self.lower = self.qmdp.aihtr
+        self.bounds = dict.fromkeys(("paper", "valid", "clocked"))
+        if isinstance(world, HiddenWorld):
+            self.upper = float(mode_bound(world)[:, 0].mean())
+            self.qmdp = evaluate(world, qmdp.solve(averaged(world)))
+        else:
+            if world.max_steps is None:
+                self.bounds["paper"] = float(bounds.paper(world).mean())
+            self.bounds["valid"], self.upper = float(bounds.valid(world).mean()), float(bounds.clocked(world).mean())
+            self.qmdp = evaluate(world, qmdp.solve(world))
+        self.bounds["clocked"], self.lower = self.upper, self.qmdp.aihtr
 
     def evaluate(self, policy: PolicyTable) -> Evaluation:
         """Exact figures of a policy."""
         return evaluate(self.world, policy, per_cell=False)
-
-
-class HiddenEvaluator(Evaluator):
-    """Evaluates exactly where targets have a mode; the bound knows it at all times, Q_MDP plans with cells alone."""
-
-    world: HiddenWorld
-    qmdp: Evaluation
-
-    def __init__(self, world: HiddenWorld) -> None:
-        self.world = world
-        self.qmdp = evaluate(world, qmdp.solve(averaged(world)))
-        self.upper, self.lower = float(mode_bound(world)[:, 0].mean()), self.qmdp.aihtr
-        self.bounds = {"paper": None, "valid": None, "clocked": self.upper}
-
-    def evaluate(self, policy: PolicyTable) -> Evaluation:
-        """Exact figures of a policy."""
-        return evaluate(self.world, policy)
 
 
 def while_collecting(upper: float, evaluation: Evaluation, reward: float, frames: int) -> dict[str, float]:

@@ -19,9 +19,8 @@ from trackmdp.solvers.kernel_estimate import KernelEstimate
 from trackmdp.solvers.path_exchange import choose_plan
 from trackmdp.solvers.recorded import ReplayedTracks, replay
 from trackmdp.statistics import MeanInterval
-from trackmdp.training.evaluator import Evaluator, ExactEvaluator, HiddenEvaluator, Score
+from trackmdp.training.evaluator import Evaluator, ExactEvaluator, Score
 from trackmdp.world.model import World
-from trackmdp.world.modes import HiddenWorld
 from trackmdp.world.tracks import Problem, Recorded, Tracks
 
 ESTIMATED = "Q_MDP of the estimated kernel"
@@ -32,9 +31,7 @@ CELL_ALONE = "task.memory=cell"
 
 def make_evaluator(problem: Problem) -> Evaluator:
     """Exact where there is a motion model, else on the held-out tracks."""
-    if isinstance(problem, HiddenWorld):
-        return HiddenEvaluator(problem)
-    return ExactEvaluator(problem) if isinstance(problem, World) else HeldOutEvaluator(problem)
+    return HeldOutEvaluator(problem) if isinstance(problem, Recorded) else ExactEvaluator(problem)
 
 
 class HeldOutEvaluator(Evaluator):

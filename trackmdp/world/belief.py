@@ -14,14 +14,9 @@ class BeliefFilter:
     One step is `predict`, then `detect` or `miss`. All methods are pure.
     """
 
-    def __init__(self, kernel: sparse.csr_array, device: torch.device | str = "cpu") -> None:
-        into = sparse.coo_array(kernel.T.tocsr())  # entry (y, x): from x into y; sorted, so that sums have one order
-        places = torch.as_tensor(np.stack([into.row, into.col]).astype(np.int64))
-        values = torch.as_tensor(into.data, dtype=torch.float64)
+    def __init__(self, kernel: sparse.csr_array) -> None:
         self.num_cells: int = kernel.shape[0]
-        self._into = torch.sparse_coo_tensor(
-            places, values, into.shape, device=device, check_invariants=True
-        ).coalesce()
+        self._into = kernel.T.tocsr()  # entry (y, x): from x into y
 
     def detect(self, cell: Tensor) -> Tensor:
         """Certainty after a detection in `cell` `[B]`."""
@@ -29,7 +24,7 @@ class BeliefFilter:
 
     def predict(self, belief: Tensor) -> Tensor:
         """`[B, M]` predicted probability of each cell after one move; a row sums to the probability of no exit."""
-        return torch.sparse.mm(self._into, belief.T).T.contiguous()
+        return summed(self._into, belief)
 
     def miss(self, predicted: Tensor, action: Tensor) -> Tensor:
         """Condition `predicted` `[B, M]` on no detection under `action` `[B, M]` and no exit.
@@ -44,3 +39,12 @@ class BeliefFilter:
         grid = predicted / predicted.sum(-1, keepdim=True).clamp_min(torch.finfo(predicted.dtype).tiny)
         # `where` evaluates both sides; the clamps keep 0 / 0 out of the one that is not taken.
         return torch.where(mass > 0, unseen / mass.clamp_min(torch.finfo(predicted.dtype).tiny), grid)
+
+
+def summed(into: sparse.csr_array, belief: Tensor) -> Tensor:
+    """`into` `[Y, X]` times each row of `belief` `[B, X]`, with sums whose order does not depend on B.
+
+    A product of dense matrices may add up in another order for one row than for many, which would make an episode
+    differ in the last bit when it is simulated again alone; a sparse one adds up each result entry by entry.
+    """
+    return torch.from_numpy(np.ascontiguousarray((into @ np.ascontiguousarray(belief.numpy().T)).T))

@@ -34,12 +34,10 @@ class Window(nn.Module):
 
     _row: Tensor
     _column: Tensor
-    _code: Tensor
-    _corner: Tensor
     _cells: Tensor | None
     _slots: Tensor
-    _line_code: Tensor
-    _line_corner: Tensor
+    _code: Tensor
+    _corner: Tensor
     _groups: Tensor
     _inside: Tensor
 
@@ -47,21 +45,11 @@ class Window(nn.Module):
         super().__init__()
         self.rows, self.columns = size.size if isinstance(size, Task) else grid_size(size)
         self.num_cells, self.radius = self.rows * self.columns, radius
+        self.width = self.num_cells if radius is None else (2 * radius + 1) ** 2
         cell = torch.arange(self.num_cells, device=device)
-        row, column = cell // self.columns, cell % self.columns
-        side = self.columns if radius is None else 2 * radius + 1
-        self.width = self.num_cells if radius is None else side**2
-        # With code(x) = side · row + column, the window of x begins at the corner code(x) - W · (side + 1), and its
-        # local sensor for cell y is code(y) - corner(x). Radius 1, from 7 to 14 on 6 columns: 3·2+2 - (3·1+1-4) = 8.
-        # Without a radius code(x) is x itself, and every window begins at 0.
-        code = side * row + column
-        corner = torch.zeros_like(code) if radius is None else code - radius * (side + 1)
-        tables = {"_row": row, "_column": column, "_code": code, "_corner": corner}
-        for name, table in tables.items():
-            # The exited target, cell M, has the place of cell 0: inside the tables, and told apart by callers.
-            self.register_buffer(name, torch.cat([table, table[:1]]), persistent=False)
+        self.register_buffer("_row", cell // self.columns, persistent=False)
+        self.register_buffer("_column", cell % self.columns, persistent=False)
         self.register_buffer("_cells", None, persistent=False)
-
         self._find_tables(device)
 
     def _find_tables(self, device: torch.device | str) -> None:
@@ -78,11 +66,12 @@ class Window(nn.Module):
         local = torch.where(place % line < side, place // line * side + place % line, k)
         outside = torch.full((1,), k, device=device)
         self.register_buffer("_slots", torch.cat([outside, local, outside]), persistent=False)
-        code = line * self._row + self._column
-        code[-1] = 4 * line * (self.rows + side)  # an exited target lies behind every line
-        self.register_buffer("_line_code", code, persistent=False)
+        code, exited = line * self._row + self._column, 4 * line * (self.rows + side)  # which lies behind every line
+        self.register_buffer("_code", torch.cat([code, code.new_tensor([exited])]), persistent=False)
         # + 1: place 0 of the table stands for all that lies before it
-        self.register_buffer("_line_corner", code[:-1] - radius * (line + 1) - 1, persistent=False)
+        corner = code - radius * (line + 1) - 1
+        # A path may go on from M once its target has exited: it has the place of cell 0, told apart by callers.
+        self.register_buffer("_corner", torch.cat([corner, corner[:1]]), persistent=False)
         groups = self.groups()
         first = torch.full((int(groups.max()) + 1,), self.num_cells, device=device)
         first.scatter_reduce_(0, groups, torch.arange(self.num_cells, device=device), "amin")
@@ -109,7 +98,7 @@ class Window(nn.Module):
     def cells(self) -> Tensor:
         """`[M, K]` int64, the cell of each local sensor; M where it lies outside the grid."""
         if self._cells is None:
-            self._cells = self.around(torch.arange(self.num_cells, device=self._code.device))
+            self._cells = self.around(torch.arange(self.num_cells, device=self._row.device))
         return self._cells
 
     def around(self, start: Tensor) -> Tensor:
@@ -126,33 +115,27 @@ class Window(nn.Module):
 
     def contains(self, start: Tensor, cell: Tensor) -> Tensor:
         """`[*B]` bool, whether `cell` `[*B]` is a cell of the window of `start` `[*B]`; never where it is M."""
-        inside = cell < self.num_cells
-        if self.radius is None:
-            return inside
-        rows, columns = self._row[cell] - self._row[start], self._column[cell] - self._column[start]
-        return inside & (torch.maximum(rows.abs(), columns.abs()) <= self.radius)
+        return self.find(start, cell) < self.width
 
     def find(self, start: Tensor, cell: Tensor) -> Tensor:
-        """`[B]` int64, the local number of `cell` `[B]` seen from `start` `[B]`; at least K where there is none."""
+        """`[*L, B]` int64, the local number of `cell` `[*L, B]` seen from `start` `[B]`; at least K where it has none.
+
+        `start` may have the shape of `cell`, too.
+        """
         if self.radius is None:
             return cell
-        place = self._line_code.index_select(0, cell) - self._line_corner.index_select(0, start)
-        return self._slots.index_select(0, place.clamp_(0, len(self._slots) - 1))
+        place = _at(self._code, cell) - _at(self._corner, start)
+        return _at(self._slots, place.clamp_(0, len(self._slots) - 1))
+
+    def index(self, start: Tensor, cell: Tensor) -> Tensor:
+        """As `find`; some number from 0 to K - 1 where the window does not hold the cell, as where it is M (exited)."""
+        return self.find(start, cell).clamp_max(self.width - 1)
 
     def inside(self, start: Tensor) -> Tensor:
         """`[B, K]` bool, whether each local sensor seen from `start` `[B]` is a cell of the grid."""
         if self.radius is None:
             return torch.ones(len(start), self.width, dtype=torch.bool, device=start.device)
         return self._inside.index_select(0, self._groups.index_select(0, start))
-
-    def index(self, start: Tensor, cell: Tensor) -> Tensor:
-        """`[*L, B]` int64, the local number of `cell` `[*L, B]` seen from `start` `[B]`.
-
-        Some number from 0 to K - 1 where the window does not hold it, as where it is M (exited).
-        """
-        code = self._code.index_select(0, cell.reshape(-1)).view(cell.shape)
-        place = code - self._corner.index_select(0, start.reshape(-1)).view(start.shape)
-        return place.clamp_(0, self.width - 1)
 
     def to_global(self, start: Tensor, local: Tensor) -> Tensor:
         """`[*B, M]` over all cells, from `[*B, K]` over the window of `start` `[*B]`; zero elsewhere."""
@@ -184,7 +167,12 @@ class Window(nn.Module):
         if classes is not None and (classes != classes[0]).any():
             known = torch.cat([torch.unique(classes, return_inverse=True)[1], classes.new_tensor([-1])])
             return torch.unique(known[self.cells], dim=0, return_inverse=True)[1]
-        row, column = self._row[:-1], self._column[:-1]
+        row, column = self._row, self._column
         # Distances to the four borders, up to the radius: all cells farther inside are of one group.
         margins = torch.stack([row, self.rows - 1 - row, column, self.columns - 1 - column], dim=1)
         return torch.unique(margins.clamp(max=self.radius), dim=0, return_inverse=True)[1]
+
+
+def _at(table: Tensor, index: Tensor) -> Tensor:
+    """`table` `[N]` at an `index` of any shape; on a CPU `index_select` takes half the time of `table[index]`."""
+    return table.index_select(0, index.reshape(-1)).view(index.shape)
