@@ -53,8 +53,10 @@ class States:
 
     def kept(self, rows: Tensor) -> States:
         """Those of the positions `rows`."""
-        known = (self.row, self.place, self.last_cell, self.key, self.misses)
-        return States(*(part[rows] for part in known), step=self.step)
+        row, place, last_cell, key, misses = (
+            part[rows] for part in (self.row, self.place, self.last_cell, self.key, self.misses)
+        )
+        return States(row, place, last_cell, key, misses, self.step)
 
 
 @dataclass(frozen=True)

@@ -61,10 +61,10 @@ def per_cell(
         UserError: a list or file is missing or malformed, holds another number of numbers, or one out of range.
     """
     count, each = (math.prod(grid_size(size)), "cell") if sensors is None else (sensors, "sensor")
-    source, values = key, given
-    if isinstance(given, str):
-        source, values = f"{key}={given}", read_numbers(key, given, name=key.rpartition(".")[2]).ravel()
-    return one_each(source, values, count, each, allowed, expected)
+    if not isinstance(given, str):
+        return one_each(key, given, count, each, allowed, expected)
+    values = read_numbers(key, given, name=key.rpartition(".")[2]).ravel()
+    return one_each(f"{key}={given}", values, count, each, allowed, expected)
 
 
 def read_matrix(key: str, path: str | Path, *, name: str) -> sparse.csr_array | Array:

@@ -32,7 +32,12 @@ def worlds(size: int, t_max: int) -> dict[str, Maker]:
     """By name, worlds on `size` x `size` cells."""
 
     def made(kernel: str, cost: float | list[float], **options: Any) -> Maker:
-        return lambda: make_world(kernel, size=size, t_max=t_max, cost=cost, **options)
+        def world() -> World:
+            found = make_world(kernel, size=size, t_max=t_max, cost=cost, **options)
+            assert isinstance(found, World)  # none of these kernels has modes
+            return found
+
+        return world
 
     def table(kernel: Array, cost: float) -> Maker:
         return lambda: World(kernel, size, cost=cost, t_max=t_max)
