@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
@@ -38,17 +38,23 @@ _HYDRAS_OWN = {
 """Hydra's default under `hydra.sweeper`, where a primary config chooses no sweeper; this package never calls it."""
 
 
+_stored: dict[tuple[str, str], type[Any]] = {}
+"""The schema of each group and choice that Hydra knows, of the commands in the group `""`."""
+
+
 def register() -> None:
     """Make every schema known to Hydra as `base_<name>`, for the `defaults` lists in `conf/`."""
     register_resolvers()
     load_plugins()  # installed packages add their choices to `GROUPS`
+    # A config typed by a dataclass is what makes Hydra refuse an unknown key or a wrong type while it composes.
+    schemas = {("", command): root for command, root in ROOTS.items()}
+    schemas |= {(group, name): schema for group, members in GROUPS.items() for name, schema in members.items()}
+    if schemas == _stored:  # making nodes of them takes longer than composing
+        return
+    _stored.update(schemas)
     store = ConfigStore.instance()
-    for command, root in ROOTS.items():
-        # A config typed by a dataclass is what makes Hydra refuse an unknown key or a wrong type while it composes.
-        store.store(name=f"base_{command}", node=root)
-    for group, members in GROUPS.items():
-        for name, schema in members.items():
-            store.store(group=group, name=f"base_{name}", node=schema)
+    for (group, name), schema in schemas.items():
+        store.store(group=group or None, name=f"base_{name}", node=schema)
     # First load Hydra's plugins, then take out what they stored: what they store later would stay.
     Plugins.instance()  # Hydra's plugins store launchers and sweepers of the same names, which ours replace
     for group, members in PLUGINS.items():
