@@ -7,9 +7,8 @@ import io
 import tokenize
 from collections import Counter
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
-
-import pytest
 
 PACKAGE = Path(__file__).parents[1] / "trackmdp"
 FILES = sorted(PACKAGE.rglob("*.py"))
@@ -56,6 +55,11 @@ def module_name(file: Path) -> str:
     return ".".join(file.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__")
 
 
+@cache
+def trees() -> dict[str, ast.Module]:
+    return {module_name(file): ast.parse(file.read_text(encoding="utf-8")) for file in FILES}
+
+
 def imported(tree: ast.AST) -> Iterator[str]:
     """Modules of this package that a syntax tree imports, wherever the import stands."""
     for node in ast.walk(tree):
@@ -73,29 +77,33 @@ def is_module(name: str) -> bool:
     return path.with_suffix(".py").is_file() or (path / "__init__.py").is_file()
 
 
-def against_the_arrow(module: str, source: str) -> list[str]:
+def against_the_arrow(module: str, tree: ast.AST) -> list[str]:
     if module == "trackmdp":  # the front door names what stands behind it, and imports it when first asked for
         return []
-    ours = (name for name in imported(ast.parse(source)) if name.split(".")[0] == "trackmdp")
+    ours = (name for name in imported(tree) if name.split(".")[0] == "trackmdp")
     return [name for name in ours if rank(name) > rank(module)]
 
 
-@pytest.mark.parametrize("file", FILES, ids=module_name)
-def test_modules_import_only_from_the_left_of_the_arrow(file: Path) -> None:
-    assert not against_the_arrow(module_name(file), file.read_text(encoding="utf-8"))
+def test_modules_import_only_from_the_left_of_the_arrow() -> None:
+    found = {module: against_the_arrow(module, tree) for module, tree in trees().items()}
+    assert not {module: names for module, names in found.items() if names}
 
 
 def test_the_arrow_test_sees_a_broken_arrow() -> None:
-    assert against_the_arrow("trackmdp.world.env", "from trackmdp.algos import ppo") == ["trackmdp.algos.ppo"]
-    assert against_the_arrow("trackmdp.config.tree", "def f():\n    import trackmdp.app.cli") == ["trackmdp.app.cli"]
-    assert not against_the_arrow("trackmdp.algos.ppo", "from trackmdp.world.model import Task\nimport torch")
+    for module, source, found in (
+        ("trackmdp.world.env", "from trackmdp.algos import ppo", ["trackmdp.algos.ppo"]),
+        ("trackmdp.config.tree", "def f():\n    import trackmdp.app.cli", ["trackmdp.app.cli"]),
+        ("trackmdp.algos.ppo", "from trackmdp.world.model import Task\nimport torch", []),
+    ):
+        assert against_the_arrow(module, ast.parse(source)) == found
 
 
 def test_modules_do_not_import_each_other_in_a_circle() -> None:
+    packages = {module_name(file) for file in FILES if file.name == "__init__.py"}
     edges = {
-        module_name(file): {name for name in imported(ast.parse(file.read_text(encoding="utf-8"))) if is_module(name)}
-        for file in FILES
-        if file.name != "__init__.py"
+        module: {name for name in imported(tree) if is_module(name)}
+        for module, tree in trees().items()
+        if module not in packages
     }
     done: set[str] = set()
 
@@ -118,13 +126,12 @@ def top_level(tree: ast.AST) -> set[str]:
     }
 
 
-@pytest.mark.parametrize("file", FILES, ids=module_name)
-def test_hydra_stays_in_app_and_the_schema_is_light(file: Path) -> None:
-    module, used = module_name(file), top_level(ast.parse(file.read_text(encoding="utf-8")))
-    if not module.startswith("trackmdp.app"):
-        assert "hydra" not in used
-    if module.startswith("trackmdp.config") or module in ("trackmdp", "trackmdp.errors"):
-        assert not used & {"torch", "tensordict", "torchrl", "numpy", "scipy"}
+def test_hydra_stays_in_app_and_the_schema_is_light() -> None:
+    for module, tree in trees().items():
+        used = top_level(tree)
+        assert module.startswith("trackmdp.app") or "hydra" not in used, module
+        if module.startswith("trackmdp.config") or module in ("trackmdp", "trackmdp.errors"):
+            assert not used & {"torch", "tensordict", "torchrl", "numpy", "scipy"}, module
 
 
 def asks_for_a_schema(tree: ast.AST) -> list[int]:
@@ -138,10 +145,9 @@ def asks_for_a_schema(tree: ast.AST) -> list[int]:
     ]
 
 
-@pytest.mark.parametrize("file", FILES, ids=module_name)
-def test_nothing_but_config_and_app_asks_for_the_class_of_a_config(file: Path) -> None:
-    if not module_name(file).startswith(("trackmdp.config", "trackmdp.app")):
-        assert not asks_for_a_schema(ast.parse(file.read_text(encoding="utf-8")))
+def test_nothing_but_config_and_app_asks_for_the_class_of_a_config() -> None:
+    for module, tree in trees().items():
+        assert module.startswith(("trackmdp.config", "trackmdp.app")) or not asks_for_a_schema(tree), module
 
 
 def test_the_test_of_schemas_sees_one() -> None:
@@ -158,7 +164,7 @@ def public_names() -> dict[str, list[str]]:
     for file in FILES:
         if file.name == "__init__.py":
             continue
-        body = ast.parse(file.read_text(encoding="utf-8")).body
+        body = trees()[module_name(file)].body
         for name in {node.name for node in body if isinstance(node, ast.FunctionDef | ast.ClassDef)}:
             if not name.startswith("_"):
                 found.setdefault(name, []).append(module_name(file))
@@ -173,29 +179,27 @@ def test_no_public_name_means_two_things() -> None:
     assert not twice
 
 
-LEARNERS = [file for file in FILES if module_name(file).startswith(("trackmdp.algos", "trackmdp.policies"))]
-
-
-@pytest.mark.parametrize("file", LEARNERS, ids=module_name)
-def test_learners_do_not_reach_for_the_motion(file: Path) -> None:
-    names = set(imported(ast.parse(file.read_text(encoding="utf-8"))))
+def test_learners_do_not_reach_for_the_motion() -> None:
     apart = {f"trackmdp.world.{name}" for name in ("kernels", "motion", "belief")}
-    assert not names & apart
-    assert not any(name.startswith("trackmdp.paper") for name in names)
+    for module, tree in trees().items():
+        if module.startswith(("trackmdp.algos", "trackmdp.policies")):
+            names = set(imported(tree))
+            assert not names & apart, module
+            assert not any(name.startswith("trackmdp.paper") for name in names), module
 
 
-@pytest.mark.parametrize("file", FILES, ids=module_name)
-def test_nothing_prints_or_unpickles(file: Path) -> None:
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+def test_nothing_prints_or_unpickles() -> None:
+    nodes = ((module, node) for module, tree in trees().items() for node in ast.walk(tree))
+    for module, node in nodes:
         if not isinstance(node, ast.Call):
             continue
         called = ast.unparse(node.func)
         arguments = {word.arg: ast.unparse(word.value) for word in node.keywords}
-        assert called not in ("print", "pickle.load", "pickle.loads"), f"{file}:{node.lineno}"
+        assert called not in ("print", "pickle.load", "pickle.loads"), f"{module}:{node.lineno}"
         if called == "np.load":
-            assert arguments.get("allow_pickle") == "False", f"{file}:{node.lineno}"
+            assert arguments.get("allow_pickle") == "False", f"{module}:{node.lineno}"
         if called == "torch.load":
-            assert arguments.get("weights_only") == "True", f"{file}:{node.lineno}"
+            assert arguments.get("weights_only") == "True", f"{module}:{node.lineno}"
 
 
 def lines_of(source: str) -> tuple[set[int], int]:

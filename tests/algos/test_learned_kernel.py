@@ -16,7 +16,7 @@ from trackmdp.world.model import World
 
 
 def learn(world: World, batches: int, *overrides: str) -> tuple[object, list[dict[str, float]]]:
-    learner = algorithm("learned_kernel", world, "algo.rounds_at_end=50", *overrides)
+    learner = algorithm("learned_kernel", world, "algo.rounds_at_end=50", "algo.samples=2", *overrides)
     learner.iterations = batches
     return learner, [learner.step(collect(world, learner.policy, 256, 20, seed=batch)) for batch in range(batches)]
 
@@ -73,7 +73,7 @@ def test_its_uncertainty_shrinks_and_covers_the_truth() -> None:
 
 def test_a_resumed_learner_goes_on_as_the_first() -> None:
     world = small_world(3)
-    words = ("algo.sensing=chosen", "algo.warm_up=0")
+    words = ("algo.sensing=chosen", "algo.warm_up=0", "algo.samples=2")
     first, _ = learn(world, 3, *words)
     second = algorithm("learned_kernel", world, *words)
     second.iterations = 3

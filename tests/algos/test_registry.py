@@ -52,7 +52,13 @@ BUDGETS = {
 QUIET = ("quiet=true", "optimal.enabled=false", "evaluation.every=100000")
 
 
-@pytest.mark.parametrize("name", ALGORITHMS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] * (name in ("a2c", "dqn", "path_counts", "ppo")))
+        for name in ALGORITHMS
+    ],
+)
 def test_it_solves_a_tiny_world(name: str, tmp_path: Path) -> None:
     """Within 3 % of the certified optimum 5.83; FCR gets 4.87, no sensors -2.15, all sensors -7.2."""
     cfg = train_config(*QUIET, *WORLD, f"algo={name}", *BUDGETS.get(name, "").split(), "seed=0")
@@ -153,7 +159,7 @@ def test_a_run_is_decided_by_its_seed(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in ALGORITHMS if not name.endswith("_per_sensor")])
+@pytest.mark.parametrize("name", ["dqn", "hindsight"])
 def test_a_run_is_the_same_in_another_process(name: str, tmp_path: Path) -> None:
     """By the command line, the second time after another run in the same process."""
     words = [sys.executable, str(ROOT / "scripts" / "train.py"), *tiny(name)]

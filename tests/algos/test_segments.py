@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.helpers import algorithm, collect, headings, small_world
@@ -208,7 +208,6 @@ def test_moves_are_all_of_the_segments() -> None:
 
 
 @given(st.integers(0, 2**31), st.integers(1, 5), st.integers(1, 12))
-@settings(max_examples=30)
 def test_segments_are_pieces_of_tracks(seed: int, steps: int, time: int) -> None:
     tracks = drawn(small_world(exit_probability=0.2).kernel, 20, seed)
     made = buffer(steps)
@@ -230,6 +229,7 @@ def test_a_saved_buffer_goes_on_the_same() -> None:
     assert torch.equal(one.paths(50, 3), other.paths(50, 3))
 
 
+@pytest.mark.slow
 def test_what_depends_on_more_than_the_cell_is_learned_from_whole_paths_only() -> None:
     """The target goes 3, 4, 5, 4, 3, 4 ...: two steps after 3 it is in 5, as moves alone do not tell.
 

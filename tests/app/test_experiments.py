@@ -23,6 +23,7 @@ def test_the_runs_of_an_experiment_are_accepted(name: str) -> None:
         blocks = compose([f"experiment={name}"]).hydra.sweeper.blocks
         grids = [combinations([block], [f"experiment={name}"]) for block in blocks]
         assert sum(map(len, grids)) == RUNS[name]
-        few = [words for grid in grids for words in (grid[0], grid[-1])]
-        refusals = {job.refusal for job in plan("train", few, Path("none"), compose)}
+        # Of runs that differ in the seed alone one will do.
+        few = {" ".join(words).partition(" seed=")[0]: words for words in (grid[-1] for grid in grids)}
+        refusals = {job.refusal for job in plan("train", [*few.values()], Path("none"), compose)}
     assert refusals == {""}

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 from tests.config.cases import of_command
-from tests.typed import ENVIRONMENT, ROOT, refused
+from tests.typed import ENVIRONMENT, refused
 from trackmdp.app.cli import COMMANDS, main
 from trackmdp.app.manual import EXAMPLES
 from trackmdp.config import GROUPS, ROOTS, SELECTORS, options
-from trackmdp.config.world import KernelConfig
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
@@ -57,36 +54,6 @@ def test_help_of_a_choice_shows_what_it_reads(
     assert max(map(len, text.splitlines())) < 80
     assert text.index("Examples\n  trackmdp train ") < text.index(shown)
     assert refused(capsys, "train", "algo=sac", "--help").startswith("algo=sac: expected one of ")
-
-
-def test_choices_of_an_installed_package_are_offered(tmp_path: Path) -> None:
-    site, inherited = tmp_path / "site", "".join(f"{key}: false\n" for key in options(KernelConfig))
-    files = {
-        "levy-1.dist-info/METADATA": "Metadata-Version: 2.1\nName: levy\nVersion: 1\n",
-        "levy-1.dist-info/entry_points.txt": "[trackmdp.plugins]\nlevy = trackmdp_levy\n",
-        "trackmdp_levy/__init__.py": """
-from dataclasses import dataclass
-from trackmdp.config.options import choice, option
-from trackmdp.config.world import KernelConfig
-
-@choice("kernel", "levy", makes="trackmdp_levy.flight:levy")
-@dataclass(kw_only=True)
-class LevyConfig(KernelConfig):
-    \"\"\"Long jumps now and then.\"\"\"
-
-    alpha: float = option("exponent of the jumps", gt=0)
-""",
-        "trackmdp_levy/conf/kernel/levy.yaml": "defaults: [base_levy]\nalpha: 1.5\n" + inherited,
-    }
-    for name, text in files.items():
-        (site / name).parent.mkdir(parents=True, exist_ok=True)
-        (site / name).write_text(text)
-    env = ENVIRONMENT | {"PYTHONPATH": f"{ROOT}{os.pathsep}{site}"}
-    command = [sys.executable, "-m", "trackmdp.app.cli", "train", "kernel=levy"]
-    for words, shown in ((["--help"], "  kernel.alpha=1.5 "), (["-c", "job", "-p", "kernel"], "alpha: 1.5\n")):
-        result = subprocess.run([*command, *words], capture_output=True, text=True, env=env, check=False)
-        assert (result.returncode, result.stderr) == (0, "")
-        assert shown in result.stdout
 
 
 def test_examples_of_the_help_can_be_typed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

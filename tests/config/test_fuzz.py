@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,9 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from tests.config.cases import distinct, files_of
 from tests.typed import refused
-from trackmdp.config import Option
+from trackmdp.config import ROOTS, Option
+from trackmdp.config.compose import compose
+from trackmdp.errors import UserError
 
 CASES = distinct()
 NAMES = [f"{command} {' '.join(words)} {key}" for command, words, key, _ in CASES]
@@ -49,34 +52,49 @@ def bad_values(item: Option) -> list[str]:
     return bad
 
 
-def check(case: tuple[str, list[str], str, Option], value: str, capsys: pytest.CaptureFixture[str]) -> None:
-    command, words, key, _ = case
-    line = refused(capsys, command, *words, f"{key}={value}")
-    assert line.startswith(key), line
-    assert "expected" in line
+def by_rules_of_its_own(item: Option) -> bool:
+    return item.kind is Any or item.expects.startswith("cpu")
+
+
+KINDS = {(item.kind, item.nullable, bool(item.choices)): index for index, (*_, item) in enumerate(CASES)}
+TYPED = {
+    *KINDS.values(),
+    *(index for index, (*_, item) in enumerate(CASES) if by_rules_of_its_own(item)),
+    *(next(index for index, case in enumerate(CASES) if case[0] == command) for command in ROOTS),
+}
+"""One option of each kind and one of each command: what is done with a typed value depends on nothing else."""
+
+
+@pytest.mark.parametrize("index", sorted(TYPED), ids=NAMES.__getitem__)
+def test_an_option_of_each_kind_refuses_a_bad_value_in_one_line(index: int, capsys: pytest.CaptureFixture[str]) -> None:
+    command, words, key, item = CASES[index]
+    for value in bad_values(item)[index % 3 : 9 : 3]:
+        line = refused(capsys, command, *words, f"{key}={value}")
+        assert line.startswith(key), line
+        assert "expected" in line
+
+
+def composed_with(command: str, words: list[str], **more: Any) -> Any:
+    return compose(command, dict(word.split("=", 1) for word in words) | more)
+
+
+@cache
+def read(value: str) -> Any:
+    """A value as Hydra reads it."""
+    return OverridesParser.create().parse_override(f"key={value}").value()
 
 
 @pytest.mark.parametrize("index", range(len(CASES)), ids=NAMES)
-def test_every_option_refuses_a_bad_value_in_one_line(index: int, capsys: pytest.CaptureFixture[str]) -> None:
-    if bad := bad_values(CASES[index][-1]):
-        check(CASES[index], bad[index % len(bad)], capsys)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("index", range(len(CASES)), ids=NAMES)
-def test_every_option_refuses_another_bad_value_in_one_line(index: int, capsys: pytest.CaptureFixture[str]) -> None:
-    if bad := bad_values(CASES[index][-1]):
-        check(CASES[index], bad[(index + 1) % len(bad)], capsys)
-
-
-@pytest.mark.parametrize("index", range(len(CASES)), ids=NAMES)
-def test_every_option_allows_none_of_its_bad_values(index: int) -> None:
-    item = CASES[index][-1]
-    if item.kind is Any or item.expects.startswith("cpu"):
-        return  # checked by rules of their own, through the command line above
-    parser = OverridesParser.create()
-    for value in bad_values(item):
-        assert not item.allows(parser.parse_override(f"key={value}").value()), value
+def test_every_option_refuses_its_bad_values(index: int) -> None:
+    command, words, key, item = CASES[index]
+    if by_rules_of_its_own(item) or not (bad := bad_values(item)):
+        return
+    for value in bad:
+        assert not item.allows(read(value)), value
+    with pytest.raises(UserError) as caught:
+        composed_with(command, words, **{key: read(bad[index % len(bad)])})
+    assert str(caught.value).startswith(key)
+    assert "expected" in str(caught.value)
 
 
 NODES = list({(command, *words, key.rpartition(".")[0]): None for command, words, key, _ in CASES})
@@ -87,6 +105,11 @@ def test_unknown_keys_are_refused_everywhere(index: int, capsys: pytest.CaptureF
     command, *words, key = NODES[index]
     name = f"{key}.sizzle".lstrip(".")
     words = list(dict.fromkeys([*words, *files_of(command, words[0] if words else "")]))
-    line = refused(capsys, command, *words, f"{'+' if index % 2 else ''}{name}=1")
-    assert line.startswith(f"{name}: unknown ")
-    assert "(known: " in line
+    with pytest.raises(UserError) as caught:
+        composed_with(command, words, **{name: 1})
+    lines = [str(caught.value)]
+    if index % 6 == 0:
+        lines += [refused(capsys, command, *words, f"{plus}{name}=1") for plus in ("", "+")]
+    for line in lines:
+        assert line.startswith(f"{name}: unknown ")
+        assert "(known: " in line

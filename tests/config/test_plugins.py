@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -18,16 +19,26 @@ TRAIN = "train algo=lazy kernel=jump log=[csv,lines] grid.size=3 optimal.enabled
 TWICE = FILES["outside/jump_config.py"].replace('"jump"', '"drift"')
 
 
-def run(site: Path, folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    """A new process that finds what is installed in `site`."""
-    path = os.pathsep.join([str(site), str(ROOT)])
-    return subprocess.run(
-        [sys.executable, *words], cwd=folder, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True
-    )
+CALLED = """
+import contextlib, io, json, sys
+from trackmdp.app.cli import main
+said = []
+for line in json.loads(sys.argv[1]):
+    streams = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(streams[0]), contextlib.redirect_stderr(streams[1]):
+        status = main(line.split())
+    said.append([status, *(stream.getvalue() for stream in streams)])
+print(json.dumps(said))
+"""
 
 
-def command(site: Path, folder: Path, words: str) -> subprocess.CompletedProcess[str]:
-    return run(site, folder, "-m", "trackmdp.app.cli", *words.split())
+def called(site: Path, folder: Path, *lines: str, before: str = "") -> list[tuple[int, str, str]]:
+    """Status and what is said of each line, in one new process that finds what is installed in `site`."""
+    words, path = [sys.executable, "-c", before + CALLED, json.dumps(lines)], os.pathsep.join([str(site), str(ROOT)])
+    environment = {**os.environ, "PYTHONPATH": path}
+    done = subprocess.run(words, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return [(status, out, err) for status, out, err in json.loads(done.stdout)]
 
 
 @pytest.fixture(scope="module")
@@ -42,56 +53,45 @@ def test_three_files_each() -> None:
 
 
 def test_help_lists_it(site: Path, tmp_path: Path) -> None:
-    shown = command(site, tmp_path, "train --help").stdout
-    assert "algo=lazy: Sleeps with all sensors on." in shown
-    assert "kernel=jump: Stays, or jumps to the opposite cell." in shown
-    assert "  algo.naps=1" in shown
-    assert "solver=nearest" in command(site, tmp_path, "solve --help").stdout
+    lines = "train --help", "solve --help", "train kernel=jump --help", "train kernel=jump -c job -p kernel"
+    train, solve, jump, job = (said for _, said, _ in called(site, tmp_path, *lines))
+    assert "algo=lazy: Sleeps with all sensors on." in train
+    assert "kernel=jump: Stays, or jumps to the opposite cell." in train
+    assert "  algo.naps=1" in train
+    assert "solver=nearest" in solve
+    assert "  kernel.stay=0.5 " in jump
+    assert "stay: 0.5\n" in job
 
 
-def test_a_run_uses_it_and_says_what_memory_it_takes(site: Path, tmp_path: Path) -> None:
-    done = command(site, tmp_path, f"{TRAIN} hydra.run.dir=run")
-    assert done.returncode == 0, done.stderr
-    assert "algo.bed 0.00 GiB" in done.stdout
-    assert (tmp_path / "run" / "lines.txt").read_text().splitlines()[0] == "line 1"
-    again = command(site, tmp_path, "evaluate run=run episodes=0")
-    assert again.returncode == 0, again.stderr
-
-
-def test_a_solver_is_valued(site: Path, tmp_path: Path) -> None:
-    done = command(site, tmp_path, "solve solver=nearest solver.reach=2 grid.size=3 hydra.run.dir=solved")
-    assert done.returncode == 0, done.stderr
-    assert (tmp_path / "solved" / "solution.json").is_file()
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (f"{TRAIN} algo.naps=10", "algo.naps=10: expected an integer from 0 to 9 (naps)"),
-        (f"{TRAIN} algo.naps=5 algo.envs=4", "algo.naps=5: expected at most collector.envs=4"),
-        (f"{TRAIN} algo.bed=1000000000000000", "algo.bed=1000000000000000: needs about"),
-        (
-            "train kernel=jmup",
-            "kernel=jmup: expected one of random_support, random_walk, drift, table, tracks, heading, regimes, "
-            "constant_velocity, coordinated_turn, jump",
-        ),
-    ],
-)
-def test_its_options_are_checked(site: Path, tmp_path: Path, words: str, message: str) -> None:
-    done = command(site, tmp_path, words)
-    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1), done
-    assert done.stderr.startswith(f"trackmdp train: {message}")
-
-
-def test_from_python_and_in_the_lists_that_tests_run_over(site: Path, tmp_path: Path) -> None:
-    code = """
+USED = """
 import trackmdp as tm
 from tests import helpers
 assert tm.make_world("jump", size=3, stay=0.25).kernel[0, 0] == 0.25 * 0.9
 assert "jump" in helpers.KERNELS and "lazy" in helpers.ALGORITHMS
 """
-    done = run(site, tmp_path, "-c", code)
-    assert done.returncode == 0, done.stderr
+
+
+def test_it_is_used_by_the_commands_from_python_and_by_the_tests_over_all_choices(site: Path, tmp_path: Path) -> None:
+    solved = "solve solver=nearest solver.reach=2 grid.size=3 hydra.run.dir=solved"
+    lines = f"{TRAIN} hydra.run.dir=run", "evaluate run=run episodes=0", solved
+    said = called(site, tmp_path, *lines, before=USED)
+    assert [status for status, _, _ in said] == [0, 0, 0], said
+    assert "algo.bed 0.00 GiB" in said[0][1]
+    assert (tmp_path / "run" / "lines.txt").read_text().splitlines()[0] == "line 1"
+    assert (tmp_path / "solved" / "solution.json").is_file()
+
+
+def test_its_options_are_checked(site: Path, tmp_path: Path) -> None:
+    kernels = "random_support, random_walk, drift, table, tracks, heading, regimes, constant_velocity, coordinated_turn"
+    refused = {
+        f"{TRAIN} algo.naps=10": "algo.naps=10: expected an integer from 0 to 9 (naps)",
+        f"{TRAIN} algo.naps=5 algo.envs=4": "algo.naps=5: expected at most collector.envs=4",
+        f"{TRAIN} algo.bed=1000000000000000": "algo.bed=1000000000000000: needs about",
+        "train kernel=jmup": f"kernel=jmup: expected one of {kernels}, jump",
+    }
+    for (status, _, error), message in zip(called(site, tmp_path, *refused), refused.values(), strict=True):
+        assert (status, error.count("\n")) == (2, 1)
+        assert error.startswith(f"trackmdp train: {message}")
 
 
 @pytest.mark.parametrize(
@@ -99,14 +99,11 @@ assert "jump" in helpers.KERNELS and "lazy" in helpers.ALGORITHMS
     [
         ({"outside/__init__.py": "import no_such_module"}, "cannot be loaded (ModuleNotFoundError: No module named"),
         ({"outside/conf/algo/lazy.yaml": None}, "algo/lazy.yaml with the values of algo=lazy"),
-        (
-            {"outside/jump_config.py": FILES["outside/jump_config.py"].replace('"jump"', '"drift"')},
-            "kernel=drift: offered by",
-        ),
+        ({"outside/jump_config.py": TWICE}, "kernel=drift: offered by"),
     ],
 )
 def test_a_broken_one_is_one_line(tmp_path: Path, replaced: Mapping[str, str | None], message: str) -> None:
-    done = command(install(tmp_path / "site", replaced), tmp_path, "solve --help")
-    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1), done
-    assert "plugin outside" in done.stderr
-    assert message in done.stderr
+    ((status, _, error),) = called(install(tmp_path / "site", replaced), tmp_path, "solve --help")
+    assert (status, error.count("\n")) == (2, 1), error
+    assert "plugin outside" in error
+    assert message in error

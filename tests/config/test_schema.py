@@ -132,7 +132,9 @@ def test_every_option_says_what_it_is_and_what_it_may_be(where: str, item: Optio
 
 @pytest.mark.parametrize(("command", "choice"), COMBINATIONS)
 def test_every_choice_composes_and_survives_config_yaml(command: str, choice: str, tmp_path: Path) -> None:
-    cfg = composed(command, choice, *files_of(command, choice))
+    words = [choice, *files_of(command, choice)]
+    words += ["baseline=qmdp"] * (command == "evaluate" and not choice.startswith("baseline="))
+    cfg = configured(command, *words)
     group, name = choice.split("=")
     chosen = getattr(cfg, group)
     assert [node.name for node in (chosen.values() if isinstance(chosen, dict) else [chosen])] == [name]

@@ -48,7 +48,7 @@ def regions(file: Path) -> list[tuple[int, int, int]]:
     return [(0, 0, len(container.MAGIC)), *found, (0, place, file.stat().st_size)]
 
 
-def test_300_flipped_bits_are_reported_or_lie_outside_all_data(log: Path, tmp_path: Path) -> None:
+def test_120_flipped_bits_are_reported_or_lie_outside_all_data(log: Path, tmp_path: Path) -> None:
     """Half of them anywhere, half in metadata, attachments, header, footer and indexes, each kind as often.
 
     The reader passes over a flip only in a message index, which it does not use, and in the record that ends the data
@@ -58,8 +58,8 @@ def test_300_flipped_bits_are_reported_or_lie_outside_all_data(log: Path, tmp_pa
     expected, flipped = everything(log), tmp_path / "flipped.mcap"
     small = [region for region in regions(log) if region[0] != container.CHUNK]
     kinds = sorted({opcode for opcode, _, _ in small})
-    places = [rng.randrange(len(content)) for _ in range(150)]
-    for kind in rng.choices(kinds, k=150):
+    places = [rng.randrange(len(content)) for _ in range(60)]
+    for kind in rng.choices(kinds, k=60):
         _, first, end = rng.choice([region for region in small if region[0] == kind])
         places.append(rng.randrange(first, end))
     silent = []
@@ -78,7 +78,7 @@ def test_300_flipped_bits_are_reported_or_lie_outside_all_data(log: Path, tmp_pa
         with EpisodeReader(flipped) as reader, pytest.raises(UserError, match="damaged"):
             reader.check_all()
     assert set(silent) <= {container.MESSAGE_INDEX, container.DATA_END}
-    assert len(silent) < 100
+    assert len(silent) < 40
 
 
 def flushed(file: Path) -> int:
@@ -101,7 +101,7 @@ def test_a_cut_log_gives_back_every_flushed_episode(log: Path, tmp_path: Path) -
     content, rng = log.read_bytes(), random.Random(1)
     start = next(first for opcode, first, _ in regions(log) if opcode == container.CHUNK)
     kept = []
-    for cut in sorted(rng.randrange(start, len(content)) for _ in range(20)):
+    for cut in sorted(rng.randrange(start, len(content)) for _ in range(10)):
         folder = tmp_path / str(cut)
         folder.mkdir()
         part = folder / "a.mcap.part"
@@ -173,7 +173,7 @@ def killed(work: Callable[[int], None], reports: int) -> int:
     return int(struct.unpack("<I", data[-4:])[0])
 
 
-@pytest.mark.parametrize("kills", [5, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kills", [2, pytest.param(10, marks=pytest.mark.slow)])
 def test_a_killed_writer_loses_nothing_that_was_flushed(kills: int, tmp_path: Path) -> None:
     episodes, rng = recorded(1000), random.Random(kills)
     for kill in range(kills):

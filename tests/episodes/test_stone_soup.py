@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import subprocess
+import importlib.util
+import re
 import sys
 from datetime import timedelta
+from typing import Any
 
 import numpy as np
 import pytest
@@ -132,13 +134,12 @@ def test_two_tracks_share_the_sensors() -> None:
     assert on == set(np.flatnonzero(dense[0, 0] | dense[8, 0]))
 
 
-def test_without_the_extra_it_is_one_line() -> None:
-    code = (
-        "import sys, importlib.util as u; f = u.find_spec\n"
-        "u.find_spec = lambda name, *a: None if name == 'stonesoup' else f(name, *a)\n"
-        "import trackmdp.episodes.stone_soup"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.stderr.splitlines()[-1].endswith(
-        f"trackmdp.episodes.stone_soup: needs stonesoup, which {adding('stonesoup')} adds"
-    )
+def test_without_the_extra_it_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def find(name: str, *more: Any) -> Any:
+        return None if name == "stonesoup" else found(name, *more)
+
+    found = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", find)
+    monkeypatch.delitem(sys.modules, "trackmdp.episodes.stone_soup")
+    with pytest.raises(UserError, match=re.escape(f"stone_soup: needs stonesoup, which {adding('stonesoup')} adds")):
+        importlib.import_module("trackmdp.episodes.stone_soup")

@@ -28,7 +28,7 @@ def named(rows: dict[tuple[str, str], Check], name: str) -> list[Check]:
     return [row for (own, _), row in rows.items() if own == name]
 
 
-@settings(max_examples=25)
+@settings(max_examples=12)
 @given(tiny_worlds(most_t_max=2))
 def test_every_claim_holds(world: World) -> None:
     for row in checks(world).values():

@@ -200,11 +200,11 @@ def test_stored_results_that_were_changed_are_refused(sweep: Path, tmp_path: Pat
 EVIL = ["=<script>alert(1)<@BODY@", "@$x^{$\\input{x}{}~^&%#_", "\x1b]0;t\x07a\nb\u202e", "[x]"]
 
 
-@pytest.mark.parametrize("evil", EVIL)
-def test_a_folders_name_is_a_name_everywhere(evil: str, sweep: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    name = evil.replace("/", "")
-    (sweep / "a").rename(sweep / name)
-    (sweep / "b/failed.json").write_text(json.dumps({"reason": evil}))
+def test_a_folders_name_is_a_name_everywhere(sweep: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in EVIL:
+        shutil.copytree(sweep / "a", sweep / name)
+        (sweep / f"failed {name}").mkdir()
+        (sweep / f"failed {name}/failed.json").write_text(json.dumps({"reason": name}))
     report = build(gather_runs(sweep))
     page = report.html()
     assert "<script>alert" not in page
@@ -216,8 +216,7 @@ def test_a_folders_name_is_a_name_everywhere(evil: str, sweep: Path, capsys: pyt
     watch.watch(sweep, Console(force_terminal=False), 0.01)
     said = capsys.readouterr().out
     assert "\x1b" not in said
-    if evil == "[x]":
-        assert f"{name}: done" in said
+    assert "[x]: done" in said
 
 
 def test_latex_letters_are_letters() -> None:

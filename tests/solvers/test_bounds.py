@@ -9,7 +9,7 @@ from hypothesis import given
 from tests.solvers.worlds import (
     PAPER_REFERENCES,
     REFERENCES,
-    best_by_enumeration,
+    best_of_all,
     paper_world,
     reference_world,
     tiny_worlds,
@@ -41,7 +41,7 @@ def test_the_papers_worlds(row: dict) -> None:
 
 @given(tiny_worlds())
 def test_no_chain_beats_the_clocked_bound_and_it_beats_no_valid_one(world: World) -> None:
-    best, bound = best_by_enumeration(world), bounds.clocked(world)
+    best, bound = best_of_all(world), bounds.clocked(world)
     slack = 1e-9 * (1.0 + np.abs(bound).max())
     assert (best <= bound + slack).all()
     assert (bound <= bounds.valid(world) + slack).all()

@@ -88,12 +88,12 @@ def test_a_search_cut_short_keeps_a_bracket_around_the_optimum() -> None:
 
 
 def test_every_bound_is_above_the_best_of_all_plans(monkeypatch: pytest.MonkeyPatch) -> None:
-    """300 worlds, the search stopped after 1, 30, 300 nodes or at its end: no policy exceeds what it claims.
+    """80 worlds, the search stopped after 1, 30, 300 nodes or at its end: no policy exceeds what it claims.
 
     With the tables of positions revealed late, which close many of them at once, and by the tree alone.
     """
     rng, closed = np.random.default_rng(7), {0: 0, delayed.WIDEST: 0}
-    for nodes in np.tile([1, 30, 300, 100_000], 75):
+    for nodes in np.tile([1, 30, 300, 100_000], 20):
         world = random_tiny_world(rng)
         best = best_of_all(world)
         scale = 1.0 + np.abs(best).max()
@@ -107,14 +107,14 @@ def test_every_bound_is_above_the_best_of_all_plans(monkeypatch: pytest.MonkeyPa
                 assert solution.certified
                 np.testing.assert_allclose(solution.value, best, atol=1e-7 * scale)
             closed[widest] += solution.certified and solution.nodes > 0
-    assert closed[0] > 40
-    assert closed[delayed.WIDEST] > 20
+    assert closed[0] > 5
+    assert closed[delayed.WIDEST] > 2
 
 
 def test_what_is_paid_on_the_way_covers_what_any_plan_gains() -> None:
     """Over a policy that senses nothing, the tree stopped anywhere: every plan, with the mass it leaves undetected."""
     rng, less = np.random.default_rng(1), 0.0
-    for nodes in np.tile([0, 4, 16, 64], 25):
+    for nodes in np.tile([0, 4, 16, 64], 10):
         world = random_tiny_world(rng)
         value = evaluate(world, PolicyTable.none(world)).value
         problem = InnerProblem.of(world, reachable_layers(world, world.num_choices), value)

@@ -15,7 +15,6 @@ from trackmdp.solvers.evaluate import evaluate
 from trackmdp.world.model import BoolArray, World
 
 
-@settings(max_examples=40)
 @given(tiny_worlds(most_t_max=2))
 def test_the_exact_form_is_the_belief(world: World) -> None:
     solution = optimal.solve(world, tolerance=1e-9)

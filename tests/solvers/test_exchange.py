@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.solvers.worlds import best_by_enumeration, tiny_worlds
+from tests.solvers.worlds import best_of_all, tiny_worlds
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import exchange, optimal, search
 from trackmdp.solvers.evaluate import evaluate
@@ -24,7 +24,6 @@ def improved(world: World, chains: BoolArray) -> PolicyTable:
     return policy_table(world, layers, exchange.exchanged(world, layers, start))
 
 
-@settings(max_examples=40)
 @given(tiny_worlds(size=3, most_t_max=3, misses=True), st.integers(0, 2**32 - 1))
 def test_no_cells_value_falls_from_whatever_sets_it_starts(world: World, seed: int) -> None:
     chains = np.random.default_rng(seed).random((9, world.num_choices, 9)) < 0.5
@@ -41,7 +40,7 @@ def test_no_cells_value_falls_from_whatever_sets_it_starts(world: World, seed: i
 @settings(max_examples=30, derandomize=True)  # a search, not a proof: these 30 have to come out, others may not
 @given(tiny_worlds(size=2, most_t_max=1))
 def test_tiny_worlds_are_solved_as_brute_force_solves_them(world: World) -> None:
-    best = best_by_enumeration(world)
+    best = best_of_all(world)
     found = evaluate(world, exchange.solve(world)).value
     np.testing.assert_allclose(found, best, rtol=0, atol=1e-8 * (1.0 + np.abs(best).max()))
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.solvers.worlds import best_by_enumeration, tiny_worlds, value_of
+from tests.solvers.worlds import best_of_all, tiny_worlds, value_of
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import bounds, fcr, lookahead, optimal, qmdp
@@ -58,7 +58,7 @@ def test_values_are_those_of_stepping_through_the_chains(world: World, seed: int
 @given(tiny_worlds(misses=True))
 @settings(max_examples=12, deadline=None)
 def test_the_certified_optimum_is_that_of_all_chains(world: World) -> None:
-    best, found = best_by_enumeration(world), optimal.solve(world, tolerance=1e-9)
+    best, found = best_of_all(world), optimal.solve(world, tolerance=1e-9)
     assert found.certified
     assert found.value == pytest.approx(best, abs=1e-7)
     assert (bounds.clocked(world) >= best - 1e-9).all()

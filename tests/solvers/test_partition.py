@@ -174,7 +174,8 @@ class Dies:
         return number * number
 
 
-@pytest.mark.parametrize("cluster", [None, pytest.param("local", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("cluster", [None, "local"])
 def test_what_a_killed_worker_had_is_done_again(tmp_path: Path, cluster: str | None) -> None:
     if cluster:
         pytest.importorskip("ray")
@@ -214,6 +215,7 @@ def test_a_signal_ends_all_workers_and_none_begins_another_job(tmp_path: Path) -
     assert left in ({"0 begun", "0 saved"}, {"0 begun", "0 saved", "1 begun", "1 saved"})
 
 
+@pytest.mark.slow
 def test_a_job_that_kills_every_worker_ends_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="workers died 3 times"):
         run_jobs(Dies(tmp_path, always=True), [2], workers=2)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from tests.solvers.worlds import best_by_enumeration, tiny_worlds
+from tests.solvers.worlds import best_of_all, tiny_worlds
 from trackmdp.errors import UserError
 from trackmdp.solvers import optimal, pomdp
 from trackmdp.world.model import World
@@ -23,7 +23,7 @@ def test_the_same_optimum_as_on_chains(world: World) -> None:
 @settings(max_examples=10)
 @given(tiny_worlds(most_t_max=1))
 def test_the_same_optimum_as_by_brute_force(world: World) -> None:
-    np.testing.assert_allclose(pomdp.solve(world).value, best_by_enumeration(world), rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(pomdp.solve(world).value, best_of_all(world), rtol=1e-8, atol=1e-8)
 
 
 def test_belief_states_are_counted_once() -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.helpers import limited, small_world
@@ -88,7 +88,6 @@ def in_the_environment(setting: Recorded, chains: BoolArray, max_steps: int | No
 
 
 @given(st.integers(0, 2**31), st.integers(0, 3), st.sampled_from([None, 1, 4]), st.floats(0, 1))
-@settings(max_examples=50)
 def test_figures_are_those_of_the_environment(seed: int, t_max: int, max_steps: int | None, density: float) -> None:
     rng = np.random.default_rng(seed)
     tracks = drawn(small_world(seed=seed).kernel, 30, seed)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 
 import trackmdp as tm
-from tests.solvers.worlds import best_by_enumeration, tiny_worlds
+from tests.solvers.worlds import best_of_all, tiny_worlds
 from trackmdp.errors import UserError
 from trackmdp.solvers import clocked, optimal, regions
 from trackmdp.solvers.evaluate import evaluate
@@ -33,7 +33,7 @@ def by_regions(world: World, side: int, monkeypatch: pytest.MonkeyPatch, **optio
 def test_every_chain_of_tiny_worlds_tried(world: World) -> None:
     with pytest.MonkeyPatch.context() as patch:
         solution = by_regions(world, 1, patch, tolerance=1e-9)
-    best = best_by_enumeration(world)
+    best = best_of_all(world)
     scale = 1.0 + np.abs(best).max()
     assert (best <= solution.bound + 1e-8 * scale).all()
     assert solution.certified

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy import sparse
 
@@ -74,7 +74,6 @@ def test_a_cell_that_was_always_left_alike_may_be_left_otherwise() -> None:
     assert new[1] > 2 * new[2] > 0.02
 
 
-@settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.integers(0, 30))
 def test_rows_are_probabilities_and_no_seen_move_is_lost(seed: int, most: int) -> None:
     rng = np.random.default_rng(seed)

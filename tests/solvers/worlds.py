@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
 import json
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -109,42 +107,6 @@ def renewal(world: World, x: int, chain: BoolArray) -> tuple[float, Array]:
     return earned, located
 
 
-def best_by_enumeration(world: World, allowed: BoolArray | None = None) -> Array:
-    """`[M]` V*, every chain of sets tried from every cell until no cell has a better one.
-
-    `allowed` `[M, M]`: which sensors can be chosen from which located cell.
-    """
-    tried = [_all_renewals(world, x, None if allowed is None else allowed[x]) for x in range(world.num_cells)]
-    value = value_of(world, np.zeros((world.num_cells, world.num_choices, world.num_cells), dtype=bool))
-    while True:
-        picks = [int(np.argmax(earned + located @ value)) for earned, located in tried]
-        located = np.stack([options[1][pick] for options, pick in zip(tried, picks, strict=True)])
-        earned = np.array([options[0][pick] for options, pick in zip(tried, picks, strict=True)])
-        better = np.linalg.solve(np.eye(world.num_cells) - located, earned)
-        if better.sum() <= value.sum() + 1e-11:
-            return value
-        value = better
-
-
-def _all_renewals(world: World, x: int, allowed: BoolArray | None) -> tuple[Array, Array]:
-    outcomes = [renewal(world, x, chain) for chain in all_chains(world, x, allowed)]
-    return np.array([earned for earned, _ in outcomes]), np.stack([located for _, located in outcomes])
-
-
-def all_chains(world: World, x: int, allowed: BoolArray | None = None) -> Iterator[BoolArray]:
-    """Every chain of sets of cells that can be reached in that many moves; a sensor anywhere else only costs."""
-    reachable, options = np.eye(world.num_cells)[x], []
-    for _ in range(world.num_choices):
-        reachable = reachable @ world.kernel
-        cells = np.flatnonzero(reachable if allowed is None else reachable * allowed)
-        options.append([np.isin(np.arange(world.num_cells), chosen) for chosen in _subsets(cells)])
-    return (np.stack(chain) for chain in itertools.product(*options))
-
-
-def _subsets(cells: np.ndarray) -> Iterator[tuple[int, ...]]:
-    return itertools.chain.from_iterable(itertools.combinations(cells, k) for k in range(len(cells) + 1))
-
-
 def random_tiny_world(rng: np.random.Generator) -> World:
     """Three or four cells, T_max 0 to 4: prices per cell, some of them 0, and D from nothing to very dear."""
     t_max = int(rng.integers(5))
@@ -157,10 +119,13 @@ def random_tiny_world(rng: np.random.Generator) -> World:
     return World(kernel, size, cost=cost, safe_cost=safe_cost, t_max=t_max)
 
 
-def best_of_all(world: World) -> Array:
-    """`[M]` V* as in `best_by_enumeration`, all plans of a cell at once: 4,096 of them with four cells and T_max 2."""
+def best_of_all(world: World, allowed: BoolArray | None = None) -> Array:
+    """`[M]` V*, every plan tried from every cell until no cell has a better one.
+
+    `allowed` `[M, M]`: which sensors can be chosen from which located cell.
+    """
     m = world.num_cells
-    tried = [all_plans(world, x) for x in range(m)]
+    tried = [all_plans(world, x, None if allowed is None else allowed[x]) for x in range(m)]
     value = value_of(world, np.zeros((m, world.num_choices, m), dtype=bool))
     while True:
         picks = [int(np.argmax(earned + located @ value)) for earned, located, _ in tried]
@@ -172,21 +137,29 @@ def best_of_all(world: World) -> Array:
         value = better
 
 
-def all_plans(world: World, x: int) -> tuple[Array, Array, Array]:
-    """Every plan from x: `[C]` its reward, `[C, M]` where the target is located, and the sum of z_t undetected."""
+def all_plans(world: World, x: int, allowed: BoolArray | None = None) -> tuple[Array, Array, Array]:
+    """Every plan from x: `[C]` its reward, `[C, M]` where the target is located, and the sum of z_t undetected.
+
+    Its sets are those of cells that can be reached in that many moves; a sensor anywhere else only costs.
+    """
     m, mass, earned = world.num_cells, np.eye(world.num_cells)[[x]], np.zeros(1)
-    subsets = (np.arange(2**m)[:, None] >> np.arange(m)) % 2 > 0
-    price, located, waited = subsets @ world.cost, np.zeros((1, m)), np.zeros((1, m))
+    kernel, reachable, located, waited = world.kernel.toarray(), mass[0], np.zeros((1, m)), np.zeros((1, m))
     for _ in range(world.num_choices):
-        mass = mass @ world.kernel
+        mass, reachable = mass @ kernel, reachable @ kernel
+        cells = np.flatnonzero(reachable if allowed is None else reachable * allowed)
+        subsets = np.zeros((2 ** len(cells), m))
+        subsets[:, cells] = (np.arange(len(subsets))[:, None] >> np.arange(len(cells))) % 2
         # [plans so far, sets, M], then one row per plan
-        found = mass[:, None, :] * subsets
-        paid = mass.sum(axis=1)[:, None] * price
+        found = mass[:, None, :] * (subsets * world.detection)
+        paid = mass.sum(axis=1)[:, None] * (subsets @ world.cost)
         earned = (earned[:, None] + world.reward * found.sum(axis=2) - paid).ravel()
         mass = mass[:, None, :] - found
         located, waited = (
             (total[:, None, :] + now).reshape(-1, m) for total, now in ((located, found), (waited, mass))
         )
         mass = mass.reshape(-1, m)
-    mass = mass @ world.kernel
-    return earned + (world.reward - world.safe_cost) * mass.sum(axis=1), located + mass, waited
+    # The safe action, as often as it misses.
+    mass = mass @ np.linalg.inv(np.eye(m) - kernel * (1.0 - world.safe_detection)) @ kernel
+    found = mass * world.safe_detection
+    earned = earned + world.reward * found.sum(axis=1) - world.safe_cost * mass.sum(axis=1)
+    return earned, located + found, waited

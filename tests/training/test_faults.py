@@ -33,7 +33,7 @@ from trackmdp.world.make import build_world
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Runs that nothing happened to."""
-    folders = {algo: tmp_path_factory.mktemp("whole") / algo for algo in SMALL}
+    folders = {algo: tmp_path_factory.mktemp("whole") / algo for algo in ("ppo", "hindsight")}
     for algo, folder in folders.items():
         train(folder, algo=algo)
     return folders
@@ -82,7 +82,7 @@ def test_the_folder_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert not folder.exists()
 
 
-@pytest.mark.parametrize("algo", SMALL)
+@pytest.mark.parametrize("algo", ["ppo", "hindsight"])
 def test_a_loss_that_is_not_finite_names_the_iteration_and_leaves_the_last_good_state(
     algo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: dict[str, Path]
 ) -> None:

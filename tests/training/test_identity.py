@@ -45,7 +45,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("cuts", [(2,), (3, 5), (6, 7), (8,)])
+@pytest.mark.parametrize("cuts", [(3, 5), (8,)])
 def test_the_best_does_not_depend_on_where_a_run_was_cut(
     cuts: tuple[int, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: Path
 ) -> None:
@@ -60,10 +60,10 @@ def test_the_best_does_not_depend_on_where_a_run_was_cut(
 
 
 def test_a_checkpoint_that_a_signal_asked_for_is_not_the_best(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Saved at iterations 3, 6 and 8 of 8; the run that is stopped after each of the first seven, at all of them."""
+    """Saved at iterations 3, 6 and 8 of 8; the run that is stopped after 2, 3 and 7 of them, at these as well."""
     words = ("checkpoint.every=768", "evaluation.every=1")
     train(tmp_path / "whole", *words)
-    for stop in range(1, 8):
+    for stop in (2, 3, 7):
         with monkeypatch.context() as patch, pytest.raises(Preempted):
             at_iteration(patch, stop, lambda: signal.raise_signal(signal.SIGTERM))
             train(tmp_path / "cut", *words, "resume=auto")

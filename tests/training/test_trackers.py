@@ -89,6 +89,7 @@ def test_wandb_offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert not any(key.startswith("final/") for key in first["summary"])
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # mlflow's database layer calls deprecated names
 def test_mlflow_in_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One run with the options as parameters, each row once although two processes logged it, and final figures."""

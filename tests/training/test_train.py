@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -176,19 +174,6 @@ def test_recorded_tracks_in_a_folder_are_resumed_and_evaluated(tmp_path: Path) -
     other = recorded(drawn(world.kernel, 120, seed=5), markov=False, anywhere=True)
     with pytest.raises(UserError, match="the run's recording is not the one"):
         train(other, "ppo", folder=tmp_path / "cut", resume="auto", **{**options, "collector.total_frames": 4096})
-
-
-def test_no_hydra_is_loaded() -> None:
-    code = """
-import sys
-import numpy as np
-from trackmdp.training.train import train
-from trackmdp.world.model import World
-kernel = np.full((9, 9), 0.1)
-train(World(kernel, 3, cost=0.2, t_max=1), "ppo", total_frames=512, frames_per_batch=256, envs=32)
-assert not [name for name in sys.modules if name.split(".")[0] == "hydra"]
-"""
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_the_regret_is_the_same_on_a_busy_machine(monkeypatch: pytest.MonkeyPatch) -> None:

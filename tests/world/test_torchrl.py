@@ -111,7 +111,9 @@ TABLE: dict[str, Callable[[EnvBase], EnvBase]] = {
 
 @pytest.mark.filterwarnings("ignore:Support of VecNormV2 for containers with non-empty batch-size")
 @pytest.mark.parametrize("shape", [(), (3,), (2, 2)])
-@pytest.mark.parametrize("name", TABLE)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "ParallelEnv")) for name in TABLE]
+)
 def test_it_works_with(name: str, shape: tuple[int, ...]) -> None:
     """Specs as TorchRL checks them; and 30 steps of the same episodes as without the transform."""
     if name == "ParallelEnv" and shape != (3,):

@@ -104,7 +104,7 @@ def test_every_kernel_is_solved_and_simulated(kernel: str, here: Path) -> None:
     """By the command line, hidden and told: exact = simulated within 3 standard errors, and never above the bound."""
     worth = []
     for reveals in ("false", "true"):
-        words = [f"kernel={kernel}", "grid.size=4", f"kernel.reveals={reveals}", "episodes=1500", "quiet=true"]
+        words = [f"kernel={kernel}", "grid.size=3", f"kernel.reveals={reveals}", "episodes=1500", "quiet=true"]
         folder = here / reveals
         assert main(["evaluate", *words, "baseline=optimal", "seed=1", f"hydra.run.dir={folder}"]) == 0
         found = json.loads((folder / "evaluation.json").read_text())

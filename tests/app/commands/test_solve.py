@@ -91,6 +91,7 @@ def test_cut_episodes_are_refused(tmp_path: Path, command: str, capsys: pytest.C
     assert not (tmp_path / "a").exists()
 
 
+@pytest.mark.slow
 def test_ctrl_c_prints_and_saves_the_bracket(tmp_path: Path) -> None:
     world = ["kernel=random_walk", "kernel.diagonal=true", "grid.t_max=3", "solver.nodes=1_000_000_000"]
     words = [sys.executable, "-m", "trackmdp.app.cli", "solve", *world, f"hydra.run.dir={tmp_path / 'a'}"]

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,31 +30,32 @@ from trackmdp.training.lock import locked
 __all__ = ["here"]
 
 
-def test_the_same_line_again_skips_what_is_done(here: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_same_line_again_skips_what_is_done_and_imports_nothing_heavy(here: Path) -> None:
     line = ["train", "-m", *TINY, "seed=0,1"]
     assert main(line) == 0
     (sweep,) = (here / "multirun").iterdir()
-    assert states(sweep) == ["done", "done"]
-    before = {file: file.stat().st_mtime_ns for file in sweep.rglob("*") if file.is_file()}
-    first = (sweep / "runs.csv").read_bytes()
-    capfd.readouterr()
-    assert main(line) == 0
-    said = capfd.readouterr().out
-    assert "2 runs, 2 of them done before -> multirun/train-" in said
-    assert "2 skipped; " in said
-    assert (sweep / "runs.csv").read_bytes() == first
-    after = {file: file.stat().st_mtime_ns for file in sweep.rglob("*") if file.is_file()}
-    assert {file.name for file in after if after[file] != before.get(file)} == {"sweep.json", "runs.csv"}
-
-
-def test_the_table_holds_the_figures_of_each_run(here: Path) -> None:
-    assert swept("seed=0,1", "quiet=true") == 0
-    for row, seed in zip(table(here / "all"), "01", strict=True):
-        summary = json.loads((here / "all" / row["folder"] / "summary.json").read_text())
+    for row, seed in zip(table(sweep), "01", strict=True):
+        summary = json.loads((sweep / row["folder"] / "summary.json").read_text())
         assert (row["seed"], row["state"], row["grid.size"]) == (seed, "done", "3")
         assert float(row["aihtr"]) == summary["policy"]["aihtr"]
         assert float(row["regret_per_step"]) == summary["regret_per_step"]
         assert int(row["frames"]) == 2048
+    before = {file: file.stat().st_mtime_ns for file in sweep.rglob("*") if file.is_file()}
+    first = (sweep / "runs.csv").read_bytes()
+    code = f"""
+import sys
+from trackmdp.app.cli import main
+status = main({line})
+sys.exit(str((status, sorted({{"torch", "torchrl", "scipy"}} & set(sys.modules)))))
+"""
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    again = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)
+    assert again.stderr == "(0, [])\n"
+    assert "2 runs, 2 of them done before -> multirun/train-" in again.stdout
+    assert "2 skipped; " in again.stdout
+    assert (sweep / "runs.csv").read_bytes() == first
+    after = {file: file.stat().st_mtime_ns for file in sweep.rglob("*") if file.is_file()}
+    assert {file.name for file in after if after[file] != before.get(file)} == {"sweep.json", "runs.csv"}
 
 
 def test_a_run_of_a_sweep_is_the_run_typed_alone(here: Path) -> None:
@@ -64,7 +65,10 @@ def test_a_run_of_a_sweep_is_the_run_typed_alone(here: Path) -> None:
     assert float(row["aihtr"]) == json.loads((here / "alone/summary.json").read_text())["policy"]["aihtr"]
 
 
-def test_a_mistake_in_one_run_is_told_and_the_others_go_on(here: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_mistake_in_one_run_is_told_and_the_others_go_on(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    stub(monkeypatch, "train", lambda cfg, folder: 1.0)
     assert swept("grid.size=3,2,4,1") == 2
     assert states(here / "all") == ["done", "failed", "done", "failed"]
     captured = capfd.readouterr()
@@ -79,50 +83,35 @@ def test_a_mistake_in_one_run_is_told_and_the_others_go_on(here: Path, capfd: py
     assert [path.name for path in failed.folder.iterdir()] == ["failed.json"]
 
 
-@pytest.mark.parametrize(
-    ("end", "status", "reason"),
-    [
-        (lambda: sys.exit(3), 1, "SystemExit: 3"),
-        (lambda: os._exit(3), 1, "its process ended with status 3"),
-        (lambda: os.kill(os.getpid(), signal.SIGKILL), 1, "killed by SIGKILL, perhaps for lack of memory"),
-    ],
-)
+def raised(error: BaseException) -> None:
+    raise error
+
+
+ENDS: list[tuple[Callable[[], Any], str]] = [
+    (lambda: sys.exit(3), "SystemExit: 3"),
+    (lambda: os._exit(3), "its process ended with status 3"),
+    (lambda: os.kill(os.getpid(), signal.SIGKILL), "killed by SIGKILL, perhaps for lack of memory"),
+    (lambda: raised(RunError("iteration 3: the loss\nis not finite")), "iteration 3: the loss is not finite"),
+    (lambda: raised(Preempted(15)), "stopped by signal 15"),
+    (lambda: raised(MemoryError()), "MemoryError"),
+    (lambda: raised(ZeroDivisionError("a bug")), "ZeroDivisionError: a bug"),
+]
+
+
 def test_nothing_that_ends_a_run_ends_the_others(
-    end: Any, status: int, reason: str, here: Path, monkeypatch: Any
+    here: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     def run(cfg: Any, folder: Path) -> float:
-        if cfg.seed == 1:
-            end()
+        if cfg.seed < len(ENDS):
+            ENDS[cfg.seed][0]()
         return float(cfg.seed)
 
     stub(monkeypatch, "train", run)
-    assert swept("seed=0,1,2", "quiet=true") == status
-    assert states(here / "all") == ["done", "failed", "done"]
-    assert table(here / "all")[1]["reason"] == reason
-
-
-@pytest.mark.parametrize(
-    ("error", "reason"),
-    [
-        (MemoryError(), "MemoryError"),
-        (ZeroDivisionError("a bug"), "ZeroDivisionError: a bug"),
-        (RunError("iteration 3: the loss\nis not finite"), "iteration 3: the loss is not finite"),
-        (Preempted(15), "stopped by signal 15"),
-    ],
-)
-def test_nothing_that_a_run_raises_ends_the_others(
-    error: BaseException, reason: str, here: Path, monkeypatch: Any, capfd: pytest.CaptureFixture[str]
-) -> None:
-    def run(cfg: Any, folder: Path) -> float:
-        if cfg.seed == 1:
-            raise error
-        return float(cfg.seed)
-
-    stub(monkeypatch, "train", run)
-    assert swept("seed=0,1,2", "quiet=true") == 1
-    assert [row["reason"] for row in table(here / "all")] == ["", reason, ""]
-    said = capfd.readouterr().err
-    assert ("Traceback" in said) == (type(error) in (MemoryError, ZeroDivisionError))
+    assert swept(f"seed=range({len(ENDS) + 1})", "quiet=true") == 1
+    assert states(here / "all") == ["failed"] * len(ENDS) + ["done"]
+    assert [row["reason"] for row in table(here / "all")] == [*(reason for _, reason in ENDS), ""]
+    # Of what is none of our errors: SystemExit and the last two.
+    assert capfd.readouterr().err.count("Traceback") == 3
 
 
 def test_a_failed_run_is_retried(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -130,6 +119,7 @@ def test_a_failed_run_is_retried(here: Path, monkeypatch: pytest.MonkeyPatch) ->
         stub(patch, "train", lambda cfg, folder: 1 / cfg.seed)
         assert swept("seed=0,1", "quiet=true") == 1
     assert states(here / "all") == ["failed", "done"]
+    stub(monkeypatch, "train", lambda cfg, folder: 1.0)
     assert swept("seed=0,1", "quiet=true") == 0
     assert states(here / "all") == ["done", "done"]
     assert not list(here.rglob("failed.json"))
@@ -144,7 +134,10 @@ def test_the_summary_of_another_config_does_not_count(here: Path) -> None:
     assert json.loads((run.folder / "summary.json").read_text())["policy"] == summary["policy"]
 
 
-def test_blocks_of_an_experiment_are_the_sweep(here: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_blocks_of_an_experiment_are_the_sweep(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    stub(monkeypatch, "train", lambda cfg, folder: 1.0)
     (here / "mine/experiment").mkdir(parents=True)
     (here / "mine/experiment/few.yaml").write_text(
         "# @package _global_\ngrid: {size: 3}\nalgo: {updates: 4, hidden: 8}\n"
@@ -161,7 +154,7 @@ def test_blocks_of_an_experiment_are_the_sweep(here: Path, capfd: pytest.Capture
         "support_size_4-seed_7",
     ]
     assert main(line) == 0
-    assert "3 runs, 3 of them done before" in capfd.readouterr().out
+    assert f"3 runs -> multirun/{sweep.name}" in capfd.readouterr().out
     assert main([*line, "grid.sise=3"]) == 2
     assert capfd.readouterr().err.startswith("trackmdp train: grid.sise: unknown option, did you mean grid.size?")
     assert main([*line[:-1], "experiment=fwe"]) == 2
@@ -232,20 +225,6 @@ def test_a_signal_is_told_to_the_runs_and_ends_the_sweep(tmp_path: Path) -> None
     assert seen == [(["one"], signal.SIGTERM, False)]  # a second one is taken as well
     assert (told.value.signal, stop_signal(tmp_path), signal.getsignal(signal.SIGTERM)) == (signal.SIGTERM, 0, before)
     assert states(tmp_path) == ["waiting"]
-
-
-def test_skipping_imports_nothing_heavy(here: Path) -> None:
-    assert swept("seed=0", "quiet=true") == 0
-    code = f"""
-import sys
-import time
-from trackmdp.app.cli import main
-status = main({["train", "-m", *TINY, "seed=0", "hydra.sweep.dir=all"]})
-sys.exit(str((status, sorted({{"torch", "torchrl", "scipy"}} & set(sys.modules)))))
-"""
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)
-    assert result.stderr == "(0, [])\n"
 
 
 @pytest.mark.slow
