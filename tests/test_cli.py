@@ -122,7 +122,7 @@ def test_price_files_are_checked_before_a_folder_is_made(tmp_path: Path, capsys:
     (tmp_path / "negative.csv").write_text("\n".join(["1,1,1", "1,-2,1", "1,1,1"]))
     (tmp_path / "broken.csv").write_text("a,b\n")
     for name, message in (
-        ("short.csv", "3 values, expected 9"),
+        ("short.csv", "3 values, expected one number or 9"),
         ("negative.csv", "cell 4 has -2.0"),
         ("broken.csv", "not a table of numbers"),
     ):

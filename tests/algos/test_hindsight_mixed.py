@@ -40,6 +40,7 @@ def test_mixed_learns_while_it_collects() -> None:
     assert explore[12:] == pytest.approx([0.1] * 6)
 
 
+@pytest.mark.slow
 def test_mixed_reaches_the_optimum_of_a_small_world() -> None:
     """Each batch is collected with the policy learned so far."""
     world = small_world(exit_probability=0.02)

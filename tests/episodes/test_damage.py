@@ -175,10 +175,10 @@ def killed(work: Callable[[int], None], reports: int) -> int:
 
 @pytest.mark.parametrize("kills", [2, pytest.param(10, marks=pytest.mark.slow)])
 def test_a_killed_writer_loses_nothing_that_was_flushed(kills: int, tmp_path: Path) -> None:
-    episodes, rng = recorded(1000), random.Random(kills)
+    episodes, rng = recorded(100 * kills), random.Random(kills)
     for kill in range(kills):
         file = tmp_path / f"{kill}.mcap"
-        said = killed(lambda report, file=file: logging_child(file, episodes, report), rng.randint(1, 60))
+        said = killed(lambda report, file=file: logging_child(file, episodes, report), rng.randint(1, 6 * kills))
         assert not file.exists()
         saved = recover(file.with_name(f"{kill}.mcap.part"))
         assert saved.episodes >= said

@@ -175,8 +175,7 @@ def test_a_signal_to_the_workers_as_well_is_no_failure(tmp_path: Path, monkeypat
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("collector", ["multi_sync", "multi_async"])
-@pytest.mark.parametrize("when", ["between", "while collecting"])
+@pytest.mark.parametrize(("collector", "when"), [("multi_sync", "between"), ("multi_async", "while collecting")])
 def test_a_worker_that_is_killed_is_named(
     collector: str, when: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -218,7 +217,7 @@ worker.join()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("mode", "step"), [("kill", 17), ("power", 13), ("error", 19)])
+@pytest.mark.parametrize(("mode", "step"), [("kill", 43), ("power", 37), ("error", 41)])
 def test_a_run_that_ends_at_any_file_operation_resumes_to_the_same_run(mode: str, step: int, tmp_path: Path) -> None:
     """Some of the points only; step 1 goes through all of them, in minutes."""
     words = [sys.executable, "-m", "tests.training.crashpoints", str(tmp_path), mode, str(step)]

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -119,6 +121,22 @@ def run(folder: Path, file: Path, *words: str, algo: str = "hindsight") -> dict[
     return summary
 
 
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """The folder of an algorithm's runs: on the recording, and with other cells in one of its parts."""
+
+    @cache
+    def trained(algo: str) -> Path:
+        folder = tmp_path_factory.mktemp(algo)
+        whole = write(folder / "tracks.csv", FILE)
+        run(folder / "clean", whole, algo=algo)
+        for name, part in zip(PARTS, parts(whole), strict=True):
+            run(folder / name, poisoned(folder / f"{name}.csv", part), algo=algo)
+        return folder
+
+    return trained
+
+
 def test_a_run_says_nothing_that_takes_a_kernel(file: Path, tmp_path: Path) -> None:
     summary = run(tmp_path / "run", file)
     assert (summary["qmdp"], summary["optimal"], summary["regret_per_step"]) == (None, None, None)
@@ -141,34 +159,33 @@ def test_a_run_says_nothing_that_takes_a_kernel(file: Path, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("algo", ["hindsight", "ppo"])
-def test_only_its_own_part_is_learned_from(algo: str, file: Path, tmp_path: Path) -> None:
+def test_only_its_own_part_is_learned_from(algo: str, runs: Callable[[str], Path]) -> None:
     """Other cells in the held-out or the validation tracks, and the run learns the same; in the others, it does not."""
-    run(tmp_path / "clean", file, algo=algo)
-    _, first = checkpoints(tmp_path / "clean")
-    for name, part in zip(("learned", "validation", "held_out"), parts(file), strict=True):
-        run(tmp_path / name, poisoned(tmp_path / f"{name}.csv", part), algo=algo)
-        keys, second = checkpoints(tmp_path / name)
+    folder = runs(algo)
+    _, first = checkpoints(folder / "clean")
+    for name in PARTS:
+        keys, second = checkpoints(folder / name)
         assert all(same(first[key], second[key]) for key in keys) == (name != "learned")
-    learned = [strip(row) for row in metrics(tmp_path / "clean")]
-    assert learned == [strip(row) for row in metrics(tmp_path / "validation")]
+    learned = [strip(row) for row in metrics(folder / "clean")]
+    assert learned == [strip(row) for row in metrics(folder / "validation")]
 
 
-def test_choices_are_made_on_the_validation_tracks_alone(file: Path, tmp_path: Path) -> None:
+def test_choices_are_made_on_the_validation_tracks_alone(runs: Callable[[str], Path]) -> None:
     """What is looked at while learning, best.pt and Optuna's figure: as they are, whatever the held-out tracks hold."""
-    others = {name: poisoned(tmp_path / f"{name}.csv", part) for name, part in zip(PARTS, parts(file), strict=True)}
-    summaries = {name: run(tmp_path / name, each) for name, each in {"clean": file, **others}.items()}
-    assert metrics(tmp_path / "held_out") == metrics(tmp_path / "clean")
-    assert metrics(tmp_path / "validation") != metrics(tmp_path / "clean")
+    folder = runs("hindsight")
+    summaries = {name: json.loads((folder / name / "summary.json").read_text()) for name in ("clean", *PARTS)}
+    assert metrics(folder / "held_out") == metrics(folder / "clean")
+    assert metrics(folder / "validation") != metrics(folder / "clean")
     for key, changed in (("validation", "validation"), ("policy", "held_out")):
         assert [name for name in ("validation", "held_out") if summaries[name][key] != summaries["clean"][key]] == [
             changed
         ]
     # best.pt is the first checkpoint of those with the largest figure on the validation tracks
-    shown = {int(row["iteration"]): float(row["aihtr"]) for row in metrics(tmp_path / "clean") if row["aihtr"]}
-    best = checkpoint.load(tmp_path / "clean/checkpoints" / checkpoint.BEST)
+    shown = {int(row["iteration"]): float(row["aihtr"]) for row in metrics(folder / "clean") if row["aihtr"]}
+    best = checkpoint.load(folder / "clean/checkpoints" / checkpoint.BEST)
     assert best["callbacks"]["checkpoints"]["best"] >= max(shown.values())
     assert shown.get(best["iteration"], math.inf) >= max(shown.values())
-    value = run_scores(run_of(tmp_path / "clean"))["aihtr"]
+    value = run_scores(run_of(folder / "clean"))["aihtr"]
     assert value == summaries["clean"]["validation"]["aihtr"] != summaries["clean"]["policy"]["aihtr"]
 
 

@@ -25,6 +25,14 @@ LOGGED = (
 )
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that was not cut."""
+    folder = tmp_path_factory.mktemp("logged") / "whole"
+    train(folder, *LOGGED)
+    return folder
+
+
 class Killed(BaseException):
     """The process ends here: nothing is closed."""
 
@@ -48,17 +56,15 @@ def count(log: Path) -> int:
 
 
 @pytest.mark.parametrize("closes", [False, True])
-def test_it_is_cut_back_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, closes: bool) -> None:
-    train(tmp_path / "whole", *LOGGED)
+def test_it_is_cut_back_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: Path, closes: bool) -> None:
     cut(tmp_path / "cut", monkeypatch, closes=closes)
     left = tmp_path / "cut" / ("episodes.mcap" if closes else "episodes.mcap.part")
     assert left.is_file()
     train(tmp_path / "cut", *LOGGED, "resume=auto")
     logs = sorted(file.name for file in (tmp_path / "cut").glob("episodes*"))
     assert logs == ["episodes.mcap"]
-    mine, whole = (tmp_path / run / "episodes.mcap" for run in ("cut", "whole"))
-    assert count(whole) == 15
-    assert mine.read_bytes() == whole.read_bytes()
+    assert count(whole / "episodes.mcap") == 15
+    assert (tmp_path / "cut/episodes.mcap").read_bytes() == (whole / "episodes.mcap").read_bytes()
 
 
 def test_a_log_that_lost_episodes_is_left_alone(
@@ -75,22 +81,21 @@ def test_a_log_that_lost_episodes_is_left_alone(
 
 
 def test_on_a_full_disk_one_line_says_why_and_the_run_goes_on_as_if_it_never_had_been(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The log is over at iteration 2, the checkpoint after iteration 6 fails, and the same words go on later."""
 
     def full(*_: Any) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    train(tmp_path / "whole", *LOGGED)
     with monkeypatch.context() as patch, pytest.raises(RunError, match="No space left"):
         at_iteration(patch, 2, lambda: patch.setattr(EpisodeWriter, "add", full))
         at_iteration(patch, 6, full)
         train(tmp_path / "cut", *LOGGED)
     assert capsys.readouterr().err == ""
     train(tmp_path / "cut", *LOGGED, "resume=auto")
-    mine, whole = (checkpoint.load(checkpoint.newest(tmp_path / run))["callbacks"] for run in ("cut", "whole"))
-    assert mine["episodes"] == whole["episodes"] == {"policies": 5}
+    mine, theirs = (checkpoint.load(checkpoint.newest(run))["callbacks"] for run in (tmp_path / "cut", whole))
+    assert mine["episodes"] == theirs["episodes"] == {"policies": 5}
 
 
 def test_what_a_checkpoint_counts_on_is_on_the_disk_before_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

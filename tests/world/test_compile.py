@@ -82,7 +82,7 @@ def same(mine: TrackEnv, theirs: TrackEnv) -> bool:
     return bool((left == right).all()) and mine.render("text") == theirs.render("text")
 
 
-FAST = ("window", "misses", "memory")
+FAST = ("misses", "memory")
 
 
 @pytest.mark.parametrize(

@@ -99,7 +99,9 @@ def test_large_systems_are_iterated_to_the_same_value(monkeypatch: pytest.Monkey
     assert iterated.evaluation.accuracy == pytest.approx(exact.evaluation.accuracy, rel=1e-11)
 
 
-@pytest.mark.parametrize("kernel", ["regimes", "constant_velocity", "coordinated_turn"])
+@pytest.mark.parametrize(
+    "kernel", ["regimes", "constant_velocity", pytest.param("coordinated_turn", marks=pytest.mark.slow)]
+)
 def test_every_kernel_is_solved_and_simulated(kernel: str, here: Path) -> None:
     """By the command line, hidden and told: exact = simulated within 3 standard errors, and never above the bound."""
     worth = []

@@ -66,6 +66,7 @@ def test_the_study_goes_on_to_the_number_asked_for(here: Path, monkeypatch: pyte
     assert trials(here / "whole") == trials(here / "all")
 
 
+@pytest.mark.slow
 def test_a_finished_training_run_is_not_run_again_by_the_study(here: Path) -> None:
     assert swept("hydra/sweeper=optuna", "quiet=true", "algo.hidden=8,16", "hydra.sweeper.n_trials=2") == 0
     before = {run.folder: (run.folder / "summary.json").stat().st_mtime_ns for run in runs_of(here / "all")}
