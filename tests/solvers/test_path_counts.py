@@ -131,6 +131,20 @@ def test_keys_never_seen_follow_what_is_shared() -> None:
     assert found[5 * 10 + right, 0].sum() == 0  # at the border there is nothing to the right
 
 
+def test_a_key_never_seen_is_told_by_its_cell_and_its_class() -> None:
+    """After a move to the right, half go on to the right and half down; from the centre, 4, nobody goes to the right.
+
+    Nobody was seen to come to 4 from the left, so that its class alone would have both sensed (each at 1/2 > .2).
+    """
+    told = by_hand(*[[0, 1, 2]] * 30, *[[0, 1, 4, 7]] * 30, *[[6, 7, 8]] * 30)
+    task = recorded(told, memory="displacement", clip=1)
+    sets = plan_keys(task, told, prior=1.0, discount=0.9, rounds=2).policy.dense()[:, 0]
+    right = 1 + 1 * 3 + 2
+    assert sets[1 * 10 + right].nonzero()[0].tolist() == [2, 4]
+    assert sets[4 * 10 + right].nonzero()[0].tolist() == [7]
+    assert sets[5 * 10 + right].nonzero()[0].tolist() == [8]  # never seen at all, and to the right is outside
+
+
 def test_the_window_limits_the_sets() -> None:
     tracks = by_hand(*[[0, 2, 0, 2, 0, 2]] * 10, exits=False)
     far = recorded(tracks)

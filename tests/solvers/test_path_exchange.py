@@ -10,8 +10,9 @@ import pytest
 
 from tests.tracks import by_hand, recorded
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers.path_counts import Paths, plan_keys
-from trackmdp.solvers.path_exchange import _followed, choose_plan, exchanged_keys, parted
+from trackmdp.solvers.path_counts import plan_keys
+from trackmdp.solvers.path_exchange import PRIORS, _followed, choose_plan, exchanged_keys, parted
+from trackmdp.solvers.path_states import Paths
 from trackmdp.solvers.recorded import replay
 from trackmdp.world.tracks import Recorded, Tracks
 
@@ -99,11 +100,11 @@ def test_no_recording_learns_and_judges() -> None:
 
 
 def test_the_choice_is_the_one_that_earns_most_where_it_is_judged() -> None:
-    """Of what is tried, weights 3, 10 and 30 and then exchange, none earns more on the paths that judge."""
+    """Of what is tried, all weights and then exchange, none earns more on the paths that judge."""
     tracks, judge = line_walks(5, count=30), line_walks(5, count=31).select(np.arange(31) > 20)
     task = recorded(tracks, memory="displacement", clip=1)
     found = choose_plan(task, tracks, judge=judge, discount=1.0, rounds=5)
-    for prior in (3.0, 10.0, 30.0):
+    for prior in PRIORS:
         other = plan_keys(task, tracks, prior=prior, discount=1.0, rounds=5)
         assert (
             replay(task, judge, found.policy).totals[:, 0].sum() >= replay(task, judge, other.policy).totals[:, 0].sum()

@@ -15,12 +15,13 @@ from scipy import sparse
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
 from trackmdp.solvers.keyed_exchange import Chains, ChainStep, exchange_chains
-from trackmdp.solvers.path_counts import AlongPaths, Paths, Planned, plan_paths
+from trackmdp.solvers.path_counts import Planned, plan_paths
+from trackmdp.solvers.path_states import AlongPaths, Paths
 from trackmdp.solvers.renewal import IndexArray, per_row
 from trackmdp.world.model import Task
 from trackmdp.world.tracks import Tracks, draw_parts
 
-PRIORS = (3.0, 10.0, 30.0)
+PRIORS = (1.0, 3.0, 10.0, 30.0, 100.0)
 """Weights of what keys share that are tried."""
 _UNJUDGED = 10.0
 """The weight that is taken where there are no paths to judge by."""
