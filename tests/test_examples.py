@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -129,4 +131,31 @@ def test_the_plugin_learns_by_its_name(tmp_path: Path) -> None:
 def test_remembering_the_displacement_pays_on_the_ring() -> None:
     """A vehicle that is known to go round one way: no sensor is on behind it."""
     known = {line.split()[0]: numbers(line)[0] for line in example("memory")}
+    assert known["displacement"] > known["cell"] + 0.1
+
+
+@pytest.mark.slow
+def test_storms_are_gridded_from_the_columns_of_ibtracs(tmp_path: Path) -> None:
+    """Along a parallel, one degree a fix: half of the storms to the east over the date line, half to the west.
+
+    A fix 12 h after the one before ends a storm, and one of five fixes is none.
+    """
+    lines = ["track_id,season,time,lon,lat"]
+    for storm in range(40):
+        way, fixes = 1 if storm % 2 else -1, 5 if storm == 0 else 14
+        for fix in range(fixes):
+            day, hour = divmod(6 * (fix + (fix > 11)), 24)
+            lon = (178.5 + way * (fix - 7 + storm % 5) + 180) % 360 - 180
+            lines.append(f"s{storm:02},2001,2001-01-{day + 1:02} {hour:02}:00:00,{lon},{12.5 - storm % 3}")
+    (tmp_path / "fixes.csv").write_text("\n".join(lines) + "\n")
+    cells = tmp_path / "cells.csv"
+    storms = runpy.run_path(str(EXAMPLES / "storms.py"))
+    assert storms["gridded"](tmp_path / "fixes.csv", cells) == (3, 360)
+    track, row, column = np.loadtxt(cells, delimiter=",", skiprows=1, dtype=int).T
+    assert np.bincount(track).tolist() == [12] * 39
+    assert row[:12].tolist() == [1] * 12
+    assert column[:12].tolist() == list(range(172, 184))
+    known = {
+        line.split()[0]: numbers(line)[0] for line in run(str(EXAMPLES / "storms.py"), str(tmp_path / "fixes.csv"))
+    }
     assert known["displacement"] > known["cell"] + 0.1
