@@ -23,9 +23,12 @@ def words_of(command: str, choice: str) -> list[str]:
     return words if command != "evaluate" or "baseline=" in choice else ["baseline=qmdp", *words]
 
 
-ONCE = {choice: (command, choice) for command, choice in reversed(COMBINATIONS)}
+ONCE = {
+    choice if choice.startswith(("algo=", "log=")) else choice.partition("=")[0]: (command, choice)
+    for command, choice in reversed(COMBINATIONS)
+}
 FIRST = {command: (command, choice) for command, choice in reversed(COMBINATIONS)}
-"""Each choice with one of the commands that take it, and each command with one of its choices."""
+"""Each algorithm, each log, and a choice of each other group and each command."""
 
 
 @pytest.mark.parametrize(("command", "choice"), sorted({*ONCE.values(), *FIRST.values(), *SELECTED}))

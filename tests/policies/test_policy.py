@@ -188,12 +188,12 @@ def stochastic(reads_history: bool, width: int = M) -> ProbabilisticActor:
 
 
 def test_a_stochastic_actor_is_valued_as_the_mixture_it_is() -> None:
-    """By its probabilities exactly, in agreement with 20,000 episodes of its draws; by its mode where that is asked."""
+    """By its probabilities exactly, in agreement with 6,000 episodes of its draws; by its mode where that is asked."""
     actor = stochastic(reads_history=False)
     x, n, j = np.ogrid[:M, :CHOICES, :M]
     exact = evaluate(WORLD, Policy.from_dense(WORLD, 1 / (1 + np.exp(2 - (x + n + j) / 4))))
     assert evaluate(WORLD, actor).aihtr == pytest.approx(exact.aihtr, rel=1e-6)
-    simulated = simulate(WORLD, actor, 20_000).figures().aihtr
+    simulated = simulate(WORLD, actor, 6_000).figures().aihtr
     assert abs(simulated.mean - exact.aihtr) < 4 * simulated.standard_error
     mode = evaluate(WORLD, Policy.from_module(WORLD, actor)).aihtr
     assert mode == pytest.approx(evaluate(WORLD, (x + n + j) / 4 > 2).aihtr)
@@ -207,7 +207,7 @@ def test_draws_that_depend_on_draws_before_are_refused_and_can_be_simulated() ->
     with pytest.raises(UserError, match="depend on the sets that it drew before, so no exact value; simulate it") as no:
         evaluate(WORLD, actor)
     assert "\n" not in str(no.value)
-    drawn, free = (simulate(WORLD, stochastic(each), 20_000).figures() for each in (True, False))
+    drawn, free = (simulate(WORLD, stochastic(each), 6_000).figures() for each in (True, False))
     assert drawn.sensors_per_step.mean > free.sensors_per_step.mean + 0.05
     assert Policy.from_module(WORLD, actor).deterministic
     once = replace(WORLD, t_max=0)
