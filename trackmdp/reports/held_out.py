@@ -50,7 +50,7 @@ def recorded_page(
     )
     shares = {name: each.watched / max(each.totals[:, 1].sum(), 1) for name, each in replayed.items()}
     most = max(float(share.max()) for share in shares.values())
-    maps = [_figure(_recording(problem), "The held-out tracks, on the cells they visit (darker: more often).")]
+    maps = [_figure(_recording(problem), "The held-out tracks, on the cells they visit (stronger: more often).")]
     maps += [
         _figure(
             _svg(problem.size, _shaded(problem, share / (most or 1.0))),

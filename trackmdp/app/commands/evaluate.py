@@ -164,5 +164,5 @@ def _show(
         rows.append([label, f"{exact[key]:,.4f}", simulated, f"{qmdp[key]:,.4f}"])
     title = f"simulated, {simulation.episodes} episodes ± s.e." if simulation else "simulated"
     console.print(table(subject, ["figure", "exact", title, "Q_MDP exact"], rows))
-    where = f"results in {folder}, sets in {sets_name(evaluator.world)}"
-    console.print(f"upper bound ({source}) {evaluator.upper:,.4f}; {score.regret}; {where}")
+    console.print(f"upper bound ({source}) {evaluator.upper:,.4f}; {score.regret}")
+    console.print(f"results in {folder}, sets in {sets_name(evaluator.world)}")

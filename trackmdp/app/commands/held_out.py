@@ -51,18 +51,15 @@ def show_loaded(console: Console, problem: Problem) -> None:
 
 def show_held_out(console: Console, subject: str, report: dict[str, Any]) -> None:
     """The figures of a policy beside those of the references, with their intervals."""
-    rows = [
-        [
-            subject if name == "policy" else name,
-            with_interval(figures["aihtr"], 2),
-            with_interval(figures["reward_per_step"], 4),
-            with_interval(figures["accuracy"], 2, 100.0, " %"),
-            with_interval(figures["sensors_per_step"], 2),
-        ]
-        for name, figures in report["figures"].items()
-    ]
-    title = f"{report['tracks']} held-out tracks, mean and 95 % interval"
-    console.print(table(title, ["policy", "AIHTR", "reward per step", "accuracy", "sensors per step"], rows))
+    shown: dict[str, tuple[Any, ...]] = {"aihtr": ("AIHTR", 2), "reward_per_step": ("reward per step", 4)}
+    shown |= {"accuracy": ("accuracy", 2, 100.0, " %"), "sensors_per_step": ("sensors per step", 2)}
+    rows = []
+    # Figure by figure, policies under each other: side by side the intervals would be wider than 80 columns.
+    for key, (label, *form) in shown.items():
+        rows.append([label, ""])
+        for name, figures in report["figures"].items():
+            rows.append([f"  {subject if name == 'policy' else name}", with_interval(figures[key], *form)])
+    console.print(table(f"{report['tracks']} held-out tracks", ["", "mean (95 % interval)"], rows))
 
 
 def with_interval(interval: dict[str, float | None], digits: int, scale: float = 1.0, unit: str = "") -> str:

@@ -115,17 +115,21 @@ def _list(console: Console, reader: EpisodeReader) -> None:
     (rows, columns), seed = reader.run.size, reader.run.said.get("seed", "")
     grid = f"{rows}x{columns} grid"
     console.print(f"{len(reader)} episodes, {steps:,} steps on a {grid}, T_max {reader.run.t_max}, seed {seed}")
+    labels = [reader.policies[row["policy"]].get("label", "") for row in reader.rows]
+    one = len(set(labels)) == 1
+    if one:
+        console.print(f"policy: {labels[0]}")
     entries = [
         [
             str(row["episode"]),
-            reader.policies[row["policy"]].get("label", ""),
+            *([] if one else [label]),
             str(row["length"]),
             f"{row['return']:,.2f}",
             str(row["detections"]),
             str(row["forced"]),
             "exited" if row["terminated"] else "truncated",
         ]
-        for row in reader.rows
+        for label, row in zip(labels, reader.rows, strict=True)
     ]
-    names = ["episode", "policy", "steps", "return", "located", "forced", "end"]
+    names = ["episode", *([] if one else ["policy"]), "steps", "return", "located", "forced", "end"]
     console.print(table(str(reader.file), names, entries))
