@@ -82,6 +82,16 @@ def test_equal_paths_are_followed_once_and_count_as_often_as_they_are_there() ->
     assert _followed(paths, policy, 0.9).reward == pytest.approx(total)
 
 
+def test_paths_that_are_there_three_times_say_what_they_say_once_to_three_times_the_weight() -> None:
+    tracks = line_walks(1)
+    task = recorded(tracks, memory="displacement", clip=1)
+    for prior in (3.0, 10.0):
+        once = plan_keys(task, tracks, prior=prior, discount=0.9, rounds=0)
+        thrice = plan_keys(task, repeated(tracks, [3] * 12), prior=3 * prior, discount=0.9, rounds=0)
+        assert (thrice.policy.dense() == once.policy.dense()).all()
+        assert thrice.reward == pytest.approx(3 * once.reward)
+
+
 def test_rare_keys_keep_their_plans() -> None:
     task = recorded(line_walks(1), memory="displacement", clip=1)
     paths, policy = Paths(task, task.tracks), PolicyTable.from_dense(task, np.zeros((90, 2, 9), dtype=bool))

@@ -73,8 +73,8 @@ class PathCountsConfig(AlgoConfig):
     credit: ClassVar[str | None] = None
     remembers: ClassVar[bool] = True
     prior: float | None = option(
-        "what is known without the cell counts as much as so many detections; null: chosen, as is whether plans are "
-        "improved by exchange, by a quarter of the paths, which then count as well",
+        "what is known of a key by its cell, and by all but its cell, counts as so many detections; null: chosen, "
+        "as is whether plans are improved by exchange, by a quarter of the paths, which then count as well",
         ge=0,
     )
     gamma: float = option("discount inside the credit; policies are evaluated undiscounted", ge=0, le=1)

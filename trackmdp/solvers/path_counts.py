@@ -24,9 +24,9 @@ _UNVISITED = 0.01
 the policy itself comes by the key."""
 _CELLS_AT_ONCE, _KEYS_AT_ONCE = 2_048, 16_384
 _LIFTED = 30.0
-"""A cell's lift is drawn to 1 as if prior² / 30 more detections had been expected, and made. Where cells have few
-detections, and large weights serve best, what its few tracks did would else be told of all its keys: on storms that
-costs more than it gains, in a city it gains (chosen by validation tracks of both)."""
+"""A cell's lift is drawn to 1 as if prior² / 30 more detections had been expected, and made; times the copies of each
+path. Where cells have few detections, and large weights serve best, what its few tracks did would else be told of all
+its keys: on storms that costs more than it gains, in a city it gains (chosen by validation tracks of both)."""
 _LITTLE = 1e-9
 """Weight of what is shared where none is asked for: what was never seen is then still told by it."""
 
@@ -224,7 +224,7 @@ class _Shared:
         gains, weight = np.maximum((summing @ own).toarray(), 0.0), summing @ arrived
         # Poisson counts with a gamma prior on the lift (DuMouchel 1999): a rare displacement that was seen once is no
         # lift of a hundred, as it would be were chances smoothed before they are divided.
-        prior = max(prior**2 / _LIFTED, _LITTLE)
+        prior = max(prior**2 / (_LIFTED * paths.copies), _LITTLE)
         chance = weight[:, None] * (gains.sum(0) / max(weight.sum(), 1e-12))
         lift = (gains + prior) / (chance + prior)
         common = np.maximum(common, 0.0)
