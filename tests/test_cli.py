@@ -25,7 +25,7 @@ pytestmark = pytest.mark.usefixtures("empty_folder")
 LONG = "a" * 300  # longer than a name may be
 
 
-@pytest.mark.parametrize("group", GROUPS)
+@pytest.mark.parametrize("group", [group for group in GROUPS if "/" not in group])
 def test_unknown_choices_are_refused_naming_the_known_ones(group: str, capsys: pytest.CaptureFixture[str]) -> None:
     command = next(command for command, root in ROOTS.items() if group in options(root))
     for bad in ("nothing_of_the_kind", "null", "3"):
@@ -55,8 +55,8 @@ def test_unknown_credit_is_refused(algo: str, bad: str, capsys: pytest.CaptureFi
         ("train -m seed=range(10000000)", "seed=range(10000000): expected at most 100,000 values"),
         ("train -m seed=range(1000) kernel.seed=range(1000)", "a sweep of 1,000,000 runs: expected at most 100,000"),
         ("train -m seed=range(0,1,0)", "seed=range(0,1,0): range() arg 3 must not be zero"),
-        ("train seed=range(0,1,0)", "seed=range(0,1,0): expected option=value"),
-        ("train seed=glob(*)", "seed=glob(*): expected one value; add -m"),
+        ("train seed=range(0,1,0)", "seed=range(0,1,0): range() arg 3 must not be zero"),
+        ("train seed=glob(*)", "seed=glob(*): expected the values themselves, separated by commas"),
         ("train -m algo=glob(*)", "algo=glob(*): expected the values themselves, separated by commas"),
         ("train seed=${nope:1} seed=-1", "seed=-1: expected an integer >= 0"),
         ("train --sizzle", "unrecognized arguments: --sizzle"),

@@ -43,37 +43,27 @@ def load_npy(stream: Any, size: int) -> npt.NDArray[Any]:
         ValueError: they are something else, hold Python objects, or are more or fewer than their header claims.
         Exception: whatever NumPy raises over a header; call it inside `untrusted.decoded`.
     """
+    content = stream.read(size + 1)  # to the very end, where zipfile compares the checksum
+    head = io.BytesIO(content)
     # An .npy file: 6 bytes magic (\x93NUMPY), 2 of version, 2 (version 1.0) or 4 (2.0) with the header's length, the
     # header as the text of a Python dict such as {'descr': '<f8', 'fortran_order': False, 'shape': (3, 4)}, then the
     # numbers. Version 3.0 differs in allowing any UTF-8 in field names, which arrays without fields do not have.
-    version = np.lib.format.read_magic(stream)
-    if version not in ((1, 0), (2, 0)):
+    version = np.lib.format.read_magic(head)
+    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    if version not in readers:
         raise ValueError("an .npy file of another version than 1.0 and 2.0")
-    # Version 2.0 has headers of up to 4 GiB, which NumPy would read whole before it looks at their length.
-    length = int.from_bytes(stream.read(2 if version == (1, 0) else 4), "little")
-    if length > _HEADER:
-        raise ValueError(f"a header of {length:,} bytes")
-    # Handed to NumPy as version 1.0, whose length has 2 bytes: the header has just been found to be short enough.
-    head = io.BytesIO(length.to_bytes(2, "little") + stream.read(length))
-    shape, fortran, dtype = np.lib.format.read_array_header_1_0(head, max_header_size=_HEADER)
+    shape, fortran, dtype = readers[version](head, max_header_size=_HEADER)
     # Objects would be unpickled, which runs code; V is structured or raw, which no file of ours is.
     if dtype.hasobject or dtype.kind == "V":
         raise ValueError(f"an array of {dtype}")
     if any(length < 0 for length in shape):
         raise ValueError(f"a shape of {shape}")
     # Python's integers do not overflow: a shape of (2**40, 2**40) cannot wrap around to a small product.
-    claimed, left = math.prod(shape) * dtype.itemsize, size - stream.tell()
+    claimed, left = math.prod(shape) * dtype.itemsize, len(content) - head.tell()
     if claimed != left:
         raise ValueError(f"its header claims {claimed:,} bytes of numbers, there are {left:,}")
-    content = bytearray()
-    while piece := stream.read(2**20):  # to the very end, where zipfile compares the checksum
-        # Piece by piece: a zip member may unfold to more than its entry says, and is given up as soon as it does.
-        content += piece
-        if len(content) > claimed:
-            raise ValueError("more bytes than its header claims")
-    if len(content) != claimed:
-        raise ValueError("fewer bytes than its header claims")
-    flat = np.frombuffer(content, dtype) if content else np.zeros(0, dtype)
+    # `bytearray`: an array over `bytes` could not be written to.
+    flat = np.frombuffer(bytearray(head.read()), dtype) if claimed else np.zeros(0, dtype)
     return flat.reshape(shape, order="F" if fortran else "C")
 
 
@@ -99,12 +89,11 @@ def load_npz(stream: BinaryIO, names: Iterable[str] | None = None) -> dict[str, 
             if member.compress_type not in _METHODS or member.flag_bits & 1:
                 raise ValueError(f"{member.filename!r} is encrypted, or neither stored nor deflated")
         known = {member.filename.removesuffix(".npy"): member for member in members}
-        return {name: _member(archive, known[name]) for name in (known if names is None else names)}
-
-
-def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> npt.NDArray[Any]:
-    with archive.open(member) as stream:
-        return load_npy(stream, member.file_size)
+        found = {}
+        for name in known if names is None else names:
+            with archive.open(known[name]) as content:
+                found[name] = load_npy(content, known[name].file_size)
+        return found
 
 
 def npy_bytes(array: npt.NDArray[Any]) -> bytes:

@@ -6,14 +6,16 @@ copy is made. Without `fsync` a power failure may cost what was saved last, neve
 
 from __future__ import annotations
 
+import csv
 import errno
+import io
 import json
 import math
 import os
 import shutil
 import stat
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from io import BufferedWriter
 from pathlib import Path
@@ -150,6 +152,13 @@ def say_lacking(folder: Path, what: str, instead: str) -> None:
 def write_text(file: Path, text: str) -> None:
     """Write a file whole or not at all."""
     write_bytes(file, text.encode())
+
+
+def csv_text(head: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
+    """A table as CSV, its lines ended by a line feed."""
+    stream = io.StringIO()
+    csv.writer(stream, lineterminator="\n").writerows([head, *rows])
+    return stream.getvalue()
 
 
 def write_bytes(file: Path, content: bytes) -> None:

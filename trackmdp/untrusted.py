@@ -122,22 +122,13 @@ def read_text(file: Path, *, most: int = SMALL, source: str = "", links: bool = 
         return content.decode("utf-8-sig")
 
 
-def read_json(file: Path, *, most: int = SMALL, source: str = "") -> Any:
-    """The content of a file of JSON; see `parse_json`.
-
-    Raises:
-        UserError: it cannot be read, or is no JSON within bounds.
-    """
-    return parse_json(read_text(file, most=most, source=source), source or str(file))
-
-
 def read_object(file: Path, *, most: int = SMALL, source: str = "") -> dict[str, Any]:
-    """The JSON object in a file.
+    """The JSON object in a file; see `parse_json`.
 
     Raises:
         UserError: it cannot be read, or is something else.
     """
-    content = read_json(file, most=most, source=source)
+    content = parse_json(read_text(file, most=most, source=source), source or str(file))
     if not isinstance(content, dict):
         raise UserError(f"{source or file}: expected a JSON object")
     return content

@@ -13,7 +13,6 @@ from omegaconf import OmegaConf
 from tests.config.cases import COMBINATIONS, composed, files_of
 from tests.helpers import configured
 from tests.reads import record_reads, unread
-from trackmdp.app.sweep.schema import PLUGINS
 from trackmdp.config import (
     GROUPS,
     ROOTS,
@@ -83,17 +82,9 @@ def test_yaml_of_a_command_holds_exactly_the_options_of_its_schema(command: str)
 def test_every_yaml_file_belongs_to_a_schema() -> None:
     found = {str(file.relative_to(CONF)) for file in CONF.rglob("*.yaml") if file.parent.name != "experiment"}
     expected = {f"{group}/{name}.yaml" for group, name in CHOICES} | {f"{command}.yaml" for command in ROOTS}
-    expected |= {f"hydra/{group}/{name}.yaml" for group, members in PLUGINS.items() for name in members}
     expected |= {f"credit/{name}.yaml" for name in SELECTORS["credit"].choices}
     expected |= {f"credit/{name}/{algo}.yaml" for name in SELECTORS["credit"].choices for algo in CREDITED}
     assert found - {"hydra/folders.yaml"} == expected
-
-
-@pytest.mark.parametrize(("group", "name"), [(group, name) for group in PLUGINS for name in PLUGINS[group]])
-def test_yaml_of_a_sweep_holds_exactly_the_options_of_its_schema(group: str, name: str) -> None:
-    values = read(CONF / "hydra" / group / f"{name}.yaml")
-    assert values.pop("defaults") == [f"base_{name}"]
-    assert set(values) == set(options(PLUGINS[group][name]))
 
 
 def test_schemas_hold_no_values() -> None:
@@ -197,7 +188,7 @@ def test_rules_between_options(command: str, words: str, message: str) -> None:
     ("change", "message"),
     [
         ("size: 10", "grid.size: missing"),
-        ("name: random_support", "kernel.name=None: expected one of random_support"),
+        ("name: random_support", "kernel=null: expected one of random_support"),
     ],
 )
 def test_a_config_file_with_a_missing_key_is_refused(change: str, message: str, tmp_path: Path) -> None:

@@ -126,7 +126,7 @@ def test_a_map_of_averaged_plans_fills_the_share_of_each_cell() -> None:
     figure = maps.policy_map("x", "here", kept, motion, (1, 2))
     assert [row[2:4] for row in figure.table.rows] == [[0.25, 2], [1.0, 1]]
     assert "At n = 0: 0.62 cells sensed, 0.88 possible ones left out on average." in figure.text
-    assert "share of the detections" in figure.text
+    assert "shares of the detections" in figure.text
     assert kept.averaged
 
 

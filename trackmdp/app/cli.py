@@ -115,17 +115,9 @@ def _printable(text: str) -> str:
 
 def _overview() -> str:
     width = max(map(len, COMMANDS))
-    lines = [f"  {name:<{width}}  {text}" for name, text in COMMANDS.items()]
-    return "\n".join(
-        [
-            "usage: trackmdp COMMAND [option=value ...]",
-            "",
-            *lines,
-            "",
-            "trackmdp COMMAND --help lists every option of a command.",
-            "",
-        ]
-    )
+    lines = "".join(f"  {name:<{width}}  {text}\n" for name, text in COMMANDS.items())
+    last = "trackmdp COMMAND --help lists every option of a command."
+    return f"usage: trackmdp COMMAND [option=value ...]\n\n{lines}\n{last}\n"
 
 
 if __name__ == "__main__":

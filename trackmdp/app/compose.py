@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Self
@@ -11,17 +11,16 @@ from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
-from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from trackmdp.app.diagnose import diagnose
 from trackmdp.app.sources import searched
-from trackmdp.app.sweep.schema import PLUGINS
+from trackmdp.app.words import parsed
 from trackmdp.config import GROUPS, ROOTS, conf_dir
 from trackmdp.config.registry import load_plugins
+from trackmdp.config.sweeping import PLUGINS
 from trackmdp.config.untrusted import entries, names_code
 from trackmdp.config.values import register_resolvers
 from trackmdp.errors import UserError
@@ -57,12 +56,11 @@ def register() -> None:
         store.store(group=group or None, name=f"base_{name}", node=schema)
     # First load Hydra's plugins, then take out what they stored: what they store later would stay.
     Plugins.instance()  # Hydra's plugins store launchers and sweepers of the same names, which ours replace
-    for group, members in PLUGINS.items():
-        for name, schema in members.items():
+    for part in PLUGINS:
+        for name in GROUPS[f"hydra/{part}"]:
             # Where `hydra-joblib-launcher` is installed, Hydra would take the `hydra/launcher/joblib` that it stores
             # for the schema of our file of that name.
-            store.repo["hydra"][group].pop(f"{name}.yaml", None)
-            store.store(group=f"hydra/{group}", name=f"base_{name}", node=schema)
+            store.repo["hydra"][part].pop(f"{name}.yaml", None)
 
 
 class Composer:
@@ -72,7 +70,6 @@ class Composer:
         command: whose `conf/<command>.yaml` is composed, unless `name` is another file.
         words: what was typed, for the folders that `hydra.searchpath=` names.
         name: of the primary config.
-        folder: a main folder in place of `conf/`.
         extra: a further folder (`--config-dir`).
 
     Raises:
@@ -80,12 +77,7 @@ class Composer:
     """
 
     def __init__(
-        self,
-        command: str,
-        words: Sequence[str] = (),
-        name: str | None = None,
-        folder: str | None = None,
-        extra: str | None = None,
+        self, command: str, words: Sequence[str] = (), name: str | None = None, extra: str | None = None
     ) -> None:
         self.command, self.name = command, name or command
         # Left in, Hydra would read those folders itself, without the checks of `trackmdp.app.sources`.
@@ -94,17 +86,15 @@ class Composer:
         named = [path for word in words if _is_search_path(word) for path in _search_path(word)]
         self._users = [_existing("--config-dir", extra)] if extra is not None else []
         self._users += [_existing("hydra.searchpath", path) for path in named]
-        self._main = None if folder is None else _existing("--config-path", folder)
         self._opened = ExitStack()
 
     def __enter__(self) -> Self:
         # Plugins of this package's are loaded by it, and their folders are searched as soon as Hydra is initialised.
         register()
-        main = str(self._main) if self._main else conf_dir()
-        self._opened.enter_context(searched(self._users, load_plugins(), main_is_users=self._main is not None))
+        self._opened.enter_context(searched(self._users, load_plugins()))
         # Without `version_base` Hydra warns, and behaves as its version 1.1. An absolute folder works for a clone, an
         # editable install and a wheel; a relative one works for a clone alone.
-        self._opened.enter_context(initialize_config_dir(main, job_name="trackmdp", version_base="1.3"))
+        self._opened.enter_context(initialize_config_dir(conf_dir(), job_name="trackmdp", version_base="1.3"))
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -134,11 +124,6 @@ class Composer:
         return compose(self.name, overrides=list(words), return_hydra_config=True)
 
 
-def run_words(words: Iterable[str]) -> list[str]:
-    """The overrides of the command's own config, without those of Hydra (`hydra.x=...`, `hydra/x=...`)."""
-    return [word for word in words if not word.lstrip("+~").startswith(("hydra.", "hydra/"))]
-
-
 def _refuse_code(cfg: DictConfig, words: Sequence[str]) -> None:
     """Refuse a config by which anything but our own code would be called.
 
@@ -148,14 +133,15 @@ def _refuse_code(cfg: DictConfig, words: Sequence[str]) -> None:
     # Unresolved: resolving would already call resolvers, before anything is checked.
     plain = OmegaConf.to_container(cfg, resolve=False)
     assert isinstance(plain, dict)
-    for group, members in PLUGINS.items():
+    for part in PLUGINS:
+        known = GROUPS[f"hydra/{part}"]
         # It names a class by `_target_`, which the search for names of code at the end would find.
-        if plain["hydra"][group] == _HYDRAS_OWN:
-            del plain["hydra"][group]
+        if plain["hydra"][part] == _HYDRAS_OWN:
+            del plain["hydra"][part]
         # The type of a node is the schema it was composed from, another for the launcher of another package. Keys that
         # `+` adds to ours keep the type, and are looked through at the end.
-        elif OmegaConf.get_type(cfg.hydra, group) not in members.values():
-            raise UserError(f"hydra/{group}: expected one of {', '.join(members)}")
+        elif OmegaConf.get_type(cfg.hydra, part) not in known.values():
+            raise UserError(f"hydra/{part}: expected one of {', '.join(known)}")
     # Hydra would make an object of each entry, by its `_target_`.
     if cfg.hydra.callbacks:
         raise UserError(f"hydra.callbacks.{next(iter(cfg.hydra.callbacks))}: a config names no code to call")
@@ -207,9 +193,9 @@ def _search_path(word: str) -> list[str]:
     """The folders that `hydra.searchpath=[...]` names."""
     try:
         # Parsed as Hydra parses it, so that quotes and escapes within the list mean the same.
-        value = OverridesParser.create().parse_override(word).value()
-    except (HydraException, OmegaConfBaseException) as error:
-        raise UserError(f"{word}: expected hydra.searchpath=[FOLDER, ...]") from error
+        value = parsed(word).value()
+    except (UserError, OmegaConfBaseException):
+        value = word
     paths = [] if value is None else value
     if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
         raise UserError(f"{word}: expected hydra.searchpath=[FOLDER, ...]")

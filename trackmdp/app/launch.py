@@ -3,26 +3,24 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.utils import configure_log, run_job
 from hydra.types import HydraContext
 from omegaconf import DictConfig, OmegaConf, read_write
 
-from trackmdp.app.compose import Composer, run_words
+from trackmdp.app.compose import Composer
 from trackmdp.app.outputs import folder_of, make_folder, remove_if_empty
 from trackmdp.app.prepare import Prepared, announce, prepare
-from trackmdp.app.questions import answer, is_question, parse
-from trackmdp.app.sweep.schema import BlocksConfig, OptunaConfig, SweeperConfig, plugin
+from trackmdp.app.questions import answer, parse
+from trackmdp.app.words import parsed, run_words
+from trackmdp.config import GROUPS
+from trackmdp.config.checks import validate
+from trackmdp.config.registry import maker
 from trackmdp.errors import UserError
-
-if TYPE_CHECKING:
-    from trackmdp.app.sweep.plan import Job
 
 
 def launch(command: str, words: Sequence[str]) -> int:
@@ -32,10 +30,9 @@ def launch(command: str, words: Sequence[str]) -> int:
         UserError: what was typed, or a file it names, is not as expected; nothing has been written then.
     """
     args = parse(words)
-    with Composer(command, args.overrides, args.config_name, args.config_path, args.config_dir) as compose:
+    with Composer(command, args.overrides, args.config_name, args.config_dir) as compose:
         # Before anything is checked or made: `--cfg job` also shows a config that a run would refuse.
-        if is_question(args):
-            answer(compose, args)
+        if answer(compose, args):
             return 0
         if args.multirun or "hydra.mode=MULTIRUN" in args.overrides:
             return _sweep(compose)
@@ -98,8 +95,7 @@ class _NoCallbacks:
 
 
 def _sweep(compose: Composer) -> int:
-    from trackmdp.app.sweep.launchers import make_launcher
-    from trackmdp.app.sweep.plan import parsed, sweep_name
+    from trackmdp.app.sweep.plan import Job, plan, sweep_name
     from trackmdp.app.sweep.sweep import sweep
     from trackmdp.training.display import make_console
 
@@ -109,23 +105,44 @@ def _sweep(compose: Composer) -> int:
     # Hydra refuses words with several values outside its own multirun; what concerns the sweep as a whole has one
     # value.
     cfg = compose([word for word in compose.words if not _has_values(word)])
-    sweeper, launcher = plugin("sweeper", cfg.hydra.sweeper), plugin("launcher", cfg.hydra.launcher)
     # Now, so that a missing package is told before anything is planned or written.
-    launch_jobs = make_launcher(launcher)
-    grids = (sweeper.blocks or []) if isinstance(sweeper, BlocksConfig) else [sweeper.name]
+    sweeper, launcher = _plugin("sweeper", cfg.hydra.sweeper), _plugin("launcher", cfg.hydra.launcher)
+    grids = getattr(sweeper, "blocks", [sweeper.name]) or []
     # `hydra.sweep.dir` says `${sweep_name:}`, which is resolved in the next line: the same words find the same folder
     # again, and with it the runs that are done. Hydra's own time stamp would begin anew each time.
     OmegaConf.register_new_resolver("sweep_name", lambda: sweep_name(command, words, grids), replace=True)
     folder = folder_of(cfg, "hydra.sweep.dir")
     # Absolute: runs start in processes, perhaps on other machines, whose current folder is another.
-    batches = _batches(compose, sweeper, words, folder.absolute())
+    place = folder.absolute()
+
+    def planned(grid: Sequence[Sequence[str]], naming: Collection[str] = ()) -> list[Job]:
+        return plan(command, grid, place, compose, naming)
+
+    def launch_jobs(jobs: Sequence[Job]) -> None:
+        maker(launcher)(launcher, [replace(job, concurrent=launcher.concurrent) for job in jobs])
+
+    batches = maker(sweeper)(sweeper, words, place, planned)
     line = shlex.join(["trackmdp", command, "-m", *compose.words])
     made = make_folder("hydra.sweep.dir", folder)
     try:
         # A grid has been composed and checked to the last run by now; a search plans its runs as it goes.
-        return sweep(folder.absolute(), command, line, batches, launch_jobs, make_console(cfg.quiet))
+        return sweep(place, command, line, batches, launch_jobs, make_console(cfg.quiet))
     finally:
         remove_if_empty(made)
+
+
+def _plugin(part: str, node: DictConfig) -> Any:
+    """The typed, checked options of `hydra.<part>`.
+
+    Raises:
+        UserError: a value is out of its range, the option chosen is none of ours, or what it needs is not installed.
+    """
+    known = GROUPS[f"hydra/{part}"]
+    if OmegaConf.get_type(node) not in known.values():
+        raise UserError(f"hydra/{part}: expected one of {', '.join(known)}")
+    typed: Any = OmegaConf.to_object(node)
+    validate(typed, f"hydra.{part}")
+    return typed
 
 
 def _has_values(word: str) -> bool:
@@ -135,24 +152,9 @@ def _has_values(word: str) -> bool:
         UserError: it asks for several values of Hydra's own settings, of which a sweep has one.
     """
     try:
-        several = OverridesParser.create().parse_override(word).is_sweep_override()
-    except Exception:  # composing says what is wrong with it
+        several = parsed(word).is_sweep_override()
+    except UserError:  # composing says what is wrong with it
         return False
     if several and not run_words([word]):
         raise UserError(f"{word}: expected one {word.partition('=')[0].split('/')[-1]}")
     return several
-
-
-def _batches(compose: Composer, sweeper: SweeperConfig, words: Sequence[str], folder: Path) -> Iterable[Sequence[Job]]:
-    """Batches of jobs: one batch with the whole grid, or the batches that a search asks for."""
-    from trackmdp.app.sweep.plan import combinations, plan
-
-    if isinstance(sweeper, BlocksConfig):
-        return [plan(compose.command, combinations(sweeper.blocks or [], words), folder, compose)]
-    assert isinstance(sweeper, OptunaConfig)
-    from trackmdp.app.sweep.trials import trials
-
-    def planned(words: Sequence[str], naming: set[str]) -> Job:
-        return plan(compose.command, [words], folder, compose, naming)[0]
-
-    return trials(sweeper, words, folder, planned)

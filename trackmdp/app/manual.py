@@ -10,13 +10,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from typing import Any
 
-from trackmdp.app.sweep.schema import PLUGINS
 from trackmdp.config import GROUPS, ROOTS, SELECTORS, Option, options
-from trackmdp.config.options import listed, several
+from trackmdp.config.options import choices_of, listed, several
 from trackmdp.config.refusals import refuse_renamed, unknown_choice
 from trackmdp.config.registry import load_plugins
+from trackmdp.config.sweeping import PLUGINS
 from trackmdp.config.values import choice_values, read_values
-from trackmdp.errors import UserError
 
 EXAMPLES = {
     "train": [
@@ -70,12 +69,11 @@ def manual(command: str, words: Sequence[str] = ()) -> str:
         # Launchers and sweepers are read by multirun alone.
         chosen = f"-m {chosen}" if any(group.startswith("hydra/") for group in typed) else chosen
         blocks += ["Examples", f"  trackmdp {command} {chosen}"]
-        for group, name in ((group, name) for group, names in typed.items() for name in _names(names)):
-            blocks += [
-                *_example(command, chosen, group, name),
-                *_choice(group, name, typed),
-                *_read_selectors(group, name, typed),
-            ]
+        # A selector stands among what its group's choice reads.
+        made = [(group, _names(names)) for group, names in typed.items() if group not in SELECTORS]
+        for group, name in ((group, name) for group, names in made for name in names):
+            blocks += [*_example(command, chosen, group, name), *_choice(group, name, typed)]
+            blocks += _read_selectors(group, name, typed)
         return "\n".join([*blocks, "", f"trackmdp {command} --help lists every other option.", ""])
     blocks += ["Examples", *(f"  {line}" for line in EXAMPLES[command]), ""]
     for flag, text in _FLAGS.items():
@@ -97,27 +95,19 @@ def _all(command: str, values: dict[str, Any]) -> Iterator[str]:
         if key not in GROUPS:
             yield from ("", *_wrapped(f"{key}: {_about(item)}"), *_entries(item, values.get(key), f"{key}."))
             continue
-        default = chosen.get(key) or "none chosen"
+        line = f"{key}={'|'.join(GROUPS[key])} (default: {chosen.get(key) or 'none chosen'})"
         if several(ROOTS[command], key):
-            default = listed(chosen[key])
-            yield from (
-                "",
-                *_wrapped(f"{key}={listed(GROUPS[key])}: any of them, none by {key}=[] (default: {default})"),
-            )
-        else:
-            yield from ("", *_wrapped(f"{key}={'|'.join(GROUPS[key])} (default: {default})"))
+            line = f"{key}={listed(GROUPS[key])}: any of them, none by {key}=[] (default: {listed(chosen[key])})"
+        yield from ("", *_wrapped(line))
         yield from _selectors(key, chosen)
         for name in GROUPS[key]:
             yield from _choice(key, name, {})
     if "override hydra/sweeper" in chosen:
-        for group, members in PLUGINS.items():
-            yield from ("", *_wrapped(f"With -m: hydra/{group}={'|'.join(members)} (default: {next(iter(members))})"))
-            for name in members:
-                yield from _choice(f"hydra/{group}", name, {})
-
-
-def _members(group: str) -> dict[str, type[Any]]:
-    return PLUGINS[group.partition("/")[2]] if group.startswith("hydra/") else GROUPS[group]
+        for group in (f"hydra/{part}" for part in PLUGINS):
+            default = next(iter(GROUPS[group]))
+            yield from ("", *_wrapped(f"With -m: {group}={'|'.join(GROUPS[group])} (default: {default})"))
+            for name in GROUPS[group]:
+                yield from _choice(group, name, {})
 
 
 def _choices(command: str, words: Sequence[str]) -> dict[str, str]:
@@ -126,20 +116,12 @@ def _choices(command: str, words: Sequence[str]) -> dict[str, str]:
     made: dict[str, str] = {}
     for word in words:
         key, _, name = word.partition("=")
-        if key in SELECTORS and SELECTORS[key].group in groups:
-            known: Any = SELECTORS[key].choices
-        elif key in groups:
-            known = _members(key)
-        else:
+        if (SELECTORS[key].group if key in SELECTORS else key) not in groups:
             continue
         for each in _names(name) if several(ROOTS[command], key) else [name]:
             refuse_renamed(key, each)
-            if each not in known:
-                raise (
-                    UserError(f"{word}: expected one of {', '.join(known)}")
-                    if "/" in key
-                    else unknown_choice(key, each)
-                )
+            if each not in choices_of(key):
+                raise unknown_choice(key, each)
         made[key] = name
     return made if made.keys() - SELECTORS.keys() else {}  # a selector alone chooses nothing
 
@@ -157,20 +139,16 @@ def _prefix(group: str, name: str) -> str:
 
 def _choice(group: str, name: str, typed: dict[str, str]) -> Iterator[str]:
     """One choice of a group with its options; a selector that was typed says which of the group's it stands for."""
-    if group in SELECTORS:
-        return
     values = _values(group, name, typed)
-    schema = _members(group)[values["name"]]
+    schema = GROUPS[group][values["name"]]
     yield from ("", *_wrapped(f"  {group}={name}: {_about(schema)}"))
     yield from _entries(schema, values, _prefix(group, name))
 
 
 def _example(command: str, chosen: str, group: str, name: str) -> Iterator[str]:
     """A line that sets the first option of a choice."""
-    if group in SELECTORS:
-        return
     for key, value in _values(group, name, {}).items():
-        if isinstance(options(_members(group)[name]).get(key), Option) and not isinstance(value, (dict, list)):
+        if isinstance(options(GROUPS[group][name]).get(key), Option) and not isinstance(value, (dict, list)):
             # "???" is OmegaConf's mark of a value that must be given.
             shown = "FILE" if value == "???" else json.dumps(value).strip('"')
             # An interpolation is not something to type after a `=`: the shell would take the `$`.
@@ -189,8 +167,6 @@ def _selectors(group: str, chosen: dict[str, Any]) -> Iterator[str]:
 
 def _read_selectors(group: str, name: str, typed: dict[str, str]) -> Iterator[str]:
     """The selectors that a choice reads, as its file says: ``defaults: [{/credit@_here_: '${credit}/ppo'}]``."""
-    if group in SELECTORS:
-        return
     # A choice reads a selector where its defaults interpolate it.
     source = str(read_values(f"{group}/{name}").get("defaults"))
     read = {key: typed.get(key, next(iter(item.choices))) for key, item in SELECTORS.items() if f"${{{key}}}" in source}

@@ -27,7 +27,7 @@ from trackmdp.config import (
 from trackmdp.config.checks import refuse_ignored
 from trackmdp.config.compose import from_hydra
 from trackmdp.config.loggers import require_packages
-from trackmdp.config.resume import continued, run_folder
+from trackmdp.config.resume import continued, key_of, run_folder
 from trackmdp.errors import UserError
 from trackmdp.imports import importing
 
@@ -43,13 +43,7 @@ def typed_config(command: str, cfg: DictConfig, folder: Path) -> CommandConfig:
     Raises:
         UserError: an option is unknown or not allowed.
     """
-    plain = cfg
-    if "hydra" in cfg:
-        # The caller still needs Hydra's part; "struct" would forbid to delete it here, where no schema has it.
-        plain = cfg.copy()
-        plain._set_flag("struct", False)
-        del plain["hydra"]
-    typed = from_hydra(plain, ROOTS[command], folder)
+    typed = from_hydra(cfg, ROOTS[command], folder)
     # A run that is resumed has a config of its own, which says what is read; `prepare` looks once it is known.
     if not getattr(typed, "resume", None):
         _refuse_ignored(typed, cfg)
@@ -127,7 +121,11 @@ def check(command: str, cfg: CommandConfig, folder: Path, words: Sequence[str]) 
         _check_files(cfg, words)
         # A world from options alone cannot fail once they are in range; one from files can, and is refused before a
         # folder is made.
-        problem = _problem(cfg) if isinstance(cfg, WorldConfig) and _reads_files(cfg) else None
+        problem = None
+        if isinstance(cfg, WorldConfig) and _reads_files(cfg):
+            from trackmdp.world.make import make_problem  # imports scipy, which takes longer than all other checks
+
+            problem = make_problem(cfg)
     except OSError as error:
         raise UserError(f"{error.filename}: cannot be read ({error.strerror})") from error
     return Prepared(command, cfg, folder, problem)
@@ -161,13 +159,6 @@ def say(line: str) -> None:
     sys.stdout.flush()
 
 
-def _problem(cfg: WorldConfig) -> Problem:
-    """The world or the tracks of `cfg`."""
-    from trackmdp.world.make import make_problem  # imports scipy, which takes longer than all other checks
-
-    return make_problem(cfg)
-
-
 def _reads_files(cfg: WorldConfig) -> bool:
     """Whether building the world can still fail: it is read from files, or its target may never exit."""
     # Where the target never exits, the undiscounted value is infinite, which only building the world finds out.
@@ -183,9 +174,7 @@ def _check_files(cfg: CommandConfig, words: Sequence[str]) -> None:
         cell_classes(cfg.algo.share_cells, cfg.grid.sides)  # type: ignore[attr-defined]
     if isinstance(cfg, EvaluateConfig) and cfg.run is not None:
         for word in words:
-            # `kernel@kernel=drift` and `kernel.radius=2` both are about the kernel.
-            key = word.lstrip("+~").split("=")[0]
-            group = key.split(".")[0].split("@")[0]
+            group = key_of(word).split(".")[0]
             if group == "sensor" and isinstance(cfg.sensor, FalseAlarmConfig):
                 continue  # how a trained policy stands up to them is what they are for
             if group in WORLD_KEYS:

@@ -34,17 +34,14 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     return args
 
 
-def is_question(args: argparse.Namespace) -> bool:
-    """Whether something is to be shown instead of run."""
-    return bool(args.cfg or args.info or args.hydra_help or args.shell_completion)
-
-
-def answer(compose: Composer, args: argparse.Namespace) -> None:
-    """Show what was asked for.
+def answer(compose: Composer, args: argparse.Namespace) -> bool:
+    """Show what was asked for; returns whether anything was, instead of a run.
 
     Raises:
         UserError: the words do not make a config, or the question makes no sense.
     """
+    if not (args.cfg or args.info or args.hydra_help or args.shell_completion):
+        return False
     hydra = GlobalHydra.instance().hydra  # its methods print; what they print is Hydra's business, not ours
     assert hydra is not None
     if args.cfg or args.info:
@@ -64,6 +61,7 @@ def answer(compose: Composer, args: argparse.Namespace) -> None:
     except Exception as error:  # of many kinds; all are about what was typed
         said = str(error).strip().splitlines() or [type(error).__name__]
         raise UserError(said[0]) from error
+    return True
 
 
 class _Parser(argparse.ArgumentParser):
@@ -86,7 +84,6 @@ def _parser() -> argparse.ArgumentParser:
     flag("--run", "-r", action="store_true", help="run once")
     flag("--multirun", "-m", action="store_true", help="run once for every combination of option=a,b,c")
     flag("--shell-completion", "-sc", action="store_true", help="install=bash, uninstall=bash, query=bash")
-    flag("--config-path", "-cp", help="a folder in place of conf/")
     flag("--config-name", "-cn", help="the primary config in place of the command's")
     flag("--config-dir", "-cd", help="a folder with further choices")
     flag("--experimental-rerun", help="not offered")

@@ -27,20 +27,15 @@ _FORBIDDEN = {
 _folders: list[tuple[str, str]] = []
 """(provider, path) of the folders that `_Folders` adds, while `searched` is open."""
 
-_main_is_users = False
-"""Whether the main folder was named by `--config-path`."""
-
 
 @contextmanager
-def searched(users: Sequence[Path], plugins: Sequence[Path], *, main_is_users: bool = False) -> Iterator[None]:
+def searched(users: Sequence[Path], plugins: Sequence[Path]) -> Iterator[None]:
     """Hydra, initialised inside, also searches these folders, after the main one and in this order.
 
     Args:
         users: named on the command line; their files are read by `_UserFolder`.
         plugins: of installed packages.
-        main_is_users: the main folder is one of the user's as well.
     """
-    global _main_is_users
     # Hydra makes both itself, without arguments, when it is initialised: they learn what to do from this module's
     # state.
     for kind in (_UserFolder, _Folders):
@@ -49,22 +44,16 @@ def searched(users: Sequence[Path], plugins: Sequence[Path], *, main_is_users: b
     _folders[:] = [("command-line", f"{_UserFolder.scheme()}://{folder.absolute()}") for folder in users]
     # An installed package has run its code already: its files are read as those of `conf/` are.
     _folders.extend(("plugin", f"file://{folder.absolute()}") for folder in plugins)
-    _main_is_users = main_is_users
     try:
         yield
     finally:
         _folders.clear()
-        _main_is_users = False
 
 
 class _Folders(SearchPathPlugin):
     """Hydra asks every such plugin for changes to its search path."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        for element in search_path.get_path():
-            # Hydra has put the main folder there under `file://` itself; only here can its reader be changed.
-            if element.provider == "main" and _main_is_users:
-                element.path = f"{_UserFolder.scheme()}://{element.path}"
         for provider, path in _folders:
             # After `conf/`: where both have a file of one name, Hydra takes the first.
             search_path.append(provider, path)
@@ -91,8 +80,6 @@ class _UserFolder(ConfigSource):
         # refused.
         text = read_text(file, most=MAX_BYTES, links=True)
         config = parse_yaml(text, str(file))
-        if not isinstance(config, DictConfig):
-            raise UserError(f"{file}: not a config (expected a mapping)")
         try:
             # Lines such as `# @package _global_`; Hydra's own reader looks for them in the first 512 characters as
             # well.

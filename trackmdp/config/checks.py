@@ -11,14 +11,20 @@ from trackmdp.config.registry import conf_file
 from trackmdp.errors import UserError
 
 
-def validate(cfg: Any) -> None:
-    """Raise a `UserError` naming key, value and allowed range for the first option that breaks a rule."""
-    for key, described, value in leaves(cfg):
+def validate(cfg: Any, place: str = "", root: Any = None) -> None:
+    """Raise a `UserError` naming key, value and allowed range for the first option that breaks a rule.
+
+    Args:
+        cfg: the config of a command, or a part of one.
+        place: dotted key of a part.
+        root: the config that a part belongs to.
+    """
+    for key, described, value in leaves(cfg, place):
         if not described.allows(value):
             raise refuse(key, value, described.expected)
     # Rules between options may count on every single value; a node's rule comes after those of the nodes around it.
-    for key, node in nodes(cfg):
-        node.check(key, cfg)
+    for key, node in nodes(cfg, place):
+        node.check(key, root or cfg)
 
 
 def refuse_ignored(cfg: Any, typed: Mapping[str, Any], choices: Mapping[str, Any]) -> None:

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 from omegaconf import DictConfig, OmegaConf
 
 from trackmdp.config.checks import absolute_paths, refuse_ignored, validate
-from trackmdp.config.options import GROUPS, SELECTORS, Option, optional, options, refuse, several
+from trackmdp.config.options import GROUPS, SELECTORS, Option, choices_of, optional, options, refuse, several
 from trackmdp.config.refusals import refuse_renamed, unknown_choice, unknown_option
 from trackmdp.config.roots import ROOTS, CommandConfig
 from trackmdp.config.tree import build_config
@@ -44,9 +44,11 @@ def compose(command: str, overrides: Mapping[str, Any] | None = None, *, folder:
     # command line.
     values: dict[str, Any] = {key: value for key, value in root.items() if key in options(schema)}
     for group, name in chosen.items():
-        if group in options(schema):
-            values[group] = _values_of(group, name, chosen)
-    known = dict(_known(schema, values))
+        if isinstance(name, list):
+            values[group] = {each: choice_values(group, each, chosen) for each in name}
+        elif group in options(schema):
+            values[group] = None if name is None else choice_values(group, name, chosen)
+    known = dict(known_options(schema, values))
     # After all choices are merged, so that `algo.epochs` is looked up among the options of the algorithm that
     # was chosen.
     typed = _by_option(typed, known)
@@ -64,16 +66,17 @@ def from_hydra(cfg: DictConfig, root: type[C], folder: Path) -> C:
     Raises:
         UserError: an unknown key (even one added with `+`), a missing value, a wrong type, or a broken rule.
     """
-    values: Any = OmegaConf.to_container(cfg, resolve=False)
-    _name_choices(values, cfg, root)
-    typed: C = _typed(values, dict(_known(root, values)), root, folder)
+    values = composed_values(cfg, root)
+    typed: C = _typed(values, dict(known_options(root, values)), root, folder)
     return typed
 
 
-def _name_choices(values: dict[str, Any], cfg: DictConfig, schema: type[Any]) -> None:
-    """Put the name of each choice beside its values, as its schema says, which is the type of Hydra's node."""
+def composed_values(cfg: DictConfig, schema: type[Any]) -> dict[str, Any]:
+    """The values that Hydra composed, unresolved, the name of each choice, which is its node's type, beside its own."""
+    values: Any = OmegaConf.to_container(cfg, resolve=False)
+    values.pop("hydra", None)  # no schema has it
     for key, value in values.items():
-        if not isinstance(value, dict):
+        if not isinstance(value, dict) or key not in options(schema):
             continue
         node = cfg._get_node(key)
         assert isinstance(node, DictConfig)
@@ -82,11 +85,9 @@ def _name_choices(values: dict[str, Any], cfg: DictConfig, schema: type[Any]) ->
                 # An entry that no file of the group made, such as that of `+log.mcap.every=2`.
                 if OmegaConf.get_type(node, name) is not GROUPS[key].get(name):
                     raise UserError(f"{key}.{name}: not chosen, expected {key}=[NAME,...] with it among the names")
-            continue
-        kind: Any = OmegaConf.get_type(node)
-        _name_choices(value, node, kind)
-        if hasattr(kind, "name"):
-            value["name"] = kind.name
+        elif name := getattr(OmegaConf.get_type(node), "name", None):
+            value["name"] = name
+    return dict(values)
 
 
 def _typed(values: dict[str, Any], known: Mapping[str, Option], schema: type[Any], folder: Path) -> Any:
@@ -140,27 +141,15 @@ def _chosen(root: Mapping[str, Any], schema: type[Any], typed: Mapping[str, Any]
         name = typed[group]
         many = several(schema, group)
         names = name if many and isinstance(name, list) else [name]
-        known = SELECTORS[group].choices if group in SELECTORS else GROUPS[group]
         for each in names:
             refuse_renamed(group, str(each))
-            if each not in list(known) and not (each is None and optional(schema, group)):
+            if each not in list(choices_of(group)) and not (each is None and optional(schema, group)):
                 raise unknown_choice(group, each)
         chosen[group] = names if many else name
     return chosen
 
 
-def _values_of(group: str, name: Any, chosen: Mapping[str, Any]) -> dict[str, Any] | None:
-    """The values of what is chosen from a group: of a list of choices by their names, and null of none."""
-    if isinstance(name, list):
-        return {each: _without_name(choice_values(group, each, chosen)) for each in name}
-    return None if name is None else choice_values(group, name, chosen)
-
-
-def _without_name(values: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in values.items() if key != "name"}
-
-
-def _known(schema: type[Any], values: Any, prefix: str = "") -> Iterator[tuple[str, Option]]:
+def known_options(schema: type[Any], values: Any, prefix: str = "") -> Iterator[tuple[str, Option]]:
     """Dotted key -> option of all that the config with these choices has."""
     for name, item in options(schema).items():
         if isinstance(item, Option):
@@ -170,9 +159,9 @@ def _known(schema: type[Any], values: Any, prefix: str = "") -> Iterator[tuple[s
         inner = values.get(name) if values else None
         if inner is not None and several(schema, name):
             for each, values_of_each in inner.items():
-                yield from _known(GROUPS[name][each], values_of_each, f"{prefix}{name}.{each}.")
+                yield from known_options(GROUPS[name][each], values_of_each, f"{prefix}{name}.{each}.")
         elif inner is not None:
-            yield from _known(GROUPS[name][inner["name"]] if name in GROUPS else item, inner, f"{prefix}{name}.")
+            yield from known_options(GROUPS[name][inner["name"]] if name in GROUPS else item, inner, f"{prefix}{name}.")
 
 
 def _by_option(typed: Mapping[str, Any], known: Mapping[str, Option]) -> dict[str, Any]:

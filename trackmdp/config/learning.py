@@ -64,25 +64,31 @@ class AlgoConfig(ChoiceConfig):
 
 
 @dataclass(kw_only=True)
-class ActorCriticConfig(AlgoConfig):
-    """What A2C and PPO have in common."""
+class NetworkConfig(AlgoConfig):
+    """What the algorithms have in common that learn networks from what they sense themselves."""
 
     remembers: ClassVar[bool] = True
     told: ClassVar[bool] = True
     knows_footprints: ClassVar[bool] = True
     gamma: float = option("discount while learning; policies are evaluated undiscounted", ge=0, le=1)
-    gae_lambda: float = option("λ of the generalised advantage estimate", ge=0, le=1)
     learning_rate: ScheduleConfig = nested(LEARNING_RATE)
-    entropy: ScheduleConfig = nested(ENTROPY)
-    critic_coef: float = option("weight of the value loss", ge=0)
     max_grad_norm: float = option("gradients are clipped to this norm", gt=0)
-    hidden: int = option("units of the hidden layer, in the actor and in the critic", unit="units", ge=1, le=4096)
-    initial_logit: float = option("actor's output bias at the start", unit="logits", ge=-20, le=20)
+    hidden: int = option("units of the hidden layer of each network", unit="units", ge=1, le=4096)
     reward_scale: float = option("factor on rewards while learning", gt=0)
 
     def needs(self, task: Sizes, root: Any) -> dict[str, int]:
-        """The two networks and their optimiser."""
+        """Two networks and their optimiser."""
         return {"algo.hidden": networks(task, self.hidden)}
+
+
+@dataclass(kw_only=True)
+class ActorCriticConfig(NetworkConfig):
+    """What A2C and PPO have in common."""
+
+    gae_lambda: float = option("λ of the generalised advantage estimate", ge=0, le=1)
+    entropy: ScheduleConfig = nested(ENTROPY)
+    critic_coef: float = option("weight of the value loss", ge=0)
+    initial_logit: float = option("actor's output bias at the start", unit="logits", ge=-20, le=20)
 
 
 @choice("algo", "a2c", makes="trackmdp.algos.a2c:A2C")
@@ -124,23 +130,15 @@ class PrioritizedConfig(NodeConfig):
 
 @choice("algo", "dqn", makes="trackmdp.algos.dqn:DQN")
 @dataclass(kw_only=True)
-class DqnConfig(AlgoConfig):
+class DqnConfig(NetworkConfig):
     """Double DQN with a Q that adds up over the sensors."""
 
-    remembers: ClassVar[bool] = True
-    told: ClassVar[bool] = True
-    knows_footprints: ClassVar[bool] = True
-    gamma: float = option("discount while learning; policies are evaluated undiscounted", ge=0, le=1)
-    learning_rate: ScheduleConfig = nested(LEARNING_RATE)
     epsilon: ScheduleConfig = nested("probability that a sensor is switched over at random while collecting")
     n_step: int = option("rewards summed before bootstrapping", unit="steps", ge=1, le=64)
     buffer_size: int = option("transitions kept for replay", unit="frames", ge=1)
     batch_size: int = option("transitions per update", unit="frames", ge=1)
     updates: int = option("updates per collected batch", ge=1, le=10**6)
     target_tau: float = option("share of the target network replaced at each update", gt=0, le=1)
-    max_grad_norm: float = option("gradients are clipped to this norm", gt=0)
-    hidden: int = option("units of the hidden layer", unit="units", ge=1, le=4096)
-    reward_scale: float = option("factor on rewards while learning", gt=0)
     prioritized: PrioritizedConfig
 
     def check(self, key: str, root: Any) -> None:
@@ -156,10 +154,7 @@ class DqnConfig(AlgoConfig):
         # terminated), an index.
         transition = 2 * state_bytes(task) + task.num_sensors + 2 * BYTES["float32"] + 1 + BYTES["int64"]
         priority = BYTES["float64"] if self.prioritized.enabled else 0
-        return {
-            "algo.buffer_size": self.buffer_size * (transition + priority),
-            "algo.hidden": networks(task, self.hidden),
-        }
+        return super().needs(task, root) | {"algo.buffer_size": self.buffer_size * (transition + priority)}
 
 
 @dataclass(kw_only=True)

@@ -203,29 +203,28 @@ def choice(group: str, name: str, *, makes: str) -> typing.Callable[[type[T]], t
     return register
 
 
+def choices_of(group: str) -> typing.Iterable[str]:
+    """The names that may be chosen from a group or by a selector."""
+    return SELECTORS[group].choices if group in SELECTORS else GROUPS[group]
+
+
 def nodes(cfg: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Every dataclass of a config with its dotted key, the outermost first."""
     yield prefix, cfg
     for name, value in vars(cfg).items():
-        if dataclasses.is_dataclass(value):
-            yield from nodes(value, f"{prefix}.{name}".lstrip("."))
-        elif isinstance(value, dict):  # a group of several: log.csv, log.mcap
-            for each, node in value.items():
-                if dataclasses.is_dataclass(node):
-                    yield from nodes(node, f"{prefix}.{name}.{each}".lstrip("."))
+        # A group of several holds a dict of its choices: log.csv, log.mcap.
+        inner = {f"{name}.{each}": node for each, node in value.items()} if isinstance(value, dict) else {name: value}
+        for key, node in inner.items():
+            if dataclasses.is_dataclass(node):
+                yield from nodes(node, f"{prefix}.{key}".lstrip("."))
 
 
 def leaves(cfg: Any, prefix: str = "") -> Iterator[tuple[str, Option, Any]]:
     """Every option of a config with its dotted key and its value."""
-    for name, described in options(type(cfg)).items():
-        key, value = f"{prefix}{name}", vars(cfg)[name]
-        if isinstance(described, Option):
-            yield key, described, value
-        elif isinstance(value, dict):  # a group of several
-            for each, node in value.items():
-                yield from leaves(node, f"{key}.{each}.")
-        elif value is not None:
-            yield from leaves(value, f"{key}.")
+    for key, node in nodes(cfg, prefix):
+        for name, described in options(type(node)).items():
+            if isinstance(described, Option):
+                yield f"{key}.{name}".lstrip("."), described, vars(node)[name]
 
 
 def as_float(value: int) -> float:

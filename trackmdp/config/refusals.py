@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from trackmdp.config.options import GROUPS, SELECTORS, Option
+from trackmdp.config.options import Option, choices_of, refuse
 from trackmdp.errors import UserError
 
 RENAMED: dict[str, str] = {
@@ -56,5 +56,4 @@ def unknown_option(key: str, known: Mapping[str, Option]) -> UserError:
 
 def unknown_choice(group: str, value: Any) -> UserError:
     """The refusal of what is none of the choices of a group or of a selector."""
-    known = SELECTORS[group].choices if group in SELECTORS else GROUPS[group]
-    return UserError(f"{group}={'null' if value is None else value}: expected one of {', '.join(known)}")
+    return refuse(group, value, f"one of {', '.join(choices_of(group))}")

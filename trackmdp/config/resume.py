@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from trackmdp.config.checks import validate
-from trackmdp.config.options import SELECTORS, listed
+from trackmdp.config.options import GROUPS, SELECTORS, listed, several
 from trackmdp.config.roots import TrainConfig
-from trackmdp.config.tree import load_run_config, to_dict, to_yaml
+from trackmdp.config.tree import build_config, load_run_config, to_dict, to_yaml
 from trackmdp.errors import UserError
 from trackmdp.untrusted import read_object, unsealed
 
@@ -103,41 +103,44 @@ def continued(cfg: TrainConfig, folder: Path, words: Sequence[str]) -> TrainConf
     """
     if cfg.resume is None or not (folder / "config.yaml").is_file():
         return cfg
-    saved = load_run_config(folder)
+    saved, typed = to_dict(load_run_config(folder)), to_dict(cfg)
     # Choices before their options: log.mcap.episodes=3 log=[mcap] first brings the mcap to set it in.
-    for key, word in sorted(((_key(word), word) for word in words), key=lambda pair: "." in pair[0]):
+    for key, word in sorted(((key_of(word), word) for word in words), key=lambda pair: "." in pair[0]):
         if key.split(".")[0] in ("hydra", "resume"):
             continue
-        old, new = _look(saved, key), _look(cfg, key)
+        old, new = _told(saved, key), _told(typed, key)
         if key in SELECTORS:
-            # `credit` is no field of the config: the algorithm that was chosen knows its own.
-            old, new = _look(saved, f"{SELECTORS[key].group}.{key}"), word.partition("=")[2]
-        if _same(old, new):
+            # `credit` is no option of the config: the algorithm that was chosen knows its own.
+            chosen = GROUPS[SELECTORS[key].group][saved[SELECTORS[key].group]["name"]]
+            old, new = getattr(chosen, key), word.partition("=")[2]
+        if old == new:
             continue
         # With the dot, so that `log` allows `log.csv.every` but not an option that merely begins with these
         # letters.
         if not any(key == allowed or key.startswith(f"{allowed}.") for allowed in CHANGEABLE):
-            raise UserError(f"{key}: the run has {_shown(old)}, typed was {_shown(new)}; it cannot change on resume")
-        _put(saved, key, new)
+            old, new = ("null" if each is None else each for each in (old, new))
+            raise UserError(f"{key}: the run has {old}, typed was {new}; it cannot change on resume")
+        _put(saved, key, _look(typed, key))
     # Once more: a new budget may break a rule against an option that was not typed, such as frames per batch.
-    validate(saved)
-    return dataclasses.replace(saved, resume=cfg.resume)
+    resumed: TrainConfig = build_config(saved, TrainConfig)
+    validate(resumed)
+    return dataclasses.replace(resumed, resume=cfg.resume)
 
 
-def _key(word: str) -> str:
+def key_of(word: str) -> str:
     """The dotted key that an override sets."""
     # Hydra's grammar: `algo.epochs=3`, `+key=1` adds, `~key` removes, `group@package=name`, `hydra/launcher=joblib`.
     return word.lstrip("+~").split("=", 1)[0].split("@")[0].replace("/", ".")
 
 
-def _look(cfg: Any, key: str) -> Any:
+def _look(plain: Any, key: str) -> Any:
     """The value at a dotted key; None where the run chose another option of a group, which has no such key."""
     for name in key.split("."):
-        cfg = cfg.get(name) if isinstance(cfg, dict) else getattr(cfg, name, None)
-    return cfg
+        plain = plain.get(name) if isinstance(plain, dict) else None
+    return plain
 
 
-def _put(cfg: Any, key: str, value: Any) -> None:
+def _put(plain: dict[str, Any], key: str, value: Any) -> None:
     """Set a changed option; of several choices those that the run has keep their values.
 
     Raises:
@@ -145,24 +148,18 @@ def _put(cfg: Any, key: str, value: Any) -> None:
     """
     *parents, last = key.split(".")
     for name in parents:
-        if isinstance(cfg, dict) and name not in cfg:
-            names = listed([*cfg, name])
-            raise UserError(f"{key}: the run has {parents[0]}={listed(cfg)}, expected {parents[0]}={names} beside it")
-        cfg = cfg[name] if isinstance(cfg, dict) else getattr(cfg, name)
-    if isinstance(value, dict):
-        value = {name: getattr(cfg, last).get(name, node) for name, node in value.items()}
-    setattr(cfg, last, value)
+        if name not in plain:
+            names = listed([*plain, name])
+            raise UserError(f"{key}: the run has {parents[0]}={listed(plain)}, expected {parents[0]}={names} beside it")
+        plain = plain[name]
+    if several(TrainConfig, key):
+        value = {name: plain[last].get(name, own) for name, own in value.items()}
+    plain[last] = value
 
 
-def _same(old: Any, new: Any) -> bool:
-    """Equal values, or the same option chosen from a group, whose own values are compared where they were typed."""
-    if isinstance(old, dict) and isinstance(new, dict):
-        return old.keys() == new.keys()
-    if dataclasses.is_dataclass(old) and hasattr(old, "name"):
-        return type(old) is type(new)
-    return bool(old == new)
-
-
-def _shown(value: Any) -> str:
-    value = listed(value) if isinstance(value, dict) else value
-    return str(getattr(value, "name", "null" if value is None else value))
+def _told(plain: dict[str, Any], key: str) -> Any:
+    """The value at a dotted key, of choices their names: their own options are compared where those are typed."""
+    value = _look(plain, key)
+    if isinstance(value, dict) and several(TrainConfig, key):
+        return listed(value)
+    return value["name"] if isinstance(value, dict) and "name" in value else value

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from trackmdp.config import counting, modes, per_sensor  # noqa: F401  (more to choose from)
+from trackmdp.config import counting, modes, per_sensor, sweeping  # noqa: F401  (more to choose from)
 from trackmdp.config.baselines import BaselineConfig
 from trackmdp.config.learning import DEVICE, AlgoConfig, CollectorConfig
 from trackmdp.config.loggers import LogConfig

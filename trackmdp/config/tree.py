@@ -21,22 +21,18 @@ from trackmdp.untrusted import read_text
 C = TypeVar("C", bound=CommandConfig)
 
 
-def to_dict(cfg: Any) -> dict[str, Any]:
+def to_dict(cfg: Any, *, named: bool = True) -> dict[str, Any]:
     """A plain copy of the config; the option chosen from a group stands under `name`, of several each under its own."""
     # A choice's name is an attribute of its class, no field: without it a saved `kernel: {...}` could not be told from
     # another choice with the same options.
-    plain: dict[str, Any] = {"name": cfg.name} if hasattr(type(cfg), "name") else {}
+    plain: dict[str, Any] = {"name": cfg.name} if named and hasattr(type(cfg), "name") else {}
     for key in options(type(cfg)):
         value = vars(cfg)[key]
         if several(type(cfg), key):  # {"csv": {"every": 1}}: its name is its key
-            plain[key] = {name: _nameless(node) for name, node in value.items()}
+            plain[key] = {name: to_dict(node, named=False) for name, node in value.items()}
         else:
             plain[key] = to_dict(value) if dataclasses.is_dataclass(value) else value
     return plain
-
-
-def _nameless(node: ChoiceConfig) -> dict[str, Any]:
-    return {key: value for key, value in to_dict(node).items() if key != "name"}
 
 
 def to_yaml(cfg: Any) -> str:
@@ -50,9 +46,7 @@ def load_config(file: Path, root: type[C]) -> C:
     Raises:
         UserError: there is no such file, or it does not hold a config of this command.
     """
-    if not file.exists():
-        raise UserError(f"{file}: no such file")
-    plain = _mapping(read_text(file, most=MAX_BYTES), str(file))
+    plain = plain_mapping(read_text(file, most=MAX_BYTES), str(file))
     try:
         typed: C = build_config(plain, root)
         validate(typed)
@@ -67,20 +61,22 @@ def world_of(text: str | bytes) -> WorldConfig:
     Raises:
         UserError: it does not describe one.
     """
-    plain, known = _mapping(text, "config.yaml"), options(WorldConfig)
+    plain, known = plain_mapping(text, "config.yaml"), options(WorldConfig)
     # The other keys belong to the command, and each command has its own.
     typed: WorldConfig = build_config({key: value for key, value in plain.items() if key in known}, WorldConfig)
     validate(typed)
     return typed
 
 
-def _mapping(text: str | bytes, source: str) -> Mapping[Any, Any]:
-    """The mapping in the text of a config."""
+def plain_mapping(text: str | bytes, source: str) -> dict[str, Any]:
+    """The plain mapping in the text of a config, which another version may have written.
+
+    Raises:
+        UserError: there is none.
+    """
     # Not resolved: every value of a saved config is plain, and `${oc.env:NAME}` in a foreign one must stay a text.
-    plain = OmegaConf.to_container(parse_yaml(text, source))
-    if not isinstance(plain, Mapping):
-        raise UserError(f"{source}: not a config (expected a mapping)")
-    return plain
+    plain: Any = OmegaConf.to_container(parse_yaml(text, source))
+    return {str(key): value for key, value in plain.items()}
 
 
 def load_run_config(folder: str | Path) -> TrainConfig:
@@ -89,28 +85,35 @@ def load_run_config(folder: str | Path) -> TrainConfig:
     Raises:
         UserError: the folder is not that of a run.
     """
-    file = Path(folder) / "config.yaml"
     if not Path(folder).is_dir():
         raise UserError(f"run={folder}: no such folder")
-    if not file.is_file():
-        raise UserError(f"run={folder}: not the folder of a run (it has no config.yaml)")
     try:
-        return load_config(file, TrainConfig)
+        return load_config(Path(folder) / "config.yaml", TrainConfig)
     except UserError as error:
         raise UserError(f"run={folder}: not the folder of a run ({error})") from error
 
 
-def build_config(plain: Mapping[Any, Any], schema: type[Any], prefix: str = "", group: str = "") -> Any:
+def build_config(plain: Any, schema: type[Any], prefix: str = "", group: str = "", named: str = "") -> Any:
     """The dataclasses of a plain config, each choice's schema by its `name`; values are not checked.
+
+    Args:
+        plain: the config, or a part of it.
+        schema: its dataclass; of a group the base of its choices.
+        prefix: of a part, what stands before its keys in messages, such as ``algo.``.
+        group: of a choice.
+        named: the choice, where it is one of several and its name stands outside.
 
     Raises:
         UserError: a key is missing or unknown, or a choice is.
     """
+    if not isinstance(plain, Mapping):
+        raise UserError(f"{prefix.rstrip('.')}={plain}: expected a mapping")
     values = dict(plain)
     if group in GROUPS and issubclass(schema, ChoiceConfig):
-        name = values.pop("name", None)
+        found = values.pop("name", None)
+        name = named or found
         if not isinstance(name, str) or name not in GROUPS[group]:
-            raise UserError(f"{prefix}name={name}: expected one of {', '.join(GROUPS[group])}")
+            raise unknown_choice(group, name)
         schema = GROUPS[group][name]
     known = options(schema)
     for key in values:
@@ -119,29 +122,15 @@ def build_config(plain: Mapping[Any, Any], schema: type[Any], prefix: str = "", 
     for key, described in known.items():
         if key not in values:
             raise UserError(f"{prefix}{key}: missing")
-        value = values[key]
-        if not isinstance(described, Option) and (value is not None or several(schema, key)):
-            if not isinstance(value, Mapping):
-                raise UserError(f"{prefix}{key}={value}: expected a mapping")
-            if several(schema, key):
-                values[key] = {name: _build_one(each, key, name, f"{prefix}{key}.") for name, each in value.items()}
-            else:
-                values[key] = build_config(value, described, f"{prefix}{key}.", key)
-        # `reward: 10` in a file is an int to YAML; `type` leaves True alone, which is an int as well, for `validate`
-        # to refuse.
-        elif isinstance(described, Option) and described.kind is float and type(value) is int:
-            values[key] = as_float(value)
+        value, inner = values[key], f"{prefix}{key}."
+        if isinstance(described, Option):
+            # `reward: 10` in a file is an int to YAML; `type` leaves True alone, which is an int as well, for
+            # `validate` to refuse.
+            values[key] = as_float(value) if described.kind is float and type(value) is int else value
+        elif several(schema, key) and isinstance(value, Mapping):
+            values[key] = {
+                name: build_config(each, described, f"{inner}{name}.", key, str(name)) for name, each in value.items()
+            }
+        elif value is not None or several(schema, key):
+            values[key] = build_config(value, described, inner, key)
     return schema(**values)
-
-
-def _build_one(plain: Any, group: str, name: Any, prefix: str) -> Any:
-    """The dataclass of one of several choices of a group.
-
-    Raises:
-        UserError: there is no such choice, or its values are not those of its schema.
-    """
-    if not isinstance(name, str) or name not in GROUPS[group]:
-        raise unknown_choice(group, name)
-    if not isinstance(plain, Mapping):
-        raise UserError(f"{prefix}{name}={plain}: expected a mapping")
-    return build_config(plain, GROUPS[group][name], f"{prefix}{name}.")

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import yaml  # type: ignore[import-untyped]  # a dependency of OmegaConf
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from trackmdp.errors import UserError
@@ -19,16 +19,16 @@ _CODE = ("_target_", "()")
 """Keys by which Hydra and Python's logging name what is called."""
 
 
-def parse_yaml(text: str | bytes, source: str) -> DictConfig | ListConfig:
-    """The content of YAML text, in UTF-8 where it is bytes; `source` is what messages call it.
+def parse_yaml(text: str | bytes, source: str) -> DictConfig:
+    """The mapping in YAML text, in UTF-8 where it is bytes; `source` is what messages call it.
 
     Raises:
-        UserError: it is not YAML, unfolds to too much, or names code to call.
+        UserError: it is not YAML of a mapping, unfolds to too much, or names code to call.
     """
     try:
         text = text.decode() if isinstance(text, bytes) else text
         _check_size(text)
-        if not isinstance(yaml.safe_load(text), (dict, list, type(None))):  # OmegaConf asserts it
+        if not isinstance(yaml.safe_load(text), (dict, type(None))):
             raise ValueError("expected a mapping")
         config: Any = OmegaConf.create(text)
         # Not resolved: `${oc.env:NAME}` would copy a variable of the reader's environment into the config.
@@ -38,7 +38,7 @@ def parse_yaml(text: str | bytes, source: str) -> DictConfig | ListConfig:
         raise UserError(f"{source}: not a config ({said[:200]})") from error
     if key := names_code(plain):
         raise UserError(f"{source}: {key}: a config is data, and names no code to call")
-    assert isinstance(config, (DictConfig, ListConfig))
+    assert isinstance(config, DictConfig)
     return config
 
 

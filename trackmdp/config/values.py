@@ -12,7 +12,8 @@ from typing import Any
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from trackmdp.config.options import GROUPS, Option, leaves, options, refuse
+from trackmdp.config.checks import validate
+from trackmdp.config.options import GROUPS, Option, options
 from trackmdp.config.refusals import unknown_option
 from trackmdp.config.registry import conf_file
 from trackmdp.errors import UserError
@@ -38,10 +39,7 @@ def nested_choice(group: str, name: str, given: dict[str, Any], key: str, root: 
             raise unknown_option(f"{key}.{option}", beside)
     plain = resolved(values | given, known, f"{key}.")
     node = GROUPS[group][name](**{option: plain[option] for option in known})
-    for place, item, value in leaves(node, f"{key}."):
-        if not item.allows(value):
-            raise refuse(place, value, item.expected)
-    node.check(key, root)
+    validate(node, key, root)
     return node
 
 

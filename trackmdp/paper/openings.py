@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,6 @@ from trackmdp.paper.theorems import Check
 from trackmdp.paper.worlds import SUPPORTS
 
 OPENINGS_FILE = "paper.json"
-_DIGITS = 6
 
 
 @dataclass(frozen=True)
@@ -61,42 +61,24 @@ def load_openings(folder: Path) -> Openings | None:
 
 
 def _packed(openings: Openings) -> dict[str, Any]:
-    return {
-        "candidates": [
-            [c.support_size, c.seed, round(c.deviation, _DIGITS), [round(a, _DIGITS) for a in c.accuracy]]
-            for c in openings.candidates
-        ],
-        "settings": [
-            [
-                s.border,
-                s.t_max,
-                s.support_size,
-                s.cost,
-                *map(_spread, (s.accuracy, s.qmdp, s.clocked)),
-                _short(s.deviation),
-            ]
-            for s in openings.settings
-        ],
-        # Two digits: further ones of a deviation at rounding level say nothing. As text, since JSON has no -inf ("no
-        # case").
-        "checks": [asdict(c) | {"deviation": repr(float(f"{c.deviation:.2g}"))} for c in openings.checks],
-    }
+    return {name: [_rounded(astuple(each)) for each in found] for name, found in vars(openings).items()}
+
+
+def _rounded(value: Any) -> Any:
+    """Numbers of six digits, as further ones may differ from machine to machine; -inf ("no case"), as a text."""
+    if isinstance(value, tuple):
+        return [_rounded(each) for each in value]
+    if isinstance(value, float):
+        return float(f"{value:.6g}") if math.isfinite(value) else repr(value)
+    return value
 
 
 def _unpacked(plain: dict[str, Any]) -> Openings:
     return Openings(
-        [Candidate(z, seed, tuple(accuracy), deviation) for z, seed, deviation, accuracy in plain["candidates"]],
+        [Candidate(*row) for row in plain["candidates"]],
         [
-            Setting(border, t_max, z, cost, Spread(*first), Spread(*second), Spread(*third), deviation)
-            for border, t_max, z, cost, first, second, third, deviation in plain["settings"]
+            Setting(border, t_max, z, cost, Spread(*accuracy), Spread(*qmdp), Spread(*clocked), deviation)
+            for border, t_max, z, cost, accuracy, qmdp, clocked, deviation in plain["settings"]
         ],
-        [Check(**{**entry, "deviation": float(entry["deviation"])}) for entry in plain["checks"]],
+        [Check(name, said, float(deviation), *rest) for name, said, deviation, *rest in plain["checks"]],
     )
-
-
-def _spread(spread: Spread) -> list[float]:
-    return [_short(value) for value in (spread.median, spread.low, spread.high)]
-
-
-def _short(value: float) -> float:
-    return float(f"{value:.6g}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -55,11 +55,10 @@ def calibration_figure(every: Sequence[Candidate]) -> Figure:
             label, at = f"seed {best.seed}", (best.deviation, place)
             axes.annotate(label, at, (-8, 0), textcoords="offset points", ha="right", va="center")
         # Deviations differ by factors, and the choice is among the smallest.
-        axes.set_xscale("log")
+        axes.set(xscale="log", xlabel="largest deviation from the printed accuracy (points)")
         # Room for the labels on the left.
         axes.margins(x=0.4)
         axes.set_yticks(list(COLOURS), [f"Z = {support_size}" for support_size in COLOURS])
-        axes.set_xlabel("largest deviation from the printed accuracy (points)")
         tidy(axes)
 
     title = f"Candidate kernels by their distance to the printed Q_MDP accuracy, n = {len(every) // 3} for each Z"
@@ -145,16 +144,8 @@ def _bars(axes: Axes, support_size: int, y: Array, spreads: Sequence[Spread]) ->
     # `[2, settings]`, lengths below and above the median. The range, not a confidence interval: how far the draw of
     # the kernel moves a figure.
     bars = np.stack([middle - low, high - middle])
-    axes.errorbar(
-        middle,
-        y,
-        xerr=bars,
-        fmt=style.marker,
-        color=style.colour,
-        markersize=3.5,
-        elinewidth=1.2,
-        label=f"Z = {support_size}",
-    )
+    points: Any = {"fmt": style.marker, "color": style.colour, "markersize": 3.5, "elinewidth": 1.2}
+    axes.errorbar(middle, y, xerr=bars, label=f"Z = {support_size}", **points)
 
 
 def _spreads(setting: Setting) -> tuple[Spread, Spread, Spread]:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 # A policy may attain the bound itself, and zero has no logarithm: such a regret is drawn here.
 FLOOR = 1e-5
 """Smallest regret drawn on a logarithmic axis."""
+PRICE = "c, price of a sensor for one step"
 BOUNDS = {
     "printed bound": "bound_paper",
     "valid bound": "bound_valid",
@@ -77,15 +78,13 @@ def against_cost(study: Study, panel: Panel) -> Figure:
         for axes in split_axes:
             _learned_lines(axes, panel, learned, looks)
             for label, values in exact.items():
-                style = LOOKS[label]
-                axes.plot(panel.costs, values, style.line, marker=style.marker, color=style.colour, label=label, lw=1.1)
+                axes.plot(panel.costs, values, label=label, lw=1.1, **LOOKS[label].of_line())
             tidy(axes)
         if split:
             _break(split_axes[0], split_axes[1], *split)
         split_axes[0].set_ylabel("AIHTR")
-        split_axes[-1].set_xlabel("c, price of a sensor for one step")
         # Ticks at the prices that were run: between them nothing was measured.
-        split_axes[-1].set_xticks(panel.costs)
+        split_axes[-1].set(xlabel=PRICE, xticks=panel.costs)
         label_lines(figure, split_axes, first=list(learned))
 
     table = _cost_table(panel, learned, exact, "aihtr", "AIHTR", digits=3)
@@ -107,20 +106,14 @@ def regret_against_cost(study: Study, panel: Panel, threshold: float | None) -> 
         axes = figure.subplots()
         # Interval ends are cut at the floor as well: one at or below zero would vanish from a logarithmic axis.
         _learned_lines(axes, panel, learned, looks, floor=FLOOR)
-        style = LOOKS["Q_MDP"]
-        axes.plot(
-            panel.costs, np.maximum(exact["Q_MDP"], FLOOR), style.line, marker="x", color=style.colour, label="Q_MDP"
-        )
+        axes.plot(panel.costs, np.maximum(exact["Q_MDP"], FLOOR), label="Q_MDP", **LOOKS["Q_MDP"].of_line())
         if threshold is not None:
             axes.axhline(threshold, color=INK, linewidth=0.6, linestyle=(0, (1, 2)), zorder=1)
             at, where = (0.01, threshold), ("axes fraction", "data")
             # x in parts of the axes, y in data: on the left, on the line; the names of the lines stand on the right.
             free = {"facecolor": PAGE, "edgecolor": "none", "pad": 0.4}
             axes.annotate(f"{threshold:g}", at, xycoords=where, va="center", bbox=free, zorder=1)
-        axes.set_yscale("log")
-        axes.set_ylabel("regret per step")
-        axes.set_xlabel("c, price of a sensor for one step")
-        axes.set_xticks(panel.costs)
+        axes.set(yscale="log", ylabel="regret per step", xlabel=PRICE, xticks=panel.costs)
         tidy(axes)
         label_lines(figure, [axes], first=list(learned))
 
@@ -165,7 +158,6 @@ def _learned_lines(
     # 4 % of the smallest distance of two prices: error bars stand side by side, and still over their price.
     step = min(np.diff(panel.costs), default=0.02) * 0.04
     for place, (method, row) in enumerate(learned.items()):
-        style = looks[method]
         x = np.asarray(panel.costs) + step * (place - (len(learned) - 1) / 2)
         mean = np.maximum([e.mean for e in row], floor)
         # No interval (fewer than three seeds): a bar of length zero, which is only the point.
@@ -173,17 +165,7 @@ def _learned_lines(
         high = np.maximum([e.mean if e.high is None else e.high for e in row], floor)
         # `[2, prices]`, lengths below and above the mean; matplotlib refuses negative ones, which rounding would make.
         bars = np.stack([np.maximum(mean - low, 0), np.maximum(high - mean, 0)])
-        axes.errorbar(
-            x,
-            mean,
-            bars,
-            fmt=style.line,
-            marker=style.marker,
-            color=style.colour,
-            capsize=2,
-            elinewidth=0.9,
-            label=method,
-        )
+        axes.errorbar(x, mean, bars, capsize=2, elinewidth=0.9, label=method, **looks[method].of_line())
 
 
 def axis_break(values: Sequence[float]) -> tuple[float, float, float, float] | None:

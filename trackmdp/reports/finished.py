@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from omegaconf import OmegaConf
 
-from trackmdp.config.untrusted import MAX_BYTES, parse_yaml
+from trackmdp.config.tree import plain_mapping
+from trackmdp.config.untrusted import MAX_BYTES
 from trackmdp.errors import UserError
 from trackmdp.reports.results import FIGURES, Anomaly, CurvePoint, FinishedRun
 from trackmdp.training.folders import FAILED_FILE, run_of
@@ -63,10 +63,7 @@ def plain_config(place: Path) -> Mapping[str, Any]:
         UserError: it cannot be read.
     """
     file = place / "config.yaml"
-    plain = OmegaConf.to_container(parse_yaml(read_text(file, most=MAX_BYTES), str(file)))
-    if not isinstance(plain, Mapping):
-        raise UserError(f"{file}: not a config (expected a mapping)")
-    return {str(key): value for key, value in plain.items()}
+    return plain_mapping(read_text(file, most=MAX_BYTES), str(file))
 
 
 def flatten(plain: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:

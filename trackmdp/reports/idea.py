@@ -87,15 +87,9 @@ def idea_figure(policy: Sensed, motion: MotionTable, size: tuple[int, int], wher
             _paint(axes, scene, size, window)
 
     rows: list[list[Cell]] = [
-        [
-            scene.title,
-            int(cell) // size[1] + 1,
-            int(cell) % size[1] + 1,
-            float(scene.belief[cell]),
-            bool(scene.on[cell]),
-        ]
+        [scene.title, cell // size[1] + 1, cell % size[1] + 1, float(scene.belief[cell]), bool(scene.on[cell])]
         for scene in story
-        for cell in np.flatnonzero((scene.belief > 0) | scene.on)
+        for cell in np.flatnonzero((scene.belief > 0) | scene.on).tolist()
     ]
     columns = [Column("moment"), Column("row"), Column("column"), Column("probability", 3), Column("sensor on")]
     title = f"The idea in one figure, {where}"
@@ -132,11 +126,7 @@ def _paint(axes: Axes, scene: Scene, size: tuple[int, int], window: tuple[int, i
     if scene.target is not None:
         row, column = divmod(scene.target, size[1])
         filled = TARGET if scene.found else "none"
-        axes.plot(
-            [column + 0.5], [row + 0.5], "o", color=TARGET, markerfacecolor=filled, markersize=9, markeredgewidth=2
-        )
+        axes.plot([column + 0.5], [row + 0.5], "o", color=TARGET, mfc=filled, ms=9, mew=2)
     axes.set_title(scene.title, loc="left")
-    axes.set_xlim(left - 0.05, right + 1.05)
-    axes.set_ylim(bottom + 1.05, top - 0.05)
-    axes.set_aspect("equal")
+    axes.set(xlim=(left - 0.05, right + 1.05), ylim=(bottom + 1.05, top - 0.05), aspect="equal")
     axes.set_axis_off()

@@ -67,16 +67,9 @@ def label_lines(figure: Canvas, parts: Sequence[Axes], first: Sequence[str] = ()
             # From the end of the line to its name, which may stand higher or lower to make room for others.
             arrow = {"arrowstyle": "-", "color": named.colour, "linewidth": 0.6, "relpos": (0, 0.5)}
             arrow |= {"shrinkA": 1, "shrinkB": 1}
-            axes.annotate(
-                "\n".join(named.rows),
-                named.end,
-                (1.05, height),
-                textcoords="axes fraction",
-                arrowprops=None if named.same else arrow,
-                color=named.colour,
-                va="center",
-                annotation_clip=False,
-            )
+            where: Any = {"textcoords": "axes fraction", "va": "center", "annotation_clip": False}
+            where |= {"color": named.colour, "arrowprops": None if named.same else arrow}
+            axes.annotate("\n".join(named.rows), named.end, (1.05, height), **where)
 
 
 def spread(wanted: Sequence[float], tall: Array) -> Array:

@@ -37,15 +37,12 @@ def curves(study: Study, points: Mapping[str, Sequence[CurvePoint]], by: str) ->
             style = looks[method]
             mean = np.maximum([e.mean for e in row], FLOOR)
             # A marker at every sixth position, so that curves are told apart without colours as well.
-            axes.plot(grid, mean, style.line, color=style.colour, label=method, marker=style.marker, markevery=6)
+            axes.plot(grid, mean, label=method, markevery=6, **style.of_line())
             ends = [(e.mean if e.low is None else e.low, e.mean if e.high is None else e.high) for e in row]
             # `.T` gives the two rows, lower and upper ends.
             axes.fill_between(grid, *np.maximum(ends, FLOOR).T, color=style.colour, alpha=0.18, linewidth=0)
         # Both logarithmic: methods differ in steps and in regret by factors of ten and more.
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-        axes.set_xlabel(unit)
-        axes.set_ylabel("regret per step")
+        axes.set(xscale="log", yscale="log", xlabel=unit, ylabel="regret per step")
         tidy(axes)
         label_lines(figure, [axes], first=list(found))
 
@@ -108,10 +105,8 @@ def profiles(study: Study, threshold: float | None) -> Figure | None:
                 axes.fill_between(levels, low, high, color=style.colour, alpha=0.18, linewidth=0)
         if threshold is not None:
             axes.axvline(threshold, color=INK, linewidth=0.6, linestyle=(0, (1, 2)))
-        axes.set_xscale("log")
-        axes.set_ylim(-0.02, 1.02)
-        axes.set_xlabel("τ, regret per step")
-        axes.set_ylabel("share of runs with regret ≤ τ")
+        axes.set(xscale="log", ylim=(-0.02, 1.02))
+        axes.set(xlabel="τ, regret per step", ylabel="share of runs with regret ≤ τ")
         tidy(axes)
         legend(figure, axes, columns=2)  # all profiles end at 1: there is no end to write a name at
 

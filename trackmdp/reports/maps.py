@@ -213,9 +213,7 @@ def _shade(figure: Canvas, every: Sequence[Axes], layers: Sequence[Array], scale
         shade = axes.pcolormesh(np.maximum(values, scale.low), cmap=colours, norm=norm)
         # Row 1 on top, as in the numbering of cells.
         axes.invert_yaxis()
-        axes.set_aspect("equal")
-        axes.set_xticks([])
-        axes.set_yticks([])
+        axes.set(aspect="equal", xticks=[], yticks=[])
     # An arrow at an end of the bar: some cells lie beyond it.
     beyond = (min(values.min() for values in layers) < scale.low, max(values.max() for values in layers) > scale.high)
     ends = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}[beyond]
@@ -282,11 +280,7 @@ def _tiles(axes: Axes, on: Array, possible: BoolArray, size: tuple[int, int], re
     right, below = columns * side - 0.5, rows * side - 0.5
     axes.vlines(np.arange(columns + 1) * side - 0.5, -0.5, below, colors=LINE, linewidths=0.5)
     axes.hlines(np.arange(rows + 1) * side - 0.5, -0.5, right, colors=LINE, linewidths=0.5)
-    axes.set_xlim(-1, columns * side)
-    axes.set_ylim(rows * side, -1)
-    axes.set_aspect("equal")
-    axes.set_xticks([])
-    axes.set_yticks([])
+    axes.set(xlim=(-1, columns * side), ylim=(rows * side, -1), aspect="equal", xticks=[], yticks=[])
     for spine in axes.spines.values():
         spine.set_color(LINE)
 

@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
-from typing import Any, TypeAlias, TypeGuard
+from typing import Any, TypeAlias
 
 from trackmdp.reports import figures, idea, learning, maps, summaries
 from trackmdp.reports.grouping import Study, study
@@ -29,6 +29,10 @@ class Folded:
 
     summary: str
     table: Table
+
+    def html(self) -> str:
+        """The table as part of the page."""
+        return f"<details><summary>{html.escape(self.summary)}</summary>{self.table.html()}</details>"
 
 
 Part: TypeAlias = "str | Table | Folded | Sequence[Figure]"
@@ -75,7 +79,8 @@ class Report:
         """Every table but those of the figures, in the order of the page."""
         found: list[Table] = []
         for section in self.sections:
-            found += [part.table if isinstance(part, Folded) else part for part in section.parts if _has_table(part)]
+            shown = [part.table if isinstance(part, Folded) else part for part in section.parts]
+            found += [part for part in shown if isinstance(part, Table)]
             found += section.files
         return found
 
@@ -127,17 +132,11 @@ def build(
 def _part(part: Part) -> str:
     if isinstance(part, str):
         return part
-    if isinstance(part, Table):
+    if isinstance(part, (Table, Folded)):
         return part.html()
-    if isinstance(part, Folded):
-        return f"<details><summary>{html.escape(part.summary)}</summary>{part.table.html()}</details>"
     # Three in a row where that leaves no row with one alone.
     kind = "figures" if len(part) % 3 == 0 else "figures two"
     return f'<div class="{kind}">{"".join(figure.html() for figure in part)}</div>'
-
-
-def _has_table(part: Part) -> TypeGuard[Table | Folded]:
-    return isinstance(part, (Table, Folded))
 
 
 def _about(results: Results) -> str:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from trackmdp.durable import write_bytes, write_text
+from trackmdp.durable import csv_text, write_bytes, write_text
 from trackmdp.errors import UserError
 from trackmdp.reports.policy import Sensed, arrays, pack_all, unpack_all
 from trackmdp.untrusted import decoded, read_bytes, read_object, read_text, sealed, unsealed
@@ -34,23 +34,10 @@ LARGEST = 2**28
 _FORMULA = ('"', "=", "+", "-", "@", "\t", "\r")
 """A spreadsheet computes a cell that begins so: such names are quoted, as are those that begin with a quote."""
 
-FIGURES = (
-    "frames",
-    "wall_seconds",
-    "cpu_seconds",
-    "aihtr",
-    "accuracy",
-    "sensors_per_step",
-    "safe_per_episode",
-    "expected_length",
-    "qmdp_aihtr",
-    "qmdp_accuracy",
-    "bound_paper",
-    "bound_valid",
-    "bound_clocked",
-    "optimal_lower",
-    "optimal_upper",
-)
+FIGURES: tuple[str, ...]
+FIGURES = ("frames", "wall_seconds", "cpu_seconds", "aihtr", "accuracy", "sensors_per_step", "safe_per_episode")
+FIGURES += ("expected_length", "qmdp_aihtr", "qmdp_accuracy", "bound_paper", "bound_valid", "bound_clocked")
+FIGURES += ("optimal_lower", "optimal_upper")
 """Columns of `runs.csv` that hold what came out of a run; the others are options."""
 
 
@@ -165,14 +152,14 @@ def save_results(results: Results, folder: Path) -> None:
         ]
         for run in results.runs
     ]
-    write_bytes(folder / "runs.csv", _csv(["run", *varied, *FIGURES], rows))
+    write_text(folder / "runs.csv", csv_text(["run", *varied, *FIGURES], rows))
     points = [
         # Curves are drawn, not computed with: 7 digits of the AIHTR are more than a figure shows.
         [index[name], point.iteration, point.frames, f"{point.seconds:.4g}", f"{point.aihtr:.7g}"]
         for name, curve in sorted(results.curves.items(), key=lambda item: index[item[0]])
         for point in curve
     ]
-    write_bytes(folder / "curves.csv", _csv(["run", "iteration", "frames", "seconds", "aihtr"], points))
+    write_text(folder / "curves.csv", csv_text(["run", "iteration", "frames", "seconds", "aihtr"], points))
     # Sorted: the same results give the same bytes, whatever order they were read in.
     write_bytes(folder / "policies.npz", pack_all({name: results.policies[name] for name in sorted(results.policies)}))
     write_bytes(folder / "worlds.npz", _pack_motions(results.motions))
@@ -298,11 +285,3 @@ def _unpack_motions(content: bytes) -> dict[str, MotionTable]:
 def _rows(file: Path) -> list[dict[str, str]]:
     text = read_text(file, most=LARGEST)
     return list(csv.DictReader(io.StringIO(text, newline=""), strict=True))
-
-
-def _csv(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> bytes:
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(head)
-    writer.writerows(rows)
-    return stream.getvalue().encode()

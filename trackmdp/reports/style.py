@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from trackmdp.errors import UserError, adding
+from trackmdp.reports.grouping import ORDER
 from trackmdp.reports.tables import Table
 
 if TYPE_CHECKING:  # an extra, and a second to import
@@ -61,6 +62,10 @@ class Look:
     marker: str = ""
     line: str = "-"
 
+    def of_line(self) -> dict[str, Any]:
+        """Arguments of matplotlib's `plot` and `errorbar`."""
+        return {"color": self.colour, "marker": self.marker, "linestyle": self.line}
+
 
 # Marker and dashes differ as well as the colour, for print without colours and for who cannot tell them apart.
 LOOKS = {
@@ -77,8 +82,7 @@ LOOKS = {
 }
 # For labels that are not listed, as of one algorithm with several options: first the colours that no list has, then
 # those of methods that are not there.
-_METHODS = ("a2c", "hindsight", "ppo", "dqn", "learned_kernel")
-_SPARE = ("#6a3fb5", "#b3123f", "#0d7f86", "#d1368a", *(LOOKS[name].colour for name in _METHODS))
+_SPARE = ("#6a3fb5", "#b3123f", "#0d7f86", "#d1368a", *(LOOKS[name].colour for name in ORDER))
 
 
 @dataclass(frozen=True)
@@ -194,18 +198,14 @@ def legend(figure: Canvas, axes: Axes, columns: int = 3, first: Sequence[str] = 
     handles, labels = axes.get_legend_handles_labels()
     # matplotlib lists lines before error bars; False sorts first and the sort is stable.
     order = sorted(range(len(labels)), key=lambda place: labels[place] not in first)
-    figure.legend(
-        [handles[place] for place in order],
-        [labels[place] for place in order],
-        loc="outside lower center",
-        ncols=columns,
-        fontsize=TEXT,
-        frameon=False,
-        columnspacing=1.2,
-    )
+    ordered = ([handles[place] for place in order], [labels[place] for place in order])
+    figure.legend(*ordered, loc="outside lower center", ncols=columns, fontsize=TEXT, frameon=False, columnspacing=1.2)
 
 
 def _settings(name: str) -> Any:
+    texts = ("font.size", "axes.titlesize", "axes.labelsize", "xtick.labelsize", "ytick.labelsize")
+    inked = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color")
+    pages = ("figure.facecolor", "axes.facecolor", "savefig.facecolor")
     return {
         # Ids in an SVG are random otherwise. By the figure's name, as several figures stand in one page, where ids
         # must differ.
@@ -214,21 +214,11 @@ def _settings(name: str) -> Any:
         "svg.fonttype": "none",
         "text.parse_math": False,  # a label is a name, and $x^{$ one that somebody may give
         "font.family": "DejaVu Sans",
-        "font.size": TEXT,
-        "axes.titlesize": TEXT,
-        "axes.labelsize": TEXT,
-        "xtick.labelsize": TEXT,
-        "ytick.labelsize": TEXT,
+        **dict.fromkeys(texts, TEXT),
+        **dict.fromkeys(inked, INK),
+        **dict.fromkeys(pages, PAGE),
         "xtick.minor.pad": 5.0,  # labels of short and long ticks on one line
-        "text.color": INK,
-        "axes.labelcolor": INK,
-        "axes.edgecolor": INK,
         "axes.linewidth": 0.6,
-        "xtick.color": INK,
-        "ytick.color": INK,
-        "figure.facecolor": PAGE,
-        "axes.facecolor": PAGE,
-        "savefig.facecolor": PAGE,
         "lines.linewidth": 1.4,
         "lines.markersize": 4.5,
         "axes.unicode_minus": True,

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 import html
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
+from trackmdp.durable import csv_text
 from trackmdp.untrusted import no_formula, printable
 
 Cell: TypeAlias = "float | int | str | bool | None"
@@ -74,12 +73,7 @@ class Table:
 
     def csv(self) -> str:
         """All digits; an empty field where there is nothing."""
-        stream = io.StringIO()
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow([column.heading for column in self.columns])
-        for row in self.rows:
-            writer.writerow([_plain(value) for value in row])
-        return stream.getvalue()
+        return csv_text([column.heading for column in self.columns], (map(_plain, row) for row in self.rows))
 
     def latex(self) -> str:
         """A `tabular` with horizontal rules; it needs no package."""
@@ -87,21 +81,10 @@ class Table:
         align = "".join("l" if self._is_text(place) else "r" for place in range(len(self.columns)))
         head = " & ".join(rf"\textbf{{{_escape(column.heading)}}}" for column in self.columns)
         body = [" & ".join(_escape(c.text(v)) for c, v in zip(self.columns, row, strict=True)) for row in self.rows]
-        lines = [rf"{line} \\" for line in body]
-        return "\n".join(
-            [
-                # In one line: what follows a line break would no longer be a comment.
-                f"% {' '.join(self.caption.split())}",
-                rf"\begin{{tabular}}{{{align}}}",
-                r"\hline",
-                rf"{head} \\",
-                r"\hline",
-                *lines,
-                r"\hline",
-                r"\end{tabular}",
-                "",
-            ]
-        )
+        # In one line: what follows a line break would no longer be a comment.
+        above = [f"% {' '.join(self.caption.split())}", rf"\begin{{tabular}}{{{align}}}"]
+        lines = [r"\hline", rf"{head} \\", r"\hline", *(rf"{line} \\" for line in body), r"\hline"]
+        return "\n".join([*above, *lines, r"\end{tabular}", ""])
 
     def html(self) -> str:
         """A table whose columns sort when their heading's button is pressed."""

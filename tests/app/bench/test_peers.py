@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.solvers.worlds import paper_world
-from trackmdp.app.bench.peers import Learned, chart
+from trackmdp.app.bench.peers import Learned
 from trackmdp.app.bench.process import Usage
 from trackmdp.app.cli import main
 
@@ -139,17 +139,3 @@ def test_the_record_leaves_out_what_recording_takes(
     with np.load(tmp_path / "record.npz", allow_pickle=False) as stored:
         assert stored["seconds"].tolist() == [0.0, 1.5, 3.0]  # due every second, and at the end
         assert stored["steps"].tolist() == [0, 2, 4]
-
-
-def test_the_chart_has_a_mark_for_every_point() -> None:
-    rows = [
-        {"seed": 0, "learner": "ours x", "curve": {"seconds": [0.0, 5.0], "regret": [10.0, 0.0001]}},
-        {"seed": 0, "learner": "peer y", "curve": {"seconds": [10.0], "regret": [0.1]}},
-        {"seed": 1, "learner": "peer y", "curve": {"seconds": [90.0], "regret": [0.1]}},
-    ]
-    lines = chart(rows, 0).splitlines()
-    assert lines[0] == "     10 |o"
-    assert lines[5] == "    0.1 |" + 71 * " " + "p"
-    assert lines[12] == " 0.0001 |" + 36 * " " + "o"
-    assert [line.strip() for line in lines[1:5]] == ["|", "1 |", "|", "|"]
-    assert "10 s" in lines[14]

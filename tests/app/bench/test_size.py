@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from trackmdp.app.bench import handoff, memory, size
+from trackmdp.app.bench import handoff, size
 from trackmdp.app.bench.process import Usage, measured
 from trackmdp.app.cli import main
 
@@ -69,8 +69,8 @@ def test_one_table_of_cost_by_size(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_memory_beside_what_was_expected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory, "SIZES", (3,))
-    monkeypatch.setattr(memory, "FRAMES", 20_000)
+    monkeypatch.setattr(size, "MEMORY_SIZES", (3,))
+    monkeypatch.setattr(size, "MEMORY_FRAMES", 20_000)
     (row,) = bench(tmp_path / "memory", "part=memory", "algos=[dqn]")
     assert 0 < row["expected_mib"] < row["peak_mib"]
 

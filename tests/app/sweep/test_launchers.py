@@ -248,12 +248,12 @@ def test_what_a_broken_launcher_left_undone_is_launched_again(
 
     calls = []
 
-    def breaks(jobs: Any) -> None:
+    def breaks(cfg: Any, jobs: Any) -> None:
         calls.append(len(jobs))
         launchers.run_job(jobs[0])
         raise OSError("the pool is gone")
 
-    monkeypatch.setattr(launchers, "_basic", breaks)
+    monkeypatch.setattr(launchers, "run_basic", breaks)
     stub(monkeypatch, "train", lambda cfg, folder: 1.0)
     assert swept("seed=range(5)", "quiet=true") == 1
     assert calls == [5, 4, 3]

@@ -146,32 +146,3 @@ def _row(run: Learned, ours: Learned) -> dict[str, Any]:
         "peak_mib": run.usage.peak_mib,
         "curve": {"seconds": [row[0] for row in run.curve], "regret": [row[2] for row in run.curve]},
     }
-
-
-_WIDTH, _HEIGHT, _LEVELS = 72, 13, (10.0, 1.0, 0.1, 0.01, 0.001, 0.0001)
-
-
-def chart(rows: list[dict[str, Any]], seed: int) -> str:
-    """Regret per step against seconds since pressing Enter, both drawn with characters; one letter per learner."""
-    shown = [row for row in rows if row["seed"] == seed]
-    end = max(row["curve"]["seconds"][-1] for row in shown)
-    lines = [[" "] * _WIDTH for _ in range(_HEIGHT)]
-    for row in shown:
-        for at, regret in zip(row["curve"]["seconds"], row["curve"]["regret"], strict=True):
-            # Later learners overwrite earlier ones where two letters meet.
-            lines[_line(regret)][min(int(at / end * _WIDTH), _WIDTH - 1)] = row["learner"].split()[0][0]
-    labels = {_line(level): f"{level:g}" for level in _LEVELS}
-    drawn = [f"{labels.get(line, ''):>7} |{''.join(text).rstrip()}" for line, text in enumerate(lines)]
-    legend = ", ".join(f"{row['learner'].split()[0][0]} {row['learner']}" for row in shown)
-    axis = f"{'':>7} +{'-' * _WIDTH}\n{'':>8}0{f'{end:.0f} s':>{_WIDTH}}"
-    return "\n".join(
-        [*drawn, axis, f"{'':>8}regret per step against seconds from pressing Enter, seed {seed}: {legend}"]
-    )
-
-
-def _line(regret: float) -> int:
-    """The line of a regret: logarithmic from the first of `_LEVELS`, at the top, to the last."""
-    top, bottom = math.log10(_LEVELS[0]), math.log10(_LEVELS[-1])
-    # Regrets below the last level, zero among them, are drawn on the last line: their logarithm would leave the chart.
-    share = (top - math.log10(max(regret, _LEVELS[-1]))) / (top - bottom)
-    return min(max(round(share * (_HEIGHT - 1)), 0), _HEIGHT - 1)

@@ -1,7 +1,8 @@
-"""Time and memory by grid size: solving, training and stepping, each in a process of its own."""
+"""Time and memory by grid size: solving, training and stepping, each in a process of its own; and memory expected."""
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import subprocess
@@ -13,13 +14,17 @@ from typing import Any
 
 import torch
 
-from trackmdp.app.bench.process import measured, typed
+from trackmdp.app.bench.process import measured, timed_training, typed
 from trackmdp.config import BenchmarkConfig
+from trackmdp.config.compose import compose
+from trackmdp.training.memory import needs
+from trackmdp.world.make import build_world
 from trackmdp.world.model import World
 
 COSTS = (0.16, 0.22)
 """Prices: at the first beliefs hardly spread, at the second all probabilities lie below c/r."""
 WINDOW, ENVS = 2, 1024
+MEMORY_SIZES, MEMORY_FRAMES = (5, 10, 20), 300_000
 
 
 def size(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator[dict[str, Any]]:  # noqa: ARG001
@@ -79,3 +84,15 @@ def _row(n: int, what: str, figure: str, file: str, *words: str) -> dict[str, An
     if "rows" in result:  # a rate: of the process only its memory is of interest
         result, usage = result["rows"][0], {"peak_mib": usage["peak_mib"]}
     return row | usage | {figure: result[figure]}
+
+
+def memory(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator[dict[str, Any]]:  # noqa: ARG001
+    """One row per algorithm and grid size: peak of the whole process, Python and torch included, of 300 k frames."""
+    for algo, size in itertools.product(cfg.algos, MEMORY_SIZES):
+        # Without the solver: its memory is not what `needs` expects of training.
+        options = {"algo": algo, "grid.size": size, "collector.total_frames": MEMORY_FRAMES, "optimal.enabled": False}
+        train, words = compose("train", options), [f"{key}={value}" for key, value in options.items()]
+        # What the check before a run adds up, without Python and torch, which `peak_mib` includes.
+        expected = sum(needs(train, build_world(train).task).values())
+        _, usage = timed_training(*words, f"threads={cfg.threads}", f"device={device}")
+        yield {"part": "memory", "algo": algo, "N": size, "expected_mib": expected / 2**20, "peak_mib": usage.peak_mib}

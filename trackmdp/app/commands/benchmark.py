@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from trackmdp.app.bench import handoff, log, memory, peers, size, speed, spreading
+from trackmdp.app.bench import handoff, peers, size, speed, spreading
 from trackmdp.config import BenchmarkConfig
 from trackmdp.durable import write_json
 from trackmdp.training.display import make_console, table
@@ -23,9 +23,9 @@ PARTS: dict[str, Callable[[BenchmarkConfig, World, torch.device], Iterable[dict[
     "train": speed.train_speed,
     "size": size.size,
     "handoff": handoff.handoff,
-    "memory": memory.memory,
+    "memory": size.memory,
     "peers": peers.peers,
-    "log": log.log_speed,
+    "log": speed.log_speed,
     "regret": spreading.regret,
     "bracket": spreading.bracket,
 }
@@ -51,8 +51,6 @@ def run(cfg: BenchmarkConfig, folder: Path, problem: Problem | None = None) -> N
     shown = [key for key in rows[0] if not isinstance(rows[0][key], dict)]
     title = f"{where['processor']}, {where['cores']} cores, {cfg.threads} torch threads, {device}"
     console.print(table(title, shown, [[_text(row[key]) for key in shown] for row in rows]))
-    if cfg.part == "peers":
-        console.print(peers.chart(rows, cfg.seeds[0]), markup=False, highlight=False)
     console.print(f"results in {folder}")
 
 

@@ -100,7 +100,7 @@ def _log_episodes(
     log = EpisodeLog(folder, world, seed=cfg.seed, config=described, layout=mcap.layout, tell=tell)
     log.add(episodes, {"label": subject})
     if log.close():
-        console.print(f"{log.episodes} episodes in {log.file}", markup=False)
+        console.print(f"{log.episodes} episodes in {log.file}")
 
 
 def _proved(run: str) -> dict[str, Any] | None:

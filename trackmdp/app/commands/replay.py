@@ -35,7 +35,7 @@ def run(cfg: ReplayConfig, folder: Path) -> None:  # noqa: ARG001  what is writt
     with EpisodeReader(file) as reader:
         # Said at once: other versions of NumPy or torch may draw other numbers, which is not damage.
         if apart := versions_apart(reader.run.said):
-            console.print(f"made by other versions: {apart}", markup=False)
+            console.print(f"made by other versions: {apart}")
         asked = _exports(console, cfg, reader)
         if cfg.verify:
             _verify(console, cfg, reader)
@@ -49,9 +49,9 @@ def run(cfg: ReplayConfig, folder: Path) -> None:  # noqa: ARG001  what is writt
 
 def _recover(console: Console, file: Path) -> Path:
     saved = recover(file)
-    console.print(f"{saved.episodes} episodes -> {saved.file}", markup=False)
+    console.print(f"{saved.episodes} episodes -> {saved.file}")
     for line in saved.damaged:
-        console.print(f"lost: {line}", markup=False)
+        console.print(f"lost: {line}")
     return saved.file
 
 
@@ -71,7 +71,7 @@ def _exports(console: Console, cfg: ReplayConfig, reader: EpisodeReader) -> bool
             write(Path(path))
         except OSError as error:
             raise UserError(f"{key}={path}: cannot be written ({(error.strerror or str(error)).lower()})") from error
-        console.print(f"{key} -> {path}", markup=False)
+        console.print(f"{key} -> {path}")
     return any(path is not None for _, path, _ in writers)
 
 
@@ -87,7 +87,7 @@ def _verify(console: Console, cfg: ReplayConfig, reader: EpisodeReader) -> None:
         apart = versions_apart(reader.run.said)
         because = f"; made by other versions: {apart}" if apart else ""
         raise RunError(f"file={cfg.file}: {difference}{because}")
-    console.print(f"{verified.episodes} episodes, {verified.steps:,} steps: the same to the bit", markup=False)
+    console.print(f"{verified.episodes} episodes, {verified.steps:,} steps: the same to the bit")
 
 
 def _kernel_difference(reader: EpisodeReader) -> str | None:

@@ -76,5 +76,5 @@ def _tell(console: Console, found: Results, folder: Path) -> None:
     if found.anomalies:
         first = found.anomalies[0]
         more = f" and {len(found.anomalies) - 1} more" if len(found.anomalies) > 1 else ""
-        console.print(f"missing or mixed: {first.run}: {first.text}{more}", markup=False)
-    console.print(f"{len(found.runs)} runs; report in {folder / 'report.html'}", markup=False)
+        console.print(f"missing or mixed: {first.run}: {first.text}{more}")
+    console.print(f"{len(found.runs)} runs; report in {folder / 'report.html'}")

@@ -43,19 +43,11 @@ def run(cfg: VerifyConfig, folder: Path, problem: Problem | None = None) -> floa
 
 
 def write_checks(world: Modelled, tolerance: float, folder: Path) -> list[Check]:
-    """Solve the world, run every check, and write `verification.json`.
-
-    Raises:
-        UserError: its sensors are not those of the paper's theorems.
-    """
+    """Solve the world, whose sensors are of one cell, run every check, and write `verification.json`."""
     if isinstance(world, HiddenWorld):
         solution = solve_keys(world)
         found = check_modes(world, solution, tolerance)
     else:
-        if world.coverage is not None:
-            raise UserError(
-                "sensor=footprint: the paper's theorems are on sensors of one cell; expected perfect or miss"
-            )
         solution = optimal.solve(world, nodes=NODES, tolerance=tolerance)
         found = theorems.check_theorems(world, solution, tolerance)
     if solution.interrupted:
@@ -80,7 +72,7 @@ def show_checks(console: Console, checks: list[Check], folder: Path) -> None:
         note = f" ({check.note})" if check.note else ""
         shown.add_row(f"{check.name}: {check.statement}{note}", _deviation(check), check.verdict)
     console.print(shown)
-    console.print(f"{theorems.summarize_checks(checks)}; results in {folder}", markup=False)
+    console.print(f"{theorems.summarize_checks(checks)}; results in {folder}")
 
 
 def _deviation(check: Check) -> str:

@@ -6,19 +6,26 @@ A launcher reports nothing: what became of each run stands in its folder, in wha
 from __future__ import annotations
 
 import os
+import signal
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
-from functools import partial
+from pathlib import Path
 from typing import Any
 
-from trackmdp.app.sweep.job import Launch, run_job
+from trackmdp.app.sweep import process
+from trackmdp.app.sweep.job import fail, run_job, stop_signal
 from trackmdp.app.sweep.plan import Job
-from trackmdp.app.sweep.process import context_for
-from trackmdp.app.sweep.schema import BasicConfig, JoblibConfig, LauncherConfig, RayConfig, SubmititConfig
 from trackmdp.config import TrainConfig
-from trackmdp.errors import UserError, require
-from trackmdp.training.signals import kept_sigterm
+from trackmdp.config.sweeping import (
+    BasicConfig,
+    JoblibConfig,
+    RayConfig,
+    SubmititLocalConfig,
+    SubmititSlurmConfig,
+)
+from trackmdp.errors import FAILED, UserError
+from trackmdp.training.signals import handled, kept_sigterm
 
 # Each names the threads of one library (OpenMP, OpenBLAS, MKL), which by default take all cores, in every run at once.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -26,32 +33,12 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _STORE = 100 * 2**20
 """Bytes for the objects of a Ray cluster started here; the runs hand over none."""
 
+SUBMISSIONS = ".submissions"
+"""Folder, in that of the sweep, of what the scheduler is given and says."""
 
-def make_launcher(cfg: LauncherConfig) -> Launch:
-    """The launcher that `hydra/launcher=NAME` chose.
-
-    Raises:
-        UserError: what it needs is not installed.
-    """
-    if isinstance(cfg, BasicConfig):
-        return _basic
-    launch = _parallel(cfg)
-    return lambda jobs: launch([replace(job, concurrent=True) for job in jobs])
-
-
-def _parallel(cfg: LauncherConfig) -> Launch:
-    option = f"hydra/launcher={cfg.name}"
-    if isinstance(cfg, JoblibConfig):
-        require("joblib", "sweep", option)
-        return partial(_joblib, cfg)
-    if isinstance(cfg, SubmititConfig):
-        require("submitit", "slurm", option)
-        from trackmdp.app.sweep import cluster
-
-        return cluster.launcher(cfg)
-    assert isinstance(cfg, RayConfig)
-    require("ray", "ray", option)
-    return partial(_on_ray, cfg)
+# Seconds between two looks for result files, and between two questions to the scheduler, which is shared by many
+# users.
+_POLL, _ASK = 0.5, 60.0
 
 
 @contextmanager
@@ -68,17 +55,18 @@ def threads_of(jobs: Sequence[Job]) -> Iterator[None]:
             os.environ.pop(name, None)
 
 
-def _basic(jobs: Sequence[Job]) -> None:
+def run_basic(cfg: BasicConfig, jobs: Sequence[Job]) -> None:  # noqa: ARG001
+    """One after the other."""
     for job in jobs:
         run_job(job)
 
 
-def _joblib(cfg: JoblibConfig, jobs: Sequence[Job]) -> None:
+def run_joblib(cfg: JoblibConfig, jobs: Sequence[Job]) -> None:
     """In threads: each only waits for the process of its run."""
     from joblib import Parallel, delayed
 
     # In the main thread, before joblib's threads start runs: only there can the fork server be made to ignore signals.
-    context_for(jobs[0].command)
+    process.context_for(jobs[0].command)
     # Cores this process may use, which in a container or a cluster's job are fewer than the machine has.
     at_once = cfg.n_jobs or len(os.sched_getaffinity(0))
     # Threads: joblib's own processes (loky) give up the whole sweep when one of them is killed. `batch_size=1`: a
@@ -86,7 +74,7 @@ def _joblib(cfg: JoblibConfig, jobs: Sequence[Job]) -> None:
     Parallel(n_jobs=at_once, backend="threading", batch_size=1)(delayed(run_job)(job) for job in jobs)
 
 
-def _on_ray(cfg: RayConfig, jobs: Sequence[Job]) -> None:
+def run_on_ray(cfg: RayConfig, jobs: Sequence[Job]) -> None:
     """Run `jobs` as tasks of a Ray cluster, which is left, or ended where it was started here.
 
     Raises:
@@ -118,3 +106,82 @@ def _join(cfg: RayConfig, ray: Any) -> None:
     except (ConnectionError, ValueError, RuntimeError) as error:
         reason = " ".join(str(error).split())
         raise UserError(f"hydra.launcher.address={cfg.address}: expected a Ray cluster ({reason})") from error
+
+
+class Submission:
+    """The submitted callable; where its job is preempted or out of time, it is submitted again and the run resumes."""
+
+    def __call__(self, job: Job) -> None:
+        """Run `job`."""
+        from submitit.core.utils import UncompletedJobError
+
+        try:
+            run_job(job)
+        except UncompletedJobError as error:  # raised by the scheduler's signal
+            process.stop_all()
+            fail(job, process.Outcome(FAILED, reason=f"stopped by the scheduler: {error}"))
+
+    def checkpoint(self, job: Job) -> Any:
+        """Let the run save, and return what is to be submitted next."""
+        from submitit.helpers import DelayedSubmission
+
+        process.stop_all()
+        # submitit submits this once more; the run finds its folder, and resumes from its last checkpoint.
+        return DelayedSubmission(self, job)
+
+
+def run_here(cfg: SubmititLocalConfig, jobs: Sequence[Job]) -> None:
+    """As processes of this machine."""
+    import submitit
+
+    executor = submitit.LocalExecutor(_submissions(jobs))
+    # 30 s before the time is out the job is told to save.
+    executor.update_parameters(timeout_min=cfg.timeout_min, signal_delay_s=30)
+    at_once = cfg.n_jobs or max(1, len(os.sched_getaffinity(0)) // cfg.cpus_per_task)
+    running: list[Any] = []
+    for job in jobs:
+        # submitit's local executor starts whatever it is given at once; the limit is kept here.
+        while sum(not each.done() for each in running) >= at_once:
+            time.sleep(_POLL)
+        if stop_signal(job.sweep):
+            break
+        # A process started here ignores Ctrl-C: the sweep receives it and stops them in order.
+        with handled(signal.SIG_IGN, signal.SIGINT):
+            running.append(executor.submit(Submission(), job))
+    _wait(running)
+
+
+def run_on_slurm(cfg: SubmititSlurmConfig, jobs: Sequence[Job]) -> None:
+    """As one array job."""
+    import submitit
+
+    executor = submitit.AutoExecutor(_submissions(jobs), cluster="slurm", slurm_max_num_timeout=cfg.max_num_timeout)
+    executor.update_parameters(
+        name=f"trackmdp_{jobs[0].command}",
+        timeout_min=cfg.timeout_min,
+        cpus_per_task=cfg.cpus_per_task,
+        mem_gb=cfg.mem_gb,
+        gpus_per_node=cfg.gpus_per_node,
+        slurm_array_parallelism=cfg.array_parallelism,
+        slurm_signal_delay_s=cfg.signal_delay_s,
+        slurm_partition=cfg.partition,
+        slurm_account=cfg.account,
+        slurm_setup=cfg.setup,
+        slurm_additional_parameters=cfg.additional_parameters,
+    )
+    # One array job, of which the scheduler runs `array_parallelism` at once; one job each would flood its queue.
+    _wait(executor.map_array(Submission(), list(jobs)))
+
+
+def _submissions(jobs: Sequence[Job]) -> Path:
+    return jobs[0].sweep / SUBMISSIONS
+
+
+def _wait(submitted: Sequence[Any]) -> None:
+    """Return once all jobs have ended; how each ended stands in its run's folder."""
+    asked = time.monotonic()
+    while left := [each for each in submitted if not each.done()]:
+        if time.monotonic() - asked > _ASK:  # one that was killed leaves no file by which it would be known
+            left[0].done(force_check=True)
+            asked = time.monotonic()
+        time.sleep(_POLL)

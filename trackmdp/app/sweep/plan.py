@@ -11,16 +11,16 @@ import shlex
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Glob, Override
-from hydra.errors import HydraException
+from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig
 
 from trackmdp.app.prepare import typed_config
+from trackmdp.app.words import parsed
 from trackmdp.config import CommandConfig, TrainConfig, to_dict
-from trackmdp.config.resume import fixed_options
+from trackmdp.config.resume import fixed_options, key_of
+from trackmdp.config.sweeping import BlocksConfig
 from trackmdp.errors import UserError
 
 _MOST = 100_000
@@ -58,6 +58,18 @@ class Job:
     def folder(self) -> Path:
         """Of the run."""
         return self.sweep / self.name
+
+
+class MakeJobs(Protocol):
+    """`plan` for one command, sweep and composer."""
+
+    def __call__(self, grid: Sequence[Sequence[str]], naming: Collection[str] = ()) -> list[Job]:
+        """The jobs of a grid of words."""
+
+
+def grid(cfg: BlocksConfig, words: Sequence[str], folder: Path, planned: MakeJobs) -> list[list[Job]]:  # noqa: ARG001
+    """One batch with the whole grid."""
+    return [planned(combinations(cfg.blocks or [], words))]
 
 
 def combinations(blocks: Sequence[str], typed: Sequence[str]) -> list[list[str]]:
@@ -124,7 +136,7 @@ def plan(
             cfg, refusal = None, str(error)
         # Words and config: where a default in conf/ has changed, the same words make another run.
         key = _digest(_distinguishing(words), _identity(cfg))
-        text = _slug([word for word in words if _key(word) in naming] or words)
+        text = _slug([word for word in words if key_of(word) in naming] or words)
         # A wider grid varies more options, so the readable part of a run's name may change; its digest does not, and
         # finds the folder that is there.
         name = known.get(key, f"{text}-{key}".lstrip("-"))
@@ -137,7 +149,7 @@ def plan(
 def sweep_name(command: str, words: Sequence[str], blocks: Sequence[str]) -> str:
     """The name of a sweep's folder: the same for the same words, in whatever order; those with many values first."""
     told = _distinguishing(words)
-    experiments = [word.partition("=")[2] for word in told if _key(word) == "experiment"]
+    experiments = [word.partition("=")[2] for word in told if key_of(word) == "experiment"]
     # Stable sort: False comes first, so that words with several values lead and survive the cut at 80 letters.
     text = _slug(sorted(told, key=lambda word: not parsed(word).is_sweep_override()), experiments or [command])
     return f"{text}-{_digest(command, told, list(blocks))}"
@@ -147,9 +159,9 @@ def _varying(grid: Sequence[Sequence[str]]) -> set[str]:
     """The options that differ between the runs of a grid."""
     values: dict[str, set[str]] = {}
     for word in (word for words in grid for word in words):
-        values.setdefault(_key(word), set()).add(word)
+        values.setdefault(key_of(word), set()).add(word)
     # An option that is missing in some words varies too, though it has one value wherever it stands.
-    shared = {key for key in values if all(any(_key(word) == key for word in words) for words in grid)}
+    shared = {key for key in values if all(any(key_of(word) == key for word in words) for words in grid)}
     return {key for key, found in values.items() if len(found) > 1 or key not in shared}
 
 
@@ -161,7 +173,7 @@ def _folders(sweep: Path) -> dict[str, str]:
 
 def _slug(words: Iterable[str], prefix: Sequence[str] = ()) -> str:
     """Words as a readable part of a folder's name."""
-    named = {_key(word): _short(word.partition("=")[2]) for word in words if _key(word) not in _UNNAMED}
+    named = {key_of(word): _short(word.partition("=")[2]) for word in words if key_of(word) not in _UNNAMED}
     # `algo.gamma` is shown as `gamma`, unless another option of the runs ends alike.
     short = [key.split(".")[-1] for key in named]
     pairs = {key if short.count(last) > 1 else last: named[key] for key, last in zip(named, short, strict=True)}
@@ -176,7 +188,7 @@ def _short(value: str) -> str:
 
 
 def _distinguishing(words: Iterable[str]) -> list[str]:
-    return sorted(word for word in words if _key(word) not in ("quiet", "resume"))
+    return sorted(word for word in words if key_of(word) not in ("quiet", "resume"))
 
 
 def _digest(*told: Any) -> str:
@@ -201,27 +213,13 @@ def _resumable(cfg: CommandConfig) -> CommandConfig:
     return replace(cfg, resume="auto")
 
 
-def parsed(word: str) -> Override:
-    """A word as Hydra reads it.
-
-    Raises:
-        UserError: it cannot be read, or names its values by `glob`, which would find the schemas beside the choices.
-    """
-    try:
-        override = OverridesParser.create().parse_override(word)
-    except (HydraException, ValueError) as error:  # ValueError: an integer of thousands of digits
-        raise UserError(f"{word}: expected option=value (a value with blanks or commas needs quotes)") from error
-    if not override.is_delete() and isinstance(override.value(), Glob):
-        raise UserError(f"{word}: expected the values themselves, separated by commas")
-    return override
-
-
 def _values(override: Override) -> list[str]:
+    """The words of the single values of a word."""
     key = override.get_key_element()
+    if override.is_delete():
+        return [str(override.input_line)]
     if not override.is_sweep_override():
-        return [
-            f"{key}={override.get_value_element_as_str()}" if not override.is_delete() else str(override.input_line)
-        ]
+        return [f"{key}={override.get_value_element_as_str()}"]
     if not override.is_discrete_sweep():
         raise UserError(f"{override.input_line}: expected values that can be counted; hydra/sweeper=optuna searches")
     try:
@@ -231,8 +229,3 @@ def _values(override: Override) -> list[str]:
     if len(values) > _MOST:
         raise UserError(f"{override.input_line}: expected at most {_MOST:,} values")
     return values
-
-
-def _key(word: str) -> str:
-    # `hydra/launcher` and `hydra.launcher` are one key here.
-    return word.lstrip("+~").partition("=")[0].replace("/", ".")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Self
@@ -19,7 +19,7 @@ from trackmdp.app.sweep.table import show_runs, status_of, write_table
 from trackmdp.config import TrainConfig
 from trackmdp.config.resume import continued, finished
 from trackmdp.errors import FAILED, Preempted, UserError
-from trackmdp.training.folders import DONE, FAILED_FILE, RunState, run_of, runs_of, write_plan
+from trackmdp.training.folders import DONE, FAILED_FILE, run_of, runs_of, write_plan
 from trackmdp.training.lock import locked
 from trackmdp.training.sealing import SUMMARY
 from trackmdp.training.signals import Signals
@@ -55,7 +55,8 @@ def sweep(
             # Before anything is run, so that `report` and `watch` know what is still to come.
             write_plan(folder, command, line, [(job.name, job.words) for job in jobs.values()])
             done = {job.folder for job in batch if _is_finished(job)}
-            console.print(_opening(batch, done, folder), markup=False)
+            before = f", {len(done)} of them done before" if done else ""
+            console.print(f"{len(batch)} runs{before} -> {shown(folder)}")
             _run([job for job in batch if job.folder not in done], launch, stop)
             skipped |= done
             if stop.received:
@@ -65,13 +66,16 @@ def sweep(
         show_runs(console, runs, skipped, folder)
     if stop.received:
         raise Preempted(stop.received)
-    _report_failures(command, runs)
+    if failed := sum(run.state == "failed" for run in runs):
+        sys.stderr.write(f"trackmdp {command}: {failed} of {len(runs)} runs failed\n")
     return status_of(runs)
 
 
 def _run(jobs: Sequence[Job], launch: Launch, stop: _Stop) -> None:
     for job in jobs:
-        _remove_results(job)
+        # A launcher's worker may die before its run begins; an old result would then be taken for the new one.
+        for name in (FAILED_FILE, DONE, SUMMARY):
+            (job.folder / name).unlink(missing_ok=True)
     # Here and not in each launcher: the fork server, worker processes and their children all inherit the environment.
     with threads_of(jobs):
         _launch(jobs, launch, stop)
@@ -88,13 +92,6 @@ def _is_finished(job: Job) -> bool:
         return finished(continued(job.cfg, job.folder, job.words), job.folder) is not None
     except UserError:
         return False
-
-
-def _remove_results(job: Job) -> None:
-    """Remove what an earlier call left of a run that is to be run now."""
-    for name in (FAILED_FILE, DONE, SUMMARY):
-        # A launcher's worker may die before its run begins; an old result would then be taken for the new one.
-        (job.folder / name).unlink(missing_ok=True)
 
 
 def _launch(jobs: Sequence[Job], launch: Launch, stop: _Stop) -> None:
@@ -116,17 +113,6 @@ def _launch(jobs: Sequence[Job], launch: Launch, stop: _Stop) -> None:
         return
     for job in jobs:
         fail(job, Outcome(FAILED, reason=reason))
-
-
-def _opening(jobs: Sequence[Job], skipped: Collection[Path], folder: Path) -> str:
-    done = f", {len(skipped)} of them done before" if skipped else ""
-    return f"{len(jobs)} runs{done} -> {shown(folder)}"
-
-
-def _report_failures(command: str, runs: Sequence[RunState]) -> None:
-    failed = [run for run in runs if run.state == "failed"]
-    if failed:
-        sys.stderr.write(f"trackmdp {command}: {len(failed)} of {len(runs)} runs failed\n")
 
 
 class _Stop(Signals):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +9,7 @@ from typing import Any
 from rich.console import Console
 
 from trackmdp.app.prepare import shown
-from trackmdp.durable import write_text
+from trackmdp.durable import csv_text, write_text
 from trackmdp.errors import FAILED, USER_MISTAKE
 from trackmdp.training.display import table
 from trackmdp.training.folders import FAILED_FILE, RunState
@@ -35,7 +33,7 @@ def show_runs(console: Console, runs: Sequence[RunState], skipped: Collection[Pa
     states = [_state(run, skipped) for run in runs]
     counts = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states))
     # `markup=False`: a folder named "[red]" is a name, not an order to rich.
-    console.print(f"{counts}; {shown(sweep) / TABLE}", markup=False)
+    console.print(f"{counts}; {shown(sweep) / TABLE}")
 
 
 def write_table(sweep: Path, runs: Sequence[RunState]) -> None:
@@ -43,17 +41,15 @@ def write_table(sweep: Path, runs: Sequence[RunState]) -> None:
 
     Nothing in it depends on time, or on how often a run was interrupted.
     """
-    words = [dict(_pair(word) for word in run.overrides) for run in runs]
+    words = [{word.partition("=")[0]: word.partition("=")[2] for word in run.overrides} for run in runs]
     # The union in order of appearance: runs of different blocks may have different options.
     keys = [key for key in dict.fromkeys(key for pairs in words for key in pairs) if key != "quiet"]
-    stream = io.StringIO(newline="")
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(["folder", "state", *_FIGURES, "reason", *keys])
+    rows = []
     for run, pairs in zip(runs, words, strict=True):
         found = run_figures(run)
         row = [_cell(run.folder.name), run.state, *(found.get(name) for name in _FIGURES), _cell(run.reason)]
-        writer.writerow([*row, *(_cell(pairs.get(key)) for key in keys)])
-    write_text(sweep / TABLE, stream.getvalue())
+        rows.append([*row, *(_cell(pairs.get(key)) for key in keys)])
+    write_text(sweep / TABLE, csv_text(["folder", "state", *_FIGURES, "reason", *keys], rows))
 
 
 def _cell(text: str | None) -> str | None:
@@ -98,8 +94,3 @@ def _short(run: RunState) -> list[str]:
     aihtr, regret = found.get("aihtr"), found.get("regret_per_step")
     # Adding 0.0 turns the -0.0 that rounding leaves into 0.0.
     return [f"{aihtr:,.3f}" if aihtr is not None else "", f"{round(regret, 4) + 0.0:.4f}" if regret is not None else ""]
-
-
-def _pair(word: str) -> tuple[str, str]:
-    key, _, value = word.partition("=")
-    return key, value

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from hydra.core.override_parser.types import IntervalSweep, Override, RangeSweep
 
-from trackmdp.app.sweep.plan import Job, parsed
-from trackmdp.app.sweep.schema import OptunaConfig
+from trackmdp.app.sweep.plan import Job, MakeJobs
 from trackmdp.app.sweep.table import run_scores
-from trackmdp.errors import UserError, require
+from trackmdp.app.words import parsed
+from trackmdp.config.sweeping import OptunaConfig
+from trackmdp.errors import UserError
 from trackmdp.seeding import derive
 from trackmdp.training.folders import run_of
 
@@ -24,21 +25,18 @@ _WORDS = "words"
 _DIRECTIONS = {"aihtr": "maximize", "regret_per_step": "minimize"}
 
 
-def trials(
-    cfg: OptunaConfig, words: Sequence[str], folder: Path, planned: Callable[[Sequence[str], set[str]], Job]
-) -> Iterator[list[Job]]:
+def trials(cfg: OptunaConfig, words: Sequence[str], folder: Path, planned: MakeJobs) -> Iterator[list[Job]]:
     """Batches of jobs, until `cfg.n_trials` are done; once a batch has been run, its results are handed to the study.
 
     Args:
         cfg: of the study.
         words: what was typed; words with several values, `range(a,b)` or `interval(a,b)` are searched.
         folder: of the sweep.
-        planned: the job of some words, of which the options in the set tell it from others.
+        planned: makes jobs of words.
 
     Raises:
-        UserError: Optuna is not installed, there is nothing to search, or the study is one of another search.
+        UserError: there is nothing to search, or the study is one of another search.
     """
-    require("optuna", "optuna", "hydra/sweeper=optuna")
     read = [parsed(word) for word in words]
     searched = {each.get_key_element(): each for each in read if each.is_sweep_override()}
     fixed = [word for word, each in zip(words, read, strict=True) if not each.is_sweep_override()]
@@ -47,10 +45,14 @@ def trials(
     timed = [each.value() for each in read if each.get_key_element() == "optimal.time_limit"]
     if cfg.objective == "regret_per_step" and any(value is not None for value in timed):
         raise UserError("optimal.time_limit: a regret would be chosen by the clock, expected null (or objective=aihtr)")
+
+    def job_of(chosen: Sequence[str]) -> Job:
+        return planned([[*fixed, *chosen]], searched)[0]
+
     with _study(cfg, folder) as study:
         # The words are kept with each trial: Optuna's own parameters would have to be put into Hydra's notation again.
         told = [trial.user_attrs.get(_WORDS, []) for trial in study.trials if trial.state == _states().COMPLETE]
-        earlier = [planned([*fixed, *chosen], set(searched)) for chosen in told]
+        earlier = [job_of(chosen) for chosen in told]
         # Handed over as a batch of its own: the sweep finds them done, and they stand in its table.
         if here := [job for job in earlier if run_of(job.folder).state == "done"]:
             yield here
@@ -61,7 +63,7 @@ def trials(
         # number; Optuna's own `optimize` would add so many each time.
         while missing := max(0, cfg.n_trials - _count(study, "COMPLETE") - failed):
             asked = [_ask(cfg, study, searched, place) for place in range(min(cfg.batch, missing))]
-            jobs = [planned([*fixed, *chosen], set(searched)) for _, chosen in asked]
+            jobs = [job_of(chosen) for _, chosen in asked]
             # A sampler may propose the same values twice within a batch: one run, whose result both trials are told.
             yield list({job.name: job for job in jobs}.values())
             # The generator goes on only when the sweep asks for the next batch, after all runs of this one are over.

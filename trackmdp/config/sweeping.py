@@ -2,56 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
-from omegaconf import OmegaConf
+from trackmdp.config.options import choice, option
+from trackmdp.config.schema import ChoiceConfig
+from trackmdp.errors import UserError, require
 
-from trackmdp.config.options import leaves, option, refuse
-from trackmdp.errors import UserError
-
-T = TypeVar("T")
-
-PLUGINS: dict[str, dict[str, type[Any]]] = {"launcher": {}, "sweeper": {}}
-"""Group of `hydra` -> option of the group -> its dataclass."""
-
-
-def _offered(group: str, name: str) -> Callable[[type[T]], type[T]]:
-    """Class decorator: make a dataclass the option `name` of the group `hydra/<group>`."""
-
-    def register(schema: type[T]) -> type[T]:
-        schema.name = name  # type: ignore[attr-defined]
-        PLUGINS[group][name] = schema
-        return schema
-
-    return register
-
-
-def plugin(group: str, node: Any) -> Any:
-    """The typed, checked options of `hydra.<group>`.
-
-    Raises:
-        UserError: a value is out of its range, or the option chosen is none of ours.
-    """
-    schema = OmegaConf.get_type(node)
-    if schema not in PLUGINS[group].values():
-        raise UserError(f"hydra/{group}: expected one of {', '.join(PLUGINS[group])}")
-    typed = OmegaConf.to_object(node)
-    for key, described, value in leaves(typed, f"hydra.{group}."):
-        if not described.allows(value):
-            raise refuse(key, value, described.expected)
-    return typed
+PLUGINS = ("launcher", "sweeper")
+"""What Hydra has plugins for, and this package choices of its own: `hydra/launcher`, `hydra/sweeper`."""
 
 
 @dataclass(kw_only=True)
-class SweeperConfig:
-    """Base of the group `hydra/sweeper`: which runs a sweep has."""
+class PluginConfig(ChoiceConfig):
+    """Base of both groups."""
 
-    name: ClassVar[str]
+    package: ClassVar[str] = ""
+    """What it imports; `extra` is the extra of this package that adds it."""
+    extra: ClassVar[str] = ""
+
+    def check(self, key: str, root: Any) -> None:
+        """What it imports is installed."""
+        if self.package:
+            require(self.package, self.extra, f"{key.replace('.', '/')}={self.name}")
 
 
-@_offered("sweeper", "blocks")
+@dataclass(kw_only=True)
+class SweeperConfig(PluginConfig):
+    """Base of the group `hydra/sweeper`: which runs a sweep has.
+
+    What a choice makes is called with its config, the typed words, the sweep's folder, and a function that makes jobs
+    of words (`plan` without its first arguments); it returns batches of jobs, and a search plans each when asked.
+    """
+
+
+@choice("hydra/sweeper", "blocks", makes="trackmdp.app.sweep.plan:grid")
 @dataclass(kw_only=True)
 class BlocksConfig(SweeperConfig):
     """Every combination of the values in each block; what is typed is added to each, or replaces its words."""
@@ -61,11 +46,12 @@ class BlocksConfig(SweeperConfig):
     )
 
 
-@_offered("sweeper", "optuna")
+@choice("hydra/sweeper", "optuna", makes="trackmdp.app.sweep.trials:trials")
 @dataclass(kw_only=True)
 class OptunaConfig(SweeperConfig):
     """A search: the words with several values, `range(a,b)` or `interval(a,b)` say what is searched."""
 
+    package = extra = "optuna"
     n_trials: int = option("runs of the whole study, those of earlier calls among them", unit="runs", ge=1)
     objective: str = option(
         "what is searched for: the largest AIHTR, or the least regret to the bound that each run proves in "
@@ -82,22 +68,29 @@ class OptunaConfig(SweeperConfig):
 
 
 @dataclass(kw_only=True)
-class LauncherConfig:
-    """Base of the group `hydra/launcher`: where the runs of a sweep take place."""
+class LauncherConfig(PluginConfig):
+    """Base of the group `hydra/launcher`: where the runs of a sweep take place.
 
-    name: ClassVar[str]
+    What a choice makes is called with its config and jobs, and returns once none of them is running.
+    """
+
+    concurrent: ClassVar[bool] = True
 
 
-@_offered("launcher", "basic")
+@choice("hydra/launcher", "basic", makes="trackmdp.app.sweep.launchers:run_basic")
 @dataclass(kw_only=True)
 class BasicConfig(LauncherConfig):
     """One run after the other, on this machine."""
 
+    concurrent: ClassVar[bool] = False
 
-@_offered("launcher", "joblib")
+
+@choice("hydra/launcher", "joblib", makes="trackmdp.app.sweep.launchers:run_joblib")
 @dataclass(kw_only=True)
 class JoblibConfig(LauncherConfig):
     """Several runs at once, on this machine."""
+
+    package, extra = "joblib", "sweep"
 
     n_jobs: int | None = option("runs at once; null = one for each core", unit="runs", ge=1, le=1024)
 
@@ -106,11 +99,13 @@ class JoblibConfig(LauncherConfig):
 class SubmititConfig(LauncherConfig):
     """Base of the launchers that write a submission for each run."""
 
+    package, extra = "submitit", "slurm"
+
     timeout_min: int = option("a run is stopped after this long, and resumes where requeued", unit="min", ge=1)
     cpus_per_task: int = option("cores of a run", unit="cores", ge=1)
 
 
-@_offered("launcher", "submitit_local")
+@choice("hydra/launcher", "submitit_local", makes="trackmdp.app.sweep.launchers:run_here")
 @dataclass(kw_only=True)
 class SubmititLocalConfig(SubmititConfig):
     """As submitit_slurm, but on this machine: to try out what a cluster will do."""
@@ -118,7 +113,7 @@ class SubmititLocalConfig(SubmititConfig):
     n_jobs: int | None = option("runs at once; null = as many as there are cores for", unit="runs", ge=1, le=1024)
 
 
-@_offered("launcher", "submitit_slurm")
+@choice("hydra/launcher", "submitit_slurm", makes="trackmdp.app.sweep.launchers:run_on_slurm")
 @dataclass(kw_only=True)
 class SubmititSlurmConfig(SubmititConfig):
     """On the nodes of a SLURM cluster, as one job array; the folder must be one that every node sees."""
@@ -133,14 +128,26 @@ class SubmititSlurmConfig(SubmititConfig):
     setup: list[str] | None = option("lines of shell before each run, such as `module load ...`", expects="a line")
     additional_parameters: dict[str, str] | None = option("further `#SBATCH` parameters", expects="{name: value}")
 
+    def check(self, key: str, root: Any) -> None:
+        """There is a cluster: submitting would fail only after the sweep's folder has been made."""
+        super().check(key, root)
+        import submitit
 
-@_offered("launcher", "ray")
+        if submitit.SlurmExecutor.affinity() < 0:
+            raise UserError(
+                "hydra/launcher=submitit_slurm: expected a machine from which jobs can be submitted (no srun)"
+            )
+
+
+@choice("hydra/launcher", "ray", makes="trackmdp.app.sweep.launchers:run_on_ray")
 @dataclass(kw_only=True)
 class RayConfig(LauncherConfig):
     """On a Ray cluster that is joined, or one that is started on this machine: for many runs on many machines.
 
     On one machine joblib does the same for less.
     """
+
+    package = extra = "ray"
 
     address: str | None = option("cluster to join; null = start one here", expects="auto, or host:port")
     num_cpus: int | None = option("cores of a cluster started here; null = all", unit="cores", ge=1)
