@@ -188,6 +188,8 @@ def test_a_worker_that_is_killed_is_named(
         while_collecting(monkeypatch, kill)
     with pytest.raises(RunError, match=r"iteration \d: collecting broke down \(worker [01] .*(SIGKILL|-9)"):
         train(tmp_path, f"collector={collector}")
+    for worker in multiprocessing.active_children():
+        worker.join(60)  # TorchRL tells all of them to end, and waits ten seconds for it, too few on a busy machine
     assert not multiprocessing.active_children()
     assert saved(tmp_path)[0] >= 2
     monkeypatch.undo()
