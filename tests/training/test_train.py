@@ -114,7 +114,7 @@ def test_a_run_in_a_folder_is_resumed_exactly(tmp_path: Path) -> None:
         train(small_world(), "ppo", callbacks=[Stop()], **words)
     with pytest.raises(UserError, match="holds a run already"):
         train(small_world(), "ppo", **words)
-    with pytest.raises(UserError, match="kernel is not the one"):
+    with pytest.raises(UserError, match=r"kernel\.npz: not what the run's config describes now"):
         train(small_world(seed=1), "ppo", resume="auto", **words)
     run = train(small_world(), "ppo", resume="auto", **words)
     assert rows(tmp_path / "cut") == rows(tmp_path / "whole")
@@ -172,7 +172,7 @@ def test_recorded_tracks_in_a_folder_are_resumed_and_evaluated(tmp_path: Path) -
     assert load_run(tmp_path / "cut").summary["policy"] == whole.summary["policy"]
     assert main(["evaluate", f"run={tmp_path / 'cut'}", "quiet=true", f"hydra.run.dir={tmp_path / 'e'}"]) == 0
     other = recorded(drawn(world.kernel, 120, seed=5), markov=False, anywhere=True)
-    with pytest.raises(UserError, match="the run's recording is not the one"):
+    with pytest.raises(UserError, match=r"tracks\.json: not what the run's config describes now"):
         train(other, "ppo", folder=tmp_path / "cut", resume="auto", **{**options, "collector.total_frames": 4096})
 
 
