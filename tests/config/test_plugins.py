@@ -76,7 +76,7 @@ def test_it_is_used_by_the_commands_from_python_and_by_the_tests_over_all_choice
     lines = f"{TRAIN} hydra.run.dir=run", "evaluate run=run episodes=0", solved
     said = called(site, tmp_path, *lines, before=USED)
     assert [status for status, _, _ in said] == [0, 0, 0], said
-    assert "algo.bed 0.00 GiB" in said[0][1]
+    assert "memory: about 0.00 GiB of " in said[0][1]
     assert (tmp_path / "run" / "lines.txt").read_text().splitlines()[0] == "line 1"
     assert (tmp_path / "solved" / "solution.json").is_file()
 
