@@ -84,6 +84,8 @@ class Option:
         """Whether `value` has the right type and lies in the range."""
         if value is None:
             return self.nullable
+        if isinstance(value, dict):  # groups are mappings, options never; what an option holds may be of any kind
+            return False
         if self._element:
             return isinstance(value, list) and len(value) > 0 and all(map(self._element.allows, value))
         if self.pair and isinstance(value, (list, tuple)):
