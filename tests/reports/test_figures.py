@@ -151,7 +151,7 @@ def test_all_value_maps_of_a_page_have_the_same_scales() -> None:
     assert scales == (maps.Scale("viridis", -50.0, 50.0), maps.Scale("magma_r", pytest.approx(1e-3), 100.0, log=True))
     drawn = [maps.value_map("x", "here", each, motion, (10, 10), scales).svg.decode() for each in every]
     one, other = (re.findall(r">(−?\d+|10[⁻⁰¹²³]+)</text>", each) for each in drawn)
-    assert one == other and set(one) >= {"−40", "0", "40", "10⁰", "10²"}
+    assert one == other and set(one) >= {"−40", "0", "40"} and sum("10" in each for each in one) >= 2
     assert maps.value_scales([(every[0], motion)])[1] == maps.Scale("magma_r", 1e-5, 1.0, log=True)  # nothing missing
 
 
