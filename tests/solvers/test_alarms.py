@@ -12,12 +12,13 @@ import pytest
 
 from tests.helpers import random_kernel, small_world
 from trackmdp.app.cli import main
-from trackmdp.episodes.filtered import _posterior, simulate_filter
+from trackmdp.episodes.filtered import _declared, _posterior, simulate_filter
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import bounds, clocked
 from trackmdp.solvers.alarms import believed
 from trackmdp.solvers.evaluate import evaluate
+from trackmdp.world.make import make_world
 from trackmdp.world.model import Array, World
 
 
@@ -142,12 +143,22 @@ def test_a_report_is_weighed_against_the_others_silence() -> None:
     assert found[0] == pytest.approx(likely / likely.sum())
 
 
-def test_only_what_is_certain_is_declared() -> None:
-    """The target stays, two cells; p_f = .5 and p_d = .6 never tell with 90 %: r comes from the safe action alone."""
-    world = World(np.diag([0.7, 0.7]), (1, 2), cost=0.01, t_max=1, detection=0.6, safe_cost=0.1)
-    sure, bold = (simulate_filter(world, 0.5, 500, certainty=certainty) for certainty in (1.1, 0.5))
-    assert (sure.totals[:, 2] == sure.totals[:, 4]).all()
-    assert bold.totals[:, 2].sum() > sure.totals[:, 2].sum()
+def test_the_likeliest_report_is_declared_where_that_is_worth_more_than_a_miss() -> None:
+    """Belief .5 .3 .2, reports from cells 1 and 2: .3 for declaring cell 1, and what is lost by it, .2 or .4."""
+    belief, told = np.array([[0.5, 0.3, 0.2]] * 3), np.array([[False, True, True]] * 2 + [[False] * 3])
+    later = np.array([[-0.2] * 3, [-0.4] * 3, [0.2] * 3])
+    declared, cell = _declared(1.0, belief, told, later)
+    assert declared.tolist() == [True, False, False]
+    assert cell[0] == 1
+
+
+def test_weighing_reports_is_no_worse_than_believing_them() -> None:
+    """Each report has the r that believing it would have; what it tells of the others' silence comes on top."""
+    given = make_world("random_support", size=4, support_size=5, cost=0.16, t_max=1, seed=100)
+    world = World.of(given, given.kernel, detection=np.full(16, 0.95))
+    played = simulate_filter(world, 0.05, 1000).totals[:, 0]
+    exact = evaluate(world, clocked.solve(world), false_alarm=0.05).aihtr
+    assert played.mean() - exact > 2 * played.std() / 1000**0.5
 
 
 def test_a_large_system_is_iterated_to_the_same_value(monkeypatch: pytest.MonkeyPatch) -> None:

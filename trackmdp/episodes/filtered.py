@@ -1,9 +1,10 @@
 """A Bayes filter's policy where sensors also report targets that are not there: its figures, by simulation.
 
 No belief between two safe actions is a point then, so that there is no table of plans, and no exact value. The filter
-weighs every report, and every silence of a sensor that is on; the sets are those of the clocked policy
-(`solvers/clocked.py`) for the filtered belief. A report declares the likeliest cell where its posterior probability is
-`certainty` or more; r is earned where that is true, and n counts on from the last declaration.
+weighs every report, and every silence of a sensor that is on. Both of its decisions look one step ahead, the clocked
+bound U (`solvers/bounds.py`) saying what follows. The sets are those of the clocked policy for the filtered belief β.
+Of the cells reported it declares the likeliest, k, if r β_k + sum_j β_j (U(j, 0) - U(j, n + 1)) > 0: r is earned where
+that is true, and n counts on from the last declaration. A wrong one costs nothing by itself, and the belief remains.
 """
 
 from __future__ import annotations
@@ -14,18 +15,15 @@ from trackmdp.seeding import derive
 from trackmdp.solvers.alarms import check_alarms
 from trackmdp.solvers.bounds import clocked_table
 from trackmdp.solvers.recorded import ReplayedTracks
+from trackmdp.solvers.renewal import IndexArray
 from trackmdp.world.model import Array, BoolArray, World
 from trackmdp.world.tracks import Problem
 
-CERTAINTY = 0.9
-"""Posterior probability from which a report counts as a detection: a wrong one costs at most the rest of it."""
 _NEVER = 1e-12
 """Stands for p_f = 0, so that the evidence of a report is finite."""
 
 
-def simulate_filter(
-    world: Problem, false_alarm: float, episodes: int, *, seed: int = 0, certainty: float = CERTAINTY
-) -> ReplayedTracks:
+def simulate_filter(world: Problem, false_alarm: float, episodes: int, *, seed: int = 0) -> ReplayedTracks:
     """What the filter's policy earns and does on independent episodes.
 
     Args:
@@ -33,7 +31,6 @@ def simulate_filter(
         false_alarm: p_f, with which a sensor that is on reports the target in a step in which it is not there.
         episodes: how many, all stepped together.
         seed: of the draws.
-        certainty: posterior probability of a cell from which a report declares the target there.
 
     Raises:
         UserError: what `trackmdp.solvers.alarms.believed` refuses as well.
@@ -41,14 +38,15 @@ def simulate_filter(
     world = check_alarms(world, false_alarm)
     m, kernel = world.num_cells, world.kernel.toarray()
     edges, table = np.cumsum(kernel, axis=1), clocked_table(world).table
-    credit = world.reward + table[:, :1] - table[:, 1:]  # [M, t_max + 1]
+    located = (table[:, :1] - table[:, 1:]).T  # [t_max + 1, M], what to know the cell is worth more than a miss
     rng = np.random.default_rng(derive(seed, "false_alarm"))
     target, totals, watched = rng.integers(m, size=episodes), np.zeros((6, episodes)), np.zeros(m)
     belief, misses, row = np.eye(m)[target], np.zeros(episodes, dtype=np.int64), np.arange(episodes)
     while len(row):
         moves, chances = rng.random(len(row)), rng.random((len(row), m))
         predicted, forced = belief @ kernel, misses > world.t_max
-        gain = predicted * world.detection * credit.T[np.minimum(misses, world.t_max)]
+        later = located[np.minimum(misses, world.t_max)]
+        gain = predicted * world.detection * (world.reward + later)
         on = (gain > world.cost * predicted.sum(axis=1, keepdims=True)) & ~forced[:, None]
         target = (moves[:, None] >= edges[target]).sum(axis=1)
         inside = target < m
@@ -56,8 +54,9 @@ def simulate_filter(
         reports = on & (chances < np.where(there, world.detection, false_alarm))
         belief = _posterior(world, predicted, on, reports, false_alarm)
         belief[forced] = there[forced]
-        declared = forced | (reports.any(axis=1) & (belief.max(axis=1) >= certainty))
-        right = declared & inside & (belief.argmax(axis=1) == target)
+        declared, cell = _declared(world.reward, belief, reports, later)
+        right = inside & (forced | (declared & (cell == target)))
+        declared |= forced
         price = np.where(forced, world.safe_cost, on @ world.cost)
         counts = (inside, right, on.sum(axis=1) * inside, forced & inside, np.ones(len(row)))
         watched += on[inside].sum(axis=0)
@@ -65,6 +64,20 @@ def simulate_filter(
         misses = np.where(declared, 0, misses + 1)
         row, target, belief, misses = row[inside], target[inside], belief[inside], misses[inside]
     return ReplayedTracks(totals[:5].T, totals[5], watched)
+
+
+def _declared(reward: float, belief: Array, reports: BoolArray, later: Array) -> tuple[BoolArray, IndexArray]:
+    """`[E]` whether to declare the likeliest of the cells that reported, and `[E]` which it is.
+
+    Args:
+        reward: r.
+        belief: `[E, M]`, after the reports.
+        reports: `[E, M]`.
+        later: `[E, M]`, what the target's being located in each cell is worth more than going on without.
+    """
+    likely = np.where(reports, belief, 0.0)
+    worth = reward * likely.max(axis=1) + (belief * later).sum(axis=1)
+    return reports.any(axis=1) & (worth > 0), likely.argmax(axis=1)
 
 
 def _posterior(world: World, predicted: Array, on: BoolArray, reports: BoolArray, false_alarm: float) -> Array:
