@@ -219,7 +219,7 @@ worker.join()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("mode", "step"), [("kill", 43), ("power", 37), ("error", 41)])
+@pytest.mark.parametrize(("mode", "step"), [("kill", 23), ("power", 19), ("error", 21)])
 def test_a_run_that_ends_at_any_file_operation_resumes_to_the_same_run(mode: str, step: int, tmp_path: Path) -> None:
     """Some of the points only; step 1 goes through all of them, in minutes."""
     words = [sys.executable, "-m", "tests.training.crashpoints", str(tmp_path), mode, str(step)]
