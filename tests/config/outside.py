@@ -23,11 +23,9 @@ FILES = {
             return (here * stay + here[::-1] * (1 - stay)) * (1 - exit_probability)
     """,
     "outside/jump_config.py": """
-        from dataclasses import dataclass
         from trackmdp.config import KernelConfig, choice, option
 
         @choice("kernel", "jump", makes="outside.jump:jump")
-        @dataclass(kw_only=True)
         class JumpConfig(KernelConfig):
             '''Stays, or jumps to the opposite cell.'''
 
@@ -59,11 +57,9 @@ FILES = {
                 pass
     """,
     "outside/lazy_config.py": """
-        from dataclasses import dataclass
         from trackmdp.config import AlgoConfig, choice, option, refuse
 
         @choice("algo", "lazy", makes="outside.lazy:Lazy")
-        @dataclass(kw_only=True)
         class LazyConfig(AlgoConfig):
             '''Sleeps with all sensors on.'''
 
@@ -98,11 +94,9 @@ FILES = {
             return Policy.from_dense(world, table)
     """,
     "outside/nearest_config.py": """
-        from dataclasses import dataclass
         from trackmdp.config import BaselineConfig, choice, option
 
         @choice("solver", "nearest", makes="outside.nearest:solve")
-        @dataclass(kw_only=True)
         class NearestConfig(BaselineConfig):
             '''Senses the cells next to the last one.'''
 
@@ -131,11 +125,9 @@ FILES = {
                 self._file.close()
     """,
     "outside/lines_config.py": """
-        from dataclasses import dataclass
         from trackmdp.config import LogConfig, choice, option
 
         @choice("log", "lines", makes="outside.lines:Lines")
-        @dataclass(kw_only=True)
         class LinesConfig(LogConfig):
             '''`lines.txt`: a word for each iteration.'''
 

@@ -5,7 +5,6 @@ The group `baseline` (evaluate) offers all of them, the group `solver` (solve) t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from trackmdp.config.options import choice, listed, option, refuse
@@ -13,7 +12,6 @@ from trackmdp.config.schema import ChoiceConfig
 from trackmdp.machine import SIZE_PATTERN
 
 
-@dataclass(kw_only=True)
 class BaselineConfig(ChoiceConfig):
     """Base of the groups `baseline` and `solver`.
 
@@ -32,7 +30,6 @@ class BaselineConfig(ChoiceConfig):
 
 @choice("baseline", "qmdp", makes="trackmdp.solvers.qmdp:solve")
 @choice("solver", "qmdp", makes="trackmdp.solvers.qmdp:solve")
-@dataclass(kw_only=True)
 class QmdpConfig(BaselineConfig):
     """Q_MDP: sense every cell whose predicted probability is worth the sensor's price."""
 
@@ -40,7 +37,6 @@ class QmdpConfig(BaselineConfig):
 
 
 @choice("baseline", "all_on", makes="trackmdp.policies.policy:Policy.all_on")
-@dataclass(kw_only=True)
 class AllOnConfig(BaselineConfig):
     """All sensors on, always."""
 
@@ -48,7 +44,6 @@ class AllOnConfig(BaselineConfig):
 
 
 @choice("baseline", "none", makes="trackmdp.policies.policy:Policy.none")
-@dataclass(kw_only=True)
 class NoSensorsConfig(BaselineConfig):
     """No sensor on until the safe action is forced."""
 
@@ -56,7 +51,6 @@ class NoSensorsConfig(BaselineConfig):
 
 
 @choice("baseline", "random_k", makes="trackmdp.policies.policy:Policy.random_k")
-@dataclass(kw_only=True)
 class RandomKConfig(BaselineConfig):
     """k sensors drawn at random each step."""
 
@@ -72,7 +66,6 @@ class RandomKConfig(BaselineConfig):
 
 
 @choice("baseline", "myopic", makes="trackmdp.solvers.myopic:solve")
-@dataclass(kw_only=True)
 class MyopicConfig(BaselineConfig):
     """Sense the cells whose belief, conditioned on the misses so far, exceeds a threshold."""
 
@@ -81,14 +74,12 @@ class MyopicConfig(BaselineConfig):
 
 @choice("baseline", "clocked", makes="trackmdp.solvers.clocked:solve")
 @choice("solver", "clocked", makes="trackmdp.solvers.clocked:solve")
-@dataclass(kw_only=True)
 class ClockedConfig(BaselineConfig):
     """Sets read off the clocked bound."""
 
 
 @choice("baseline", "fcr", makes="trackmdp.solvers.fcr:solve")
 @choice("solver", "fcr", makes="trackmdp.solvers.fcr:solve")
-@dataclass(kw_only=True)
 class FcrConfig(BaselineConfig):
     """First cost reduction: decide as if nothing were observed any more."""
 
@@ -97,7 +88,6 @@ class FcrConfig(BaselineConfig):
 
 @choice("baseline", "lookahead", makes="trackmdp.solvers.lookahead:solve")
 @choice("solver", "lookahead", makes="trackmdp.solvers.lookahead:solve")
-@dataclass(kw_only=True)
 class LookaheadConfig(BaselineConfig):
     """Plan some sets ahead, then count on a simpler value."""
 
@@ -109,7 +99,6 @@ class LookaheadConfig(BaselineConfig):
 
 @choice("baseline", "optimal", makes="trackmdp.solvers.optimal:solve")
 @choice("solver", "optimal", makes="trackmdp.solvers.optimal:solve")
-@dataclass(kw_only=True)
 class OptimalConfig(BaselineConfig):
     """Policy iteration, search and branch and bound: the optimum with a certificate, or an honest bracket."""
 
@@ -128,7 +117,6 @@ class OptimalConfig(BaselineConfig):
 
 
 @choice("baseline", "sets", makes="trackmdp.policies.saved:read_sets")
-@dataclass(kw_only=True)
 class SetsConfig(BaselineConfig):
     """The sets in a file that evaluate, solve, export or a run has written."""
 
@@ -137,7 +125,6 @@ class SetsConfig(BaselineConfig):
 
 
 @choice("baseline", "playback", makes="trackmdp.policies.playback:Playback")
-@dataclass(kw_only=True)
 class PlaybackConfig(BaselineConfig):
     """The actions of a logged episode again, step by step, whatever is observed; none on after the last."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from trackmdp.config.learning import AlgoConfig, check_classes
@@ -11,7 +10,6 @@ from trackmdp.config.schema import BYTES, Sizes
 
 
 @choice("algo", "learned_kernel", makes="trackmdp.algos.learned_kernel:LearnedKernel")
-@dataclass(kw_only=True)
 class LearnedKernelConfig(AlgoConfig):
     """Estimate the motion from detections, then plan with the estimate; no networks."""
 
@@ -63,7 +61,6 @@ class LearnedKernelConfig(AlgoConfig):
 
 
 @choice("algo", "path_counts", makes="trackmdp.algos.path_counts:PathCounts")
-@dataclass(kw_only=True)
 class PathCountsConfig(AlgoConfig):
     """Collect with all sensors on, then count on those paths what sensing gains after each key; no networks.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -18,7 +17,6 @@ DEVICE = r"auto|cpu|cuda(:\d+)?"
 LEARNING_RATE, ENTROPY = "step size of the optimiser", "weight of the entropy bonus"
 
 
-@dataclass(kw_only=True)
 class ScheduleConfig(NodeConfig):
     """A number that is `start` up to the fraction `begin` of the run, `end` from `until`, and linear between."""
 
@@ -44,7 +42,6 @@ class ScheduleConfig(NodeConfig):
         return self.start + (self.end - self.start) * (progress - self.begin) / (self.until - self.begin)
 
 
-@dataclass(kw_only=True)
 class AlgoConfig(ChoiceConfig):
     """Base of the group `algo`: how a policy is learned. The three budgets are what `collector` takes by default.
 
@@ -63,7 +60,6 @@ class AlgoConfig(ChoiceConfig):
     envs: int = option("environments stepped together", ge=1)
 
 
-@dataclass(kw_only=True)
 class NetworkConfig(AlgoConfig):
     """What the algorithms have in common that learn networks from what they sense themselves."""
 
@@ -81,7 +77,6 @@ class NetworkConfig(AlgoConfig):
         return {"algo.hidden": networks(task, self.hidden)}
 
 
-@dataclass(kw_only=True)
 class ActorCriticConfig(NetworkConfig):
     """What A2C and PPO have in common."""
 
@@ -92,13 +87,11 @@ class ActorCriticConfig(NetworkConfig):
 
 
 @choice("algo", "a2c", makes="trackmdp.algos.a2c:A2C")
-@dataclass(kw_only=True)
 class A2cConfig(ActorCriticConfig):
     """Advantage actor-critic, one Bernoulli per sensor, one joint advantage."""
 
 
 @choice("algo", "ppo", makes="trackmdp.algos.ppo:PPO")
-@dataclass(kw_only=True)
 class PpoConfig(ActorCriticConfig):
     """Proximal policy optimisation, one Bernoulli per sensor, one joint advantage."""
 
@@ -115,7 +108,6 @@ class PpoConfig(ActorCriticConfig):
             raise refuse(f"{key}.minibatches", self.minibatches, expected)
 
 
-@dataclass(kw_only=True)
 class PrioritizedConfig(NodeConfig):
     """Prioritised replay: transitions are drawn in proportion to |TD error|^alpha."""
 
@@ -129,7 +121,6 @@ class PrioritizedConfig(NodeConfig):
 
 
 @choice("algo", "dqn", makes="trackmdp.algos.dqn:DQN")
-@dataclass(kw_only=True)
 class DqnConfig(NetworkConfig):
     """Double DQN with a Q that adds up over the sensors."""
 
@@ -157,7 +148,6 @@ class DqnConfig(NetworkConfig):
         return super().needs(task, root) | {"algo.buffer_size": self.buffer_size * (transition + priority)}
 
 
-@dataclass(kw_only=True)
 class CollectorConfig(ChoiceConfig):
     """Base of the group `collector`: where the frames come from. One frame is one env step of one environment."""
 
@@ -193,12 +183,10 @@ class CollectorConfig(ChoiceConfig):
 
 
 @choice("collector", "single", makes="trackmdp.training.collect:single")
-@dataclass(kw_only=True)
 class SingleConfig(CollectorConfig):
     """In the process that learns."""
 
 
-@dataclass(kw_only=True)
 class WorkersConfig(CollectorConfig):
     """What the two collectors with worker processes have more."""
 
@@ -212,19 +200,16 @@ class WorkersConfig(CollectorConfig):
 
 
 @choice("collector", "multi_sync", makes="trackmdp.training.collect:multi_sync")
-@dataclass(kw_only=True)
 class MultiSyncConfig(WorkersConfig):
     """In worker processes; every batch waits for all of them. A resumed run starts new episodes."""
 
 
 @choice("collector", "multi_async", makes="trackmdp.training.collect:multi_async")
-@dataclass(kw_only=True)
 class MultiAsyncConfig(WorkersConfig):
     """In worker processes; a batch is what one of them has ready. A resumed run starts new episodes."""
 
 
 @choice("collector", "ray", makes="trackmdp.training.collect:ray")
-@dataclass(kw_only=True)
 class RayWorkersConfig(WorkersConfig):
     """In workers of a Ray cluster: for one run whose environments need more cores than a machine has.
 

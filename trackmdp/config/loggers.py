@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from trackmdp.config.options import choice, option
@@ -11,7 +10,6 @@ from trackmdp.config.schema import ChoiceConfig
 from trackmdp.errors import require
 
 
-@dataclass(kw_only=True)
 class LogConfig(ChoiceConfig):
     """Base of the group `log`: what is written of each iteration, next to `summary.json`; any of them together.
 
@@ -23,7 +21,6 @@ class LogConfig(ChoiceConfig):
     """What it imports beyond trackmdp's own dependencies; it comes with the extra called as the choice is."""
 
 
-@dataclass(kw_only=True)
 class RowsConfig(LogConfig):
     """A row for each iteration that is due."""
 
@@ -31,13 +28,11 @@ class RowsConfig(LogConfig):
 
 
 @choice("log", "csv", makes="trackmdp.training.metrics:CsvLogger")
-@dataclass(kw_only=True)
 class CsvConfig(RowsConfig):
     """`metrics.csv`, which a training always writes: without this choice a row for every iteration."""
 
 
 @choice("log", "tensorboard", makes="trackmdp.training.metrics:TensorboardLogger")
-@dataclass(kw_only=True)
 class TensorboardConfig(RowsConfig):
     """TensorBoard event files."""
 
@@ -45,7 +40,6 @@ class TensorboardConfig(RowsConfig):
 
 
 @choice("log", "wandb", makes="trackmdp.training.trackers:WandbLogger")
-@dataclass(kw_only=True)
 class WandbConfig(RowsConfig):
     """Weights & Biases. `wandb sync` uploads what was logged offline, in the run's folder."""
 
@@ -55,7 +49,6 @@ class WandbConfig(RowsConfig):
 
 
 @choice("log", "mlflow", makes="trackmdp.training.trackers:MlflowLogger")
-@dataclass(kw_only=True)
 class MlflowConfig(RowsConfig):
     """MLflow, in a database or on a server."""
 
@@ -65,7 +58,6 @@ class MlflowConfig(RowsConfig):
 
 
 @choice("log", "mcap", makes="trackmdp.episodes.logger:EpisodeLogger")
-@dataclass(kw_only=True)
 class McapConfig(LogConfig):
     """`episodes.mcap`: simulated episodes, step by step, for `replay` and viewers."""
 

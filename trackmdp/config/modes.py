@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -14,7 +13,6 @@ MOST_MODES = 1_000
 """Velocities, or velocities and turns; the states of a target are as many times the cells."""
 
 
-@dataclass(kw_only=True)
 class HiddenKernelConfig(KernelConfig):
     """Base of the kernels with a mode; what a choice makes returns a kernel on (cell, mode), and the number of modes.
 
@@ -45,7 +43,6 @@ class HiddenKernelConfig(KernelConfig):
 
 
 @choice("kernel", "heading", makes="trackmdp.world.modes:heading_kernel")
-@dataclass(kw_only=True)
 class HeadingConfig(HiddenKernelConfig):
     """A target with one of eight headings, which the tracker is not shown; at the border it turns back."""
 
@@ -55,7 +52,6 @@ class HeadingConfig(HiddenKernelConfig):
 
 
 @choice("kernel", "regimes", makes="trackmdp.world.regimes:regimes")
-@dataclass(kw_only=True)
 class RegimesConfig(HiddenKernelConfig):
     """A target that switches between other kernels, such as to linger and to travel; the one in force is its mode.
 
@@ -87,7 +83,6 @@ class RegimesConfig(HiddenKernelConfig):
                 raise refuse(f"{key}.stay", self.stay, "numbers from 0 to 1")
 
 
-@dataclass(kw_only=True)
 class VelocityConfig(HiddenKernelConfig):
     """What the kernels in metres and seconds have in common.
 
@@ -119,13 +114,11 @@ class VelocityConfig(HiddenKernelConfig):
 
 
 @choice("kernel", "constant_velocity", makes="trackmdp.world.velocity:constant_velocity")
-@dataclass(kw_only=True)
 class ConstantVelocityConfig(VelocityConfig):
     """Nearly constant velocity, the mode, in metres and seconds; displacements have its mean exactly, never rounded."""
 
 
 @choice("kernel", "coordinated_turn", makes="trackmdp.world.velocity:coordinated_turn")
-@dataclass(kw_only=True)
 class CoordinatedTurnConfig(VelocityConfig):
     """As constant_velocity, but the target turns left, right or not at all; turn and velocity are the mode."""
 

@@ -166,7 +166,7 @@ def options(schema: type[Any]) -> dict[str, Option | type[Any]]:
             kind = int if described.pair else kind
             found[field.name] = dataclasses.replace(described, kind=kind, nullable=nullable)
         else:
-            raise TypeError(f"{schema.__name__}.{field.name} is neither an option nor a nested config")
+            raise TypeError(f"{schema.__name__}.{field.name} is neither option(...) nor a nested config")
     return found
 
 

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 from trackmdp.config.options import listed, option, refuse
 from trackmdp.config.schema import NodeConfig
 
 
-@dataclass(kw_only=True)
 class PartitionConfig(NodeConfig):
     """Blocks of the grid that plan or learn alone, for their own cells; the policy is valued on the whole grid."""
 
@@ -47,7 +45,6 @@ class PartitionConfig(NodeConfig):
         return {name: why for name in vars(self) if name != "block"} if self.block is None else {}
 
 
-@dataclass(kw_only=True)
 class SweptPartitionConfig(PartitionConfig):
     """Blocks that plan, and the rounds over the whole grid after them."""
 

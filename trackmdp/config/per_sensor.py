@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from trackmdp.config.learning import ENTROPY, LEARNING_RATE, AlgoConfig, ScheduleConfig, check_classes, networks
@@ -19,7 +18,6 @@ SELECTORS["credit"] = Selector(
 )
 
 
-@dataclass(kw_only=True)
 class PerSensorConfig(AlgoConfig):
     """What the algorithms with a credit per sensor have in common.
 
@@ -121,12 +119,10 @@ class PerSensorConfig(AlgoConfig):
 
 
 @choice("algo", "hindsight", makes="trackmdp.algos.hindsight:Hindsight")
-@dataclass(kw_only=True)
 class HindsightConfig(PerSensorConfig):
     """Collect with all sensors on, then learn from those paths what any policy would have found and missed on them."""
 
 
-@dataclass(kw_only=True)
 class PolicyGradientConfig(PerSensorConfig):
     """What A2C and PPO with a credit per sensor have in common."""
 
@@ -135,13 +131,11 @@ class PolicyGradientConfig(PerSensorConfig):
 
 
 @choice("algo", "a2c_per_sensor", makes="trackmdp.algos.per_sensor:PerSensorA2C")
-@dataclass(kw_only=True)
 class A2cPerSensorConfig(PolicyGradientConfig):
     """Hindsight with the policy gradient of A2C, over both actions of every sensor (algo=a2c credit=per_sensor)."""
 
 
 @choice("algo", "ppo_per_sensor", makes="trackmdp.algos.per_sensor:PerSensorPPO")
-@dataclass(kw_only=True)
 class PpoPerSensorConfig(PolicyGradientConfig):
     """Hindsight with the clipped surrogate of PPO, per sensor (algo=ppo credit=per_sensor)."""
 
@@ -153,6 +147,5 @@ class PpoPerSensorConfig(PolicyGradientConfig):
 
 
 @choice("algo", "dqn_per_sensor", makes="trackmdp.algos.per_sensor:PerSensorDQN")
-@dataclass(kw_only=True)
 class DqnPerSensorConfig(PerSensorConfig):
     """Hindsight with a Q that adds up over the sensors, for DQN (algo=dqn credit=per_sensor)."""

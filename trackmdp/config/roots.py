@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from trackmdp.config import counting, modes, per_sensor, sweeping  # noqa: F401  (more to choose from)
@@ -17,7 +16,6 @@ from trackmdp.config.world import GridConfig, KernelConfig, TaskConfig
 from trackmdp.errors import UserError
 
 
-@dataclass(kw_only=True)
 class CommandConfig(NodeConfig):
     """What every command has."""
 
@@ -25,7 +23,6 @@ class CommandConfig(NodeConfig):
     quiet: bool = option("say nothing at the terminal but errors")
 
 
-@dataclass(kw_only=True)
 class WorldConfig(CommandConfig):
     """What every command has that takes place in a world."""
 
@@ -44,14 +41,12 @@ class WorldConfig(CommandConfig):
         return {} if task is None else {"memory": task.memory, "clip": task.clip}
 
 
-@dataclass(kw_only=True)
 class EvaluationConfig(NodeConfig):
     """How often the policy is evaluated while it learns."""
 
     every: int = option("iterations from one exact evaluation to the next", unit="iterations", ge=1)
 
 
-@dataclass(kw_only=True)
 class OptimalBoundConfig(NodeConfig):
     """The certified optimum beside the policy's figures."""
 
@@ -62,7 +57,6 @@ class OptimalBoundConfig(NodeConfig):
     )
 
 
-@dataclass(kw_only=True)
 class CheckpointConfig(NodeConfig):
     """When the state of the run is saved."""
 
@@ -79,7 +73,6 @@ class CheckpointConfig(NodeConfig):
     keep: int = option("newest checkpoints kept", ge=1)
 
 
-@dataclass(kw_only=True)
 class TrainConfig(WorldConfig):
     """Learn a policy without the motion model, and evaluate it exactly."""
 
@@ -107,7 +100,6 @@ class TrainConfig(WorldConfig):
     )
 
 
-@dataclass(kw_only=True)
 class EvaluateConfig(WorldConfig):
     """Value a trained policy (run=) or a baseline (baseline=), exactly and by simulation."""
 
@@ -133,7 +125,6 @@ class EvaluateConfig(WorldConfig):
             raise refuse("log", listed(self.log), "[mcap] or []; an evaluation has no iterations")
 
 
-@dataclass(kw_only=True)
 class SolveConfig(WorldConfig):
     """Solve the world with its motion model."""
 
@@ -143,7 +134,6 @@ class SolveConfig(WorldConfig):
     verify: bool = option("check the paper's theorems on this world as well")
 
 
-@dataclass(kw_only=True)
 class VerifyConfig(WorldConfig):
     """Check the paper's theorems on a world."""
 
@@ -155,7 +145,6 @@ class VerifyConfig(WorldConfig):
             raise refuse("sensor", self.sensor.name, "perfect or miss; the theorems are on sensors of one cell")
 
 
-@dataclass(kw_only=True)
 class BenchmarkConfig(WorldConfig):
     """Measure time and memory on this machine; how good the policies are, sweeps and reports say."""
 
@@ -193,7 +182,6 @@ class BenchmarkConfig(WorldConfig):
             raise refuse("sensor", self.sensor.name, "perfect with part=peers, whose scripts know no other")
 
 
-@dataclass(kw_only=True)
 class ReplayConfig(CommandConfig):
     """Look at logged episodes, prove them, rebuild a damaged log; without more than file=, list what it holds."""
 
@@ -209,7 +197,6 @@ class ReplayConfig(CommandConfig):
     speed: float = option("speed of playing", unit="steps/s", gt=0, le=1000)
 
 
-@dataclass(kw_only=True)
 class ReportConfig(CommandConfig):
     """Make figures, tables and one web page of a sweep, or watch it run."""
 
@@ -224,7 +211,6 @@ class ReportConfig(CommandConfig):
     every: float = option("seconds from one look at the runs to the next, with watch=true", unit="s", gt=0, le=3600)
 
 
-@dataclass(kw_only=True)
 class ExportConfig(CommandConfig):
     """Write a learned policy as a file that runs without this package."""
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from dataclasses import Field, dataclass
+from typing import Any, ClassVar, Protocol, dataclass_transform
+
+from trackmdp.config.options import nested, option
 
 BYTES = {"float32": 4, "int64": 8, "float64": 8, "int16": 2, "bool": 1}
 """Bytes of one number of each kind, for `memory`."""
@@ -49,9 +51,17 @@ class Sizes(Protocol):
         """Whether moves of different paths combine."""
 
 
-@dataclass(kw_only=True)
+@dataclass_transform(kw_only_default=True, field_specifiers=(option, nested))
 class NodeConfig:
-    """Base of every schema. A rule on one option is its `option(...)`; what concerns several is said here."""
+    """Base of every schema, each a dataclass with keywords only, whose decorator it need not have.
+
+    A rule on one option is its `option(...)`; what concerns several is said here.
+    """
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+    def __init_subclass__(cls) -> None:
+        dataclass(kw_only=True)(cls)
 
     def check(self, key: str, root: Any) -> None:
         """Look after the rules between options of this node, and between them and those of the whole config.
@@ -76,7 +86,6 @@ class NodeConfig:
         return {}
 
 
-@dataclass(kw_only=True)
 class ChoiceConfig(NodeConfig):
     """Base of the config groups; `choice` gives each member its name and what it makes."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -15,7 +14,6 @@ LARGEST = 1e15
 """Of a price or a reward: sums of them over cells and steps, and squares of those in a loss, stay far from overflow."""
 
 
-@dataclass(kw_only=True)
 class CostConfig(ChoiceConfig):
     """Base of the group `cost`: what sensing earns and costs.
 
@@ -24,7 +22,6 @@ class CostConfig(ChoiceConfig):
 
 
 @choice("cost", "paper", makes="trackmdp.world.make:paper_cost")
-@dataclass(kw_only=True)
 class PaperCostConfig(CostConfig):
     """The paper's rewards: r for a detection, c per sensor switched on, D for the safe action."""
 
@@ -46,7 +43,6 @@ class PaperCostConfig(CostConfig):
         _check_per_cell(f"{key}.sensor", self.sensor, count, price, "number from 0 to 1e15", each)
 
 
-@dataclass(kw_only=True)
 class SensorConfig(ChoiceConfig):
     """Base of the group `sensor`: what a sensor that is on sees of the target in its cell.
 
@@ -62,7 +58,6 @@ class SensorConfig(ChoiceConfig):
 
 
 @choice("sensor", "perfect", makes="trackmdp.world.sensors:perfect")
-@dataclass(kw_only=True)
 class PerfectSensorConfig(SensorConfig):
     """The paper's sensors: one that is on always locates the target in its cell."""
 
@@ -74,7 +69,6 @@ def _chance(help: str) -> Any:
 
 
 @choice("sensor", "miss", makes="trackmdp.world.sensors:miss")
-@dataclass(kw_only=True)
 class MissConfig(SensorConfig):
     """Sensors that miss: one that is on reports the target in its cell with probability p_d, and never another cell."""
 
@@ -92,7 +86,6 @@ class MissConfig(SensorConfig):
 
 
 @choice("sensor", "false_alarm", makes="trackmdp.world.sensors:false_alarm")
-@dataclass(kw_only=True)
 class FalseAlarmConfig(SensorConfig):
     """For evaluate alone: sensors that also report targets that are not there; a policy believes each report."""
 
@@ -115,7 +108,6 @@ class FalseAlarmConfig(SensorConfig):
 
 
 @choice("sensor", "footprint", makes="trackmdp.world.sensors:footprint")
-@dataclass(kw_only=True)
 class FootprintConfig(SensorConfig):
     """Wide sensors: each covers several cells, and if on it always locates the target in any of them, never misses."""
 

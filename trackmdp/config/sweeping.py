@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from trackmdp.config.options import choice, option
@@ -13,7 +12,6 @@ PLUGINS = ("launcher", "sweeper")
 """What Hydra has plugins for, and this package choices of its own: `hydra/launcher`, `hydra/sweeper`."""
 
 
-@dataclass(kw_only=True)
 class PluginConfig(ChoiceConfig):
     """Base of both groups."""
 
@@ -27,7 +25,6 @@ class PluginConfig(ChoiceConfig):
             require(self.package, self.extra, f"{key.replace('.', '/')}={self.name}")
 
 
-@dataclass(kw_only=True)
 class SweeperConfig(PluginConfig):
     """Base of the group `hydra/sweeper`: which runs a sweep has.
 
@@ -37,7 +34,6 @@ class SweeperConfig(PluginConfig):
 
 
 @choice("hydra/sweeper", "blocks", makes="trackmdp.app.sweep.plan:grid")
-@dataclass(kw_only=True)
 class BlocksConfig(SweeperConfig):
     """Every combination of the values in each block; what is typed is added to each, or replaces its words."""
 
@@ -47,7 +43,6 @@ class BlocksConfig(SweeperConfig):
 
 
 @choice("hydra/sweeper", "optuna", makes="trackmdp.app.sweep.trials:trials")
-@dataclass(kw_only=True)
 class OptunaConfig(SweeperConfig):
     """A search: the words with several values, `range(a,b)` or `interval(a,b)` say what is searched."""
 
@@ -67,7 +62,6 @@ class OptunaConfig(SweeperConfig):
     )
 
 
-@dataclass(kw_only=True)
 class LauncherConfig(PluginConfig):
     """Base of the group `hydra/launcher`: where the runs of a sweep take place.
 
@@ -78,7 +72,6 @@ class LauncherConfig(PluginConfig):
 
 
 @choice("hydra/launcher", "basic", makes="trackmdp.app.sweep.launchers:run_basic")
-@dataclass(kw_only=True)
 class BasicConfig(LauncherConfig):
     """One run after the other, on this machine."""
 
@@ -86,7 +79,6 @@ class BasicConfig(LauncherConfig):
 
 
 @choice("hydra/launcher", "joblib", makes="trackmdp.app.sweep.launchers:run_joblib")
-@dataclass(kw_only=True)
 class JoblibConfig(LauncherConfig):
     """Several runs at once, on this machine."""
 
@@ -95,7 +87,6 @@ class JoblibConfig(LauncherConfig):
     n_jobs: int | None = option("runs at once; null = one for each core", unit="runs", ge=1, le=1024)
 
 
-@dataclass(kw_only=True)
 class SubmititConfig(LauncherConfig):
     """Base of the launchers that write a submission for each run."""
 
@@ -106,7 +97,6 @@ class SubmititConfig(LauncherConfig):
 
 
 @choice("hydra/launcher", "submitit_local", makes="trackmdp.app.sweep.launchers:run_here")
-@dataclass(kw_only=True)
 class SubmititLocalConfig(SubmititConfig):
     """As submitit_slurm, but on this machine: to try out what a cluster will do."""
 
@@ -114,7 +104,6 @@ class SubmititLocalConfig(SubmititConfig):
 
 
 @choice("hydra/launcher", "submitit_slurm", makes="trackmdp.app.sweep.launchers:run_on_slurm")
-@dataclass(kw_only=True)
 class SubmititSlurmConfig(SubmititConfig):
     """On the nodes of a SLURM cluster, as one job array; the folder must be one that every node sees."""
 
@@ -140,7 +129,6 @@ class SubmititSlurmConfig(SubmititConfig):
 
 
 @choice("hydra/launcher", "ray", makes="trackmdp.app.sweep.launchers:run_on_ray")
-@dataclass(kw_only=True)
 class RayConfig(LauncherConfig):
     """On a Ray cluster that is joined, or one that is started on this machine: for many runs on many machines.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from trackmdp.config.options import GROUPS, choice, listed, option, refuse
@@ -12,7 +11,6 @@ BORDERS = ("renormalize", "inside", "clip", "exit")
 MEMORIES = ("cell", "displacement", "displacement_gap", "two_displacements")
 
 
-@dataclass(kw_only=True)
 class GridConfig(NodeConfig):
     """The grid of cells and the limits on an episode."""
 
@@ -46,7 +44,6 @@ class GridConfig(NodeConfig):
         return rows, columns
 
 
-@dataclass(kw_only=True)
 class TaskConfig(NodeConfig):
     """What the policy may know."""
 
@@ -85,7 +82,6 @@ class TaskConfig(NodeConfig):
         return {"clip": "with task.memory=cell"} if self.memory == "cell" else {}
 
 
-@dataclass(kw_only=True)
 class KernelConfig(ChoiceConfig):
     """Base of the group `kernel`: how the target moves.
 
@@ -103,7 +99,6 @@ class KernelConfig(ChoiceConfig):
 
 
 @choice("kernel", "random_support", makes="trackmdp.world.kernels:random_support")
-@dataclass(kw_only=True)
 class RandomSupportConfig(KernelConfig):
     """The paper's motion: Z random positions around each cell, one of low probability, the others equal."""
 
@@ -126,7 +121,6 @@ class RandomSupportConfig(KernelConfig):
 
 
 @choice("kernel", "random_walk", makes="trackmdp.world.kernels:random_walk")
-@dataclass(kw_only=True)
 class RandomWalkConfig(KernelConfig):
     """A lazy random walk on the 4 or 8 neighbours."""
 
@@ -137,7 +131,6 @@ class RandomWalkConfig(KernelConfig):
 
 
 @choice("kernel", "drift", makes="trackmdp.world.kernels:drift")
-@dataclass(kw_only=True)
 class DriftConfig(KernelConfig):
     """A target that heads one way most of the time."""
 
@@ -148,7 +141,6 @@ class DriftConfig(KernelConfig):
 
 
 @choice("kernel", "table", makes="trackmdp.world.kernels:load_table")
-@dataclass(kw_only=True)
 class TableConfig(KernelConfig):
     """A table of your own: row i holds the probabilities of moving from cell i to each cell."""
 
@@ -161,7 +153,6 @@ class TableConfig(KernelConfig):
 
 
 @choice("kernel", "tracks", makes="trackmdp.world.make:recorded")
-@dataclass(kw_only=True)
 class TracksConfig(KernelConfig):
     """No motion model but recorded tracks: learn from most of them, choose by some, and judge on those held out."""
 

@@ -1,13 +1,10 @@
 """The options of `algo=counts`: what they are, in which unit and range; their values are in `conf/algo/counts.yaml`."""
 
-from dataclasses import dataclass
-
 from trackmdp.config.learning import AlgoConfig
 from trackmdp.config.options import choice, option
 
 
 @choice("algo", "counts", makes="trackmdp_counts.learner:Counts")
-@dataclass(kw_only=True)
 class CountsConfig(AlgoConfig):
     """Count the moves that are sensed, and look where the target is most often found so many steps later."""
 
