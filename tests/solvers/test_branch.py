@@ -30,9 +30,9 @@ def _tree() -> tuple[Tree, np.ndarray, np.ndarray]:
     world = paper_world(5, 0.22, 2)
     value = evaluate(world, search.solve(world)).value
     problem = InnerProblem.of(world, reachable_layers(world, 3), value)
-    known = tables(world, problem.detected, problem.missed, 2, slack=1e-9, run=_to_the_end)
-    tree = Tree(world, problem.detected, known, value, 1e-9)
-    closed = Tree(world, problem.detected, known, value, 1e-9)
+    known = tables(problem, slack=1e-9, run=_to_the_end)
+    tree = Tree(problem, known, value, 1e-9)
+    closed = Tree(problem, known, value, 1e-9)
     _to_the_end(closed)
     return tree, value, closed.best
 
@@ -118,8 +118,8 @@ def test_what_is_paid_on_the_way_covers_what_any_plan_gains() -> None:
         world = random_tiny_world(rng)
         value = evaluate(world, PolicyTable.none(world)).value
         problem = InnerProblem.of(world, reachable_layers(world, world.num_choices), value)
-        known = tables(world, problem.detected, problem.missed, world.t_max, slack=1e-9, run=_to_the_end)
-        tree = Tree(world, problem.detected, known, value, 1e-9)
+        known = tables(problem, slack=1e-9, run=_to_the_end)
+        tree = Tree(problem, known, value, 1e-9)
         tree.run(lambda tree, most=nodes: tree.nodes < most)
         paid = payment(tree, value)
         less = max(less, float((np.maximum(tree.upper() - value, 0.0) - paid).max()))

@@ -15,7 +15,7 @@ from trackmdp.solvers import bounds, estimator, pomdp, qmdp
 from trackmdp.solvers import optimal as optimum
 from trackmdp.solvers.branch import Tree
 from trackmdp.solvers.evaluate import evaluate
-from trackmdp.solvers.known import tables
+from trackmdp.solvers.known import tables, up_to
 from trackmdp.solvers.layers import Layer, layer_sets, reachable_layers
 from trackmdp.solvers.prediction import followed
 from trackmdp.solvers.renewal import per_row, row_index
@@ -143,7 +143,7 @@ def _tower_lemma(world: World, solution: Solution) -> Iterator[Check]:
     # `[E_n]`: joint probability of being there after n misses; it begins with 1 in each located cell.
     later, mass, first = problem.undetected(sets), np.ones(world.num_cells), -np.inf
     second, closed = -np.inf, True
-    known = tables(world, problem.detected, problem.missed, world.t_max, slack=SLACK, run=_run, layers=layers)
+    known = tables(problem, slack=SLACK, run=up_to(MOST_NODES))
     for n, layer in enumerate(layers[1:]):
         mass = (mass @ layer.moves) * (1.0 - sets[n] * world.detects(layer.cells))
         missed = mass > 0
@@ -178,8 +178,8 @@ def _one_cell_less(
     left = sparse.csr_array((mass[entry], (row, layer.cells[entry])), shape=(len(others), problem.world.num_cells))
     going_on = per_row(row, mass[entry] * later[entry], len(others))
     # `tree.best` is at least where it begins: begun at `going_on` itself, a loss would never show.
-    tree = Tree(problem.world, problem.detected, known, going_on - SEARCHED, SLACK, left, windowed=False)
-    _run(tree)
+    tree = Tree(replace(problem, windowed=False), known, going_on - SEARCHED, SLACK, left)
+    up_to(MOST_NODES)(tree)
     return float((going_on - tree.best).max()), tree.closed
 
 
@@ -311,7 +311,3 @@ def _order(world: World, solution: Solution) -> Iterator[Check]:
     statement = "optimum <= the printed bound (it charges sensors on the exit step)"
     note = f"{printed.mean():.6f}"
     yield _row("order", statement, (solution.value - printed).max(), expected=False, note=note)
-
-
-def _run(tree: Tree) -> None:
-    tree.run(lambda tree: tree.nodes < MOST_NODES)

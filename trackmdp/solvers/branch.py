@@ -36,7 +36,8 @@ from trackmdp.solvers.delayed import Delayed
 from trackmdp.solvers.joint import Joint
 from trackmdp.solvers.layers import within_window
 from trackmdp.solvers.renewal import IndexArray, per_row, row_index
-from trackmdp.world.model import Array, BoolArray, World
+from trackmdp.solvers.search import InnerProblem
+from trackmdp.world.model import Array, BoolArray
 
 # Choices under one heap entry: enough of them for array arithmetic to pay, and not so many that poor ones are expanded
 # along with the best one, which gives the batch its place in the heap.
@@ -59,31 +60,26 @@ class Tree:
 
     def __init__(
         self,
-        world: World,
-        detected: Array,
+        problem: InnerProblem,
         revealed: list[Array],
         lower: Array,
         slack: float,
         mass: sparse.csr_array | None = None,
-        *,
-        windowed: bool = True,
         delayed: Delayed | None = None,
     ) -> None:
         """Start with nothing chosen.
 
         Args:
-            world: the problem.
-            detected: `[M]`, worth of sensing the target in each cell, r + V.
+            problem: what seeing the target in each cell is worth, and whether a window limits the sets.
             revealed: R_0 ... R_{H-1}, each `[M]`; R_0 is exact (what follows the last set).
             lower: `[B]`, worth of a known chain for each problem.
             slack: plans better than the best known by less than this are not looked for.
             mass: `[B, M]`, where the undetected target may be, one problem per row; without it, B = M and row x is e_x.
-            windowed: whether the task's window around the located cell of each problem limits its sets.
             delayed: bounds on complete sets, at least as tight as those of `revealed`.
         """
-        self._windowed, self._delayed = windowed, delayed
-        self._world, self._detected, self._revealed, self._slack = world, detected, revealed, slack
-        self._joint = Joint(world, detected, revealed)
+        self._world, self._detected, self._windowed = problem.world, problem.detected, problem.windowed
+        self._revealed, self._slack, self._delayed = revealed, slack, delayed
+        self._joint = Joint(problem.world, problem.detected, revealed)
         self.best = lower.copy()
         self.nodes = 0
         # Problem -> cells left unsensed at each step, for the problems with a better plan than `lower`.
@@ -93,7 +89,7 @@ class Tree:
         self._complete: dict[int, list[Choices]] = {}
         self._ticket = itertools.count()
         # Nothing is earned yet, all H sets are to be chosen, and no batch came before.
-        start = sparse.eye_array(world.num_cells, format="csr") if mass is None else mass
+        start = sparse.eye_array(self._world.num_cells, format="csr") if mass is None else mass
         most = np.full(len(lower), np.inf) if delayed is None else start @ delayed.revealed[len(revealed)]
         self._open(np.arange(len(lower)), np.zeros(len(lower)), start, len(revealed), most, None)
 

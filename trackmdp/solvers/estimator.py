@@ -14,12 +14,12 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers.branch import Tree
 from trackmdp.solvers.evaluate import evaluate
-from trackmdp.solvers.known import tables
+from trackmdp.solvers.known import tables, up_to
 from trackmdp.solvers.layers import Layer, layer_sets, reachable_layers
 from trackmdp.solvers.prediction import renewal
-from trackmdp.solvers.renewal import IndexArray, accumulate, forced_worth, per_row
+from trackmdp.solvers.renewal import IndexArray, accumulate, per_row
+from trackmdp.solvers.search import InnerProblem
 from trackmdp.world.model import Array, BoolArray, World
 
 MOST_NODES = 100_000
@@ -65,16 +65,6 @@ class EstimatorAccuracy:
     missed_per_episode: float
 
 
-def known_positions(world: World, value: Array) -> list[Array]:
-    """W after n + 1 misses, for n = 0 ... t_max, each `[M]`: best play from a known position, V = `value`."""
-    # r + V(j) for a detection; after the last free choice, R_0(x) = sum_j P_xj (r - D + V(j)).
-    detected = world.reward + value
-    forced = forced_worth(world, detected)
-    known = tables(world, detected, forced, world.t_max, slack=1e-9, run=_run)
-    # `tables` counts sets left (R_0 first), here misses: after n + 1 misses there are t_max - n sets left.
-    return known[::-1]
-
-
 def positions(world: World, policy: PolicyTable, value: Array) -> list[PositionEstimate]:
     """The estimates at every info state that `policy` brings about, n = 0 ... t_max.
 
@@ -82,7 +72,8 @@ def positions(world: World, policy: PolicyTable, value: Array) -> list[PositionE
     where `policy` and `value` are optimal.
     """
     layers = reachable_layers(world, world.num_choices)
-    later = known_positions(world, value)
+    # W after n + 1 misses, best play from a known position: there are t_max - n sets left then.
+    later = tables(InnerProblem.of(world, layers, value), slack=1e-9, run=up_to(MOST_NODES))[::-1]
     mass, estimates = np.ones(world.num_cells), []
     for n, sensed in enumerate(layer_sets(layers, policy)):
         predicted = mass @ layers[n + 1].moves
@@ -150,7 +141,3 @@ def _visits(world: World, policy: PolicyTable) -> Array:
     start = np.zeros(located.shape[0])
     start[: world.num_cells] = 1.0 / world.num_cells
     return accumulate(sparse.csr_array(located.T), start, world.size)[: world.num_cells]
-
-
-def _run(tree: Tree) -> None:
-    tree.run(lambda tree: tree.nodes < MOST_NODES)

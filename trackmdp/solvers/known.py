@@ -6,11 +6,12 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from scipy import sparse
 
 from trackmdp.solvers.branch import Tree
-from trackmdp.solvers.layers import Layer, reachable_layers
+from trackmdp.solvers.delayed import Delayed
 from trackmdp.solvers.search import InnerProblem
-from trackmdp.world.model import Array, BoolArray, World
+from trackmdp.world.model import Array, BoolArray
 
 
 def first_guess(problem: InnerProblem, known: list[Array], mass: Array) -> list[BoolArray]:
@@ -23,45 +24,42 @@ def first_guess(problem: InnerProblem, known: list[Array], mass: Array) -> list[
     return sets
 
 
-def next_table(problem: InnerProblem, known: list[Array], slack: float) -> Tree:
-    """The tree that gives R_H once run (`Tree.upper`), H the length of `problem`, from R_0 ... R_{H-1}.
-
-    The position j is revealed in the middle of a plan made in any x, so that no window around j limits the sets: R is
-    then an upper bound for every x, and exact without a window.
-    """
-    problem, mass = replace(problem, windowed=False), np.ones(problem.world.num_cells)
-    lower = problem.worth(first_guess(problem, known, mass), mass)
-    return Tree(problem.world, problem.detected, known, lower, slack, windowed=False)
-
-
 def tables(
-    world: World,
-    detected: Array,
-    missed: Array,
-    length: int,
-    *,
-    slack: float,
-    run: Callable[[Tree], None],
-    layers: list[Layer] | None = None,
-    known: list[Array] | None = None,
+    problem: InnerProblem, *, slack: float, run: Callable[[Tree], None], known: list[Array] | None = None
 ) -> list[Array]:
-    """R_0 ... R_length, each `[M]`; upper bounds where `run` ends a search early.
+    """R_0 ... R_{H-1} of a `problem` of length H, each `[M]`; upper bounds where `run` ends a search early.
 
     Args:
-        world: the problem.
-        detected: `[M]`, worth of sensing the target in each cell, r + V.
-        missed: `[M]`, R_0.
-        length: sets of the last table.
+        problem: whose window is left out of account: the position j is revealed in the middle of a plan made in any x,
+            and a window around x says nothing about j. R is then a bound for every x, and exact without a window.
         slack: worth that may be missed.
         run: runs the tree of one table, to its end or not.
-        layers: possible positions, where they are known already.
         known: R_0, R_1, ..., as far as they are known already.
     """
-    # R_h needs h layers only, the first ones of those that are there
-    layers = reachable_layers(world, length) if layers is None else layers
-    known = [missed] if known is None else known[: length + 1]
-    for sets in range(len(known), length + 1):
-        tree = next_table(InnerProblem(world, layers[: sets + 1], detected, missed), known, slack)
+    problem, mass = replace(problem, windowed=False), np.ones(problem.world.num_cells)
+    known = [problem.missed] if known is None else known[: problem.length]
+    for sets in range(len(known), problem.length):
+        # R_h needs h layers only, the first ones of those that are there
+        part = replace(problem, layers=problem.layers[: sets + 1])
+        tree = Tree(part, known, part.worth(first_guess(part, known, mass), mass), slack)
         run(tree)
         known.append(tree.upper())
     return known
+
+
+def planted(
+    problem: InnerProblem,
+    lower: Array,
+    slack: float,
+    run: Callable[[Tree], None],
+    mass: sparse.csr_array | None = None,
+) -> Tree:
+    """The tree of a `problem`, not searched yet, with the tightest tables there are; `run` makes them, see `Tree`."""
+    delayed = Delayed.of(problem.world, problem.detected, problem.missed, problem.length)
+    known = tables(problem, slack=slack, run=run, known=None if delayed is None else delayed.revealed)
+    return Tree(problem, known, lower, slack, mass, delayed)
+
+
+def up_to(nodes: int) -> Callable[[Tree], None]:
+    """Runs a tree until so many choices of it have been looked at."""
+    return lambda tree: tree.run(lambda tree: tree.nodes < nodes)

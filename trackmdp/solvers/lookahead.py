@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -12,7 +13,7 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.bounds import clocked_table, valid
 from trackmdp.solvers.branch import Tree
 from trackmdp.solvers.exchange import exchange
-from trackmdp.solvers.known import first_guess, tables
+from trackmdp.solvers.known import first_guess, tables, up_to
 from trackmdp.solvers.layers import Layer, policy_table, reachable_layers
 from trackmdp.solvers.search import InnerProblem
 from trackmdp.world.model import Array, BoolArray, World
@@ -58,32 +59,17 @@ def _tail_table(world: World, tail: Tail) -> Array:
 
 def _first_set(problem: InnerProblem, layers: list[Layer], mass: Array) -> BoolArray:
     """`[E]` the first set of the best plan from each located cell, on the second layer of `problem`."""
-    world, known = problem.world, _known(problem, layers)
+    # R of a known position is that of the first layers, which begin in each cell.
+    world, run, start = problem.world, up_to(MOST_NODES), replace(problem, layers=layers[: problem.length + 1])
+    known = tables(start, slack=SLACK, run=run)
     sets = exchange(problem, first_guess(problem, known, mass), mass)
     origin, after = problem.layers[:2]
     # one problem per located cell: its undetected mass after the sets carried out so far
     here = sparse.csr_array((mass, (origin.rows, origin.cells)), shape=(world.num_cells, world.num_cells))
     here.eliminate_zeros()
-    tree = Tree(world, problem.detected, known, problem.worth(sets, mass), SLACK, here)
-    _run(tree)
+    tree = Tree(problem, known, problem.worth(sets, mass), SLACK, here)
+    run(tree)
     better, left = tree.improvements()
     if not better.any():
         return sets[0]
     return np.where(better[after.rows], (mass @ after.moves > 0) & ~left[0].has(after.rows, after.cells), sets[0])
-
-
-def _known(problem: InnerProblem, layers: list[Layer]) -> list[Array]:
-    """R_0 ... R_{H-1} for the plan's tail."""
-    return tables(
-        problem.world,
-        problem.detected,
-        problem.missed,
-        problem.length - 1,
-        slack=SLACK,
-        run=_run,
-        layers=layers,
-    )
-
-
-def _run(tree: Tree) -> None:
-    tree.run(lambda tree: tree.nodes < MOST_NODES)

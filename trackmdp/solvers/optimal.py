@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
@@ -22,11 +23,11 @@ from trackmdp.seeding import derive
 from trackmdp.solvers import clocked
 from trackmdp.solvers.bounds import exact_clocked_table
 from trackmdp.solvers.branch import Tree
-from trackmdp.solvers.delayed import Delayed
+from trackmdp.solvers.budget import Budget, Shares
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.exchange import exchanged
-from trackmdp.solvers.known import tables
+from trackmdp.solvers.known import planted
 from trackmdp.solvers.layers import Layer, layer_sets, policy_table, reachable_layers
 from trackmdp.solvers.regions import adopted, improved, proved, region_side
 from trackmdp.solvers.renewal import RenewalSystem, expected_steps, row_index
@@ -84,7 +85,7 @@ def solve(
     """
     if world.max_steps is not None:
         raise UserError(f"grid.max_steps={world.max_steps}: only whole episodes are solved, expected null")
-    run = _Run(world, _Budget(nodes, time_limit), tolerance, start, on_progress, region_side(world, memory))
+    run = _Run(world, Budget(nodes, time_limit), tolerance, start, on_progress, region_side(world, memory))
     interrupted = False
     try:
         run.search()
@@ -93,74 +94,13 @@ def solve(
     return run.solution(interrupted)
 
 
-@dataclass
-class _Ground:
-    """What every round uses, built once there is a search: layers, the system I - P, the longest expected episode."""
-
-    world: World
-    layers: list[Layer] = field(init=False)
-    paths: RenewalSystem = field(init=False)
-    longest: float = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.layers = reachable_layers(self.world, self.world.num_choices)
-        self.paths = RenewalSystem(self.world.kernel, self.world.size)
-        self.longest = float(expected_steps(self.world).max())
-
-
-class _Budget:
-    """Work that may be done, in nodes, and that was; the clock is only read where a time limit is set."""
-
-    def __init__(self, nodes: int, time_limit: float | None) -> None:
-        self.nodes, self.spent, self.timed_out = nodes, 0, False
-        self.started = time.monotonic()
-        self._ends = None if time_limit is None else self.started + time_limit
-
-    def left(self) -> bool:
-        """Whether there is work left to do."""
-        # A limit that has passed stays passed: the rounds after it end one by one.
-        self.timed_out = self.timed_out or (self._ends is not None and time.monotonic() >= self._ends)
-        return self.spent < self.nodes and not self.timed_out
-
-    def run(self, tree: Tree, go_on: Callable[[Tree], bool]) -> None:
-        """Run `tree` while there is work left and `go_on` holds."""
-        before, spent = tree.nodes, self.spent
-
-        def within(tree: Tree) -> bool:
-            self.spent = spent + tree.nodes - before
-            return self.left() and go_on(tree)
-
-        try:
-            tree.run(within)
-        finally:
-            self.spent = spent + tree.nodes - before
-
-
-class _Shares:
-    """The `nodes` of a round, shared out among trees that are run one after the other, region by region."""
-
-    def __init__(self, budget: _Budget, nodes: int, passed: Callable[[float], bool]) -> None:
-        self._budget, self._ends, self._passed = budget, budget.spent + nodes, passed
-        self.closed = True
-
-    def run(self, done: int, regions: int, tree: Tree) -> None:
-        """Run a tree of the next region, `done` of all `regions` being done.
-
-        With 60 of 100 regions done and 800 nodes left, it has 800 / 40 = 20: what it leaves over goes to the others.
-        """
-        self._passed(done / regions)
-        most = (self._ends - self._budget.spent) / (regions - done)
-        self._budget.run(tree, lambda tree: tree.nodes < most)
-        self.closed = self.closed and tree.closed
-
-
 class _Run:
     """One search: the policy and the bracket so far."""
 
     def __init__(
         self,
         world: World,
-        budget: _Budget,
+        budget: Budget,
         tolerance: float,
         start: PolicyTable | None,
         on_progress: Callable[[SearchProgress], None] | None,
@@ -190,9 +130,28 @@ class _Run:
             self.policy, self.evaluation = policy, evaluation
         return better
 
+    @cached_property
+    def layers(self) -> list[Layer]:
+        """Where plans of the whole grid are made: not there where it is searched region by region."""
+        return reachable_layers(self.world, self.world.num_choices)
+
+    @cached_property
+    def paths(self) -> RenewalSystem:
+        return RenewalSystem(self.world.kernel, self.world.size)
+
+    @cached_property
+    def longest(self) -> float:
+        return float(expected_steps(self.world).max())
+
     @property
     def gap_allowed(self) -> float:
         return max(self.tolerance, ROUNDING) * max(1.0, abs(float(self.value.mean())))
+
+    @property
+    def slack(self) -> float:
+        # Improvements of one renewal below the slack cannot add up to more than half of the gap allowed: a path of
+        # `longest` expected steps has at most as many renewals.
+        return 0.5 * self.gap_allowed / self.longest
 
     @property
     def certified(self) -> bool:
@@ -215,8 +174,7 @@ class _Run:
         if self.side is not None:
             self.search_regions(self.side)
             return
-        self.ground = _Ground(self.world)
-        layers = self.ground.layers
+        layers = self.layers
         # first the policy, then the proof: branch and bound is the faster the better its start
         self.use(policy_table(self.world, layers, follow_credit(self.world, layers, layer_sets(layers, self.policy))))
         if self.world.coverage is None:
@@ -240,8 +198,6 @@ class _Run:
 
         Ascent and exchange, with V made anew after each round, end where the homotopy does, within a few rounds.
         """
-        longest = float(expected_steps(self.world).max())
-        paths = RenewalSystem(self.world.kernel, self.world.size)
         patience = max(FIRST_NODES, NODES_A_CELL * self.world.num_cells)
         while self.open():
             self.improve_regions(side)
@@ -250,12 +206,11 @@ class _Run:
                 self.use(self.start)
             if not self.open():
                 return
-            shares = _Shares(self.budget, patience, self.clock("branch and bound"))
-            slack = 0.5 * self.gap_allowed / longest
+            shares = Shares(self.budget, patience, self.clock("branch and bound"))
             # e(x) = eps_x pays for every plan of x (see the module), and asks for one tree at a time; `payment` asks
             # for all of them at once.
-            short, policy = proved(self.world, self.policy, self.value, side, slack, shares.run)
-            self.bound = np.minimum(self.bound, self.value + paths.upper(short, longest))
+            short, policy = proved(self.world, self.policy, self.value, side, self.slack, shares.run)
+            self.pay(short)
             better = self.use(policy)
             self.report()
             # All trees were searched to their ends and hold no better plan: more nodes would change nothing.
@@ -303,21 +258,18 @@ class _Run:
                 self.found, best = policy, value
         return self.found is not None
 
+    @property
+    def problem(self) -> InnerProblem:
+        """The search from each located cell, over the policy at hand."""
+        return InnerProblem.of(self.world, self.layers, self.value)
+
     def round(self, patience: int) -> bool:
         """Search the renewals of the policy at hand; whether a better policy was found."""
-        # Improvements of one renewal below the slack cannot add up to more than half of the gap allowed: a path of
-        # `longest` expected steps has at most as many renewals.
-        slack = 0.5 * self.gap_allowed / self.ground.longest
-        problem = InnerProblem.of(self.world, self.ground.layers, self.value)
-        given = self.world, problem.detected, problem.missed
-        delayed = Delayed.of(*given, problem.length)
 
         def run(tree: Tree) -> None:
             self.budget.run(tree, lambda tree: tree.nodes < patience)
 
-        revealed = None if delayed is None else delayed.revealed
-        revealed = tables(*given, self.world.t_max, slack=slack, run=run, layers=self.ground.layers, known=revealed)
-        tree = Tree(self.world, problem.detected, revealed, self.value, slack, delayed=delayed)
+        tree = planted(self.problem, self.value, self.slack, run)
         try:
             self.explore(tree, patience)
         finally:  # what was found and proved is kept when the user interrupts as well
@@ -331,7 +283,6 @@ class _Run:
 
     def covered_round(self) -> bool:
         """As `round`, by `two_sets`."""
-        layers, slack = self.ground.layers, 0.5 * self.gap_allowed / self.ground.longest
         if self.world.num_choices != 2:
             return False
 
@@ -339,25 +290,21 @@ class _Run:
             self.budget.spent += plans
             return self.budget.left()
 
-        problem = InnerProblem.of(self.world, layers, self.value)
-        found = best_plans(problem, layer_sets(layers, self.policy), slack, looked_at)
+        found = best_plans(self.problem, layer_sets(self.layers, self.policy), self.slack, looked_at)
         if found is None:
             return False
-        # e(x) = eps_x pays for every plan of x (see the module).
-        short = np.maximum(found[0] - self.value, 0.0)
-        self.bound = np.minimum(self.bound, self.value + self.ground.paths.upper(short, self.ground.longest))
-        return self.use(policy_table(self.world, layers, found[1]))
+        self.pay(np.maximum(found[0] - self.value, 0.0))  # e(x) = eps_x pays for every plan of x (see the module)
+        return self.use(policy_table(self.world, self.layers, found[1]))
 
     def adopt(self, tree: Tree) -> bool:
         """Use the better plans that the tree has found; whether the policy is better with them."""
-        problem = InnerProblem.of(self.world, self.ground.layers, self.value)
-        sets = adopted(problem, layer_sets(self.ground.layers, self.policy), tree)
+        sets = adopted(self.problem, layer_sets(self.layers, self.policy), tree)
         return sets is not None and self.use(self.exchanged(sets))
 
     def exchanged(self, sets: list[BoolArray]) -> PolicyTable:
         """The policy that exchange makes of `sets`."""
-        layers = self.ground.layers
-        return policy_table(self.world, layers, exchanged(self.world, layers, sets, go_on=self.budget.left))
+        better = exchanged(self.world, self.layers, sets, go_on=self.budget.left)
+        return policy_table(self.world, self.layers, better)
 
     def explore(self, tree: Tree, patience: int) -> None:
         """Run the tree until it is closed or the budget is spent.
@@ -378,7 +325,7 @@ class _Run:
             if tree.nodes >= next_look:
                 next_look += patience
                 self.tighten(tree)
-                gained = self.ground.paths.solve(tree.best - self.value).mean()
+                gained = self.paths.solve(tree.best - self.value).mean()
                 if not self.restarted:
                     self.restarted = True
                     if self.restart():
@@ -391,10 +338,12 @@ class _Run:
 
     def tighten(self, tree: Tree) -> None:
         """Use what the tree has proved so far, for any V, also one off by its error."""
-        paid = payment(tree, self.value)
+        self.pay(payment(tree, self.value))
+
+    def pay(self, paid: Array) -> None:
+        """Use a proof that `paid` `[M]`, the e of the module's text, pays for every plan over the policy at hand."""
         # The clocked bound and all that earlier rounds proved hold as well: the least of them is kept, cell by cell.
-        met = self.ground.paths.upper(paid, self.ground.longest)
-        self.bound = np.minimum(self.bound, self.value + met)
+        self.bound = np.minimum(self.bound, self.value + self.paths.upper(paid, self.longest))
 
     def solution(self, interrupted: bool) -> Solution:
         bound, certified = np.maximum(self.bound, self.value), self.certified

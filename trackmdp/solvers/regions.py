@@ -20,10 +20,9 @@ from trackmdp.machine import free_bytes, gib, parse_bytes
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import clocked
 from trackmdp.solvers.branch import Tree
-from trackmdp.solvers.delayed import Delayed
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.exchange import exchange, revealed
-from trackmdp.solvers.known import tables
+from trackmdp.solvers.known import planted
 from trackmdp.solvers.layers import Layer, reachable_layers, sensed_csr
 from trackmdp.solvers.partition import Block, blocks, cells_of, reach, sub_world
 from trackmdp.solvers.prediction import followed
@@ -211,10 +210,6 @@ def _closed(region: _Region, slack: float, run: Callable[[Tree], None]) -> tuple
     open_ = np.flatnonzero(region.own & (most > slack))
     if not len(open_):
         return region.sets, most
-    given = problem.world, problem.detected, problem.missed
-    delayed = Delayed.of(*given, problem.length)
-    known = None if delayed is None else delayed.revealed
-    known = tables(*given, problem.length - 1, slack=slack, run=run, layers=region.layers, known=known)
     # One problem per cell, so that the window of problem x is that around cell x; those that are closed have no mass,
     # and nothing is better than what they have.
     start = np.zeros(len(located))
@@ -223,7 +218,7 @@ def _closed(region: _Region, slack: float, run: Callable[[Tree], None]) -> tuple
     mass.eliminate_zeros()
     lower = np.full(len(located), np.inf)
     lower[open_] = region.value[open_]
-    tree = Tree(problem.world, problem.detected, known, lower, slack, mass, delayed=delayed)
+    tree = planted(problem, lower, slack, run, mass)
     run(tree)
     most[open_] = np.minimum(most, tree.upper() - region.value)[open_]
     return adopted(problem, region.sets, tree) or region.sets, most
