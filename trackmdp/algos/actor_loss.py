@@ -25,6 +25,8 @@ _LARGEST_LOGIT = 20.0
 _LARGEST_LOG_RATIO = 6.0
 _SOFT_LIMIT = 4.0
 _PULL = 0.1
+# Of sets that cool down, at the end: |z| = .2 is a probability of 1.8 or 98.2 %.
+_COOLEST = 0.05
 
 
 @dataclass(frozen=True)
@@ -104,19 +106,25 @@ class SensorCredit:
 class ActorLoss(nn.Module):
     """Base: the loss of every sensor at every row. Sums over paths; the caller weighs them."""
 
+    def __init__(self) -> None:
+        super().__init__()
+        self._heat = 1.0
+
     def allocate(self, shape: tuple[int, int, int], device: torch.device) -> None:
         """Make what depends on the shape (M, T+1, K) of the logits; called once."""
 
-    def prepare(self, update: int, progress: float) -> None:
+    def prepare(self, update: int, progress: float) -> None:  # noqa: ARG002
         """Set what changes in the course of a run, before update number `update`."""
+        self._heat = _COOLEST**progress
 
     def acting(self, logits: Tensor) -> Tensor:
-        """`[M, T+1, K]`, the sensors on, or with what probability: what the gain of one with footprint stands beside.
+        """`[M, T+1, K]`, with what probability the sensors are on: what the gain of one with footprint stands beside.
 
-        Of a loss that is least at log(gain / price) z is no probability; two sensors of the same cells would both be on
-        at half the gain.
+        Of a loss that is least at log(gain / price) z is no probability: at σ(z) two sensors of the same cells would
+        stay on at half the gain each. The sets cool down to z > 0 in the course of a run; hard ones from the start on
+        would be the local optimum that the first few updates fall into.
         """
-        return logits > 0
+        return (logits / self._heat).sigmoid()
 
     def forward(self, logits: Tensor, credit: SensorCredit) -> Tensor:
         """`[M, T+1, K]` losses of `logits` z `[M, T+1, K]`."""
@@ -144,8 +152,9 @@ class PolicyGradient(ActorLoss):
         super().__init__()
         self._schedule, self._entropy = entropy, entropy.start
 
-    def prepare(self, update: int, progress: float) -> None:  # noqa: ARG002
+    def prepare(self, update: int, progress: float) -> None:
         """Set β."""
+        super().prepare(update, progress)
         self._entropy = self._schedule.at(progress)
 
     def forward(self, logits: Tensor, credit: SensorCredit) -> Tensor:
