@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from hydra.core.override_parser.types import Override
@@ -12,8 +12,8 @@ from omegaconf import DictConfig
 from trackmdp.app.words import parsed, values_of
 from trackmdp.config import GROUPS, ROOTS, SELECTORS, Option, options
 from trackmdp.config.compose import composed_values, known_options
-from trackmdp.config.options import choices_of, listed, refuse, several
-from trackmdp.config.refusals import refuse_renamed, unknown_choice, unknown_option
+from trackmdp.config.options import listed, refuse, several
+from trackmdp.config.refusals import check_choice, check_option, refuse_renamed
 from trackmdp.errors import UserError
 
 Compose = Callable[[Sequence[str]], DictConfig]
@@ -28,59 +28,54 @@ def diagnose(error: Exception, command: str, words: Sequence[str], compose: Comp
         words: its overrides, as typed.
         compose: composes a config from overrides.
     """
-    if isinstance(error, UserError):  # a file of the user's was refused
-        return error
     try:
         # Composing stops at the first mistake in its own order, and its message names Hydra's internals. The words are
         # gone through again here, to name the one that is wrong with what was expected instead.
-        overrides = [_read(word) for word in words]
-    except UserError as misspelt:
-        return misspelt
+        if not isinstance(error, UserError):  # else a file of the user's was refused
+            _refuse_wrong(error, command, words, compose)
+    except UserError as refusal:
+        return refusal
+    # No word is at fault: an interpolation, a defaults list or a user's file; Hydra's message is all there is.
+    return error if isinstance(error, UserError) else UserError(_plain(error))
+
+
+def _refuse_wrong(error: Exception, command: str, words: Sequence[str], compose: Compose) -> None:
+    """Refuse the first of the words that is wrong.
+
+    Raises:
+        UserError: there is one.
+    """
+    overrides = [parsed(word) for word in words]
+    for override in overrides:
+        refuse_renamed(override.key_or_group)
     # Hydra says that a sweep "requires --multirun"; nothing is wrong with the value itself.
     sweeps = [override.input_line for override in overrides if override.is_sweep_override()]
     if sweeps and ("multirun" in str(error).lower()):
         group, _, names = str(sweeps[0]).partition("=")
         if several(ROOTS[command], group) and "[" not in names:
-            return UserError(f"{sweeps[0]}: expected {group}=[{names}]")
-        return UserError(f"{sweeps[0]}: expected one value; add -m to run once for each")
-    groups = [override for override in overrides if _of_group(override, command)]
-    files = [override for override in overrides if _is_choice(override, command)]
+            raise UserError(f"{sweeps[0]}: expected {group}=[{names}]")
+        raise UserError(f"{sweeps[0]}: expected one value; add -m to run once for each")
+    files = [override for override in overrides if _is_file(override, command)]
+    groups = [override for override in overrides if _is_choice(override, command)]
     # Choices before values: with algo=pppo every algo.* would be unknown, though only the choice is wrong.
     for override in files:
-        if refusal := _bad_file(override, error):
-            return refusal
+        _check_file(override, str(error))
     for override in groups:
-        if refusal := _bad_choice(override, error):
-            return refusal
+        _check_choice(override, str(error))
     # What options there are depends on the choices: in algo=a2c,ppo algo.epochs is an option of one of them. The first
     # combination that composes and shows a mistake decides.
-    for choices in _jobs([*files, *groups]):
+    for choices in itertools.product(*map(_single_words, [*files, *groups])):
         try:
             values = composed_values(compose(choices), ROOTS[command])
         except Exception:  # the choices themselves are at fault; at the end Hydra's own message is reported
             continue
         known = dict(known_options(ROOTS[command], values))
         for override in overrides:
-            if override not in [*files, *groups] and (refusal := _bad_value(override, known)):
-                return refusal
-    # No word is at fault: an interpolation, a defaults list or a user's file; Hydra's message is all there is.
-    return UserError(_plain(error))
+            if override not in [*files, *groups]:
+                _check_value(override, known)
 
 
-def _read(word: str) -> Override:
-    """A word as Hydra reads it.
-
-    Raises:
-        UserError: it cannot be read, or it has the former name of an option or of a choice.
-    """
-    override = parsed(word)
-    refuse_renamed(override.key_or_group)
-    for value in _names(override):
-        refuse_renamed(override.key_or_group, str(value))
-    return override
-
-
-def _of_group(override: Override, command: str) -> bool:
+def _is_choice(override: Override, command: str) -> bool:
     """Whether a word chooses from one of the command's groups."""
     # A selector such as credit=joint picks a file within its group (`algo`), and belongs to the command if the group
     # does.
@@ -89,64 +84,55 @@ def _of_group(override: Override, command: str) -> bool:
     return chosen in GROUPS and chosen in options(ROOTS[command])
 
 
-def _bad_choice(override: Override, error: Exception) -> UserError | None:
-    """The refusal of a choice that Hydra did not find."""
-    group = override.key_or_group
-    for value in _names(override):
-        # Hydra says `find` of a single choice and `load` of one in a list.
-        missing = any(f"Could not {verb} '{group}/{value}" in str(error) for verb in ("find", "load"))
-        if not isinstance(value, str) or (value not in choices_of(group) and missing):
-            return unknown_choice(group, value)
-    return None
-
-
-def _is_choice(override: Override, command: str) -> bool:
+def _is_file(override: Override, command: str) -> bool:
     """Whether a word chooses an experiment, a launcher or a sweeper: exactly one, by the name of a file."""
     key = override.key_or_group
     return key.startswith("hydra/") or (key == "experiment" and command == "train")
 
 
-def _bad_file(override: Override, error: Exception) -> UserError | None:
-    """The refusal of a choice that does not exist, or of several where one is expected; None if it is right."""
+def _check_choice(override: Override, said: str) -> None:
+    """Refuse a choice that Hydra did not find, as it `said`."""
+    group = override.key_or_group
+    for value in _names(override):
+        # Hydra says `find` of a single choice and `load` of one in a list.
+        missing = any(f"Could not {verb} '{group}/{value}" in said for verb in ("find", "load"))
+        if missing or not isinstance(value, str):
+            check_choice(group, value)
+
+
+def _check_file(override: Override, said: str) -> None:
+    """Refuse a choice that does not exist, as Hydra `said`, or several where one is expected."""
     key, values = override.key_or_group, values_of(override)
     if len(values) > 1:
-        return UserError(f"{override.input_line}: expected one {key.split('/')[-1]}")
-    said = str(error)
-    if f"Could not find '{key}/{values[0]}'" not in said:
-        return None
-    # Hydra ends its message with one option a line, each after a tab. Schemas are stored as `base_...`, and are no
-    # choices.
-    tail = said.partition(f"Available options in '{key}':")[2].splitlines()[1:]
-    names = [line.strip() for line in itertools.takewhile(lambda line: line.startswith("\t"), tail)]
-    known = [name for name in names if not name.startswith("base_")]
-    return refuse(key, values[0], f"one of {', '.join(known) or 'none, since there is none'}")
+        raise UserError(f"{override.input_line}: expected one {key.split('/')[-1]}")
+    if f"Could not find '{key}/{values[0]}'" in said:
+        # Hydra ends its message with one option a line, each after a tab. Schemas are stored as `base_...`, and are no
+        # choices.
+        tail = said.partition(f"Available options in '{key}':")[2].splitlines()[1:]
+        names = [line.strip() for line in itertools.takewhile(lambda line: line.startswith("\t"), tail)]
+        known = [name for name in names if not name.startswith("base_")]
+        raise refuse(key, values[0], f"one of {', '.join(known) or 'none, since there is none'}")
 
 
-def _jobs(groups: Sequence[Override]) -> Iterator[list[str]]:
-    """Every combination of the groups' choices, as overrides."""
-    per_group = [
-        [f"{each.key_or_group}={listed(value) if isinstance(value, list) else value}" for value in values_of(each)]
-        for each in groups
-    ]
-    yield from (list(words) for words in itertools.product(*per_group))
-
-
-def _bad_value(override: Override, known: dict[str, Option]) -> UserError | None:
+def _check_value(override: Override, known: dict[str, Option]) -> None:
+    """Refuse an option that is not among the known ones, or has a value that is not allowed."""
     key = override.key_or_group
     # Hydra's own options have no schema of ours; `group@package` moves a choice to a place that is not known here.
     if key.split(".")[0] == "hydra" or "@" in key:
-        return None
-    if key not in known:
-        if inner := [name for name in known if name.startswith(f"{key}.")]:
-            return UserError(f"{override.input_line}: expected {inner[0]}=value (known: {', '.join(inner)})")
-        return unknown_option(key, known)
+        return
+    if inner := [name for name in known if name.startswith(f"{key}.")]:
+        raise UserError(f"{override.input_line}: expected {inner[0]}=value (known: {', '.join(inner)})")
     # Every option exists already: `+` would add a second meaning, `~` would leave a hole in the typed config.
-    if override.is_delete() or override.is_add():
-        return UserError(f"{override.input_line}: expected {key}=value, without + or ~")
+    if key in known and (override.is_delete() or override.is_add()):
+        raise UserError(f"{override.input_line}: expected {key}=value, without + or ~")
     for value in values_of(override):
-        if not known[key].allows(value):
-            return refuse(key, value, known[key].expected)
-    return None
+        check_option(key, value, known)
+
+
+def _single_words(override: Override) -> list[str]:
+    """A word for each of the choices that a word makes."""
+    values = [listed(value) if isinstance(value, list) else value for value in values_of(override)]
+    return [f"{override.key_or_group}={value}" for value in values]
 
 
 def _names(override: Override) -> list[Any]:

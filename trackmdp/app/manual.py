@@ -11,8 +11,8 @@ from dataclasses import fields
 from typing import Any
 
 from trackmdp.config import GROUPS, ROOTS, SELECTORS, Option, options
-from trackmdp.config.options import choices_of, listed, several
-from trackmdp.config.refusals import refuse_renamed, unknown_choice
+from trackmdp.config.options import listed, several
+from trackmdp.config.refusals import check_choice
 from trackmdp.config.registry import load_plugins
 from trackmdp.config.sweeping import PLUGINS
 from trackmdp.config.values import choice_values, read_values
@@ -119,9 +119,7 @@ def _choices(command: str, words: Sequence[str]) -> dict[str, str]:
         if (SELECTORS[key].group if key in SELECTORS else key) not in groups:
             continue
         for each in _names(name) if several(ROOTS[command], key) else [name]:
-            refuse_renamed(key, each)
-            if each not in choices_of(key):
-                raise unknown_choice(key, each)
+            check_choice(key, each)
         made[key] = name
     return made if made.keys() - SELECTORS.keys() else {}  # a selector alone chooses nothing
 

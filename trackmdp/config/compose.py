@@ -15,8 +15,8 @@ from typing import Any, TypeVar
 from omegaconf import DictConfig, OmegaConf
 
 from trackmdp.config.checks import absolute_paths, refuse_ignored, validate
-from trackmdp.config.options import GROUPS, SELECTORS, Option, choices_of, optional, options, refuse, several
-from trackmdp.config.refusals import refuse_renamed, unknown_choice, unknown_option
+from trackmdp.config.options import GROUPS, SELECTORS, Option, optional, options, several
+from trackmdp.config.refusals import check_choice, check_option
 from trackmdp.config.roots import ROOTS, CommandConfig
 from trackmdp.config.tree import build_config
 from trackmdp.config.values import choice_values, read_values, resolved
@@ -36,7 +36,7 @@ def compose(command: str, overrides: Mapping[str, Any] | None = None, *, folder:
     Raises:
         UserError: a name, a type or a range is wrong, or a rule between options is broken.
     """
-    typed = {key: _plain(value) for key, value in (overrides or {}).items()}
+    typed = dict(_by_option(overrides or {}))
     root = read_values(command)
     schema = ROOTS[command]
     chosen = _chosen(root, schema, typed)
@@ -51,7 +51,6 @@ def compose(command: str, overrides: Mapping[str, Any] | None = None, *, folder:
     known = dict(known_options(schema, values))
     # After all choices are merged, so that `algo.epochs` is looked up among the options of the algorithm that
     # was chosen.
-    typed = _by_option(typed, known)
     for key, value in typed.items():
         if key not in chosen:
             _put(values, key, value, known)
@@ -142,9 +141,8 @@ def _chosen(root: Mapping[str, Any], schema: type[Any], typed: Mapping[str, Any]
         many = several(schema, group)
         names = name if many and isinstance(name, list) else [name]
         for each in names:
-            refuse_renamed(group, str(each))
-            if each not in list(choices_of(group)) and not (each is None and optional(schema, group)):
-                raise unknown_choice(group, each)
+            if each is not None or not optional(schema, group):
+                check_choice(group, each)
         chosen[group] = names if many else name
     return chosen
 
@@ -164,22 +162,18 @@ def known_options(schema: type[Any], values: Any, prefix: str = "") -> Iterator[
             yield from known_options(GROUPS[name][inner["name"]] if name in GROUPS else item, inner, f"{prefix}{name}.")
 
 
-def _by_option(typed: Mapping[str, Any], known: Mapping[str, Option]) -> dict[str, Any]:
-    """What was given by the name of a node as a mapping, `algo.entropy={"start": 0.1}`, by those of its options."""
-    flat: dict[str, Any] = {}
-    for key, value in typed.items():
-        inner = isinstance(value, Mapping) and key not in known
-        flat |= _by_option({f"{key}.{name}": each for name, each in value.items()}, known) if inner else {key: value}
-    return flat
+def _by_option(given: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Options by their dotted names; a mapping, as in ``{"algo.entropy": {"start": 0.1}}``, holds those of a node."""
+    for name, value in given.items():
+        if isinstance(value, Mapping):
+            yield from _by_option(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", _plain(value)
 
 
 def _put(values: dict[str, Any], key: str, value: Any, known: Mapping[str, Option]) -> None:
     """Set the option `key`, checked."""
-    if key not in known:
-        refuse_renamed(key)
-        raise unknown_option(key, known)
-    if not known[key].allows(value):
-        raise refuse(key, value, known[key].expected)
+    check_option(key, value, known)
     *parents, last = key.split(".")
     for parent in parents:
         values = values[parent]

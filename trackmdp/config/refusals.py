@@ -22,18 +22,17 @@ RENAMED: dict[str, str] = {
     "log.layout": "log.mcap.layout",
     "lr": "algo.learning_rate",
 }
-"""Former name of an option (``group.option``) or of a choice (``group=choice``) -> its name."""
+"""Former name of an option (``group.option``) -> its name."""
 
 
-def refuse_renamed(key: str, choice: str = "") -> None:
-    """Refuse the former name of an option, or of the choice `choice` of the group `key`.
+def refuse_renamed(key: str) -> None:
+    """Refuse the former name of an option.
 
     Raises:
         UserError: it is one; the message has the new name.
     """
-    former = f"{key}={choice}" if choice else key
-    if former in RENAMED:
-        raise UserError(f"{former}: renamed, expected {RENAMED[former]}")
+    if key in RENAMED:
+        raise UserError(f"{key}: renamed, expected {RENAMED[key]}")
 
 
 def suggestion(name: str, known: Iterable[str], listed: Iterable[str] | None = None) -> str:
@@ -54,6 +53,24 @@ def unknown_option(key: str, known: Mapping[str, Option]) -> UserError:
     return UserError(f"{key}: unknown option{suggestion(key, known, names)}")
 
 
-def unknown_choice(group: str, value: Any) -> UserError:
-    """The refusal of what is none of the choices of a group or of a selector."""
-    return refuse(group, value, f"one of {', '.join(choices_of(group))}")
+def check_option(key: str, value: Any, known: Mapping[str, Option]) -> None:
+    """Refuse an option that is not among the known ones, or a value that it does not allow.
+
+    Raises:
+        UserError: it is one; the message names the option that may be meant.
+    """
+    if key not in known:
+        refuse_renamed(key)
+        raise unknown_option(key, known)
+    if not known[key].allows(value):
+        raise refuse(key, value, known[key].expected)
+
+
+def check_choice(group: str, name: Any) -> None:
+    """Refuse what is none of the choices of a group or of a selector.
+
+    Raises:
+        UserError: it is none.
+    """
+    if not isinstance(name, str) or name not in choices_of(group):
+        raise refuse(group, name, f"one of {', '.join(choices_of(group))}")

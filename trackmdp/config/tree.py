@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 
 from trackmdp.config.checks import validate
 from trackmdp.config.options import GROUPS, Option, as_float, options, several
-from trackmdp.config.refusals import suggestion, unknown_choice
+from trackmdp.config.refusals import check_choice, suggestion
 from trackmdp.config.roots import CommandConfig, TrainConfig, WorldConfig
 from trackmdp.config.schema import ChoiceConfig
 from trackmdp.config.untrusted import MAX_BYTES, parse_yaml
@@ -111,10 +111,8 @@ def build_config(plain: Any, schema: type[Any], prefix: str = "", group: str = "
     values = dict(plain)
     if group in GROUPS and issubclass(schema, ChoiceConfig):
         found = values.pop("name", None)
-        name = named or found
-        if not isinstance(name, str) or name not in GROUPS[group]:
-            raise unknown_choice(group, name)
-        schema = GROUPS[group][name]
+        check_choice(group, named or found)
+        schema = GROUPS[group][named or found]
     known = options(schema)
     for key in values:
         if key not in known:

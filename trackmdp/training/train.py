@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -59,7 +59,7 @@ def train(
         Preempted: a signal ended the run; with a folder it can be resumed.
     """
     place = None if folder is None else Path(folder)
-    given = dict(_flat(options)) | {"algo": algo, "seed": seed, "quiet": not progress}
+    given = {_key(name): value for name, value in options.items()} | {"algo": algo, "seed": seed, "quiet": not progress}
     config: TrainConfig = compose("train", given | _described(problem, place))
     if place is not None:
         require_packages(config.log)
@@ -71,15 +71,10 @@ def train(
         return complete(make_trainer(problem, config, folder=place, callbacks=callbacks, console=console))
 
 
-def _flat(given: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Options by the dotted names of the command line."""
-    for name, value in given.items():
-        known = prefix or "." in name or name in options(TrainConfig) or name in SELECTORS or name in GROUPS
-        key = f"{prefix}{name}" if known else f"algo.{name}"
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{key}.")
-        else:
-            yield key, value
+def _key(name: str) -> str:
+    """The option, or group of them, that an argument names."""
+    known = "." in name or name in options(TrainConfig) or name in SELECTORS or name in GROUPS
+    return name if known else f"algo.{name}"
 
 
 def _described(problem: Problem, folder: Path | None) -> dict[str, Any]:

@@ -22,6 +22,15 @@ from trackmdp.world.model import World
 from trackmdp.world.sensors import false_alarm
 from trackmdp.world.tracks import Problem
 
+FIGURES = {
+    "aihtr": "AIHTR",
+    "accuracy": "accuracy",
+    "sensors_per_step": "sensors per step",
+    "safe_per_episode": "safe actions per episode",
+    "expected_length": "steps per episode",
+}
+"""Figures of a policy as tables at the terminal have them."""
+
 
 def run(cfg: EvaluateConfig, problem: Problem, policy: Policy, subject: str, folder: Path, console: Console) -> float:
     """Write `evaluation.json` to `folder`; returns the exact AIHTR with the false alarms, each report believed.
@@ -40,33 +49,29 @@ def run(cfg: EvaluateConfig, problem: Problem, policy: Policy, subject: str, fol
     silent, alarmed = evaluate(world, policy), evaluate(world, policy, false_alarm=sensor.p_f)
     # A window is about the last located cell, and the filter is never sure of one.
     wanted = cfg.episodes if world.window is None else 0
-    played = simulate_filter(world, sensor.p_f, wanted, seed=cfg.seed).intervals(np.arange(wanted))
-    filtered = {key: asdict(each) for key, each in played.items()}
+    simulated = simulate_filter(world, sensor.p_f, wanted, seed=cfg.seed).intervals(np.arange(wanted))
+    filtered = {key: asdict(each) for key, each in simulated.items()}
     # How long a target stays is known exactly, and whatever is sensed the same: most of what returns vary by.
     steps, rate = alarmed.expected_length, filtered["reward_per_step"]
     filtered["aihtr"] |= {end: rate[end] and steps * rate[end] for end in ("mean", "low", "high")}
     # Not the clocked bound: a report that is wrong sets the clock back, and D is paid later.
     bound = float(bounds.valid(world).mean())
     loss = (silent.aihtr - alarmed.aihtr) / alarmed.expected_length
-    write_json(
-        folder / "evaluation.json",
-        {
-            "policy": subject,
-            "p_f": sensor.p_f,
-            "exact": figures(alarmed),
-            "without_false_alarms": figures(silent),
-            "filter": filtered if wanted else None,
-            "bounds": {"valid": bound},
-            "loss_per_step": loss,
-        },
-    )
-    names = {"aihtr": "AIHTR", "accuracy": "accuracy", "sensors_per_step": "sensors per step"}
     told, plain = figures(alarmed), figures(silent)
+    report = {
+        "policy": subject,
+        "p_f": sensor.p_f,
+        "exact": told,
+        "without_false_alarms": plain,
+        "filter": filtered if wanted else None,
+        "bounds": {"valid": bound},
+        "loss_per_step": loss,
+    }
+    write_json(folder / "evaluation.json", report)
     rows = []
-    for key, label in names.items():
-        rows.append(
-            [label, f"{told[key]:,.4f}", f"{plain[key]:,.4f}", with_interval(filtered[key], 4) if wanted else ""]
-        )
+    for key in ("aihtr", "accuracy", "sensors_per_step"):
+        played = with_interval(filtered[key], 4) if wanted else ""
+        rows.append([FIGURES[key], f"{told[key]:,.4f}", f"{plain[key]:,.4f}", played])
     heads = ["figure", f"p_f = {sensor.p_f:g}, exact", "p_f = 0", f"Bayes filter, {wanted} episodes, 95 %"]
     console.print(table(f"{subject}, each report taken for the truth", heads, rows))
     console.print(

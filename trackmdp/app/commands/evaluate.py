@@ -9,12 +9,12 @@ from typing import Any
 
 import torch
 from rich.console import Console
+from rich.table import Table
 
 from trackmdp.app.commands import alarms, held_out, playback
 from trackmdp.app.commands.trained import trained
 from trackmdp.config import EvaluateConfig, FalseAlarmConfig, McapConfig, PlaybackConfig, load_run_config, to_yaml
 from trackmdp.durable import write_json, write_text
-from trackmdp.episodes.batch import Episodes
 from trackmdp.episodes.figures import Simulation
 from trackmdp.episodes.log import EpisodeLog
 from trackmdp.episodes.simulate import simulate
@@ -24,7 +24,7 @@ from trackmdp.reports.picture import draw_picture
 from trackmdp.solvers import estimator
 from trackmdp.solvers.solve import baseline_policy
 from trackmdp.training.display import make_console, table
-from trackmdp.training.evaluator import Evaluator, Score, figures
+from trackmdp.training.evaluator import figures
 from trackmdp.training.held_out import make_evaluator
 from trackmdp.training.machine import make_device
 from trackmdp.training.sealing import SUMMARY, check_files, read_summary
@@ -53,6 +53,11 @@ def run(cfg: EvaluateConfig, folder: Path, problem: Problem | None = None) -> fl
     # Recorded tracks have no kernel, hence no exact value and no bound: figures come from the held-out tracks.
     if isinstance(world, Recorded):
         return held_out.run(world, policy, subject, folder, console, cfg.seed)
+    return _exact(cfg, world, policy, subject, folder, console)
+
+
+def _exact(cfg: EvaluateConfig, world: Modelled, policy: Policy, subject: str, folder: Path, console: Console) -> float:
+    """Evaluate with the motion model."""
     evaluator = make_evaluator(world)
     # The run's own summary has measured against what it proved; the same world gets the same regret here.
     proved = _proved(cfg.run) if cfg.run else None
@@ -65,15 +70,29 @@ def run(cfg: EvaluateConfig, folder: Path, problem: Problem | None = None) -> fl
     told = policy.deterministic and world.max_steps is None and world.perfect and not policy.task.keyed
     told = told and world.coverage is None
     estimate = estimator.accuracy(world, policy) if told and isinstance(world, World) else None
-    report = _report(subject, evaluator, score, simulation) | {
+    report = {
+        "policy": subject,
+        "exact": figures(score.evaluation),
+        "simulated": asdict(simulation) if simulation else None,
+        "qmdp": figures(evaluator.qmdp) if evaluator.qmdp else None,
+        "bounds": evaluator.bounds,
+        "regret_per_step": score.regret_per_step,
+        "regret_per_step_lower": score.regret_per_step_lower,
         "optimal": proved,
         "estimator": asdict(estimate) if estimate else None,
     }
     write_json(folder / "evaluation.json", report | write_sets(folder, policy, value=score.evaluation.value))
     write_text(folder / "picture.txt", draw_picture(episodes, world))
-    _show(console, subject, evaluator, score, simulation, folder, "run's bracket" if proved else "clocked")
+    console.print(_compared(subject, report, simulation))
+    source = "run's bracket" if proved else "clocked"
+    console.print(f"upper bound ({source}) {evaluator.upper:,.4f}; {score.regret}")
+    console.print(f"results in {folder}, sets in {sets_name(world)}")
     if isinstance(mcap := cfg.log.get("mcap"), McapConfig):
-        _log_episodes(cfg, mcap, world, episodes, subject, folder, console)
+        config = to_yaml(load_run_config(cfg.run) if cfg.run else cfg)
+        log = EpisodeLog(folder, world, seed=cfg.seed, config=config, layout=mcap.layout, tell=_tell)
+        log.add(episodes, {"label": subject})
+        if log.close():
+            console.print(f"{log.episodes} episodes in {log.file}")
     if estimate is not None:
         shares = (
             f"from Q {estimate.exact:.2%} (printed form {estimate.paper:.2%}), from the belief {estimate.bayes:.2%}"
@@ -82,25 +101,8 @@ def run(cfg: EvaluateConfig, folder: Path, problem: Problem | None = None) -> fl
     return score.evaluation.aihtr
 
 
-def _log_episodes(
-    cfg: EvaluateConfig,
-    mcap: McapConfig,
-    world: Modelled,
-    episodes: Episodes,
-    subject: str,
-    folder: Path,
-    console: Console,
-) -> None:
-    """Write `episodes.mcap`: the episodes that the simulated figures are those of."""
-    described = to_yaml(load_run_config(cfg.run) if cfg.run else cfg)
-
-    def tell(line: str) -> None:
-        sys.stderr.write(f"trackmdp evaluate: {line}\n")
-
-    log = EpisodeLog(folder, world, seed=cfg.seed, config=described, layout=mcap.layout, tell=tell)
-    log.add(episodes, {"label": subject})
-    if log.close():
-        console.print(f"{log.episodes} episodes in {log.file}")
+def _tell(line: str) -> None:
+    sys.stderr.write(f"trackmdp evaluate: {line}\n")
 
 
 def _proved(run: str) -> dict[str, Any] | None:
@@ -127,42 +129,12 @@ def _baseline(cfg: EvaluateConfig, problem: Problem | None) -> tuple[Problem, Po
     return world, baseline_policy(world, cfg.baseline), cfg.baseline.name
 
 
-def _report(subject: str, evaluator: Evaluator, score: Score, simulation: Simulation | None) -> dict[str, Any]:
-    return {
-        "policy": subject,
-        "exact": figures(score.evaluation),
-        "simulated": asdict(simulation) if simulation else None,
-        "qmdp": figures(evaluator.qmdp) if evaluator.qmdp else None,
-        "bounds": evaluator.bounds,
-        "regret_per_step": score.regret_per_step,
-        "regret_per_step_lower": score.regret_per_step_lower,
-    }
-
-
-def _show(
-    console: Console,
-    subject: str,
-    evaluator: Evaluator,
-    score: Score,
-    simulation: Simulation | None,
-    folder: Path,
-    source: str,
-) -> None:
-    names = {
-        "aihtr": "AIHTR",
-        "accuracy": "accuracy",
-        "sensors_per_step": "sensors per step",
-        "safe_per_episode": "safe actions per episode",
-        "expected_length": "steps per episode",
-    }
-    assert evaluator.qmdp is not None  # there is a motion model
-    exact, qmdp = figures(score.evaluation), figures(evaluator.qmdp)
+def _compared(subject: str, report: dict[str, Any], simulation: Simulation | None) -> Table:
+    """The figures of the policy, exact and simulated, beside those of Q_MDP."""
     rows = []
-    for key, label in names.items():
+    for key, label in alarms.FIGURES.items():
         estimate = getattr(simulation, key) if simulation else None
         simulated = f"{estimate.mean:,.4f} ± {estimate.standard_error:.4f}" if estimate else ""
-        rows.append([label, f"{exact[key]:,.4f}", simulated, f"{qmdp[key]:,.4f}"])
+        rows.append([label, f"{report['exact'][key]:,.4f}", simulated, f"{report['qmdp'][key]:,.4f}"])
     title = f"simulated, {simulation.episodes} episodes ± s.e." if simulation else "simulated"
-    console.print(table(subject, ["figure", "exact", title, "Q_MDP exact"], rows))
-    console.print(f"upper bound ({source}) {evaluator.upper:,.4f}; {score.regret}")
-    console.print(f"results in {folder}, sets in {sets_name(evaluator.world)}")
+    return table(subject, ["figure", "exact", title, "Q_MDP exact"], rows)
