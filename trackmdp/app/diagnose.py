@@ -11,9 +11,9 @@ from omegaconf import DictConfig
 
 from trackmdp.app.words import parsed, values_of
 from trackmdp.config import GROUPS, ROOTS, SELECTORS, Option, options
+from trackmdp.config.checks import check_choice, check_option, refuse_renamed
 from trackmdp.config.compose import composed_values, known_options
 from trackmdp.config.options import listed, refuse, several
-from trackmdp.config.refusals import check_choice, check_option, refuse_renamed
 from trackmdp.errors import UserError
 
 Compose = Callable[[Sequence[str]], DictConfig]
@@ -48,6 +48,7 @@ def _refuse_wrong(error: Exception, command: str, words: Sequence[str], compose:
     overrides = [parsed(word) for word in words]
     for override in overrides:
         refuse_renamed(override.key_or_group)
+        values_of(override)  # refused here where they cannot be listed
     # Hydra says that a sweep "requires --multirun"; nothing is wrong with the value itself.
     sweeps = [override.input_line for override in overrides if override.is_sweep_override()]
     if sweeps and ("multirun" in str(error).lower()):

@@ -11,8 +11,8 @@ from dataclasses import fields
 from typing import Any
 
 from trackmdp.config import GROUPS, ROOTS, SELECTORS, Option, options
+from trackmdp.config.checks import check_choice
 from trackmdp.config.options import listed, several
-from trackmdp.config.refusals import check_choice
 from trackmdp.config.registry import load_plugins
 from trackmdp.config.sweeping import PLUGINS
 from trackmdp.config.values import choice_values, read_values

@@ -6,7 +6,18 @@ Here stand the names that commands and plugins use most; each schema is in a mod
 from trackmdp.config.baselines import BaselineConfig, PlaybackConfig
 from trackmdp.config.learning import AlgoConfig, CollectorConfig, DqnConfig, ScheduleConfig
 from trackmdp.config.loggers import CsvConfig, LogConfig, McapConfig, MlflowConfig, TensorboardConfig, WandbConfig
-from trackmdp.config.options import GROUPS, SELECTORS, Option, choice, option, options, refuse
+from trackmdp.config.options import (
+    GROUPS,
+    SELECTORS,
+    ChoiceConfig,
+    NodeConfig,
+    Option,
+    Sizes,
+    choice,
+    option,
+    options,
+    refuse,
+)
 from trackmdp.config.per_sensor import PerSensorConfig
 from trackmdp.config.registry import conf_dir, load_plugins
 from trackmdp.config.roots import (
@@ -23,7 +34,6 @@ from trackmdp.config.roots import (
     VerifyConfig,
     WorldConfig,
 )
-from trackmdp.config.schema import ChoiceConfig, NodeConfig, Sizes
 from trackmdp.config.sensing import CostConfig, FalseAlarmConfig, PaperCostConfig, SensorConfig
 from trackmdp.config.tree import load_config, load_run_config, to_dict, to_yaml, world_of
 from trackmdp.config.world import KernelConfig, TableConfig

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-from trackmdp.config.options import choice, listed, option, refuse
-from trackmdp.config.schema import ChoiceConfig
+from trackmdp.config.options import ChoiceConfig, choice, listed, option, refuse
 from trackmdp.machine import SIZE_PATTERN
 
 

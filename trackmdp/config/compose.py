@@ -14,9 +14,8 @@ from typing import Any, TypeVar
 
 from omegaconf import DictConfig, OmegaConf
 
-from trackmdp.config.checks import absolute_paths, refuse_ignored, validate
+from trackmdp.config.checks import absolute_paths, check_choice, check_option, refuse_ignored, validate
 from trackmdp.config.options import GROUPS, SELECTORS, Option, optional, options, several
-from trackmdp.config.refusals import check_choice, check_option
 from trackmdp.config.roots import ROOTS, CommandConfig
 from trackmdp.config.tree import build_config
 from trackmdp.config.values import choice_values, read_values, resolved

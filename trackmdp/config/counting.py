@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 from trackmdp.config.learning import AlgoConfig, check_classes
-from trackmdp.config.options import choice, option, refuse
-from trackmdp.config.schema import BYTES, Sizes
+from trackmdp.config.options import BYTES, Sizes, choice, option, refuse
 
 
 @choice("algo", "learned_kernel", makes="trackmdp.algos.learned_kernel:LearnedKernel")

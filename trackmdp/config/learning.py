@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, ClassVar
 
-from trackmdp.config.options import choice, nested, option, refuse
-from trackmdp.config.schema import BYTES, ChoiceConfig, NodeConfig, Sizes
+from trackmdp.config.options import BYTES, ChoiceConfig, NodeConfig, Sizes, choice, nested, option, refuse
 
 MOST_FRAMES = 10**12
 """Of a run: eleven days at a million frames per second. What asks for more would not end, and is a slip."""

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from trackmdp.config.options import choice, option
-from trackmdp.config.schema import ChoiceConfig
+from trackmdp.config.options import ChoiceConfig, choice, option
 from trackmdp.errors import require
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from trackmdp.config.options import listed, option, refuse
-from trackmdp.config.schema import NodeConfig
+from trackmdp.config.options import NodeConfig, listed, option, refuse
 
 
 class PartitionConfig(NodeConfig):

@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 from trackmdp.config.learning import ENTROPY, LEARNING_RATE, AlgoConfig, ScheduleConfig, check_classes, networks
-from trackmdp.config.options import SELECTORS, Selector, choice, nested, option, refuse
-from trackmdp.config.schema import BYTES, Sizes
+from trackmdp.config.options import BYTES, SELECTORS, Selector, Sizes, choice, nested, option, refuse
 
 SELECTORS["credit"] = Selector(
     group="algo",

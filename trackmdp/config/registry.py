@@ -23,8 +23,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from trackmdp.config.options import GROUPS, options
-from trackmdp.config.schema import ChoiceConfig
+from trackmdp.config.options import GROUPS, ChoiceConfig, options
 from trackmdp.errors import UserError
 
 ENTRY_POINTS = "trackmdp.plugins"

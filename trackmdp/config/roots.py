@@ -8,9 +8,8 @@ from trackmdp.config import counting, modes, per_sensor, sweeping  # noqa: F401 
 from trackmdp.config.baselines import BaselineConfig
 from trackmdp.config.learning import DEVICE, AlgoConfig, CollectorConfig
 from trackmdp.config.loggers import LogConfig
-from trackmdp.config.options import GROUPS, listed, option, refuse
+from trackmdp.config.options import GROUPS, NodeConfig, listed, option, refuse
 from trackmdp.config.partition import PartitionConfig, SweptPartitionConfig
-from trackmdp.config.schema import NodeConfig
 from trackmdp.config.sensing import CostConfig, SensorConfig
 from trackmdp.config.world import GridConfig, KernelConfig, TaskConfig
 from trackmdp.errors import UserError

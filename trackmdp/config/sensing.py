@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, ClassVar
 
-from trackmdp.config.options import GROUPS, Option, choice, listed, option, refuse
-from trackmdp.config.schema import ChoiceConfig
+from trackmdp.config.options import GROUPS, ChoiceConfig, Option, choice, listed, option, refuse
 from trackmdp.config.world import GridConfig
 from trackmdp.errors import UserError
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-from trackmdp.config.options import choice, option
-from trackmdp.config.schema import ChoiceConfig
+from trackmdp.config.options import ChoiceConfig, choice, option
 from trackmdp.errors import UserError, require
 
 PLUGINS = ("launcher", "sweeper")

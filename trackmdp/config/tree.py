@@ -9,11 +9,9 @@ from typing import Any, TypeVar
 
 from omegaconf import OmegaConf
 
-from trackmdp.config.checks import validate
-from trackmdp.config.options import GROUPS, Option, as_float, options, several
-from trackmdp.config.refusals import check_choice, suggestion
+from trackmdp.config.checks import check_choice, suggestion, validate
+from trackmdp.config.options import GROUPS, ChoiceConfig, Option, as_float, options, several
 from trackmdp.config.roots import CommandConfig, TrainConfig, WorldConfig
-from trackmdp.config.schema import ChoiceConfig
 from trackmdp.config.untrusted import MAX_BYTES, parse_yaml
 from trackmdp.errors import UserError
 from trackmdp.untrusted import read_text

@@ -12,9 +12,8 @@ from typing import Any
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from trackmdp.config.checks import validate
+from trackmdp.config.checks import unknown_option, validate
 from trackmdp.config.options import GROUPS, Option, options
-from trackmdp.config.refusals import unknown_option
 from trackmdp.config.registry import conf_file
 from trackmdp.errors import UserError
 

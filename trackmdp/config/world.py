@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-from trackmdp.config.options import GROUPS, choice, listed, option, refuse
-from trackmdp.config.schema import ChoiceConfig, NodeConfig, Sizes
+from trackmdp.config.options import GROUPS, ChoiceConfig, NodeConfig, Sizes, choice, listed, option, refuse
 
 BORDERS = ("renormalize", "inside", "clip", "exit")
 MEMORIES = ("cell", "displacement", "displacement_gap", "two_displacements")
