@@ -69,6 +69,24 @@ def test_three_overlapping_sensors_by_hand() -> None:
     assert covering.best(gain, price, exact=True).upper == pytest.approx([0.9 - 0.4, 0, 0, 0])
 
 
+def test_of_sensors_that_see_the_same_the_cheapest_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From the one cell the target goes to cells 1 2 3 with .3 each, never to cell 4, which some cover as well."""
+    kernel = np.zeros((5, 5))
+    kernel[0, 1:4] = 0.3
+    coverage = np.array([[0, 1, 1, 0, 0], [0, 1, 1, 0, 1], [0, 1, 1, 0, 0], [0, 0, 0, 1, 1], [0, 0, 0, 1, 0]])
+    world = World(kernel, (1, 5), cost=[0.3, 0.1, 0.1, 0.2, 0.1], t_max=0, safe_cost=1.0, coverage=coverage)
+    covering = Covering.of(world, row_index(world.kernel), world.kernel.indices)
+    assert covering is not None
+    gain, price = world.kernel.data, covering.price(world.cost, np.ones(5))
+    assert covering.sensors[covering.distinct(price)].tolist() == [1, 4]
+    for on in (covering.greedy(gain, price), covering.best(gain, price).on, covering.best(gain, price, exact=True).on):
+        assert covering.sensors[on > 0].tolist() == [1, 4]
+    # 3 sensors see cell 1, 3 cell 2 and 2 cell 3
+    monkeypatch.setattr("trackmdp.solvers.cover._MOST", 7)
+    with pytest.raises(UserError, match=r"coverage: 8 pairs of a cell .* expected at most 7"):
+        Covering.of(world, row_index(world.kernel), world.kernel.indices)
+
+
 @pytest.mark.parametrize("seed", range(40))
 def test_sets_and_bounds_of_coverage_problems(seed: int) -> None:
     world, covering, gain, price = _prices_and_gains(seed)

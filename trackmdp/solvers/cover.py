@@ -18,10 +18,12 @@ the bound.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy import sparse
 
+from trackmdp.errors import UserError
 from trackmdp.solvers.renewal import IndexArray, per_row
 from trackmdp.world.model import Array, BoolArray, Task
 
@@ -31,6 +33,8 @@ _PROVED = 1e-9
 """Part of what could be gained up to which a set counts as the best: rounding of linear and integer programs."""
 _SCALE = 1e5
 """The largest gain as an integer program is told it."""
+_MOST = 2**26
+"""Sensors that see the entries of a layer, entry by entry: some 5 GB."""
 
 
 @dataclass(frozen=True)
@@ -114,9 +118,18 @@ class Covering:
 
     @classmethod
     def of(cls, task: Task, rows: IndexArray, cells: IndexArray) -> Covering | None:
-        """Of the entries (`rows`, `cells`) `[E]`; None where each sensor covers its own cell, and needs no problem."""
+        """Of the entries (`rows`, `cells`) `[E]`; None where each sensor covers its own cell, and needs no problem.
+
+        Raises:
+            UserError: there are too many.
+        """
         if task.coverage is None:
             return None
+        if (total := int(task.coverage.degree[cells].sum())) > _MOST:
+            reach = f"{total:,} pairs of a cell where the target may be and a sensor that covers it"
+            raise UserError(
+                f"coverage: {reach}, expected at most {_MOST:,}; leave out sensors, or cells that they cover"
+            )
         sensors = task.coverage.by_cell[cells]
         entry = np.repeat(np.arange(len(cells)), np.diff(sensors.indptr))
         # Of 9 sensors, the pair (located cell 2, sensor 5) has the number 2 * 9 + 5 = 23; sorted, they are the pairs.
@@ -145,12 +158,38 @@ class Covering:
         times = on.astype(np.float64) @ self.covers
         return np.divide(gain, times, out=np.zeros_like(gain), where=times > 0)
 
+    def distinct(self, price: Array) -> IndexArray:
+        """Of the pairs that cover the same entries the cheapest, the first of several: no best set needs another."""
+        order = np.lexsort((price, self._kind))
+        return np.sort(order[np.diff(self._kind[order], prepend=-1) > 0])
+
+    def part(self, pairs: IndexArray) -> Covering:
+        """Some of the pairs `[P]`."""
+        return Covering(self.count, self.rows[pairs], self.sensors[pairs], self.covers[pairs])
+
+    @cached_property
+    def _kind(self) -> IndexArray:
+        """`[P]`, one number for all pairs that cover the same entries, 0 ... without gaps."""
+        (pairs, entries), start, length = self.covers.shape, self.covers.indptr[:-1], np.diff(self.covers.indptr)
+        kind = np.zeros(pairs, dtype=np.int64)
+        for place in range(int(length.max(initial=0))):
+            # Pairs alike up to here are told apart by their next entry; `entries` stands for none.
+            entry = np.full(pairs, entries, dtype=np.int64)
+            entry[length > place] = self.covers.indices[start[length > place] + place]
+            kind = np.unique(kind * (entries + 1) + entry, return_inverse=True)[1]
+        return kind
+
     def greedy(self, gain: Array, price: Array) -> BoolArray:
         """`[P]`, a good set for each located cell: by adding and dropping one sensor at a time, from none and from all.
 
         In both passes every located cell takes the one change that gains it most, until none gains; the better of the
-        two ends is kept.
+        two ends is kept. Of sensors that cover the same entries the cheapest takes part.
         """
+        kept = self.distinct(price)
+        if len(kept) < len(price):
+            on = np.zeros(len(price), dtype=bool)
+            on[kept] = self.part(kept).greedy(gain, price[kept])
+            return on
         none = self._add_drop(np.zeros(len(price), dtype=bool), gain, price)
         every = self._add_drop(self.covers @ np.maximum(gain, 0.0) > price, gain, price)
         return self._better(none, every, gain, price)
@@ -185,7 +224,8 @@ class Covering:
         few if any, as integer programs.
         """
         # A sensor whose cells together gain no more than its price is in no solution, of fractions or not.
-        use = np.flatnonzero(self.covers @ np.maximum(gain, 0.0) > price)
+        use = self.distinct(price)
+        use = use[self.covers[use] @ np.maximum(gain, 0.0) > price[use]]
         entries = np.flatnonzero((np.bincount(self.covers[use].indices, minlength=len(gain)) > 0) & (gain > 0))
         covers, cost, value = self.covers[use][:, entries], price[use], gain[entries]
         on, upper = np.zeros(len(price)), np.zeros(self.count)
@@ -207,8 +247,9 @@ class Covering:
         sets = self._better(on > 0.5, self.greedy(gain, price), gain, price)
         other, upper = sets.copy(), upper.copy()
         left = upper - self.worth(sets, gain, price)
+        kept = self.distinct(price)
         for row in np.flatnonzero(left > _PROVED * np.maximum(upper, 1e-3)):
-            mine = np.flatnonzero(self.rows == row)
+            mine = kept[self.rows[kept] == row]
             other[mine], proved = _integer(self.covers[mine], gain, price[mine])
             upper[row] = min(upper[row], proved)
         return self._better(sets, other, gain, price), upper

@@ -45,7 +45,8 @@ def best_plans(
     if m << (int(number.max()) + 1) > _MOST_PATTERNS:
         return None
     price = first.covering.price(world.cost, per_row(first.rows, mass, m))
-    cheapest = _cheapest(first.covering, price, number)
+    kept = first.covering.distinct(price)
+    cheapest = _cheapest(first.covering.part(kept), price[kept], number)
     revealed, missed = one_set(world, problem.detected, problem.missed), problem.missed[last.cells]
     before = problem.worth(sets, np.ones(m))
     most, seen_best, last_best = before + slack, np.zeros(len(first.rows), dtype=bool), sets[1].copy()
