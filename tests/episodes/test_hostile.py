@@ -111,6 +111,7 @@ CASES: dict[str, Callable[[Parts], Any]] = {
     "safe_cost inf": says(safe_cost="inf"),
     "max_steps 0": says(max_steps="0"),
     "no t_max": lambda parts: parts["m"][RUN].pop("t_max"),
+    "no max_steps": lambda parts: parts["m"][RUN].pop("max_steps"),
     "policies 10^9": lambda parts: parts["m"][END].update(policies="1000000000"),
     "no policies": lambda parts: parts["m"][END].pop("policies"),
     "kind": lambda parts: parts["m"][POLICY].pop("kind"),

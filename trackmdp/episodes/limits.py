@@ -56,7 +56,8 @@ class LoggedRun:
         self.cells = math.prod(self.size)
         self.sensors = known("sensors", 1, _LARGEST_GRID**2) or self.cells
         self.window, self.modes, self.revealed = known("window", 0), known("modes", 1) or 0, known("revealed", 1) or 1
-        self.t_max, self.max_steps = _count(said, "t_max", 0, _MOST), known("max_steps", 1, _MOST)
+        self.t_max = _count(said, "t_max", 0, _MOST)
+        self.max_steps = _count(said, "max_steps", 1, _MOST) if said["max_steps"] else None
         self.reward, self.safe_cost = float(said["reward"]), float(said["safe_cost"])
         if not (abs(self.reward) < _FINITE and abs(self.safe_cost) < _FINITE and said.get("trackmdp")):
             raise ValueError("a reward or cost that is not finite, or no version of trackmdp")
