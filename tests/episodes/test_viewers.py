@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from base64 import b64encode
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from types import UnionType
@@ -126,6 +126,20 @@ def test_the_messages_of_a_large_grid_are_as_large_as_what_is_known() -> None:
         assert max(len(text) for text in layers.values()) < 1000
 
 
+def test_the_part_that_viewers_look_at_moves_by_nine_rows_within_the_grid() -> None:
+    """60 x 10 cells, of which 25 x 10 are looked at; rows are counted from the top, y from the bottom."""
+    world = make_world("random_walk", size=(60, 10), cost=0.2, t_max=1, safe_cost=10.0)
+    episodes = simulate(limited(world, 6), Policy.none(world), 20, seed=0).complete()
+    episode = next(each for each in episodes if len(each) == 6)
+    target = np.array([0, 30, 35, 36, 59, 60]) * 10  # the last has exited
+    parts = [
+        json.loads(layers["/part"])["translation"]
+        for layers in grids.grid_messages(replace(episode, target=target), world.size, 0)
+    ]
+    assert [part["y"] for part in parts] == [60 - 12.5, 60 - 31.5, 60 - 31.5, 60 - 40.5, 12.5, 12.5]
+    assert {(part["x"], part["z"]) for part in parts} == {(5, 0)}
+
+
 @pytest.mark.parametrize("place", [{"x": -1}, {"x": 4}, {"y": -1}, {"y": 2}, {"x": 0.5}, {"x": None}])
 def test_a_grid_that_lies_outside_is_damage(place: dict[str, Any]) -> None:
     [episode] = recorded(1, acting=policy(WALK), world=WALK)
@@ -182,6 +196,27 @@ def test_every_panel_is_one_of_foxgloves(size: tuple[int, int]) -> None:
     assert set(re.findall(r'"timestampMethod": "(\w+)"', json.dumps(made))) == {"receiveTime"}
     shown = re.findall(r'"([^"]+![^"]+)"', json.dumps(made["layout"]))
     assert sorted(shown) == sorted(made["configById"])
+
+
+@pytest.mark.parametrize("size", [(1, 1), (2, 5), (64, 64), (70, 30)])
+def test_lines_surround_all_cells_and_none_outside(size: tuple[int, int]) -> None:
+    rows, columns = size
+    for panel in layout(size)["configById"].values():
+        within = np.zeros(size, bool)
+        for lines in panel.get("layers", {}).values():
+            assert (lines["frameId"], lines["divisions"]) == ("grid", lines["size"])
+            left, low = (middle - lines["size"] / 2 for middle in lines["position"][:2])
+            assert min(left, low) >= 0 and left + lines["size"] <= columns and low + lines["size"] <= rows
+            assert left % 1 == low % 1 == 0
+            within[int(low) : int(low) + lines["size"], int(left) : int(left) + lines["size"]] = True
+        assert within.all() == ("layers" in panel)
+
+
+@pytest.mark.parametrize(("size", "distance"), [((10, 4), 12), ((300, 300), 30)])
+def test_cameras_look_at_the_part_and_see_all_of_it(size: tuple[int, int], distance: float) -> None:
+    cameras = [panel for panel in layout(size)["configById"].values() if "cameraState" in panel]
+    assert [panel["cameraState"]["distance"] for panel in cameras] == [distance, distance]
+    assert {panel["followTf"] for panel in cameras} == {"part"}
 
 
 def test_what_panels_show_is_in_the_messages(log: Path) -> None:

@@ -1,4 +1,7 @@
-"""What viewers draw of a step, one `foxglove.Grid` for each layer: belief and policy, the cells sensed, the target."""
+"""What viewers draw of a step, one `foxglove.Grid` for each layer: belief and policy, the cells sensed, the target.
+
+And where they look: a frame of coordinates in the middle of the part of a large grid that is worth looking at.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +19,10 @@ from trackmdp.world.model import BoolArray
 
 WHOLE_CELLS = 64 * 64
 """Cells up to which belief and policy are written whole; of a larger grid, where either is more than 0."""
+
+PART, _STEP = 25, 9
+"""Rows and columns that a viewer shows of a larger grid, and how far that part moves at once: it stays where it is
+while the target does not leave 9 x 9 cells."""
 
 _CELL = np.dtype([("belief", "<f4"), ("policy", "<f4")])
 _ACTIVE, _TARGET = np.dtype([("active", "u1")]), np.dtype([("target", "u1")])
@@ -43,7 +50,7 @@ _DOT = np.array([[[1]], [[0]]], np.uint8)
 def grid_messages(
     episode: Episode, size: tuple[int, int], first_tick: int, covered: BoolArray | None = None
 ) -> Iterator[dict[str, bytes]]:
-    """Of each step topic -> message, a layer above the other in this order.
+    """Of each step topic -> message, a layer above the other in this order, and where viewers look.
 
     `covered` `[T, M]` are the cells that the sensors on see; None where each sees its own.
     """
@@ -57,8 +64,8 @@ def grid_messages(
     sensed = active.view(np.uint8)
     exited = (episode.target == rows * columns).astype(int).tolist()
     at = np.stack(np.divmod(episode.target % (rows * columns), columns), axis=1).tolist()
-    boxes = zip(_boxes(used), _boxes(active), at, strict=True)
-    for t, ((top, bottom, left, right), (first, last, start, stop), (row, column)) in enumerate(boxes):
+    boxes = zip(_boxes(used), _boxes(active), at, _parts(episode, size), strict=True)
+    for t, ((top, bottom, left, right), (first, last, start, stop), (row, column), (y, x)) in enumerate(boxes):
         seconds, rest = divmod(time_of(first_tick + t), 1_000_000_000)
         stamp = b'{"timestamp":{"sec":%d,"nsec":%d}' % (seconds, rest)
         yield {
@@ -66,7 +73,27 @@ def grid_messages(
             "/active": _grid(stamp, _ACTIVE_SAYS, sensed[t, first:last, start:stop], start, rows - last, 0.01),
             # half as wide as its cell, so that the layers beneath it show: in column 3 from x = 3.25 to 3.75
             "/target": _grid(stamp, _TARGET_SAYS, _DOT[exited[t]], column + 0.25, rows - row - 0.75, 0.02),
+            "/part": (
+                b'%s,"parent_frame_id":"grid","child_frame_id":"part","translation":{"x":%g,"y":%g,"z":0},'
+                b'"rotation":{"x":0,"y":0,"z":0,"w":1}}'
+            )
+            % (stamp, x, rows - y),
         }
+
+
+def _parts(episode: Episode, size: tuple[int, int]) -> list[list[float]]:
+    """Of each step the middle (y, x) of the part of the grid around the target, from the top left.
+
+    Of one that has exited, around where it was. Row 100 lies in the block of rows 99 to 107, in the middle of which,
+    at y = 103.5, a part is; rows 0 to 8 in that of y = 12.5, since a part does not reach beyond the grid.
+    """
+    rows, columns = size
+    before = np.concatenate([[episode.start], episode.target[:-1]])
+    seen = np.where(episode.target == rows * columns, before, episode.target)
+    middles = np.stack(np.divmod(seen, columns), axis=1) // _STEP * _STEP + _STEP / 2
+    half = np.minimum(size, PART) / 2
+    parts: list[list[float]] = np.clip(middles, half, np.array(size) - half).tolist()
+    return parts
 
 
 def _boxes(used: BoolArray) -> Iterator[tuple[int, int, int, int]]:

@@ -10,7 +10,7 @@ from typing import Any
 
 from trackmdp import __version__
 
-LOG_FORMAT = "2"
+LOG_FORMAT = "3"
 """Version of this layout; a reader refuses any other."""
 
 RUN, POLICY, END = "trackmdp.run", "trackmdp.policy", "trackmdp.end"
@@ -83,6 +83,16 @@ SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
     "/grid": _layer("belief and policy of every cell, of large grids of the part where they are not 0"),
     "/active": _layer("the cells sensed, in the smallest rectangle around them"),
     "/target": _layer("the true cell of the target"),
+    "/part": (
+        "foxglove.FrameTransform",
+        _object(
+            "the middle of the part of a large grid that the target is in",
+            timestamp=_inner("integer", "sec nsec"),
+            **_fields("string", "parent_frame_id child_frame_id"),
+            translation=_inner("number", "x y z"),
+            rotation=_inner("number", "x y z w"),
+        ),
+    ),
     "/episode": (
         "trackmdp.Episode",
         _object(
