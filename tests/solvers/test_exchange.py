@@ -100,6 +100,37 @@ def test_parts_and_windows(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (whole != alone).nnz == 0
 
 
+def test_each_cell_takes_the_best_plan_of_all_starts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half of the cells have good plans in one start, half in another; each is poor elsewhere."""
+    world = make_world("drift", size=4, persistence=0.5, cost=0.3, t_max=2, exit_probability=0.02)
+    best, layers = exchange.solve(world, 0), reachable_layers(world, 3)
+    monkeypatch.setattr(exchange, "exchange", lambda problem, sets, *_, **__: sets)  # the plans as they are
+    monkeypatch.setattr(InnerProblem, "ascend", lambda _, sets, *__, **___: sets)
+    good, none = layer_sets(layers, best), layer_sets(layers, PolicyTable.none(world))
+    halves = [
+        [np.where((layer.rows < 8) == first, *on) for layer, *on in zip(layers[1:], good, none, strict=True)]
+        for first in (True, False)
+    ]
+    found = policy_table(world, layers, exchange.best_of(world, layers, none, halves))
+    assert (found.sets != best.sets).nnz == 0
+    kept = exchange.best_of(world, layers, good, [none, *halves])
+    assert all((new == old).all() for new, old in zip(kept, good, strict=True))
+
+
+def test_other_starts_are_led_by_other_prices_and_end_higher() -> None:
+    world = make_world("random_walk", size=6, cost=0.15, t_max=2, diagonal=True)
+    layers = reachable_layers(world, world.num_choices)
+    first, again = (list(exchange.other_starts(world, layers, 2)) for _ in range(2))
+    assert all(
+        (one == other).all()
+        for each, same in zip(first, again, strict=True)
+        for one, other in zip(each, same, strict=True)
+    )
+    assert any((one != other).any() for one, other in zip(*first, strict=True))
+    values = [evaluate(world, exchange.solve(world, starts)).aihtr for starts in (0, 4)]
+    assert values[1] > values[0] + 1e-3
+
+
 def test_without_a_free_choice_after_the_first_there_is_nothing_to_exchange() -> None:
     world = make_world("drift", size=5, cost=0.2, t_max=0)
     table = search.solve(world)

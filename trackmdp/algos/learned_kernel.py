@@ -81,7 +81,7 @@ class LearnedKernel:
         self._estimate.fit(self.cfg.rounds_at_end if last else self.cfg.rounds)
         believed = self._estimate.believed(self._least)
         # What is only looked at on the way starts from the plan before, which saves half of the time.
-        plan = self._plan(believed, None if last or self._chooses else self.actor.sets)
+        plan = self._plan(believed, None if last or self._chooses else self.actor.sets, exchange.STARTS if last else 0)
         self.actor = as_policy(self.task, plan)
         # Acting on a draw, not on the mean: where the estimate is unsure the draws differ, and so moves get sensed that
         # the mean may leave out for good.
@@ -90,12 +90,16 @@ class LearnedKernel:
         self._believed = self._beliefs(plan, believed)
         return self._diagnostics()
 
-    def _plan(self, kernel: sparse.csr_array, start: sparse.csr_array | None = None) -> PolicyTable:
-        """The plan for the `[M, M + 1]` kernel believed, from the sets `start` where there are any."""
+    def _plan(self, kernel: sparse.csr_array, start: sparse.csr_array | None = None, others: int = 0) -> PolicyTable:
+        """The plan for the `[M, M + 1]` kernel believed, from the sets `start` where there are any.
+
+        Else from those of `search`, and from as many `others`.
+        """
         world = self._world(kernel)
         if isinstance(world, HiddenWorld):
             return solve_keys(world, start=None if start is None else PolicyTable(self.task, start)).table
-        return exchange.solve(world) if start is None else exchange.improve(world, PolicyTable(self.task, start))
+        table = None if start is None else PolicyTable(self.task, start)
+        return exchange.solve(world, others) if table is None else exchange.improve(world, table)
 
     def _world(self, kernel: sparse.csr_array) -> Modelled:
         """The task with the `[M, M + 1]` kernel believed, but for what is negligible."""

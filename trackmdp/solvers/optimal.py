@@ -12,25 +12,23 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
-from trackmdp.seeding import derive
 from trackmdp.solvers import clocked
 from trackmdp.solvers.bounds import exact_clocked_table
 from trackmdp.solvers.branch import Tree
 from trackmdp.solvers.budget import Budget, Shares
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import Evaluation
-from trackmdp.solvers.exchange import exchanged
+from trackmdp.solvers.exchange import best_of, exchanged, other_starts
 from trackmdp.solvers.known import planted
 from trackmdp.solvers.layers import Layer, layer_sets, policy_table, reachable_layers
 from trackmdp.solvers.regions import adopted, improved, proved, region_side
-from trackmdp.solvers.renewal import RenewalSystem, expected_steps, row_index
+from trackmdp.solvers.renewal import RenewalSystem, expected_steps
 from trackmdp.solvers.search import InnerProblem, follow_credit
 from trackmdp.solvers.solution import SearchProgress, Solution
 from trackmdp.solvers.two_sets import best_plans
@@ -43,9 +41,8 @@ FIRST_NODES = 100_000
 same world gives the same policy on any machine."""
 NODES_BETWEEN_REPORTS = 100_000
 """Nodes after which the bracket is brought up to date while a tree is searched: about a second's."""
-RESTARTS, SPREAD, MOST_RESTARTED = 4, 0.05, 500
-"""Searches led by another kernel where the first tree leaves the bracket open, how far its entries are off (standard
-deviation of their logarithms), and the cells above which the time is better spent on the tree."""
+RESTARTS = 16
+"""Searches from other starts where the first tree leaves the bracket open."""
 NODES_A_CELL = 4
 """Nodes before improvements are used in regions, for each cell of the grid: more than most regions need."""
 WORTH_A_ROUND = 0.02
@@ -239,24 +236,13 @@ class _Run:
         return passed
 
     def restart(self) -> bool:
-        """Search once more, led by kernels that are a little off; whether that gave a better policy, to be used next.
-
-        The homotopy is led by the bound of a kernel whose entries are off by 5 %, and so goes another way; what it
-        finds is exchanged and valued with the true one.
-        """
-        rng, best = np.random.default_rng(derive(0, "optimal", "restarts")), float(self.value.sum())
-        for _ in range(RESTARTS if self.world.num_cells <= MOST_RESTARTED else 0):
-            kernel = self.world.kernel.copy()
-            kernel.data *= np.exp(SPREAD * rng.standard_normal(kernel.nnz))
-            # rows keep their sums: what is off is where the target goes, not when it exits
-            kernel.data *= (self.world.stay_probability / kernel.sum(axis=1))[row_index(kernel)]
-            other = replace(self.world, kernel=kernel)
-            layers = reachable_layers(other, other.num_choices)
-            policy = self.exchanged(follow_credit(other, layers, layer_sets(layers, clocked.solve(other))))
-            value = float(evaluate(self.world, policy, guess=self.value).value.sum())
-            if value > best:
-                self.found, best = policy, value
-        return self.found is not None
+        """Search from other starts; whether that gave a better policy, to be used next."""
+        world, layers = self.world, self.layers
+        sets, others = layer_sets(layers, self.policy), other_starts(world, layers, RESTARTS)
+        found = policy_table(world, layers, best_of(world, layers, sets, others, self.value, go_on=self.budget.left))
+        better = evaluate(world, found, guess=self.value).value.sum() > self.value.sum()
+        self.found = found if better else None
+        return better
 
     @property
     def problem(self) -> InnerProblem:

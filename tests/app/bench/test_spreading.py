@@ -19,7 +19,7 @@ def bench(folder: Path, *words: str) -> list[dict[str, float | str]]:
 
 def test_all_worlds_can_be_made_and_are_what_they_are_called() -> None:
     made = {name: make() for name, make in spreading.worlds(6, 2).items()}
-    assert len(made) == 40
+    assert len(made) == 52
     assert {(world.size, world.t_max) for world in made.values()} == {((6, 6), 2)}
     assert {name for name, world in made.items() if world.safe_cost == 1000} == {n for n in made if "D 1000" in n}
     rare, far, many = (made[name].kernel.toarray() for name in ("rare far jumps", "far jumps", "20 successors c .08"))
@@ -41,6 +41,18 @@ def test_regret_of_both_learners_over_the_seeds(tmp_path: Path, monkeypatch: pyt
     for two, one in zip(both, first, strict=True):
         assert two["worst"] >= max(two["mean"], one["worst"]) >= min(two["mean"], one["worst"]) >= -1e-9
         assert two["bracket"] <= two["worst"] + 1e-9
+
+
+def test_the_best_found_is_looked_for_from_other_starts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A walk of two free misses whose bracket is left open: more is lost to the best of them than to the solver's."""
+    monkeypatch.setattr(spreading, "ALGOS", ("learned_kernel",))
+    monkeypatch.setattr(spreading, "STARTS", 4)
+    words = ["part=regret", "grid.size=6", "grid.t_max=2", "worlds=[diagonal c .2]", "seeds=[0]", "nodes=1"]
+    (far,) = bench(tmp_path / "a", *words)
+    monkeypatch.setattr(spreading, "best_of", lambda world, layers, sets, others: sets)
+    (near,) = bench(tmp_path / "b", *words)
+    assert near["bracket"] == far["bracket"] > 0.001
+    assert 0 <= near["worst_to_best"] < far["worst_to_best"] <= far["worst"]
 
 
 def test_what_is_proved(tmp_path: Path) -> None:
