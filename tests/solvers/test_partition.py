@@ -18,7 +18,7 @@ from trackmdp.errors import Preempted, UserError
 from trackmdp.solvers import regions
 from trackmdp.solvers.partition import Block, blocks, default_halo, plan_by_blocks, reach, sub_world
 from trackmdp.solvers.solve import run_solver
-from trackmdp.solvers.workers import run_jobs
+from trackmdp.solvers.workers import crew, in_turn
 from trackmdp.training.signals import Signals, handled
 from trackmdp.world.model import World
 
@@ -77,7 +77,7 @@ def test_with_the_default_halo_blocks_lose_nothing_and_without_one_they_do(cost:
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:partition.halo=0")
-def test_sweeps_over_the_whole_grid_mend_what_blocks_cannot(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sweeps_over_the_whole_grid_mend_what_blocks_cannot() -> None:
     world = tm.make_world("random_support", size=12, support_size=5, radius=1, cost=0.22, t_max=1, safe_cost=8)
     whole, alone = tm.solve(world), tm.solve(world, block=4, halo=0, sweeps=0)
     once, mended = (tm.solve(world, block=4, halo=0, sweeps=sweeps) for sweeps in (1, 10))
@@ -86,11 +86,11 @@ def test_sweeps_over_the_whole_grid_mend_what_blocks_cannot(monkeypatch: pytest.
     # no cell's value is lower for it
     assert (mended.evaluation.value - alone.evaluation.value).min() > -1e-9
     # a round that gains nothing is the last one
-    rounds: list[float] = []
-    improve = regions.improved
-    monkeypatch.setattr(regions, "improved", lambda *given: [rounds.append(1.0), improve(*given)][1])
-    again = regions.settled(world, mended.table, 4, 10)
-    assert len(rounds) == 1
+    rounds: list[int] = []
+    again = regions.settled(
+        world, mended.table, 4, 10, lambda work, jobs: [rounds.append(len(jobs)), in_turn(work, jobs)][1]
+    )
+    assert rounds == [9]
     assert again is mended.table
 
 
@@ -152,7 +152,8 @@ class Counts:
 @pytest.mark.slow
 def test_a_killed_worker_of_a_cluster_costs_its_own_job_alone(tmp_path: Path) -> None:
     pytest.importorskip("ray")
-    assert run_jobs(Counts(tmp_path), range(6), workers=2, cluster="local") == [*range(6)]
+    with crew(2, "local") as run:
+        assert run(Counts(tmp_path), range(6)) == [*range(6)]
     begun = {number: (tmp_path / str(number)).read_text().count("begun") for number in range(6)}
     assert begun == {0: 1, 1: 1, 2: 2, 3: 1, 4: 1, 5: 1}
 
@@ -179,10 +180,13 @@ class Dies:
 def test_what_a_killed_worker_had_is_done_again(tmp_path: Path, cluster: str | None) -> None:
     if cluster:
         pytest.importorskip("ray")
-    assert run_jobs(Dies(tmp_path), range(5), workers=2, cluster=cluster) == [0, 1, 4, 9, 16]
-    assert (tmp_path / "killed").exists()
-    with pytest.raises(UserError, match="nine"):
-        run_jobs(Dies(tmp_path), [9], workers=2, cluster=cluster)
+    with crew(2, cluster) as run:
+        assert run(Dies(tmp_path), range(5)) == [0, 1, 4, 9, 16]
+        assert (tmp_path / "killed").exists()
+        with pytest.raises(UserError, match="nine"):
+            run(Dies(tmp_path), [9])
+        # an error of a job leaves the others' workers as they were
+        assert run(Dies(tmp_path), [3]) == [9]
 
 
 @dataclass(frozen=True)
@@ -207,8 +211,8 @@ def test_a_signal_ends_all_workers_and_none_begins_another_job(tmp_path: Path) -
     def end(number: int, frame: object) -> None:
         raise Preempted(number)
 
-    with handled(end, signal.SIGUSR1), pytest.raises(Preempted) as told:
-        run_jobs(Saves(tmp_path), range(6), workers=2)
+    with handled(end, signal.SIGUSR1), pytest.raises(Preempted) as told, crew(2) as run:
+        run(Saves(tmp_path), range(6))
     assert told.value.signal == signal.SIGUSR1
     # the other worker may have been told before it began
     left = {file.name for file in tmp_path.iterdir()}
@@ -217,8 +221,8 @@ def test_a_signal_ends_all_workers_and_none_begins_another_job(tmp_path: Path) -
 
 @pytest.mark.slow
 def test_a_job_that_kills_every_worker_ends_in_one_line(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="workers died 3 times"):
-        run_jobs(Dies(tmp_path, always=True), [2], workers=2)
+    with crew(2) as run, pytest.raises(UserError, match="workers died 3 times"):
+        run(Dies(tmp_path, always=True), [2])
 
 
 def test_a_policy_that_draws_cannot_be_put_together() -> None:

@@ -16,9 +16,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
+from scipy import sparse
 
 from trackmdp.config.partition import PartitionConfig
 from trackmdp.errors import UserError
@@ -26,7 +27,7 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.layers import sensed_csr
 from trackmdp.solvers.renewal import IndexArray, row_index
-from trackmdp.solvers.workers import run_jobs
+from trackmdp.solvers.workers import Crew, Made, in_turn
 from trackmdp.world.model import World
 
 Planner: TypeAlias = "Callable[[int, World], PolicyTable]"
@@ -79,27 +80,25 @@ def sub_world(world: World, seen: Rectangle) -> World:
     """The world inside a rectangle of the grid; whoever leaves it has exited."""
     rows, columns = seen
     cells = cells_of(world, seen)
-    moves = world.kernel[cells]
-    # Not by kernel[cells][:, cells], which takes M steps for each block. With 10 columns, cell 57 is (5, 7): in the
-    # rectangle of rows 4 to 8 and columns 6 to 8 it is (1, 1), number 1 * 3 + 1 = 4.
-    row, column = np.divmod(moves.indices, world.columns)
-    row, column = row - rows.start, column - columns.start
-    inside = (row >= 0) & (row < len(rows)) & (column >= 0) & (column < len(columns))
-    start = row_index(moves)[inside]
-    place = (start, (row * len(columns) + column)[inside])
-    kernel = type(moves)((moves.data[inside], place), shape=(len(cells), len(cells)))
+    kernel = within(world.kernel[cells], world, seen)
     own = {name: getattr(world, name)[cells] for name in ("cost", "detection", "safe_detection")}
     return World.of(world, kernel, size=(len(rows), len(columns)), **own)
 
 
+def within(matrix: sparse.csr_array, world: World, seen: Rectangle) -> sparse.csr_array:
+    """`[K, L]`, of a matrix `[K, M]` the columns of the L cells of a rectangle, numbered as in it."""
+    rows, columns = seen
+    # Not by matrix[:, cells], which takes M steps for each block. With 10 columns, cell 57 is (5, 7): in the rectangle
+    # of rows 4 to 8 and columns 6 to 8 it is (1, 1), number 1 * 3 + 1 = 4.
+    row, column = np.divmod(matrix.indices, world.columns)
+    row, column = row - rows.start, column - columns.start
+    inside = (row >= 0) & (row < len(rows)) & (column >= 0) & (column < len(columns))
+    place = (row_index(matrix)[inside], (row * len(columns) + column)[inside])
+    return type(matrix)((matrix.data[inside], place), shape=(matrix.shape[0], len(rows) * len(columns)))
+
+
 def plan_by_blocks(
-    world: World,
-    plan: Planner,
-    block: int,
-    halo: int | None = None,
-    *,
-    workers: int = 1,
-    cluster: str | None = None,
+    world: World, plan: Planner, block: int, halo: int | None = None, run: Crew = in_turn
 ) -> PolicyTable:
     """The policy put together from the plans of all blocks; the same bits however many workers there are.
 
@@ -108,15 +107,19 @@ def plan_by_blocks(
         plan: finds the deterministic policy of a block, whatever the clock says; pickled where there are workers.
         block: side of the blocks.
         halo: cells around its own that a block knows of; None: `default_halo`.
-        workers: processes that plan; see `run_jobs`.
-        cluster: Ray cluster that plans.
+        run: who plans.
 
     Raises:
-        UserError: a policy that draws was planned, or Ray is asked for and not there.
+        UserError: a policy that draws was planned.
     """
     parts = blocks(world.size, block, default_halo(world) if halo is None else halo)
-    jobs = _Jobs(world, parts)
-    done = run_jobs(_PlanJob(plan, world.columns), jobs, workers=workers, cluster=cluster)
+    ends = np.linspace(0, len(parts), min(_JOBS, len(parts)) + 1).astype(int)
+
+    def some(job: int) -> list[tuple[int, World, Block]]:
+        # with their worlds: no worker needs the rest of the grid
+        return [(n, sub_world(world, parts[n].seen), parts[n]) for n in range(ends[job], ends[job + 1])]
+
+    done = run(_PlanJob(plan, world.columns), Made(len(ends) - 1, some))
     sensed = [_joined([job[n] for job in done]) for n in range(world.num_choices)]
     return PolicyTable(world, sensed_csr(world, sensed))
 
@@ -131,23 +134,6 @@ def narrow_halo(world: World, partition: PartitionConfig, upper: float, found: E
         f"partition.halo={partition.halo}: below {wide} = R (T_max + 2), so blocks do not see all that they decide on; "
         f"at most {lost:.4f} per step is lost"
     )
-
-
-class _Jobs(Sequence[list[tuple[int, World, Block]]]):
-    """Some blocks in a row each, with their worlds, made when asked for: no worker needs the rest of the grid."""
-
-    def __init__(self, world: World, parts: Sequence[Block]) -> None:
-        self._world, self._parts = world, parts
-        self._ends = np.linspace(0, len(parts), min(_JOBS, len(parts)) + 1).astype(int)
-
-    def __len__(self) -> int:
-        return len(self._ends) - 1
-
-    def __getitem__(self, number: Any) -> Any:
-        if not 0 <= number < len(self):
-            raise IndexError(number)
-        mine = range(self._ends[number], self._ends[number + 1])
-        return [(each, sub_world(self._world, self._parts[each].seen), self._parts[each]) for each in mine]
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,9 @@ policy of no less value anywhere, and what is proved of each plan bounds the who
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
 
 import numpy as np
 from scipy import sparse
@@ -23,11 +24,12 @@ from trackmdp.solvers.branch import Tree
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.exchange import exchange, revealed
 from trackmdp.solvers.known import planted
-from trackmdp.solvers.layers import Layer, reachable_layers, sensed_csr
-from trackmdp.solvers.partition import Block, blocks, cells_of, reach, sub_world
+from trackmdp.solvers.layers import Layer, layer_sets, reachable_layers, sensed_csr
+from trackmdp.solvers.partition import blocks, cells_of, reach, sub_world, within
 from trackmdp.solvers.prediction import followed
 from trackmdp.solvers.renewal import DIRECT_CELLS, IndexArray, forced_worth
 from trackmdp.solvers.search import InnerProblem
+from trackmdp.solvers.workers import Crew, Made, in_turn
 from trackmdp.world.model import Array, BoolArray, World
 
 ROOM, SMALLEST, LARGEST = 2**28, 32, 128
@@ -41,28 +43,48 @@ Pairs = tuple[IndexArray, IndexArray]
 """Located cells and sensors, a pair for each sensor that is on."""
 
 
+@dataclass(frozen=True)
 class _Region:
     """The plans of the located cells of a block, cells numbered as in the rectangle that it sees.
 
     Attributes:
+        world: what it sees.
         cells: `[L]`, numbers of the region's cells on the whole grid.
         own: `[L]`, the located cells whose plans belong to it.
+        policy: the one at hand.
         value: `[L]`, V.
-        problem: the search from each of its cells; plans of cells of the halo are not looked at.
-        sets: sensed entries of each layer but the first, those of the policy at hand.
+        detected, missed: `[L]`, as of `InnerProblem`.
     """
 
-    def __init__(self, world: World, block: Block, policy: PolicyTable, worth: Sequence[Array]) -> None:
-        self.cells = cells_of(world, block.seen)
-        row, column = (np.isin(np.array(seen), np.array(own)) for seen, own in zip(block.seen, block.own, strict=True))
-        self.own = (row[:, None] & column).ravel()
-        here = sub_world(world, block.seen)
-        self.layers: list[Layer] = reachable_layers(here, here.num_choices)
-        self.value, detected, missed = (each[self.cells] for each in worth)
-        self.problem = InnerProblem(here, self.layers, detected, missed)
-        self.sets: list[BoolArray] = [
-            policy.on(n, self.cells[layer.rows], self.cells[layer.cells]) > 0 for n, layer in enumerate(self.layers[1:])
-        ]
+    world: World
+    cells: IndexArray
+    own: BoolArray
+    policy: PolicyTable
+    value: Array
+    detected: Array
+    missed: Array
+
+    @cached_property
+    def layers(self) -> list[Layer]:
+        """Where the target may be after each move from each of its cells."""
+        return reachable_layers(self.world, self.world.num_choices)
+
+    @cached_property
+    def problem(self) -> InnerProblem:
+        """The search from each of its cells; plans of cells of the halo are not looked at."""
+        return InnerProblem(self.world, self.layers, self.detected, self.missed)
+
+    @cached_property
+    def sets(self) -> list[BoolArray]:
+        """Sensed entries of each layer but the first, those of the policy at hand."""
+        return layer_sets(self.layers, self.policy)
+
+    def improved(self) -> list[Pairs]:
+        """What is sensed after ascent and exchange; see `sensed`."""
+        located = np.ones(len(self.cells))
+        return self.sensed(
+            exchange(self.problem, self.problem.ascend(self.sets, located, sweeps=10), located, self.own)
+        )
 
     def sensed(self, sets: Sequence[BoolArray]) -> list[Pairs]:
         """What `sets` sense at each n, of its own located cells, numbered as on the whole grid."""
@@ -127,11 +149,23 @@ def _region_bytes(world: World, side: int) -> int:
     return seen * each
 
 
-def _regions(world: World, policy: PolicyTable, value: Array, side: int) -> Iterator[_Region]:
+def _regions(world: World, policy: PolicyTable, value: Array, side: int) -> Made[_Region]:
     detected = world.reward + value
     worth = (value, detected, forced_worth(world, detected))
-    for block in blocks(world.size, side, reach(world) * world.num_choices):
-        yield _Region(world, block, policy, worth)
+    parts = blocks(world.size, side, reach(world) * world.num_choices)
+
+    def region(number: int) -> _Region:
+        block = parts[number]
+        cells, here = cells_of(world, block.seen), sub_world(world, block.seen)
+        row, column = (np.isin(np.array(seen), np.array(own)) for seen, own in zip(block.seen, block.own, strict=True))
+        if policy.sets is None:
+            mine = PolicyTable(here, probability=policy.probability)
+        else:
+            states = (cells[:, None] * world.num_choices + np.arange(world.num_choices)).ravel()
+            mine = PolicyTable(here, within(policy.sets[states], world, block.seen))
+        return _Region(here, cells, (row[:, None] & column).ravel(), mine, *(each[cells] for each in worth))
+
+    return Made(len(parts), region)
 
 
 def improved(
@@ -146,25 +180,22 @@ def improved(
         side: located cells of a region, in each direction.
         passed: told the share of the regions that are done; whether to look further.
     """
-    found, count, go_on = [], len(blocks(world.size, side, 0)), True
-    for number, region in enumerate(_regions(world, policy, value, side), start=1):
-        sets, problem, located = region.sets, region.problem, np.ones(len(region.cells))
-        if go_on:
-            sets = exchange(problem, problem.ascend(sets, located, sweeps=10), located, region.own)
-            go_on = passed(number / count)
-        found.append(region.sensed(sets))
+    found, regions, go_on = [], _regions(world, policy, value, side), True
+    for number, region in enumerate(regions, start=1):
+        found.append(region.improved() if go_on else region.sensed(region.sets))
+        go_on = go_on and passed(number / len(regions))
     return _joined(world, found)
 
 
-def settled(world: World, policy: PolicyTable, side: int, rounds: int) -> PolicyTable:
-    """The policy after at most `rounds` of `improved`, fewer where no value grows.
+def settled(world: World, policy: PolicyTable, side: int, rounds: int, run: Crew = in_turn) -> PolicyTable:
+    """The policy after at most `rounds` of `improved`, each done by `run`, fewer where no value grows.
 
     Blocks that planned without each other's values leave plans that none of them would change: .006 per step at
     c = .22, T_max 2, blocks of 5 and a halo of 4.
     """
     value = evaluate(world, policy).value
     for _ in range(rounds):
-        candidate = improved(world, policy, value, side, lambda _: True)
+        candidate = _joined(world, run(_Region.improved, _regions(world, policy, value, side)))
         after = evaluate(world, candidate).value
         # As in `exchange`: no value is lower, so that the sum tells; the margin is rounding.
         if after.sum() <= value.sum() + 1e-12 * np.abs(value).sum():
@@ -194,9 +225,9 @@ def proved(
     Returns:
         `[M]` no less than what any plan is worth more than V, and the policy with the better plans found.
     """
-    short, found, count = np.full(world.num_cells, slack), [], len(blocks(world.size, side, 0))
-    for number, region in enumerate(_regions(world, policy, value, side)):
-        sets, excess = _closed(region, slack, partial(run, number, count))
+    short, found, regions = np.full(world.num_cells, slack), [], _regions(world, policy, value, side)
+    for number, region in enumerate(regions):
+        sets, excess = _closed(region, slack, partial(run, number, len(regions)))
         own = region.own
         short[region.cells[own]] = np.maximum(excess[own], 0.0)
         found.append(region.sensed(sets))

@@ -20,6 +20,7 @@ from trackmdp.solvers.keyed_search import solve_keys
 from trackmdp.solvers.partition import narrow_halo, plan_by_blocks
 from trackmdp.solvers.regions import settled
 from trackmdp.solvers.solution import SearchProgress, Solution, bracketed
+from trackmdp.solvers.workers import crew
 from trackmdp.world.model import World
 from trackmdp.world.modes import HiddenWorld, Modelled
 from trackmdp.world.tracks import Problem
@@ -97,18 +98,12 @@ def run_solver(
         raise UserError(f"partition.block={partition.block}: expected null with sensors that have footprints")
     started = time.monotonic()
     if partition is not None and partition.block is not None:
-        table = plan_by_blocks(
-            world,
-            _Planner(choice),
-            block=partition.block,
-            halo=partition.halo,
-            workers=partition.workers,
-            cluster=partition.cluster,
-        )
         # Other solvers' plans are what they are; what a narrow halo loses stays to be seen, unless asked otherwise.
         sweeps = (_SWEEPS if partition.halo is None else 0) if partition.sweeps is None else partition.sweeps
-        if choice.name == "optimal":
-            table = settled(world, table, partition.block, sweeps)
+        with crew(partition.workers, partition.cluster) as run:
+            table = plan_by_blocks(world, _Planner(choice), partition.block, partition.halo, run)
+            if choice.name == "optimal":
+                table = settled(world, table, partition.block, sweeps, run)
         return bracketed(world, table, time.monotonic() - started)
     watched = {"on_progress": on_progress} if "on_progress" in signature(maker(choice)).parameters else {}
     made = make(choice, world, **watched)

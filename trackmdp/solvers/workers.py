@@ -7,11 +7,12 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import suppress
-from typing import Any, TypeVar
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeVar
 
 from trackmdp.errors import Preempted, UserError, require
 
@@ -22,49 +23,87 @@ _ATTEMPTS = 3
 """Times that a job is begun, if the worker that has it dies, before all is given up."""
 
 
-def run_jobs(
-    work: Callable[[Job], Result], jobs: Sequence[Job], *, workers: int = 1, cluster: str | None = None
-) -> list[Result]:
-    """`work` of every job, in their order, whoever did it; `work` and jobs are pickled where there are workers.
+class Crew(Protocol):
+    """Who does jobs."""
+
+    def __call__(self, work: Callable[[Job], Result], jobs: Sequence[Job]) -> list[Result]:
+        """Some work done to each of the jobs, in their order; both are pickled where there are workers.
+
+        Raises:
+            UserError: the same job has killed its worker three times. Errors of the work are raised as they are.
+        """
+
+
+def in_turn(work: Callable[[Job], Result], jobs: Sequence[Job]) -> list[Result]:
+    """A `Crew` of this process alone."""
+    return [work(job) for job in jobs]
+
+
+@dataclass(frozen=True)
+class Made(Sequence[Job]):
+    """Jobs that are made when asked for, so that not all of them are there at once."""
+
+    size: int
+    make: Callable[[int], Job]
+
+    def __len__(self) -> int:
+        return self.size
+
+    def __getitem__(self, number: Any) -> Any:
+        if not 0 <= number < self.size:
+            raise IndexError(number)
+        return self.make(number)
+
+
+@contextmanager
+def crew(workers: int = 1, cluster: str | None = None) -> Iterator[Crew]:
+    """Workers that stay from one call to the next; what an error or a signal leaves of them is ended.
 
     Args:
-        work: what is done; its own errors are raised here.
-        jobs: what it is done to.
         workers: processes; one: this one.
         cluster: ``local``: a Ray cluster of so many workers on this machine; ``auto`` or host:port: one to join, which
             has as many as it has cores. None: no Ray.
 
     Raises:
-        UserError: Ray is not installed or there is no such cluster, or the same job has killed its worker three times.
+        UserError: Ray is not installed or there is no such cluster.
     """
     if cluster is not None:
-        return _on_ray(work, jobs, workers, cluster)
-    if workers == 1:
-        return [work(job) for job in jobs]
-    return _in_processes(work, jobs, workers)
+        yield from _ray(workers, cluster)
+    elif workers == 1:
+        yield in_turn
+    else:
+        yield from _processes(workers)
 
 
-def _in_processes(work: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -> list[Result]:
-    results: dict[int, Result] = {}
-    for _ in range(_ATTEMPTS):
-        left = [number for number in range(len(jobs)) if number not in results]
-        # Spawned, not forked: a fork copies locks that another thread of this process may hold.
-        spawning = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(min(workers, len(left)), spawning, _begin) as pool:
+def _processes(workers: int) -> Iterator[Crew]:
+    # Spawned, not forked: a fork copies locks that another thread of this process may hold.
+    spawning = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(workers, spawning, _begin)
+
+    def run(work: Callable[[Job], Result], jobs: Sequence[Job]) -> list[Result]:
+        nonlocal pool
+        results: dict[int, Result] = {}
+        for _ in range(_ATTEMPTS):
+            left = [number for number in range(len(jobs)) if number not in results]
             futures = {number: pool.submit(_done, work, jobs[number]) for number in left}
-            try:
-                for number, future in futures.items():
-                    # a worker died: what it and the others had not finished is done again
-                    with suppress(BrokenProcessPool):
-                        results[number] = future.result()
-            except BaseException:
-                for worker in list(pool._processes.values()):
-                    worker.terminate()  # SIGTERM: who learns saves what there is, and is waited for
-                pool.shutdown(cancel_futures=True)  # what was not begun is not begun any more
-                raise
-        if len(results) == len(jobs):
-            return [results[number] for number in range(len(jobs))]
-    raise UserError(f"partition.workers={workers}: workers died {_ATTEMPTS} times, expected enough memory for each")
+            for number, future in futures.items():
+                # a worker died: what it and the others had not finished is done again
+                with suppress(BrokenProcessPool):
+                    results[number] = future.result()
+            if len(results) == len(jobs):
+                return [results[number] for number in range(len(jobs))]
+            pool.shutdown()
+            pool = ProcessPoolExecutor(workers, spawning, _begin)
+        raise UserError(f"partition.workers={workers}: workers died {_ATTEMPTS} times, expected enough memory for each")
+
+    try:
+        yield run
+    except BaseException:
+        for worker in list((pool._processes or {}).values()):
+            worker.terminate()  # SIGTERM: who learns saves what there is, and is waited for
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)  # what was not begun is not begun any more
 
 
 _ended: list[Preempted] = []
@@ -100,7 +139,7 @@ def end_with_parent() -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
-def _on_ray(work: Callable[[Job], Result], jobs: Sequence[Job], workers: int, cluster: str) -> list[Result]:
+def _ray(workers: int, cluster: str) -> Iterator[Crew]:
     require("ray", "ray", f"partition.cluster={cluster}")
     import ray
 
@@ -114,14 +153,19 @@ def _on_ray(work: Callable[[Job], Result], jobs: Sequence[Job], workers: int, cl
     except (ConnectionError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise UserError(f"partition.cluster={cluster}: expected a Ray cluster ({reason})") from error
-    try:
+
+    def run(work: Callable[[Job], Result], jobs: Sequence[Job]) -> list[Result]:
         # Ray itself begins a task again whose worker or machine was lost.
         task: Any = ray.remote(num_cpus=1, max_retries=_ATTEMPTS - 1)(lambda job: work(job))
-        return list(ray.get([task.remote(job) for job in jobs]))
-    except ray.exceptions.RayTaskError as error:  # an error of the work itself, as it would be raised here
-        raise error.cause from None
-    except ray.exceptions.RayError as error:
-        raise UserError(f"partition.cluster={cluster}: a worker was lost {_ATTEMPTS} times ({error})") from error
+        try:
+            return list(ray.get([task.remote(job) for job in jobs]))
+        except ray.exceptions.RayTaskError as error:  # an error of the work itself, as it would be raised here
+            raise error.cause from None
+        except ray.exceptions.RayError as error:
+            raise UserError(f"partition.cluster={cluster}: a worker was lost {_ATTEMPTS} times ({error})") from error
+
+    try:
+        yield run
     finally:
         if begun:
             ray.shutdown()

@@ -30,6 +30,7 @@ from trackmdp.policies.policy import Policy
 from trackmdp.seeding import derive, preserved_global_rng
 from trackmdp.solvers.alike import cell_classes
 from trackmdp.solvers.partition import Block, blocks, default_halo, narrow_halo, plan_by_blocks
+from trackmdp.solvers.workers import crew
 from trackmdp.training.callbacks import Callback, Learning
 from trackmdp.training.display import make_console
 from trackmdp.training.evaluator import Evaluator, Score
@@ -114,7 +115,8 @@ class BlockTrainer:
             # A block hears signals while it learns; here they end what is between two blocks, and all workers.
             opened.enter_context(handled(_stop, *HEARD))
             learner = _BlockLearner(self.config, place / "blocks", parts)
-            table = plan_by_blocks(world, learner, side, halo, workers=cfg.workers, cluster=cfg.cluster)
+            run = opened.enter_context(crew(cfg.workers, cfg.cluster))
+            table = plan_by_blocks(world, learner, side, halo, run)
             with decoded(str(place / "blocks"), "the runs of blocks"):
                 ends = [read_summary(learner.place(number)) for number in range(len(parts))]
                 earned = sum(end["frames"] * end["while_collecting"]["reward_per_frame"] for end in ends)
