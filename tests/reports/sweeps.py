@@ -61,9 +61,9 @@ def write_run(
         "regret_per_step": score.regret_per_step,
         "versions": versions or VERSIONS,
         "machine": MACHINE,
-        "config_sha256": config_digest(cfg),
+        "config_sha256": config_digest(cfg, folder),
     }
-    (folder / "config.yaml").write_text(config_text(cfg), encoding="utf-8")
+    (folder / "config.yaml").write_text(config_text(cfg, folder), encoding="utf-8")
     sparse.save_npz(folder / "kernel.npz", world.kernel)
     Policy.from_dense(world, chains).save(folder / "policy.npz", score.evaluation.value)
     write_summary(folder, summary)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 from pathlib import Path
 from typing import Any
@@ -89,18 +90,27 @@ def test_a_cut_run_ends_as_if_it_had_not_been(uncut: tm.Run, tmp_path: Path, mon
 
     monkeypatch.setattr(Checkpoints, "save", noted)
     with pytest.raises(KeyboardInterrupt):
-        learned(tmp_path)
-    assert list(policies(tmp_path)) == ["blocks/00000/policy.npz"]
-    done = (tmp_path / "blocks" / "00000" / "summary.json").stat().st_mtime_ns
+        learned(tmp_path / "begun")
+    assert list(policies(tmp_path / "begun")) == ["blocks/00000/policy.npz"]
+    folder = (tmp_path / "begun").rename(tmp_path / "moved")
+    done = (folder / "blocks" / "00000" / "summary.json").stat().st_mtime_ns
     saved.clear()
-    learned(tmp_path, resume="auto")
-    # what was finished is not learned again, and what was cut goes on from its checkpoint
-    assert done == (tmp_path / "blocks" / "00000" / "summary.json").stat().st_mtime_ns
+    monkeypatch.chdir(tmp_path)
+    learned(Path("moved"), resume="auto")
+    # what was finished is not learned again, and what was cut goes on from its checkpoint, wherever the run lies
+    assert done == (folder / "blocks" / "00000" / "summary.json").stat().st_mtime_ns
     assert saved[:2] == [("00001", 1200), ("00001", 1500)]
     assert {name for name, _ in saved} == {"00001", "00002", "00003"}
     assert uncut.folder is not None
-    assert policies(tmp_path) == policies(uncut.folder)
-    assert len(policies(tmp_path)) == 5
+    assert policies(folder) == policies(uncut.folder)
+    assert len(policies(folder)) == 5
+    copied = Path(shutil.copytree(folder, tmp_path / "copied"))
+    shutil.rmtree(folder)
+    block = tm.load_run(copied / "blocks" / "00001")
+    words = ["evaluate", f"run={block.folder}", "episodes=0", f"hydra.run.dir={tmp_path / 'figures'}"]
+    assert main(words) == 0
+    figures = json.loads((tmp_path / "figures" / "evaluation.json").read_text())
+    assert figures["exact"]["aihtr"] == block.evaluation.aihtr
 
 
 def test_blocks_have_their_part_of_a_map(tmp_path: Path) -> None:

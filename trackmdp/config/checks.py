@@ -5,14 +5,17 @@ What is refused is told in one line, the same from Python and at the terminal.
 
 from __future__ import annotations
 
+import copy
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from trackmdp.config.options import GROUPS, SELECTORS, Option, choices_of, leaves, nodes, options, refuse
 from trackmdp.config.registry import conf_file
 from trackmdp.errors import UserError
+
+T = TypeVar("T")
 
 RENAMED: dict[str, str] = {
     "algo.average": "algo.ema_decay",
@@ -130,18 +133,33 @@ def _selects(selector: str, group: str, choice: str) -> bool:
 def absolute_paths(cfg: Any, folder: Path) -> None:
     """Resolve every path of the config against `folder`, where the user typed the command."""
     # Saved as absolute paths, they still mean the same files when the run is resumed from another folder.
+    _each_path(cfg, lambda path: str(folder / path))  # `path` itself where that is absolute
+
+
+def own_paths(cfg: T, folder: Path) -> T:
+    """A copy in which what lies in `folder`, that of the run, is named relative to it: a run may be moved."""
+    copied, place = copy.deepcopy(cfg), folder.absolute()
+
+    def relative(path: str) -> str:
+        return str(Path(path).relative_to(place)) if Path(path).is_relative_to(place) else path
+
+    _each_path(copied, relative)
+    return copied
+
+
+def _each_path(cfg: Any, change: Callable[[str], str]) -> None:
     for _, node in nodes(cfg):
         for name, described in options(type(node)).items():
             value = vars(node)[name]
-            if isinstance(described, Option) and described.path:
-                # resume=auto is a word, not a file called `auto`.
-                setattr(node, name, value if value in described.words else _absolute(value, folder))
+            # resume=auto is a word, not a file called `auto`.
+            if isinstance(described, Option) and described.path and value not in described.words:
+                setattr(node, name, _changed(value, change))
 
 
-def _absolute(value: Any, folder: Path) -> Any:
+def _changed(value: Any, change: Callable[[str], str]) -> Any:
     """A path, or in a list of choices with their options (`kernel.regimes`) each `path`; anything else as it is."""
     if isinstance(value, str):
-        return str(folder / value)  # `value` itself where that is absolute
+        return change(value)
     if isinstance(value, list):
-        return [_absolute(each, folder) if isinstance(each, dict) else each for each in value]
-    return value | {"path": _absolute(value["path"], folder)} if isinstance(value, dict) and "path" in value else value
+        return [_changed(each, change) if isinstance(each, dict) else each for each in value]
+    return value | {"path": _changed(value["path"], change)} if isinstance(value, dict) and "path" in value else value

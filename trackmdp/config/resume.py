@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from trackmdp.config.checks import validate
+from trackmdp.config.checks import own_paths, validate
 from trackmdp.config.options import GROUPS, SELECTORS, listed, several
 from trackmdp.config.roots import TrainConfig
 from trackmdp.config.tree import build_config, load_run_config, to_dict, to_yaml
@@ -42,16 +42,17 @@ def fixed_options(cfg: TrainConfig) -> dict[str, Any]:
     return plain
 
 
-def config_text(cfg: TrainConfig) -> str:
-    """The text of `config.yaml`, without `resume`."""
+def config_text(cfg: TrainConfig, folder: Path | None) -> str:
+    """The text of `config.yaml` in the folder of the run, where it has one: without `resume`, and movable with it."""
+    cfg = own_paths(cfg, folder) if folder is not None else cfg
     # With `resume` in it, config.yaml and its digest would differ between a run and the same run interrupted
     # and resumed.
     return to_yaml(dataclasses.replace(cfg, resume=None))
 
 
-def config_digest(cfg: TrainConfig) -> str:
+def config_digest(cfg: TrainConfig, folder: Path | None) -> str:
     """SHA-256 of `config.yaml`."""
-    return hashlib.sha256(config_text(cfg).encode()).hexdigest()
+    return hashlib.sha256(config_text(cfg, folder).encode()).hexdigest()
 
 
 def finished(cfg: TrainConfig, folder: Path) -> dict[str, Any] | None:
@@ -63,7 +64,7 @@ def finished(cfg: TrainConfig, folder: Path) -> dict[str, Any] | None:
         return None
     # `quiet` changes what is shown and nothing else, but stands in the config: both texts are this run.
     mine = summary.get("config_sha256") in [
-        config_digest(dataclasses.replace(cfg, quiet=quiet)) for quiet in (True, False)
+        config_digest(dataclasses.replace(cfg, quiet=quiet), folder) for quiet in (True, False)
     ]
     return summary if mine else None
 

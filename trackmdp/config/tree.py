@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from omegaconf import OmegaConf
 
-from trackmdp.config.checks import check_choice, suggestion, validate
+from trackmdp.config.checks import absolute_paths, check_choice, suggestion, validate
 from trackmdp.config.options import GROUPS, ChoiceConfig, Option, as_float, options, several
 from trackmdp.config.roots import CommandConfig, TrainConfig, WorldConfig
 from trackmdp.config.untrusted import MAX_BYTES, parse_yaml
@@ -86,9 +86,11 @@ def load_run_config(folder: str | Path) -> TrainConfig:
     if not Path(folder).is_dir():
         raise UserError(f"run={folder}: no such folder")
     try:
-        return load_config(Path(folder) / "config.yaml", TrainConfig)
+        config = load_config(Path(folder) / "config.yaml", TrainConfig)
     except UserError as error:
         raise UserError(f"run={folder}: not the folder of a run ({error})") from error
+    absolute_paths(config, Path(folder).absolute())  # those of the run's own files are relative to it
+    return config
 
 
 def build_config(plain: Any, schema: type[Any], prefix: str = "", group: str = "", named: str = "") -> Any:

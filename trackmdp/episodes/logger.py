@@ -42,7 +42,7 @@ class EpisodeLogger(Callback):
             self._folder,
             trainer.problem,
             seed=trainer.config.seed,
-            config=config_text(trainer.config),
+            config=config_text(trainer.config, trainer.folder),
             layout=self._cfg.layout,
             policies=self._policies or None,
             tell=tell,

@@ -114,7 +114,7 @@ class BlockTrainer:
             own_folder(place / "blocks")
             # A block hears signals while it learns; here they end what is between two blocks, and all workers.
             opened.enter_context(handled(_stop, *HEARD))
-            learner = _BlockLearner(self.config, place / "blocks", parts)
+            learner = _BlockLearner(self.config, place.absolute() / "blocks", parts)
             run = opened.enter_context(crew(cfg.workers, cfg.cluster))
             table = plan_by_blocks(world, learner, side, halo, run)
             with decoded(str(place / "blocks"), "the runs of blocks"):
@@ -141,7 +141,7 @@ def _resumed(config: TrainConfig, folder: Path) -> bool:
     """
     if not (folder / "config.yaml").is_file():
         return False
-    if identity(load_run_config(folder)) != identity(config):
+    if identity(load_run_config(folder), folder) != identity(config, folder):
         raise UserError(f"{folder}: holds a run with another config, which cannot change on resume")
     return True
 

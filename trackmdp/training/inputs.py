@@ -58,7 +58,7 @@ def write_inputs(config: TrainConfig, problem: Problem, folder: Path, *, resumed
         for name, content in contents.items():
             write_bytes(folder / name, content)
     # The config last: with it the folder is that of a run, and all that it names must be there.
-    write_text(folder / "config.yaml", config_text(config))
+    write_text(folder / "config.yaml", config_text(config, folder))
 
 
 def check_inputs(problem: Problem, folder: Path) -> None:

@@ -89,7 +89,8 @@ class Checkpoints(Callback):
         # `_best` and `_is_best` are part of the state, so they are set before it is taken. The logs are called before
         # this callback: the lengths of files in their states include this iteration's row and episodes.
         named = {each.name: each.state_dict() for each in trainer.callbacks if each.name}
-        state = capture(trainer.config, trainer.algorithm, trainer.collector, trainer.position, named)
+        run = self._folder.parent
+        state = capture(trainer.config, run, trainer.algorithm, trainer.collector, trainer.position, named)
         file = checkpoint.save(self._folder, trainer.position.iteration, state, keep=self._cfg.keep, best=self._is_best)
         # Measured, since saving a large replay buffer to a slow disk may take longer than the interval asked for.
         self._saved, self._rest = trainer.position, _SAVING * (time.monotonic() - begin)

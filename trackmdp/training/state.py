@@ -15,6 +15,7 @@ from torchrl.collectors import BaseCollector, Collector
 
 from trackmdp.algos.common import Algorithm
 from trackmdp.config import TrainConfig
+from trackmdp.config.checks import own_paths
 from trackmdp.config.resume import fixed_options
 from trackmdp.errors import UserError
 from trackmdp.training import checkpoint
@@ -38,14 +39,15 @@ class Position:
     reward: float = 0.0
 
 
-def identity(cfg: TrainConfig) -> str:
-    """SHA-256 of all options that must not change when a run is resumed."""
+def identity(cfg: TrainConfig, folder: Path) -> str:
+    """SHA-256 of all options that must not change when the run in `folder` is resumed."""
     # repr writes floats with all digits, so that equal hashes mean equal options.
-    return hashlib.sha256(repr(fixed_options(cfg)).encode()).hexdigest()
+    return hashlib.sha256(repr(fixed_options(own_paths(cfg, folder))).encode()).hexdigest()
 
 
 def capture(
     cfg: TrainConfig,
+    folder: Path,
     algorithm: Algorithm,
     collector: BaseCollector,
     at: Position,
@@ -55,6 +57,7 @@ def capture(
 
     Args:
         cfg: the run's config.
+        folder: of the run.
         algorithm: networks, optimizers, schedules, buffers.
         collector: rows in mid-episode and the environment's generators.
         at: how far the run is.
@@ -62,7 +65,7 @@ def capture(
     """
     cuda = torch.cuda.get_rng_state_all() if torch.cuda.is_available() else []
     return {
-        "identity": identity(cfg),
+        "identity": identity(cfg, folder),
         "versions": {name: version(name) for name in _EXACT},
         "algorithm": algorithm.state_dict(),
         "collector": collector_state(collector),
@@ -152,7 +155,7 @@ def load_learned(algorithm: Algorithm, cfg: TrainConfig, file: Path, device: tor
 
 
 def _check_identity(state: Mapping[str, Any], cfg: TrainConfig, file: Path) -> None:
-    if state.get("identity") != identity(cfg):
+    if state.get("identity") != identity(cfg, file.parent.parent):  # RUN/checkpoints/iteration-00000012.pt
         raise UserError(f"{file}: belongs to a run with another config")
 
 

@@ -51,5 +51,5 @@ def summarize(
         "versions": {"trackmdp": __version__, "python": platform.python_version()}
         | {name: version(name) for name in _PACKAGES},
         "machine": machine(),
-        "config_sha256": config_digest(config),
+        "config_sha256": config_digest(config, trainer.folder),
     }
