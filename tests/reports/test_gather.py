@@ -156,6 +156,17 @@ def test_a_curve_keeps_its_ends_and_few_points(sweep: Path) -> None:
     assert gaps[0] < gaps[-1]
 
 
+def test_a_run_by_blocks_is_one_run_that_needs_no_curve(tmp_path: Path) -> None:
+    write_run(tmp_path / "whole", "partition.block=4")
+    (tmp_path / "whole" / "metrics.csv").unlink()
+    for number in range(2):
+        write_run(tmp_path / "whole" / "blocks" / f"{number:05d}", seed=number)
+    for place, name in ((tmp_path, "whole"), (tmp_path / "whole", ".")):  # the folder of the run itself, too
+        found = gather_runs(place)
+        assert [run.name for run in found.runs] == [name]
+        assert found.anomalies == []
+
+
 @pytest.mark.parametrize("text", ["{", "[]", "{}"])
 def test_a_failure_or_a_plan_that_says_nothing_is_no_obstacle(sweep: Path, text: str) -> None:
     for name in ("a2c-0.16-0/failed.json", "sweep.json"):

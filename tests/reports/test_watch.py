@@ -57,6 +57,17 @@ def test_every_state_is_read_from_the_folder(tmp_path: Path) -> None:
     ]
 
 
+def test_of_a_run_by_blocks_those_that_are_done_are_counted(tmp_path: Path) -> None:
+    place = tmp_path / "a"
+    for number in range(3):
+        (place / "blocks" / f"{number:05d}").mkdir(parents=True)
+    (place / "config.yaml").touch()
+    write_json(place / "plan.json", {"blocks": 4})
+    finish(place / "blocks" / "00000")
+    with locked(place):
+        assert statuses(tmp_path) == [Status("a", "running", 0.25)]
+
+
 def test_only_the_end_of_a_long_table_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(watch, "TAIL", 40)
     sweep = sweep_of(tmp_path / "s", "a")

@@ -70,7 +70,8 @@ def gather_runs(folder: Path) -> Results:
     runs = [run for run in runs if run.name not in repeated]
     curves = {run.name: read_curve(folder / run.name / "metrics.csv") for run in runs}
     grouped = study(runs)
-    anomalies += [Anomaly(name, "no learning curve") for name, curve in curves.items() if not curve]
+    whole = [run.name for run in runs if run.settings.get("partition.block") is None]  # each block has a curve
+    anomalies += [Anomaly(name, "no learning curve") for name in whole if not curves[name]]
     # Nothing says otherwise what was planned: the seeds of one world are what the others are expected to have.
     anomalies += _missing_seeds(grouped) if plan is None else []  # a plan says what else there should be
     policies, unread = _policies(folder, grouped)
@@ -102,8 +103,14 @@ def run_folders(folder: Path, plan: Mapping[str, Any] | None) -> list[str]:
     # Resolved, since `..` or a link within a name may lead anywhere.
     root = folder.resolve()
     inside = {name for name in named | found if (folder / name).resolve().is_relative_to(root)}
-    # `.` is the sweep's own folder, which is no run of it.
-    return sorted(inside - {"."}, key=_natural)
+    # `.` is the sweep's own folder, which is no run of it, unless it is the folder of a run itself.
+    none = set() if (folder / "config.yaml").is_file() else {"."}
+    return sorted((name for name in inside - none if not _is_block(folder / name)), key=_natural)
+
+
+def _is_block(place: Path) -> bool:
+    """Whether a folder is that of a block, whose run is part of another one: RUN/blocks/00012."""
+    return place.parent.name == "blocks" and (place.parent.parent / "config.yaml").is_file()
 
 
 def _relative(folder: Path, name: str) -> str:

@@ -18,6 +18,7 @@ from rich.text import Text
 from trackmdp.errors import UserError
 from trackmdp.reports.gather import planned, run_folders
 from trackmdp.training.folders import run_of
+from trackmdp.training.sealing import SUMMARY
 from trackmdp.untrusted import decoded, known_object, opened, printable
 
 WAITING, RUNNING, CUT, FAILED, DONE = "waiting", "running", "cut", "failed", "done"
@@ -118,8 +119,9 @@ def _status(place: Path, name: str) -> Status:
         bounds = [bound for bound in (upper, best) if bound is not None]
         # The solver's bound may be tighter than the clocked one of the plan.
         return Status(name, DONE, 1.0, min(bounds) - earned if bounds and earned is not None else None, 0.0)
-    if not last:
-        return Status(name, found.state)
+    if not last:  # not begun, or a run by blocks, each of which has metrics of its own
+        done, blocks = len([*place.glob(f"blocks/*/{SUMMARY}")]), _number(plan, "blocks") or 0.0
+        return Status(name, found.state, min(1.0, done / blocks) if blocks >= 1 else 0.0)
     planned = _number(plan, "iterations") or 0.0
     share = min(1.0, last[-1]["iteration"] / planned) if planned >= 1 else 0.0
     judged = [row["aihtr"] for row in last if "aihtr" in row]

@@ -24,7 +24,7 @@ from trackmdp.config.partition import PartitionConfig
 from trackmdp.config.resume import finished
 from trackmdp.config.sensing import MissConfig, PaperCostConfig, PerfectSensorConfig
 from trackmdp.config.world import TableConfig
-from trackmdp.durable import own_folder, write_bytes
+from trackmdp.durable import own_folder, write_bytes, write_json
 from trackmdp.errors import Preempted, UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.seeding import derive, preserved_global_rng
@@ -111,6 +111,7 @@ class BlockTrainer:
             place = self.folder or Path(opened.enter_context(TemporaryDirectory()))
             if self.folder is not None:
                 write_inputs(self.config, world, place, resumed=_resumed(self.config, place))
+                write_json(place / "plan.json", {"blocks": len(parts)})  # for those who watch the run
             own_folder(place / "blocks")
             # A block hears signals while it learns; here they end what is between two blocks, and all workers.
             opened.enter_context(handled(_stop, *HEARD))
