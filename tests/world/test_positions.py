@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import re
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -223,6 +224,23 @@ def test_a_parquet_file_that_unfolds_to_too_much_is_refused(tmp_path: Path, monk
     monkeypatch.setattr("trackmdp.world.position_tables.LONGEST", 100_000)
     assert (tmp_path / "t.parquet").stat().st_size < 100_000
     with pytest.raises(UserError, match=r"not a table of positions \([\d,]+ bytes once unfolded, expected"):
+        read_positions(tmp_path / "t.parquet", "points")
+
+
+def test_one_long_text_in_all_rows_of_a_parquet_file_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("trackmdp.world.position_tables.LONGEST", 100_000)
+    numbers = {name: np.arange(1000.0) for name in ("t", "x", "y")}
+    for size, fine in ((50, True), (150, False)):
+        pd.DataFrame({"id": "v" * size, **numbers}).to_parquet(tmp_path / "t.parquet")
+        with nullcontext() if fine else pytest.raises(UserError, match="150,000 bytes once unfolded, expected at most"):
+            assert len(read_positions(tmp_path / "t.parquet", "points").time) == 1000
+
+
+def test_columns_of_lists_are_no_columns_of_a_parquet_file(tmp_path: Path) -> None:
+    pd.DataFrame({"id": [1, 1], "t": [0, 5], "x": [[1.0], [2.0]], "y": [0, 1]}).to_parquet(tmp_path / "t.parquet")
+    with pytest.raises(UserError, match="columns id, t, y: expected either x, y or lat, lon"):
         read_positions(tmp_path / "t.parquet", "points")
 
 

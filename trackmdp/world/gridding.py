@@ -185,7 +185,7 @@ def _cells(x: Array, y: Array, corner: Sequence[float], grid: Gridding, *, downw
     cell 1 · 3 + 2 = 5. (30, 5) is outside: a cell has its left and lower edges, not the others.
     """
     rows, columns = grid.size
-    with np.errstate(invalid="ignore"):  # inf, where the projection does not reach
+    with np.errstate(invalid="ignore", over="ignore"):  # inf, where the projection does not reach
         column, up = (np.floor((each - low) / grid.cell) for each, low in zip((x, y), corner, strict=True))
         inside = (column >= 0) & (column < columns) & (up >= 0) & (up < rows)
         row = up if downwards else rows - 1 - up

@@ -53,19 +53,31 @@ def _read_csv(stream: BinaryIO, names: Sequence[str], columns: Mapping[str, str]
 
 
 def _parquet_names(stream: BinaryIO) -> list[str]:
-    from pyarrow import parquet
+    """The columns that hold one value for each row; lists may hold any number."""
+    from pyarrow import parquet, types
 
     file = parquet.ParquetFile(stream)
     # Some bytes of a file may unfold to any number of equal values: its own claims are held against the limit first.
     groups = (file.metadata.row_group(place) for place in range(file.metadata.num_row_groups))
-    unfolded = max(sum(group.total_byte_size for group in groups), 8 * file.metadata.num_rows)
-    if unfolded > LONGEST:
-        raise ValueError(f"{unfolded:,} bytes once unfolded, expected at most {LONGEST:,}")
-    return list(file.schema_arrow.names)
+    widest = max(8, *(column.length for column in file.schema))  # of numbers, and of bytes of a fixed length
+    _check_unfolded(max(sum(group.total_byte_size for group in groups), widest * file.metadata.num_rows))
+    return [column.name for column in file.schema_arrow if not types.is_nested(column.type)]
 
 
 def _read_parquet(stream: BinaryIO, columns: Mapping[str, str]) -> Any:
-    from pyarrow import parquet
+    from pyarrow import compute, parquet, types
 
     stream.seek(0)
-    return parquet.read_table(stream, columns=list(columns.values())).to_pandas()
+    # Texts as a dictionary, as they are stored: one text of megabytes may be that of every row.
+    table = parquet.read_table(stream, columns=list(columns.values()), read_dictionary=list(columns.values()))
+    for place, column in enumerate(table.columns):
+        if types.is_dictionary(column.type):
+            lengths = [compute.take(compute.binary_length(part.dictionary), part.indices) for part in column.chunks]
+            _check_unfolded(sum(compute.sum(each).as_py() or 0 for each in lengths))
+            table = table.set_column(place, table.column_names[place], column.cast(column.type.value_type))
+    return table.to_pandas()
+
+
+def _check_unfolded(size: int) -> None:
+    if size > LONGEST:
+        raise ValueError(f"{size:,} bytes once unfolded, expected at most {LONGEST:,}")
