@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 
 from tests.solvers.worlds import paper_world, tiny_worlds
-from trackmdp.paper import remarks, theorems, worlds
+from trackmdp.paper import theorems, worlds
 from trackmdp.paper.theorems import Check
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import bounds, clocked, optimal, qmdp
@@ -73,7 +73,7 @@ def test_with_a_cheap_safe_action_being_overdue_is_worth_more_than_being_located
 
 
 def test_the_remark_on_worlds_where_qmdp_is_optimal() -> None:
-    rows = {row.name: row for row in remarks.check_remarks(1e-9)}
+    rows = {row.name: row for row in theorems.check_remarks(1e-9)}
     assert rows["remark, c = 0.14, Z = 4"].holds
     world = paper_world(4, 0.14, 1)
     np.testing.assert_array_equal(qmdp.solve(world).dense()[:, 0], world.kernel.toarray() > 0)
@@ -81,7 +81,7 @@ def test_the_remark_on_worlds_where_qmdp_is_optimal() -> None:
 
 
 def test_the_printed_bound_is_exceeded() -> None:
-    (row,) = [row for row in remarks.check_remarks(1e-9) if row.name == "the printed bound"]
+    (row,) = [row for row in theorems.check_remarks(1e-9) if row.name == "the printed bound"]
     world = worlds.paper_world(worlds.paper_kernel(5, 5, "inside"), 0.16, 5)
     attained = evaluate(world, clocked.solve(world)).aihtr
     assert attained > bounds.paper(world).mean() + 0.5

@@ -12,8 +12,7 @@ import pytest
 from tests.episodes.browser import CHROMIUM, Browser
 from tests.reports.sweeps import write_run
 from trackmdp.paper.calibration import candidates, sensitivity
-from trackmdp.paper.critique import checks
-from trackmdp.paper.openings import Openings
+from trackmdp.paper.openings import Openings, checks
 from trackmdp.paper.printed import pairs
 from trackmdp.paper.sections import accuracy_table, sections
 from trackmdp.reports.gather import gather_runs

@@ -21,8 +21,7 @@ from trackmdp.errors import UserError
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.make import make_problem
 from trackmdp.world.model import World
-from trackmdp.world.modes import HiddenWorld, check_revealed, heading_kernel
-from trackmdp.world.regimes import regimes
+from trackmdp.world.modes import HiddenWorld, check_revealed, heading_kernel, regimes
 from trackmdp.world.velocity import constant_velocity, coordinated_turn, dithered, steps_of
 
 WALK = {"kernel": "random_walk", "stay": 0.6, "diagonal": False, "exit_probability": 0.1, "border": "clip"}

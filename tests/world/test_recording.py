@@ -11,7 +11,7 @@ import pytest
 
 from tests.tracks import by_hand, recorded
 from trackmdp.errors import UserError
-from trackmdp.world.recording import read_recording, recording_bytes
+from trackmdp.world.track_files import read_recording, recording_bytes
 from trackmdp.world.tracks import Recorded
 
 

@@ -56,7 +56,7 @@ class MlflowConfig(RowsConfig):
     experiment: str = option("experiment of the run", expects="a name", pattern=r"[\w .-]{1,128}")
 
 
-@choice("log", "mcap", makes="trackmdp.episodes.logger:EpisodeLogger")
+@choice("log", "mcap", makes="trackmdp.episodes.log:EpisodeLogger")
 class McapConfig(LogConfig):
     """`episodes.mcap`: simulated episodes, step by step, for `replay` and viewers."""
 

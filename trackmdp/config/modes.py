@@ -51,7 +51,7 @@ class HeadingConfig(HiddenKernelConfig):
     exit_probability: float = option("probability of leaving the grid", unit="per step", gt=0, lt=1)
 
 
-@choice("kernel", "regimes", makes="trackmdp.world.regimes:regimes")
+@choice("kernel", "regimes", makes="trackmdp.world.modes:regimes")
 class RegimesConfig(HiddenKernelConfig):
     """A target that switches between other kernels, such as to linger and to travel; the one in force is its mode.
 

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 import torch
+from scipy import sparse
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
@@ -23,8 +24,7 @@ from trackmdp.policies.policy import Policy, PolicyLike, as_policy, looked_up, r
 from trackmdp.policies.unroll import STATE_KEYS, DrawsError, Rule, acting, kept_keys, module_action
 from trackmdp.world.costs import Costs
 from trackmdp.world.model import Task
-from trackmdp.world.sight import Sight
-from trackmdp.world.windows import Window
+from trackmdp.world.windows import Sight, Window
 
 _MOST_ROWS = 4096  # episodes stepped together: their generators take 5 kB each
 _DRAWS = 25_600  # of one step: 256 steps of them are held at a time, 26 MB
@@ -37,7 +37,7 @@ class States:
 
     Attributes:
         row: `[B]` which episodes of the batch these are.
-        place: `[B]` of the targets (`world/sources.py`), for the simulator's eyes.
+        place: `[B]` of the targets (`world/targets.py`), for the simulator's eyes.
         last_cell: `[B]` cell of the last detection.
         key: `[B]` what the policy remembered there; the cell, where that is all.
         misses: `[B]` n since then.
@@ -53,10 +53,7 @@ class States:
 
     def kept(self, rows: Tensor) -> States:
         """Those of the positions `rows`."""
-        row, place, last_cell, key, misses = (
-            part[rows] for part in (self.row, self.place, self.last_cell, self.key, self.misses)
-        )
-        return States(row, place, last_cell, key, misses, self.step)
+        return replace(self, **{name: part[rows] for name, part in vars(self).items() if name != "step"})
 
 
 @dataclass(frozen=True)
@@ -112,41 +109,28 @@ class _Writing(Actor):
 
 
 class Following(Actor):
-    """A deterministic policy with a table."""
+    """A deterministic policy: a row of its table for each state, or one for all where all sensors are on, or none."""
 
     policy: Policy
 
     def __init__(self, policy: Policy, costs: Costs) -> None:
-        assert policy.sets is not None
-        self.policy, cpu = policy, torch.device("cpu")
-        self._table = policy.lookup(cpu) if policy.seen is policy.sets else looked_up(policy.seen, cpu)
+        self.policy, sets, coverage = policy, policy.sets, policy.task.coverage
+        if sets is None:
+            sets = sparse.csr_array(np.full((1, policy.task.total_sensors), policy.probability == 1.0))
+            seen = sets if coverage is None else coverage.seen(sets)
+        else:
+            seen = policy.seen
+        cpu = torch.device("cpu")
+        self._table = policy.lookup(cpu) if seen is policy.sets else looked_up(seen, cpu)
         # A CSR matrix's indptr says where each row's entries begin: 0 2 2 5 are rows of 2, 0 and 3 sensors.
-        self._count = torch.as_tensor(np.diff(policy.sets.indptr).astype(np.int64))
-        self._spent = costs.of_sets(policy.sets)
+        self._count = torch.as_tensor(np.diff(sets.indptr).astype(np.int64))
+        self._spent = costs.of_sets(sets)
 
     def decide(self, states: States, draws: Tensor) -> Choice:  # noqa: ARG002
         """See `Actor`."""
-        row = self.policy.row(states.key, states.misses)
+        alike = self.policy.sets is None
+        row = torch.zeros_like(states.key) if alike else self.policy.row(states.key, states.misses)
         return Choice(self._count[row], self._spent[row], partial(self._table.entry, row))
-
-
-class Uniform(Actor):
-    """All sensors on, or none."""
-
-    def __init__(self, policy: Policy, costs: Costs) -> None:
-        self.policy = policy
-        on, coverage = policy.probability == 1.0, policy.task.coverage
-        action = torch.full((1, policy.task.total_sensors), on)
-        self._seen = torch.full((policy.task.num_cells,), on)
-        if coverage is not None:
-            self._seen &= torch.as_tensor(coverage.degree) > 0
-        self._count, self._spent = action.sum(-1), costs.price_of(action)
-
-    def decide(self, states: States, draws: Tensor) -> Choice:  # noqa: ARG002
-        """See `Actor`."""
-        b = len(states.row)
-        # expand repeats one number B times without memory of its own.
-        return Choice(self._count.expand(b), self._spent.expand(b), self._seen.__getitem__)
 
 
 class Drawing(_Writing):
@@ -237,6 +221,4 @@ def actor_of(task: Task, policy: PolicyLike | Playback, costs: Costs) -> Actor:
         if isinstance(policy, TensorDictModuleBase) and kept_keys(policy):
             return Remembering(told, policy, costs)
         return Asking(task, rule_of(told, policy), costs)
-    if not made.deterministic:
-        return Drawing(made, costs)
-    return Uniform(made, costs) if made.sets is None else Following(made, costs)
+    return Following(made, costs) if made.deterministic else Drawing(made, costs)

@@ -6,6 +6,7 @@ import hashlib
 import json
 import platform
 from importlib.metadata import version
+from importlib.resources import files
 from typing import Any
 
 from trackmdp import __version__
@@ -33,85 +34,34 @@ def tick_of(log_time: int) -> int:
     return (log_time - _BASE_NS) // TICK_NS
 
 
-def _object(title: str, **properties: Any) -> dict[str, Any]:
-    return {"title": title, "type": "object", "properties": properties}
+_FIELDS = json.loads(files("trackmdp.episodes").joinpath("schemas.json").read_text(encoding="utf-8"))
+"""Name of a schema -> its properties, in the order in which messages have them."""
 
-
-def _fields(kind: str, names: str) -> dict[str, Any]:
-    """Properties of one type."""
-    return {name: {"type": kind} for name in names.split()}
-
-
-def _inner(kind: str, names: str) -> dict[str, Any]:
-    """A property with properties of one type."""
-    return {"type": "object", "properties": _fields(kind, names)}
-
-
-_INTEGER = {"type": "integer"}
-
-
-def _layer(title: str) -> tuple[str, dict[str, Any]]:
-    place = {"position": _inner("number", "x y z"), "orientation": _inner("number", "x y z w")}
-    field = {"type": "object", "properties": _fields("string", "name") | _fields("integer", "offset type")}
-    return "foxglove.Grid", _object(
-        f"{title}; the first row is the lowest",
-        timestamp=_inner("integer", "sec nsec"),
-        **_fields("string", "frame_id"),
-        pose={"type": "object", "properties": place},
-        column_count=_INTEGER,
-        cell_size=_inner("number", "x y"),
-        **_fields("integer", "row_stride cell_stride"),
-        fields={"type": "array", "items": field},
-        data={"type": "string", "contentEncoding": "base64"},
-    )
-
+_TOPICS = {
+    "/step": ("trackmdp.Step", "One step: what was known and chosen before the move, what came of it after"),
+    "/grid": (
+        "foxglove.Grid",
+        "belief and policy of every cell, of large grids of the part where they are not 0; the first row is the lowest",
+    ),
+    "/active": (
+        "foxglove.Grid",
+        "the cells sensed, in the smallest rectangle around them; the first row is the lowest",
+    ),
+    "/target": ("foxglove.Grid", "the true cell of the target; the first row is the lowest"),
+    "/part": ("foxglove.FrameTransform", "the middle of the part of a large grid that the target is in"),
+    "/episode": ("trackmdp.Episode", "One episode, at the time of its last step"),
+}
 
 SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
-    "/step": (
-        "trackmdp.Step",
-        _object(
-            "One step: what was known and chosen before the move, what came of it after",
-            **_fields("integer", "episode t n last_cell"),
-            active={"type": "array", "items": _INTEGER},
-            n_active=_INTEGER,
-            forced={"type": "boolean"},
-            **_fields("integer", "target target_x target_y obs"),
-            **_fields("number", "reward ep_return"),
-            **_fields("boolean", "first last"),
-        ),
-    ),
-    "/grid": _layer("belief and policy of every cell, of large grids of the part where they are not 0"),
-    "/active": _layer("the cells sensed, in the smallest rectangle around them"),
-    "/target": _layer("the true cell of the target"),
-    "/part": (
-        "foxglove.FrameTransform",
-        _object(
-            "the middle of the part of a large grid that the target is in",
-            timestamp=_inner("integer", "sec nsec"),
-            **_fields("string", "parent_frame_id child_frame_id"),
-            translation=_inner("number", "x y z"),
-            rotation=_inner("number", "x y z w"),
-        ),
-    ),
-    "/episode": (
-        "trackmdp.Episode",
-        _object(
-            "One episode, at the time of its last step",
-            episode=_INTEGER,
-            seed={"type": "string"},
-            **_fields("integer", "policy start length detections forced"),
-            **_fields("boolean", "terminated truncated"),
-            **_fields("string", "start_time end_time"),
-            **_fields("number", "return"),
-        ),
-    ),
+    topic: (name, {"title": title, "type": "object", "properties": _FIELDS[name]})
+    for topic, (name, title) in _TOPICS.items()
 }
 """Topic -> (name of its schema, JSON schema), within the subset that viewers read: no null, no array of arrays.
 
 Cells are numbered row by row from the top left; -1 stands for no cell: a target that exited, nothing observed.
 """
 
-MODE = {"/step": {"mode": _INTEGER}, "/episode": {"start_mode": _INTEGER}}
+MODE = {"/step": {"mode": {"type": "integer"}}, "/episode": {"start_mode": {"type": "integer"}}}
 """Topic -> what its messages have besides, in logs of targets with a mode."""
 
 

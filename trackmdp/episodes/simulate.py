@@ -18,7 +18,7 @@ from trackmdp.seeding import derive, preserved_global_rng
 from trackmdp.world.costs import Costs
 from trackmdp.world.modes import check_revealed
 from trackmdp.world.reports import Reports
-from trackmdp.world.sources import Source, held_out_source
+from trackmdp.world.targets import Source, held_out_source
 from trackmdp.world.tracks import Problem
 
 _BLOCK = 256  # draws taken from an episode's generator at a time; part of what a seed means, so never to be changed

@@ -11,12 +11,16 @@ from typing import Any
 
 from trackmdp.durable import write_text
 from trackmdp.errors import UserError
-from trackmdp.paper import critique
+from trackmdp.paper import theorems
 from trackmdp.paper.calibration import BORDER, T_MAX, Candidate, Setting, Spread, candidates, chosen, sensitivity
 from trackmdp.paper.theorems import Check
-from trackmdp.paper.worlds import SUPPORTS
+from trackmdp.paper.worlds import COSTS, SUPPORTS, paper_kernel, paper_world
+from trackmdp.solvers import optimal
 
 OPENINGS_FILE = "paper.json"
+TOLERANCE = 1e-9
+# Z = 5 is where Q_MDP fails: each likely move has (1 - 0.15 - 0.005) / 4 = 0.211, below c/r = 0.22.
+HARDEST = 5
 
 
 @dataclass(frozen=True)
@@ -35,9 +39,16 @@ def compute(say: Callable[[str], None]) -> Openings:
     say("the paper's unstated settings")
     settings = list(sensitivity())
     say("the paper's theorems")
-    found = critique.checks(chosen(every)[critique.HARDEST], border=BORDER, t_max=T_MAX)
+    found = checks(chosen(every)[HARDEST], border=BORDER, t_max=T_MAX)
     # Through the stored form even now: a report made from `paper.json` later has to give the same bytes as this one.
     return _unpacked(_packed(Openings(every, settings, found)))
+
+
+def checks(seed: int, *, border: str, t_max: int) -> list[Check]:
+    """The paper's theorems on the world with Z = 5 at the lowest price, and the two remarks."""
+    world = paper_world(paper_kernel(HARDEST, seed, border), COSTS[0], t_max)  # type: ignore[arg-type]
+    solution = optimal.solve(world, tolerance=TOLERANCE)
+    return [*theorems.check_theorems(world, solution, TOLERANCE), *theorems.check_remarks(TOLERANCE)]
 
 
 def save_openings(openings: Openings, folder: Path) -> None:

@@ -19,7 +19,7 @@ from trackmdp.solvers.alike import cell_classes
 from trackmdp.untrusted import parse_json, read_bytes
 from trackmdp.world.files import csr_bytes
 from trackmdp.world.model import Array
-from trackmdp.world.recording import recording_bytes
+from trackmdp.world.track_files import recording_bytes
 from trackmdp.world.tracks import Problem, Recorded
 
 KERNEL, TRACKS = "kernel.npz", "tracks.json"

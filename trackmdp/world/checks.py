@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse.csgraph import breadth_first_order
 
+from trackmdp.config.sensing import LARGEST
 from trackmdp.errors import UserError
 from trackmdp.world.rows import pairwise_row_sums
+
+Range: TypeAlias = tuple[Callable[[npt.NDArray[np.float64]], npt.NDArray[np.bool_]], str]
+"""Which of some numbers are allowed, and in words; a nan is in no range."""
+
+PRICES: Range = (lambda price: (price >= 0) & (price <= LARGEST), "a number from 0 to 1e15")
+PROBABILITIES: Range = (lambda p: (p > 0) & (p <= 1), "a probability above 0, at most 1")
 
 
 def canonical_kernel(kernel: Any, source: str = "kernel") -> sparse.csr_array:
@@ -48,8 +55,7 @@ def one_each(
     given: npt.ArrayLike,
     count: int,
     each: str,
-    allowed: Callable[[npt.NDArray[np.float64]], npt.NDArray[np.bool_]],
-    expected: str,
+    allowed: Range,
 ) -> npt.NDArray[np.float64]:
     """`[count]` numbers, from one for all or from one for each.
 
@@ -58,8 +64,7 @@ def one_each(
         given: a number, or a list.
         count: how many there are to be.
         each: what each is of: a cell, or a sensor.
-        allowed: which of some numbers are in range; a nan is in none.
-        expected: the range in words.
+        allowed: which of some numbers are in range, and the range in words.
 
     Raises:
         UserError: another number of numbers, or one out of range.
@@ -67,7 +72,8 @@ def one_each(
     values = np.asarray(given, dtype=np.float64)
     if values.shape not in ((), (count,)):
         raise UserError(f"{source}: {values.size} values, expected one number or {count} (one per {each})")
-    if not (fine := allowed(values)).all():
+    within, expected = allowed
+    if not (fine := np.asarray(within(values))).all():
         bad = int(np.flatnonzero(~fine)[0])
         raise UserError(f"{source}: {each} {bad} has {values.flat[bad]}, expected {expected}")
     return np.broadcast_to(values, (count,)).copy()

@@ -17,10 +17,9 @@ from trackmdp.errors import UserError
 from trackmdp.world.costs import Costs
 from trackmdp.world.render import PICTURE_LEGEND, pixels, text_rows
 from trackmdp.world.reports import Reports
-from trackmdp.world.sight import Sight
 from trackmdp.world.targets import make_targets
 from trackmdp.world.tracks import Problem
-from trackmdp.world.windows import Window
+from trackmdp.world.windows import Sight, Window
 
 _FLAGS = ("done", "terminated", "truncated")
 

@@ -6,10 +6,11 @@ import io
 import math
 import os
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 from scipy import sparse
@@ -17,12 +18,14 @@ from scipy import sparse
 from trackmdp.arrays import LARGE, load_npy, load_npz, size_of
 from trackmdp.errors import UserError
 from trackmdp.untrusted import decoded, opened
-from trackmdp.world.checks import one_each
-from trackmdp.world.model import Array, BoolArray, Size, grid_size
+from trackmdp.world.checks import Range, one_each
+from trackmdp.world.model import Array, Size, grid_size
 
 _LONGEST_TEXT, _LONGEST_HEAD = 2**30, 2**16
 """Bytes of the longest .csv file, a recording of some eighty million steps, and of its first line."""
 
+
+T = TypeVar("T")
 
 _CSR = {"data", "indices", "indptr", "shape"}
 
@@ -43,8 +46,7 @@ def per_cell(
     key: str,
     given: float | list[float] | str,
     size: Size,
-    allowed: Callable[[Array], BoolArray],
-    expected: str,
+    allowed: Range,
     sensors: int | None = None,
 ) -> Array:
     """`[M]` one number per cell, or `[S]` per sensor: one for all, a list, or what is in a file.
@@ -53,8 +55,7 @@ def per_cell(
         key: the option, for messages.
         given: a number, a list, or a path as in `read_numbers`.
         size: of the grid.
-        allowed: which of some numbers are in range.
-        expected: the range in words.
+        allowed: which of some numbers are in range, and the range in words.
         sensors: S, where the numbers are those of sensors that lie at no cell.
 
     Raises:
@@ -62,9 +63,9 @@ def per_cell(
     """
     count, each = (math.prod(grid_size(size)), "cell") if sensors is None else (sensors, "sensor")
     if not isinstance(given, str):
-        return one_each(key, given, count, each, allowed, expected)
+        return one_each(key, given, count, each, allowed)
     values = read_numbers(key, given, name=key.rpartition(".")[2]).ravel()
-    return one_each(f"{key}={given}", values, count, each, allowed, expected)
+    return one_each(f"{key}={given}", values, count, each, allowed)
 
 
 def read_matrix(key: str, path: str | Path, *, name: str) -> sparse.csr_array | Array:
@@ -137,6 +138,20 @@ def read_columns(key: str, path: str | Path) -> dict[str, Array]:
         lengths = ", ".join(f"{name} {len(column)}" for name, column in columns.items())
         raise UserError(f"{source}: columns of different lengths ({lengths})")
     return {name: column.astype(np.float64) for name, column in columns.items()}
+
+
+def once(read: Callable[..., T], path: str | Path, *how: Hashable) -> T:
+    """`read(path, *how)`, kept until the file changes: a run is checked before its folder is made, and asks again."""
+    file = Path(path)
+    stamp = (file.stat().st_mtime_ns, file.stat().st_size, file.stat().st_ino) if file.is_file() else None
+    found: T = _kept(read, path, how, stamp)
+    return found
+
+
+@lru_cache(maxsize=1)
+def _kept(read: Callable[..., Any], path: str | Path, how: tuple[Hashable, ...], stamp: Any) -> Any:  # noqa: ARG001
+    """See `once`; `stamp` tells the file from what it was before."""
+    return read(path, *how)
 
 
 def column_names(key: str, path: str | Path) -> list[str]:

@@ -27,6 +27,9 @@ class _Tracking:
 
     world: Problem
     render_mode: str | None
+    observation_space: Any
+    np_random: Any
+    _np_random: Any
     _env: TrackEnv
 
     def _make(
@@ -39,11 +42,25 @@ class _Tracking:
         self._env = TrackEnv(self.world, shape)
         return _spaces(self.world)
 
-    def _begin(self, rng: np.random.Generator, seed: int | None, *, begun: bool) -> TensorDictBase:
-        """New episodes; the first ones of what `rng` gives, if there is a seed or none have been before."""
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """A new episode of each target; with a seed, the first one of it. There are no `options`."""
+        begun = self._np_random is not None
+        super().reset(seed=seed, options=options)  # type: ignore[misc]  # of Gymnasium's own class, the next in line
         if seed is not None or not begun:
-            self._env.set_seed(int(rng.integers(2**31)))
-        return self._env.reset()
+            self._env.set_seed(int(self.np_random.integers(2**31)))
+        return self._seen(self._env.reset()), self._info()
+
+    def _seen(self, state: TensorDictBase) -> Observation:
+        """The observation in numpy, of the dtypes of its space; copies, for the tensors are the environment's own."""
+        seen = {key: state[key].numpy().astype(part.dtype) for key, part in self.observation_space.items()}
+        # Discrete spaces hold numpy's numbers, not arrays of none.
+        return {key: value if value.ndim else value[()] for key, value in seen.items()}
+
+    def _info(self) -> dict[str, Any]:
+        target = self._env.target.numpy()
+        return {"target": target if target.ndim else int(target)}
 
     def render(self) -> Any:
         """The (first target's) grid after the last step, in the render mode."""
@@ -70,27 +87,11 @@ class TrackGym(_Tracking, gymnasium.Env[Observation, npt.NDArray[np.int8]]):
     def __init__(self, world: Problem | None = None, *, render_mode: str | None = None, **options: Any) -> None:
         self.observation_space, self.action_space = self._make(world, options, render_mode, ())
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
-        """A new episode; with a seed, the first one of it. There are no `options`."""
-        begun = self._np_random is not None
-        super().reset(seed=seed, options=options)
-        return self._seen(self._begin(self.np_random, seed, begun=begun)), self._info()
-
     def step(self, action: npt.NDArray[np.int8]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One step with the sensors of `action` `[K]` on."""
         after = self._env.step(_acting(action, ()))["next"]
         ends = (bool(after[key].item()) for key in ("terminated", "truncated"))
         return self._seen(after), after["reward"].item(), *ends, self._info()
-
-    def _seen(self, state: TensorDictBase) -> Observation:
-        seen = _numpy(state, self.observation_space)
-        # Discrete spaces hold numpy's numbers, not arrays of none.
-        return {key: value if value.ndim else value[()] for key, value in seen.items()}
-
-    def _info(self) -> dict[str, Any]:
-        return {"target": int(self._env.target)}
 
 
 class TrackVector(_Tracking, VectorEnv[Observation, npt.NDArray[np.int8], npt.NDArray[Any]]):
@@ -119,15 +120,6 @@ class TrackVector(_Tracking, VectorEnv[Observation, npt.NDArray[np.int8], npt.ND
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
-        """New episodes; with a seed, the first ones of it. There are no `options`."""
-        begun = self._np_random is not None
-        super().reset(seed=seed, options=options)
-        rows = self._begin(self.np_random, seed, begun=begun)
-        return _numpy(rows, self.observation_space), {"target": self._env.target.numpy()}
-
     def step(
         self, actions: npt.NDArray[np.int8]
     ) -> tuple[Observation, npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any], dict[str, Any]]:
@@ -137,14 +129,13 @@ class TrackVector(_Tracking, VectorEnv[Observation, npt.NDArray[np.int8], npt.ND
             after[key].squeeze(-1).numpy() for key in ("reward", "terminated", "truncated", "done")
         )
         infos: dict[str, Any] = {}
-        seen = _numpy(after, self.observation_space)
+        seen = self._seen(after)
         if done.any():
             infos = self._final(seen, done)
             # The state before, too: TorchRL puts the new rows into it.
             begun = self._env.reset(after.select(*seen).set("_reset", after["done"]))
-            seen = _numpy(begun, self.observation_space)
-        infos["target"] = self._env.target.numpy()
-        return seen, reward, terminated, truncated, infos
+            seen = self._seen(begun)
+        return seen, reward, terminated, truncated, infos | self._info()
 
     def _final(self, seen: Observation, done: npt.NDArray[np.bool_]) -> dict[str, Any]:
         """What ended, in the form of Gymnasium's own vector environments: a mask beside each key."""
@@ -171,12 +162,6 @@ def _spaces(world: Problem) -> tuple[spaces.Dict, spaces.MultiBinary]:
     if world.max_steps:
         seen["step_count"] = spaces.Discrete(world.max_steps + 1)
     return spaces.Dict(seen), spaces.MultiBinary(world.num_sensors)
-
-
-def _numpy(state: TensorDictBase, space: spaces.Space[Any]) -> Observation:
-    """The observation in numpy, of the dtypes of the space; copies, for the tensors are the environment's own."""
-    assert isinstance(space, spaces.Dict)
-    return {key: state[key].numpy().astype(part.dtype) for key, part in space.items()}
 
 
 def _acting(action: npt.ArrayLike, shape: tuple[int, ...]) -> TensorDict:

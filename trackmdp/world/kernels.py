@@ -17,7 +17,7 @@ from scipy import sparse
 from trackmdp.world.checks import canonical_kernel
 from trackmdp.world.files import read_matrix
 from trackmdp.world.model import Array, BoolArray, Size, grid_size
-from trackmdp.world.rows import pairwise_row_sums
+from trackmdp.world.rows import merged, pairwise_row_sums
 
 Border: TypeAlias = Literal["renormalize", "inside", "clip", "exit"]
 
@@ -170,12 +170,8 @@ def _summed(
 ) -> sparse.csr_array:
     """The matrix with these entries; entries of one place are added up in the order given."""
     order = np.lexsort((column, row))  # stable, which `sum_duplicates` of SciPy is not
-    row, column, values = row[order], column[order], values[order]
-    new = np.ones(len(row), dtype=bool)
-    new[1:] = (row[1:] != row[:-1]) | (column[1:] != column[:-1])
-    total = np.zeros(int(new.sum()))
-    np.add.at(total, np.cumsum(new) - 1, values)
-    return sparse.csr_array((total, (row[new], column[new])), shape=shape)
+    row, column, total = merged(row[order], column[order], values[order])
+    return sparse.csr_array((total, (row, column)), shape=shape)
 
 
 def _homogeneous(

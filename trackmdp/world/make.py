@@ -15,12 +15,11 @@ from trackmdp.config import WorldConfig
 from trackmdp.config.compose import compose, default, given
 from trackmdp.config.options import options, refuse
 from trackmdp.config.registry import make, maker
-from trackmdp.world.checks import canonical_kernel, check_kernel
+from trackmdp.world.checks import PRICES, canonical_kernel, check_kernel
 from trackmdp.world.files import per_cell
-from trackmdp.world.model import Size, World, affordable, grid_size
+from trackmdp.world.model import Size, World, grid_size
 from trackmdp.world.modes import HiddenWorld, Modelled
-from trackmdp.world.recording import read_recording
-from trackmdp.world.track_files import read_track_file
+from trackmdp.world.track_files import read_recording, read_track_file
 from trackmdp.world.tracks import Problem, Recorded, split
 
 _OF_TASK = {
@@ -237,9 +236,7 @@ def paper_cost(
     Raises:
         UserError: a file of prices is missing or malformed, or does not have one price per sensor.
     """
-    allowed = "a number from 0 to 1e15"
-    price = per_cell("cost.sensor", sensor, size, affordable, allowed, sensors)
-    return {"reward": reward, "cost": price, "safe_cost": safe}
+    return {"reward": reward, "cost": per_cell("cost.sensor", sensor, size, PRICES, sensors), "safe_cost": safe}
 
 
 def _words(arguments: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from scipy import sparse
 from trackmdp.config.sensing import LARGEST
 from trackmdp.config.world import MEMORIES
 from trackmdp.errors import UserError
-from trackmdp.world.checks import canonical_kernel, check_kernel, one_each
+from trackmdp.world.checks import PRICES, PROBABILITIES, canonical_kernel, check_kernel, one_each
 from trackmdp.world.coverage import Coverage
 from trackmdp.world.memory import KeySpace
 from trackmdp.world.rows import pairwise_row_sums
@@ -114,7 +114,7 @@ class Task:
         rows, columns = grid_size(size)
         footprints = Coverage.of(coverage, rows * columns)
         count, each = (rows * columns, "cell") if footprints is None else (footprints.num_sensors, "sensor")
-        prices = one_each("cost", cost, count, each, affordable, "a number from 0 to 1e15")
+        prices = one_each("cost", cost, count, each, PRICES)
         values = {
             "size": (rows, columns),
             "cost": prices,
@@ -123,8 +123,8 @@ class Task:
             "reward": _price("reward", reward),
             "max_steps": None if max_steps is None else _at_least(1, "max_steps", max_steps),
             "window": None if window is None else _at_least(0, "window", window),
-            "detection": _probabilities("detection", detection, rows * columns),
-            "safe_detection": _probabilities("safe_detection", safe_detection, rows * columns),
+            "detection": one_each("detection", detection, rows * columns, "cell", PROBABILITIES),
+            "safe_detection": one_each("safe_detection", safe_detection, rows * columns, "cell", PROBABILITIES),
             "coverage": footprints,
             "markov": markov,
             "memory": memory,
@@ -291,11 +291,6 @@ class World(Task):
         return gain if self.safe else gain - self.reward * (self.kernel @ (1.0 - self.safe_detection))
 
 
-def affordable(prices: Array) -> BoolArray:
-    """Which `prices` are in range; a nan is not."""
-    return (prices >= 0) & (prices <= LARGEST)
-
-
 def grid_size(size: Size) -> tuple[int, int]:
     """(rows, columns) of one number, or of two.
 
@@ -306,12 +301,6 @@ def grid_size(size: Size) -> tuple[int, int]:
     if len(pair) != 2 or not all(isinstance(side, (int, np.integer)) and side >= 1 for side in pair):
         raise UserError(f"size={size}: expected an integer >= 1, or two of them, rows and columns")
     return int(pair[0]), int(pair[1])
-
-
-def _probabilities(name: str, given: npt.ArrayLike, cells: int) -> Array:
-    """`[M]` probabilities in (0, 1], from one number for all or from one for each."""
-    expected = "a probability above 0, at most 1"
-    return one_each(name, given, cells, "cell", lambda p: np.asarray((p > 0) & (p <= 1)), expected)
 
 
 def _price(name: str, value: float, most: float = LARGEST) -> float:

@@ -24,15 +24,15 @@ def pairwise_row_sums(matrix: sparse.csr_array) -> npt.NDArray[np.float64]:
     codes = _codes(matrix.shape[1])[matrix.indices]
     order = np.lexsort((codes, rows))  # stable: within a lane in the order of the columns
     rows, codes, sums = rows[order], codes[order], matrix.data[order]
-    rows, codes, sums = _merged(rows, codes, sums)
+    rows, codes, sums = merged(rows, codes, sums)
     while len(codes) and codes.max() > 0:
-        rows, codes, sums = _merged(rows, codes >> 1, sums)
+        rows, codes, sums = merged(rows, codes >> 1, sums)
     total = np.zeros(matrix.shape[0])
     total[rows] = sums  # at the root a row has one sum left
     return total
 
 
-def _merged(rows: np.ndarray, codes: np.ndarray, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def merged(rows: np.ndarray, codes: np.ndarray, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Partial sums of one row and one code added up, in their order."""
     new = np.ones(len(rows), dtype=bool)
     new[1:] = (rows[1:] != rows[:-1]) | (codes[1:] != codes[:-1])

@@ -8,9 +8,10 @@ import numpy as np
 
 from trackmdp.config.sensing import lattice
 from trackmdp.errors import UserError
+from trackmdp.world.checks import PROBABILITIES
 from trackmdp.world.coverage import Coverage, discs
 from trackmdp.world.files import per_cell, read_matrix
-from trackmdp.world.model import Array, Size, grid_size
+from trackmdp.world.model import Size, grid_size
 
 
 def perfect(size: Size) -> dict[str, Any]:  # noqa: ARG001
@@ -25,8 +26,8 @@ def miss(size: Size, *, p_d: float | list[float] | str, p_s: float | list[float]
         UserError: a file is missing or malformed, or does not have one probability per cell.
     """
     return {
-        "detection": _probabilities("sensor.p_d", p_d, size),
-        "safe_detection": _probabilities("sensor.p_s", p_s, size),
+        "detection": per_cell("sensor.p_d", p_d, size, PROBABILITIES),
+        "safe_detection": per_cell("sensor.p_s", p_s, size, PROBABILITIES),
     }
 
 
@@ -36,7 +37,7 @@ def false_alarm(size: Size, *, p_d: float | list[float] | str, p_f: float) -> di
     Raises:
         UserError: as `miss`.
     """
-    return {"detection": _probabilities("sensor.p_d", p_d, size)}
+    return {"detection": per_cell("sensor.p_d", p_d, size, PROBABILITIES)}
 
 
 def footprint(size: Size, *, radius: float, spacing: int, path: str | None) -> dict[str, Any]:
@@ -54,8 +55,3 @@ def footprint(size: Size, *, radius: float, spacing: int, path: str | None) -> d
             raise UserError(f"sensor.path={path}: {str(error).removeprefix('coverage: ')}") from error
     places = np.stack(np.meshgrid(lattice(rows, spacing), lattice(columns, spacing), indexing="ij"), axis=-1)
     return {"coverage": Coverage.of(discs((rows, columns), places.reshape(-1, 2), radius), rows * columns)}
-
-
-def _probabilities(key: str, given: float | list[float] | str, size: Size) -> Array:
-    expected = "a probability above 0, at most 1"
-    return per_cell(key, given, size, lambda p: np.asarray((p > 0) & (p <= 1)), expected)

@@ -1,27 +1,123 @@
-"""The targets of an environment: where they go (`sources`), and the generators of their starts and moves."""
+"""The targets of an environment or a simulation: where they go, and the generators of their starts and moves.
+
+They go by draws of the kernel, or along recorded tracks. A place, int64, is the full state of a target: its cell, the
+cell and the mode, or a point of a track.
+"""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from typing import TypeAlias
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from trackmdp.seeding import generator
 from trackmdp.world.draws import Draw
 from trackmdp.world.modes import HiddenWorld, Modelled
-from trackmdp.world.sources import Replayed, Sampled, Source
-from trackmdp.world.tracks import Problem, Recorded
+from trackmdp.world.motion import Motion
+from trackmdp.world.tracks import Problem, Recorded, Tracks
 
 
-def make_targets(problem: Problem, device: torch.device) -> Targets:
-    """The targets of a world or of recorded tracks."""
-    return RecordedTargets(problem, device) if isinstance(problem, Recorded) else SampledTargets(problem, device)
+class Sampled:
+    """Targets that move as the kernel says; a place is a cell, or with modes cell · H + mode. All are starts.
+
+    Attributes:
+        starts: how many places to start in there are.
+        device: where the tensors live.
+    """
+
+    def __init__(self, world: Modelled, device: torch.device) -> None:
+        self.starts, self.device, self._motion = world.kernel.shape[0], device, Motion(world.kernel, device)
+        self._modes = world.modes if isinstance(world, HiddenWorld) else 1
+
+    def begin(self, numbers: Tensor) -> Tensor:
+        """`[B]` places of the starts `numbers` `[B]`."""
+        return numbers
+
+    def draw(self, count: int, generator: torch.Generator) -> Tensor:
+        """`[count]` float64 draws, each for one move of one target."""
+        return self._motion.draw(count, generator)
+
+    def move(self, place: Tensor, draws: Tensor) -> Tensor:
+        """`[B]` places after one move."""
+        return self._motion.move(place, draws)
+
+    def cell(self, place: Tensor) -> Tensor:
+        """`[B]` cells; M for a target that has exited, which is in the place behind all others."""
+        return place if self._modes == 1 else place // self._modes
+
+    def mode(self, place: Tensor) -> Tensor | None:
+        """`[B]` modes, -1 for a target that has exited; None where targets have none."""
+        return None if self._modes == 1 else torch.where(place < self.starts, place % self._modes, -1)
+
+    def stops(self, place: Tensor) -> Tensor | None:  # noqa: ARG002
+        """`[B]` bool, whether the recording stops here with the target still in the grid; None if it never does."""
+        return None
 
 
-class Targets(ABC):
-    """A batch of targets. Their places are in the environment's state; this object holds only the generators.
+class Replayed:
+    """Targets that go along recorded tracks; methods as those of `Sampled`.
+
+    A place is a point of the line that all tracks, each closed by the exit, form end to end. Starts are the first cells
+    of the tracks, or with `anywhere` all recorded points.
+    """
+
+    def __init__(self, tracks: Tracks, num_cells: int, device: torch.device, *, anywhere: bool = False) -> None:
+        # Track 3 4, which exits, and track 7 8, which stops: cells 3 4 M 7 8, following 1 2 2 4 4 (the last point of a
+        # track stays where it is), stops at point 4, starts 0 and 3. With `anywhere` episodes may start at 0, 1 and 3:
+        # neither at an exit, nor where no next step is known.
+        line = tracks.closed(num_cells)
+        last, following = line.first[1:] - 1, np.arange(len(line.cells)) + 1
+        following[last] = last
+        stops = np.zeros(len(line.cells), dtype=bool)
+        stops[last] = ~tracks.exits
+        begins = np.flatnonzero((line.cells < num_cells) & ~stops) if anywhere else line.first[:-1]
+        self.starts, self.device = len(begins), device
+        self._cells, self._following, self._begins, self._stops = (
+            torch.as_tensor(part, device=device) for part in (line.cells, following, begins, stops)
+        )
+
+    def begin(self, numbers: Tensor) -> Tensor:
+        """See `Sampled`."""
+        return self._begins[numbers]
+
+    def draw(self, count: int, generator: torch.Generator) -> Tensor:  # noqa: ARG002
+        """See `Sampled`."""
+        return torch.zeros(count, dtype=torch.float64, device=self.device)  # a recorded path needs none
+
+    def move(self, place: Tensor, draws: Tensor) -> Tensor:  # noqa: ARG002
+        """See `Sampled`."""
+        return self._following[place]
+
+    def cell(self, place: Tensor) -> Tensor:
+        """See `Sampled`."""
+        return self._cells[place]
+
+    def mode(self, place: Tensor) -> None:
+        """See `Sampled`."""
+
+    def stops(self, place: Tensor) -> Tensor:
+        """See `Sampled`."""
+        return self._stops[place]
+
+
+Source: TypeAlias = Sampled | Replayed
+
+
+def held_out_source(problem: Problem) -> Source:
+    """What a policy is judged by: the motion of a world, or the held-out ones of recorded tracks."""
+    cpu = torch.device("cpu")
+    if isinstance(problem, Recorded):
+        return Replayed(problem.held_out, problem.num_cells, cpu)
+    return Sampled(problem, cpu)
+
+
+class Targets:
+    """A batch of targets that start uniformly over the places, and move as the kernel says.
+
+    Their places are in the environment's state; this object holds only the generators.
 
     Args:
         source: where they go.
@@ -33,25 +129,30 @@ class Targets(ABC):
         self._starts = Draw(self._start_of, torch.int64, source.device)
         self._draws = Draw(self._draw_of, torch.float64, source.device)
 
-    @abstractmethod
     def seed(self, seed: int, stream: str) -> None:
-        """Begin the draws of a seed and a stream."""
+        """Begin the draws of the generators called (`stream`, "motion") and (`stream`, "start")."""
+        device = self.source.device
+        self._generators = {name: generator(seed, stream, name, device=device) for name in ("motion", "start")}
 
-    @abstractmethod
     def state(self) -> dict[str, Tensor]:
         """State of the generators, for a checkpoint."""
+        return {name: rng.get_state() for name, rng in self._generators.items()}
 
-    @abstractmethod
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Go on where `state` was taken."""
+        for name, rng in self._generators.items():
+            # A checkpoint read for a GPU has all its tensors there; a generator's state is on the CPU at all times.
+            rng.set_state(state[name].cpu())
 
-    @abstractmethod
     def _start_of(self, rows: Tensor) -> Tensor:
         """`[B]` places of fresh targets, of which the mask `rows` `[B]` is used."""
+        # For all rows, so that what a row gets does not depend on the others.
+        rng, device = self._generators["start"], self.source.device
+        return torch.randint(self.source.starts, rows.shape, generator=rng, device=device)
 
-    @abstractmethod
     def _draw_of(self, rows: Tensor) -> Tensor:
         """The random numbers for the next move of the targets `rows` `[B]`."""
+        return self.source.draw(len(rows), self._generators["motion"])
 
     def start(self, rows: Tensor) -> dict[str, Tensor]:
         """`target`, and what else a move depends on, `[B]` of fresh targets, of which the mask `rows` `[B]` is used."""
@@ -77,45 +178,11 @@ class Targets(ABC):
         return {"target": self.source.cell(place), self._key: place}
 
 
-class SampledTargets(Targets):
-    """Targets that move as the kernel says; they start uniformly over the cells, or over cells and modes."""
-
-    def __init__(self, world: Modelled, device: torch.device) -> None:
-        super().__init__(Sampled(world, device), "place" if isinstance(world, HiddenWorld) else "target")
-
-    def seed(self, seed: int, stream: str) -> None:
-        """The generators are those called (`stream`, "motion") and (`stream`, "start")."""
-        device = self.source.device
-        self._generators = {name: generator(seed, stream, name, device=device) for name in ("motion", "start")}
-
-    def state(self) -> dict[str, Tensor]:
-        """See `Targets`."""
-        return {name: rng.get_state() for name, rng in self._generators.items()}
-
-    def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """See `Targets`."""
-        for name, rng in self._generators.items():
-            # A checkpoint read for a GPU has all its tensors there; a generator's state is on the CPU at all times.
-            rng.set_state(state[name].cpu())
-
-    def _start_of(self, rows: Tensor) -> Tensor:
-        # For all rows, so that what a row gets does not depend on the others.
-        return torch.randint(
-            self.source.starts, rows.shape, generator=self._generators["start"], device=self.source.device
-        )
-
-    def _draw_of(self, rows: Tensor) -> Tensor:
-        return self.source.draw(len(rows), self._generators["motion"])
-
-
 class RecordedTargets(Targets):
     """Targets that go along recorded tracks; episodes begin at the starts in shuffled order, each once in a round.
 
     The e-th order of the starts comes from the generator called (`stream`, "tracks", e).
     """
-
-    def __init__(self, problem: Recorded, device: torch.device) -> None:
-        super().__init__(Replayed(problem.tracks, problem.num_cells, device, anywhere=problem.anywhere), "place")
 
     def seed(self, seed: int, stream: str) -> None:
         """See `Targets`."""
@@ -155,3 +222,10 @@ class RecordedTargets(Targets):
 
     def _draw_of(self, rows: Tensor) -> Tensor:
         return torch.zeros(rows.shape, dtype=torch.float64, device=rows.device)  # a recorded target's move is known
+
+
+def make_targets(problem: Problem, device: torch.device) -> Targets:
+    """The targets of a world or of recorded tracks."""
+    if isinstance(problem, Recorded):
+        return RecordedTargets(Replayed(problem.tracks, problem.num_cells, device, anywhere=problem.anywhere), "place")
+    return Targets(Sampled(problem, device), "place" if isinstance(problem, HiddenWorld) else "target")

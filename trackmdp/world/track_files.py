@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO, TypeAlias
 
+import numpy as np
+
+from trackmdp.arrays import LARGE, load_npz, npz_bytes
 from trackmdp.errors import UserError, require
 from trackmdp.untrusted import decoded, opened
-from trackmdp.world.files import column_names
+from trackmdp.world.files import column_names, once
 from trackmdp.world.gridding import Gridding, to_tracks
-from trackmdp.world.position_files import geojson, gpx, mot, sumo
-from trackmdp.world.position_tables import position_table
+from trackmdp.world.position_files import geojson, gpx, mot, position_table, sumo
 from trackmdp.world.positions import ALIASES, LONGEST, Positions
-from trackmdp.world.tracks import Tracks, check_tracks, read_tracks
+from trackmdp.world.tracks import Recorded, Tracks, check_tracks, read_tracks
 
 _FORMATS = {
     ".npz": "cells",
@@ -95,17 +96,14 @@ def read_track_file(
         if name not in given:
             raise UserError(f"kernel.{name}: missing, expected {what}; {source} holds positions")
     if "origin" in given:
-        given["origin"] = tuple(map(float, given["origin"]))  # of a list no hash can be taken, by which `_load` keeps
+        given["origin"] = tuple(map(float, given["origin"]))  # of a list no hash can be taken, by which `once` keeps
     own = {"max_gap": _GAP * given["step"]} | given
     made = Gridding(size=size, shortest=shortest, exits=exits, **own)
-    file = Path(path)
-    stamp = (file.stat().st_mtime_ns, file.stat().st_size, file.stat().st_ino) if file.is_file() else None
-    return _load(path, kind, made, stamp)
+    return once(_on_grid, path, kind, made)
 
 
-@lru_cache(maxsize=1)  # a run is checked before its folder is made, and asks again after
-def _load(path: str | Path, kind: str, grid: Gridding, stamp: Any) -> tuple[Tracks, Mapping[str, int]]:  # noqa: ARG001
-    """See `read_track_file`; `stamp` tells the file from what it was before."""
+def _on_grid(path: str | Path, kind: str, grid: Gridding) -> tuple[Tracks, Mapping[str, int]]:
+    """See `read_track_file`."""
     return to_tracks(read_positions(path, kind), grid, f"kernel.path={path}")
 
 
@@ -123,3 +121,48 @@ def _format_of(path: str | Path) -> str:
         known = ", ".join([".csv", *_FORMATS])
         raise UserError(f"kernel.path={path}: expected a file that ends with one of {known}, or kernel.format")
     return _FORMATS[suffix]
+
+
+_PARTS = ("tracks", "validation", "held_out")
+_KINDS = {"cells": "i", "first": "i", "exits": "b", "names": "i"}
+"""Array of `Tracks` -> kind of its numbers."""
+
+
+def recording_bytes(problem: Recorded) -> bytes:
+    """The content of `recording.npz`; the same tracks, the same bytes."""
+    return npz_bytes({f"{part}_{name}": getattr(getattr(problem, part), name) for part in _PARTS for name in _KINDS})
+
+
+def read_recording(path: str | Path, num_cells: int) -> tuple[Tracks, Tracks, Tracks] | None:
+    """The tracks to learn from, to choose by and held out; None where the file has not these, but columns.
+
+    Raises:
+        UserError: the file is missing or damaged, or a cell lies outside a grid of so many cells.
+    """
+    source = f"kernel.path={path}"
+    if Path(path).suffix != ".npz":
+        return None
+    with opened(Path(path), most=LARGE, source=source, links=True) as stream, decoded(source, "recorded tracks"):
+        arrays = load_npz(stream)
+        if set(arrays) != {f"{part}_{name}" for part in _PARTS for name in _KINDS}:
+            return None
+        learned, chosen, judged = (
+            _part({name: arrays[f"{part}_{name}"] for name in _KINDS}, num_cells) for part in _PARTS
+        )
+    return learned, chosen, judged
+
+
+def _part(arrays: dict[str, Any], num_cells: int) -> Tracks:
+    for name, array in arrays.items():
+        if array.ndim != 1 or array.dtype.kind != _KINDS[name]:
+            raise ValueError(f"{name} of {array.dtype}, shape {array.shape}")
+    tracks = Tracks(
+        **{name: array if _KINDS[name] == "b" else array.astype(np.int64) for name, array in arrays.items()}
+    )
+    # Whoever replays them takes `first` for places in `cells`, and a cell for a place in tables of the grid.
+    whole = len(tracks.first) == len(tracks) + 1 == len(tracks.names) + 1 and len(tracks) > 0
+    if not (whole and tracks.first[0] == 0 and tracks.first[-1] == len(tracks.cells) and (tracks.lengths > 0).all()):
+        raise ValueError("tracks that do not follow each other")
+    if not ((tracks.cells >= 0) & (tracks.cells < num_cells)).all():
+        raise ValueError(f"a cell outside the grid of {num_cells} cells")
+    return tracks

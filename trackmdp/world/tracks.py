@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import TypeAlias, Unpack
 
@@ -14,7 +13,7 @@ import numpy.typing as npt
 
 from trackmdp.errors import UserError
 from trackmdp.seeding import derive
-from trackmdp.world.files import read_columns
+from trackmdp.world.files import once, read_columns
 from trackmdp.world.model import Array, BoolArray, Size, Task, TaskOptions, World, grid_size
 from trackmdp.world.modes import HiddenWorld
 
@@ -144,14 +143,11 @@ def read_tracks(path: str | Path, size: Size, *, exits: bool) -> Tracks:
     Raises:
         UserError: the file is not of that form, a cell lies outside the grid, or a step is missing or there twice.
     """
-    file = Path(path)
-    stamp = (file.stat().st_mtime_ns, file.stat().st_size, file.stat().st_ino) if file.is_file() else None
-    return _load(path, grid_size(size), exits, stamp)
+    return once(_read, path, grid_size(size), exits)
 
 
-@lru_cache(maxsize=1)  # a run is checked before its folder is made, and asks again after
-def _load(path: str | Path, size: tuple[int, int], exits: bool, stamp: tuple[int, ...] | None) -> Tracks:  # noqa: ARG001
-    """See `read_tracks`; `stamp` tells the file from what it was before."""
+def _read(path: str | Path, size: tuple[int, int], exits: bool) -> Tracks:
+    """See `read_tracks`."""
     source, columns = f"kernel.path={path}", read_columns("kernel.path", path)
     if set(columns) not in _COLUMNS:
         raise UserError(f"{source}: columns {', '.join(columns)}, expected {_FORMAT}")

@@ -12,8 +12,7 @@ from rich.table import Table
 from trackmdp.config import VerifyConfig
 from trackmdp.durable import write_json
 from trackmdp.errors import UserError
-from trackmdp.paper import remarks, theorems
-from trackmdp.paper.modes import check_modes
+from trackmdp.paper import theorems
 from trackmdp.paper.theorems import Check
 from trackmdp.solvers import optimal
 from trackmdp.solvers.keyed_search import solve_keys
@@ -46,13 +45,13 @@ def write_checks(world: Modelled, tolerance: float, folder: Path) -> list[Check]
     """Solve the world, whose sensors are of one cell, run every check, and write `verification.json`."""
     if isinstance(world, HiddenWorld):
         solution = solve_keys(world)
-        found = check_modes(world, solution, tolerance)
+        found = theorems.check_modes(world, solution, tolerance)
     else:
         solution = optimal.solve(world, nodes=NODES, tolerance=tolerance)
         found = theorems.check_theorems(world, solution, tolerance)
     if solution.interrupted:
         raise KeyboardInterrupt
-    checks = [*found, *remarks.check_remarks(tolerance)]
+    checks = [*found, *theorems.check_remarks(tolerance)]
     content = {
         "optimum": {"lower": solution.lower, "upper": solution.upper, "certified": solution.certified},
         "tolerance": tolerance,
