@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import re
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy import sparse
 
 from tests.reports.sweeps import write_sweep
-from trackmdp.errors import UserError
-from trackmdp.reports import figures, learning, maps, style
+from trackmdp.app.cli import main
+from trackmdp.reports import figures, maps
 from trackmdp.reports.figures import Panel
 from trackmdp.reports.gather import gather_runs
 from trackmdp.reports.grouping import Study, study
@@ -80,7 +81,7 @@ def test_regret_is_to_the_proved_bound(grouped: Study, panel: Panel) -> None:
 
 
 def test_a_learning_curve_ends_where_the_runs_do(results: Results, grouped: Study) -> None:
-    figure = learning.curves(grouped, results.curves, "frames")
+    figure = figures.curves(grouped, results.curves, "frames")
     last = [row for row in figure.table.rows if row[0] == "a2c"][-1]
     regrets = [value for world in grouped.worlds for value in grouped.regrets(world, "a2c")]
     assert last[1] == pytest.approx(8000.0)
@@ -90,11 +91,11 @@ def test_a_learning_curve_ends_where_the_runs_do(results: Results, grouped: Stud
 
 def test_a_curve_is_a_staircase() -> None:
     curve = np.array([[10.0, 3.0], [20.0, 2.0], [40.0, 1.0]])
-    assert [learning.value_at(curve, x) for x in (5, 10, 19, 20, 39, 40, 99)] == [3, 3, 3, 2, 2, 1, 1]
+    assert [figures.value_at(curve, x) for x in (5, 10, 19, 20, 39, 40, 99)] == [3, 3, 3, 2, 2, 1, 1]
 
 
 def test_profiles_count_runs(grouped: Study) -> None:
-    figure = learning.profiles(grouped, None)
+    figure = figures.profiles(grouped, None)
     row = next(row for row in figure.table.rows if row[0] == "a2c")
     regrets = [value for world in grouped.worlds for value in grouped.regrets(world, "a2c")]
     marks = (0.001, 0.005, 0.01, 0.02, 0.05, 0.1)
@@ -204,10 +205,12 @@ def test_in_the_page_a_figure_has_a_text_alternative_and_the_colours_of_the_page
     assert text.count("<table") == 1
 
 
-def test_without_matplotlib_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_matplotlib_one_line_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(UserError, match=r"pip install .*\[report\]"):
-        style.require_matplotlib()
+    assert main(["report", f"sweep={tmp_path}", f"hydra.run.dir={tmp_path}/report"]) == 2
+    assert re.search(r"needs matplotlib, which pip install .*\[report\]", capsys.readouterr().err)
 
 
 def test_files_are_named_after_what_they_show() -> None:

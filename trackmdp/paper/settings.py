@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from trackmdp.paper.calibration import BORDER, DRAWS, SEEDS, T_MAX, Candidate, Setting, Spread, chosen
 from trackmdp.paper.printed import PRINTED_QMDP
 from trackmdp.paper.worlds import COSTS, SUPPORTS
-from trackmdp.reports.style import INK, LOOKS, Figure, draw_figure, legend, tidy
+from trackmdp.reports.style import INK, LOOKS, Axes, Canvas, Figure, draw_figure, legend, tidy
 from trackmdp.reports.tables import Cell, Column, Table
 from trackmdp.world.model import Array
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure as Canvas
 
 RULE = (
     f"Of the kernels drawn with seeds {SEEDS[0]} to {SEEDS[-1]} (T_max = {T_MAX}, border {BORDER}), each Z takes the "

@@ -314,7 +314,7 @@ def _from_histories(world: World) -> Check:
     for state in solved.q:
         belief = histories.filtered(small, solved, state)
         for cell, estimate in histories.estimates(small, solved, state).items():
-            worst = max(worst, abs(estimate - belief[cell]))
+            worst = max(worst, float(abs(estimate - belief[cell])))
     note = f"on the {CORNER}x{CORNER} corner, t_max {small.t_max}, Q of {len(solved.q)} histories, without a belief"
     return Check("Theorem 3, exact form", "the estimate from Q is the belief", worst, note=note)
 

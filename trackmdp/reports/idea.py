@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import sparse
 
 from trackmdp.reports.policy import Sensed
 from trackmdp.reports.results import MotionTable
-from trackmdp.reports.style import INK, LINE, Figure, draw_figure
+from trackmdp.reports.style import INK, LINE, Axes, Canvas, Figure, draw_figure
 from trackmdp.reports.tables import Cell, Column, Table
 from trackmdp.world.model import Array, BoolArray
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure as Canvas
 
 BELIEF, TARGET = "#0072b2", "#d55e01"
 _MARGIN = 1

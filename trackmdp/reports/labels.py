@@ -8,16 +8,12 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from trackmdp.reports.style import TEXT, legend
+from trackmdp.reports.style import TEXT, Axes, Canvas, legend
 from trackmdp.world.model import Array
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure as Canvas
 
 _TOUCHING = 0.012
 """Parts of the height of the axes: lines are some 2 points wide, of 200; closer ones are seen as one."""

@@ -7,19 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from trackmdp.reports.policy import Sensed
 from trackmdp.reports.results import MotionTable
-from trackmdp.reports.style import INK, LINE, Figure, draw_figure, power
+from trackmdp.reports.style import INK, LINE, Axes, Canvas, Figure, draw_figure, power
 from trackmdp.reports.tables import Cell, Column, Table
 from trackmdp.world.model import Array, BoolArray
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure as Canvas
 
 # 20 x 20: with tiles of four to six cells each, more would not be seen on a page.
 MOST_MAP_CELLS = 400

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any, TypeAlias
 
-from trackmdp.reports import figures, idea, learning, maps, summaries
+from trackmdp.reports import figures, idea, maps, summaries
 from trackmdp.reports.grouping import Study, study
 from trackmdp.reports.policy import Sensed
 from trackmdp.reports.results import MotionTable, Results
@@ -167,8 +167,8 @@ def _against_cost(grouped: Study, threshold: float | None) -> list[Section]:
 
 
 def _learning(results: Results, grouped: Study, threshold: float | None) -> list[Section]:
-    drawn = [learning.curves(grouped, results.curves, by) for by in ("frames", "seconds")]
-    shown = [figure for figure in (*drawn, learning.profiles(grouped, threshold)) if figure]
+    drawn = [figures.curves(grouped, results.curves, by) for by in ("frames", "seconds")]
+    shown = [figure for figure in (*drawn, figures.profiles(grouped, threshold)) if figure]
     return [Section("learning", "Learning curves and profiles", [shown])] if shown else []
 
 

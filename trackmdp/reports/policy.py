@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
-from trackmdp.arrays import load_npz
+from trackmdp.arrays import load_npz, npz_bytes
 from trackmdp.errors import UserError
 from trackmdp.policies.saved import load_policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.renewal import IndexArray, per_row
+from trackmdp.world.files import whole_csr
 from trackmdp.world.model import Array
 
 POLICY_FILE = "policy.npz"
@@ -50,14 +49,16 @@ class Sensed:
         return self.sets[n :: self.choices]
 
 
-def arrays(content: bytes, *keys: str) -> list[npt.NDArray[Any]]:
-    """The arrays of a `.npz`; code in it is not run.
+def joined(parts: Iterable[np.ndarray]) -> np.ndarray:
+    """Arrays `[K_i]` end to end, the form in which many small ones are stored; `[0]` of none."""
+    return np.concatenate([np.zeros(0), *parts])
 
-    Raises:
-        Exception: whatever zipfile and NumPy raise over damage; call it inside `untrusted.decoded`.
-    """
-    found = load_npz(io.BytesIO(content), keys)
-    return [found[key] for key in keys]
+
+def parted(streams: Iterable[np.ndarray], sizes: Iterable[np.ndarray]) -> Iterator[tuple[np.ndarray, ...]]:
+    """Of each item its part of every stream of `joined`, in which item i takes `sizes[i]` places."""
+    # The last sum is the end of the stream, not a place to cut.
+    pairs = zip(streams, sizes, strict=True)
+    return zip(*(np.split(each, np.cumsum(size)[:-1]) for each, size in pairs), strict=True)
 
 
 def pack_all(policies: Mapping[str, Sensed]) -> bytes:
@@ -69,16 +70,14 @@ def pack_all(policies: Mapping[str, Sensed]) -> bytes:
         "names": np.array(list(policies), dtype=np.str_),
         # `reshape`: no policy at all is still a table of three columns.
         "shapes": np.array([(*each.sets.shape, each.sets.nnz) for each in every], dtype=np.int64).reshape(-1, 3),
-        "indices": np.concatenate([each.sets.indices for each in every] or [np.zeros(0)]).astype(np.int32),
-        "indptr": np.concatenate([each.sets.indptr for each in every] or [np.zeros(0)]).astype(np.int64),
-        "values": np.concatenate([each.value for each in every] or [np.zeros(0)]),
+        "indices": joined(each.sets.indices for each in every).astype(np.int32),
+        "indptr": joined(each.sets.indptr for each in every).astype(np.int64),
+        "values": joined(each.value for each in every),
     }
     if any(each.averaged for each in every):
-        packed["shares"] = np.concatenate([each.sets.data.astype(np.float32) for each in every])
+        packed["shares"] = joined(each.sets.data for each in every).astype(np.float32)
         packed["averaged"] = np.array([each.averaged for each in every])
-    stream = io.BytesIO()
-    np.savez_compressed(stream, **packed)  # type: ignore[arg-type]
-    return stream.getvalue()
+    return npz_bytes(packed)
 
 
 def unpack_all(content: bytes) -> dict[str, Sensed]:
@@ -91,14 +90,10 @@ def unpack_all(content: bytes) -> dict[str, Sensed]:
     names, shapes, indices, indptr, values = (stored[key] for key in ("names", "shapes", "indices", "indptr", "values"))
     shares, averaged = stored.get("shares", np.ones(len(indices))), stored.get("averaged", np.zeros(len(names)))
     found: dict[str, Sensed] = {}
-    # The last sum is the end of each stream, not a place to cut.
     sizes = (shapes[:, 2], shapes[:, 2], shapes[:, 0] + 1, shapes[:, 1])
-    streams = zip((indices, shares, indptr, values), sizes, strict=True)
-    parts = zip(*(np.split(each, np.cumsum(size)[:-1]) for each, size in streams), strict=True)
-    for name, shape, mean, (cells, data, *rest) in zip(names, shapes.tolist(), averaged, parts, strict=False):
-        (rows, columns, _), (pointer, value) = shape, rest
-        sets = sparse.csr_array((data.astype(float if mean else bool), cells, pointer), shape=(rows, columns))
-        sets.check_format(full_check=True)  # indices of somebody else's file may lead anywhere
+    parts = parted((indices, shares, indptr, values), sizes)
+    for name, shape, mean, (cells, data, pointer, value) in zip(names, shapes.tolist(), averaged, parts, strict=False):
+        sets = whole_csr(data.astype(float if mean else bool), cells, pointer, tuple(shape[:2]))
         found[str(name)] = Sensed(sets, value)
     return found
 

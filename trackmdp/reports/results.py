@@ -18,10 +18,12 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
+from trackmdp.arrays import load_npz, npz_bytes
 from trackmdp.durable import csv_text, write_bytes, write_text
 from trackmdp.errors import UserError
-from trackmdp.reports.policy import Sensed, arrays, pack_all, unpack_all
+from trackmdp.reports.policy import Sensed, joined, pack_all, parted, unpack_all
 from trackmdp.untrusted import decoded, read_bytes, read_object, read_text, sealed, unsealed
+from trackmdp.world.files import whole_csr
 from trackmdp.world.model import Array
 
 # Counted up when a file changes its meaning: results of another format are then not taken for stored results.
@@ -255,31 +257,23 @@ def _pack_motions(motions: Mapping[str, MotionTable]) -> bytes:
         "runs": np.array(names, dtype=np.str_),
         "cells": np.array([len(m.qmdp) for m in each], dtype=np.int64),
         "entries": np.array([m.kernel.nnz for m in each], dtype=np.int64),
-        "data": np.concatenate([m.kernel.data for m in each] or [np.zeros(0)]),
-        "indices": np.concatenate([m.kernel.indices for m in each] or [np.zeros(0)]).astype(np.int32),
-        "indptr": np.concatenate([m.kernel.indptr for m in each] or [np.zeros(0)]).astype(np.int32),
-        "qmdp": np.concatenate([m.qmdp for m in each] or [np.zeros(0)]),
-        "clocked": np.concatenate([m.clocked for m in each] or [np.zeros(0)]),
+        "data": joined(m.kernel.data for m in each),
+        "indices": joined(m.kernel.indices for m in each).astype(np.int32),
+        "indptr": joined(m.kernel.indptr for m in each).astype(np.int32),
+        "qmdp": joined(m.qmdp for m in each),
+        "clocked": joined(m.clocked for m in each),
     }
-    stream = io.BytesIO()
-    np.savez_compressed(stream, **packed)  # type: ignore[arg-type]
-    return stream.getvalue()
+    return npz_bytes(packed)
 
 
 def _unpack_motions(content: bytes) -> dict[str, MotionTable]:
-    keys = ("runs", "cells", "entries", "data", "indices", "indptr", "qmdp", "clocked")
-    stored = dict(zip(keys, arrays(content, *keys), strict=True))
-    found, cell, entry = {}, 0, 0
-    for place, name in enumerate(stored["runs"]):
-        m, nnz = int(stored["cells"][place]), int(stored["entries"][place])
-        # Worlds before this one: `cell` cells, hence cell + place row pointers, and `entry` entries.
-        inner, outer = slice(entry, entry + nnz), slice(cell + place, cell + place + m + 1)
-        rows = (stored["data"][inner], stored["indices"][inner], stored["indptr"][outer])
-        cells = slice(cell, cell + m)
-        kernel = sparse.csr_array(rows, shape=(m, m))
-        found[str(name)] = MotionTable(kernel, stored["qmdp"][cells], stored["clocked"][cells])
-        cell, entry = cell + m, entry + nnz
-    return found
+    stored, streams = load_npz(io.BytesIO(content)), ("data", "indices", "indptr", "qmdp", "clocked")
+    cells, entries = stored["cells"], stored["entries"]
+    parts = parted((stored[key] for key in streams), (entries, entries, cells + 1, cells, cells))
+    return {
+        str(name): MotionTable(whole_csr(data, indices, indptr, (m, m)), qmdp, clocked)
+        for name, m, (data, indices, indptr, qmdp, clocked) in zip(stored["runs"], cells.tolist(), parts, strict=False)
+    }
 
 
 def _rows(file: Path) -> list[dict[str, str]]:

@@ -11,14 +11,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from trackmdp.errors import UserError, adding
 from trackmdp.reports.grouping import ORDER
 from trackmdp.reports.tables import Table
 
 if TYPE_CHECKING:  # an extra, and a second to import
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure as Canvas
+    from matplotlib import axes, figure
 
+Axes: TypeAlias = "axes.Axes"
+Canvas: TypeAlias = "figure.Figure"
 Say: TypeAlias = Callable[[str], None]
 """Receives short progress messages."""
 
@@ -111,14 +111,6 @@ class Figure:
             f'<figure id="{self.name}">{drawing}<figcaption>{html.escape(self.title)}</figcaption>'
             f"<details><summary>Numbers</summary>{self.table.html()}</details></figure>"
         )
-
-
-def require_matplotlib() -> None:
-    """Raise a `UserError` where matplotlib is not installed."""
-    try:
-        import matplotlib  # noqa: F401
-    except ImportError as error:
-        raise UserError(f"report: drawing needs matplotlib, which {adding('report')} adds") from error
 
 
 def looks_of(labels: Sequence[str]) -> dict[str, Look]:

@@ -9,6 +9,7 @@ from rich.text import Text
 
 from trackmdp.config import ReportConfig
 from trackmdp.durable import write_bytes, write_text
+from trackmdp.errors import require
 from trackmdp.paper.openings import compute, load_openings, save_openings
 from trackmdp.paper.printed import PRINTED_QMDP, pairs
 from trackmdp.paper.sections import sections
@@ -30,7 +31,7 @@ def run(cfg: ReportConfig, folder: Path) -> float:
     sweep, console = Path(cfg.sweep), make_console(cfg.quiet)
     if cfg.watch:
         return float(watch.watch(sweep, console, cfg.every))
-    style.require_matplotlib()
+    require("matplotlib", "report", "report")
     with console.status("reading runs") as status:
 
         def say(line: str) -> None:
