@@ -54,7 +54,7 @@ def joined(parts: Iterable[np.ndarray]) -> np.ndarray:
     return np.concatenate([np.zeros(0), *parts])
 
 
-def parted(streams: Iterable[np.ndarray], sizes: Iterable[np.ndarray]) -> Iterator[tuple[np.ndarray, ...]]:
+def taken_apart(streams: Iterable[np.ndarray], sizes: Iterable[np.ndarray]) -> Iterator[tuple[np.ndarray, ...]]:
     """Of each item its part of every stream of `joined`, in which item i takes `sizes[i]` places."""
     # The last sum is the end of the stream, not a place to cut.
     pairs = zip(streams, sizes, strict=True)
@@ -91,7 +91,7 @@ def unpack_all(content: bytes) -> dict[str, Sensed]:
     shares, averaged = stored.get("shares", np.ones(len(indices))), stored.get("averaged", np.zeros(len(names)))
     found: dict[str, Sensed] = {}
     sizes = (shapes[:, 2], shapes[:, 2], shapes[:, 0] + 1, shapes[:, 1])
-    parts = parted((indices, shares, indptr, values), sizes)
+    parts = taken_apart((indices, shares, indptr, values), sizes)
     for name, shape, mean, (cells, data, pointer, value) in zip(names, shapes.tolist(), averaged, parts, strict=False):
         sets = whole_csr(data.astype(float if mean else bool), cells, pointer, tuple(shape[:2]))
         found[str(name)] = Sensed(sets, value)

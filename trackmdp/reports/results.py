@@ -21,7 +21,7 @@ from scipy import sparse
 from trackmdp.arrays import load_npz, npz_bytes
 from trackmdp.durable import csv_text, write_bytes, write_text
 from trackmdp.errors import UserError
-from trackmdp.reports.policy import Sensed, joined, pack_all, parted, unpack_all
+from trackmdp.reports.policy import Sensed, joined, pack_all, taken_apart, unpack_all
 from trackmdp.untrusted import decoded, read_bytes, read_object, read_text, sealed, unsealed
 from trackmdp.world.files import whole_csr
 from trackmdp.world.model import Array
@@ -269,7 +269,7 @@ def _pack_motions(motions: Mapping[str, MotionTable]) -> bytes:
 def _unpack_motions(content: bytes) -> dict[str, MotionTable]:
     stored, streams = load_npz(io.BytesIO(content)), ("data", "indices", "indptr", "qmdp", "clocked")
     cells, entries = stored["cells"], stored["entries"]
-    parts = parted((stored[key] for key in streams), (entries, entries, cells + 1, cells, cells))
+    parts = taken_apart((stored[key] for key in streams), (entries, entries, cells + 1, cells, cells))
     return {
         str(name): MotionTable(whole_csr(data, indices, indptr, (m, m)), qmdp, clocked)
         for name, m, (data, indices, indptr, qmdp, clocked) in zip(stored["runs"], cells.tolist(), parts, strict=False)
