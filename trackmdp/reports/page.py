@@ -187,9 +187,9 @@ def _idea(results: Results, grouped: Study) -> list[Section]:
 def _maps(results: Results, grouped: Study) -> list[Section]:
     """Policies and values in the first and the last world."""
     found = list[tuple[str, str, Sensed, MotionTable, tuple[int, int]]]()
-    # The last and the first world differ most, since worlds are in the order of Z and c; a dict, as they may be the
+    # The first and the last world differ most, since worlds are in the order of Z and c; a dict, as they may be the
     # same.
-    for world in dict.fromkeys((grouped.worlds[-1], grouped.worlds[0])):
+    for world in dict.fromkeys((grouped.worlds[0], grouped.worlds[-1])):
         motion = next((results.motions[r.name] for r in grouped.in_world(world) if r.name in results.motions), None)
         for method in grouped.methods[:MAPPED]:
             run = next((run for run in grouped.of(world, method) if run.name in results.policies), None)

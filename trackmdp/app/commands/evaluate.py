@@ -94,10 +94,9 @@ def _exact(cfg: EvaluateConfig, world: Modelled, policy: Policy, subject: str, f
         if log.close():
             console.print(f"{log.episodes} episodes in {log.file}")
     if estimate is not None:
-        shares = (
-            f"from Q {estimate.exact:.2%} (printed form {estimate.paper:.2%}), from the belief {estimate.bayes:.2%}"
-        )
-        console.print(f"missed steps whose position is estimated right: {shares}")
+        said = {"from Q": estimate.exact, "by the printed form": estimate.paper, "from the belief": estimate.bayes}
+        shares = ", ".join(f"{name} {100 * share:.2f} %" for name, share in said.items())
+        console.print(f"positions of missed steps estimated right:\n  {shares}")
     return score.evaluation.aihtr
 
 
@@ -136,5 +135,5 @@ def _compared(subject: str, report: dict[str, Any], simulation: Simulation | Non
         estimate = getattr(simulation, key) if simulation else None
         simulated = f"{estimate.mean:,.4f} ± {estimate.standard_error:.4f}" if estimate else ""
         rows.append([label, f"{report['exact'][key]:,.4f}", simulated, f"{report['qmdp'][key]:,.4f}"])
-    title = f"simulated, {simulation.episodes} episodes ± s.e." if simulation else "simulated"
+    title = f"{simulation.episodes} simulated ± s.e." if simulation else "simulated"
     return table(subject, ["figure", "exact", title, "Q_MDP exact"], rows)
