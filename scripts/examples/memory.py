@@ -15,7 +15,7 @@ import numpy as np
 import trackmdp as tm
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.path_exchange import choose_plan
-from trackmdp.training.held_out import HeldOutEvaluator
+from trackmdp.training.evaluator import HeldOutEvaluator
 
 RING = [1, 2, 3, 7, 11, 15, 14, 13, 12, 8, 4, 0]
 """The border cells of a grid of 4 x 4, in order."""

@@ -17,7 +17,7 @@ from trackmdp.config.resume import config_digest, config_text
 from trackmdp.policies.policy import Policy
 from trackmdp.solvers import clocked
 from trackmdp.training.evaluator import ExactEvaluator, figures
-from trackmdp.training.sealing import write_summary
+from trackmdp.training.folders import write_summary
 from trackmdp.world.make import build_world
 
 VERSIONS = {"trackmdp": "0.1.0", "torch": "2.13.0"}

@@ -21,8 +21,8 @@ from trackmdp.reports.gather import gather_runs
 from trackmdp.reports.results import Results
 from trackmdp.solvers import bounds, qmdp
 from trackmdp.solvers.evaluate import evaluate
+from trackmdp.training.folders import read_summary, write_summary
 from trackmdp.training.lock import locked
-from trackmdp.training.sealing import read_summary, write_summary
 from trackmdp.world.make import build_world
 from trackmdp.world.model import Array, Task
 

@@ -11,7 +11,7 @@ from tests.tracks import by_hand, recorded
 from trackmdp.episodes.simulate import simulate
 from trackmdp.policies.policy import Policy
 from trackmdp.reports.held_out import recorded_page
-from trackmdp.training.held_out import HeldOutEvaluator
+from trackmdp.training.evaluator import HeldOutEvaluator
 
 
 def page(*tracks: list[int], cells: tuple[int, ...] = (1,)) -> str:

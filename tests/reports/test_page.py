@@ -20,7 +20,7 @@ from trackmdp.reports.grouping import study
 from trackmdp.reports.page import Report, build
 from trackmdp.reports.results import Anomaly, Results
 from trackmdp.reports.summaries import groups_table, methods_table
-from trackmdp.training.sealing import write_summary
+from trackmdp.training.folders import write_summary
 
 PAIRS = ((3, 0.22), (5, 0.16), (5, 0.22))
 WRONG = {"a2c": 40, "hindsight": 1}

@@ -22,7 +22,7 @@ from trackmdp.reports.gather import gather_runs
 from trackmdp.reports.page import build
 from trackmdp.reports.results import is_stored, load_results, save_results
 from trackmdp.reports.tables import Column, Table
-from trackmdp.training.sealing import read_summary, write_summary
+from trackmdp.training.folders import read_summary, write_summary
 from trackmdp.untrusted import sealed
 
 Change = Callable[[Path], Any]

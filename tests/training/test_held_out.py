@@ -24,9 +24,15 @@ from trackmdp.app.sweep.table import run_scores
 from trackmdp.policies.policy import Policy
 from trackmdp.solvers import qmdp
 from trackmdp.training import checkpoint
-from trackmdp.training.evaluator import ExactEvaluator
+from trackmdp.training.evaluator import (
+    CELL_ALONE,
+    ESTIMATED,
+    ExactEvaluator,
+    HeldOutEvaluator,
+    estimated_kernel,
+    make_evaluator,
+)
 from trackmdp.training.folders import run_of
-from trackmdp.training.held_out import CELL_ALONE, ESTIMATED, HeldOutEvaluator, estimated_kernel, make_evaluator
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Tracks, read_tracks, split
 

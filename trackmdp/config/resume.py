@@ -13,7 +13,6 @@ from trackmdp.config.options import GROUPS, SELECTORS, listed, several
 from trackmdp.config.roots import TrainConfig
 from trackmdp.config.tree import build_config, load_run_config, to_dict, to_yaml
 from trackmdp.errors import UserError
-from trackmdp.untrusted import read_object, unsealed
 
 CHANGEABLE = (
     "collector.total_frames",
@@ -53,20 +52,6 @@ def config_text(cfg: TrainConfig, folder: Path | None) -> str:
 def config_digest(cfg: TrainConfig, folder: Path | None) -> str:
     """SHA-256 of `config.yaml`."""
     return hashlib.sha256(config_text(cfg, folder).encode()).hexdigest()
-
-
-def finished(cfg: TrainConfig, folder: Path) -> dict[str, Any] | None:
-    """The `summary.json` of a run that has nothing left to do; None where there is none, or one of another config."""
-    file = folder / "summary.json"
-    try:
-        summary = unsealed(read_object(file), str(file))
-    except UserError:
-        return None
-    # `quiet` changes what is shown and nothing else, but stands in the config: both texts are this run.
-    mine = summary.get("config_sha256") in [
-        config_digest(dataclasses.replace(cfg, quiet=quiet), folder) for quiet in (True, False)
-    ]
-    return summary if mine else None
 
 
 def run_folder(cfg: TrainConfig, chosen: Path) -> Path:

@@ -15,8 +15,7 @@ from trackmdp.config.tree import plain_mapping
 from trackmdp.config.untrusted import MAX_BYTES
 from trackmdp.errors import UserError
 from trackmdp.reports.results import FIGURES, Anomaly, CurvePoint, FinishedRun
-from trackmdp.training.folders import FAILED_FILE, run_of
-from trackmdp.training.sealing import SUMMARY, check_files, read_summary
+from trackmdp.training.folders import FAILED_FILE, SUMMARY, check_files, read_summary, run_of
 from trackmdp.untrusted import decoded, known_object, printable, read_text
 
 MOST_POINTS = 16

@@ -29,8 +29,7 @@ from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.keyed import averaged, visits_of_keys
 from trackmdp.solvers.keyed_search import cell_bound
 from trackmdp.solvers.renewal import DIRECT_CELLS
-from trackmdp.training.folders import FAILED_FILE, PLAN
-from trackmdp.training.sealing import SUMMARY, check_files, read_summary
+from trackmdp.training.folders import FAILED_FILE, PLAN, SUMMARY, check_files, read_summary
 from trackmdp.untrusted import known_object, printable
 from trackmdp.world.checks import canonical_kernel
 from trackmdp.world.make import build_world, of_task

@@ -21,7 +21,6 @@ from trackmdp.arrays import npy_bytes
 from trackmdp.config import TrainConfig, load_run_config
 from trackmdp.config.learning import AlgoConfig
 from trackmdp.config.partition import PartitionConfig
-from trackmdp.config.resume import finished
 from trackmdp.config.sensing import MissConfig, PaperCostConfig, PerfectSensorConfig
 from trackmdp.config.world import TableConfig
 from trackmdp.durable import own_folder, write_bytes, write_json
@@ -33,12 +32,11 @@ from trackmdp.solvers.partition import Block, blocks, default_halo, narrow_halo,
 from trackmdp.solvers.workers import crew
 from trackmdp.training.callbacks import Callback, Learning
 from trackmdp.training.display import make_console
-from trackmdp.training.evaluator import Evaluator, Score
-from trackmdp.training.held_out import make_evaluator
+from trackmdp.training.evaluator import Evaluator, Score, make_evaluator
+from trackmdp.training.folders import SUMMARY, finished, read_summary
 from trackmdp.training.inputs import CLASSES, short, write_inputs
 from trackmdp.training.lock import locked
 from trackmdp.training.run import complete, load_run
-from trackmdp.training.sealing import read_summary
 from trackmdp.training.signals import HEARD, handled
 from trackmdp.training.state import Position, identity
 from trackmdp.training.trainer import Trainer
@@ -170,7 +168,7 @@ class _BlockLearner:
             before = finished(config, folder) is not None
             if not before:
                 # One of an older config, such as a smaller budget, must not be taken for this one.
-                (folder / "summary.json").unlink(missing_ok=True)
+                (folder / SUMMARY).unlink(missing_ok=True)
                 with preserved_global_rng():
                     complete(Trainer(world, config, folder=folder))
         run = load_run(folder)

@@ -1,20 +1,76 @@
-"""The state of a sweep's runs, read from its folder while they run and afterwards."""
+"""What runs and sweeps leave in their folders: `summary.json`, and the state that others read, also while they run.
+
+A summary holds what came out of a run, a digest of each file it belongs to, and one of itself. So a summary, a kernel,
+a config or a policy copied from another run, or changed by hand, is noticed by whoever reads the results. The digests
+are no signatures: who means to deceive can compute them anew.
+"""
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from trackmdp.durable import write_json
+from trackmdp.config import TrainConfig
+from trackmdp.config.resume import config_digest
+from trackmdp.durable import write_json, write_sealed
 from trackmdp.errors import UserError
 from trackmdp.training.lock import is_locked
-from trackmdp.training.sealing import read_summary
-from trackmdp.untrusted import known_object
+from trackmdp.untrusted import known_object, opened, read_object, unsealed
 
+SUMMARY = "summary.json"
+_FILES = ("config.yaml", "kernel.npz", "tracks.json", "policy.npz")
+_LARGEST = 2**36
 PLAN, FAILED_FILE, DONE = "sweep.json", "failed.json", "done.json"
 """Files: of a sweep; of a run that failed, of a run of another command than `train` that ended."""
+
+
+def write_summary(folder: Path, content: Mapping[str, Any]) -> None:
+    """Write `summary.json` of the run in `folder`, once all its other files are there."""
+    files = {name: _digest(folder / name) for name in _FILES if (folder / name).is_file()}
+    write_sealed(folder / SUMMARY, {**content, "files": files})
+
+
+def read_summary(folder: Path) -> dict[str, Any]:
+    """The summary of the run in `folder`, as it was written.
+
+    Raises:
+        UserError: there is none, or it is damaged or changed.
+    """
+    return unsealed(read_object(folder / SUMMARY), str(folder / SUMMARY))
+
+
+def finished(cfg: TrainConfig, folder: Path) -> dict[str, Any] | None:
+    """The summary of a run that has nothing left to do; None where there is none, or one of another config."""
+    try:
+        summary = read_summary(folder)
+    except UserError:
+        return None
+    # `quiet` changes what is shown and nothing else, but stands in the config: both texts are this run.
+    mine = [config_digest(dataclasses.replace(cfg, quiet=quiet), folder) for quiet in (True, False)]
+    return summary if summary.get("config_sha256") in mine else None
+
+
+def check_files(folder: Path, summary: Mapping[str, Any], *names: str) -> None:
+    """See that the files `names`, by default all, are those that the run of `summary` left.
+
+    Raises:
+        UserError: one is missing, or is another.
+    """
+    known = summary.get("files")
+    if not isinstance(known, Mapping):
+        raise UserError(f"{folder / SUMMARY}: names no files; it is by another version of this program")
+    for name in names or known:
+        if name not in known or known[name] != _digest(folder / name):
+            raise UserError(f"{folder / name}: not the file that this run left, as its {SUMMARY} has it")
+
+
+def _digest(file: Path) -> str:
+    with opened(file, most=_LARGEST) as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 @dataclass(frozen=True)

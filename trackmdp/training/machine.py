@@ -1,4 +1,4 @@
-"""The machine: its devices by their names, and what is told of it beside a figure."""
+"""The machine: its devices by their names, the memory that a run needs of it, what is told of it beside a figure."""
 
 from __future__ import annotations
 
@@ -10,7 +10,11 @@ from typing import Any
 
 import torch
 
+from trackmdp.config import TrainConfig
+from trackmdp.config.options import nodes
 from trackmdp.errors import UserError
+from trackmdp.machine import free_bytes, gib
+from trackmdp.world.model import Task
 
 
 def make_device(name: str, key: str = "device") -> torch.device:
@@ -29,6 +33,34 @@ def make_device(name: str, key: str = "device") -> torch.device:
     if device.type == "cuda" and (device.index or 0) >= count:
         raise UserError(f"{key}={name}: no such device here ({count} CUDA devices found); use cpu or auto")
     return device
+
+
+def check_memory(cfg: TrainConfig, task: Task, device: torch.device) -> str:
+    """One line about the memory that the run needs and what there is on `device`.
+
+    Raises:
+        UserError: it cannot fit; the option that takes most of it is named.
+    """
+    parts, free = needs(cfg, task), available_bytes(device)
+    total = sum(parts.values())
+    key = max(parts, key=lambda name: parts[name])
+    if total > free:
+        value = getattr(getattr(cfg, key.split(".")[0]), key.split(".")[1])
+        raise UserError(f"{key}={value}: needs about {gib(total)}, {gib(free)} are available")
+    return f"memory: about {gib(total)} of {gib(free)}, most by {key}"
+
+
+def needs(cfg: TrainConfig, task: Task) -> dict[str, int]:
+    """Bytes of the replay buffer, of collected batches and of networks, by the option that they grow with."""
+    parts: dict[str, int] = {}
+    for _, node in nodes(cfg):
+        parts |= node.needs(task, cfg)
+    return parts
+
+
+def available_bytes(device: torch.device, root: Path = Path("/")) -> int:
+    """Bytes that can still be had on `device`; `root` is where the system's files are (`machine.free_bytes`)."""
+    return int(torch.cuda.mem_get_info(device)[0]) if device.type == "cuda" else free_bytes(root)
 
 
 def machine() -> dict[str, Any]:

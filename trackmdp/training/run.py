@@ -19,7 +19,7 @@ from trackmdp.solvers import optimal
 from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.solution import Solution
 from trackmdp.training.callbacks import Callback, Learning, Row, Training
-from trackmdp.training.sealing import check_files, read_summary, write_summary
+from trackmdp.training.folders import SUMMARY, check_files, read_summary, write_summary
 from trackmdp.training.summary import summarize
 from trackmdp.untrusted import decoded, read_text
 from trackmdp.world.model import Array, World
@@ -113,8 +113,8 @@ def load_run(folder: str | Path) -> Run:
         UserError: the folder is not that of a finished run, or a file in it is damaged.
     """
     place = Path(folder)
-    if not (place / "summary.json").is_file():
-        raise UserError(f"run={folder}: not the folder of a finished run (it has no summary.json)")
+    if not (place / SUMMARY).is_file():
+        raise UserError(f"run={folder}: not the folder of a finished run (it has no {SUMMARY})")
     summary = read_summary(place)
     check_files(place, summary)
     table, value = load_policy(place / "policy.npz")
@@ -123,7 +123,7 @@ def load_run(folder: str | Path) -> Run:
 
 def _evaluation(folder: Path, summary: Mapping[str, Any], value: Array | None) -> Evaluation:
     """The figures of the summary and the values of the policy; what else is known per cell is not kept in a folder."""
-    with decoded(str(folder / "summary.json"), "the summary of a run"):
+    with decoded(str(folder / SUMMARY), "the summary of a run"):
         known = {field.name for field in fields(Evaluation)}
         figures: dict[str, Any] = {name: _number(it) for name, it in summary["policy"].items() if name in known}
         cells = 0 if value is None else len(value)

@@ -18,13 +18,11 @@ from trackmdp.durable import write_json
 from trackmdp.errors import Preempted, RunError
 from trackmdp.policies.policy import Policy, actor_table
 from trackmdp.seeding import seed_global
-from trackmdp.training import memory
 from trackmdp.training.callbacks import Callback, Row
 from trackmdp.training.display import Display
-from trackmdp.training.evaluator import Score, while_collecting
-from trackmdp.training.held_out import make_evaluator
+from trackmdp.training.evaluator import Score, make_evaluator, while_collecting
 from trackmdp.training.inputs import write_inputs
-from trackmdp.training.machine import make_device
+from trackmdp.training.machine import check_memory, make_device
 from trackmdp.training.make import make_algorithm, make_collector, make_loggers
 from trackmdp.training.saving import Checkpoints
 from trackmdp.training.signals import Signals
@@ -77,7 +75,7 @@ class Trainer:
             self.callbacks[:0] = make_loggers(config, folder)
         self.start, self.position = Position(), Position()
         self.error: BaseException | None = None
-        self.console.print(memory.check_memory(config, problem, self.device))
+        self.console.print(check_memory(config, problem, self.device))
 
     @property
     def iterations(self) -> int:

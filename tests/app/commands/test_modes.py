@@ -15,7 +15,7 @@ from trackmdp.config.compose import compose
 from trackmdp.solvers import keyed
 from trackmdp.solvers.keyed import KeyedPairs
 from trackmdp.solvers.keyed_search import solve_keys
-from trackmdp.training.memory import needs
+from trackmdp.training.machine import needs
 from trackmdp.world.make import make_problem
 from trackmdp.world.modes import HiddenWorld
 

@@ -17,7 +17,7 @@ import torch
 from trackmdp.app.bench.process import measured, timed_training, typed
 from trackmdp.config import BenchmarkConfig
 from trackmdp.config.compose import compose
-from trackmdp.training.memory import needs
+from trackmdp.training.machine import needs
 from trackmdp.world.make import build_world
 from trackmdp.world.model import World
 

@@ -7,34 +7,46 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from rich.console import Console
 from rich.table import Table
 
-from trackmdp.app.commands import alarms, held_out, playback
+from trackmdp.app.commands import held_out, playback
 from trackmdp.app.commands.trained import trained
 from trackmdp.config import EvaluateConfig, FalseAlarmConfig, McapConfig, PlaybackConfig, load_run_config, to_yaml
 from trackmdp.durable import write_json, write_text
 from trackmdp.episodes.figures import Simulation
+from trackmdp.episodes.filtered import simulate_filter
 from trackmdp.episodes.log import EpisodeLog
 from trackmdp.episodes.simulate import simulate
+from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import sets_name, write_sets
 from trackmdp.reports.picture import draw_picture
-from trackmdp.solvers import estimator
+from trackmdp.solvers import bounds, estimator
+from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.solve import baseline_policy
 from trackmdp.training.display import make_console, table
-from trackmdp.training.evaluator import figures
-from trackmdp.training.held_out import make_evaluator
+from trackmdp.training.evaluator import figures, make_evaluator
+from trackmdp.training.folders import SUMMARY, check_files, read_summary
 from trackmdp.training.machine import make_device
-from trackmdp.training.sealing import SUMMARY, check_files, read_summary
 from trackmdp.untrusted import decoded
 from trackmdp.world.make import make_problem
 from trackmdp.world.model import World
 from trackmdp.world.modes import Modelled
+from trackmdp.world.sensors import false_alarm
 from trackmdp.world.tracks import Problem, Recorded
 
 _FOR_THE_PICTURE = 16  # episodes simulated where none are asked for
+_FIGURES = {
+    "aihtr": "AIHTR",
+    "accuracy": "accuracy",
+    "sensors_per_step": "sensors per step",
+    "safe_per_episode": "safe actions per episode",
+    "expected_length": "steps per episode",
+}
+"""Figures of a policy as tables at the terminal have them."""
 
 
 def run(cfg: EvaluateConfig, folder: Path, problem: Problem | None = None) -> float:
@@ -49,7 +61,7 @@ def run(cfg: EvaluateConfig, folder: Path, problem: Problem | None = None) -> fl
         return playback.run(cfg, folder, console, problem)
     world, policy, subject = trained(cfg.run, device) if cfg.run else _baseline(cfg, problem)
     if isinstance(cfg.sensor, FalseAlarmConfig):
-        return alarms.run(cfg, world, policy, subject, folder, console)
+        return _believing(cfg, world, policy, subject, folder, console)
     # Recorded tracks have no kernel, hence no exact value and no bound: figures come from the held-out tracks.
     if isinstance(world, Recorded):
         return held_out.run(world, policy, subject, folder, console, cfg.seed)
@@ -131,9 +143,57 @@ def _baseline(cfg: EvaluateConfig, problem: Problem | None) -> tuple[Problem, Po
 def _compared(subject: str, report: dict[str, Any], simulation: Simulation | None) -> Table:
     """The figures of the policy, exact and simulated, beside those of Q_MDP."""
     rows = []
-    for key, label in alarms.FIGURES.items():
+    for key, label in _FIGURES.items():
         estimate = getattr(simulation, key) if simulation else None
         simulated = f"{estimate.mean:,.4f} ± {estimate.standard_error:.4f}" if estimate else ""
         rows.append([label, f"{report['exact'][key]:,.4f}", simulated, f"{report['qmdp'][key]:,.4f}"])
     title = f"{simulation.episodes} simulated ± s.e." if simulation else "simulated"
     return table(subject, ["figure", "exact", title, "Q_MDP exact"], rows)
+
+
+def _believing(cfg: EvaluateConfig, problem: Problem, policy: Policy, subject: str, folder: Path, at: Console) -> float:
+    """Evaluate where sensors report targets that are not there: the exact AIHTR, each report taken for the truth.
+
+    Raises:
+        UserError: tracks instead of a world, or what `trackmdp.solvers.alarms.believed` refuses.
+    """
+    sensor = cfg.sensor
+    assert isinstance(sensor, FalseAlarmConfig)
+    if not isinstance(problem, World):
+        raise UserError("sensor=false_alarm: needs a motion model of cells alone, without modes; not recorded tracks")
+    # A trained policy's world is that of its run, with the sensors asked for.
+    world = World.of(
+        problem, problem.kernel, safe_detection=1.0, **false_alarm(problem.size, p_d=sensor.p_d, p_f=sensor.p_f)
+    )
+    silent, alarmed = evaluate(world, policy), evaluate(world, policy, false_alarm=sensor.p_f)
+    # A window is about the last located cell, and the filter is never sure of one.
+    wanted = cfg.episodes if world.window is None else 0
+    simulated = simulate_filter(world, sensor.p_f, wanted, seed=cfg.seed).intervals(np.arange(wanted))
+    filtered = {key: asdict(each) for key, each in simulated.items()}
+    # How long a target stays is known exactly, and whatever is sensed the same: most of what returns vary by.
+    steps, rate = alarmed.expected_length, filtered["reward_per_step"]
+    filtered["aihtr"] |= {end: rate[end] and steps * rate[end] for end in ("mean", "low", "high")}
+    # Not the clocked bound: a report that is wrong sets the clock back, and D is paid later.
+    bound = float(bounds.valid(world).mean())
+    loss = (silent.aihtr - alarmed.aihtr) / alarmed.expected_length
+    told, plain = figures(alarmed), figures(silent)
+    report = {
+        "policy": subject,
+        "p_f": sensor.p_f,
+        "exact": told,
+        "without_false_alarms": plain,
+        "filter": filtered if wanted else None,
+        "bounds": {"valid": bound},
+        "loss_per_step": loss,
+    }
+    write_json(folder / "evaluation.json", report)
+    rows = []
+    for key in ("aihtr", "accuracy", "sensors_per_step"):
+        played = held_out.with_interval(filtered[key], 4) if wanted else ""
+        rows.append([_FIGURES[key], f"{told[key]:,.4f}", f"{plain[key]:,.4f}", played])
+    heads = ["figure", f"p_f = {sensor.p_f:g}, exact", "p_f = 0", f"Bayes filter, {wanted} episodes, 95 %"]
+    at.print(table(f"{subject}, each report taken for the truth", heads, rows))
+    at.print(
+        f"upper bound (valid, of p_f = 0) {bound:,.4f}; {loss:.4f} a step lost to false alarms; results in {folder}"
+    )
+    return alarmed.aihtr

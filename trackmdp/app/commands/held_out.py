@@ -14,7 +14,7 @@ from trackmdp.policies.saved import write_sets
 from trackmdp.reports.held_out import recorded_page
 from trackmdp.reports.picture import draw_picture
 from trackmdp.training.display import table
-from trackmdp.training.held_out import CELL_ALONE, HeldOutEvaluator
+from trackmdp.training.evaluator import CELL_ALONE, HeldOutEvaluator
 from trackmdp.world.gridding import said
 from trackmdp.world.tracks import Problem, Recorded
 

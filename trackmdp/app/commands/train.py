@@ -8,12 +8,12 @@ from rich.console import Console
 
 from trackmdp.app.commands.held_out import show_held_out, show_loaded
 from trackmdp.config import TrainConfig
-from trackmdp.config.resume import finished
 from trackmdp.errors import RunError
 from trackmdp.policies.policy import Policy
 from trackmdp.training.blocks import make_trainer
 from trackmdp.training.callbacks import Learning
 from trackmdp.training.display import make_console, table
+from trackmdp.training.folders import SUMMARY, finished
 from trackmdp.training.lock import locked
 from trackmdp.training.run import Run, complete
 from trackmdp.world.make import make_problem
@@ -71,7 +71,7 @@ def _finished(cfg: TrainConfig, folder: Path) -> float | None:
     if summary is None:
         # It belongs to an older config; left there, whoever looks at the folder meanwhile would take this run for
         # done.
-        (folder / "summary.json").unlink(missing_ok=True)
+        (folder / SUMMARY).unlink(missing_ok=True)
         return None
     return float(summary["policy"]["aihtr"])
 

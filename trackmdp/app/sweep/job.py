@@ -15,8 +15,7 @@ from trackmdp.app.sweep.process import Outcome, run_in_process
 from trackmdp.config import TrainConfig
 from trackmdp.durable import write_json
 from trackmdp.errors import USER_MISTAKE
-from trackmdp.training.folders import DONE, FAILED_FILE, run_of
-from trackmdp.training.sealing import SUMMARY
+from trackmdp.training.folders import DONE, FAILED_FILE, SUMMARY, run_of
 
 Launch = Callable[[Sequence[Job]], None]
 """Runs jobs, and returns once none of them is running."""

@@ -17,11 +17,10 @@ from trackmdp.app.sweep.plan import Job
 from trackmdp.app.sweep.process import Outcome
 from trackmdp.app.sweep.table import show_runs, status_of, write_table
 from trackmdp.config import TrainConfig
-from trackmdp.config.resume import continued, finished
+from trackmdp.config.resume import continued
 from trackmdp.errors import FAILED, Preempted, UserError
-from trackmdp.training.folders import DONE, FAILED_FILE, run_of, runs_of, write_plan
+from trackmdp.training.folders import DONE, FAILED_FILE, SUMMARY, finished, run_of, runs_of, write_plan
 from trackmdp.training.lock import locked
-from trackmdp.training.sealing import SUMMARY
 from trackmdp.training.signals import Signals
 
 _ROUNDS = 3
