@@ -29,7 +29,7 @@ ARROW = [
     ["trackmdp.paper"],
     ["trackmdp.app.bench"],
     ["trackmdp.app.commands"],
-    ["trackmdp.app.outputs", "trackmdp.app.words"],
+    ["trackmdp.app.words"],
     ["trackmdp.app.manual", "trackmdp.app.diagnose", "trackmdp.app.prepare"],
     ["trackmdp.app.sources"],
     ["trackmdp.app.compose"],

@@ -42,11 +42,8 @@ class Preempted(BaseException):
 def adding(extra: str) -> str:
     """The line that installs an extra: in the clone that this package is imported from, or by the package's name."""
     clone = Path(__file__).parents[1]
-    return (
-        f"pip install -e '{clone}[{extra}]'"
-        if (clone / "pyproject.toml").is_file()
-        else f"pip install 'trackmdp[{extra}]'"
-    )
+    package = f"-e '{clone}[{extra}]'" if (clone / "pyproject.toml").is_file() else f"'trackmdp[{extra}]'"
+    return f"pip install {package}"
 
 
 def require(module: str, extra: str, option: str) -> None:

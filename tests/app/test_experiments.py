@@ -25,5 +25,5 @@ def test_the_runs_of_an_experiment_are_accepted(name: str) -> None:
         assert sum(map(len, grids)) == RUNS[name]
         # Of runs that differ in the seed alone one will do.
         few = {" ".join(words).partition(" seed=")[0]: words for words in (grid[-1] for grid in grids)}
-        refusals = {job.refusal for job in plan("train", [*few.values()], Path("none"), compose)}
+        refusals = {job.refusal for job in plan("train", Path("none"), compose, [*few.values()])}
     assert refusals == {""}

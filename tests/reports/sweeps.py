@@ -13,7 +13,7 @@ from scipy import sparse
 
 from tests.helpers import train_config
 from trackmdp.config import PaperCostConfig, TrainConfig
-from trackmdp.config.resume import config_digest, config_text
+from trackmdp.config.tree import config_digest, config_text
 from trackmdp.policies.policy import Policy
 from trackmdp.solvers import clocked
 from trackmdp.training.evaluator import ExactEvaluator, figures

@@ -13,7 +13,7 @@ import torch
 from tests.helpers import train_config
 from trackmdp.app.commands.train import run
 from trackmdp.training import checkpoint
-from trackmdp.training.metrics import CsvLogger
+from trackmdp.training.loggers import CsvLogger
 
 TIMED = ("seconds", "frames_per_second")
 QUICK = ("grid.size=3", "quiet=true", "optimal.enabled=false", "evaluation.every=4", "checkpoint.seconds=null")

@@ -25,8 +25,8 @@ from trackmdp.training import checkpoint
 from trackmdp.training.callbacks import Callback, Training
 from trackmdp.training.lock import locked
 from trackmdp.training.make import make_algorithm
+from trackmdp.training.signals import Watch
 from trackmdp.training.state import _weights
-from trackmdp.training.workers import Watch
 from trackmdp.world.make import build_world
 
 

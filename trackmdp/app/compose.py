@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, Self
 
@@ -19,10 +19,9 @@ from trackmdp.app.diagnose import diagnose
 from trackmdp.app.sources import searched
 from trackmdp.app.words import parsed
 from trackmdp.config import GROUPS, ROOTS, conf_dir
-from trackmdp.config.registry import load_plugins
+from trackmdp.config.registry import load_plugins, register_resolvers
 from trackmdp.config.sweeping import PLUGINS
 from trackmdp.config.untrusted import entries, names_code
-from trackmdp.config.values import register_resolvers
 from trackmdp.errors import UserError
 
 _LOG_FILE = "${hydra.runtime.output_dir}/${hydra.job.name}.log"
@@ -206,11 +205,7 @@ def _search_path(word: str) -> list[str]:
 
 
 def _existing(option: str, folder: str) -> Path:
-    path = Path(folder).absolute()
-    try:
-        found = path.is_dir()
-    except OSError:  # a name that is too long
-        found = False
-    if not found:
-        raise UserError(f"{option} {folder}: no such folder")
-    return path
+    with suppress(OSError):  # a name that is too long
+        if (path := Path(folder).absolute()).is_dir():
+            return path
+    raise UserError(f"{option} {folder}: no such folder")

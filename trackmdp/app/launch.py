@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from hydra.core.global_hydra import GlobalHydra
@@ -13,8 +14,7 @@ from hydra.types import HydraContext
 from omegaconf import DictConfig, OmegaConf, read_write
 
 from trackmdp.app.compose import Composer
-from trackmdp.app.outputs import folder_of, make_folder, remove_if_empty
-from trackmdp.app.prepare import Prepared, announce, prepare
+from trackmdp.app.prepare import Prepared, announce, folder_of, make_folder, prepare, remove_if_empty
 from trackmdp.app.questions import answer, parse
 from trackmdp.app.words import parsed, run_words
 from trackmdp.config import GROUPS
@@ -115,13 +115,10 @@ def _sweep(compose: Composer) -> int:
     # Absolute: runs start in processes, perhaps on other machines, whose current folder is another.
     place = folder.absolute()
 
-    def planned(grid: Sequence[Sequence[str]], naming: Collection[str] = ()) -> list[Job]:
-        return plan(command, grid, place, compose, naming)
-
     def launch_jobs(jobs: Sequence[Job]) -> None:
         maker(launcher)(launcher, [replace(job, concurrent=launcher.concurrent) for job in jobs])
 
-    batches = maker(sweeper)(sweeper, words, place, planned)
+    batches = maker(sweeper)(sweeper, words, place, partial(plan, command, place, compose))
     line = shlex.join(["trackmdp", command, "-m", *compose.words])
     made = make_folder("hydra.sweep.dir", folder)
     try:

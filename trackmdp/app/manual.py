@@ -13,9 +13,8 @@ from typing import Any
 from trackmdp.config import GROUPS, ROOTS, SELECTORS, Option, options
 from trackmdp.config.checks import check_choice
 from trackmdp.config.options import listed, several
-from trackmdp.config.registry import load_plugins
+from trackmdp.config.registry import choice_values, load_plugins, read_values
 from trackmdp.config.sweeping import PLUGINS
-from trackmdp.config.values import choice_values, read_values
 
 EXAMPLES = {
     "train": [

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
+import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from trackmdp.app.outputs import folder_of
 from trackmdp.config import (
     ROOTS,
     CommandConfig,
@@ -27,7 +28,7 @@ from trackmdp.config import (
 from trackmdp.config.checks import refuse_ignored
 from trackmdp.config.compose import from_hydra
 from trackmdp.config.loggers import require_packages
-from trackmdp.config.resume import continued, key_of, run_folder
+from trackmdp.config.tree import continued, key_of, run_folder
 from trackmdp.errors import UserError
 from trackmdp.imports import importing
 
@@ -196,3 +197,57 @@ def _check_outputs(cfg: ReplayConfig) -> None:
             raise UserError(f"{key}={named}: expected a file to write, not a folder")
     if cfg.csv is not None and Path(cfg.csv).exists() and not Path(cfg.csv).is_dir():
         raise UserError(f"csv={cfg.csv}: expected a folder")
+
+
+def folder_of(cfg: DictConfig, key: str) -> Path:
+    """The folder at a dotted key, such as ``hydra.run.dir``, its interpolations resolved.
+
+    Raises:
+        UserError: it is missing or no folder's name, or an interpolation in it leads nowhere.
+    """
+    try:
+        value = OmegaConf.select(cfg, key)  # None for a missing key, and for "???"
+    except Exception as error:  # a resolver of `${name:...}` raises what it likes
+        said = str(error).strip().splitlines() or [type(error).__name__]
+        raise UserError(f"{key}: {said[0]}") from error
+    if not isinstance(value, str):
+        raise UserError(f"{key}: missing, expected a folder")
+    folder = Path(value)
+    try:
+        # Asked for its error alone: a name that is too long, or a folder that may not be looked into, is refused here
+        # in one line.
+        folder.exists()
+    except OSError as error:
+        raise UserError(f"{key}={value}: expected a folder that can be written to ({error.strerror})") from error
+    return folder
+
+
+def make_folder(key: str, folder: Path) -> list[Path]:
+    """Make `folder`; returns the folders that were not there before, the innermost first.
+
+    Raises:
+        UserError: it cannot be made or written to. Nothing is left behind then.
+    """
+    # Noted before anything is made, so that exactly these are taken away again.
+    path = folder.absolute()
+    made = [each for each in (path, *path.parents) if not each.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        # A folder that was there already may be read-only: mkdir does not complain, the first file would.
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise PermissionError(errno.EACCES, "it cannot be written to")
+    except OSError as error:
+        remove_if_empty(made)
+        raise UserError(f"{key}={folder}: expected a folder that can be written to ({error.strerror})") from error
+    return made
+
+
+def remove_if_empty(folders: Iterable[Path]) -> None:
+    """Remove the folders, in this order, up to the first that is not empty."""
+    for folder in folders:
+        try:
+            folder.rmdir()
+        except FileNotFoundError:
+            continue
+        except OSError:
+            return

@@ -16,9 +16,9 @@ from omegaconf import DictConfig, OmegaConf
 
 from trackmdp.config.checks import absolute_paths, check_choice, check_option, refuse_ignored, validate
 from trackmdp.config.options import GROUPS, SELECTORS, Option, optional, options, several
+from trackmdp.config.registry import choice_values, read_values, resolved
 from trackmdp.config.roots import ROOTS, CommandConfig
 from trackmdp.config.tree import build_config
-from trackmdp.config.values import choice_values, read_values, resolved
 from trackmdp.errors import UserError
 
 C = TypeVar("C", bound=CommandConfig)

@@ -26,19 +26,19 @@ class RowsConfig(LogConfig):
     every: int = option("iterations from one row to the next", unit="iterations", ge=1)
 
 
-@choice("log", "csv", makes="trackmdp.training.metrics:CsvLogger")
+@choice("log", "csv", makes="trackmdp.training.loggers:CsvLogger")
 class CsvConfig(RowsConfig):
     """`metrics.csv`, which a training always writes: without this choice a row for every iteration."""
 
 
-@choice("log", "tensorboard", makes="trackmdp.training.metrics:TensorboardLogger")
+@choice("log", "tensorboard", makes="trackmdp.training.loggers:TensorboardLogger")
 class TensorboardConfig(RowsConfig):
     """TensorBoard event files."""
 
     package: ClassVar[str | None] = "tensorboard"
 
 
-@choice("log", "wandb", makes="trackmdp.training.trackers:WandbLogger")
+@choice("log", "wandb", makes="trackmdp.training.loggers:WandbLogger")
 class WandbConfig(RowsConfig):
     """Weights & Biases. `wandb sync` uploads what was logged offline, in the run's folder."""
 
@@ -47,7 +47,7 @@ class WandbConfig(RowsConfig):
     project: str = option("project of the run", expects="a name", pattern=r"[\w .-]{1,128}")
 
 
-@choice("log", "mlflow", makes="trackmdp.training.trackers:MlflowLogger")
+@choice("log", "mlflow", makes="trackmdp.training.loggers:MlflowLogger")
 class MlflowConfig(RowsConfig):
     """MLflow, in a database or on a server."""
 

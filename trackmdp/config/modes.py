@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, ClassVar
 
-from trackmdp.config.options import GROUPS, Option, choice, option, refuse
-from trackmdp.config.values import nested_choice
+from trackmdp.config.checks import unknown_option, validate
+from trackmdp.config.options import GROUPS, Option, choice, option, options, refuse
+from trackmdp.config.registry import choice_values, resolved
 from trackmdp.config.world import KernelConfig
 
 MOST_MODES = 1_000
@@ -127,7 +128,7 @@ class CoordinatedTurnConfig(VelocityConfig):
 
 
 def _regime(key: str, entry: Any, root: Any) -> dict[str, Any]:
-    """One regime with all its options.
+    """One regime with all its options, checked; what is not given is as in `conf/`.
 
     Raises:
         UserError: there is no such kernel of cells, or an option is not allowed.
@@ -140,4 +141,11 @@ def _regime(key: str, entry: Any, root: Any) -> dict[str, Any]:
     given = dict(entry)
     if (name := given.pop("kernel")) not in known:
         raise refuse(f"{key}.kernel", name, f"one of {', '.join(known)}")
-    return {"kernel": name} | vars(nested_choice("kernel", name, given, key, root))
+    values, schema = choice_values("kernel", name, {}), options(GROUPS["kernel"][name])
+    if unknown := [each for each in given if each not in schema]:
+        beside = {f"{key}.{each}": item for each, item in schema.items() if isinstance(item, Option)}
+        raise unknown_option(f"{key}.{unknown[0]}", beside)
+    plain = resolved(values | given, schema, f"{key}.")
+    node = GROUPS["kernel"][name](**{option: plain[option] for option in schema})
+    validate(node, key, root)
+    return {"kernel": name} | vars(node)

@@ -140,14 +140,11 @@ class FootprintConfig(SensorConfig):
 
     def _check_solver(self, key: str, root: Any) -> None:
         """What plans and proves for sensors of one cell alone."""
-        for group in ("solver", "baseline"):
+        for group in ("solver", "baseline", "algo"):
             planner = getattr(root, group, None)
             if planner is not None and not planner.knows_footprints:
                 known = [name for name, schema in GROUPS[group].items() if schema.knows_footprints]
                 raise refuse(group, planner.name, f"one of {', '.join(known)} with {key}={self.name}")
-        if root.learns and not root.algo.knows_footprints:
-            known = [name for name, schema in GROUPS["algo"].items() if schema.knows_footprints]
-            raise refuse("algo", root.algo.name, f"one of {', '.join(known)} with {key}={self.name}")
         if getattr(root, "verify", False):
             raise refuse("verify", True, f"false with {key}={self.name}: the theorems are on sensors of one cell")
         if (partition := getattr(root, "partition", None)) is not None and partition.block is not None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from trackmdp.config import McapConfig
-from trackmdp.config.resume import config_text
+from trackmdp.config.tree import config_text
 from trackmdp.episodes.batch import Episodes
 from trackmdp.episodes.layout import write_layout
 from trackmdp.episodes.recover import taken_over

@@ -17,8 +17,7 @@ from rich.text import Text
 
 from trackmdp.errors import UserError
 from trackmdp.reports.gather import planned, run_folders
-from trackmdp.training.folders import run_of
-from trackmdp.training.sealing import SUMMARY
+from trackmdp.training.folders import SUMMARY, run_of
 from trackmdp.untrusted import decoded, known_object, opened, printable
 
 WAITING, RUNNING, CUT, FAILED, DONE = "waiting", "running", "cut", "failed", "done"

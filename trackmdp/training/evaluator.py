@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from trackmdp.config.values import choice_values
+from trackmdp.config.registry import choice_values
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import bounds, qmdp
 from trackmdp.solvers.evaluate import evaluate

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from trackmdp.config import TrainConfig
-from trackmdp.config.resume import config_digest
+from trackmdp.config.tree import config_digest
 from trackmdp.durable import write_json, write_sealed
 from trackmdp.errors import UserError
 from trackmdp.training.lock import is_locked

@@ -12,7 +12,7 @@ from scipy import sparse
 
 from trackmdp.arrays import LARGE, npy_bytes
 from trackmdp.config import TrainConfig
-from trackmdp.config.resume import config_text
+from trackmdp.config.tree import config_text
 from trackmdp.durable import write_bytes, write_text
 from trackmdp.errors import UserError
 from trackmdp.solvers.alike import cell_classes

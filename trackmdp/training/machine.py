@@ -28,11 +28,11 @@ def make_device(name: str, key: str = "device") -> torch.device:
         return torch.device("cuda:0" if count else "cpu")
     try:
         device = torch.device(name)
+        if device.type != "cuda" or (device.index or 0) < count:
+            return device
     except RuntimeError:  # an index that is no C integer
-        raise UserError(f"{key}={name}: no such device here ({count} CUDA devices found); use cpu or auto") from None
-    if device.type == "cuda" and (device.index or 0) >= count:
-        raise UserError(f"{key}={name}: no such device here ({count} CUDA devices found); use cpu or auto")
-    return device
+        pass
+    raise UserError(f"{key}={name}: no such device here ({count} CUDA devices found); use cpu or auto")
 
 
 def check_memory(cfg: TrainConfig, task: Task, device: torch.device) -> str:

@@ -1,4 +1,4 @@
-"""Signals that ask a run to stop: noted when they come, acted upon between two iterations."""
+"""Signals: those that ask a run to stop are acted upon between two iterations; the death of a worker at once."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ import time
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from types import FrameType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
+
+if TYPE_CHECKING:  # a sweep hears signals without loading torch
+    from torchrl.collectors import BaseCollector
 
 HEARD = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
 """Signals that ask a run to stop."""
@@ -86,3 +89,57 @@ def handled(handler: Any, *numbers: signal.Signals) -> Iterator[None]:
 def kept_sigterm() -> AbstractContextManager[None]:
     """Around a start of Ray, which installs a handler that exits: the run would end without its checkpoint."""
     return handled(signal.getsignal(signal.SIGTERM), signal.SIGTERM)
+
+
+class Watch:
+    """While entered, the end of a worker process of `collector` interrupts the call that waits for it.
+
+    TorchRL looks for dead workers where it waits for a batch, but waits for ever where one should acknowledge new
+    weights. Here SIGCHLD interrupts the wait. Outside the main thread, and without workers, nothing is done.
+    """
+
+    def __init__(self, collector: BaseCollector) -> None:
+        # TorchRL keeps them as `procs`; a collector in this process, or on Ray, has none.
+        self._processes: list[Any] = list(getattr(collector, "procs", ()))
+        self._waiting = False
+
+    def __enter__(self) -> Watch:
+        self._before: Any = None
+        if self._processes and threading.current_thread() is threading.main_thread():
+            self._before = signal.signal(signal.SIGCHLD, self._heard)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._before is not None:
+            signal.signal(signal.SIGCHLD, self._before)
+
+    @contextmanager
+    def waiting(self) -> Iterator[None]:
+        """Around a call of the collector.
+
+        Raises:
+            RuntimeError: a worker has died, before or meanwhile.
+        """
+        self._waiting = True
+        try:
+            self._check()
+            yield
+        finally:
+            self._waiting = False
+
+    def _heard(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
+        # Only while the collector waits: an exception out of a signal handler anywhere else, in the middle of an
+        # optimizer step or of a saving, would leave half a state. A worker that dies at such a moment is found by the
+        # next call.
+        if self._waiting:
+            self._check()
+
+    def _check(self) -> None:
+        for index, process in enumerate(self._processes):
+            # `exitcode` raises on a process object that was closed. None: still running; negative: the number of the
+            # signal that killed it.
+            code = None if process._closed else process.exitcode
+            if code is not None:
+                self._waiting = False  # the others end next, when the collector is shut down
+                how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with status {code}"
+                raise RuntimeError(f"worker {index} {how}")

@@ -16,7 +16,7 @@ from torchrl.collectors import BaseCollector, Collector
 from trackmdp.algos.common import Algorithm
 from trackmdp.config import TrainConfig
 from trackmdp.config.checks import own_paths
-from trackmdp.config.resume import fixed_options
+from trackmdp.config.tree import fixed_options
 from trackmdp.errors import UserError
 from trackmdp.training import checkpoint
 from trackmdp.training.collect import collector_state, load_collector_state

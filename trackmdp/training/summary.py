@@ -7,7 +7,7 @@ from importlib.metadata import version
 from typing import Any
 
 from trackmdp import __version__
-from trackmdp.config.resume import config_digest
+from trackmdp.config.tree import config_digest
 from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.solution import Solution
 from trackmdp.training.callbacks import Learning

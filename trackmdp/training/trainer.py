@@ -25,9 +25,8 @@ from trackmdp.training.inputs import write_inputs
 from trackmdp.training.machine import check_memory, make_device
 from trackmdp.training.make import make_algorithm, make_collector, make_loggers
 from trackmdp.training.saving import Checkpoints
-from trackmdp.training.signals import Signals
+from trackmdp.training.signals import Signals, Watch
 from trackmdp.training.state import Position, find, restore, take_weights
-from trackmdp.training.workers import Watch
 from trackmdp.untrusted import decoded
 from trackmdp.world.tracks import Problem
 

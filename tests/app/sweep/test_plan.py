@@ -26,7 +26,7 @@ def planned(blocks: Sequence[str], *typed: str, sweep: Path = Path("none"), more
 
     register()
     with initialize_config_dir(config_dir=conf_dir(), version_base="1.3"):
-        return [job.name for job in plan("train", combinations(blocks, typed), sweep, composed)]
+        return [job.name for job in plan("train", sweep, composed, combinations(blocks, typed))]
 
 
 def test_every_combination_in_the_order_typed() -> None:
@@ -122,6 +122,6 @@ def test_the_sweep_has_the_same_folder_in_whatever_order_it_is_typed(words: list
 def test_a_run_cannot_be_told_to_go_on_elsewhere() -> None:
     register()
     with initialize_config_dir(config_dir=conf_dir(), version_base="1.3"):
-        jobs = plan("train", [["resume=runs/a"]], Path("none"), lambda words: compose("train", overrides=list(words)))
+        jobs = plan("train", Path("none"), lambda words: compose("train", overrides=list(words)), [["resume=runs/a"]])
     assert jobs[0].cfg is None
     assert jobs[0].refusal.startswith(f"resume={Path.cwd() / 'runs/a'}: expected null or auto in a sweep")

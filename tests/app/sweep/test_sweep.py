@@ -18,8 +18,8 @@ from rich.console import Console
 from tests.app.sweep.runs import ROOT, TINY, here, started, states, swept, table
 from tests.typed import stub
 from trackmdp.app.cli import main
-from trackmdp.app.sweep.job import stop_signal
 from trackmdp.app.sweep.plan import Job
+from trackmdp.app.sweep.process import stop_signal
 from trackmdp.app.sweep.sweep import sweep
 from trackmdp.app.sweep.table import write_table
 from trackmdp.durable import write_sealed

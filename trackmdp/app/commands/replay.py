@@ -31,7 +31,11 @@ def run(cfg: ReplayConfig, folder: Path) -> None:  # noqa: ARG001  what is writt
     console = make_console(cfg.quiet)
     file = Path(cfg.file)
     if cfg.recover:
-        file = _recover(console, file)
+        saved = recover(file)
+        file = saved.file
+        console.print(f"{saved.episodes} episodes -> {file}")
+        for line in saved.damaged:
+            console.print(f"lost: {line}")
     with EpisodeReader(file) as reader:
         # Said at once: other versions of NumPy or torch may draw other numbers, which is not damage.
         if apart := versions_apart(reader.run.said):
@@ -45,14 +49,6 @@ def run(cfg: ReplayConfig, folder: Path) -> None:  # noqa: ARG001  what is writt
             _list(console, reader)
         else:
             play(console, reader.read(cfg.episode), reader.world(), cfg.speed)
-
-
-def _recover(console: Console, file: Path) -> Path:
-    saved = recover(file)
-    console.print(f"{saved.episodes} episodes -> {saved.file}")
-    for line in saved.damaged:
-        console.print(f"lost: {line}")
-    return saved.file
 
 
 def _exports(console: Console, cfg: ReplayConfig, reader: EpisodeReader) -> bool:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.status import Status
 
 from trackmdp.config import SolveConfig
 from trackmdp.durable import write_json
@@ -41,8 +43,8 @@ def run(cfg: SolveConfig, folder: Path, problem: Problem | None = None) -> float
         raise UserError(f"grid.max_steps={cfg.grid.max_steps}: only whole episodes are solved, expected null")
     world = make_problem(cfg) if problem is None else problem
     assert not isinstance(world, Recorded)  # they are refused: there is no kernel to solve with
-    with _SearchDisplay(console, f"solve {cfg.solver.name}") as display:
-        solution = run_solver(world, cfg.solver, display.update, cfg.partition)
+    with console.status(title := f"solve {cfg.solver.name}") as status:
+        solution = run_solver(world, cfg.solver, _display(console, status, title), cfg.partition)
     # The paper's bounds are on targets without a hidden mode.
     bound = {name: float(each(world).mean()) for name, each in _BOUNDS.items()} if isinstance(world, World) else {}
     arrays = write_sets(folder, solution.table, value=solution.value, upper_value=solution.bound)
@@ -101,29 +103,20 @@ def _show(
     )
 
 
-class _SearchDisplay:
-    """The bracket while a search goes on: one changing line at a terminal, a plain line now and then when piped."""
+def _display(console: Console, status: Status, title: str) -> Callable[[SearchProgress], None]:
+    """Shows the bracket as a search goes on: one changing line at a terminal, a plain line now and then when piped."""
+    last = time.monotonic()
 
-    def __init__(self, console: Console, title: str) -> None:
-        self._console, self._title = console, title
-        self._status = console.status(title)
-        self._last_line = time.monotonic()
-
-    def __enter__(self) -> _SearchDisplay:
-        self._status.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._status.stop()
-
-    def update(self, progress: SearchProgress) -> None:
-        """Show how far the search has come."""
+    def show(progress: SearchProgress) -> None:
+        nonlocal last
         bracket = f"bracket {progress.lower:,.4f} ... {progress.upper:,.4f}"
-        line = f"{self._title}: {progress.seconds:.0f} s  {bracket}  {progress.nodes:,} nodes"
+        line = f"{title}: {progress.seconds:.0f} s  {bracket}  {progress.nodes:,} nodes"
         if progress.left is not None:
             line += f"  {progress.stage}, {progress.left:.0f} s left"
-        if self._console.is_terminal:
-            self._status.update(line)
-        elif time.monotonic() - self._last_line >= _SECONDS_BETWEEN_LINES:
-            self._last_line = time.monotonic()
-            self._console.print(line)
+        if console.is_terminal:
+            status.update(line)
+        elif time.monotonic() - last >= _SECONDS_BETWEEN_LINES:
+            last = time.monotonic()
+            console.print(line)
+
+    return show

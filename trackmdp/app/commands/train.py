@@ -47,10 +47,13 @@ def run(cfg: TrainConfig, folder: Path, problem: Problem | None = None) -> float
 
 def _run(cfg: TrainConfig, folder: Path, problem: Problem | None) -> float:
     console = make_console(cfg.quiet)
-    reached = _finished(cfg, folder)
-    if reached is not None:
-        console.print(f"finished before; results in {folder}")
-        return reached
+    if cfg.resume is not None:
+        if summary := finished(cfg, folder):
+            console.print(f"finished before; results in {folder}")
+            return float(summary["policy"]["aihtr"])
+        # It belongs to an older config; left there, whoever looks at the folder meanwhile would take this run for
+        # done.
+        (folder / SUMMARY).unlink(missing_ok=True)
     problem = problem or make_problem(cfg)
     show_loaded(console, problem)
     trainer = make_trainer(problem, cfg, folder=folder, console=console)
@@ -61,19 +64,6 @@ def _run(cfg: TrainConfig, folder: Path, problem: Problem | None) -> float:
         show_held_out(console, f"learned ({cfg.algo.name})", done.summary["held_out"])
     console.print(f"{done.summary['wall_seconds']:.1f} s; results in {folder}")
     return done.evaluation.aihtr
-
-
-def _finished(cfg: TrainConfig, folder: Path) -> float | None:
-    """The AIHTR of a run that has nothing left to do; what an older config led to does not count, and is removed."""
-    if cfg.resume is None:
-        return None
-    summary = finished(cfg, folder)
-    if summary is None:
-        # It belongs to an older config; left there, whoever looks at the folder meanwhile would take this run for
-        # done.
-        (folder / SUMMARY).unlink(missing_ok=True)
-        return None
-    return float(summary["policy"]["aihtr"])
 
 
 def _show_summary(console: Console, trainer: Learning, run: Run) -> None:

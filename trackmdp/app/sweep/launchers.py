@@ -10,12 +10,11 @@ import signal
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 from trackmdp.app.sweep import process
-from trackmdp.app.sweep.job import fail, run_job, stop_signal
 from trackmdp.app.sweep.plan import Job
+from trackmdp.app.sweep.process import fail, run_job, stop_signal
 from trackmdp.config import TrainConfig
 from trackmdp.config.sweeping import (
     BasicConfig,
@@ -134,7 +133,7 @@ def run_here(cfg: SubmititLocalConfig, jobs: Sequence[Job]) -> None:
     """As processes of this machine."""
     import submitit
 
-    executor = submitit.LocalExecutor(_submissions(jobs))
+    executor = submitit.LocalExecutor(jobs[0].sweep / SUBMISSIONS)
     # 30 s before the time is out the job is told to save.
     executor.update_parameters(timeout_min=cfg.timeout_min, signal_delay_s=30)
     at_once = cfg.n_jobs or max(1, len(os.sched_getaffinity(0)) // cfg.cpus_per_task)
@@ -155,7 +154,8 @@ def run_on_slurm(cfg: SubmititSlurmConfig, jobs: Sequence[Job]) -> None:
     """As one array job."""
     import submitit
 
-    executor = submitit.AutoExecutor(_submissions(jobs), cluster="slurm", slurm_max_num_timeout=cfg.max_num_timeout)
+    folder = jobs[0].sweep / SUBMISSIONS
+    executor = submitit.AutoExecutor(folder, cluster="slurm", slurm_max_num_timeout=cfg.max_num_timeout)
     executor.update_parameters(
         name=f"trackmdp_{jobs[0].command}",
         timeout_min=cfg.timeout_min,
@@ -171,10 +171,6 @@ def run_on_slurm(cfg: SubmititSlurmConfig, jobs: Sequence[Job]) -> None:
     )
     # One array job, of which the scheduler runs `array_parallelism` at once; one job each would flood its queue.
     _wait(executor.map_array(Submission(), list(jobs)))
-
-
-def _submissions(jobs: Sequence[Job]) -> Path:
-    return jobs[0].sweep / SUBMISSIONS
 
 
 def _wait(submitted: Sequence[Any]) -> None:

@@ -11,7 +11,7 @@ import shlex
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig
@@ -19,8 +19,8 @@ from omegaconf import DictConfig
 from trackmdp.app.prepare import typed_config
 from trackmdp.app.words import parsed
 from trackmdp.config import CommandConfig, TrainConfig, to_dict
-from trackmdp.config.resume import fixed_options, key_of
 from trackmdp.config.sweeping import BlocksConfig
+from trackmdp.config.tree import fixed_options, key_of
 from trackmdp.errors import UserError
 
 _MOST = 100_000
@@ -60,11 +60,8 @@ class Job:
         return self.sweep / self.name
 
 
-class MakeJobs(Protocol):
-    """`plan` for one command, sweep and composer."""
-
-    def __call__(self, grid: Sequence[Sequence[str]], naming: Collection[str] = ()) -> list[Job]:
-        """The jobs of a grid of words."""
+MakeJobs = Callable[..., list[Job]]
+"""`plan` for one command, sweep and composer: called with a grid of words, and `naming`."""
 
 
 def grid(cfg: BlocksConfig, words: Sequence[str], folder: Path, planned: MakeJobs) -> list[list[Job]]:  # noqa: ARG001
@@ -103,9 +100,9 @@ def combinations(blocks: Sequence[str], typed: Sequence[str]) -> list[list[str]]
 
 def plan(
     command: str,
-    grid: Sequence[Sequence[str]],
     sweep: Path,
     compose: Callable[[Sequence[str]], DictConfig],
+    grid: Sequence[Sequence[str]],
     naming: Collection[str] = (),
 ) -> list[Job]:
     """The jobs of a sweep, without duplicates.
@@ -115,9 +112,9 @@ def plan(
 
     Args:
         command: what is run.
-        grid: the words of each run.
         sweep: the sweep's folder.
         compose: the config of some words.
+        grid: the words of each run.
         naming: options whose values name the folders; if there are none, those whose values differ in the grid.
 
     Raises:

@@ -11,13 +11,12 @@ from typing import Self
 from rich.console import Console
 
 from trackmdp.app.prepare import shown
-from trackmdp.app.sweep.job import STOP, Launch, fail
 from trackmdp.app.sweep.launchers import threads_of
 from trackmdp.app.sweep.plan import Job
-from trackmdp.app.sweep.process import Outcome
+from trackmdp.app.sweep.process import STOP, Launch, Outcome, fail
 from trackmdp.app.sweep.table import show_runs, status_of, write_table
 from trackmdp.config import TrainConfig
-from trackmdp.config.resume import continued
+from trackmdp.config.tree import continued
 from trackmdp.errors import FAILED, Preempted, UserError
 from trackmdp.training.folders import DONE, FAILED_FILE, SUMMARY, finished, run_of, runs_of, write_plan
 from trackmdp.training.lock import locked
