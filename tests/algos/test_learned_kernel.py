@@ -12,6 +12,7 @@ from trackmdp.algos.learned_kernel import observed_paths
 from trackmdp.policies.policy import Policy
 from trackmdp.solvers import optimal
 from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers.shrinkage import believed_world
 from trackmdp.world.model import World
 
 
@@ -124,7 +125,7 @@ def test_negligible_moves_are_planned_without_and_leave_the_exit_as_it_is() -> N
     kernel[1, [0, 2, 3, 4, 9]] = 0.2, 0.2, 0.2, 0.2, 0.2  # all would go, and all stay
     for row in range(2, 9):
         kernel[row, [row, 9]] = 0.5, 0.5
-    believed = learner._world(sparse.csr_array(kernel)).kernel.toarray()
+    believed = believed_world(world, sparse.csr_array(kernel), learner._least).kernel.toarray()
     np.testing.assert_allclose(believed[0, [1, 3, 4]], [0.5625, 0.3375, 0.0])
     np.testing.assert_allclose(believed[1, [0, 2, 3, 4]], 0.2)
     np.testing.assert_allclose(believed.sum(axis=1), [0.9, 0.8, *[0.5] * 7])

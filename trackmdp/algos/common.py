@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, Protocol
 
+import numpy.typing as npt
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -38,6 +39,16 @@ class Algorithm(Protocol):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`."""
         ...
+
+
+def tensors(arrays: Mapping[str, Any]) -> dict[str, Tensor]:
+    """NumPy arrays as a checkpoint holds them."""
+    return {name: torch.as_tensor(part) for name, part in arrays.items()}
+
+
+def arrays(tensors: Mapping[str, Tensor]) -> dict[str, npt.NDArray[Any]]:
+    """The arrays of `tensors`, wherever a checkpoint was loaded to."""
+    return {name: part.cpu().numpy() for name, part in tensors.items()}
 
 
 class Averages:

@@ -16,9 +16,9 @@ from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.kernel_estimate import KernelEstimate
 from trackmdp.solvers.keyed_search import solve_keys
 from trackmdp.solvers.renewal import IndexArray
-from trackmdp.solvers.shrinkage import least_worth_planning, without
+from trackmdp.solvers.shrinkage import believed_world, least_worth_planning
 from trackmdp.world.model import Task
-from trackmdp.world.modes import HiddenWorld, Modelled, with_motion
+from trackmdp.world.modes import HiddenWorld, Modelled
 
 EXIT_WEIGHT = 1.0
 """The exit probability of all cells counts as one move in each, so that no episode is endless on the counts."""
@@ -51,7 +51,7 @@ def counted_world(
         counts = estimate.counts
         counts.data /= np.append(np.repeat(task.detection, modes), 1.0)[counts.indices]
     least = least_worth_planning(task)
-    return with_motion(task, without(sparse.csr_array(estimate.believed(least)[:, :-1]), least))
+    return believed_world(task, estimate.believed(least), least)
 
 
 def exchanged_sets(

@@ -11,6 +11,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from trackmdp.algos.common import arrays, tensors
 from trackmdp.algos.learned_kernel import observed_paths
 from trackmdp.algos.moves import MoveBuffer
 from trackmdp.algos.paths import CellIndex
@@ -70,9 +71,9 @@ class InferredMoves(MoveBuffer):
 
     def state_dict(self) -> dict[str, Tensor]:
         """What was observed; the generator is its owner's to save."""
-        return {name: torch.as_tensor(part) for name, part in self._estimate.state().items()}
+        return tensors(self._estimate.state())
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Continue from a `state_dict`."""
-        self._estimate.load_state({name: part.cpu().numpy() for name, part in state.items()})
+        self._estimate.load_state(arrays(state))
         self._index = self._inferred = None

@@ -7,6 +7,7 @@ costs far less and leaves moves to be inferred from misses.
 
 from __future__ import annotations
 
+import json
 import math
 from typing import Any
 
@@ -15,10 +16,12 @@ import torch
 from scipy import sparse
 from tensordict import TensorDictBase
 
+from trackmdp.algos.common import arrays, tensors
 from trackmdp.algos.paths import known_as
 from trackmdp.config.counting import LearnedKernelConfig
 from trackmdp.policies.explore import RenewedTable
 from trackmdp.policies.policy import Policy, as_policy
+from trackmdp.policies.saved import packed, unpacked
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
 from trackmdp.solvers import exchange
@@ -27,9 +30,9 @@ from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.kernel_estimate import KernelEstimate, ObservedPaths
 from trackmdp.solvers.keyed_search import solve_keys
 from trackmdp.solvers.renewal import DIRECT_CELLS
-from trackmdp.solvers.shrinkage import least_worth_planning, without
+from trackmdp.solvers.shrinkage import believed_world, least_worth_planning
 from trackmdp.world.model import Task
-from trackmdp.world.modes import HiddenWorld, Modelled, with_motion
+from trackmdp.world.modes import HiddenWorld
 from trackmdp.world.windows import Window
 
 
@@ -95,16 +98,11 @@ class LearnedKernel:
 
         Else from those of `search`, and from as many `others`.
         """
-        world = self._world(kernel)
+        world = believed_world(self.task, kernel, self._least)
         if isinstance(world, HiddenWorld):
             return solve_keys(world, start=None if start is None else PolicyTable(self.task, start)).table
         table = None if start is None else PolicyTable(self.task, start)
         return exchange.solve(world, others) if table is None else exchange.improve(world, table)
-
-    def _world(self, kernel: sparse.csr_array) -> Modelled:
-        """The task with the `[M, M + 1]` kernel believed, but for what is negligible."""
-        # Plans on several moves grow with a power of the number of moves, most of which the prior may have added.
-        return with_motion(self.task, without(sparse.csr_array(kernel[:, :-1]), self._least))
 
     def _diagnostics(self) -> dict[str, float]:
         """What the last plan is believed to be worth, how sure that is, and what learning has cost so far."""
@@ -113,10 +111,9 @@ class LearnedKernel:
         return self._believed | seen
 
     def _beliefs(self, plan: PolicyTable, kernel: sparse.csr_array) -> dict[str, float]:
-        drawn = [self._world(self._estimate.sample(self._rng)) for _ in range(self.cfg.samples)]
-        believed = np.array([evaluate(world, plan).aihtr for world in drawn])
-        believes = evaluate(self._world(kernel), plan).aihtr
-        return {"believed_aihtr": believes, "believed_deviation": float(believed.std())}
+        drawn = (self._estimate.sample(self._rng) for _ in range(self.cfg.samples))
+        mean, *others = (evaluate(believed_world(self.task, k, self._least), plan).aihtr for k in (kernel, *drawn))
+        return {"believed_aihtr": mean, "believed_deviation": float(np.std(others))}
 
     def state_dict(self) -> dict[str, Any]:
         """The observations, the estimate, the draws to come and the two tables."""
@@ -124,20 +121,20 @@ class LearnedKernel:
             "iteration": self._iteration,
             "spent": torch.as_tensor(self._spent),
             "believed": dict(self._believed),
-            "rng": _rng_state(self._rng),
-            "estimate": {name: torch.as_tensor(part) for name, part in self._estimate.state().items()},
+            "rng": json.dumps(self._rng.bit_generator.state),  # of 128 bits, more than a checkpoint's integers hold
+            "estimate": tensors(self._estimate.state()),
             "policy": self.policy.state_dict(),
-            "actor": policy_tensors(self.actor),
+            "actor": tensors(packed(self.actor)),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`."""
         self._iteration, self._spent = state["iteration"], state["spent"].cpu().numpy().copy()
         self._believed = dict(state["believed"])
-        self._rng.bit_generator.state = _unpacked(state["rng"])
-        self._estimate.load_state({name: part.cpu().numpy() for name, part in state["estimate"].items()})
+        self._rng.bit_generator.state = json.loads(state["rng"])
+        self._estimate.load_state(arrays(state["estimate"]))
         self.policy.load_state_dict(state["policy"])
-        self.actor = Policy.all_on(self.task) if state["actor"] is None else tensors_policy(self.task, state["actor"])
+        self.actor = Policy.from_table(unpacked(self.task, arrays(state["actor"])))
 
 
 def observed_paths(batch: TensorDictBase, task: Task) -> ObservedPaths:
@@ -156,25 +153,19 @@ def observed_paths(batch: TensorDictBase, task: Task) -> ObservedPaths:
     start, end = batch[name][ended], torch.where(exited, task.num_keys, after[name])[ended]
     if not task.safe:  # how many safe actions it took is not told: what is known ends with the last set
         end = torch.where(misses == task.num_choices, task.num_keys + 1, end)
-    if not misses.any():  # as with all sensors on: no set is read, so that the histories, most of a batch, stay unread
-        rows = np.zeros(len(start) * task.num_choices + 1, dtype=np.int64)
-        sensed = sparse.csr_array((rows[:0] > 0, rows[:0], rows), shape=(len(rows) - 1, task.num_keys))
-        return ObservedPaths(start.cpu().numpy(), misses.cpu().numpy(), sensed, end.cpu().numpy())
-    # Of the step that ended the path: its history holds the sets of all misses since the detection, wherever the batch
-    # began.
-    history = batch["action_history"][ended]
+    # A path's sets are in the history of the step that ended it, wherever the batch began; those of paths without a
+    # miss, with all sensors on most of a batch, stay unread.
+    missed = misses.nonzero().squeeze(-1)
+    history = batch["action_history"][ended & (batch["steps_since_detection"] > 0)]
     path, miss, sensor = history.nonzero(as_tuple=True)
+    if task.window is not None:  # numbered within the window of the located cell; those outside the grid sense nothing
+        sensor = Window.of(task, sensor.device).around(cell[missed])[path, sensor]
+    there = sensor < task.total_sensors
+    place = ((missed[path] * task.num_choices + miss)[there].cpu().numpy(), sensor[there].cpu().numpy())
+    shape = (len(start) * task.num_choices, task.total_sensors)
+    sensed = sparse.csr_array((np.ones(len(place[0]), dtype=bool), place), shape=shape)
     if task.coverage is not None:
-        place = (path * history.shape[1] + miss).cpu().numpy(), sensor.cpu().numpy()
-        shape = (len(start) * history.shape[1], task.total_sensors)
-        sensed = task.coverage.seen(sparse.csr_array((np.ones(len(place[0]), dtype=bool), place), shape=shape))
-        return ObservedPaths(start.cpu().numpy(), misses.cpu().numpy(), sensed, end.cpu().numpy())
-    # Sensors are numbered within the window of the located cell; those outside the grid sense nothing.
-    there = sensor if task.window is None else Window.of(task, history.device).around(cell)[path, sensor]
-    row, inside = path * history.shape[1] + miss, there < task.num_cells
-    places = (row[inside].cpu().numpy(), there[inside].cpu().numpy())
-    shape = (len(start) * history.shape[1], task.num_cells)
-    sensed = sparse.csr_array((np.ones(len(places[0]), dtype=bool), places), shape=shape)
+        sensed = task.coverage.seen(sensed)
     if task.keyed:
         sensed = sparse.kron(sensed, np.ones((1, task.keys.num_classes), dtype=bool), format="csr")
     return ObservedPaths(start.cpu().numpy(), misses.cpu().numpy(), sensed, end.cpu().numpy())
@@ -187,29 +178,3 @@ def _sensors_on(batch: TensorDictBase) -> float:
     if free.all():
         return float(batch["action"].count_nonzero())
     return (batch["action"].sum(-1) * free).sum().item()
-
-
-def _rng_state(rng: np.random.Generator) -> dict[str, Any]:
-    """PCG64's state without integers beyond 64 bits."""
-    state = rng.bit_generator.state
-    # PCG64 counts with 128 bits, more than a checkpoint's integers hold.
-    inner = {name: str(value) for name, value in state["state"].items()}
-    return {**state, "state": inner}
-
-
-def _unpacked(state: dict[str, Any]) -> dict[str, Any]:
-    return {**state, "state": {name: int(value) for name, value in state["state"].items()}}
-
-
-def policy_tensors(policy: PolicyTable) -> dict[str, torch.Tensor] | None:
-    """The table's sparse matrix as tensors; None for all sensors on, before the first plan."""
-    if policy.sets is None:
-        return None
-    return {"indices": torch.as_tensor(policy.sets.indices), "indptr": torch.as_tensor(policy.sets.indptr)}
-
-
-def tensors_policy(task: Task, tensors: dict[str, torch.Tensor]) -> Policy:
-    """The policy of `policy_tensors`."""
-    indices, indptr = (tensors[name].cpu().numpy().copy() for name in ("indices", "indptr"))
-    shape = (task.num_keys * task.num_choices, task.total_sensors)
-    return Policy(task, sparse.csr_array((np.ones(len(indices), dtype=bool), indices, indptr), shape=shape))

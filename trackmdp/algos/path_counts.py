@@ -8,11 +8,12 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from trackmdp.algos.learned_kernel import policy_tensors, tensors_policy
+from trackmdp.algos.common import arrays, tensors
 from trackmdp.algos.segments import SensedPaths
 from trackmdp.config.counting import PathCountsConfig
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy, as_policy
+from trackmdp.policies.saved import packed, unpacked
 from trackmdp.solvers.path_counts import plan_keys
 from trackmdp.solvers.path_exchange import choose_plan
 from trackmdp.world.model import Task
@@ -29,15 +30,7 @@ class PathCounts:
         device: where batches come from; paths and plans are on the CPU.
     """
 
-    def __init__(
-        self,
-        task: Task,
-        cfg: PathCountsConfig,
-        *,
-        iterations: int,
-        seed: int,
-        device: torch.device,
-    ) -> None:
+    def __init__(self, task: Task, cfg: PathCountsConfig, *, iterations: int, seed: int, device: torch.device) -> None:
         if not (task.perfect and task.safe):
             raise UserError("algo=path_counts: with sensors that may miss, expected another algorithm")
         self.task, self.cfg, self.iterations, self.device = task, cfg, iterations, device
@@ -65,13 +58,13 @@ class PathCounts:
 
     def state_dict(self) -> dict[str, Any]:
         """The paths, what they are parted by, and the plan."""
-        return {"seed": self._seed, "paths": self._paths.state_dict(), "actor": policy_tensors(self.actor)}
+        return {"seed": self._seed, "paths": self._paths.state_dict(), "actor": tensors(packed(self.actor))}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`."""
         self._seed = state["seed"]
         self._paths.load_state_dict(state["paths"])
-        self.actor = Policy.none(self.task) if state["actor"] is None else tensors_policy(self.task, state["actor"])
+        self.actor = Policy.from_table(unpacked(self.task, arrays(state["actor"])))
 
 
 class _AllSensors(TensorDictModuleBase):

@@ -6,6 +6,7 @@ enough to be worth writing out: a million cells would be 260 MB.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -47,18 +48,8 @@ def save_policy(file: Path, policy: PolicyTable, value: Array | None = None, **m
         content |= {"task_memory": np.str_(policy.task.memory), "task_clip": np.int64(policy.task.clip)}
     if policy.task.revealed > 1:
         content["task_revealed"] = np.int64(policy.task.revealed)
-    if policy.sets is None:
-        content["probability"] = np.float64(policy.probability)
-    else:
-        # Fixed integer widths: SciPy's own choice depends on the number of entries, and the bytes would with it.
-        content |= {"indices": policy.sets.indices.astype(np.int32), "indptr": policy.sets.indptr.astype(np.int64)}
-        if not policy.deterministic:  # else every entry stored is a sensor on
-            content["data"] = policy.sets.data
-    if policy.k is not None:
-        content["k"] = np.int64(policy.k)
-    if value is not None:
-        content["value"] = value
-    write_bytes(file, npz_bytes(content | more))
+    values = more if value is None else {"value": value, **more}
+    write_bytes(file, npz_bytes(content | packed(policy) | values))
 
 
 def load_policy(file: Path) -> tuple[PolicyTable, Array | None]:
@@ -73,10 +64,36 @@ def load_policy(file: Path) -> tuple[PolicyTable, Array | None]:
         value = content.get("value")
         if value is not None and (value.shape != (task.num_cells,) or value.dtype != np.float64):
             raise ValueError(f"values {value.dtype} {value.shape} for {task.num_cells} cells")
-        k = int(content["k"]) if "k" in content else None
-        if "probability" in content:
-            return PolicyTable(task, probability=float(content["probability"]), k=k), value
-        return PolicyTable(task, _sets(content, task), k=k), value
+        return unpacked(task, content), value
+
+
+def packed(policy: PolicyTable) -> dict[str, Any]:
+    """What a policy does, as plain arrays: its table or its one probability, and how many sensors it draws."""
+    if policy.sets is None:
+        content: dict[str, Any] = {"probability": np.float64(policy.probability)}
+    else:
+        # Fixed integer widths: SciPy's own choice depends on the number of entries, and the bytes would with it.
+        content = {"indices": policy.sets.indices.astype(np.int32), "indptr": policy.sets.indptr.astype(np.int64)}
+        if not policy.deterministic:  # else every entry stored is a sensor on
+            content["data"] = policy.sets.data
+    return content if policy.k is None else content | {"k": np.int64(policy.k)}
+
+
+def unpacked(task: Task, content: Mapping[str, npt.NDArray[Any]]) -> PolicyTable:
+    """The policy of `packed` arrays.
+
+    Raises:
+        UserError: they are no policy of `task`.
+    """
+    k = int(content["k"]) if "k" in content else None
+    if "probability" in content:
+        return PolicyTable(task, probability=float(content["probability"]), k=k)
+    indices, indptr = content["indices"], content["indptr"]
+    data = content.get("data", np.ones(len(indices), dtype=bool))
+    sets = whole_csr(data, indices, indptr, (task.num_keys * task.num_choices, task.total_sensors))
+    if not np.isfinite(sets.data).all():
+        raise UserError("a probability that is not finite")
+    return PolicyTable(task, sets, k=k)
 
 
 def sets_name(task: Task) -> str:
@@ -118,11 +135,11 @@ def read_sets(task: Task, file: str | Path) -> PolicyTable:
     with decoded(str(file), "sets"):
         memory = content.get("memory", {"kind": "cell", "clip": 2})
         own = task.remembering(memory["kind"], clip=memory["clip"], revealed=memory.get("revealed", 1))
-        return PolicyTable(own, _listed(own, content))
+        return _listed(own, content)
 
 
-def _listed(task: Task, content: dict[str, Any]) -> sparse.csr_array:
-    """`[keys (t_max + 1), S]` bool of what `PolicyTable.as_lists` wrote."""
+def _listed(task: Task, content: dict[str, Any]) -> PolicyTable:
+    """The policy that `PolicyTable.as_lists` wrote."""
     if content.get("footprints") != (None if task.coverage is None else task.coverage.as_lists()):
         raise ValueError("sets of sensors of other footprints")
     keys, count = content["sets"], task.num_keys
@@ -132,7 +149,7 @@ def _listed(task: Task, content: dict[str, Any]) -> sparse.csr_array:
     rows = [each for key in range(count) for each in keys[str(key)]]
     pointer = np.cumsum([0, *map(len, rows)])
     indices = np.array([each for row in rows for each in row], dtype=np.int64)
-    return _sets({"indices": indices, "indptr": pointer}, task)
+    return unpacked(task, {"indices": indices, "indptr": pointer})
 
 
 def _number(value: Any) -> npt.NDArray[Any]:
@@ -158,15 +175,6 @@ def _task(content: dict[str, npt.NDArray[Any]]) -> Task:
         clip=int(content.get("task_clip", 2)),
         revealed=int(content.get("task_revealed", 1)),
     )
-
-
-def _sets(content: dict[str, npt.NDArray[Any]], task: Task) -> sparse.csr_array:
-    indices, indptr = content["indices"], content["indptr"]
-    data = content.get("data", np.ones(len(indices), dtype=bool))
-    sets = whole_csr(data, indices, indptr, (task.num_keys * task.num_choices, task.total_sensors))
-    if not np.isfinite(sets.data).all():
-        raise UserError("a probability that is not finite")
-    return sets
 
 
 def _footprints(coverage: Coverage) -> dict[str, Any]:

@@ -5,6 +5,7 @@ It loads without torch, so that solving a world from the command line does not w
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, Self
 
@@ -79,6 +80,18 @@ class PolicyTable:
         if table.shape != expected:
             raise UserError(f"policy: expected shape {expected} (keys, t_max + 1, sensors), got {table.shape}")
         return cls(task, sparse.csr_array(np.ascontiguousarray(table).reshape(-1, task.total_sensors)))
+
+    @classmethod
+    def from_sensed(cls, task: Task, parts: Sequence[tuple[npt.NDArray[Any], npt.NDArray[Any]]]) -> Self:
+        """A policy that does not draw, from what is on at n = 0 ... t_max: the keys and the sensors, `[Q]` each."""
+        # Key x after n misses is row x (t_max + 1) + n: with t_max = 1, (x, n) = (3, 1) is row 7.
+        # rows of several n interleave, so that the table is sorted once all are there
+        rows = np.concatenate([keys * task.num_choices + n for n, (keys, _) in enumerate(parts)])
+        sensors = np.concatenate([on for _, on in parts])
+        shape = (task.num_keys * task.num_choices, task.total_sensors)
+        table = sparse.csr_array((np.ones(len(rows), dtype=bool), (rows, sensors)), shape=shape)
+        table.sort_indices()
+        return cls(task, short_indices(table))
 
     # What exact evaluation reads, for arrays of any E.
 

@@ -63,8 +63,7 @@ def believed(world: Problem, policy: PolicyTable, false_alarm: float) -> Evaluat
     totals = system.solve(gathered)
     # As in `evaluate`: no more reports than steps, which the longest episode bounds.
     error = 0.0 if system.exact else float(np.abs(system.residual(gathered, totals)).max() * totals[:, 5].max())
-    start = totals[:: m + 1]  # episodes begin in pairs (z, z)
-    return pooled(start[:, :5], start[:, 5], error)
+    return pooled(totals[:: m + 1].T, error)  # episodes begin in pairs (z, z)
 
 
 def check_alarms(world: Problem, false_alarm: float) -> World:

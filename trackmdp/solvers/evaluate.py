@@ -14,7 +14,7 @@ from scipy import sparse
 
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.alarms import believed
-from trackmdp.solvers.evaluation import Evaluation, pooled, summed_up
+from trackmdp.solvers.evaluation import Evaluation, pooled
 from trackmdp.solvers.horizon import truncated_value
 from trackmdp.solvers.keyed import evaluate_keys
 from trackmdp.solvers.prediction import renewal
@@ -78,7 +78,7 @@ def _whole_episodes(world: World, policy: PolicyTable, guess: Array | None, per_
         # All six totals by one factorisation: reward, steps in the grid, detections, sensors, safe actions, steps.
         totals = system.solve(gathered)
         check_length(totals[:, 5])
-        return pooled(totals[:m, :5], totals[:m, 5])
+        return pooled(totals[:m].T)
     # By iteration, the value and the pooled figures by two solves in place of six.
     length = expected_steps(world)
     # what a missed target is worth is near to what a located one in its cell is
@@ -89,14 +89,13 @@ def _whole_episodes(world: World, policy: PolicyTable, guess: Array | None, per_
     # Sensing does not move the target, and each episode has one exit step: the steps in the grid are all but that one.
     steps = length - 1.0
     if per_cell:
-        others = system.solve(gathered[:, 2:5])[:m]
-        return pooled(np.column_stack([value[:m], steps, others]), length, error)
+        return pooled([value[:m], steps, *system.solve(gathered[:, 2:5])[:m].T, length], error)
     # Detections and the like are wanted for a uniform start s alone, s (I - T)^-1 b: with the visits v = s (I - T)^-1,
     # that is v = s + v T, each is a scalar product v b. One system goes before the next comes: both are large.
     del system
     system = RenewalSystem(sparse.csr_array(located.T), world.size)
     visits = system.solve(np.concatenate([np.full(m, 1 / m), np.zeros(states - m)]))
-    return summed_up(value[:m], steps, length, list(visits @ gathered[:, 2:5]), error)
+    return pooled([value[:m], steps, *(visits @ gathered[:, 2:5]), length], error)
 
 
 def _table(problem: Problem, policy: PolicyLike | Array | BoolArray) -> PolicyTable:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
+
+import numpy as np
 
 from trackmdp.world.model import Array
 
@@ -43,39 +45,27 @@ def regret_per_step(upper_aihtr: float, evaluation: Evaluation) -> float:
     return (upper_aihtr - evaluation.aihtr) / evaluation.expected_length
 
 
-def pooled(totals: Array, length: Array, error: float = 0.0) -> Evaluation:
-    """An evaluation from `[M, 5]` reward, steps in the grid, detections, sensors, safe actions per episode.
+def pooled(totals: Iterable[Array | float], error: float = 0.0) -> Evaluation:
+    """An evaluation from what an episode comes to from each start cell, pooled over a uniform start.
 
-    `length` `[M]` is the expected number of steps of an episode, the exit step included.
+    Args:
+        totals: reward, steps in the grid, detections, sensors on, safe actions, steps: `[M]` each; or of the third to
+            the fifth a mean, where start cells were not told apart.
+        error: see `Evaluation`.
     """
-    value, steps, detections, sensors, safe = totals.T
-    means = [float(each.mean()) for each in (detections, sensors, safe)]
-    return summed_up(value, steps, length, means, error, parts=(detections, sensors, safe))
-
-
-def summed_up(
-    value: Array,
-    steps: Array,
-    length: Array,
-    means: Sequence[float],
-    error: float,
-    *,
-    parts: tuple[Array | None, Array | None, Array | None] = (None, None, None),
-) -> Evaluation:
-    """An evaluation from what is known of each start cell and the `means` of detections, sensors and safe actions."""
+    value, steps, detections, sensors, safe, length = map(np.asarray, totals)
     # Ratios of means, not means of ratios: pooled over a uniform start, a long episode counts for all of its steps.
     in_grid = float(steps.mean())
-    detections, sensors, safe = means
     return Evaluation(
         aihtr=float(value.mean()),
         value=value,
-        accuracy=detections / in_grid if in_grid else 1.0,
-        sensors_per_step=sensors / in_grid if in_grid else 0.0,
-        safe_per_episode=safe,
+        accuracy=float(detections.mean()) / in_grid if in_grid else 1.0,
+        sensors_per_step=float(sensors.mean()) / in_grid if in_grid else 0.0,
+        safe_per_episode=float(safe.mean()),
         expected_length=float(length.mean()),
         steps=steps,
-        detections=parts[0],
-        sensors=parts[1],
-        safe_actions=parts[2],
+        detections=detections if detections.ndim else None,
+        sensors=sensors if sensors.ndim else None,
+        safe_actions=safe if safe.ndim else None,
         error=error,
     )

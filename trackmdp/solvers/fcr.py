@@ -10,7 +10,7 @@ from scipy import sparse
 
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.cover import Offer, best_sets
-from trackmdp.solvers.layers import sensed_csr, within_window
+from trackmdp.solvers.layers import within_window
 from trackmdp.solvers.prediction import predict
 from trackmdp.world.model import World
 
@@ -32,4 +32,4 @@ def solve(world: World, *, in_grid: bool = False) -> PolicyTable:
         on = best_sets(world, seen.rows, seen.cells, offer, within_window(world, seen.rows, seen.cells))
         sensed.append((on.rows, on.sensors))
         moved = seen.part(np.ones(len(seen.mass)))  # nothing is taken away: a miss is not learned from
-    return PolicyTable(world, sensed_csr(world, sensed))
+    return PolicyTable.from_sensed(world, sensed)

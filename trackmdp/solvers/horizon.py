@@ -30,5 +30,4 @@ def truncated_value(world: World, policy: PolicyTable, max_steps: int) -> Evalua
         if len(left) == len(steps) and all(np.array_equal(now, later) for later in left):
             break
         left = [np.asarray(now), *left[: len(steps) - 1]]
-    figures = left[0][: world.num_cells]
-    return pooled(figures[:, :5], figures[:, 5])
+    return pooled(left[0][: world.num_cells].T)

@@ -176,13 +176,8 @@ class KeyedPairs:
 
     def table(self, sets: list[BoolArray]) -> PolicyTable:
         """The policy of sets."""
-        world, parts = self.world, []
-        for n, (on, groups) in enumerate(zip(sets, self.groups, strict=True)):
-            key, cell = np.divmod(groups[on], world.num_cells)
-            parts.append((key * world.num_choices + n, cell))
-        rows, cells = (np.concatenate(part) for part in zip(*parts, strict=True))
-        shape = (world.num_keys * world.num_choices, world.num_cells)
-        return PolicyTable(world, sparse.csr_array((np.ones(len(rows), dtype=bool), (rows, cells)), shape=shape))
+        on_groups = (groups[on] for on, groups in zip(sets, self.groups, strict=True))
+        return PolicyTable.from_sensed(self.world, [np.divmod(each, self.world.num_cells) for each in on_groups])
 
 
 def evaluate_keys(world: HiddenWorld, policy: PolicyTable) -> Evaluation:
@@ -195,7 +190,7 @@ def evaluate_keys(world: HiddenWorld, policy: PolicyTable) -> Evaluation:
     # The value of a start cell is the mean over its modes.
     of_cell = totals[pairs.first].mean(axis=1)
     # |V - V̂| <= (steps of an episode) · max |residual|, as an episode has no more renewals than steps.
-    return pooled(of_cell[:, :5], of_cell[:, 5], left * float(totals[:, 5].max()))
+    return pooled(of_cell.T, left * float(totals[:, 5].max()))
 
 
 def visits_of_keys(problem: World | HiddenWorld, policy: PolicyTable) -> Array:

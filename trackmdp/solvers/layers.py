@@ -24,7 +24,6 @@ from scipy import sparse
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.cover import Covering
 from trackmdp.solvers.renewal import IndexArray, row_index
-from trackmdp.world.checks import short_indices
 from trackmdp.world.model import Array, BoolArray, Task, World
 
 
@@ -131,24 +130,11 @@ def within_window(task: Task, rows: IndexArray, cells: IndexArray) -> BoolArray 
     return near
 
 
-def sensed_csr(task: Task, parts: Sequence[tuple[IndexArray, IndexArray]]) -> sparse.csr_array:
-    """`[M * (t_max + 1), S]` bool, the sets of a `PolicyTable`, from what is on at each n: (rows, sensors)."""
-    choices, m = task.num_choices, task.num_cells
-    # Located in x after n misses is row x (t_max + 1) + n: with t_max = 1, (x, n) = (3, 1) is row 7.
-    # rows of several n interleave, so that the table is sorted once all are there
-    rows = np.concatenate([part[0] * choices + n for n, part in enumerate(parts)])
-    sensors = np.concatenate([part[1] for part in parts])
-    shape = (m * choices, task.total_sensors)
-    table = sparse.csr_array((np.ones(len(rows), dtype=bool), (rows, sensors)), shape=shape)
-    table.sort_indices()
-    return short_indices(table)
-
-
 def policy_table(task: Task, layers: Sequence[Layer], sets: Sequence[BoolArray]) -> PolicyTable:
     """The policy whose `sets` are given on layers 1 ... t_max + 1."""
     # Layer n + 1 is where the target may be when it is looked for after n misses: zip starts at layers[1].
     sensed = [(layer.on_rows[on], layer.sensors[on]) for layer, on in zip(layers[1:], sets, strict=True)]
-    return PolicyTable(task, sensed_csr(task, sensed))
+    return PolicyTable.from_sensed(task, sensed)
 
 
 def layer_sets(layers: Sequence[Layer], policy: PolicyTable) -> list[BoolArray]:

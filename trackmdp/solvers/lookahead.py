@@ -15,6 +15,7 @@ from trackmdp.solvers.branch import Tree
 from trackmdp.solvers.exchange import exchange
 from trackmdp.solvers.known import first_guess, tables, up_to
 from trackmdp.solvers.layers import Layer, policy_table, reachable_layers
+from trackmdp.solvers.regions import adopted
 from trackmdp.solvers.search import InnerProblem
 from trackmdp.world.model import Array, BoolArray, World
 
@@ -63,13 +64,10 @@ def _first_set(problem: InnerProblem, layers: list[Layer], mass: Array) -> BoolA
     world, run, start = problem.world, up_to(MOST_NODES), replace(problem, layers=layers[: problem.length + 1])
     known = tables(start, slack=SLACK, run=run)
     sets = exchange(problem, first_guess(problem, known, mass), mass)
-    origin, after = problem.layers[:2]
+    origin = problem.layers[0]
     # one problem per located cell: its undetected mass after the sets carried out so far
     here = sparse.csr_array((mass, (origin.rows, origin.cells)), shape=(world.num_cells, world.num_cells))
     here.eliminate_zeros()
     tree = Tree(problem, known, problem.worth(sets, mass), SLACK, here)
     run(tree)
-    better, left = tree.improvements()
-    if not better.any():
-        return sets[0]
-    return np.where(better[after.rows], (mass @ after.moves > 0) & ~left[0].has(after.rows, after.cells), sets[0])
+    return (adopted(problem, sets, tree, mass) or sets)[0]

@@ -25,16 +25,17 @@ from trackmdp.config.partition import PartitionConfig
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.evaluation import Evaluation
-from trackmdp.solvers.layers import sensed_csr
 from trackmdp.solvers.renewal import IndexArray, row_index
 from trackmdp.solvers.workers import Crew, Made, in_turn
-from trackmdp.world.model import World
+from trackmdp.world.model import BoolArray, World
 
 Planner: TypeAlias = "Callable[[int, World], PolicyTable]"
 """From a block's number and its world to its policy, by planning or by learning."""
 Rectangle: TypeAlias = tuple[range, range]
 """Rows and columns of the grid."""
 
+Pairs: TypeAlias = tuple[IndexArray, IndexArray]
+"""Located cells and sensors, a pair for each sensor that is on."""
 _JOBS = 64
 """Jobs that the blocks of a grid are put into: a worker that dies loses one, and each costs a message."""
 
@@ -45,6 +46,12 @@ class Block:
 
     own: Rectangle
     seen: Rectangle
+
+    @property
+    def mine(self) -> BoolArray:
+        """`[L]`, which of the cells seen are its own."""
+        row, column = (np.isin(np.array(seen), np.array(own)) for seen, own in zip(self.seen, self.own, strict=True))
+        return (row[:, None] & column).ravel()
 
 
 def reach(world: World) -> int:
@@ -79,7 +86,7 @@ def blocks(size: tuple[int, int], side: int, halo: int) -> list[Block]:
 def sub_world(world: World, seen: Rectangle) -> World:
     """The world inside a rectangle of the grid; whoever leaves it has exited."""
     rows, columns = seen
-    cells = cells_of(world, seen)
+    cells = cells_of(seen, world.columns)
     kernel = within(world.kernel[cells], world, seen)
     own = {name: getattr(world, name)[cells] for name in ("cost", "detection", "safe_detection")}
     return World.of(world, kernel, size=(len(rows), len(columns)), **own)
@@ -120,8 +127,7 @@ def plan_by_blocks(
         return [(n, sub_world(world, parts[n].seen), parts[n]) for n in range(ends[job], ends[job + 1])]
 
     done = run(_PlanJob(plan, world.columns), Made(len(ends) - 1, some))
-    sensed = [_joined([job[n] for job in done]) for n in range(world.num_choices)]
-    return PolicyTable(world, sensed_csr(world, sensed))
+    return PolicyTable.from_sensed(world, joined(done))
 
 
 def narrow_halo(world: World, partition: PartitionConfig, upper: float, found: Evaluation) -> str | None:
@@ -143,11 +149,10 @@ class _PlanJob:
     plan: Planner
     columns: int
 
-    def __call__(self, job: Sequence[tuple[int, World, Block]]) -> list[tuple[IndexArray, IndexArray]]:
-        found = [self._block(*each) for each in job]
-        return [_joined([part[n] for part in found]) for n in range(len(found[0]))]
+    def __call__(self, job: Sequence[tuple[int, World, Block]]) -> list[Pairs]:
+        return joined([self._block(*each) for each in job])
 
-    def _block(self, number: int, world: World, block: Block) -> list[tuple[IndexArray, IndexArray]]:
+    def _block(self, number: int, world: World, block: Block) -> list[Pairs]:
         table = self.plan(number, world)
         table.check_fits(world)
         if not table.deterministic:
@@ -155,30 +160,21 @@ class _PlanJob:
         # A single probability of 0 or 1 for all sensors says nothing about the world beyond the halo.
         sets = table.sets if table.sets is not None else PolicyTable.from_dense(world, table.dense()).sets
         assert sets is not None
-        rows, columns = block.seen
-        everywhere = (np.array(rows)[:, None] * self.columns + np.array(columns)).ravel()
-        own = np.zeros((len(rows), len(columns)), dtype=bool)
-        own[_within(block.own[0], rows), _within(block.own[1], columns)] = True
-        state, sensor = row_index(sets), sets.indices
         # Row 7 of a table with two choices is cell 3 after one miss.
-        cell, n = np.divmod(state, world.num_choices)
-        kept = own.ravel()[cell]
-        return [
-            (everywhere[cell[kept & (n == each)]], everywhere[sensor[kept & (n == each)]])
-            for each in range(world.num_choices)
-        ]
+        cell, n = np.divmod(row_index(sets), world.num_choices)
+        numbers, kept = cells_of(block.seen, self.columns), block.mine[cell]
+        on = (np.flatnonzero(kept & (n == each)) for each in range(world.num_choices))
+        return [(numbers[cell[each]], numbers[sets.indices[each]]) for each in on]
 
 
-def _joined(parts: Sequence[tuple[IndexArray, IndexArray]]) -> tuple[IndexArray, IndexArray]:
-    """Located cells and sensors of several parts end to end."""
-    return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
+def joined(parts: Sequence[Sequence[Pairs]]) -> list[Pairs]:
+    """What several parts sense at each n, end to end."""
+    return [
+        (np.concatenate([cells for cells, _ in step]), np.concatenate([sensors for _, sensors in step]))
+        for step in zip(*parts, strict=True)
+    ]
 
 
-def cells_of(world: World, part: Rectangle) -> IndexArray:
-    """Numbers of the cells of a rectangle, row by row."""
-    rows, columns = part
-    return (np.array(rows)[:, None] * world.columns + np.array(columns)).ravel()
-
-
-def _within(inner: range, outer: range) -> slice:
-    return slice(inner.start - outer.start, inner.stop - outer.start)
+def cells_of(part: Rectangle, columns: int) -> IndexArray:
+    """Numbers of the cells of a rectangle, row by row, on a grid of so many columns."""
+    return (np.array(part[0])[:, None] * columns + np.array(part[1])).ravel()

@@ -12,7 +12,7 @@ from scipy import sparse
 
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.cover import Offer, best_sets
-from trackmdp.solvers.layers import sensed_csr, within_window
+from trackmdp.solvers.layers import within_window
 from trackmdp.solvers.renewal import IndexArray, per_row, row_index
 from trackmdp.world.model import Array, World
 
@@ -66,7 +66,7 @@ def unroll(world: World, rule: Callable[[Prediction], Offer]) -> PolicyTable:
         on = best_sets(world, seen.rows, seen.cells, rule(seen), within_window(world, seen.rows, seen.cells))
         sensed.append((on.rows, on.sensors))
         undetected = seen.part(1.0 - on.seen * world.detects(seen.cells))
-    return PolicyTable(world, sensed_csr(world, sensed))
+    return PolicyTable.from_sensed(world, sensed)
 
 
 def followed(world: World, policy: PolicyTable) -> Iterator[Prediction]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
@@ -105,24 +105,13 @@ class ReplayedTracks:
 
     def evaluation(self, starts: IndexArray, num_cells: int) -> Evaluation:
         """The figures of all tracks together, and by start cell, nan where no track starts; `starts` is `[K]`."""
-        together = pooled(self.totals, self.length)
+        together = pooled([*self.totals.T, self.length])
         count = np.bincount(starts, minlength=num_cells)
         with np.errstate(invalid="ignore"):
             # 0 / 0 is nan on purpose: no track starts there, and 0 would read as a worth.
             by_cell = [np.bincount(starts, weights, num_cells) / count for weights in self.totals.T]
         value, steps, detections, sensors, safe = by_cell
-        return Evaluation(
-            aihtr=together.aihtr,
-            value=value,
-            accuracy=together.accuracy,
-            sensors_per_step=together.sensors_per_step,
-            safe_per_episode=together.safe_per_episode,
-            expected_length=together.expected_length,
-            steps=steps,
-            detections=detections,
-            sensors=sensors,
-            safe_actions=safe,
-        )
+        return replace(together, value=value, steps=steps, detections=detections, sensors=sensors, safe_actions=safe)
 
     def intervals(self, names: IndexArray) -> dict[str, MeanInterval]:
         """Figure -> its mean over tracks and its interval; `names` `[K]` are those of the targets.

@@ -24,8 +24,8 @@ from trackmdp.solvers.branch import Tree
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.exchange import exchange, revealed
 from trackmdp.solvers.known import planted
-from trackmdp.solvers.layers import Layer, layer_sets, reachable_layers, sensed_csr
-from trackmdp.solvers.partition import blocks, cells_of, reach, sub_world, within
+from trackmdp.solvers.layers import Layer, layer_sets, reachable_layers
+from trackmdp.solvers.partition import Pairs, blocks, cells_of, joined, reach, sub_world, within
 from trackmdp.solvers.prediction import followed
 from trackmdp.solvers.renewal import DIRECT_CELLS, IndexArray, forced_worth
 from trackmdp.solvers.search import InnerProblem
@@ -38,9 +38,6 @@ share of halo, 13 % at 128 cells, R = 2 and T_max = 1; in narrow ones most of th
 
 PATCH = 24
 """Rows and columns of the middle of the grid that the memory of the whole is estimated on."""
-
-Pairs = tuple[IndexArray, IndexArray]
-"""Located cells and sensors, a pair for each sensor that is on."""
 
 
 @dataclass(frozen=True)
@@ -156,14 +153,13 @@ def _regions(world: World, policy: PolicyTable, value: Array, side: int) -> Made
 
     def region(number: int) -> _Region:
         block = parts[number]
-        cells, here = cells_of(world, block.seen), sub_world(world, block.seen)
-        row, column = (np.isin(np.array(seen), np.array(own)) for seen, own in zip(block.seen, block.own, strict=True))
+        cells, here = cells_of(block.seen, world.columns), sub_world(world, block.seen)
         if policy.sets is None:
             mine = PolicyTable(here, probability=policy.probability)
         else:
             states = (cells[:, None] * world.num_choices + np.arange(world.num_choices)).ravel()
             mine = PolicyTable(here, within(policy.sets[states], world, block.seen))
-        return _Region(here, cells, (row[:, None] & column).ravel(), mine, *(each[cells] for each in worth))
+        return _Region(here, cells, block.mine, mine, *(each[cells] for each in worth))
 
     return Made(len(parts), region)
 
@@ -184,7 +180,7 @@ def improved(
     for number, region in enumerate(regions, start=1):
         found.append(region.improved() if go_on else region.sensed(region.sets))
         go_on = go_on and passed(number / len(regions))
-    return _joined(world, found)
+    return PolicyTable.from_sensed(world, joined(found))
 
 
 def settled(world: World, policy: PolicyTable, side: int, rounds: int, run: Crew = in_turn) -> PolicyTable:
@@ -195,7 +191,7 @@ def settled(world: World, policy: PolicyTable, side: int, rounds: int, run: Crew
     """
     value = evaluate(world, policy).value
     for _ in range(rounds):
-        candidate = _joined(world, run(_Region.improved, _regions(world, policy, value, side)))
+        candidate = PolicyTable.from_sensed(world, joined(run(_Region.improved, _regions(world, policy, value, side))))
         after = evaluate(world, candidate).value
         # As in `exchange`: no value is lower, so that the sum tells; the margin is rounding.
         if after.sum() <= value.sum() + 1e-12 * np.abs(value).sum():
@@ -231,7 +227,7 @@ def proved(
         own = region.own
         short[region.cells[own]] = np.maximum(excess[own], 0.0)
         found.append(region.sensed(sets))
-    return short, _joined(world, found)
+    return short, PolicyTable.from_sensed(world, joined(found))
 
 
 def _closed(region: _Region, slack: float, run: Callable[[Tree], None]) -> tuple[list[BoolArray], Array]:
@@ -255,20 +251,20 @@ def _closed(region: _Region, slack: float, run: Callable[[Tree], None]) -> tuple
     return adopted(problem, region.sets, tree) or region.sets, most
 
 
-def adopted(problem: InnerProblem, sets: list[BoolArray], tree: Tree) -> list[BoolArray] | None:
-    """`sets` with the better plans that a tree has found, from mass 1 in each located cell; None if there are none."""
+def adopted(
+    problem: InnerProblem, sets: list[BoolArray], tree: Tree, mass: Array | None = None
+) -> list[BoolArray] | None:
+    """`sets` with the better plans that a tree has found, from `mass` `[E]`; None if there are none.
+
+    Without a `mass` it is 1 in each located cell.
+    """
     better, left = tree.improvements()
     if not better.any():
         return None
-    found, mass = [], np.ones(problem.world.num_cells)
+    found, mass = [], np.ones(problem.world.num_cells) if mass is None else mass
     for layer, on, out in zip(problem.layers[1:], sets, left, strict=True):
         mass = mass @ layer.moves
         # a plan of the tree senses every possible cell but those left out
         found.append(np.where(better[layer.rows], (mass > 0) & ~out.has(layer.rows, layer.cells), on))
         mass = mass * (1.0 - found[-1] * problem.world.detects(layer.cells))
     return found
-
-
-def _joined(world: World, found: Sequence[Sequence[Pairs]]) -> PolicyTable:
-    parts = [tuple(np.concatenate(each) for each in zip(*step, strict=True)) for step in zip(*found, strict=True)]
-    return PolicyTable(world, sensed_csr(world, [(rows, cells) for rows, cells in parts]))

@@ -27,6 +27,7 @@ from scipy.special import betaln
 
 from trackmdp.solvers.renewal import IndexArray, per_row, row_index
 from trackmdp.world.model import Array, Task
+from trackmdp.world.modes import Modelled, with_motion
 
 PRECISIONS = (30.0, 300.0, 3000.0)
 """a + b of the Beta(a, b) of the mixture: what stands for broad and for narrow groups of probabilities."""
@@ -127,6 +128,12 @@ def least_worth_planning(task: Task) -> float:
     """
     paid = task.cost[task.cost > 0]
     return SHARE_OF_PRICE * float(paid.min(initial=task.reward)) / (task.reward + task.safe_cost)
+
+
+def believed_world(task: Task, kernel: sparse.csr_array, least: float) -> Modelled:
+    """The task with the motion of a `[M, M + 1]` kernel, the last column its exit, without moves below `least`."""
+    # Plans on several moves grow with a power of the number of moves, most of which the prior may have added.
+    return with_motion(task, without(sparse.csr_array(kernel[:, :-1]), least))
 
 
 def without(moves: sparse.csr_array, least: float) -> sparse.csr_array:
