@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tests.solvers.worlds import best_of_all, tiny_worlds
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers import exchange, optimal, search
+from trackmdp.solvers import exchange, optimal, plans, search
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.layers import layer_sets, policy_table, reachable_layers
 from trackmdp.solvers.search import InnerProblem
@@ -93,7 +93,7 @@ def test_parts_and_windows(monkeypatch: pytest.MonkeyPatch) -> None:
     world = make_world("random_walk", size=6, cost=0.3, t_max=2, window=1)
     whole = exchange.solve(world).sets
     assert evaluate(world, PolicyTable(world, whole)).aihtr > evaluate(world, search.solve(world)).aihtr + 1.0
-    monkeypatch.setattr(exchange, "MOST_NUMBERS", 1)
+    monkeypatch.setattr(plans, "MOST_NUMBERS", 1)
     alone = exchange.solve(world).sets
     assert whole is not None
     assert alone is not None

@@ -14,9 +14,10 @@ from scipy import sparse
 
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
-from trackmdp.solvers.keyed_exchange import Chains, ChainStep, exchange_chains
+from trackmdp.solvers.keyed_exchange import exchange_chains
 from trackmdp.solvers.path_counts import Planned, plan_paths
 from trackmdp.solvers.path_states import AlongPaths, Paths
+from trackmdp.solvers.plans import Chains, ChainStep
 from trackmdp.solvers.renewal import IndexArray, per_row
 from trackmdp.world.model import Task
 from trackmdp.world.tracks import Tracks, draw_parts
@@ -164,9 +165,8 @@ def _trees(paths: Paths, followed: AlongPaths, keys: IndexArray, discount: float
         owner, group = np.unique(rows * m + codes % m, return_inverse=True)
         price = np.zeros(len(owner))
         price[group[now]] = np.minimum(paths.price[n, at], _OUT_OF_VIEW)
-        steps.append(
-            ChainStep(rows, moves, per_row(now, times * worth, len(codes)) / arrived, np.ones(len(codes)), group, price)
-        )
+        worth = per_row(now, times * worth, len(codes)) / arrived
+        steps.append(ChainStep(rows, moves, worth, np.ones(len(codes)), price, group=group))
         owners.append(owner)
         entry, mass = now, arrived
     forced = task.reward + discount * followed.value[paths.following[-1, at]] - task.safe_cost
