@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDictBase
 from torchrl.objectives import A2CLoss
 
-from trackmdp.algos.common import Averages, clipped_step
 from trackmdp.algos.on_policy import OnPolicy
 from trackmdp.config.learning import A2cConfig
 from trackmdp.world.model import Task
@@ -25,7 +23,6 @@ class A2C(OnPolicy):
         device: torch.device,
     ) -> None:
         super().__init__(task, cfg, iterations=iterations, device=device)
-        self.cfg = cfg
         self.loss = A2CLoss(
             self.policy,
             self.critic,
@@ -33,18 +30,3 @@ class A2C(OnPolicy):
             critic_coeff=cfg.critic_coef,
             loss_critic_type="l2",
         )
-
-    def step(self, batch: TensorDictBase | None) -> dict[str, float]:
-        """Learn from one batch `[B, time]` of fresh frames."""
-        data, diagnostics = self.prepare(batch)
-        losses = self.loss(data)
-        total = losses["loss_objective"] + losses["loss_entropy"] + losses["loss_critic"]
-        norm = clipped_step(total, self.optimizer, self.parameters, self.cfg.max_grad_norm)
-        averages = Averages()
-        averages.add(
-            loss_actor=losses["loss_objective"],
-            loss_critic=losses["loss_critic"],
-            entropy=losses["entropy"],
-            grad_norm=norm,
-        )
-        return diagnostics | averages.means()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy.typing as npt
 import torch
@@ -39,6 +39,36 @@ class Algorithm(Protocol):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`."""
         ...
+
+
+class Checkpointed:
+    """What goes into a checkpoint by the names of its parts.
+
+    Modules, optimizers and the like by their `state_dict`, generators by their state, plain values as they are.
+    """
+
+    parts: ClassVar[tuple[str, ...]]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to resume exactly."""
+        return {name: _state(getattr(self, name)) for name in self.parts}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from a `state_dict`."""
+        for name in self.parts:
+            part = getattr(self, name)
+            if isinstance(part, torch.Generator):
+                part.set_state(state[name].cpu())
+            elif hasattr(part, "load_state_dict"):
+                part.load_state_dict(state[name])
+            else:
+                setattr(self, name, state[name])
+
+
+def _state(part: Any) -> Any:
+    if isinstance(part, torch.Generator):
+        return part.get_state()
+    return part.state_dict() if hasattr(part, "state_dict") else part
 
 
 def tensors(arrays: Mapping[str, Any]) -> dict[str, Tensor]:

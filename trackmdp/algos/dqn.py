@@ -6,7 +6,7 @@ Mnih et al. 2015, van Hasselt et al. 2016; value decomposition after Sunehag et 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -15,7 +15,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import RandomSampler
 from torchrl.objectives import LossModule, SoftUpdate
 
-from trackmdp.algos.common import Averages, clipped_step, set_learning_rate
+from trackmdp.algos.common import Averages, Checkpointed, clipped_step, set_learning_rate
 from trackmdp.algos.prioritized import PrioritizedSampler
 from trackmdp.config.learning import DqnConfig
 from trackmdp.policies.qvalue import EpsilonFlip, joint_value, make_qvalue
@@ -68,8 +68,10 @@ class _ZeroedStorage(LazyTensorStorage):
         self._storage.zero_()
 
 
-class DQN:
+class DQN(Checkpointed):
     """Learns off policy from a replay buffer; explores by flipping sensors; the target network is what is evaluated."""
+
+    parts: ClassVar[tuple[str, ...]] = ("loss", "optimizer", "buffer", "explore", "iteration")
 
     def __init__(self, task: Task, cfg: DqnConfig, *, iterations: int, seed: int, device: torch.device) -> None:
         self.cfg, self.iterations, self.iteration, self.device = cfg, iterations, 0, device
@@ -116,24 +118,6 @@ class DQN:
         epsilon = self.cfg.epsilon.at(progress)
         self.explore.epsilon.fill_(epsilon)
         return {"learning_rate": rate, "epsilon": epsilon} | averages.means()
-
-    def state_dict(self) -> dict[str, Any]:
-        """Networks, target, optimizer, buffer and iteration."""
-        return {
-            "loss": self.loss.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "buffer": self.buffer.state_dict(),
-            "epsilon": self.explore.epsilon.clone(),
-            "iteration": self.iteration,
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a `state_dict`."""
-        self.loss.load_state_dict(state["loss"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.buffer.load_state_dict(state["buffer"])
-        self.explore.epsilon.copy_(state["epsilon"])
-        self.iteration = state["iteration"]
 
 
 def n_step(batch: TensorDictBase, steps: int, gamma: float, state: Sequence[str] = STATE_KEYS) -> TensorDictBase:

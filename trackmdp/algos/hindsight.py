@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import copy
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from trackmdp.algos.actor_loss import ActorLoss, Decision
-from trackmdp.algos.common import Averages, set_learning_rate
+from trackmdp.algos.common import Averages, Checkpointed, set_learning_rate
 from trackmdp.algos.exchanged import exchanged_sets
 from trackmdp.algos.hindsight_loss import HindsightLoss
 from trackmdp.algos.inferred import InferredMoves
@@ -260,11 +260,13 @@ def _within(cells: Tensor, reach: int, task: Task) -> Tensor:
     return torch.cat([cells[:1], cells[1:].masked_fill(gone, task.num_keys)])
 
 
-class _Learner:
+class _Learner(Checkpointed):
     """The nets, their optimizer, and the exponential moving average of the actor, which is replayed and evaluated."""
 
+    parts: ClassVar[tuple[str, ...]] = ("reach", "loss", "ema", "optimizer", "count")
+
     def __init__(self, loss: HindsightLoss, ema_decay: float) -> None:
-        self.loss, self._decay, self._count = loss, ema_decay, 0
+        self.loss, self.reach, self._decay, self.count = loss, loss.reach, ema_decay, 0
         # Paths are replayed with the average, whose decisions change less from update to update than those of the
         # weights.
         self.ema = copy.deepcopy(loss.actor).requires_grad_(False)
@@ -281,8 +283,8 @@ class _Learner:
             losses |= {name: loss.detach() + losses.get(name, 0.0) for name, loss in part.items()}
         self.optimizer.step()
         # At first the average forgets faster, or it would stay with the initial weights.
-        decay = min(self._decay, (1 + self._count) / (10 + self._count))
-        self._count += 1
+        decay = min(self._decay, (1 + self.count) / (10 + self.count))
+        self.count += 1
         with torch.no_grad():
             for mean, weight in zip(self.ema.parameters(), self.loss.actor.parameters(), strict=True):
                 mean.lerp_(weight, 1.0 - decay)
@@ -304,18 +306,3 @@ class _Learner:
         place = ((key * task.num_choices + n)[there].cpu().numpy(), column[there].cpu().numpy())
         shape = (task.num_keys * task.num_choices, task.total_sensors)
         return sparse.csr_array((np.ones(len(place[0]), dtype=bool), place), shape=shape)
-
-    def state_dict(self) -> dict[str, Any]:
-        return {
-            "reach": self.loss.reach,
-            "loss": self.loss.state_dict(),
-            "ema": self.ema.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "count": self._count,
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.loss.load_state_dict(state["loss"])
-        self.ema.load_state_dict(state["ema"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        self._count = state["count"]

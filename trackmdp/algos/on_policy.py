@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterator
+from typing import ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -11,7 +12,7 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 from torchrl.objectives.value import GAE
 
-from trackmdp.algos.common import explained_variance, set_learning_rate
+from trackmdp.algos.common import Averages, Checkpointed, clipped_step, explained_variance, set_learning_rate
 from trackmdp.config.learning import ActorCriticConfig
 from trackmdp.policies.actor_critic import make_actor, make_critic
 from trackmdp.world.model import Task
@@ -19,13 +20,16 @@ from trackmdp.world.model import Task
 _KEPT = ("action", "action_log_prob", "advantage", "value_target")
 
 
-class OnPolicy:
-    """Actor, critic and their optimizer; turns a collected batch into rows with a GAE advantage."""
+class OnPolicy(Checkpointed):
+    """Actor, critic and their optimizer, which learn from rows with a GAE advantage."""
 
+    parts: ClassVar[tuple[str, ...]] = ("policy", "critic", "optimizer", "iteration")
     loss: LossModule
+    diagnostics: ClassVar = {"loss_actor": "loss_objective", "loss_critic": "loss_critic", "entropy": "entropy"}
+    """What is reported, by its name in `loss`."""
 
     def __init__(self, task: Task, cfg: ActorCriticConfig, *, iterations: int, device: torch.device) -> None:
-        self._settings, self._t_max = cfg, task.t_max
+        self.cfg, self._t_max = cfg, task.t_max
         self.iterations, self.iteration, self.device = iterations, 0, device
         self.policy = make_actor(task, cfg.hidden, cfg.initial_logit).to(device)
         self.critic = make_critic(task, cfg.hidden).to(device)
@@ -38,6 +42,21 @@ class OnPolicy:
         """The policy itself; its mode is what is evaluated."""
         return self.policy
 
+    def step(self, batch: TensorDictBase | None) -> dict[str, float]:
+        """Learn from one batch `[B, time]` of fresh frames."""
+        data, diagnostics = self.prepare(batch)
+        averages = Averages()
+        for rows in self.minibatches(data):
+            losses = self.loss(rows)
+            total = losses["loss_objective"] + losses["loss_entropy"] + losses["loss_critic"]
+            norm = clipped_step(total, self.optimizer, self.parameters, self.cfg.max_grad_norm)
+            averages.add(**{name: losses[key] for name, key in self.diagnostics.items()}, grad_norm=norm)
+        return diagnostics | averages.means()
+
+    def minibatches(self, data: TensorDictBase) -> Iterator[TensorDictBase]:
+        """The rows of each gradient step."""
+        yield data
+
     def prepare(self, batch: TensorDictBase | None) -> tuple[TensorDictBase, dict[str, float]]:
         """Set this iteration's schedules and return the batch as `[frames]` rows with a normalised advantage.
 
@@ -48,33 +67,17 @@ class OnPolicy:
             raise ValueError("an on-policy algorithm learns from fresh frames only")
         progress = self.iteration / self.iterations
         self.iteration += 1
-        rate, entropy = self._settings.learning_rate.at(progress), self._settings.entropy.at(progress)
+        rate, entropy = self.cfg.learning_rate.at(progress), self.cfg.entropy.at(progress)
         set_learning_rate(self.optimizer, rate)
         self.loss.entropy_coeff.fill_(entropy)
         # Before the advantage, so that the critic's targets are scaled as well; evaluation never sees scaled rewards.
-        batch["next", "reward"] = batch["next", "reward"] * self._settings.reward_scale
+        batch["next", "reward"] = batch["next", "reward"] * self.cfg.reward_scale
         with torch.no_grad():
             self.advantage(batch)
         fit = explained_variance(batch["state_value"], batch["value_target"]).item()
         data = batch.select(*self.critic.in_keys, *_KEPT).reshape(-1)
         data["advantage"] = _normalised(data["advantage"], data["steps_since_detection"].unsqueeze(-1), self._t_max)
         return data, {"learning_rate": rate, "entropy_coef": entropy, "explained_variance": fit}
-
-    def state_dict(self) -> dict[str, Any]:
-        """Networks, optimizer and iteration."""
-        return {
-            "policy": self.policy.state_dict(),
-            "critic": self.critic.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "iteration": self.iteration,
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a `state_dict`."""
-        self.policy.load_state_dict(state["policy"])
-        self.critic.load_state_dict(state["critic"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.iteration = state["iteration"]
 
 
 def _normalised(advantage: Tensor, misses: Tensor, t_max: int) -> Tensor:

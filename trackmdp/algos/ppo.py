@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterator
+from typing import ClassVar
 
 import torch
 from tensordict import TensorDictBase
 from torchrl.objectives import ClipPPOLoss
 
-from trackmdp.algos.common import Averages, clipped_step
 from trackmdp.algos.on_policy import OnPolicy
 from trackmdp.config.learning import PpoConfig
 from trackmdp.seeding import generator
@@ -21,9 +21,12 @@ class PPO(OnPolicy):
     One Bernoulli per sensor; ratio and advantage belong to the whole subset.
     """
 
+    cfg: PpoConfig
+    parts: ClassVar[tuple[str, ...]] = (*OnPolicy.parts, "generator")
+    diagnostics: ClassVar = OnPolicy.diagnostics | {"approx_kl": "kl_approx", "clip_fraction": "clip_fraction"}
+
     def __init__(self, task: Task, cfg: PpoConfig, *, iterations: int, seed: int, device: torch.device) -> None:
         super().__init__(task, cfg, iterations=iterations, device=device)
-        self.cfg = cfg
         self.generator = generator(seed, "minibatches")
         self.loss = ClipPPOLoss(
             self.policy,
@@ -35,31 +38,8 @@ class PPO(OnPolicy):
             normalize_advantage=False,
         )
 
-    def step(self, batch: TensorDictBase | None) -> dict[str, float]:
-        """Learn from one batch `[B, time]` of fresh frames."""
-        data, diagnostics = self.prepare(batch)
-        averages = Averages()
+    def minibatches(self, data: TensorDictBase) -> Iterator[TensorDictBase]:
+        """The rows of each gradient step."""
         for _ in range(self.cfg.epochs):
             order = torch.randperm(len(data), generator=self.generator)
-            for rows in order.chunk(self.cfg.minibatches):
-                losses = self.loss(data[rows])
-                total = losses["loss_objective"] + losses["loss_entropy"] + losses["loss_critic"]
-                norm = clipped_step(total, self.optimizer, self.parameters, self.cfg.max_grad_norm)
-                averages.add(
-                    loss_actor=losses["loss_objective"],
-                    loss_critic=losses["loss_critic"],
-                    entropy=losses["entropy"],
-                    approx_kl=losses["kl_approx"],
-                    clip_fraction=losses["clip_fraction"],
-                    grad_norm=norm,
-                )
-        return diagnostics | averages.means()
-
-    def state_dict(self) -> dict[str, Any]:
-        """Networks, optimizer, iteration and the generator of the minibatches."""
-        return super().state_dict() | {"generator": self.generator.get_state()}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a `state_dict`."""
-        super().load_state_dict(state)
-        self.generator.set_state(state["generator"].cpu())
+            yield from (data[rows] for rows in order.chunk(self.cfg.minibatches))

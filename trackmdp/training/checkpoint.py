@@ -22,7 +22,7 @@ from trackmdp.durable import own_folder, second_name, sync_folder, whole_file
 from trackmdp.errors import UserError
 from trackmdp.untrusted import decoded, opened
 
-CHECKPOINT_FORMAT = 4
+CHECKPOINT_FORMAT = 5
 BEST, LAST = "best.pt", "last.pt"
 _SEAL = 128
 _SMALL, _LARGEST = 2**20, 2**38
