@@ -170,7 +170,7 @@ def _seal(digest: str) -> bytes:
 
 def _check(file: Path, stream: BinaryIO) -> int:
     """The bytes before the seal, once their hash is the one that it names."""
-    # The last 128 bytes: a newline, `trackmdp checkpoint 4 sha256 ` and 64 hexadecimal digits, blanks, a newline.
+    # The last 128 bytes: a newline, `trackmdp checkpoint N sha256 ` and 64 hexadecimal digits, blanks, a newline.
     size = left = max(stream.seek(0, os.SEEK_END) - _SEAL, 0)
     stream.seek(size)
     found = re.fullmatch(rb"\ntrackmdp checkpoint (\d+) sha256 ([0-9a-f]{64}) *\n", stream.read())
