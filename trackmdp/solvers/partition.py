@@ -127,7 +127,7 @@ def plan_by_blocks(
         return [(n, sub_world(world, parts[n].seen), parts[n]) for n in range(ends[job], ends[job + 1])]
 
     done = run(_PlanJob(plan, world.columns), Made(len(ends) - 1, some))
-    return PolicyTable.from_sensed(world, joined(done))
+    return PolicyTable.from_sensed(world, end_to_end(done))
 
 
 def narrow_halo(world: World, partition: PartitionConfig, upper: float, found: Evaluation) -> str | None:
@@ -150,7 +150,7 @@ class _PlanJob:
     columns: int
 
     def __call__(self, job: Sequence[tuple[int, World, Block]]) -> list[Pairs]:
-        return joined([self._block(*each) for each in job])
+        return end_to_end([self._block(*each) for each in job])
 
     def _block(self, number: int, world: World, block: Block) -> list[Pairs]:
         table = self.plan(number, world)
@@ -167,7 +167,7 @@ class _PlanJob:
         return [(numbers[cell[each]], numbers[sets.indices[each]]) for each in on]
 
 
-def joined(parts: Sequence[Sequence[Pairs]]) -> list[Pairs]:
+def end_to_end(parts: Sequence[Sequence[Pairs]]) -> list[Pairs]:
     """What several parts sense at each n, end to end."""
     return [
         (np.concatenate([cells for cells, _ in step]), np.concatenate([sensors for _, sensors in step]))

@@ -25,7 +25,7 @@ from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.exchange import exchange, revealed
 from trackmdp.solvers.known import planted
 from trackmdp.solvers.layers import Layer, layer_sets, reachable_layers
-from trackmdp.solvers.partition import Pairs, blocks, cells_of, joined, reach, sub_world, within
+from trackmdp.solvers.partition import Pairs, blocks, cells_of, end_to_end, reach, sub_world, within
 from trackmdp.solvers.prediction import followed
 from trackmdp.solvers.renewal import DIRECT_CELLS, IndexArray, forced_worth
 from trackmdp.solvers.search import InnerProblem
@@ -180,7 +180,7 @@ def improved(
     for number, region in enumerate(regions, start=1):
         found.append(region.improved() if go_on else region.sensed(region.sets))
         go_on = go_on and passed(number / len(regions))
-    return PolicyTable.from_sensed(world, joined(found))
+    return PolicyTable.from_sensed(world, end_to_end(found))
 
 
 def settled(world: World, policy: PolicyTable, side: int, rounds: int, run: Crew = in_turn) -> PolicyTable:
@@ -191,7 +191,9 @@ def settled(world: World, policy: PolicyTable, side: int, rounds: int, run: Crew
     """
     value = evaluate(world, policy).value
     for _ in range(rounds):
-        candidate = PolicyTable.from_sensed(world, joined(run(_Region.improved, _regions(world, policy, value, side))))
+        candidate = PolicyTable.from_sensed(
+            world, end_to_end(run(_Region.improved, _regions(world, policy, value, side)))
+        )
         after = evaluate(world, candidate).value
         # As in `exchange`: no value is lower, so that the sum tells; the margin is rounding.
         if after.sum() <= value.sum() + 1e-12 * np.abs(value).sum():
@@ -227,7 +229,7 @@ def proved(
         own = region.own
         short[region.cells[own]] = np.maximum(excess[own], 0.0)
         found.append(region.sensed(sets))
-    return short, PolicyTable.from_sensed(world, joined(found))
+    return short, PolicyTable.from_sensed(world, end_to_end(found))
 
 
 def _closed(region: _Region, slack: float, run: Callable[[Tree], None]) -> tuple[list[BoolArray], Array]:
