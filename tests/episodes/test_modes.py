@@ -167,7 +167,9 @@ def test_a_mode_that_differs_is_named() -> None:
 def test_a_mode_that_there_is_none_of_is_damage(wrong: str) -> None:
     world = headings()
     [episode] = simulate(world, Policy.all_on(world), 1, seed=4).complete()
-    run = LoggedRun({"size": "3", "modes": "8", "t_max": "1", "reward": "1", "safe_cost": "1", "trackmdp": "0"})
+    run = LoggedRun(
+        {"size": "3", "modes": "8", "t_max": "1", "max_steps": "", "reward": "1", "safe_cost": "1", "trackmdp": "0"}
+    )
     steps = list(step_messages(episode, run))
     grids = [layers["/grid"] for layers in grid_messages(episode, (3, 3), 0)]
     row = json.loads(json.dumps(row_of(episode, 1, 0)))
