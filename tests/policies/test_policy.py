@@ -22,7 +22,7 @@ from trackmdp.policies.actor_critic import SubsetDistribution
 from trackmdp.policies.policy import Policy, actor_table, as_policy
 from trackmdp.policies.unroll import STATE_KEYS
 from trackmdp.solvers.evaluate import evaluate
-from trackmdp.world.model import World
+from trackmdp.world.model import Task, World
 
 WORLD = small_world(t_max=2)
 M, CHOICES = WORLD.num_cells, WORLD.num_choices
@@ -285,7 +285,8 @@ WRONG: dict[str, tuple[Any, str]] = {
     "reads the target": (sequence("target"), "reads target"),
     "no action": (TensorDictModule(torch.nn.Identity(), in_keys=["last_cell"], out_keys=["a"]), "writes no action"),
     "a number": (3, "got int"),
-    "another world": (Policy.all_on(small_world(2, t_max=2)), "made for 4 cells"),
+    "another world": (Policy.all_on(small_world(2, t_max=2)), "made for 2 x 2 cells, t_max 2; expected 3 x 3"),
+    "as many cells": (Policy.all_on(Task((1, 9), cost=0.1, t_max=2)), "made for 1 x 9 cells"),
 }
 
 

@@ -159,8 +159,8 @@ class PolicyTable:
         mine, other = self.task.coverage, task.coverage
         if not (mine is other or (mine is not None and mine.same_as(other))):
             raise UserError("policy: made for sensors of other footprints than the world's")
-        if (self.task.num_cells, self.task.t_max) != (task.num_cells, task.t_max):
-            theirs, ours = (f"{each.num_cells} cells, t_max {each.t_max}" for each in (self.task, task))
+        if (self.task.size, self.task.t_max) != (task.size, task.t_max):
+            theirs, ours = (f"{each.rows} x {each.columns} cells, t_max {each.t_max}" for each in (self.task, task))
             raise UserError(f"policy: made for {theirs}; expected {ours}")
 
     def dense(self) -> BoolArray:
