@@ -21,7 +21,7 @@ from trackmdp.algos.paths import known_as
 from trackmdp.config.counting import LearnedKernelConfig
 from trackmdp.policies.explore import RenewedTable
 from trackmdp.policies.policy import Policy, as_policy
-from trackmdp.policies.saved import packed, packed_policy
+from trackmdp.policies.saved import packed, unpacked_policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
 from trackmdp.solvers import exchange
@@ -134,7 +134,7 @@ class LearnedKernel:
         self._rng.bit_generator.state = json.loads(state["rng"])
         self._estimate.load_state(arrays(state["estimate"]))
         self.policy.load_state_dict(state["policy"])
-        self.actor = Policy.from_table(packed_policy(self.task, arrays(state["actor"])))
+        self.actor = Policy.from_table(unpacked_policy(self.task, arrays(state["actor"])))
 
 
 def observed_paths(batch: TensorDictBase, task: Task) -> ObservedPaths:

@@ -13,7 +13,7 @@ from trackmdp.algos.segments import SensedPaths
 from trackmdp.config.counting import PathCountsConfig
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy, as_policy
-from trackmdp.policies.saved import packed, packed_policy
+from trackmdp.policies.saved import packed, unpacked_policy
 from trackmdp.solvers.path_counts import plan_keys
 from trackmdp.solvers.path_exchange import choose_plan
 from trackmdp.world.model import Task
@@ -64,7 +64,7 @@ class PathCounts:
         """Continue from a `state_dict`."""
         self._seed = state["seed"]
         self._paths.load_state_dict(state["paths"])
-        self.actor = Policy.from_table(packed_policy(self.task, arrays(state["actor"])))
+        self.actor = Policy.from_table(unpacked_policy(self.task, arrays(state["actor"])))
 
 
 class _AllSensors(TensorDictModuleBase):

@@ -64,7 +64,7 @@ def load_policy(file: Path) -> tuple[PolicyTable, Array | None]:
         value = content.get("value")
         if value is not None and (value.shape != (task.num_cells,) or value.dtype != np.float64):
             raise ValueError(f"values {value.dtype} {value.shape} for {task.num_cells} cells")
-        return packed_policy(task, content), value
+        return unpacked_policy(task, content), value
 
 
 def packed(policy: PolicyTable) -> dict[str, Any]:
@@ -79,7 +79,7 @@ def packed(policy: PolicyTable) -> dict[str, Any]:
     return content if policy.k is None else content | {"k": np.int64(policy.k)}
 
 
-def packed_policy(task: Task, content: Mapping[str, npt.NDArray[Any]]) -> PolicyTable:
+def unpacked_policy(task: Task, content: Mapping[str, npt.NDArray[Any]]) -> PolicyTable:
     """The policy of `packed` arrays.
 
     Raises:
@@ -149,7 +149,7 @@ def _listed(task: Task, content: dict[str, Any]) -> PolicyTable:
     rows = [each for key in range(count) for each in keys[str(key)]]
     pointer = np.cumsum([0, *map(len, rows)])
     indices = np.array([each for row in rows for each in row], dtype=np.int64)
-    return packed_policy(task, {"indices": indices, "indptr": pointer})
+    return unpacked_policy(task, {"indices": indices, "indptr": pointer})
 
 
 def _number(value: Any) -> npt.NDArray[Any]:
