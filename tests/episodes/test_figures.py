@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from tests.helpers import BASELINES, algorithm, evaluate_config, hop_world, limited, small_world
-from trackmdp.episodes.figures import Simulation
+from trackmdp.episodes.batch import Simulation
 from trackmdp.episodes.simulate import simulate
 from trackmdp.policies.policy import Policy
 from trackmdp.solvers.solve import baseline_policy

@@ -10,8 +10,7 @@ import pytest
 
 from trackmdp.config import conf_dir
 from trackmdp.paper.calibration import Candidate, candidates, chosen, sensitivity
-from trackmdp.paper.printed import PRINTED_QMDP, PRINTED_TMDP
-from trackmdp.paper.worlds import COSTS, SUPPORTS, paper_kernel, paper_world
+from trackmdp.paper.worlds import COSTS, PRINTED_QMDP, PRINTED_TMDP, SUPPORTS, paper_kernel, paper_world
 from trackmdp.solvers import bounds, qmdp
 from trackmdp.solvers.evaluate import evaluate
 

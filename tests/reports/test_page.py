@@ -13,8 +13,8 @@ from tests.episodes.browser import CHROMIUM, Browser
 from tests.reports.sweeps import write_run
 from trackmdp.paper.calibration import candidates, sensitivity
 from trackmdp.paper.openings import Openings, checks
-from trackmdp.paper.printed import pairs
 from trackmdp.paper.sections import accuracy_table, sections
+from trackmdp.paper.worlds import pairs
 from trackmdp.reports.gather import gather_runs
 from trackmdp.reports.grouping import study
 from trackmdp.reports.page import Report, build

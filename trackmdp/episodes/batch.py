@@ -1,7 +1,11 @@
-"""Simulated episodes as a few columns with the steps of all; an `Episode` is made from them on request."""
+"""Simulated episodes as a few columns with the steps of all, from which an `Episode` is made on request; their figures.
+
+Figures are means over episodes, each with its standard error.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, overload
@@ -14,13 +18,36 @@ from torch import Tensor
 from trackmdp.episodes.actors import Choice
 from trackmdp.episodes.belief import beliefs
 from trackmdp.episodes.episode import Episode, Floats, Integers, last_cells
-from trackmdp.episodes.figures import Simulation, summary
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.world.model import Array, BoolArray
 from trackmdp.world.tracks import Problem, Recorded
 
 _BELIEF = 25_600  # cells, or hidden states, of the beliefs updated together: memory stays bounded on large grids
+
+
+@dataclass(frozen=True)
+class MeanEstimate:
+    """A mean over simulated episodes with its standard error (nan for a single episode)."""
+
+    mean: float
+    standard_error: float
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """Figures of simulated episodes; `accuracy` is pooled, as the exact one, `episode_accuracy` the mean over episodes.
+
+    Figures per step are ratios of sums over all episodes; their standard errors are those of a ratio estimate.
+    """
+
+    episodes: int
+    aihtr: MeanEstimate
+    accuracy: MeanEstimate
+    episode_accuracy: MeanEstimate
+    sensors_per_step: MeanEstimate
+    safe_per_episode: MeanEstimate
+    expected_length: MeanEstimate
 
 
 class Steps:
@@ -172,7 +199,7 @@ class Episodes(Sequence[Episode]):
     def figures(self) -> Simulation:
         """What the episodes say of the policy, with standard errors."""
         if not len(self):
-            return summary(np.zeros((6, 0)))
+            return _summary(np.zeros((6, 0)))
         in_grid = self.target < self.problem.num_cells
         forced = (self.misses > self.problem.t_max) & in_grid
         # Sensors are counted where they cost: not at the exit, nor where the safe action replaced them.
@@ -181,7 +208,7 @@ class Episodes(Sequence[Episode]):
         columns: list[npt.NDArray[Any]] = [self.reward, in_grid, self.located, chosen, forced, every]
         # Every episode has a step, so that no two of `first` are the same and each sum is that of one episode.
         totals: Array = np.stack([np.add.reduceat(column.astype(np.float64), self.first[:-1]) for column in columns])
-        return summary(totals)
+        return _summary(totals)
 
     def complete(self) -> Iterator[Episode]:
         """The episodes with `belief` and `probability`, computed for a bounded number of them at a time.
@@ -204,3 +231,42 @@ class Episodes(Sequence[Episode]):
         key = self._keys(steps, episode.last_cell)
         state = torch.from_numpy(key), torch.from_numpy(episode.misses)
         return self.policy.seeing(*state).float().numpy()
+
+
+def _summary(totals: Array) -> Simulation:
+    """The figures of E episodes from `[6, E]` sums over their steps.
+
+    The rows of `totals` are reward, steps in the grid, detections, sensors on by choice, safe actions, and steps.
+    """
+    reward, steps, detections, sensors, forced, length = totals
+    # An episode whose first step is the exit has no step in the grid, and no accuracy.
+    some = steps > 0
+    return Simulation(
+        episodes=len(reward),
+        aihtr=_mean(reward),
+        accuracy=_ratio(detections, steps),
+        episode_accuracy=_mean(detections[some] / steps[some]),
+        sensors_per_step=_ratio(sensors, steps),
+        safe_per_episode=_mean(forced),
+        expected_length=_mean(length),
+    )
+
+
+def _mean(values: Array) -> MeanEstimate:
+    if len(values) == 0:
+        return MeanEstimate(math.nan, math.nan)
+    error = float(values.std(ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else math.nan
+    return MeanEstimate(float(values.mean()), error)
+
+
+def _ratio(part: Array, whole: Array) -> MeanEstimate:
+    """Σ part / Σ whole; its standard error by the delta method.
+
+    The ratio R = mean(p) / mean(w) errs to first order by mean(p - R w) / mean(w), a mean over episodes.
+    """
+    if not whole.any():
+        return MeanEstimate(math.nan, math.nan)
+    ratio = float(part.sum() / whole.sum())
+    residual = part - ratio * whole
+    scale = float(whole.mean()) * math.sqrt(len(part))
+    return MeanEstimate(ratio, float(residual.std(ddof=1)) / scale if len(part) > 1 else math.nan)

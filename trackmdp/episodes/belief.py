@@ -32,7 +32,8 @@ def beliefs(world: Modelled, episodes: Sequence[Episode]) -> list[Floats]:
     action = torch.as_tensor(np.concatenate([_reported(world, episode) for episode in episodes]))
     target = torch.as_tensor(np.concatenate([episode.target for episode in episodes]))
     located = torch.as_tensor(np.concatenate([episode.located for episode in episodes]))
-    mode = torch.as_tensor(np.concatenate([_modes_of(episode) for episode in episodes]))
+    # 0 where targets have none
+    mode = torch.as_tensor(np.concatenate([0 * each.target if each.mode is None else each.mode for each in episodes]))
     found = torch.zeros(len(target), world.num_cells)
     start, first_mode = (torch.tensor([getattr(each, name) for each in episodes]) for name in ("start", "start_mode"))
     # Where the mode is not told, any of the cell's is as likely at the start.
@@ -55,11 +56,6 @@ def beliefs(world: Modelled, episodes: Sequence[Episode]) -> list[Floats]:
             located[step, None], seen, exact.miss(predicted, action[step].repeat_interleave(modes, -1))
         )
     return [part.numpy() for part in found.split(lengths.tolist())]
-
-
-def _modes_of(episode: Episode) -> npt.NDArray[Any]:
-    """`[T]` the mode after each step; 0 where targets have none."""
-    return np.zeros(len(episode), dtype=np.int64) if episode.mode is None else episode.mode
 
 
 def _reported(world: Task, episode: Episode) -> npt.NDArray[Any]:

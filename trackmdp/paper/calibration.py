@@ -10,8 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trackmdp.paper.printed import PRINTED_QMDP
-from trackmdp.paper.worlds import COSTS, SUPPORTS, paper_kernel, paper_world
+from trackmdp.paper.worlds import COSTS, PRINTED_QMDP, SUPPORTS, paper_kernel, paper_world
 from trackmdp.solvers import bounds, qmdp
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.world.kernels import Border

@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from trackmdp.durable import write_text
-from trackmdp.errors import UserError
 from trackmdp.paper import theorems
 from trackmdp.paper.calibration import BORDER, T_MAX, Candidate, Setting, Spread, candidates, chosen, sensitivity
 from trackmdp.paper.theorems import Check
 from trackmdp.paper.worlds import COSTS, SUPPORTS, paper_kernel, paper_world
 from trackmdp.solvers import optimal
+from trackmdp.untrusted import decoded, read_object
 
 OPENINGS_FILE = "paper.json"
 TOLERANCE = 1e-9
@@ -65,10 +65,8 @@ def load_openings(folder: Path) -> Openings | None:
     file = folder / OPENINGS_FILE
     if not file.is_file():
         return None
-    try:
-        return _unpacked(json.loads(file.read_text(encoding="utf-8")))
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{file}: cannot be read ({' '.join(str(error).split())})") from error
+    with decoded(str(file), "what a report says of the paper"):
+        return _unpacked(read_object(file))
 
 
 def _packed(openings: Openings) -> dict[str, Any]:

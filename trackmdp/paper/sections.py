@@ -12,9 +12,8 @@ import numpy as np
 from trackmdp.paper import settings
 from trackmdp.paper.calibration import DRAWS
 from trackmdp.paper.openings import HARDEST, Openings
-from trackmdp.paper.printed import PRINTED_QMDP, PRINTED_TMDP, pairs
 from trackmdp.paper.theorems import Check
-from trackmdp.paper.worlds import COSTS
+from trackmdp.paper.worlds import COSTS, PRINTED_QMDP, PRINTED_TMDP, pairs
 from trackmdp.reports.grouping import Study
 from trackmdp.reports.page import Part, Section
 from trackmdp.reports.tables import Cell, Column, Table

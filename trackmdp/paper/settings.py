@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import astuple
 from typing import Any
 
 import numpy as np
 
 from trackmdp.paper.calibration import BORDER, DRAWS, SEEDS, T_MAX, Candidate, Setting, Spread, chosen
-from trackmdp.paper.printed import PRINTED_QMDP
-from trackmdp.paper.worlds import COSTS, SUPPORTS
+from trackmdp.paper.worlds import COSTS, PRINTED_QMDP, SUPPORTS
 from trackmdp.reports.style import INK, LOOKS, Axes, Canvas, Figure, draw_figure, legend, tidy
 from trackmdp.reports.tables import Cell, Column, Table
 from trackmdp.world.model import Array
@@ -82,7 +82,7 @@ def sensitivity_table(settings: Sequence[Setting]) -> Table:
     for label, digits in (("Q_MDP accuracy %", 2), ("Q_MDP AIHTR", 1), ("clocked bound AIHTR", 1)):
         columns += [Column(f"{label}, median", digits), Column("low", digits), Column("high", digits)]
     rows = [
-        [s.border, s.t_max, s.support_size, s.cost, *(v for spread in _spreads(s) for v in vars(spread).values())]
+        [s.border, s.t_max, s.support_size, s.cost, *astuple(s.accuracy), *astuple(s.qmdp), *astuple(s.clocked)]
         for s in settings
     ]
     return Table(
@@ -128,7 +128,7 @@ def _ranges(
     ends = [of(setting).median for setting in settings]
     text = f"Medians from {min(ends):.1f} to {max(ends):.1f}." + (" Dotted: the printed values." if printed else "")
     columns = [Column("border"), Column("T_max"), Column("Z"), Column("median", 2), Column("low", 2), Column("high", 2)]
-    numbers: list[list[Cell]] = [[s.border, s.t_max, s.support_size, *vars(of(s)).values()] for s in settings]
+    numbers: list[list[Cell]] = [[s.border, s.t_max, s.support_size, *astuple(of(s))] for s in settings]
     table = Table(f"sensitivity-{name}", title, columns, numbers)
     return draw_figure(f"sensitivity-{name}", title, text, table, 4.2, paint)
 
@@ -142,7 +142,3 @@ def _bars(axes: Axes, support_size: int, y: Array, spreads: Sequence[Spread]) ->
     bars = np.stack([middle - low, high - middle])
     points: Any = {"fmt": style.marker, "color": style.colour, "markersize": 3.5, "elinewidth": 1.2}
     axes.errorbar(middle, y, xerr=bars, label=f"Z = {support_size}", **points)
-
-
-def _spreads(setting: Setting) -> tuple[Spread, Spread, Spread]:
-    return setting.accuracy, setting.qmdp, setting.clocked

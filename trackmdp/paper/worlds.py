@@ -1,9 +1,14 @@
-"""The worlds of the paper's experiments (Section VII)."""
+"""The paper's experiments (Section VII): their worlds, the numbers it prints, and the runs that are of its worlds."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
+from trackmdp.reports.grouping import Study
+from trackmdp.reports.results import FinishedRun
 from trackmdp.world.kernels import Border, random_support
 from trackmdp.world.model import Array, World
 
@@ -15,6 +20,36 @@ SIZE, REWARD = 10, 1.0
 """N, and r."""
 RADIUS, LOW_PROBABILITY, EXIT_PROBABILITY = 1, 0.15, 0.005
 """Of the motion; T_max, the border rule and the draw of the kernel the paper does not say."""
+
+PRINTED_QMDP: Mapping[tuple[int, float], float] = {
+    **{(3, c): 90.74 for c in COSTS},
+    **{(4, c): 88.82 for c in COSTS},
+    # The drop at c = 0.22: all probabilities lie below c/r, and Q_MDP senses only when it is forced (remark on Figure
+    # z_5).
+    **{(5, c): 89.95 for c in COSTS[:3]},
+    (5, 0.22): 54.3,
+}
+"""Table II, accuracy of Q_MDP in per cent, by (Z, c)."""
+
+PRINTED_TMDP: Mapping[tuple[int, float], float] = {
+    **dict(zip([(3, c) for c in COSTS], (92.39, 92.06, 93.23, 87.18), strict=True)),
+    **dict(zip([(4, c) for c in COSTS], (94.28, 95.56, 89.7, 88.85), strict=True)),
+    **dict(zip([(5, c) for c in COSTS], (93.75, 94.94, 92.45, 90.21), strict=True)),
+}
+"""Table II, accuracy of the paper's learned policy in per cent, by (Z, c)."""
+
+_FIXED = {
+    "grid.size": SIZE,
+    "grid.max_steps": None,
+    "grid.window": None,
+    "kernel.name": "random_support",
+    "kernel.radius": RADIUS,
+    "kernel.low_probability": LOW_PROBABILITY,
+    "kernel.exit_probability": EXIT_PROBABILITY,
+    "cost.reward": REWARD,
+    "cost.safe": None,
+}
+"""What the paper says of its worlds."""
 
 
 def paper_kernel(support_size: int, seed: int, border: Border) -> Array:
@@ -34,3 +69,26 @@ def paper_world(kernel: Array, cost: float, t_max: int) -> World:
     """The paper's world with this kernel `[100, 100]`: the safe action costs as much as all sensors, D = N² c."""
     m = SIZE**2
     return World(kernel, SIZE, cost=np.full(m, cost), safe_cost=m * cost, t_max=t_max, reward=REWARD)
+
+
+def pair_of(settings: Mapping[str, Any]) -> tuple[int, float] | None:
+    """(Z, c) of a run in one of the paper's worlds, else None."""
+    # T_max, border and seed of the kernel are not compared: the paper does not give them.
+    if any(settings.get(key) != value for key, value in _FIXED.items()):
+        return None
+    pair = settings.get("kernel.support_size"), settings.get("cost.sensor")
+    return pair if pair in PRINTED_QMDP else None  # type: ignore[return-value]
+
+
+def pairs(study: Study) -> dict[tuple[int, float], str]:
+    """The paper's (Z, c) -> the label of the world that stands for it, in the order of the figures.
+
+    Where several do (other T_max, border or kernel), it is the one with most runs.
+    """
+    found: dict[tuple[int, float], str] = {}
+    for world in study.worlds:
+        runs: list[FinishedRun] = study.in_world(world)
+        pair = pair_of(runs[0].settings)
+        if pair is not None and (pair not in found or len(study.in_world(found[pair])) < len(runs)):
+            found[pair] = world
+    return dict(sorted(found.items()))

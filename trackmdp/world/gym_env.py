@@ -36,7 +36,9 @@ class _Tracking:
         self, world: Problem | None, options: dict[str, Any], render_mode: str | None, shape: tuple[int, ...]
     ) -> tuple[spaces.Dict, spaces.MultiBinary]:
         """Set the three up; returns the spaces of one target."""
-        self.world, self.render_mode = _problem(world, options), render_mode
+        if world is not None and options:
+            raise UserError(f"{', '.join(options)}: expected either a world, or options to make one of")
+        self.world, self.render_mode = make_world(**options) if world is None else world, render_mode
         if render_mode is not None and render_mode not in _MODES:
             raise UserError(f"render_mode={render_mode}: expected one of {', '.join(_MODES)}")
         self._env = TrackEnv(self.world, shape)
@@ -144,12 +146,6 @@ class TrackVector(_Tracking, VectorEnv[Observation, npt.NDArray[np.int8], npt.ND
             final[row] = {key: value[row] for key, value in seen.items()}
         info = {"target": np.where(done, self._env.target.numpy(), 0), "_target": done}
         return {"final_obs": final, "_final_obs": done, "final_info": info, "_final_info": done}
-
-
-def _problem(world: Problem | None, options: dict[str, Any]) -> Problem:
-    if world is not None and options:
-        raise UserError(f"{', '.join(options)}: expected either a world, or options to make one of")
-    return make_world(**options) if world is None else world
 
 
 def _spaces(world: Problem) -> tuple[spaces.Dict, spaces.MultiBinary]:

@@ -20,7 +20,7 @@ from trackmdp.world.motion import Motion
 from trackmdp.world.tracks import Problem, Recorded, Tracks
 
 
-class Sampled:
+class Sampled(Motion):
     """Targets that move as the kernel says; a place is a cell, or with modes cell · H + mode. All are starts.
 
     Attributes:
@@ -29,20 +29,13 @@ class Sampled:
     """
 
     def __init__(self, world: Modelled, device: torch.device) -> None:
-        self.starts, self.device, self._motion = world.kernel.shape[0], device, Motion(world.kernel, device)
+        super().__init__(world.kernel, device)
+        self.starts, self.device = world.kernel.shape[0], device
         self._modes = world.modes if isinstance(world, HiddenWorld) else 1
 
     def begin(self, numbers: Tensor) -> Tensor:
         """`[B]` places of the starts `numbers` `[B]`."""
         return numbers
-
-    def draw(self, count: int, generator: torch.Generator) -> Tensor:
-        """`[count]` float64 draws, each for one move of one target."""
-        return self._motion.draw(count, generator)
-
-    def move(self, place: Tensor, draws: Tensor) -> Tensor:
-        """`[B]` places after one move."""
-        return self._motion.move(place, draws)
 
     def cell(self, place: Tensor) -> Tensor:
         """`[B]` cells; M for a target that has exited, which is in the place behind all others."""
@@ -122,12 +115,15 @@ class Targets:
     Args:
         source: where they go.
         key: under which name the environment keeps their places; "target", the cell, where the two are the same.
+
+    Attributes:
+        draw: gives the random numbers for the next move of the targets of a mask `[B]`.
     """
 
     def __init__(self, source: Source, key: str) -> None:
         self.source, self._key = source, key
         self._starts = Draw(self._start_of, torch.int64, source.device)
-        self._draws = Draw(self._draw_of, torch.float64, source.device)
+        self.draw = Draw(self._draw_of, torch.float64, source.device)
 
     def seed(self, seed: int, stream: str) -> None:
         """Begin the draws of the generators called (`stream`, "motion") and (`stream`, "start")."""
@@ -157,10 +153,6 @@ class Targets:
     def start(self, rows: Tensor) -> dict[str, Tensor]:
         """`target`, and what else a move depends on, `[B]` of fresh targets, of which the mask `rows` `[B]` is used."""
         return self._known(self._starts(rows))
-
-    def draw(self, rows: Tensor) -> Tensor:
-        """The random numbers for the next move of the targets `rows` `[B]`."""
-        return self._draws(rows)
 
     def move(self, state: Mapping[str, Tensor], draws: Tensor) -> dict[str, Tensor]:
         """The same as of `start` after one move; a target of M has exited."""

@@ -17,29 +17,22 @@ from trackmdp.world.position_files import geojson, gpx, mot, position_table, sum
 from trackmdp.world.positions import ALIASES, LONGEST, Positions
 from trackmdp.world.tracks import Recorded, Tracks, check_tracks, read_tracks
 
-_FORMATS = {
-    ".npz": "cells",
-    ".parquet": "points",
-    ".geojson": "geojson",
-    ".json": "geojson",
-    ".gpx": "gpx",
-    ".txt": "mot",
-    ".xml": "sumo",
-}
 _GAP = 3
 """Steps that are bridged where no `kernel.max_gap` is given."""
 
 Reader: TypeAlias = Callable[[BinaryIO], Positions]
 
 
-_READERS: dict[str, tuple[str, Sequence[str], Reader]] = {
-    "points": ("a table of positions", ("pandas", "pyarrow"), position_table),
-    "geojson": ("GeoJSON with the times of its points", ("pandas",), geojson),
-    "gpx": ("a GPX track log", ("gpxpy", "defusedxml", "pandas"), gpx),
-    "mot": ("MOT-Challenge text", ("pandas",), mot),
-    "sumo": ("SUMO's fcd-output", ("defusedxml", "pandas"), sumo),
+_READERS: dict[str, tuple[Sequence[str], str, Sequence[str], Reader]] = {
+    "points": ((".parquet",), "a table of positions", ("pandas", "pyarrow"), position_table),
+    "geojson": ((".geojson", ".json"), "GeoJSON with the times of its points", ("pandas",), geojson),
+    "gpx": ((".gpx",), "a GPX track log", ("gpxpy", "defusedxml", "pandas"), gpx),
+    "mot": ((".txt",), "MOT-Challenge text", ("pandas",), mot),
+    "sumo": ((".xml",), "SUMO's fcd-output", ("defusedxml", "pandas"), sumo),
 }
-"""Format -> what a message calls it, the modules it takes, and what reads it."""
+"""Format -> how its files end, what a message calls it, the modules it takes, and what reads it."""
+
+_FORMATS = {".npz": "cells"} | {end: kind for kind, (ends, *_) in _READERS.items() for end in ends}
 
 
 def read_positions(path: str | Path, kind: str) -> Positions:
@@ -53,7 +46,7 @@ def read_positions(path: str | Path, kind: str) -> Positions:
         UserError: there is no such file, it is too large, not of that form, or without reports.
     """
     source = f"kernel.path={path}"
-    words, needed, reader = _READERS[kind]
+    _, words, needed, reader = _READERS[kind]
     for module in needed:
         require(module, "tracks", source)
     with opened(Path(path), most=LONGEST, source=source, links=True) as stream, decoded(source, words):

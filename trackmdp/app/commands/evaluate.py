@@ -16,7 +16,7 @@ from trackmdp.app.commands import held_out, playback
 from trackmdp.app.commands.trained import trained
 from trackmdp.config import EvaluateConfig, FalseAlarmConfig, McapConfig, PlaybackConfig, load_run_config, to_yaml
 from trackmdp.durable import write_json, write_text
-from trackmdp.episodes.figures import Simulation
+from trackmdp.episodes.batch import Simulation
 from trackmdp.episodes.filtered import simulate_filter
 from trackmdp.episodes.log import EpisodeLog
 from trackmdp.episodes.simulate import simulate

@@ -11,8 +11,8 @@ from trackmdp.config import ReportConfig
 from trackmdp.durable import write_bytes, write_text
 from trackmdp.errors import require
 from trackmdp.paper.openings import compute, load_openings, save_openings
-from trackmdp.paper.printed import PRINTED_QMDP, pairs
 from trackmdp.paper.sections import sections
+from trackmdp.paper.worlds import PRINTED_QMDP, pairs
 from trackmdp.reports import style, watch
 from trackmdp.reports.gather import gather_runs
 from trackmdp.reports.grouping import study
