@@ -58,22 +58,21 @@ def panels(study: Study) -> list[Panel]:
 
 def against_cost(study: Study, panel: Panel) -> Figure:
     """AIHTR against c: the learned policies with their intervals, Q_MDP, the bounds, the optimum."""
-    learned = _estimates(study, panel, regret=False)
     exact = {"Q_MDP": _exact(study, panel, "qmdp_aihtr")}
     exact |= {label: _exact(study, panel, key) for label, key in BOUNDS.items()}
     # A bound that no run has, as where no optimum was solved for, gets no empty entry in the legend.
     exact = {label: values for label, values in exact.items() if not all(map(math.isnan, values))}
+    drawn = _Against.of(study, panel, exact, regret=False)
+    learned = [e.mean for row in drawn.learned.values() for e in row]
     # Q_MDP falls far below 0 where only the safe action senses (Z = 5, c = 0.22); on one axis the learned policies
     # would become one line.
-    split = axis_break([e.mean for row in learned.values() for e in row] + [v for row in exact.values() for v in row])
-
-    looks = looks_of(study.methods)
+    split = axis_break(learned + [v for row in exact.values() for v in row])
 
     def paint(figure: Canvas) -> None:
         # The upper part, where the methods differ, gets four fifths of the height.
         split_axes = figure.subplots(2, 1, sharex=True, height_ratios=[4, 1]) if split else [figure.subplots()]
         for axes in split_axes:
-            _learned_lines(axes, panel, learned, looks)
+            drawn.learned_lines(axes)
             for label, values in exact.items():
                 axes.plot(panel.costs, values, label=label, lw=1.1, **LOOKS[label].of_line())
             tidy(axes)
@@ -82,27 +81,23 @@ def against_cost(study: Study, panel: Panel) -> Figure:
         split_axes[0].set_ylabel("AIHTR")
         # Ticks at the prices that were run: between them nothing was measured.
         split_axes[-1].set(xlabel=PRICE, xticks=panel.costs)
-        label_lines(figure, split_axes, first=list(learned))
+        label_lines(figure, split_axes, first=list(drawn.learned))
 
-    table = _cost_table(panel, learned, exact, "aihtr", "AIHTR", digits=3)
-    text = _spoken(panel, learned, exact, digits=1) + (
-        " The axis is broken between the groups of values." if split else ""
-    )
-    title = f"AIHTR against the price of a sensor, {panel.title}; {_n_text(learned)}"
-    return draw_figure(f"aihtr-{panel.name}", title, text, table, 3.9, paint)
+    table = drawn.table("aihtr", "AIHTR", digits=3)
+    text = drawn.spoken(digits=1) + (" The axis is broken between the groups of values." if split else "")
+    return draw_figure(table.name, drawn.titled("AIHTR against the price of a sensor"), text, table, 3.9, paint)
 
 
 def regret_against_cost(study: Study, panel: Panel, threshold: float | None) -> Figure:
     """Regret per step against c, logarithmic, so that the best are told apart; a line at the `threshold`."""
-    learned = _estimates(study, panel, regret=True)
-    exact = {"Q_MDP": [_qmdp_regret(study, world) for world in panel.worlds]}
-
-    looks = looks_of(study.methods)
+    first = {world: study.in_world(world)[0] for world in panel.worlds}
+    exact = {"Q_MDP": [study.regret(run, world, run.figure("qmdp_aihtr")) for world, run in first.items()]}
+    drawn = _Against.of(study, panel, exact, regret=True)
 
     def paint(figure: Canvas) -> None:
         axes = figure.subplots()
         # Interval ends are cut at the floor as well: one at or below zero would vanish from a logarithmic axis.
-        _learned_lines(axes, panel, learned, looks, floor=FLOOR)
+        drawn.learned_lines(axes, floor=FLOOR)
         axes.plot(panel.costs, np.maximum(exact["Q_MDP"], FLOOR), label="Q_MDP", **LOOKS["Q_MDP"].of_line())
         if threshold is not None:
             axes.axhline(threshold, color=INK, linewidth=0.6, linestyle=(0, (1, 2)), zorder=1)
@@ -112,23 +107,78 @@ def regret_against_cost(study: Study, panel: Panel, threshold: float | None) -> 
             axes.annotate(f"{threshold:g}", at, xycoords=where, va="center", bbox=free, zorder=1)
         axes.set(yscale="log", ylabel="regret per step", xlabel=PRICE, xticks=panel.costs)
         tidy(axes)
-        label_lines(figure, [axes], first=list(learned))
+        label_lines(figure, [axes], first=list(drawn.learned))
 
-    table = _cost_table(panel, learned, exact, "regret", "regret per step", digits=5)
-    title = f"Regret per step to the proved upper bound, {panel.title}; {_n_text(learned)}"
-    return draw_figure(f"regret-{panel.name}", title, _spoken(panel, learned, exact, digits=4), table, 3.4, paint)
+    table = drawn.table("regret", "regret per step", digits=5)
+    title = drawn.titled("Regret per step to the proved upper bound")
+    return draw_figure(table.name, title, drawn.spoken(digits=4), table, 3.4, paint)
 
 
-def _estimates(study: Study, panel: Panel, *, regret: bool) -> dict[str, list[MeanInterval]]:
-    found = {}
-    for method in study.methods:
-        groups = [
-            study.regrets(world, method) if regret else [run.figure("aihtr") for run in study.of(world, method)]
-            for world in panel.worlds
-        ]
-        if any(groups):
-            found[method] = [mean_over_groups([group]) for group in groups]
-    return found
+@dataclass(frozen=True)
+class _Against:
+    """What is drawn against the price of a sensor.
+
+    Attributes:
+        panel: the worlds.
+        looks: of each method.
+        learned: method -> its estimate in each world.
+        exact: policy or bound -> its value in each world.
+    """
+
+    panel: Panel
+    looks: Mapping[str, Look]
+    learned: Mapping[str, Sequence[MeanInterval]]
+    exact: Mapping[str, Sequence[float]]
+
+    @classmethod
+    def of(cls, study: Study, panel: Panel, exact: Mapping[str, Sequence[float]], *, regret: bool) -> _Against:
+        """The AIHTR or the regret of every method of a study, beside `exact`."""
+        found = {}
+        for method in study.methods:
+            groups = [
+                study.regrets(world, method) if regret else [run.figure("aihtr") for run in study.of(world, method)]
+                for world in panel.worlds
+            ]
+            if any(groups):
+                found[method] = [mean_over_groups([group]) for group in groups]
+        return cls(panel, looks_of(study.methods), found, exact)
+
+    def learned_lines(self, axes: Axes, floor: float = -math.inf) -> None:
+        """Lines with error bars, a little apart so that the bars can be told from each other."""
+        # 4 % of the smallest distance of two prices: error bars stand side by side, and still over their price.
+        step = min(np.diff(self.panel.costs), default=0.02) * 0.04
+        for place, (method, row) in enumerate(self.learned.items()):
+            x = np.asarray(self.panel.costs) + step * (place - (len(self.learned) - 1) / 2)
+            mean, low, high = _drawn(row, floor)
+            # `[2, prices]`, lengths below and above the mean; matplotlib refuses negative ones, which rounding would
+            # make.
+            bars = np.stack([np.maximum(mean - low, 0), np.maximum(high - mean, 0)])
+            axes.errorbar(x, mean, bars, capsize=2, elinewidth=0.9, label=method, **self.looks[method].of_line())
+
+    def table(self, kind: str, label: str, digits: int) -> Table:
+        """The numbers."""
+        rows: list[list[Cell]] = []
+        for place, cost in enumerate(self.panel.costs):
+            # Where a method has no run at a price it gets no row; n = 0 would be read as a result.
+            some = {method: row[place] for method, row in self.learned.items() if row[place].n}
+            rows += [[cost, method, *estimate_cells(found), found.n] for method, found in some.items()]
+            rows += [[cost, name, values[place], None, None, None] for name, values in self.exact.items()]
+        columns = [Column("c", 2), Column("policy or bound"), *estimate_columns(label, digits), Column("n")]
+        caption = f"{label} by price, {self.panel.title}: mean over seeds"
+        return Table(f"{kind}-{self.panel.name}", caption, columns, rows)
+
+    def spoken(self, digits: int) -> str:
+        """The values of every line, in words."""
+        lines = {method: [e.mean for e in row] for method, row in self.learned.items()} | dict(self.exact)
+        costs = ", ".join(f"{cost:g}" for cost in self.panel.costs)
+        said = [f"{name}: {', '.join(f'{v:.{digits}f}' for v in values)}" for name, values in lines.items()]
+        return f"At c = {costs}. {'; '.join(said)}."
+
+    def titled(self, what: str) -> str:
+        """The title: what it shows, where, and how many runs stand behind a point, as in `ppo n = 2–5`."""
+        counts = {method: sorted({e.n for e in row if e.n}) for method, row in self.learned.items()}
+        seeds = ", ".join(f"{m} n = {'–'.join(map(str, (c[0], c[-1])[: len(c)]))}" for m, c in counts.items())
+        return f"{what}, {self.panel.title}; seeds per point: {seeds}"
 
 
 def _exact(study: Study, panel: Panel, key: str) -> list[float]:
@@ -139,30 +189,11 @@ def _exact(study: Study, panel: Panel, key: str) -> list[float]:
     ]
 
 
-def _qmdp_regret(study: Study, world: str) -> float:
-    run = study.in_world(world)[0]
-    return study.regret(run, world, run.figure("qmdp_aihtr"))
-
-
-def _learned_lines(
-    axes: Axes,
-    panel: Panel,
-    learned: Mapping[str, Sequence[MeanInterval]],
-    looks: Mapping[str, Look],
-    floor: float = -math.inf,
-) -> None:
-    """Lines with error bars, a little apart so that the bars can be told from each other."""
-    # 4 % of the smallest distance of two prices: error bars stand side by side, and still over their price.
-    step = min(np.diff(panel.costs), default=0.02) * 0.04
-    for place, (method, row) in enumerate(learned.items()):
-        x = np.asarray(panel.costs) + step * (place - (len(learned) - 1) / 2)
-        mean = np.maximum([e.mean for e in row], floor)
-        # No interval (fewer than three seeds): a bar of length zero, which is only the point.
-        low = np.maximum([e.mean if e.low is None else e.low for e in row], floor)
-        high = np.maximum([e.mean if e.high is None else e.high for e in row], floor)
-        # `[2, prices]`, lengths below and above the mean; matplotlib refuses negative ones, which rounding would make.
-        bars = np.stack([np.maximum(mean - low, 0), np.maximum(high - mean, 0)])
-        axes.errorbar(x, mean, bars, capsize=2, elinewidth=0.9, label=method, **looks[method].of_line())
+def _drawn(row: Sequence[MeanInterval], floor: float) -> Array:
+    """`[3, K]` the means, the lower and the upper ends of some estimates, none below `floor`."""
+    # No interval (fewer than three seeds): a bar of length zero, which is only the point.
+    ends = [(e.mean, e.mean if e.low is None else e.low, e.mean if e.high is None else e.high) for e in row]
+    return np.maximum(ends, floor).T
 
 
 def axis_break(values: Sequence[float]) -> tuple[float, float, float, float] | None:
@@ -198,42 +229,6 @@ def _break(upper: Axes, lower: Axes, bottom: float, lower_end: float, upper_star
     lower.plot([0], [1], transform=lower.transAxes, **marks)  # type: ignore[arg-type]
 
 
-def _cost_table(
-    panel: Panel,
-    learned: Mapping[str, Sequence[MeanInterval]],
-    exact: Mapping[str, Sequence[float]],
-    kind: str,
-    label: str,
-    digits: int,
-) -> Table:
-    rows: list[list[Cell]] = []
-    for place, cost in enumerate(panel.costs):
-        # Where a method has no run at a price it gets no row; n = 0 would be read as a result.
-        rows += [
-            [cost, method, *estimate_cells(row[place]), row[place].n] for method, row in learned.items() if row[place].n
-        ]
-        rows += [[cost, name, values[place], None, None, None] for name, values in exact.items()]
-    columns = [Column("c", 2), Column("policy or bound"), *estimate_columns(label, digits), Column("n")]
-    return Table(f"{kind}-{panel.name}", f"{label} by price, {panel.title}: mean over seeds", columns, rows)
-
-
-def _spoken(
-    panel: Panel, learned: Mapping[str, Sequence[MeanInterval]], exact: Mapping[str, Sequence[float]], digits: int
-) -> str:
-    lines = {method: [e.mean for e in row] for method, row in learned.items()} | dict(exact)
-    costs = ", ".join(f"{cost:g}" for cost in panel.costs)
-    said = [f"{name}: {', '.join(f'{v:.{digits}f}' for v in values)}" for name, values in lines.items()]
-    return f"At c = {costs}. {'; '.join(said)}."
-
-
-def _n_text(learned: Mapping[str, Sequence[MeanInterval]]) -> str:
-    """`n = 5 seeds (ppo 2)`: how many runs stand behind a point."""
-    counts = {method: sorted({e.n for e in row if e.n}) for method, row in learned.items()}
-    return "seeds per point: " + ", ".join(
-        f"{m} n = {'–'.join(map(str, (c[0], c[-1])[: len(c)]))}" for m, c in counts.items()
-    )
-
-
 def slug(title: str) -> str:
     """A title as part of a file's name."""
     kept = "".join(character if character.isalnum() else "-" for character in title.lower())
@@ -253,12 +248,10 @@ def curves(study: Study, points: Mapping[str, Sequence[CurvePoint]], by: str) ->
         axes = figure.subplots()
         for method, (grid, row) in found.items():
             style = looks[method]
-            mean = np.maximum([e.mean for e in row], FLOOR)
+            mean, low, high = _drawn(row, FLOOR)
             # A marker at every sixth position, so that curves are told apart without colours as well.
             axes.plot(grid, mean, label=method, markevery=6, **style.of_line())
-            ends = [(e.mean if e.low is None else e.low, e.mean if e.high is None else e.high) for e in row]
-            # `.T` gives the two rows, lower and upper ends.
-            axes.fill_between(grid, *np.maximum(ends, FLOOR).T, color=style.colour, alpha=0.18, linewidth=0)
+            axes.fill_between(grid, low, high, color=style.colour, alpha=0.18, linewidth=0)
         # Both logarithmic: methods differ in steps and in regret by factors of ten and more.
         axes.set(xscale="log", yscale="log", xlabel=unit, ylabel="regret per step")
         tidy(axes)

@@ -24,6 +24,7 @@ MOST_TILES = 60
 LEVELS = 24
 """Shades of a colour scale."""
 ON, OFF, IDLE = "#0072b2", "#dcebf4", "#d55e01"
+_AFTER = ("just located (n = 0)", "after one miss (n = 1)")
 _SIDE = 0.92
 """Of a cell's square: the gap shows the grid without lines."""
 _AVERAGED = " Plans differ by what is remembered or told: filled areas are shares of the detections in a tile's cell."
@@ -59,7 +60,7 @@ def policy_map(name: str, where: str, policy: Sensed, motion: MotionTable, size:
         reach = max(_farthest(can | (on > 0), size[1]) for can, on in zip(possible, drawn, strict=True))
         for axes, n in zip(np.atleast_1d(figure.subplots(len(shown), 1)), shown, strict=True):
             _tiles(axes, drawn[n], possible[n], size, max(reach, 1))
-            axes.set_title("just located (n = 0)" if n == 0 else "after one miss (n = 1)")
+            axes.set_title(_AFTER[n])
 
     rows: list[list[Cell]] = [
         [x, n, (on := chains[n][x]).sum().item(), int(possible[n][x].sum()), _cells_text(on, size[1])]
@@ -72,15 +73,15 @@ def policy_map(name: str, where: str, policy: Sensed, motion: MotionTable, size:
     columns = [Column("located in cell"), Column("misses n"), sensed, Column("possible cells")]
     title = f"Sets sensed around each located cell, {where}"
     table = Table(f"sets-{name}", title, [*columns, Column("which (row.column)")], rows)
-    reached = [possible[n].any(axis=1) for n in shown]
-    mean = [float(chains[n][r].sum(axis=1).mean()) if r.any() else 0.0 for n, r in enumerate(reached)]
-    unsensed = [
-        float((possible[n] * (1.0 - chains[n]))[r].sum(axis=1).mean()) if r.any() else 0.0
-        for n, r in enumerate(reached)
-    ]
+
+    def average(counted: Array, n: int) -> float:
+        reached = possible[n].any(axis=1)
+        return float(counted[reached].sum(axis=1).mean()) if reached.any() else 0.0
+
     text = "Each tile is one located cell and its neighbourhood. " + " ".join(
-        f"At n = {n}: {on:.2f} cells sensed, {off:.2f} possible ones left out on average."
-        for n, on, off in zip(shown, mean, unsensed, strict=True)
+        f"At n = {n}: {average(chains[n], n):.2f} cells sensed, {average(possible[n] * (1.0 - chains[n]), n):.2f} "
+        "possible ones left out on average."
+        for n in shown
     )
     text += _AVERAGED if policy.averaged else ""
     return draw_figure(f"sets-{name}", title, text, table, 0.4 + 3.9 * len(shown), paint)
@@ -96,7 +97,7 @@ def _intensity_map(name: str, where: str, policy: Sensed, size: tuple[int, int])
         every = list(np.atleast_1d(figure.subplots(1, len(shown))))
         _shade(figure, every, list(means.values()), Scale("viridis", 0.0, _ends(list(means.values()))[1]))
         for axes, n in zip(every, shown, strict=True):
-            axes.set_title("just located (n = 0)" if n == 0 else "after one miss (n = 1)")
+            axes.set_title(_AFTER[n])
 
     title = f"Cells sensed, by where the target was located, {where}"
     return draw_figure(
