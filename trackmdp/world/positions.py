@@ -100,18 +100,11 @@ def table_of(
     kept = kept.sort_values(["track", "piece", "time"])
     once = ~kept.duplicated(["track", "piece", "time"])
     counts = {NO_POSITION: int((~good).sum()), REPEATED: int((~once).sum())}
-    kept = kept[once]
-    pieces = kept[["track", "piece"]].ne(kept[["track", "piece"]].shift()).any(axis=1).cumsum() - 1
-    return Positions(
-        track=kept["track"].to_numpy(np.int64),
-        piece=pieces.to_numpy(np.int64),
-        time=kept["time"].to_numpy(np.float64),
-        x=kept["x"].to_numpy(np.float64),
-        y=kept["y"].to_numpy(np.float64),
-        geographic=geographic,
-        downwards=downwards,
-        dropped={**(dropped or {}), **counts},
-    )
+    kept = kept[once].copy()
+    kept["piece"] = kept[["track", "piece"]].ne(kept[["track", "piece"]].shift()).any(axis=1).cumsum() - 1
+    kinds = dict.fromkeys(("track", "piece"), np.int64) | dict.fromkeys(("time", "x", "y"), np.float64)
+    columns = {name: kept[name].to_numpy(kind) for name, kind in kinds.items()}
+    return Positions(**columns, geographic=geographic, downwards=downwards, dropped={**(dropped or {}), **counts})
 
 
 def _number(column: Any) -> Any:

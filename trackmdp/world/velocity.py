@@ -23,33 +23,42 @@ _TAIL = 4.0
 """Standard deviations at which the noise ends, on either side: 6e-5 of a normal law, and its mean stays exact."""
 
 
-def constant_velocity(
-    size: Size, *, cell: float, step: float, speed: float, spacing: float, noise: float, exit_probability: float
-) -> tuple[sparse.csr_array, int]:
+def constant_velocity(size: Size, **motion: float) -> tuple[sparse.csr_array, int]:
     """Nearly constant velocity: v' = v + w.
 
     Args:
         size: of the grid.
-        cell: side of a cell, m.
-        step: time of a step, s.
-        speed: the greatest along rows and along columns, m/s; a faster target has that.
-        spacing: of the velocities that are told apart, along either, m/s.
-        noise: standard deviation of the acceleration along either, m/s², the same for the whole step.
-        exit_probability: of leaving the grid, from anywhere.
+        motion: `cell`, its side, m; `step`, its time, s; `speed`, the greatest along rows and along columns, m/s (a
+            faster target has that); `spacing` of the velocities that are told apart, along either, m/s; `noise`,
+            standard deviation of the acceleration along either, m/s², the same for the whole step; `exit_probability`
+            of leaving the grid, from anywhere.
 
     Returns:
         The kernel on (cell, velocity), and the number of velocities: (2 L + 1)², L = floor(speed / spacing).
     """
-    velocity = _velocities(speed, spacing)
-    switch = _changes(velocity, velocity, spacing, noise * step)
-    offsets, shares = steps_of(velocity * step / cell)
-    # Velocities are listed symmetrically about 0, so that the opposite of the k-th is the k-th from the end.
-    opposite = np.arange(len(velocity))[::-1]
-    return turning_back(size, switch, offsets, shares, opposite, exit_probability), len(velocity)
+    return _turning(size, np.zeros(1), np.ones((1, 1)), **motion)
 
 
-def coordinated_turn(
+def coordinated_turn(size: Size, *, turn_rate: float, stay: float, **motion: float) -> tuple[sparse.csr_array, int]:
+    """A turn by ω in {-ω0, 0, ω0} in each step: v' = R(ω) v + w.
+
+    Args:
+        size: of the grid.
+        turn_rate: ω0 in degrees/s.
+        stay: probability that ω is what it was; else each of the other two is as likely.
+        motion: see `constant_velocity`.
+
+    Returns:
+        The kernel on (cell, mode), mode = 3 · velocity + turn, and the number of modes.
+    """
+    change = np.where(np.eye(3) > 0, stay, (1.0 - stay) / 2)
+    return _turning(size, turn_rate * np.array([-1.0, 0.0, 1.0]), change, **motion)
+
+
+def _turning(
     size: Size,
+    rates: Array,
+    change: Array,
     *,
     cell: float,
     step: float,
@@ -57,39 +66,21 @@ def coordinated_turn(
     spacing: float,
     noise: float,
     exit_probability: float,
-    turn_rate: float,
-    stay: float,
 ) -> tuple[sparse.csr_array, int]:
-    """A turn by ω in {-ω0, 0, ω0} in each step: v' = R(ω) v + w.
-
-    Args:
-        size: of the grid.
-        cell: see `constant_velocity`, as for the following.
-        step: s.
-        speed: m/s.
-        spacing: m/s.
-        noise: m/s².
-        exit_probability: from anywhere.
-        turn_rate: ω0 in degrees/s.
-        stay: probability that ω is what it was; else each of the other two is as likely.
-
-    Returns:
-        The kernel on (cell, mode), mode = 3 · velocity + turn, and the number of modes.
-    """
-    velocity, angle = _velocities(speed, spacing), math.radians(turn_rate * step)
-    switch = np.zeros((len(velocity), 3, len(velocity), 3))
-    for turn, sign in enumerate((-1, 0, 1)):
-        sine, cosine = math.sin(sign * angle), math.cos(angle if sign else 0.0)
+    """The kernel of turns at `rates` `[T]`, degrees/s, with the probability `change` `[T, T]` of each next one."""
+    velocity, turns = _velocities(speed, spacing), len(rates)
+    switch = np.zeros((len(velocity), turns, len(velocity), turns))
+    for turn, rate in enumerate(rates.tolist()):
+        sine, cosine = math.sin(math.radians(rate * step)), math.cos(math.radians(rate * step))
         turned = velocity @ np.array([[cosine, sine], [-sine, cosine]])
         # The new turn first, from whichever it was, then the velocity that it leads to.
-        chance = np.where(np.arange(3) == turn, stay, (1.0 - stay) / 2)
-        switch[..., turn] = chance[:, None] * _changes(turned, velocity, spacing, noise * step)[:, None]
-    modes = 3 * len(velocity)
-    offsets, shares = steps_of(velocity.repeat(3, axis=0) * step / cell)
-    # Turning back keeps the turn.
-    opposite = (np.arange(len(velocity))[::-1, None] * 3 + np.arange(3)).ravel()
-    table = switch.reshape(modes, modes)
-    return turning_back(size, table, offsets, shares, opposite, exit_probability), modes
+        switch[..., turn] = change[:, turn, None] * _changes(turned, velocity, spacing, noise * step)[:, None]
+    modes = turns * len(velocity)
+    offsets, shares = steps_of(velocity.repeat(turns, axis=0) * step / cell)
+    # Velocities are listed symmetrically about 0, so that the opposite of the k-th is the k-th from the end. Turning
+    # back keeps the turn.
+    opposite = (np.arange(len(velocity))[::-1, None] * turns + np.arange(turns)).ravel()
+    return turning_back(size, switch.reshape(modes, modes), offsets, shares, opposite, exit_probability), modes
 
 
 def dithered(mean: Array, deviation: float, reach: int) -> Array:
