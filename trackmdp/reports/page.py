@@ -6,7 +6,7 @@ import html
 import math
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from typing import Any, TypeAlias
 
@@ -23,19 +23,7 @@ MAPPED = 2
 """Methods and worlds whose policies are drawn on the page."""
 
 
-@dataclass(frozen=True)
-class Folded:
-    """A table that shows when its summary is pressed."""
-
-    summary: str
-    table: Table
-
-    def html(self) -> str:
-        """The table as part of the page."""
-        return f"<details><summary>{html.escape(self.summary)}</summary>{self.table.html()}</details>"
-
-
-Part: TypeAlias = "str | Table | Folded | Sequence[Figure]"
+Part: TypeAlias = "str | Table | Sequence[Figure]"
 
 
 @dataclass(frozen=True)
@@ -72,17 +60,13 @@ class Report:
     def figures(self) -> list[Figure]:
         """Every figure, in the order of the page."""
         parts = [part for section in self.sections for part in section.parts]
-        return [figure for part in parts if not isinstance(part, (str, Table, Folded)) for figure in part]
+        return [figure for part in parts if not isinstance(part, (str, Table)) for figure in part]
 
     @property
     def tables(self) -> list[Table]:
         """Every table but those of the figures, in the order of the page."""
-        found: list[Table] = []
-        for section in self.sections:
-            shown = [part.table if isinstance(part, Folded) else part for part in section.parts]
-            found += [part for part in shown if isinstance(part, Table)]
-            found += section.files
-        return found
+        parts = [part for section in self.sections for part in (*section.parts, *section.files)]
+        return [part for part in parts if isinstance(part, Table)]
 
     def html(self) -> str:
         """The page."""
@@ -123,8 +107,8 @@ def build(
     sections += [missing] if results.anomalies else []
     sections += _idea(results, grouped)
     sections += [*_against_cost(grouped, threshold), *_learning(results, grouped, threshold), *_maps(results, grouped)]
-    by_group = Folded("By world and method", summaries.groups_table(grouped, threshold))
-    runs = Section("runs", "All runs", [by_group, Folded("Every run", summaries.runs_table(grouped))])
+    by_group = replace(summaries.groups_table(grouped, threshold), folded="By world and method")
+    runs = Section("runs", "All runs", [by_group, replace(summaries.runs_table(grouped), folded="Every run")])
     made = Section("made", "How it was made", [_made(results.manifest)])
     return Report(_about(results), [*sections, *extra, runs, made])
 
@@ -132,7 +116,7 @@ def build(
 def _part(part: Part) -> str:
     if isinstance(part, str):
         return part
-    if isinstance(part, (Table, Folded)):
+    if isinstance(part, Table):
         return part.html()
     # Three in a row where that leaves no row with one alone.
     kind = "figures" if len(part) % 3 == 0 else "figures two"

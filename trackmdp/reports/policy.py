@@ -117,10 +117,9 @@ def read(file: Path, visits: Callable[[PolicyTable], Array]) -> Sensed:
     task = table.task
     # One probability for all sensors is written out: all of them on, on a grid small enough, or none.
     shape = (task.num_keys * task.num_choices, task.total_sensors)
-    none = sparse.csr_array(shape, dtype=bool)
-    written = none if table.probability == 0.0 else None
-    sets = table.sets if table.sets is not None else written
-    sets = sparse.csr_array(table.dense().reshape(shape)) if sets is None else sets
+    sets = table.sets
+    if sets is None:
+        sets = sparse.csr_array(table.dense().reshape(shape) if table.probability else shape, dtype=bool)
     sets = sets if task.coverage is None else task.coverage.seen(sets)
     return Sensed(_averaged(table, sets, visits(table)) if task.keyed else sets, value)
 

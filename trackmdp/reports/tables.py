@@ -64,12 +64,16 @@ class Column:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows under columns; `name` is that of its files, `caption` says what it shows, with n."""
+    """Rows under columns; `name` is that of its files, `caption` says what it shows, with n.
+
+    On a page one with a text in `folded` shows when that is pressed.
+    """
 
     name: str
     caption: str
     columns: Sequence[Column]
     rows: Sequence[Sequence[Cell]]
+    folded: str = ""
 
     def csv(self) -> str:
         """All digits; an empty field where there is nothing."""
@@ -94,11 +98,12 @@ class Table:
         )
         rows = "\n".join(f"<tr>{self._cells(row)}</tr>" for row in self.rows)
         caption = html.escape(self.caption)
-        return (
+        shown = (
             # A wide table scrolls within its own box; `tabindex` lets the keyboard scroll it too.
             f'<div class="scroll" tabindex="0" role="region" aria-label="{caption}"><table class="sortable">'
             f"<caption>{caption}</caption><thead><tr>{heads}</tr></thead>\n<tbody>{rows}</tbody></table></div>"
         )
+        return f"<details><summary>{html.escape(self.folded)}</summary>{shown}</details>" if self.folded else shown
 
     def _cells(self, row: Sequence[Cell]) -> str:
         cells = []
