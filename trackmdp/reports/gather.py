@@ -15,7 +15,7 @@ import numpy as np
 from omegaconf import OmegaConf
 from scipy import sparse
 
-from trackmdp.config import GROUPS, TableConfig, WorldConfig, world_of
+from trackmdp.config import TableConfig, WorldConfig, world_of
 from trackmdp.config.registry import make
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
@@ -189,8 +189,7 @@ def _policies(folder: Path, grouped: Study) -> tuple[dict[str, policy.Sensed], l
                 # Against the summary's digest: a policy copied from another run would be drawn under this one's name.
                 check_files(folder / run.name, read_summary(folder / run.name), policy.POLICY_FILE)
                 place = folder / run.name
-                visits = partial(_visits, place, hides=_hides(run))
-                found[run.name] = policy.read(place / policy.POLICY_FILE, visits)
+                found[run.name] = policy.read(place / policy.POLICY_FILE, partial(_visits, place))
                 break
             except UserError as error:
                 anomalies.append(Anomaly(run.name, str(error).removeprefix(f"{folder / run.name}/")))
@@ -210,34 +209,27 @@ def _motions(folder: Path, runs: Iterable[FinishedRun]) -> tuple[dict[str, Motio
             continue  # no motion is known there
         try:
             check_files(folder / run.name, read_summary(folder / run.name), "kernel.npz")
-            found[run.name] = _motion(_world_config(folder / run.name), hides=_hides(run))
+            found[run.name] = _motion(_world_config(folder / run.name))
         except UserError as error:
             anomalies.append(Anomaly(run.name, f"its world cannot be built ({error})"))
     return found, anomalies
 
 
-def _hides(run: FinishedRun) -> bool:
-    """Whether its target has a mode: its kernel is then on (cell, mode)."""
-    schema = GROUPS["kernel"].get(str(run.settings["kernel.name"]))
-    return schema is not None and schema.hides
-
-
-def _modelled(cfg: WorldConfig, *, hides: bool) -> Modelled:
-    """The world of a run."""
-    if not hides:
-        return build_world(cfg)
+def _modelled(cfg: WorldConfig) -> Modelled:
+    """The world of a run, whose target has a mode where its stored kernel is on (cell, mode)."""
     kernel = canonical_kernel(make(cfg.kernel, cfg.grid.size))
-    return HiddenWorld(kernel, cfg.grid.size, modes=kernel.shape[0] // cfg.grid.num_cells, **of_task(cfg))
+    modes = kernel.shape[0] // cfg.grid.num_cells
+    return HiddenWorld(kernel, cfg.grid.size, modes=modes, **of_task(cfg)) if modes > 1 else build_world(cfg)
 
 
-def _visits(place: Path, table: PolicyTable, *, hides: bool) -> Array:
+def _visits(place: Path, table: PolicyTable) -> Array:
     """`[keys]`, see `policy.read`."""
-    return visits_of_keys(_modelled(_world_config(place), hides=hides), table)
+    return visits_of_keys(_modelled(_world_config(place)), table)
 
 
-def _motion(cfg: WorldConfig, *, hides: bool) -> MotionTable:
+def _motion(cfg: WorldConfig) -> MotionTable:
     """What maps show besides the policy; the motion only where it is drawn, cell by cell."""
-    problem = _modelled(cfg, hides=hides)
+    problem = _modelled(cfg)
     if isinstance(problem, HiddenWorld):
         world, bound = averaged(problem), cell_bound(problem)
     else:
