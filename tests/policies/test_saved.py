@@ -153,7 +153,7 @@ def test_sets_are_read_back_from_a_list_and_from_an_array_file(
     assert named["value"] == (value.tolist() if listed > 9 else "sets.npz")
     found = saved.read_sets(world, tmp_path / saved.sets_name(world))
     assert np.array_equal(found.dense(), policy.dense())
-    with pytest.raises(UserError, match="; expected (4, 1|2 x 2)"):
+    with pytest.raises(UserError, match=r"; expected (4, 1|2 x 2)"):
         saved.read_sets(small_world(2, t_max=1), tmp_path / saved.sets_name(world))
 
 
