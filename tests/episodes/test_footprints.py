@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,7 @@ import pytest
 from tests.helpers import small_world
 from trackmdp.app.cli import main
 from trackmdp.episodes.log import EpisodeLog
+from trackmdp.episodes.page import page
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.episodes.recover import recover
 from trackmdp.episodes.simulate import simulate
@@ -61,6 +64,17 @@ def test_a_log_is_simulated_again_to_the_bit_and_recovered(tmp_path: Path) -> No
     with EpisodeReader(recover(cut).file) as reader:
         assert verify(reader).difference is None
         assert np.array_equal(reader.read(0).action, whole[0].action)
+
+
+def test_a_page_counts_sensors_and_frames_what_they_see(tmp_path: Path) -> None:
+    """Sensor 0 of `_world` sees the corner and the two cells beside it."""
+    chains = np.zeros((9, 2, 4), dtype=bool)
+    chains[..., 0] = True
+    with EpisodeReader(_log(tmp_path, Policy.from_dense(_world(), chains))) as reader:
+        content = re.search(r'type="application/json">(.*?)</script>', page(reader, reader.read(0)))
+    assert content is not None
+    said = json.loads(content[1])
+    assert (said["on"][0], said["sensed"][0], said["frame"]) == (1, [0, 1, 3], "cell sensed")
 
 
 def test_beliefs_leave_out_what_was_covered(tmp_path: Path) -> None:

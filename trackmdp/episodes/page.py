@@ -74,7 +74,9 @@ def _content(reader: EpisodeReader, episode: Episode) -> dict[str, Any]:
         "n": episode.misses[shown].tolist(),
         "reward": episode.reward[shown].tolist(),
         "total": episode.returns[shown].tolist(),
-        "active": [row.nonzero()[0].tolist() for row in world.covered(episode.action[shown])],
+        "on": episode.action[shown].sum(axis=1).tolist(),
+        "sensed": [row.nonzero()[0].tolist() for row in world.covered(episode.action[shown])],
+        "frame": "sensor on" if world.coverage is None else "cell sensed",
         "belief": [_sparse(row) for row in episode.belief[shown]],
     }
 
