@@ -52,7 +52,18 @@ def test_worlds_that_differ_in_price_make_a_panel(panel: Panel) -> None:
     ],
 )
 def test_an_axis_breaks_where_one_gap_takes_more_than_half_of_it(values: list[float], split: object) -> None:
-    assert figures.axis_break(values) == split
+    assert figures.axis_break([values]) == split
+
+
+def test_an_axis_does_not_break_between_two_prices() -> None:
+    assert figures.axis_break([[150.0, 148.0], [136.0, 134.0]]) is None
+    assert figures.axis_break([[150.0, 148.0], [146.0, -134.0]]) == (-134.0, -134.0, 146.0, 150.0)
+
+
+def test_what_was_judged_once_has_no_curve(grouped: Study, results: Results) -> None:
+    assert figures.curves(grouped, results.curves, "frames") is not None
+    ends = {name: points[-1:] for name, points in results.curves.items()}
+    assert figures.curves(grouped, ends, "frames") is None
 
 
 def test_the_numbers_of_a_figure_are_those_of_the_runs(grouped: Study, panel: Panel) -> None:

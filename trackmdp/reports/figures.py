@@ -63,10 +63,10 @@ def against_cost(study: Study, panel: Panel) -> Figure:
     # A bound that no run has, as where no optimum was solved for, gets no empty entry in the legend.
     exact = {label: values for label, values in exact.items() if not all(map(math.isnan, values))}
     drawn = _Against.of(study, panel, exact, regret=False)
-    learned = [e.mean for row in drawn.learned.values() for e in row]
+    learned = [[e.mean for e in row] for row in drawn.learned.values()]
     # Q_MDP falls far below 0 where only the safe action senses (Z = 5, c = 0.22); on one axis the learned policies
     # would become one line.
-    split = axis_break(learned + [v for row in exact.values() for v in row])
+    split = axis_break(list(zip(*learned, *exact.values(), strict=True)))
 
     def paint(figure: Canvas) -> None:
         # The upper part, where the methods differ, gets four fifths of the height.
@@ -196,19 +196,23 @@ def _drawn(row: Sequence[MeanInterval], floor: float) -> Array:
     return np.maximum(ends, floor).T
 
 
-def axis_break(values: Sequence[float]) -> tuple[float, float, float, float] | None:
+def axis_break(prices: Sequence[Sequence[float]]) -> tuple[float, float, float, float] | None:
     """Where to break the axis: (lowest, end of the lower part, start of the upper one, highest), None if nowhere.
 
-    It breaks where the widest gap between neighbouring values takes more than half of the axis.
+    It breaks where the widest gap between neighbouring values takes more than half of the axis, unless all values of
+    one of the `prices` lie below: then every line would be cut.
     """
     # nan, where a method was not run at a price, is no value to make room for.
-    ordered = np.sort([value for value in values if math.isfinite(value)])
+    known = [[value for value in values if math.isfinite(value)] for values in prices]
+    ordered = np.sort([value for values in known for value in values])
     if len(ordered) < 3:
         return None
     gaps = np.diff(ordered)
     widest = int(gaps.argmax())
     # Breaking an axis hides proportions; it is done only where one gap would take more room than all the values.
     if gaps[widest] <= 0.5 * (ordered[-1] - ordered[0]):
+        return None
+    if any(max(values) < ordered[widest + 1] for values in known if values):
         return None
     return float(ordered[0]), float(ordered[widest]), float(ordered[widest + 1]), float(ordered[-1])
 
@@ -286,8 +290,10 @@ def _averaged(
         return None
     # From the latest of all first points: before it some runs have no value, and the mean would be over others.
     start, end = (float(max(curve[place, 0] for curve in everything)) for place in (0, -1))
-    # 40 positions, evenly spaced on the logarithmic axis; `1.001` keeps a curve of one point from an empty range.
-    grid = np.geomspace(max(start, 1e-2), max(end, start * 1.001), 40)
+    if end <= (start := max(start, 1e-2)):
+        return None  # judged once, as what learns from one batch is: a point is no curve
+    # 40 positions, evenly spaced on the logarithmic axis
+    grid = np.geomspace(start, end, 40)
     # `[world][run]` -> `[G]`; a run that has ended keeps its last value, as its policy does not change any more.
     values = [[np.array([value_at(curve, x) for x in grid]) for curve in group] for group in known]
     return grid, [mean_over_groups([[v[i] for v in g] for g in values]) for i in range(len(grid))]

@@ -61,9 +61,7 @@ def recorded_page(
     chosen = {name: max(each, key=lambda one: len(np.unique(one.target[:_STEPS]))) for name, each in episodes.items()}
     part = _part(problem, chosen.values())
     strips = [f"<h3>{html.escape(names[name])}</h3>{_strip(problem, each, part)}" for name, each in chosen.items()]
-    note = (
-        "<p>Blue: sensor on. Disc: target located; ring: missed; line: where it came from. Of 16 tracks drawn by the "
-    )
+    note = "<p>Blue: sensed. Disc: target located; ring: missed; line: where it came from. Of 16 tracks drawn by the "
     note += f"seed, the one through the most cells in {_STEPS} steps.</p>"
     sections = [
         Section("earns", "What it earns", [_table(names, report)]),

@@ -86,11 +86,11 @@ def idea_figure(policy: Sensed, motion: MotionTable, size: tuple[int, int], wher
         for scene in story
         for cell in np.flatnonzero((scene.belief > 0) | scene.on).tolist()
     ]
-    columns = [Column("moment"), Column("row"), Column("column"), Column("probability", 3), Column("sensor on")]
+    columns = [Column("moment"), Column("row"), Column("column"), Column("probability", 3), Column("sensed")]
     title = f"The idea in one figure, {where}"
     text = (
-        "Shade: how likely the target is there. Frame: sensor on. Disc: target detected. Ring: target missed, where no "
-        "sensor is on; what was sensed in vain is then ruled out, and the next sensors look where the rest may be."
+        "Shade: how likely the target is there. Frame: sensed. Disc: target detected. Ring: target missed, where "
+        "nothing is sensed; what was sensed in vain is then ruled out, and the next sensors look where the rest may be."
     )
     return draw_figure("story", f"{title}. {text}", text, Table("story", title, columns, rows), 4.6, paint)
 

@@ -184,8 +184,8 @@ def _maps(results: Results, grouped: Study) -> list[Section]:
         return []
     scales = maps.value_scales((policy, motion) for _, _, policy, motion, _ in found)
     note = (
-        "<p>Dot: where the target was located. Filled: sensor on. Pale: possible cell left out. Dot alone: no miss can "
-        "happen there. Contrasting: sensor on where the target cannot be. The run is the one in the middle of its "
+        "<p>Dot: where the target was located. Filled: sensed. Pale: possible cell left out. Dot alone: no miss can "
+        "happen there. Contrasting: sensed where the target cannot be. The run is the one in the middle of its "
         "seeds.</p>"
     )
     large = any(len(policy.value) > maps.MOST_MAP_CELLS for _, _, policy, _, _ in found)
