@@ -17,9 +17,9 @@ import stat
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from io import BufferedWriter
+from io import BufferedRandom
 from pathlib import Path
-from typing import IO, Any, BinaryIO
+from typing import IO, Any
 
 from trackmdp.errors import UserError
 from trackmdp.untrusted import printable, sealed
@@ -32,7 +32,7 @@ _said: set[str] = set()
 
 
 @contextmanager
-def whole_file(file: Path) -> Iterator[BinaryIO]:
+def whole_file(file: Path) -> Iterator[BufferedRandom]:
     """Write to `file`, which appears under its name only once its bytes are on the disk; a failure leaves no trace.
 
     Where `file` is a symbolic link, the link is replaced, and what it leads to stays as it is.
@@ -52,12 +52,12 @@ def whole_file(file: Path) -> Iterator[BinaryIO]:
         raise
 
 
-def create(file: Path) -> BufferedWriter:
-    """A new file, open for writing; whatever had its name, a link included, is removed first, not followed."""
+def create(file: Path) -> BufferedRandom:
+    """A new file, open for writing and reading; whatever had its name, a link included, is removed, not followed."""
     file.unlink(missing_ok=True)
     # O_EXCL: if somebody puts a link under this name after the unlink, the call fails instead of writing where it
     # leads.
-    return os.fdopen(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666), "wb")
+    return os.fdopen(os.open(file, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666), "w+b")
 
 
 def reopen(file: Path, mode: str) -> int:

@@ -19,6 +19,7 @@ from typing import Any
 import pytest
 import torch
 
+from trackmdp import durable
 from trackmdp.errors import UserError
 from trackmdp.training import checkpoint
 
@@ -161,15 +162,16 @@ def test_a_full_disk_leaves_the_older_checkpoints_whole(tmp_path: Path, room: in
     assert checkpoint.load(tmp_path / checkpoint.LAST)["counter"] == 2
 
 
-def test_the_reason_of_a_failed_write_is_not_lost_in_torch() -> None:
-    class Full(io.BytesIO):
+def test_the_reason_of_a_failed_write_is_not_lost_in_torch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Full(io.BufferedRandom):
         def write(self, piece: Any) -> int:
             if self.tell() > 500:
                 raise OSError(28, "No space left on device")
             return super().write(piece)
 
+    monkeypatch.setattr(durable, "create", lambda file: Full(io.FileIO(file, "x+")))
     with pytest.raises(OSError, match="No space left"):
-        checkpoint._Hashed(Full()).save(state())
+        checkpoint.save(tmp_path, 1, state(), keep=1)
 
 
 @pytest.mark.parametrize("call", ["fsync", "link"])

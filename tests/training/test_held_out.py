@@ -20,7 +20,7 @@ from tests.tracks import by_hand, drawn, recorded, write
 from tests.training.runs import rows as metrics
 from tests.training.runs import tensors
 from tests.training.runs import train as train_run
-from trackmdp.app.sweep.table import run_scores
+from trackmdp.app.sweep.sweep import run_scores
 from trackmdp.policies.policy import Policy
 from trackmdp.solvers import qmdp
 from trackmdp.training import checkpoint

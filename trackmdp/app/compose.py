@@ -15,9 +15,8 @@ from hydra.core.plugins import Plugins
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from trackmdp.app.diagnose import diagnose
 from trackmdp.app.sources import searched
-from trackmdp.app.words import parsed
+from trackmdp.app.words import diagnose, parsed
 from trackmdp.config import GROUPS, ROOTS, conf_dir
 from trackmdp.config.registry import load_plugins, register_resolvers
 from trackmdp.config.sweeping import PLUGINS

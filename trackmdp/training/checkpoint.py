@@ -14,7 +14,7 @@ import sys
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import IO, Any, BinaryIO, cast
+from typing import Any, BinaryIO
 
 import torch
 
@@ -41,13 +41,16 @@ def save(folder: Path, iteration: int, state: dict[str, Any], *, keep: int, best
     # Three steps, and the process may be killed between any two: the new file (whole or absent), the names last.pt and
     # best.pt (put right by the run that resumes), the removal of old files (done by the next saving).
     with whole_file(file) as stream:
-        hashed = _Hashed(stream)
-        hashed.save({"format": CHECKPOINT_FORMAT, "iteration": iteration, **state})
-        # Behind the archive, where the hash of all before it is known without going back. Zip readers look for their
-        # directory backwards from the end of the file, and 128 bytes more do not hide it.
-        stream.write(_seal(hashed.digest.hexdigest()))
+        try:
+            torch.save({"format": CHECKPOINT_FORMAT, "iteration": iteration, **state}, stream)
+        except RuntimeError as error:  # what torch says when a write failed, whatever the reason
+            raise (error.__context__ if isinstance(error.__context__, OSError) else error) from None
+        stream.seek(0)
+        digest = hashlib.file_digest(stream, "sha256").hexdigest()
+        # Zip readers look for their directory backwards from the end of the file, and 128 bytes more do not hide it.
+        stream.write(_seal(digest))
     point(file, best=best)
-    for old in _numbered(folder)[:-keep]:
+    for old in available_checkpoints(folder)[keep:]:
         # best.pt may be another name of this file: the bytes then stay, under that name.
         old.unlink()
     return file
@@ -69,8 +72,13 @@ def point(file: Path, *, best: bool) -> None:
 
 
 def available_checkpoints(folder: Path) -> list[Path]:
-    """The checkpoints in a run's folder of checkpoints, the newest first."""
-    return _numbered(folder)[::-1]
+    """The checkpoints in a run's folder of checkpoints, the newest first.
+
+    What is no ordinary file is somebody else's, not to be read or removed.
+    """
+    found = [file for file in folder.glob("iteration-*.pt") if _NAME.fullmatch(file.name)]
+    # By name, which is by number, since the names have eight digits each. lstat: a link is not followed.
+    return sorted((file for file in found if stat.S_ISREG(file.lstat().st_mode)), reverse=True)
 
 
 def newest(run: Path) -> Path:
@@ -138,32 +146,6 @@ def _stored(tensors: Iterable[torch.Tensor]) -> int:
     return sum(sizes.values())
 
 
-class _Hashed:
-    """A file that is only written to, front to back, and hashed on the way."""
-
-    def __init__(self, stream: BinaryIO) -> None:
-        self._stream, self.digest = stream, hashlib.sha256()
-        self._failure: OSError | None = None
-
-    def save(self, state: dict[str, Any]) -> None:
-        try:
-            torch.save(state, cast("IO[bytes]", self))
-        except RuntimeError as error:  # what torch says when a write failed, whatever the reason
-            cause = error.__context__ if isinstance(error.__context__, OSError) else error
-            raise self._failure or cause from None
-
-    def write(self, piece: bytes) -> int:
-        self.digest.update(piece)
-        try:
-            return self._stream.write(piece)
-        except OSError as error:
-            self._failure = error
-            raise
-
-    def flush(self) -> None:
-        self._stream.flush()
-
-
 def _seal(digest: str) -> bytes:
     return f"\ntrackmdp checkpoint {CHECKPOINT_FORMAT} sha256 {digest}".encode().ljust(_SEAL - 1) + b"\n"
 
@@ -209,10 +191,3 @@ def _check_archive(stream: BinaryIO, size: int) -> int:
     # The archive's members: NAME/data.pkl (the structure), NAME/data/0, NAME/data/1, ... (one for each storage), and a
     # few bytes of version and byte order.
     return sum(member.file_size for member in members if re.search(r"/data/[0-9]+$", member.filename))
-
-
-def _numbered(folder: Path) -> list[Path]:
-    """The checkpoints, the oldest first; what is no ordinary file is somebody else's, not to be read or removed."""
-    found = [file for file in folder.glob("iteration-*.pt") if _NAME.fullmatch(file.name)]
-    # By name, which is by number, since the names have eight digits each. lstat: a link is not followed.
-    return sorted(file for file in found if stat.S_ISREG(file.lstat().st_mode))

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import csv
+import platform
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from trackmdp import __version__
 from trackmdp.arrays import LARGE
+from trackmdp.config.tree import config_digest
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import load_policy
@@ -19,12 +23,14 @@ from trackmdp.solvers import optimal
 from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.solution import Solution
 from trackmdp.training.callbacks import Callback, Learning, Row, Training
+from trackmdp.training.evaluator import Score, figures, while_collecting
 from trackmdp.training.folders import SUMMARY, check_files, read_summary, write_summary
-from trackmdp.training.summary import summarize
+from trackmdp.training.machine import machine
 from trackmdp.untrusted import decoded, read_text
 from trackmdp.world.model import Array, World
 from trackmdp.world.tracks import Recorded
 
+_PACKAGES = ("torch", "torchrl", "tensordict", "hydra-core", "numpy", "scipy")
 Metrics = dict[str, list[float | int | None]]
 """Columns by their names, as in `metrics.csv`: one value for each logged iteration, None for what was not measured."""
 
@@ -155,3 +161,41 @@ def _cell(text: str) -> float | int | None:
         return None
     # A float is logged with a point or an exponent (2.0, 1e-05), so that digits alone are an int.
     return int(text) if text.lstrip("-").isdigit() else float(text)
+
+
+def summarize(
+    trainer: Learning, final: Evaluation, score: Score, solution: Solution | None, times: dict[str, float]
+) -> dict[str, Any]:
+    """The figures of a run that has ended; on recorded tracks there are no bounds, no Q_MDP and no regret.
+
+    Args:
+        trainer: of the run.
+        final: figures of the last policy.
+        score: of the last policy, its regret to the best bound known by now; on recorded tracks it is of others than
+            `final`, and stands under `validation`.
+        solution: the optimum or a bracket of it, where it was solved for.
+        times: seconds spent, by their names in the summary.
+    """
+    config, evaluator, end = trainer.config, trainer.evaluator, trainer.position
+    return {
+        "algo": config.algo.name,
+        "credit": config.algo.credit,
+        "seed": config.seed,
+        "frames": end.frames,
+        **times,
+        "policy": figures(final),
+        "validation": None if final is score.evaluation else figures(score.evaluation),
+        "qmdp": figures(evaluator.qmdp) if evaluator.qmdp else None,
+        "bounds": evaluator.bounds,
+        "optimal": {key: getattr(solution, key) for key in ("lower", "upper", "certified", "timed_out")}
+        if solution
+        else None,
+        "regret_per_step": score.regret_per_step,
+        "regret_per_step_lower": score.regret_per_step_lower,
+        "while_collecting": while_collecting(evaluator.upper, final, end.reward, end.frames),
+        "held_out": evaluator.report(trainer.policy()),
+        "versions": {"trackmdp": __version__, "python": platform.python_version()}
+        | {name: version(name) for name in _PACKAGES},
+        "machine": machine(),
+        "config_sha256": config_digest(config, trainer.folder),
+    }

@@ -20,8 +20,7 @@ from tests.typed import stub
 from trackmdp.app.cli import main
 from trackmdp.app.sweep.plan import Job
 from trackmdp.app.sweep.process import stop_signal
-from trackmdp.app.sweep.sweep import sweep
-from trackmdp.app.sweep.table import write_table
+from trackmdp.app.sweep.sweep import sweep, write_table
 from trackmdp.durable import write_sealed
 from trackmdp.errors import Preempted, RunError
 from trackmdp.training.folders import RunState, read_plan, run_of, runs_of

@@ -11,7 +11,7 @@ from typing import Any
 from hydra.core.override_parser.types import IntervalSweep, Override, RangeSweep
 
 from trackmdp.app.sweep.plan import Job, MakeJobs
-from trackmdp.app.sweep.table import run_scores
+from trackmdp.app.sweep.sweep import run_scores
 from trackmdp.app.words import parsed
 from trackmdp.config.sweeping import OptunaConfig
 from trackmdp.errors import UserError
