@@ -68,8 +68,8 @@ class Prepared:
         command: what is run.
         cfg: its config.
         folder: where it writes.
-        problem: the world or the tracks of `cfg`, where checking has built them; else the command builds them, after
-            its first line is on the terminal.
+        problem: the world or the tracks of `cfg`, where checking has built them; else `run` builds them, when the
+            command's first line is on the terminal.
     """
 
     command: str
@@ -84,7 +84,9 @@ class Prepared:
         with importing():
             run: Callable[..., Any] = importlib.import_module(f"trackmdp.app.commands.{self.command}").run
         if isinstance(self.cfg, WorldConfig):
-            return run(self.cfg, self.folder, self.problem)
+            from trackmdp.world.make import make_problem
+
+            return run(self.cfg, self.folder, self.problem or make_problem(self.cfg))
         return run(self.cfg, self.folder)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import re
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import pytest
 from tests.config.cases import composed
 from tests.helpers import BASELINES
 from tests.reads import record_reads, unread
+from trackmdp.app.prepare import Prepared
 from trackmdp.config import GROUPS, PerSensorConfig, conf_dir
 
 SHORT = "quiet=true grid.size=3 collector.total_frames=2048 collector.frames_per_batch=1024 collector.envs=64"
@@ -29,9 +29,8 @@ MIXED = " algo.updates=2 algo.collect=mixed collector.frames_per_batch=512 algo.
 
 def never_read(command: str, words: str, folder: Path) -> set[str]:
     cfg = composed(command, *words.split())
-    run = importlib.import_module(f"trackmdp.app.commands.{command}").run
     with record_reads(cfg) as reads:
-        run(cfg, folder)
+        Prepared(command, cfg, folder).run()
     return unread(cfg, reads | {source for key, source in DEFAULTS.items() if key in reads})
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import dataclasses
 import errno
-import importlib
 import json
 import os
 import pty
@@ -22,6 +21,7 @@ from tests.config.cases import composed
 from tests.reads import record_reads, unread
 from trackmdp.app.cli import main
 from trackmdp.app.commands.playback import reissued
+from trackmdp.app.prepare import Prepared
 from trackmdp.config import world_of
 from trackmdp.episodes import schema
 from trackmdp.episodes.episode import Episode, first_difference
@@ -132,17 +132,17 @@ def test_every_option_is_read(log: Path, tmp_path: Path) -> None:
     words = ("quiet=true", "log=[mcap]", "evaluation.every=2", "log.mcap.evaluations=1", *TRAIN)
     cfg = composed("train", *words)
     with record_reads(cfg) as reads:
-        importlib.import_module("trackmdp.app.commands.train").run(cfg, tmp_path)
+        Prepared("train", cfg, tmp_path).run()
     assert {key for key in unread(cfg, reads) if key.startswith("log")} == set()
     cfg = composed("replay", f"file={log}", "quiet=true", "episode=2")
     with record_reads(cfg) as reads:
-        importlib.import_module("trackmdp.app.commands.replay").run(cfg, tmp_path)
+        Prepared("replay", cfg, tmp_path).run()
     assert unread(cfg, reads) == set()
     playback = ("baseline=playback", f"baseline.file={log}", *WORLD, "quiet=true", "episodes=5")
     for words in (playback, ("baseline=qmdp", "log=[mcap]", *WORLD, "quiet=true", "episodes=5")):
         cfg = composed("evaluate", *words)
         with record_reads(cfg) as reads:
-            importlib.import_module("trackmdp.app.commands.evaluate").run(cfg, tmp_path)
+            Prepared("evaluate", cfg, tmp_path).run()
         of_training = {"log.mcap.evaluations", "log.mcap.episodes"}
         assert unread(cfg, reads) - of_training == set()
 

@@ -13,7 +13,6 @@ from trackmdp.config import BenchmarkConfig
 from trackmdp.durable import write_json
 from trackmdp.training.display import make_console, table
 from trackmdp.training.machine import machine, make_device
-from trackmdp.world.make import build_world
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Problem
 
@@ -31,17 +30,13 @@ PARTS: dict[str, Callable[[BenchmarkConfig, World, torch.device], Iterable[dict[
 }
 
 
-def run(cfg: BenchmarkConfig, folder: Path, problem: Problem | None = None) -> None:
-    """Measure `cfg.part` and write `benchmark.json` to `folder`, row by row as they come.
-
-    `problem` is the world of `cfg`, where it is built already.
-    """
+def run(cfg: BenchmarkConfig, folder: Path, world: Problem) -> None:
+    """Measure `cfg.part` and write `benchmark.json` to `folder`, row by row as they come."""
     console = make_console(cfg.quiet)
     torch.set_num_threads(cfg.threads)
     device = make_device(cfg.device)
     where = machine()
     rows: list[dict[str, Any]] = []
-    world = build_world(cfg) if problem is None else problem
     assert isinstance(world, World)  # recorded tracks are refused
     with console.status(f"measuring {cfg.part}") as status:
         for row in PARTS[cfg.part](cfg, world, device):

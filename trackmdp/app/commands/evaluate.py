@@ -32,7 +32,6 @@ from trackmdp.training.evaluator import figures, make_evaluator
 from trackmdp.training.folders import SUMMARY, check_files, read_summary
 from trackmdp.training.machine import make_device
 from trackmdp.untrusted import decoded
-from trackmdp.world.make import make_problem
 from trackmdp.world.model import World
 from trackmdp.world.modes import Modelled
 from trackmdp.world.sensors import false_alarm
@@ -49,17 +48,21 @@ _FIGURES = {
 """Figures of a policy as tables at the terminal have them."""
 
 
-def run(cfg: EvaluateConfig, folder: Path, problem: Problem | None = None) -> float:
+def run(cfg: EvaluateConfig, folder: Path, problem: Problem) -> float:
     """Write `evaluation.json`, and without false alarms `sets.json` and `picture.txt`; returns the exact AIHTR.
 
-    `problem` is the world of `cfg`, where it is built already.
+    `problem` is the world of `cfg`; a trained policy is evaluated in that of its run.
     """
     console = make_console(cfg.quiet)
     torch.set_num_threads(cfg.threads)
     device = make_device(cfg.device)
     if cfg.run is None and isinstance(cfg.baseline, PlaybackConfig) and not isinstance(cfg.sensor, FalseAlarmConfig):
-        return playback.run(cfg, folder, console, problem)
-    world, policy, subject = trained(cfg.run, device) if cfg.run else _baseline(cfg, problem)
+        return playback.run(cfg, folder, problem, console)
+    if cfg.run:
+        world, policy, subject = trained(cfg.run, device)
+    else:
+        assert cfg.baseline is not None
+        world, policy, subject = problem, baseline_policy(problem, cfg.baseline), cfg.baseline.name
     if isinstance(cfg.sensor, FalseAlarmConfig):
         return _believing(cfg, world, policy, subject, folder, console)
     # Recorded tracks have no kernel, hence no exact value and no bound: figures come from the held-out tracks.
@@ -132,12 +135,6 @@ def _proved(run: str) -> dict[str, Any] | None:
         return None
     with decoded(str(folder / SUMMARY), "the summary of a run"):
         return {name: float(summary["optimal"][name]) for name in ("lower", "upper")}
-
-
-def _baseline(cfg: EvaluateConfig, problem: Problem | None) -> tuple[Problem, Policy, str]:
-    assert cfg.baseline is not None
-    world = make_problem(cfg) if problem is None else problem
-    return world, baseline_policy(world, cfg.baseline), cfg.baseline.name
 
 
 def _compared(subject: str, report: dict[str, Any], simulation: Simulation | None) -> Table:

@@ -15,18 +15,16 @@ from trackmdp.episodes.simulate import resimulate, simulate
 from trackmdp.errors import UserError
 from trackmdp.policies.playback import Playback
 from trackmdp.training.display import table
-from trackmdp.world.make import make_problem
 from trackmdp.world.modes import Modelled
 from trackmdp.world.tracks import Problem, Recorded
 
 
-def run(cfg: EvaluateConfig, folder: Path, console: Console, problem: Problem | None = None) -> float:
+def run(cfg: EvaluateConfig, folder: Path, world: Problem, console: Console) -> float:
     """Write `evaluation.json` to `folder`; returns the simulated AIHTR.
 
     Such a policy ignores what it observes, so that it has no table and no exact value.
     """
     assert isinstance(cfg.baseline, PlaybackConfig)
-    world = make_problem(cfg) if problem is None else problem
     assert not isinstance(world, Recorded)  # they are refused
     with EpisodeReader(cfg.baseline.file) as reader:
         recorded = reader.run.size

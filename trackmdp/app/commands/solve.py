@@ -23,7 +23,6 @@ from trackmdp.solvers.solution import SearchProgress, Solution
 from trackmdp.solvers.solve import run_solver
 from trackmdp.training.display import make_console, table
 from trackmdp.training.evaluator import figures
-from trackmdp.world.make import make_problem
 from trackmdp.world.model import World
 from trackmdp.world.modes import Modelled
 from trackmdp.world.tracks import Problem, Recorded
@@ -32,16 +31,14 @@ _SECONDS_BETWEEN_LINES = 2.0
 _BOUNDS = {"paper": bounds.paper, "valid": bounds.valid, "clocked": bounds.clocked}
 
 
-def run(cfg: SolveConfig, folder: Path, problem: Problem | None = None) -> float:
+def run(cfg: SolveConfig, folder: Path, world: Problem) -> float:
     """Write `solution.json` (and `verification.json`) to `folder`; returns the AIHTR.
 
     Ctrl-C ends a search early: the bracket reached so far is printed and saved.
-    `problem` is the world of `cfg`, where it is built already.
     """
     console = make_console(cfg.quiet)
     if cfg.grid.max_steps is not None:
         raise UserError(f"grid.max_steps={cfg.grid.max_steps}: only whole episodes are solved, expected null")
-    world = make_problem(cfg) if problem is None else problem
     assert not isinstance(world, Recorded)  # they are refused: there is no kernel to solve with
     with console.status(title := f"solve {cfg.solver.name}") as status:
         solution = run_solver(world, cfg.solver, _display(console, status, title), cfg.partition)

@@ -17,7 +17,6 @@ from trackmdp.paper.theorems import Check
 from trackmdp.solvers import optimal
 from trackmdp.solvers.keyed_search import solve_keys
 from trackmdp.training.display import make_console
-from trackmdp.world.make import make_problem
 from trackmdp.world.modes import HiddenWorld, Modelled
 from trackmdp.world.tracks import Problem, Recorded
 
@@ -25,16 +24,12 @@ NODES = 10_000_000
 """Work for the optimum the theorems are about: two minutes or so."""
 
 
-def run(cfg: VerifyConfig, folder: Path, problem: Problem | None = None) -> float:
-    """Write `verification.json` to `folder`; returns the number of claims that fail (0 is what is expected).
-
-    `problem` is the world of `cfg`, where it is built already.
-    """
+def run(cfg: VerifyConfig, folder: Path, world: Problem) -> float:
+    """Write `verification.json` to `folder`; returns the number of claims that fail (0 is what is expected)."""
     console = make_console(cfg.quiet)
     if cfg.grid.max_steps is not None:
         raise UserError(f"grid.max_steps={cfg.grid.max_steps}: theorems are on whole episodes, expected null")
     with console.status("checking the paper's theorems"):
-        world = make_problem(cfg) if problem is None else problem
         assert not isinstance(world, Recorded)  # they are refused
         checks = write_checks(world, cfg.tolerance, folder)
     show_checks(console, checks, folder)
