@@ -118,20 +118,3 @@ def _remote_env(world: Problem, worker: str, env: dict[str, Any], threads: int) 
     torch.set_num_threads(threads)
     torch.manual_seed(derive(env["seed"], "torch", worker))
     return TrackEnv(world, stream=f"world-{worker}", **env)
-
-
-def collector_state(collector: BaseCollector) -> dict[str, Any] | None:
-    """Where collecting stands between two batches: the targets in mid-episode and the environment's generators.
-
-    None for collectors in worker processes, whose environments cannot be asked: they start new episodes on resume.
-    """
-    if not isinstance(collector, Collector):
-        return None
-    return {"environment": collector.env.snapshot()}
-
-
-def load_collector_state(collector: Collector, state: dict[str, Any]) -> None:
-    """Resume from a `collector_state`; call before the first batch."""
-    # Private, but in no state_dict of TorchRL: the observations with which the next batch begins, rows in mid-episode.
-    # An episode's end is not among them, for the environment has begun the next one in that row.
-    collector._carrier.update(collector.env.restore(state["environment"]))

@@ -129,16 +129,12 @@ def run_of(folder: Path, overrides: tuple[str, ...] = ()) -> RunState:
     # Asked first: a resumed run is running although an earlier failure or summary may still be in its folder.
     if is_locked(folder):
         return RunState(folder, overrides, "running")
-    if result := _result(folder):
+    try:
+        result = read_summary(folder)
+    except UserError:  # none, or none that can be trusted
+        result = known_object(folder / DONE)
+    if result:
         return RunState(folder, overrides, "done", "", result)
     if failed := known_object(folder / FAILED_FILE):
         return RunState(folder, overrides, "failed", str(failed.get("reason", "")))
     return RunState(folder, overrides, "cut" if (folder / "config.yaml").is_file() else "waiting")
-
-
-def _result(folder: Path) -> dict[str, Any]:
-    """What a run that is done left; empty where it left nothing, or nothing that can be trusted."""
-    try:
-        return read_summary(folder)
-    except UserError:
-        return known_object(folder / DONE)

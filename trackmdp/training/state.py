@@ -19,7 +19,6 @@ from trackmdp.config.checks import own_paths
 from trackmdp.config.tree import fixed_options
 from trackmdp.errors import UserError
 from trackmdp.training import checkpoint
-from trackmdp.training.collect import collector_state, load_collector_state
 from trackmdp.untrusted import decoded
 
 _EXACT = ("torch", "torchrl", "tensordict", "numpy", "scipy", "hydra-core", "trackmdp")
@@ -68,7 +67,8 @@ def capture(
         "identity": identity(cfg, folder),
         "versions": {name: version(name) for name in _EXACT},
         "algorithm": algorithm.state_dict(),
-        "collector": collector_state(collector),
+        # None for collectors in worker processes, whose environments cannot be asked: they begin new episodes.
+        "collector": {"environment": collector.env.snapshot()} if isinstance(collector, Collector) else None,
         "random": {"cpu": torch.get_rng_state(), "cuda": cuda},
         "position": vars(at),
         "callbacks": dict(callbacks),
@@ -79,7 +79,9 @@ def restore(state: Mapping[str, Any], algorithm: Algorithm, collector: BaseColle
     """Put a captured state back, the random generators last; call after everything has been built."""
     algorithm.load_state_dict(state["algorithm"])
     if state["collector"] is not None and isinstance(collector, Collector):
-        load_collector_state(collector, state["collector"])
+        # Private, but in no state_dict of TorchRL: the observations with which the next batch begins, rows in
+        # mid-episode. An episode's end is not among them, for the environment has begun the next one in that row.
+        collector._carrier.update(collector.env.restore(state["collector"]["environment"]))
     # Last, since building the learner and the collector (which resets its environments) draws numbers. `.cpu()`: with
     # device=cuda the checkpoint's tensors were loaded to the GPU, generators' states must lie on the CPU.
     torch.set_rng_state(state["random"]["cpu"].cpu())

@@ -105,4 +105,4 @@ def test_onnx_is_asked_for_by_name(
 ) -> None:
     monkeypatch.setitem(sys.modules, "onnx", None)
     assert main(["export", f"run={run}", "format=onnx"]) == 2
-    assert "format=onnx: needs the package onnx" in capsys.readouterr().err
+    assert "format=onnx: needs onnx, which pip install" in capsys.readouterr().err

@@ -18,7 +18,7 @@ from trackmdp import __version__
 from trackmdp.app.commands.trained import trained
 from trackmdp.config import ExportConfig
 from trackmdp.durable import write_bytes
-from trackmdp.errors import UserError, adding
+from trackmdp.errors import UserError, require
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import sets_name, write_sets
 from trackmdp.training.display import make_console
@@ -70,11 +70,9 @@ def to_onnx(policy: Policy, about: dict[str, str]) -> bytes:
     Raises:
         UserError: the package onnx is not installed.
     """
-    try:
-        import onnx
-        from onnx import TensorProto, helper, numpy_helper
-    except ImportError:
-        raise UserError(f"format=onnx: needs the package onnx, which {adding('onnx')} adds") from None
+    require("onnx", "onnx", "format=onnx")
+    import onnx
+    from onnx import TensorProto, helper, numpy_helper
 
     table = _table(policy)
     # table[last_cell, min(n, last_row)]: GatherND wants its indices as one `[B, 2]` array, which the nodes put
