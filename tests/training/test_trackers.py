@@ -6,15 +6,17 @@ import json
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
 from tests.training.runs import at_iteration, rows, train
 from tests.training.test_log_resume import Killed, killed
 from trackmdp.app.cli import main
-from trackmdp.config import load_run_config, to_dict
+from trackmdp.config import MlflowConfig, load_run_config, to_dict
 from trackmdp.errors import UserError, adding
+from trackmdp.training.callbacks import Training
+from trackmdp.training.loggers import MlflowLogger
 from trackmdp.training.run import load_run
 from trackmdp.training.train import train as train_in_python
 from trackmdp.world.make import make_world
@@ -113,6 +115,15 @@ def test_mlflow_in_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert aihtr == {int(row["frames"]): float(row["aihtr"]) for row in table if row["aihtr"]}
     assert run.data.metrics["final/aihtr"] == load_run(tmp_path).evaluation.aihtr
     assert not (tmp_path / "mlruns").exists()
+
+
+def test_no_database_is_made_through_a_link(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/mlflow.db").symlink_to(tmp_path / "theirs.db")
+    logger = MlflowLogger(MlflowConfig(every=1, uri=None, experiment="mine"), tmp_path / "run")
+    with pytest.raises(UserError, match=r"mlflow\.db: a link, a folder or a device, expected an ordinary file"):
+        logger.on_start(cast(Training, None))
+    assert not (tmp_path / "theirs.db").exists()
 
 
 @pytest.mark.parametrize("name", ["wandb", "mlflow", "tensorboard"])

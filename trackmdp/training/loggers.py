@@ -247,8 +247,11 @@ class MlflowLogger(Callback):
 
         Raises:
             RunError: the server or the database cannot be reached.
+            UserError: the database of the run's folder is a link, or no ordinary file.
         """
         if self._cfg.uri is None:
+            # SQLite would follow a link out of the folder; an empty file is a new database to it.
+            os.close(reopen(self._folder / "mlflow.db", "r+"))
             # Reports of how mlflow is used would go out over the network from a run that is to stay here.
             os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
         # Its database tells on standard error what tables it makes.
