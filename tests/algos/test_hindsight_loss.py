@@ -37,13 +37,13 @@ def test_decision_loss_stops_pulling_at_large_logits() -> None:
     assert logits.grad.tolist() == [0.0, 0.0]
 
 
-def of_one_path(form: str, z: Tensor, cost: Tensor, covers: Tensor, gain: Tensor) -> Tensor:
+def of_one_path(form: str, z: Tensor, cost: Tensor, covers: Tensor, gain: Tensor, on: Tensor) -> Tensor:
     """The loss of one path at one clock, which it reaches unlocated and leaves for a cell that the sensors `covers` do.
 
-    What seeing it there gains is the gain of each sensor that sees it while none of the others does.
+    What seeing it there gains is the gain of each sensor that sees it while none of the others does; `on` says with
+    what probability they are on.
     """
     softplus = torch.nn.functional.softplus
-    on = (z > 0).float() if form in ("decision", "poisson") else z.detach().sigmoid()
     missed = [(1 - on * covers)[torch.arange(len(z)) != s].prod() for s in range(len(z))]
     one = covers * torch.stack(missed)
     if form == "decision":
@@ -97,7 +97,7 @@ def written_out(
                 aim = aim - float((chosen.numpy() * cost).sum())
                 gain = 1.0 + g * (u[y][0] - u[y][n + 1]).detach()
                 total["clocked_actor"] = total["clocked_actor"] + of_one_path(
-                    "decision", clocked_actor[x, n], price, covers[:, y], gain
+                    "decision", clocked_actor[x, n], price, covers[:, y], gain, chosen.float()
                 )
             total["clocked_critic"] = total["clocked_critic"] + (u[x][n] - aim.detach()).square()
         for n in range(last):
@@ -106,7 +106,9 @@ def written_out(
                 break
             trust = (1 - blend) * (u[y][0] - u[y][n + 1]) + blend * (value[y] - follow(path, n + 1))
             gain = (1.0 + g * trust).detach()
-            total["actor"] = total["actor"] + of_one_path(form, actor[x, n], price, covers[:, y], gain)
+            # halfway through a run, sets have cooled down to .05^½
+            drawn = (actor[x, n].detach() / (0.05**0.5 if form in ("decision", "poisson") else 1.0)).sigmoid()
+            total["actor"] = total["actor"] + of_one_path(form, actor[x, n], price, covers[:, y], gain, drawn)
             if (on[x, n] & covers[:, y]).any():
                 break
     return total
@@ -136,6 +138,7 @@ def test_summed_up_losses_are_those_of_every_path_apart(form: str, t_max: int, b
     if coverage is not None:  # some sensors on, so that others see no more than these do
         loss.actor.bias.data += torch.tensor([2.0, 0.0, 1.5, 0.0, 2.0])
         loss.clocked_actor.bias.data += torch.tensor([0.0, 2.0, 0.0, 2.0, 1.5])
+    loss.actor_loss.prepare(0, 0.5)
     summed, apart = loss(cells, on, blend), written_out(loss, world, cells, on, blend, form)
     for name in ("critic", "clocked_critic"):
         ours, theirs = (gradient(part[name], getattr(loss, name)) for part in (summed, apart))
