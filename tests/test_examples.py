@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from trackmdp.config.world import MEMORIES
+
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "scripts" / "examples"
 SOURCES = sorted(EXAMPLES.rglob("*.py"))
@@ -130,8 +132,12 @@ def test_the_plugin_learns_by_its_name(tmp_path: Path) -> None:
 
 def test_remembering_the_displacement_pays_on_the_ring() -> None:
     """A vehicle that is known to go round one way: no sensor is on behind it."""
-    known = {line.split()[0]: numbers(line)[0] for line in example("memory")}
-    assert known["displacement"] > known["cell"] + 0.1
+    lines = example("memory")
+    known = {line.split()[0]: numbers(line)[0] for line in lines}
+    assert list(known) == list(MEMORIES)
+    assert min(known[memory] for memory in MEMORIES[1:]) > known["cell"] + 0.1
+    (chosen,) = (line.split()[0] for line in lines if line.endswith(", the choice of the validation"))
+    assert chosen != "cell"
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 import trackmdp as tm
+from trackmdp.config.world import MEMORIES
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.path_exchange import choose_plan
 from trackmdp.training.evaluator import HeldOutEvaluator
@@ -33,12 +34,9 @@ def vehicles(file: Path, count: int = 200) -> Path:
 
 
 def main(file: Path, size: tuple[int, int], price: float, safe: float, t_max: int = 1, **position: float) -> None:
-    """Print the held-out reward per step of each memory, with its 95 % interval over tracks.
-
-    Weights, exchange and the memory are chosen by the validation tracks; the held-out ones tell the figures alone.
-    """
+    """Print each memory's held-out reward per step, 95 % interval over tracks; validation tracks alone choose."""
     found = {}
-    for memory in ("cell", "displacement", "displacement_gap"):
+    for memory in MEMORIES:
         tracks = tm.load_tracks(file, size, t_max=t_max, cost=price, safe_cost=safe, memory=memory, **position)
         policy = choose_plan(tracks.task, tracks.tracks, judge=tracks.validation, discount=0.9).policy
         reward = HeldOutEvaluator(tracks).intervals(policy)["reward_per_step"]
@@ -46,7 +44,7 @@ def main(file: Path, size: tuple[int, int], price: float, safe: float, t_max: in
     best = max(found, key=lambda memory: found[memory][0])
     for memory, (_, reward) in found.items():
         interval = f"({reward.low:.3f} ... {reward.high:.3f}) on {reward.n} tracks"
-        print(f"{memory:17} {reward.mean:6.3f} {interval}{', the choice of the validation' * (memory == best)}")
+        print(f"{memory:18} {reward.mean:6.3f} {interval}{', the choice of the validation' * (memory == best)}")
 
 
 if __name__ == "__main__":

@@ -48,7 +48,8 @@ class TaskConfig(NodeConfig):
 
     memory: str = option(
         "what a policy remembers at a detection: the cell; with it the displacement since the detection before, with "
-        "or without the misses between; or the last displacement and the direction of the one before",
+        "or without the misses between; or the last displacement and the direction of the one before; "
+        "algo=path_counts learns more than the cell best and fastest",
         choices=MEMORIES,
     )
     clip: int = option(
