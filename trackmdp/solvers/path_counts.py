@@ -95,8 +95,8 @@ class _Counted:
         alive = [np.ones(paths.states, dtype=bool) for _ in range(len(shared) + 1)]
         self.hits = np.zeros((choices, paths.states), dtype=bool)
         self.spent = np.zeros((choices, paths.states))
-        self._own: list[tuple[sparse.csr_array, Array]] = []
         self._shared: list[_Shared] = []
+        self._sets: list[sparse.csr_array] = []  # `[keys seen, M]` bool each
         above = self._above()
         for n in range(choices):
             mean = np.zeros((1, paths.width))
@@ -107,9 +107,8 @@ class _Counted:
                 padded = np.append(mean, np.zeros((count, 1)), axis=1)
                 alive[level] &= paths.inside[n] & ~(padded[context, paths.local[n]] > paths.price[n])
             own, arrived = self._sums(n, paths.of_seen, len(paths.seen), gain[n], weight * alive[-1])
-            self._own.append((own, arrived))
             self._shared.append(_Shared.of(paths, mean, own, arrived, prior))
-            on = self._sets_of_seen(n)
+            self._sets.append(on := self._sets_of_seen(own, arrived))
             found = np.zeros(paths.states, dtype=bool)
             near = paths.local[n] < paths.width
             found[near] = np.asarray(on[paths.of_seen[near], paths.cells[n][near]]).ravel()
@@ -139,18 +138,18 @@ class _Counted:
         gains = sparse.csr_array(((weight * gain)[near], place), shape=(count, paths.width))
         return gains, per_row(context, weight, count)
 
-    def _sets_of_seen(self, n: int) -> sparse.csr_array:
-        """`[keys seen, M]` bool, the sets at n of the keys that were seen."""
-        paths, (own, arrived), prior = self._paths, self._own[n], self._prior
+    def _sets_of_seen(self, own: sparse.csr_array, arrived: Array) -> sparse.csr_array:
+        """`[keys seen, M]` bool, the sets of the keys seen by their gains and arrivals and what they share last."""
+        paths, prior, known = self._paths, self._prior, self._shared[-1]
         cost, parts = np.append(paths.task.cost, np.inf), []
         # Most displacements are worth their price after no key at all.
         share = sparse.diags_array(1.0 / np.maximum(arrived + prior, 1e-12)) @ own
-        most = share.max(axis=0).toarray().ravel() + self._shared[n].most.max(0)
+        most = share.max(axis=0).toarray().ravel() + known.most.max(0)
         wanted = np.flatnonzero(most > cost.min())
         for begin in range(0, len(paths.seen), _KEYS_AT_ONCE):
             each = slice(begin, begin + _KEYS_AT_ONCE)
             shared = prior / np.maximum(arrived[each] + prior, 1e-12)
-            value = share[each][:, wanted].toarray() + shared[:, None] * self._shared[n].after(paths.seen[each], wanted)
+            value = share[each][:, wanted].toarray() + shared[:, None] * known.after(paths.seen[each], wanted)
             key, place = np.nonzero(value > cost.min())
             local = wanted[place]
             cell, inside = paths.put_down(paths.task.keys.cell(paths.seen[begin + key]), local)
@@ -162,18 +161,17 @@ class _Counted:
 
     def table(self) -> sparse.csr_array:
         """`[keys (t_max + 1), M]`, the sets of all keys: by their own count, or where they were never seen without."""
-        task, paths = self._paths.task, self._paths
+        task, paths, choices = self._paths.task, self._paths, self._paths.task.num_choices
         unseen = np.ones(task.num_keys, dtype=bool)
         unseen[paths.seen] = False
-        tables = []
-        for n in range(task.num_choices):
-            own, (key, cell) = self._sets_of_seen(n).tocoo(), self._unseen(n, unseen)
-            rows, cells = np.concatenate([paths.seen[own.row], key]), np.concatenate([own.col, cell])
-            on = np.ones(len(rows), dtype=bool)
-            tables.append(sparse.csr_array((on, (rows, cells)), shape=(task.num_keys, task.num_cells)))
-        # From one table per n to row key · (t_max + 1) + n.
-        order = np.arange(task.num_choices * task.num_keys).reshape(task.num_choices, -1).T.ravel()
-        return sparse.csr_array(sparse.vstack(tables, format="csr")[order])
+        rows, cells = [], []
+        for n, sets in enumerate(self._sets):
+            own, (key, cell) = sets.tocoo(), self._unseen(n, unseen)
+            rows += [paths.seen[own.row] * choices + n, key * choices + n]
+            cells += [own.col, cell]
+        place = np.concatenate(rows), np.concatenate(cells)
+        on = np.ones(len(place[0]), dtype=bool)
+        return sparse.csr_array((on, place), shape=(task.num_keys * choices, task.num_cells))
 
     def _unseen(self, n: int, unseen: BoolArray) -> tuple[IndexArray, IndexArray]:
         """Keys and cells of the sets of keys that were not seen, a bool for each key."""
