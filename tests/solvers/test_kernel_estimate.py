@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from trackmdp.solvers.kernel_estimate import KernelEstimate, ObservedPaths
+from trackmdp.solvers.censored import ObservedPaths
+from trackmdp.solvers.kernel_estimate import KernelEstimate
 from trackmdp.world.model import Array
 
 KERNEL = np.array([[0.0, 0.5, 0.3, 0.0], [0.1, 0.0, 0.0, 0.8], [0.6, 0.0, 0.2, 0.1], [0.3, 0.3, 0.3, 0.0]])

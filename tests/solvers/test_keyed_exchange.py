@@ -46,9 +46,9 @@ def test_cells_of_many_modes_are_decided_once_and_paid_once() -> None:
     pairs = KeyedPairs(headings(3, 0.8, cost=0.2, memory="displacement"))
     sets = [np.ones(len(groups), dtype=bool) for groups in pairs.groups]
     value, visits, _ = pairs.value(sets)
-    located, gathered = pairs.run(*pairs.of_sets(sets))
+    located, gathered = pairs.run(*pairs.of_policy(pairs.table(sets)))
     found = exchanged_pairs(pairs, sets, value, visits)
-    other, spent = pairs.run(*pairs.of_sets(found))
+    other, spent = pairs.run(*pairs.of_policy(pairs.table(found)))
     # One step of policy improvement: what each pair earns until its next detection, and V from there on.
     before, after = (visits * (g[:, 0] + k @ value) for k, g in ((located, gathered), (other, spent)))
     first, second = (np.bincount(pairs.key, part) for part in (before, after))

@@ -26,8 +26,9 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
 from trackmdp.solvers import exchange
 from trackmdp.solvers.alike import cell_classes
+from trackmdp.solvers.censored import ObservedPaths
 from trackmdp.solvers.evaluate import evaluate
-from trackmdp.solvers.kernel_estimate import KernelEstimate, ObservedPaths
+from trackmdp.solvers.kernel_estimate import KernelEstimate
 from trackmdp.solvers.keyed_search import solve_keys
 from trackmdp.solvers.renewal import DIRECT_CELLS
 from trackmdp.solvers.shrinkage import believed_world, least_worth_planning

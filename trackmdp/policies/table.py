@@ -15,7 +15,7 @@ from scipy import sparse
 
 from trackmdp.errors import UserError
 from trackmdp.world.checks import short_indices
-from trackmdp.world.model import Array, BoolArray, Task
+from trackmdp.world.model import Array, BoolArray, Task, apart
 
 
 class PolicyTable:
@@ -222,18 +222,11 @@ def _checked(task: Task, sets: sparse.csr_array) -> sparse.csr_array:
     sets.eliminate_zeros()
     if task.window is not None:
         start = task.keys.cell(np.repeat(np.arange(sets.shape[0]), np.diff(sets.indptr)) // task.num_choices)
-        far = _distance(task, start, sets.indices) > task.window
+        far = apart(task.columns, start, sets.indices) > task.window
         if far.any():
             x, cell = int(start[far][0]), int(sets.indices[far][0])
             raise UserError(f"policy: sensor {cell} cannot be chosen from cell {x} with grid.window={task.window}")
     return sets
-
-
-def _distance(task: Task, start: npt.NDArray[Any], cell: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Chebyshev distance of cells on the grid: rows or columns apart, whichever is more."""
-    row, column = np.divmod(start, task.columns)
-    other_row, other_column = np.divmod(cell, task.columns)
-    return np.maximum(np.abs(row - other_row), np.abs(column - other_column))
 
 
 def _window_sets(task: Task, probability: float) -> sparse.csr_array:

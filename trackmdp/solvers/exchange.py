@@ -19,9 +19,10 @@ from scipy import sparse
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
 from trackmdp.solvers import clocked, search
+from trackmdp.solvers.bounds import one_set
 from trackmdp.solvers.layers import Layer, layer_sets, policy_table, reachable_layers
 from trackmdp.solvers.plans import Chains, ChainStep, exchanged_parts, parts
-from trackmdp.solvers.renewal import IndexArray, per_row, row_index
+from trackmdp.solvers.renewal import IndexArray, per_row
 from trackmdp.solvers.search import InnerProblem, located_value
 from trackmdp.world.model import Array, BoolArray, World
 
@@ -185,11 +186,7 @@ def _chains(problem: InnerProblem, mass: Array, cells: IndexArray) -> tuple[Chai
 
 def revealed(problem: InnerProblem, mass: Array) -> Array:
     """`[M]` the worth of the best plans if the position were revealed after every set; no plan is worth more."""
-    kernel, world, worth = problem.world.kernel, problem.world, problem.missed
-    rows, cells, p = row_index(kernel), kernel.indices, kernel.data
-    report, price = world.detects(cells), world.cost[cells] * world.stay_probability[rows]
+    origin, worth = problem.layers[0], problem.missed
     for _ in range(problem.length):
-        left = worth[cells]
-        gain = p * report * (problem.detected[cells] - left) - price
-        worth = per_row(rows, p * left + np.maximum(gain, 0.0), world.num_cells)
-    return per_row(problem.layers[0].rows, mass * worth[problem.layers[0].cells], world.num_cells)
+        worth = one_set(problem.world, problem.detected, worth)
+    return per_row(origin.rows, mass * worth[origin.cells], problem.world.num_cells)

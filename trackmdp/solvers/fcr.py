@@ -6,12 +6,10 @@ The opposite simplification of Q_MDP, which acts as if the position were known a
 from __future__ import annotations
 
 import numpy as np
-from scipy import sparse
 
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers.cover import Offer, best_sets
-from trackmdp.solvers.layers import within_window
-from trackmdp.solvers.prediction import predict
+from trackmdp.solvers.cover import Offer
+from trackmdp.solvers.prediction import Prediction, unroll
 from trackmdp.world.model import World
 
 
@@ -22,14 +20,11 @@ def solve(world: World, *, in_grid: bool = False) -> PolicyTable:
         world: the problem.
         in_grid: charge sensors only while the target is in the grid: p_d p_j r >= c_j p_in.
     """
-    moved, sensed = sparse.eye_array(world.num_cells, format="csr"), []
-    for n in range(world.num_choices):
-        seen = predict(world, moved, n)
-        charged = seen.inside if in_grid else np.ones(world.num_cells)
+
+    def worth_it(seen: Prediction) -> Offer:
         # seen.mass is e_x P^(n+1) itself: since nothing is taken away at a miss, no probability of misses has to be
         # divided by.
-        offer = Offer(seen.mass * world.detects(seen.cells) * world.reward, world.cost, charged, ties=True)
-        on = best_sets(world, seen.rows, seen.cells, offer, within_window(world, seen.rows, seen.cells))
-        sensed.append((on.rows, on.sensors))
-        moved = seen.part(np.ones(len(seen.mass)))  # nothing is taken away: a miss is not learned from
-    return PolicyTable.from_sensed(world, sensed)
+        charged = seen.inside if in_grid else np.ones(world.num_cells)
+        return Offer(seen.mass * world.detects(seen.cells) * world.reward, world.cost, charged, ties=True)
+
+    return unroll(world, worth_it, learns=False)

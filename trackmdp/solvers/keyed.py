@@ -108,19 +108,9 @@ class KeyedPairs:
         spent, sensors = ([policy.spent(n, each)[self.key] for n in free] for each in (self.world.cost, one))
         return seen, spent, sensors
 
-    def of_sets(self, sets: list[BoolArray]) -> tuple[list[Array], list[Array], list[Array]]:
-        """Sets, a bool for each group, as arguments of `run`."""
-        seen = [on[group] * chance for on, group, chance in zip(sets, self.group, self.chance, strict=False)]
-        spent, sensors = [], []
-        for on, groups in zip(sets, self.groups, strict=True):
-            key, cell = np.divmod(groups[on], self.world.num_cells)
-            spent.append(per_row(key, self.world.cost[cell], self.world.num_keys)[self.key])
-            sensors.append(per_row(key, np.ones(len(key)), self.world.num_keys)[self.key])
-        return seen, spent, sensors
-
     def value(self, sets: list[BoolArray]) -> tuple[Array, Array, float]:
         """`[B]` V, `[B]` visits of an episode, and the AIHTR."""
-        located, gathered = self.run(*self.of_sets(sets))
+        located, gathered = self.run(*self.of_policy(self.table(sets)))
         value = _solved(located, gathered[:, 0])[0]
         # Begun after some detections: no key is come by a second time where it stands for an episode's start, so that
         # all that is left of the start at first would be orthogonal to what follows, and BiCGSTAB would break down.
@@ -160,7 +150,7 @@ class KeyedPairs:
 
     def _undetected(self, sets: list[BoolArray], value: Array) -> list[Array]:
         """Per free choice `[E]` W: what follows when the target is there, undetected, and `sets` go on."""
-        world, (seen, spent, _) = self.world, self.of_sets(sets)
+        world, (seen, spent, _) = self.world, self.of_policy(self.table(sets))
         last = world.num_choices
         worth = world.reward + value[self.following[last]]
         later = [self.layers[last].moves @ worth - world.safe_cost * self.stay[last]]

@@ -24,7 +24,7 @@ from scipy import sparse
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.cover import Covering
 from trackmdp.solvers.renewal import IndexArray, row_index
-from trackmdp.world.model import Array, BoolArray, Task, World
+from trackmdp.world.model import Array, BoolArray, Task, World, apart
 
 
 @dataclass(frozen=True)
@@ -124,10 +124,7 @@ def within_window(task: Task, rows: IndexArray, cells: IndexArray) -> BoolArray 
     """
     if task.window is None:
         return None
-    row, column = np.divmod(rows, task.columns)
-    other_row, other_column = np.divmod(cells, task.columns)
-    near: BoolArray = np.maximum(np.abs(row - other_row), np.abs(column - other_column)) <= task.window
-    return near
+    return apart(task.columns, rows, cells) <= task.window
 
 
 def policy_table(task: Task, layers: Sequence[Layer], sets: Sequence[BoolArray]) -> PolicyTable:

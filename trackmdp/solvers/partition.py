@@ -27,7 +27,7 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.renewal import IndexArray, row_index
 from trackmdp.solvers.workers import Crew, Made, in_turn
-from trackmdp.world.model import BoolArray, World
+from trackmdp.world.model import BoolArray, World, apart
 
 Planner: TypeAlias = "Callable[[int, World], PolicyTable]"
 """From a block's number and its world to its policy, by planning or by learning."""
@@ -56,9 +56,7 @@ class Block:
 
 def reach(world: World) -> int:
     """R, the most rows or columns that a move can lead away."""
-    row, column = np.divmod(row_index(world.kernel), world.columns)
-    to_row, to_column = np.divmod(world.kernel.indices, world.columns)
-    return int(np.maximum(np.abs(row - to_row), np.abs(column - to_column)).max(initial=0))
+    return int(apart(world.columns, row_index(world.kernel), world.kernel.indices).max(initial=0))
 
 
 def default_halo(world: World) -> int:

@@ -55,7 +55,7 @@ def predict(world: World, undetected: sparse.csr_array, n: int) -> Prediction:
     return Prediction(n, rows, moved.indices, moved.data, before, per_row(rows, moved.data, world.num_cells))
 
 
-def unroll(world: World, rule: Callable[[Prediction], Offer]) -> PolicyTable:
+def unroll(world: World, rule: Callable[[Prediction], Offer], *, learns: bool = True) -> PolicyTable:
     """The policy that takes the set of most worth by a `rule` from a prediction, within the task's window.
 
     Cells of probability zero are never sensed, and after a miss that cannot happen nothing is.
@@ -65,7 +65,7 @@ def unroll(world: World, rule: Callable[[Prediction], Offer]) -> PolicyTable:
         seen = predict(world, undetected, n)
         on = best_sets(world, seen.rows, seen.cells, rule(seen), within_window(world, seen.rows, seen.cells))
         sensed.append((on.rows, on.sensors))
-        undetected = seen.part(1.0 - on.seen * world.detects(seen.cells))
+        undetected = seen.part(1.0 - on.seen * world.detects(seen.cells) * learns)
     return PolicyTable.from_sensed(world, sensed)
 
 
@@ -90,26 +90,21 @@ def renewal(world: World, policy: PolicyTable) -> Iterator[tuple[sparse.csr_arra
         step (column M + j: of being missed in j by the safe action), and `[S, 6]`, expected reward, step in the grid,
         detection, sensors on by choice, safe action, step.
     """
-    m = world.num_cells
-    start = undetected = sparse.eye_array(m, format="csr")
     # What the M states of a missed target do: all of it at the first step, nothing at the later ones.
-    nowhere, again = sparse.csr_array((m, m)), np.zeros((m, 6))
-    found = missed = nowhere
-    if not world.safe:
-        found, missed, again = _safe_action(world, predict(world, start, world.num_choices))
-    for n in range(world.num_choices):
+    nowhere = sparse.csr_array((world.num_cells, world.num_cells))
+    nothing = nowhere, nowhere, np.zeros((world.num_cells, 6))
+    last, start = world.num_choices, sparse.eye_array(world.num_cells, format="csr")
+    again = nothing if world.safe else _safe_action(world, predict(world, start, last))
+    undetected = start
+    for n in range(last + 1):
         seen = predict(world, undetected, n)
-        hit, undetected, earned = _free_choice(world, policy, seen)
+        hit, undetected, earned = _free_choice(world, policy, seen) if n < last else _safe_action(world, seen)
         if world.safe:
             yield hit, earned
-        else:
-            yield _blocks(hit, nowhere, found, missed), np.concatenate([earned, again])
-            found, missed, again = nowhere, nowhere, np.zeros((m, 6))
-    hit, lost, earned = _safe_action(world, predict(world, undetected, world.num_choices))
-    if world.safe:
-        yield hit, earned
-    else:
-        yield _blocks(hit, lost, nowhere, nowhere), np.concatenate([earned, again])
+            continue
+        found, missed, after = again
+        yield _blocks(hit, undetected if n == last else nowhere, found, missed), np.concatenate([earned, after])
+        again = nothing
 
 
 def _free_choice(

@@ -291,6 +291,12 @@ class World(Task):
         return gain if self.safe else gain - self.reward * (self.kernel @ (1.0 - self.safe_detection))
 
 
+def apart(columns: int, start: npt.NDArray[Any], end: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """How far cells lie apart, in rows or in columns, whichever is more; arrays of any shapes that go together."""
+    (row, column), (other_row, other_column) = np.divmod(start, columns), np.divmod(end, columns)
+    return np.maximum(np.abs(row - other_row), np.abs(column - other_column))
+
+
 def grid_size(size: Size) -> tuple[int, int]:
     """(rows, columns) of one number, or of two.
 
