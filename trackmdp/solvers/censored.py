@@ -53,7 +53,7 @@ class ObservedPaths:
         return cls(start, misses, sparse.csr_array(sparse.vstack([part.sensed for part in each])), end)
 
 
-def merged(paths: ObservedPaths) -> tuple[ObservedPaths, Array]:
+def each_once(paths: ObservedPaths) -> tuple[ObservedPaths, Array]:
     """Equal paths once, and how often each occurs.
 
     Sets are told apart by two sums of 64 random bits per (miss, cell): unequal ones agree with probability 2^-128.

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.solvers.alike import AlikeCells
-from trackmdp.solvers.censored import ObservedPaths, counted, expected_moves, merged
+from trackmdp.solvers.censored import ObservedPaths, counted, each_once, expected_moves
 from trackmdp.solvers.renewal import IndexArray, per_row, row_index
 from trackmdp.solvers.shrinkage import posterior_mean, unseen
 from trackmdp.world.model import Array, apart, grid_size
@@ -121,7 +121,7 @@ class KernelEstimate:
             self.counts = self.direct.copy()  # a fit of its own, not what is added later
             return
         # Policies repeat themselves: equal paths have equal expectations, and are worked out once.
-        paths, copies = merged(ObservedPaths.of(self._censored, self.num_cells))
+        paths, copies = each_once(ObservedPaths.of(self._censored, self.num_cells))
         for first in [True, *[False] * (rounds - 1)]:
             kernel = (1.0 - OPEN) * self.mean() + OPEN * self._open_moves(paths) if first else self.mean()
             self.counts = self.direct + expected_moves(kernel, paths, copies, self._detection)
