@@ -10,6 +10,7 @@ from torch import Tensor
 
 from tests.helpers import algorithm, collect, small_world
 from trackmdp.algos.actor_loss import ActorLoss, Decision, Poisson, PolicyGradient, Surrogate
+from trackmdp.algos.hindsight_loss import HindsightLoss
 from trackmdp.config import ScheduleConfig
 from trackmdp.policies.policy import as_policy
 from trackmdp.solvers import optimal
@@ -67,3 +68,11 @@ def assert_same(first: Any, second: Any) -> None:
         assert bool((first == second).all())
     else:
         assert first == second
+
+
+def total(loss: HindsightLoss, cells: Tensor, on: Tensor, blend: float) -> dict[str, Tensor]:
+    """The losses, each under the name of the net that it trains: those of all parts added up."""
+    losses: dict[str, Tensor] = {}
+    for part in loss.parts(cells, on, blend):
+        losses |= {name: losses[name] + each if name in losses else each for name, each in part.items()}
+    return losses

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from tests.algos.hindsight import FORMS
+from tests.algos.hindsight import FORMS, total
 from tests.helpers import small_world
 from trackmdp.algos.actor_loss import Decision, decision_loss
 from trackmdp.algos.hindsight_loss import HindsightLoss
@@ -139,7 +139,7 @@ def test_summed_up_losses_are_those_of_every_path_apart(form: str, t_max: int, b
         loss.actor.bias.data += torch.tensor([2.0, 0.0, 1.5, 0.0, 2.0])
         loss.clocked_actor.bias.data += torch.tensor([0.0, 2.0, 0.0, 2.0, 1.5])
     loss.actor_loss.prepare(0, 0.5)
-    summed, apart = loss(cells, on, blend), written_out(loss, world, cells, on, blend, form)
+    summed, apart = total(loss, cells, on, blend), written_out(loss, world, cells, on, blend, form)
     for name in ("critic", "clocked_critic"):
         ours, theirs = (gradient(part[name], getattr(loss, name)) for part in (summed, apart))
         torch.testing.assert_close(ours * cells.shape[1], theirs, rtol=1e-3, atol=1e-3)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.algos.hindsight import FORMS
+from tests.algos.hindsight import FORMS, total
 from tests.helpers import algorithm, small_world
 from trackmdp.algos.hindsight_loss import HindsightLoss
 from trackmdp.world.coverage import discs
@@ -55,7 +55,7 @@ def gradients(
         cells = torch.stack(steps)
         cells = torch.where((cells == m).cummax(0).values, m, cells)
         on = torch.rand(m, t + 1, loss.sensors.width, generator=rng) < 0.3
-        losses = loss(cells, on, 0.6)
+        losses = total(loss, cells, on, 0.6)
         torch.stack(list(losses.values())).sum().backward()
     grads = [weight.grad for weight in loss.parameters() if weight.grad is not None]
     assert len(grads) == len(list(loss.parameters()))

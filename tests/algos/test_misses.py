@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.algos.hindsight import SOLVES, batches, learn, policy
+from tests.algos.hindsight import SOLVES, batches, learn, policy, total
 from tests.helpers import algorithm, small_world
 from trackmdp.algos.actor_loss import Decision
 from trackmdp.algos.gains import chain_returns
@@ -125,7 +125,7 @@ def test_critics_settle_at_the_value_of_what_is_repeated(hidden: int) -> None:
     off = torch.zeros(1, 1, 1, dtype=torch.bool)
     for _ in range(1500):
         optimizer.zero_grad()
-        losses = loss(cells, off, 0.0)
+        losses = total(loss, cells, off, 0.0)
         (losses["critic"] + losses["clocked_critic"]).backward()
         optimizer.step()
     # V = .9 · .8 L, and U is the same: nothing is worth 9.

@@ -155,13 +155,6 @@ class HindsightLoss(nn.Module):
         groups, classes = window.groups(alike).unsqueeze(1), torch.arange(self._classes, device=self.view.cells.device)
         return (groups * self._classes + classes).flatten()
 
-    def forward(self, cells: Tensor, on: Tensor, blend: float) -> dict[str, Tensor]:
-        """The losses, each under the name of the net that it trains: those of all `parts` added up."""
-        losses: dict[str, Tensor] = {}
-        for part in self.parts(cells, on, blend):
-            losses |= {name: losses[name] + loss if name in losses else loss for name, loss in part.items()}
-        return losses
-
     def parts(self, cells: Tensor, on: Tensor, blend: float) -> Iterator[dict[str, Tensor]]:
         """The losses, a few located cells at a time; the critics' come with the last part.
 
