@@ -1,8 +1,9 @@
 """Pictures of everything that people look at, to be looked at: ``python -m tests.screenshots FOLDER``.
 
-A sweep of four short runs, its report, the page of an episode and that of recorded tracks, each on a desktop, on a
-phone and in the dark; and what the commands print in a terminal of 80 columns. Takes Chromium and the extras `report`
-and `tracks`; about two minutes.
+A sweep of four short runs and its report; runs with sensors of one cell and of several, one of a policy that remembers
+and one by blocks, each with its report and an episode; and recorded tracks: all on a desktop, on a phone and in the
+dark. And what the commands print in a terminal of 80 columns. Takes Chromium and the extras `report` and `tracks`;
+some four minutes on idle cores.
 """
 
 from __future__ import annotations
@@ -23,6 +24,12 @@ VIEWS = {"desktop": (1280, 900, "light"), "phone": (390, 844, "light"), "dark": 
 TERMINAL = {"80": (800, 300, "light")}  # 80 letters are 770 pixels wide; the page is as high as its text
 CITY = ("kernel.step=5", "kernel.cell=50", "grid.size=[18,15]", "cost.sensor=0.1")
 SHORT = ("algo.total_frames=60_000", "algo.frames_per_batch=10_000")
+RUNS = {
+    "run": ["cost.sensor=0.22"],
+    "footprint": ["sensor=footprint", "sensor.radius=1", "sensor.spacing=2", "grid.size=8", "cost.sensor=0.22"],
+    "memory": ["algo=path_counts", "kernel=heading", "task.memory=displacement", "grid.size=5", *SHORT],
+    "blocks": ["grid.size=16", "cost.sensor=0.22", "partition.block=8"],
+}
 
 
 def in_terminal(words: list[str]) -> str:
@@ -61,11 +68,9 @@ def terminal_page(text: str, file: Path) -> None:
 def main(folder: Path) -> None:
     """Make the pictures in `folder`."""
     folder.mkdir(parents=True, exist_ok=True)
-    sweep, run, episode, tracks = (folder / each for each in ("sweep", "run", "episode.html", "tracks"))
+    sweep, tracks = folder / "sweep", folder / "tracks"
     city = f"kernel.path={Path(__file__).parent / 'data/city.csv'}"
     commands = {
-        "train": ["train", "cost.sensor=0.22", f"hydra.run.dir={run}"],
-        "evaluate": ["evaluate", f"run={run}", "log=[mcap]", "episodes=20", f"hydra.run.dir={run}/e"],
         "tracks": ["train", "algo=path_counts", "kernel=tracks", city, *CITY, f"hydra.run.dir={tracks}"],
         "held-out": ["evaluate", f"run={tracks}", f"hydra.run.dir={tracks}/e"],
         "sweep": ["train", "-m", "seed=0,1", "cost.sensor=0.16,0.22", *SHORT, f"hydra.sweep.dir={sweep}"],
@@ -73,13 +78,22 @@ def main(folder: Path) -> None:
         "watch": ["report", f"sweep={sweep}", "watch=true"],
         "verify": ["verify", f"hydra.run.dir={folder / 'verify'}"],
         "solve": ["solve", "cost.sensor=0.22", f"hydra.run.dir={folder / 'solve'}"],
-        "list": ["replay", f"file={run}/e/episodes.mcap"],
-        "replay": ["replay", f"file={run}/e/episodes.mcap", "episode=3", f"html={episode}"],
         "mistake": ["train", "algo.lr=3"],
         "help": ["train", "algo=ppo", "--help"],
         "commands": ["--help"],
     }
-    pages = {"report": sweep / "report/report.html", "episode": episode, "tracks": tracks / "e/tracks.html"}
+    pages = {"report": sweep / "report/report.html", "tracks": tracks / "e/tracks.html"}
+    for name, words in RUNS.items():
+        run, pages[f"{name}-episode"] = folder / name, folder / f"{name}.html"
+        log = f"file={run}/e/episodes.mcap"
+        commands |= {
+            name: ["train", *words, f"hydra.run.dir={run}"],
+            f"{name}-evaluate": ["evaluate", f"run={run}", "log=[mcap]", "episodes=20", f"hydra.run.dir={run}/e"],
+            f"{name}-list": ["replay", log],
+            f"{name}-replay": ["replay", log, "episode=3", f"html={pages[f'{name}-episode']}"],
+            f"{name}-report": ["report", f"sweep={run}"],
+        }
+        pages[f"{name}-report"] = run / "report/report.html"
     for name, words in commands.items():
         terminal_page(in_terminal(words), page := folder / f"terminal-{name}.html")
         pages[f"terminal-{name}"] = page
@@ -88,7 +102,7 @@ def main(folder: Path) -> None:
             for view, (width, height, scheme) in (TERMINAL if "terminal" in name else VIEWS).items():
                 browser.view(width, height, scheme)
                 browser.open(page)
-                if name == "episode":  # at its first miss
+                if name.endswith("episode"):  # at its first miss
                     browser.ask("show(data.located.findIndex((seen) => !seen))")
                 browser.shoot(folder / f"{name}-{view}.png")
     sys.stdout.write(f"{len(list(folder.glob('*.png')))} pictures in {folder}\n")

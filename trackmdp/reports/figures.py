@@ -11,7 +11,7 @@ import numpy as np
 from trackmdp.reports.grouping import Study
 from trackmdp.reports.labels import label_lines
 from trackmdp.reports.results import CurvePoint, FinishedRun
-from trackmdp.reports.style import INK, LOOKS, PAGE, Axes, Canvas, Figure, Look, draw_figure, legend, looks_of, tidy
+from trackmdp.reports.style import INK, LOOKS, PAGE, Axes, Canvas, Figure, Look, draw_figure, looks_of, tidy
 from trackmdp.reports.summaries import estimate_cells, estimate_columns
 from trackmdp.reports.tables import Cell, Column, Table
 from trackmdp.statistics import MeanInterval, mean_over_groups, share
@@ -325,7 +325,13 @@ def profiles(study: Study, threshold: float | None) -> Figure | None:
         axes.set(xscale="log", ylim=(-0.02, 1.02))
         axes.set(xlabel="τ, regret per step", ylabel="share of runs with regret ≤ τ")
         tidy(axes)
-        legend(figure, axes, columns=2)  # all profiles end at 1: there is no end to write a name at
+        # All end at 1: names stand right of the lines, each at a height of its own, that of the best one on top.
+        best = sorted(found, key=lambda method: float(np.median(regrets[method])))
+        for place, method in enumerate(best):
+            height = max(1 - (place + 0.5) / len(best), found[method][0].mean)
+            risen = next(level for level, e in zip(levels, found[method], strict=True) if e.mean >= height)
+            colour = looks[method].colour
+            axes.annotate(method, (risen, height), (6, 0), textcoords="offset points", va="center", color=colour)
 
     counts = ", ".join(f"{method} n = {len(values)}" for method, values in regrets.items())
     title = f"Performance profiles: share of runs whose regret per step is at most τ, with 95 % interval; {counts}"
