@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -101,11 +101,9 @@ class LoggedRun:
         Raises:
             ValueError, KeyError, TypeError: it is something else.
         """
-        whole = dict.fromkeys(("episode", "policy", "length", "detections", "forced"), _MOST) | {"start": self.cells}
-        whole |= {"start_mode": self.modes} if self.modes else {}
-        for name, limit in whole.items():
-            if type(row[name]) is not int or not 0 <= row[name] < limit:
-                raise ValueError(f"{name} {str(row[name])[:40]} of an episode")
+        whole = dict.fromkeys(("episode", "policy", "length", "detections", "forced"), range(_MOST))
+        whole |= {"start": range(self.cells)} | ({"start_mode": range(self.modes)} if self.modes else {})
+        _check_whole(row, whole, "an episode")
         if type(row["terminated"]) is not bool or type(row["truncated"]) is not bool:
             raise ValueError("how an episode ended")
         if not _is_number(row["return"]):
@@ -123,19 +121,22 @@ class LoggedRun:
         Raises:
             ValueError, KeyError, TypeError: one does not.
         """
-        rules: dict[str, Callable[[Any], bool]] = {
-            "n": lambda n: type(n) is int and 0 <= n < _MOST,
-            "target": lambda cell: type(cell) is int and -1 <= cell < self.cells,
-            "obs": lambda cell: type(cell) is int and -1 <= cell < self.cells,
-            "reward": _is_number,
-            "active": lambda on: type(on) is list and all(type(it) is int and 0 <= it < self.sensors for it in on),
-        }
-        if self.modes:
-            rules["mode"] = lambda mode: type(mode) is int and -1 <= mode < self.modes
+        whole = {"n": range(_MOST)} | dict.fromkeys(("target", "obs"), range(-1, self.cells))
+        whole |= {"mode": range(-1, self.modes)} if self.modes else {}
         for step in steps:
-            for name, holds in rules.items():
-                if not holds(step[name]):
-                    raise ValueError(f"{name} {str(step[name])[:40]} of a step")
+            _check_whole(step, whole, "a step")
+            on, reward = step["active"], step["reward"]
+            if type(on) is not list or not all(type(it) is int and 0 <= it < self.sensors for it in on):
+                raise ValueError(f"active {str(on)[:40]} of a step")
+            if not _is_number(reward):
+                raise ValueError(f"reward {str(reward)[:40]} of a step")
+
+
+def _check_whole(said: Mapping[str, Any], allowed: Mapping[str, range], of: str) -> None:
+    """See that each of some entries is a whole number that is allowed."""
+    for name, numbers in allowed.items():
+        if type(said[name]) is not int or said[name] not in numbers:
+            raise ValueError(f"{name} {str(said[name])[:40]} of {of}")
 
 
 def _count(said: Mapping[str, Any], name: str, least: int, most: int) -> int:

@@ -10,9 +10,8 @@ import numpy as np
 
 from trackmdp.paper.calibration import BORDER, DRAWS, SEEDS, T_MAX, Candidate, Setting, Spread, chosen
 from trackmdp.paper.worlds import COSTS, PRINTED_QMDP, SUPPORTS
-from trackmdp.reports.style import INK, LOOKS, Axes, Canvas, Figure, draw_figure, legend, tidy
+from trackmdp.reports.style import INK, LOOKS, Canvas, Figure, draw_figure, legend, tidy
 from trackmdp.reports.tables import Cell, Column, Table
-from trackmdp.world.model import Array
 
 RULE = (
     f"Of the kernels drawn with seeds {SEEDS[0]} to {SEEDS[-1]} (T_max = {T_MAX}, border {BORDER}), each Z takes the "
@@ -111,11 +110,15 @@ def _ranges(
         axes = figure.subplots()
         # The three Z of a setting stand in one row, a little apart.
         for offset, support_size in zip((-0.24, 0.0, 0.24), COLOURS, strict=True):
-            spreads = [of(s) for s in settings if s.support_size == support_size]
-            _bars(axes, support_size, np.arange(len(rows), dtype=np.float64) + offset, spreads)
+            look = COLOURS[support_size]
+            middle, low, high = np.array([astuple(of(s)) for s in settings if s.support_size == support_size]).T
+            # `[2, settings]`, lengths below and above the median. The range, not a confidence interval: how far the
+            # draw of the kernel moves a figure.
+            bars, y = np.stack([middle - low, high - middle]), np.arange(len(rows)) + offset
+            points: Any = {"fmt": look.marker, "color": look.colour, "markersize": 3.5, "elinewidth": 1.2}
+            axes.errorbar(middle, y, xerr=bars, label=f"Z = {support_size}", **points)
             if printed:
-                colour = COLOURS[support_size].colour
-                axes.axvline(PRINTED_QMDP[support_size, COSTS[0]], color=colour, linewidth=0.8, linestyle=":")
+                axes.axvline(PRINTED_QMDP[support_size, COSTS[0]], color=look.colour, linewidth=0.8, linestyle=":")
         axes.set_yticks(range(len(rows)), [f"{border}, T_max {t_max}" for border, t_max in rows])
         # The first setting on top, as in the table.
         axes.invert_yaxis()
@@ -131,14 +134,3 @@ def _ranges(
     numbers: list[list[Cell]] = [[s.border, s.t_max, s.support_size, *astuple(of(s))] for s in settings]
     table = Table(f"sensitivity-{name}", title, columns, numbers)
     return draw_figure(f"sensitivity-{name}", title, text, table, 4.2, paint)
-
-
-def _bars(axes: Axes, support_size: int, y: Array, spreads: Sequence[Spread]) -> None:
-    """Median and range, one row each."""
-    style = COLOURS[support_size]
-    middle, low, high = (np.array([getattr(spread, part) for spread in spreads]) for part in ("median", "low", "high"))
-    # `[2, settings]`, lengths below and above the median. The range, not a confidence interval: how far the draw of
-    # the kernel moves a figure.
-    bars = np.stack([middle - low, high - middle])
-    points: Any = {"fmt": style.marker, "color": style.colour, "markersize": 3.5, "elinewidth": 1.2}
-    axes.errorbar(middle, y, xerr=bars, label=f"Z = {support_size}", **points)

@@ -211,14 +211,8 @@ def recorded(
     # A located cell, t_max + 1 free choices and the forced step: t_max + 3 cells, the segment that hindsight learns
     # from.
     shortest = max(min_length or of_task["t_max"] + 3, 1 if ends == "exit" else 2)  # a cut track of one has no step
-    tracks, loaded = read_track_file(
-        path,
-        grid_size(size),
-        exits=ends == "exit",
-        shortest=shortest,
-        format=format,
-        gridding={"step": step, "cell": cell, "max_gap": max_gap, "origin": origin, "crs": crs},
-    )
+    gridding = {"step": step, "cell": cell, "max_gap": max_gap, "origin": origin, "crs": crs}
+    tracks, loaded = read_track_file(path, grid_size(size), ends == "exit", shortest, format, gridding)
     mine, chosen, judged = split(tracks, held_out, validation, seed)
     return Recorded(mine, size, validation=chosen, held_out=judged, loaded=loaded, **of_task)
 

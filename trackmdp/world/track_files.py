@@ -57,13 +57,7 @@ def read_positions(path: str | Path, kind: str) -> Positions:
 
 
 def read_track_file(
-    path: str | Path,
-    size: tuple[int, int],
-    *,
-    exits: bool,
-    shortest: int,
-    format: str | None,
-    gridding: Mapping[str, Any],
+    path: str | Path, size: tuple[int, int], exits: bool, shortest: int, format: str | None, gridding: Mapping[str, Any]
 ) -> tuple[Tracks, Mapping[str, int]]:
     """The tracks in a file, and how many of what was read, cut and dropped; of cells nothing is dropped.
 
