@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import html
 from collections.abc import Iterable, Mapping, Sequence
-from importlib.resources import files
 from typing import Any
 
 import numpy as np
 
 from trackmdp.paper import settings
-from trackmdp.paper.calibration import DRAWS
+from trackmdp.paper.calibration import BORDER, DRAWS, SEEDS, T_MAX
 from trackmdp.paper.openings import HARDEST, Openings
 from trackmdp.paper.theorems import Check
 from trackmdp.paper.worlds import COSTS, PRINTED_QMDP, PRINTED_TMDP, pairs
 from trackmdp.reports.grouping import Study
 from trackmdp.reports.page import Part, Section
+from trackmdp.reports.prose import paragraphs
 from trackmdp.reports.tables import Cell, Column, Table
 
 
@@ -49,29 +49,21 @@ def accuracy_table(study: Study, chosen: Mapping[tuple[int, float], str]) -> Tab
 def _about_accuracy(study: Study, chosen: Mapping[tuple[int, float], str]) -> str:
     """What the printed accuracies can be held against, and that the learned ones are not reproduced."""
     printed = PRINTED_TMDP.values()
-    text = "Of the paper's results this table alone is set beside printed numbers; its Figures 3 to 5 print no values. "
     a2c = [100 * run.figure("accuracy") for world in chosen.values() for run in study.of(world, "a2c")]
-    # Said only where the two ranges are apart; where they overlap nothing is claimed.
-    if not a2c or min(a2c) <= max(printed):
-        return text
-    return text + (
-        f"The paper's learned policies detect the target in {min(printed):.1f} to {max(printed):.1f} % of the steps, "
-        f"A2C here in {min(a2c):.1f} to {max(a2c):.1f} %: that column is not reproduced. The most likely reasons are "
-        "what the paper leaves open (T_max, the kernels, the border, the network, the length of training), and a "
-        "learner that stopped before every cell that is worth its price was sensed."
-    )
+    # The second said only where the two ranges are apart; where they overlap nothing is claimed.
+    names = ["accuracy", "not reproduced"] if a2c and min(a2c) > max(printed) else ["accuracy"]
+    ends = [(min(each), max(each)) for each in (printed, a2c) if each]
+    return " ".join(paragraphs("trackmdp.paper")[name].format(*ends) for name in names)
 
 
 def _worlds(openings: Openings) -> Section:
     best = settings.fit_table(openings.settings)
     # `fit_table` puts the best setting first.
     border, t_max, *_, worst = best.rows[0]
-    note = (
-        f"<p>Nothing in the paper tells the settings apart but the printed accuracy of Q_MDP. Of those tried, border "
-        f"{border} with T_max = {t_max} fits it best (within {worst:.2f} points for every Z, with {len(DRAWS)} draws "
-        "only); the kernels above are for T_max = 1 and renormalize, this project's defaults.</p>"
-    )
-    rule = f"<p>{html.escape(settings.RULE)}</p>"
+    told = paragraphs("trackmdp.paper")
+    fit = told["fit"].format(border=border, t_max=t_max, worst=worst, draws=len(DRAWS))
+    rule = told["rule"].format(first=SEEDS[0], last=SEEDS[-1], t_max=T_MAX, border=BORDER)
+    note, rule = f"<p>{fit}</p>", f"<p>{rule}</p>"
     drawn = settings.sensitivity_figures(openings.settings)
     parts: list[Part] = [rule, [settings.calibration_figure(openings.candidates)], note, best, drawn]
     tables = [settings.candidates_table(openings.candidates), settings.sensitivity_table(openings.settings)]
@@ -116,9 +108,8 @@ def bounds_table(study: Study, pairs: Mapping[tuple[int, float], str]) -> Table:
 
 def _points(study: Study, table: Table, pairs: Mapping[tuple[int, float], str], found: Sequence[Check]) -> str:
     """The headings and paragraphs of `critique.txt`, in the order of the paper, with the figures of this sweep."""
-    text = files("trackmdp.paper").joinpath("critique.txt").read_text(encoding="utf-8")
     facts = _exit_price(table, found) | _theorem_three(found) | _hardest(study, pairs)
-    points = ((head, " ".join(lines).format(**facts)) for head, *lines in map(str.splitlines, text.split("\n\n")))
+    points = ((head, text.format(**facts)) for head, text in paragraphs("trackmdp.paper", "critique.txt").items())
     return "".join(f"<h3>{html.escape(head)}</h3><p>{html.escape(body)}</p>" for head, body in points)
 
 

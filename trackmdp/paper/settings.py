@@ -8,16 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from trackmdp.paper.calibration import BORDER, DRAWS, SEEDS, T_MAX, Candidate, Setting, Spread, chosen
+from trackmdp.paper.calibration import DRAWS, Candidate, Setting, Spread, chosen
 from trackmdp.paper.worlds import COSTS, PRINTED_QMDP, SUPPORTS
 from trackmdp.reports.style import INK, LOOKS, Canvas, Figure, draw_figure, legend, tidy
 from trackmdp.reports.tables import Cell, Column, Table
 
-RULE = (
-    f"Of the kernels drawn with seeds {SEEDS[0]} to {SEEDS[-1]} (T_max = {T_MAX}, border {BORDER}), each Z takes the "
-    "one whose exact pooled accuracy of Q_MDP deviates least from the printed column, the largest deviation of the "
-    "four prices counting; ties go to the lower seed. What a learned policy does plays no part in it."
-)
 # One colour per Z through all figures of this part; they are those of methods, which do not occur here.
 COLOURS = {3: LOOKS["a2c"], 4: LOOKS["ppo"], 5: LOOKS["hindsight"]}
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from trackmdp.episodes.episode import Episode
 from trackmdp.reports.page import Report, Section
+from trackmdp.reports.prose import paragraphs
 from trackmdp.reports.tables import Cell, Column, Table
 from trackmdp.solvers.recorded import ReplayedTracks
 from trackmdp.world.gridding import said
@@ -61,8 +62,7 @@ def recorded_page(
     chosen = {name: max(each, key=lambda one: len(np.unique(one.target[:_STEPS]))) for name, each in episodes.items()}
     part = _part(problem, chosen.values())
     strips = [f"<h3>{html.escape(names[name])}</h3>{_strip(problem, each, part)}" for name, each in chosen.items()]
-    note = "<p>Blue: sensed. Disc: target located; ring: missed; line: where it came from. Of 16 tracks drawn by the "
-    note += f"seed, the one through the most cells in {_STEPS} steps.</p>"
+    note = f"<p>{paragraphs('trackmdp.reports')['steps'].format(steps=_STEPS)}</p>"
     sections = [
         Section("earns", "What it earns", [_table(names, report)]),
         Section("where", "Where it senses", [f'<div class="figures">{"".join(maps)}</div>']),

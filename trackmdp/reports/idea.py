@@ -8,6 +8,7 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.reports.policy import Sensed
+from trackmdp.reports.prose import paragraphs
 from trackmdp.reports.results import MotionTable
 from trackmdp.reports.style import INK, LINE, Axes, Canvas, Figure, draw_figure
 from trackmdp.reports.tables import Cell, Column, Table
@@ -88,10 +89,7 @@ def idea_figure(policy: Sensed, motion: MotionTable, size: tuple[int, int], wher
     ]
     columns = [Column("moment"), Column("row"), Column("column"), Column("probability", 3), Column("sensed")]
     title = f"The idea in one figure, {where}"
-    text = (
-        "Shade: how likely the target is there. Frame: sensed. Disc: target detected. Ring: target missed, where "
-        "nothing is sensed; what was sensed in vain is then ruled out, and the next sensors look where the rest may be."
-    )
+    text = paragraphs("trackmdp.reports")["idea"]
     return draw_figure("story", f"{title}. {text}", text, Table("story", title, columns, rows), 4.6, paint)
 
 

@@ -13,11 +13,13 @@ from typing import Any, TypeAlias
 from trackmdp.reports import figures, idea, maps, summaries
 from trackmdp.reports.grouping import Study, study
 from trackmdp.reports.policy import Sensed
+from trackmdp.reports.prose import paragraphs
 from trackmdp.reports.results import MotionTable, Results
 from trackmdp.reports.style import Figure
 from trackmdp.reports.tables import Table
 from trackmdp.world.model import grid_size
 
+PROSE = paragraphs("trackmdp.reports")
 # All of them would be dozens of figures; the policies that are not drawn are in `policies.npz`.
 MAPPED = 2
 """Methods and worlds whose policies are drawn on the page."""
@@ -138,11 +140,7 @@ def _against_cost(grouped: Study, threshold: float | None) -> list[Section]:
     found = figures.panels(grouped)
     if not found:
         return []
-    note = (
-        "<p>Learned policies: mean over seeds, bars are 95 % intervals (Student's t; none below three seeds). Q_MDP, "
-        "the bounds and the solver's policy are valued exactly. Above: the distance to the proved upper bound, which "
-        "tells the best apart; below: the reward itself.</p>"
-    )
+    note = f"<p>{PROSE['prices']}</p>"
     above = [figures.against_cost(grouped, panel) for panel in found]
     # No regret where a world has no proved bound, as one on recorded tracks.
     bounded = [panel for panel in found if not any(math.isnan(grouped.upper(world)) for world in panel.worlds)]
@@ -183,11 +181,7 @@ def _maps(results: Results, grouped: Study) -> list[Section]:
     if not found:
         return []
     scales = maps.value_scales((policy, motion) for _, _, policy, motion, _ in found)
-    note = (
-        "<p>Dot: where the target was located. Filled: sensed. Pale: possible cell left out. Dot alone: no miss can "
-        "happen there. Contrasting: sensed where the target cannot be. The run is the one in the middle of its "
-        "seeds.</p>"
-    )
+    note = f"<p>{PROSE['maps']}</p>"
     large = any(len(policy.value) > maps.MOST_MAP_CELLS for _, _, policy, _, _ in found)
     values, sets = [maps.value_map(*each, scales) for each in found], [maps.policy_map(*each) for each in found]
     return [Section("maps", "Policies and values, cell by cell", [values, "" if large else note, sets])]
@@ -201,9 +195,6 @@ def _made(manifest: Any) -> str:
             facts[f"{label}, {entry['runs']} runs"] = text
     seconds = [f"{manifest.get(key, 0):,.0f} s {key.split('_')[0]}" for key in ("wall_seconds", "cpu_seconds")]
     facts["Run time"] = ", ".join(seconds)
-    facts["Intervals"] = (
-        "95 %, Student's t over seeds within each world, worlds combined after Welch and Satterthwaite; shares of runs "
-        "after Clopper and Pearson; none below three seeds"
-    )
+    facts["Intervals"] = PROSE["intervals"]
     items = "".join(f"<div><dt>{html.escape(k)}</dt><dd>{html.escape(v)}</dd></div>" for k, v in facts.items())
     return f'<dl class="facts">{items}</dl><p class="faint">Numbers in full: the CSV files beside this page.</p>'
