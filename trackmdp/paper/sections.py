@@ -48,12 +48,13 @@ def accuracy_table(study: Study, chosen: Mapping[tuple[int, float], str]) -> Tab
 
 def _about_accuracy(study: Study, chosen: Mapping[tuple[int, float], str]) -> str:
     """What the printed accuracies can be held against, and that the learned ones are not reproduced."""
-    printed = PRINTED_TMDP.values()
+    told, printed = paragraphs("trackmdp.paper"), PRINTED_TMDP.values()
     a2c = [100 * run.figure("accuracy") for world in chosen.values() for run in study.of(world, "a2c")]
-    # The second said only where the two ranges are apart; where they overlap nothing is claimed.
-    names = ["accuracy", "not reproduced"] if a2c and min(a2c) > max(printed) else ["accuracy"]
-    ends = [(min(each), max(each)) for each in (printed, a2c) if each]
-    return " ".join(paragraphs("trackmdp.paper")[name].format(*ends) for name in names)
+    # Said only where the two ranges are apart; where they overlap nothing is claimed.
+    if not a2c or min(a2c) <= max(printed):
+        return told["accuracy"]
+    theirs, ours = (f"{min(each):.1f} to {max(each):.1f} %" for each in (printed, a2c))
+    return f"{told['accuracy']} {told['not reproduced'].format(theirs=theirs, ours=ours)}"
 
 
 def _worlds(openings: Openings) -> Section:
@@ -63,9 +64,9 @@ def _worlds(openings: Openings) -> Section:
     told = paragraphs("trackmdp.paper")
     fit = told["fit"].format(border=border, t_max=t_max, worst=worst, draws=len(DRAWS))
     rule = told["rule"].format(first=SEEDS[0], last=SEEDS[-1], t_max=T_MAX, border=BORDER)
-    note, rule = f"<p>{fit}</p>", f"<p>{rule}</p>"
     drawn = settings.sensitivity_figures(openings.settings)
-    parts: list[Part] = [rule, [settings.calibration_figure(openings.candidates)], note, best, drawn]
+    figure = settings.calibration_figure(openings.candidates)
+    parts: list[Part] = [f"<p>{rule}</p>", [figure], f"<p>{fit}</p>", best, drawn]
     tables = [settings.candidates_table(openings.candidates), settings.sensitivity_table(openings.settings)]
     return Section("worlds", "The paper's worlds, calibrated", parts, tables)
 
