@@ -9,7 +9,7 @@ import numpy as np
 from trackmdp.episodes.episode import Episode
 from trackmdp.world.model import Task
 from trackmdp.world.modes import HiddenWorld
-from trackmdp.world.render import FOUND, MISSED, ON, around
+from trackmdp.world.render import FOUND, MISSED, ON, around, symbols
 
 WIDE, STEP = 37, 9
 """Rows and columns of a grid that are drawn at most, which 80 characters hold, and how far the part drawn moves at
@@ -68,13 +68,11 @@ def frame(episode: Episode, t: int, task: Task) -> str:
     belief = np.zeros(task.num_cells) if episode.belief is None else episode.belief[t]
     # digitize gives 0 below 1e-6, 1 below .05, ... 4 from .5 on: an index into the shades.
     levels = np.digitize(belief, [1e-6, 0.05, 0.2, 0.5])
-    marks = np.array(list(_SHADES))[levels]
-    if outcome(episode, t, task) != "forced":
-        marks = np.where(task.covered(episode.action[t]), ON, marks)
-    if episode.target[t] < task.num_cells:
-        marks[episode.target[t]] = FOUND if episode.located[t] else MISSED
+    on = task.covered(episode.action[t]) & (outcome(episode, t, task) != "forced")
+    shades, found = np.array(list(_SHADES))[levels], bool(episode.located[t])
+    marks = symbols(task.size, int(episode.target[t]), on, found=found, empty=shades)
     down, across = _part(episode, t, task)
-    rows = [" ".join(row[across.start : across.stop]) for row in marks.reshape(task.size)[down.start : down.stop]]
+    rows = [" ".join(row[across.start : across.stop]) for row in marks[down.start : down.stop]]
     edge = "─" * (2 * len(across) + 1)
     lines = [f"┌{edge}┐", *(f"│ {row} │" for row in rows), f"└{edge}┘"]
     if (len(down), len(across)) != task.size:

@@ -8,7 +8,7 @@ import numpy as np
 
 from trackmdp.episodes.episode import Episode
 from trackmdp.world.model import BoolArray, Task
-from trackmdp.world.render import PICTURE_LEGEND, around, text_rows
+from trackmdp.world.render import PICTURE_LEGEND, around, symbols
 
 MARGIN = "   "
 WIDE = 21
@@ -32,22 +32,14 @@ def draw_picture(episodes: Sequence[Episode], task: Task, *, steps: int = 6) -> 
     # around the middle of its way
     middle = [(int(each.min()) + int(each.max())) // 2 if len(each) else 0 for each in way]
     rows, columns = (around(place, length, WIDE) for place, length in zip(middle, task.size, strict=True))
-    frames = [_frame(task, rows, columns, cell, on) for cell, on in shown]
-    pieces = [[f"step {k}", *frame] for k, frame in enumerate(frames, start=1)]
+    part = slice(rows.start, rows.stop), slice(columns.start, columns.stop)
+    frames = (symbols(task.size, cell, on, found=bool(on[cell]))[part] for cell, on in shown)
+    pieces = [[f"step {k}", *map(" ".join, frame)] for k, frame in enumerate(frames, start=1)]
     wide = [[row.ljust(max(map(len, column))) for row in column] for column in pieces]
     lines = [MARGIN.join(parts) for parts in zip(*wide, strict=True)]
     whole = (len(rows), len(columns)) == task.size
     where = f"rows {rows[0]} to {rows[-1]} of {task.rows}, columns {columns[0]} to {columns[-1]} of {task.columns}"
     return "\n".join([*(line.rstrip() for line in lines), "", *([] if whole else [where]), PICTURE_LEGEND, ""])
-
-
-def _frame(task: Task, rows: range, columns: range, cell: int, on: BoolArray) -> list[str]:
-    """The text of some rows and columns; a target beyond them is not drawn."""
-    row, column = divmod(cell, task.columns)
-    inside = row in rows and column in columns
-    here = (row - rows.start) * len(columns) + column - columns.start if inside else len(rows) * len(columns)
-    cut = on.reshape(task.size)[rows.start : rows.stop, columns.start : columns.stop].ravel()
-    return text_rows((len(rows), len(columns)), here, cut, found=bool(on[cell]))
 
 
 def _steps(episode: Episode, task: Task, steps: int) -> Iterator[tuple[int, BoolArray]]:

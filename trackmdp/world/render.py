@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,9 +18,9 @@ _COLOURS = {FOUND: (0, 90, 181), MISSED: (220, 50, 32), ON: (255, 194, 10), OFF:
 _SIDE, _GAP = 16, 1  # pixels of a cell, and of the white line around it
 
 
-def _marks(size: Sequence[int], cell: int, on: BoolArray, found: bool) -> npt.NDArray[np.str_]:
-    """`[rows, columns]` symbols; the target's cell M, where it has exited, is on no grid."""
-    marks = np.where(on, ON, OFF)
+def symbols(size: Sequence[int], cell: int, on: BoolArray, *, found: bool, empty: Any = OFF) -> npt.NDArray[np.str_]:
+    """`[rows, columns]` symbols, `empty` where no sensor is on; the target's cell M, exited, is on no grid."""
+    marks = np.where(on, ON, empty)
     if cell < len(marks):
         marks[cell] = FOUND if found else MISSED
     return marks.reshape(tuple(size))
@@ -43,12 +44,12 @@ def text_rows(size: Sequence[int], cell: int, on: BoolArray, *, found: bool) -> 
         on: `[M]` sensors that are on.
         found: whether the target is detected.
     """
-    return [" ".join(row) for row in _marks(size, cell, on, found)]
+    return [" ".join(row) for row in symbols(size, cell, on, found=found)]
 
 
 def pixels(size: Sequence[int], cell: int, on: BoolArray, *, found: bool) -> npt.NDArray[np.uint8]:
     """`[16 rows, 16 columns, 3]` red, green and blue; arguments as for `text_rows`."""
-    marks = _marks(size, cell, on, found)
+    marks = symbols(size, cell, on, found=found)
     picture = np.full((*marks.shape, _SIDE, _SIDE, 3), 255, dtype=np.uint8)
     for symbol, colour in _COLOURS.items():
         # A boolean index picks whole tiles, [hits, side, side, 3], whose inner part gets the colour.
