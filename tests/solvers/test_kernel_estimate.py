@@ -118,7 +118,7 @@ def test_samples_spread_around_the_mean_as_counts_allow() -> None:
     estimate.add(paths_of([(0, [], 1)] * 30 + [(0, [], 2)] * 60 + [(0, [], 4)] * 10))
     estimate.fit(1)
     rng = np.random.default_rng(0)
-    drawn = np.stack([estimate.sample(rng).toarray()[0] for _ in range(4000)])
+    drawn = np.stack([drawn.toarray()[0] for drawn in estimate.samples(rng, 4000)])
     np.testing.assert_allclose(drawn.mean(axis=0), [0, 0.3, 0.6, 0, 0.1], atol=0.005)
     np.testing.assert_allclose(drawn[:, 2].std(), np.sqrt(0.6 * 0.4 / 101), rtol=0.05)
     np.testing.assert_allclose(drawn[:, 4].std(), np.sqrt(0.1 * 0.9 / 101), rtol=0.05)

@@ -112,7 +112,7 @@ class LearnedKernel:
         return self._believed | seen
 
     def _beliefs(self, plan: PolicyTable, kernel: sparse.csr_array) -> dict[str, float]:
-        drawn = (self._estimate.sample(self._rng) for _ in range(self.cfg.samples))
+        drawn = self._estimate.samples(self._rng, self.cfg.samples)
         mean, *others = (evaluate(believed_world(self.task, k, self._least), plan).aihtr for k in (kernel, *drawn))
         return {"believed_aihtr": mean, "believed_deviation": float(np.std(others))}
 

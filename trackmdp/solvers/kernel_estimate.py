@@ -10,6 +10,8 @@ seen, and those that the prior adds, which puts the displacements seen anywhere 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from scipy import sparse
 
@@ -166,13 +168,21 @@ class KernelEstimate:
 
     def sample(self, rng: np.random.Generator) -> sparse.csr_array:
         """`[M, M + 1]` one kernel drawn from the posterior, censored paths taken at their expected moves."""
+        return next(self.samples(rng, 1))
+
+    def samples(self, rng: np.random.Generator, count: int) -> Iterator[sparse.csr_array]:
+        """As many as `count` of them."""
         moves, exits = self._parameters()
-        # A Dirichlet draw is a row of gamma draws, scaled to 1; 1e-300 keeps a row of tiny parameters from 0 / 0.
-        moves.data = rng.standard_gamma(moves.data) + 1e-300
-        # Where exits are rare and few were seen most draws are 0 but for rounding, and an episode may never end.
-        drawn = self._kernel(moves, np.maximum(rng.beta(exits[:, 0], exits[:, 1]), LEAST_EXIT))
         # Cells that move alike are drawn once: the draws of many would average out.
-        return drawn if self.share_cells is False else self._alike().spread(drawn)
+        alike = None if self.share_cells is False else self._alike()
+        for _ in range(count):
+            # A Dirichlet draw is a row of gamma draws, scaled to 1; 1e-300 keeps a row of tiny parameters from 0 / 0.
+            weights = sparse.csr_array(
+                (rng.standard_gamma(moves.data) + 1e-300, moves.indices, moves.indptr), moves.shape
+            )
+            # Where exits are rare and few were seen most draws are 0 but for rounding, and an episode may never end.
+            drawn = self._kernel(weights, np.maximum(rng.beta(exits[:, 0], exits[:, 1]), LEAST_EXIT))
+            yield drawn if alike is None else alike.spread(drawn)
 
     def _alike(self) -> AlikeCells:
         judged = self.counts if self.share_cells is None else None
