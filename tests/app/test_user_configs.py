@@ -57,6 +57,7 @@ def test_a_config_folder_of_ones_own_adds_choices(
         ("hydra/job_logging/a", "root: {level: 1}\nfilters: {x: {(): os.mkdir}}", "hydra/job_logging=a", "x.(): a con"),
         ("hydra/job_logging/a", "root: {level: INFO}", "hydra/job_logging=a", "expected one of none, default"),
         ("hydra/launcher/a", f"x: {EVIL}", "hydra/launcher=a", "x._target_: a config is data"),
+        ("sensor/a", "", "sensor=a", "sensor: expected a file that begins with defaults: [perfect|miss|"),
         ("hydra/launcher/a", "x: 1", "hydra/launcher=a", "hydra/launcher: expected one of basic, joblib"),
     ],
 )
