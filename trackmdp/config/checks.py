@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 import difflib
+import itertools
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -69,6 +70,9 @@ def check_option(key: str, value: Any, known: Mapping[str, Option]) -> None:
     """
     if key not in known:
         refuse_renamed(key)
+        *parents, _ = itertools.accumulate(key.split("."), "{}.{}".format)
+        if above := next((each for each in parents if each in known), None):
+            raise UserError(f"{above}: a mapping, expected {known[above].expected}")
         raise unknown_option(key, known)
     if not known[key].allows(value):
         raise refuse(key, value, known[key].expected)
