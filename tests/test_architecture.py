@@ -13,7 +13,18 @@ from pathlib import Path
 PACKAGE = Path(__file__).parents[1] / "trackmdp"
 FILES = sorted(PACKAGE.rglob("*.py"))
 
-BEFORE_ALL = ("errors", "imports", "gym", "seeding", "durable", "untrusted", "arrays", "statistics", "machine")
+BEFORE_ALL = (
+    "errors",
+    "imports",
+    "gym",
+    "seeding",
+    "durable",
+    "untrusted",
+    "arrays",
+    "statistics",
+    "machine",
+    "signals",
+)
 
 # What each may import: itself, and all before it.
 ARROW = [

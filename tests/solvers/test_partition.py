@@ -15,11 +15,11 @@ import trackmdp as tm
 from trackmdp.app.cli import main
 from trackmdp.config.compose import compose
 from trackmdp.errors import Preempted, UserError
+from trackmdp.signals import Signals, handled
 from trackmdp.solvers import regions
 from trackmdp.solvers.partition import Block, blocks, default_halo, plan_by_blocks, reach, sub_world
 from trackmdp.solvers.solve import run_solver
 from trackmdp.solvers.workers import crew, in_turn
-from trackmdp.training.signals import Signals, handled
 from trackmdp.world.model import World
 
 
@@ -191,15 +191,17 @@ def test_what_a_killed_worker_had_is_done_again(tmp_path: Path, cluster: str | N
 
 @dataclass(frozen=True)
 class Saves:
-    """As a learner does, hears the signal, saves and ends; the first job tells whoever began it."""
+    """As a learner does, hears the signal, saves and ends; the first job tells `parent`, who began it."""
 
     folder: Path
+    parent: int
+    kind: signal.Signals
 
     def __call__(self, number: int) -> None:
         with Signals() as signals:
             (self.folder / f"{number} begun").touch()
             if number == 0:
-                os.kill(os.getppid(), signal.SIGUSR1)
+                os.kill(self.parent, self.kind)
             while not signals.heard():
                 pass
             (self.folder / f"{number} saved").touch()
@@ -207,13 +209,21 @@ class Saves:
 
 
 @pytest.mark.slow
-def test_a_signal_ends_all_workers_and_none_begins_another_job(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("cluster", "kind"), [(None, signal.SIGUSR1), (None, signal.SIGTERM), ("local", signal.SIGTERM)]
+)
+def test_a_signal_ends_all_workers_and_none_begins_another_job(
+    tmp_path: Path, cluster: str | None, kind: signal.Signals
+) -> None:
+    if cluster:
+        pytest.importorskip("ray")
+
     def end(number: int, frame: object) -> None:
         raise Preempted(number)
 
-    with handled(end, signal.SIGUSR1), pytest.raises(Preempted) as told, crew(2) as run:
-        run(Saves(tmp_path), range(6))
-    assert told.value.signal == signal.SIGUSR1
+    with handled(end, kind), pytest.raises(Preempted) as told, crew(2, cluster) as run:
+        run(Saves(tmp_path, os.getpid(), kind), range(6))
+    assert told.value.signal == kind
     # the other worker may have been told before it began
     left = {file.name for file in tmp_path.iterdir()}
     assert left in ({"0 begun", "0 saved"}, {"0 begun", "0 saved", "1 begun", "1 saved"})
@@ -223,6 +233,14 @@ def test_a_signal_ends_all_workers_and_none_begins_another_job(tmp_path: Path) -
 def test_a_job_that_kills_every_worker_ends_in_one_line(tmp_path: Path) -> None:
     with crew(2) as run, pytest.raises(UserError, match="workers died 3 times"):
         run(Dies(tmp_path, always=True), [2])
+
+
+def test_a_policy_of_another_grid_cannot_be_put_together() -> None:
+    def whole(number: int, world: World) -> tm.Policy:
+        return tm.Policy.all_on(tm.make_world(size=8))
+
+    with pytest.raises(UserError, match="policy: made for 64 cells, t_max 1; expected 49 cells, t_max 1"):
+        plan_by_blocks(tm.make_world(size=8), whole, 4)
 
 
 def test_a_policy_that_draws_cannot_be_put_together() -> None:

@@ -6,7 +6,7 @@ from contextlib import nullcontext
 
 import pytest
 
-from trackmdp.training.signals import Signals, kept_sigterm
+from trackmdp.signals import Signals, kept_sigterm
 
 
 def test_the_first_signal_is_noted_and_a_later_one_acts_as_before(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -20,7 +20,7 @@ def test_the_first_signal_is_noted_and_a_later_one_acts_as_before(monkeypatch: p
             signal.raise_signal(signal.SIGTERM)
             signal.raise_signal(signal.SIGTERM)  # `timeout` signals the process, and then its group once more
             assert (signals.received, heard) == (signal.SIGTERM, [])
-            monkeypatch.setattr("trackmdp.training.signals._ONE", 0.0)
+            monkeypatch.setattr("trackmdp.signals._ONE", 0.0)
             signal.raise_signal(signal.SIGTERM)
             assert heard == [signal.SIGTERM]
             monkeypatch.undo()

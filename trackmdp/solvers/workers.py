@@ -12,9 +12,11 @@ from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from types import FrameType
 from typing import Any, Protocol, TypeVar
 
 from trackmdp.errors import Preempted, UserError, require
+from trackmdp.signals import HEARD, handled, kept_sigterm
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -149,7 +151,8 @@ def _ray(workers: int, cluster: str) -> Iterator[Crew]:
     begun = not ray.is_initialized()
     try:
         if begun:
-            ray.init(logging_level=logging.ERROR, log_to_driver=False, **where)
+            with kept_sigterm():
+                ray.init(logging_level=logging.ERROR, log_to_driver=False, **where)
     except (ConnectionError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise UserError(f"partition.cluster={cluster}: expected a Ray cluster ({reason})") from error
@@ -157,8 +160,10 @@ def _ray(workers: int, cluster: str) -> Iterator[Crew]:
     def run(work: Callable[[Job], Result], jobs: Sequence[Job]) -> list[Result]:
         # Ray itself begins a task again whose worker or machine was lost.
         task: Any = ray.remote(num_cpus=1, max_retries=_ATTEMPTS - 1)(lambda job: work(job))
+        tasks = [task.remote(job) for job in jobs]
         try:
-            return list(ray.get([task.remote(job) for job in jobs]))
+            with _cancelled(ray, tasks):
+                return list(ray.get(tasks))
         except ray.exceptions.RayTaskError as error:  # an error of the work itself, as it would be raised here
             raise error.cause from None
         except ray.exceptions.RayError as error:
@@ -169,3 +174,25 @@ def _ray(workers: int, cluster: str) -> Iterator[Crew]:
     finally:
         if begun:
             ray.shutdown()
+
+
+@contextmanager
+def _cancelled(ray: Any, tasks: Sequence[Any]) -> Iterator[None]:
+    """On an error or a signal, end the tasks that are under way and wait for them; begin no others."""
+    before = {number: told for number in HEARD if callable(told := signal.getsignal(number))}
+    heard: list[signal.Signals] = []
+
+    def interrupt(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
+        heard.append(signal.Signals(number))
+        raise KeyboardInterrupt  # Ray's waits swallow all others
+
+    try:
+        with handled(interrupt, *before):
+            yield
+    except BaseException:
+        for task in tasks:
+            ray.cancel(task)  # SIGINT: who learns saves what there is
+        ray.wait(tasks, num_returns=len(tasks))
+        for number in heard[:1]:
+            before[number](number, None)
+        raise

@@ -27,6 +27,7 @@ from trackmdp.durable import own_folder, write_bytes, write_json
 from trackmdp.errors import Preempted, UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.seeding import derive, preserved_global_rng
+from trackmdp.signals import HEARD, handled
 from trackmdp.solvers.alike import cell_classes
 from trackmdp.solvers.partition import Block, blocks, default_halo, narrow_halo, plan_by_blocks
 from trackmdp.solvers.workers import crew
@@ -37,7 +38,6 @@ from trackmdp.training.folders import SUMMARY, finished, read_summary
 from trackmdp.training.inputs import CLASSES, short, write_inputs
 from trackmdp.training.lock import locked
 from trackmdp.training.run import complete, load_run
-from trackmdp.training.signals import HEARD, handled
 from trackmdp.training.state import Position, identity
 from trackmdp.training.trainer import Trainer
 from trackmdp.untrusted import decoded

@@ -12,7 +12,7 @@ from torchrl.collectors.distributed import RayCollector
 
 from trackmdp.config.learning import RayWorkersConfig
 from trackmdp.errors import UserError, require
-from trackmdp.training.signals import kept_sigterm
+from trackmdp.signals import kept_sigterm
 from trackmdp.world.env import TrackEnv
 
 _STORE = 2**30

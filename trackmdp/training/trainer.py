@@ -18,6 +18,7 @@ from trackmdp.durable import write_json
 from trackmdp.errors import Preempted, RunError
 from trackmdp.policies.policy import Policy, actor_table
 from trackmdp.seeding import seed_global
+from trackmdp.signals import Signals, Watch
 from trackmdp.training.callbacks import Callback, Row
 from trackmdp.training.display import Display
 from trackmdp.training.evaluator import Score, make_evaluator, while_collecting
@@ -25,7 +26,6 @@ from trackmdp.training.inputs import write_inputs
 from trackmdp.training.machine import check_memory, make_device
 from trackmdp.training.make import make_algorithm, make_collector, make_loggers
 from trackmdp.training.saving import Checkpoints
-from trackmdp.training.signals import Signals, Watch
 from trackmdp.training.state import Position, find, restore, take_weights
 from trackmdp.untrusted import decoded
 from trackmdp.world.tracks import Problem

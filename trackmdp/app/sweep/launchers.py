@@ -24,7 +24,7 @@ from trackmdp.config.sweeping import (
     SubmititSlurmConfig,
 )
 from trackmdp.errors import FAILED, UserError
-from trackmdp.training.signals import handled, kept_sigterm
+from trackmdp.signals import handled, kept_sigterm
 
 # Each names the threads of one library (OpenMP, OpenBLAS, MKL), which by default take all cores, in every run at once.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")

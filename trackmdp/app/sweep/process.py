@@ -25,8 +25,8 @@ from trackmdp.app.sweep.plan import Job
 from trackmdp.config import TrainConfig
 from trackmdp.durable import write_json
 from trackmdp.errors import FAILED, USER_MISTAKE, Preempted, RunError, UserError
+from trackmdp.signals import handled
 from trackmdp.training.folders import DONE, FAILED_FILE, SUMMARY, run_of
-from trackmdp.training.signals import handled
 
 Launch = Callable[[Sequence[Job]], None]
 """Runs jobs, and returns once none of them is running."""

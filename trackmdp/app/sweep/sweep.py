@@ -18,10 +18,10 @@ from trackmdp.config import TrainConfig
 from trackmdp.config.tree import continued
 from trackmdp.durable import csv_text, write_text
 from trackmdp.errors import FAILED, USER_MISTAKE, Preempted, UserError
+from trackmdp.signals import Signals
 from trackmdp.training.display import table
 from trackmdp.training.folders import DONE, FAILED_FILE, SUMMARY, RunState, finished, run_of, runs_of, write_plan
 from trackmdp.training.lock import locked
-from trackmdp.training.signals import Signals
 from trackmdp.untrusted import known_object, no_formula
 
 TABLE = "runs.csv"
