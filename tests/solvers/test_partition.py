@@ -239,7 +239,7 @@ def test_a_policy_of_another_grid_cannot_be_put_together() -> None:
     def whole(number: int, world: World) -> tm.Policy:
         return tm.Policy.all_on(tm.make_world(size=8))
 
-    with pytest.raises(UserError, match="policy: made for 64 cells, t_max 1; expected 49 cells, t_max 1"):
+    with pytest.raises(UserError, match="policy: made for 8 x 8 cells, t_max 1; expected 7 x 7 cells, t_max 1"):
         plan_by_blocks(tm.make_world(size=8), whole, 4)
 
 
