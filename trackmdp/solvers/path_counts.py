@@ -76,7 +76,7 @@ def plan_paths(paths: Paths, *, prior: float, discount: float, rounds: int) -> P
         if after.reward <= value.reward:
             break
         best, value, kept = tried, after, kept + 1
-    return Planned(PolicyTable(task, best.table()), value.reward, len(paths.seen), kept)
+    return Planned(best.table(), value.reward, len(paths.seen), kept)
 
 
 class _Counted:
@@ -159,19 +159,16 @@ class _Counted:
         shape = (len(paths.seen), paths.task.num_cells)
         return sparse.csr_array((np.ones(len(key), dtype=bool), (key, cell)), shape=shape)
 
-    def table(self) -> sparse.csr_array:
-        """`[keys (t_max + 1), M]`, the sets of all keys: by their own count, or where they were never seen without."""
-        task, paths, choices = self._paths.task, self._paths, self._paths.task.num_choices
-        unseen = np.ones(task.num_keys, dtype=bool)
+    def table(self) -> PolicyTable:
+        """The sets of all keys: by their own count, or where they were never seen without."""
+        paths = self._paths
+        unseen = np.ones(paths.task.num_keys, dtype=bool)
         unseen[paths.seen] = False
-        rows, cells = [], []
+        sensed = []
         for n, sets in enumerate(self._sets):
             own, (key, cell) = sets.tocoo(), self._unseen(n, unseen)
-            rows += [paths.seen[own.row] * choices + n, key * choices + n]
-            cells += [own.col, cell]
-        place = np.concatenate(rows), np.concatenate(cells)
-        on = np.ones(len(place[0]), dtype=bool)
-        return sparse.csr_array((on, place), shape=(task.num_keys * choices, task.num_cells))
+            sensed.append((np.concatenate([paths.seen[own.row], key]), np.concatenate([own.col, cell])))
+        return PolicyTable.from_sensed(paths.task, sensed)
 
     def _unseen(self, n: int, unseen: BoolArray) -> tuple[IndexArray, IndexArray]:
         """Keys and cells of the sets of keys that were not seen, a bool for each key."""
