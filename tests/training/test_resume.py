@@ -39,6 +39,7 @@ RECIPES = {
 # Environment and replay buffer with sensors that miss; the joint learners know of them through the environment alone.
 # As large grids are learned: tables in place of nets, and actions of the window's sensors alone.
 RECIPES["hindsight-tables"] = [*RECIPES["hindsight"], "algo.hidden=0", "grid.window=1"]
+RECIPES["hindsight-map"] = [*RECIPES["hindsight-tables"], "algo.share_cells={folder}/map.csv"]
 # Policies that know more at a detection than the cell.
 RECIPES["ppo-told"] = [*RECIPES["ppo"], "kernel=heading", "kernel.reveals=true"]
 RECIPES["hindsight-told"] = [*RECIPES["hindsight"], "kernel=heading", "kernel.reveals=true"]
@@ -74,7 +75,8 @@ def cut(folder: Path, number: int, after: int, *words: str) -> int:
 
 def resumes_exactly(folder: Path, recipe: str, kills: int) -> None:
     """`kills` SIGKILLs at random moments, then on to the end: equal to a run that was never cut."""
-    words = [*SMALL, *BATCHES, *RECIPES[recipe]]
+    words = [*SMALL, *BATCHES, *(word.format(folder=folder) for word in RECIPES[recipe])]
+    (folder / "map.csv").write_text("0,0,0\n0,0,1\n1,1,1\n")
     assert train(folder / "whole", *words).returncode == 0
     whole, moments = len(rows(folder / "whole")), random.Random(recipe)
     words += ["resume=auto", "checkpoint.every=2048", "checkpoint.seconds=0.05"]

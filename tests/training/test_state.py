@@ -192,6 +192,34 @@ def test_a_kernel_that_changed_is_refused(
     assert "kernel.npz: not what the run's config describes now" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("algo", ["hindsight", "learned_kernel"])
+def test_a_map_of_classes_is_kept_and_no_other_one_taken(
+    algo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    classes, file = np.array([0, 0, 0, 0, 0, 0, 1, 1, 1]), tmp_path / "map.npy"
+    np.save(file, classes)
+    words = [f"algo.share_cells={file}", *(SMALL["hindsight"] if algo == "hindsight" else [f"algo={algo}"])]
+    command = [*words, *QUICK, *BUDGET, "resume=auto", f"hydra.run.dir={tmp_path / 'run'}"]
+    for folder in ("whole", "run"):
+        with monkeypatch.context() as patch:
+            if folder == "run":
+                at_iteration(patch, 5, breaks)
+            assert main(["train", *command[:-1], f"hydra.run.dir={tmp_path / folder}"]) == (folder == "run")
+    before = files(tmp_path / "run")
+    capsys.readouterr()
+    np.save(file, np.zeros(9))
+    assert main(["train", *command]) == 2
+    assert "classes.npy: not what the run's config describes now" in capsys.readouterr().err
+    file.unlink()
+    assert main(["train", *command]) == 2
+    assert capsys.readouterr().err == f"trackmdp train: algo.share_cells={file}: no such file\n"
+    assert before == files(tmp_path / "run")
+    np.save(file, classes)
+    assert main(["train", *command]) == 0
+    assert_same_run(tmp_path / "run", tmp_path / "whole")
+    assert (tmp_path / "run" / "policy.npz").read_bytes() == (tmp_path / "whole" / "policy.npz").read_bytes()
+
+
 def test_events_after_the_checkpoint_are_hidden(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 

@@ -27,6 +27,7 @@ from trackmdp.config import (
 )
 from trackmdp.config.checks import refuse_ignored
 from trackmdp.config.compose import from_hydra
+from trackmdp.config.learning import file_of_classes
 from trackmdp.config.loggers import require_packages
 from trackmdp.config.tree import continued, key_of, run_folder
 from trackmdp.errors import UserError
@@ -171,10 +172,10 @@ def _reads_files(cfg: WorldConfig) -> bool:
 
 
 def _check_files(cfg: CommandConfig, words: Sequence[str]) -> None:
-    if isinstance(cfg, TrainConfig) and getattr(cfg.algo, "share_cells", None) not in (None, "all", "none"):
+    if isinstance(cfg, TrainConfig) and (classes := file_of_classes(cfg.algo)):
         from trackmdp.solvers.alike import cell_classes  # imports scipy, as a world does
 
-        cell_classes(cfg.algo.share_cells, cfg.grid.sides)  # type: ignore[attr-defined]
+        cell_classes(classes, cfg.grid.sides)
     if isinstance(cfg, EvaluateConfig) and cfg.run is not None:
         for word in words:
             group = key_of(word).split(".")[0]

@@ -49,7 +49,7 @@ class LearnedKernelConfig(AlgoConfig):
 
     def check(self, key: str, root: Any) -> None:
         """The file of the classes is a table; where a detection tells the mode, cells do not move alike."""
-        check_classes(f"{key}.share_cells", self.share_cells)
+        check_classes(f"{key}.share_cells", self)
         if root.kernel.hides and self.share_cells not in (None, "none"):
             raise refuse(f"{key}.share_cells", self.share_cells, "none or null with kernel.reveals=true")
 

@@ -221,9 +221,16 @@ class RayWorkersConfig(WorkersConfig):
     gpus_per_worker: float = option("GPUs of each worker", unit="GPUs", ge=0)
 
 
-def check_classes(key: str, given: str | None) -> None:
+def file_of_classes(algo: AlgoConfig) -> str | None:
+    """The file that `share_cells` names; None where it is one of its words, or the algorithm has no such option."""
+    given: str | None = getattr(algo, "share_cells", None)
+    return None if given in ("all", "none") else given
+
+
+def check_classes(key: str, algo: AlgoConfig) -> None:
     """Refuse what is neither a word of `share_cells` nor the name of a table, such as the former true and false."""
-    if given not in ("all", "none", None) and Path(given).suffix not in (".npy", ".npz", ".csv"):
+    given = file_of_classes(algo)
+    if given is not None and Path(given).suffix not in (".npy", ".npz", ".csv"):
         expected = "all (formerly true), none (formerly false), or a path to a .npy, .npz or .csv file"
         raise refuse(key, given, expected)
 

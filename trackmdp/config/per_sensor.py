@@ -74,7 +74,7 @@ class PerSensorConfig(AlgoConfig):
 
     def check(self, key: str, root: Any) -> None:
         """`explore` is a probability; where whole paths are learned from, episodes have room for one."""
-        check_classes(f"{key}.share_cells", self.share_cells)
+        check_classes(f"{key}.share_cells", self)
         for end in ("start", "end"):
             if (probability := getattr(self.explore, end)) > 1:
                 raise refuse(f"{key}.explore.{end}", probability, "a number from 0 to 1, a probability")

@@ -19,7 +19,7 @@ from rich.console import Console
 
 from trackmdp.arrays import npy_bytes
 from trackmdp.config import TrainConfig, load_run_config
-from trackmdp.config.learning import AlgoConfig
+from trackmdp.config.learning import AlgoConfig, file_of_classes
 from trackmdp.config.partition import PartitionConfig
 from trackmdp.config.sensing import MissConfig, PaperCostConfig, PerfectSensorConfig
 from trackmdp.config.world import TableConfig
@@ -206,11 +206,9 @@ class _BlockLearner:
     def _algo(self, number: int, folder: Path) -> AlgoConfig:
         """The algorithm, with the block's part of the classes of cells where a file holds those of the whole grid."""
         algo, size = self.config.algo, self.config.grid.sides
-        named = getattr(algo, "share_cells", None)
-        if named in (None, "all", "none"):
+        classes, (rows, columns) = cell_classes(file_of_classes(algo), size), self.parts[number].seen
+        if classes is None:
             return algo
-        classes, (rows, columns) = cell_classes(named, size), self.parts[number].seen
-        assert classes is not None
         part = classes.reshape(size)[rows.start : rows.stop, columns.start : columns.stop]
         write_bytes(folder / CLASSES, npy_bytes(part.ravel()))
         return replace(algo, share_cells=str(folder / CLASSES))  # type: ignore[call-arg]

@@ -12,6 +12,7 @@ from scipy import sparse
 
 from trackmdp.arrays import LARGE, npy_bytes
 from trackmdp.config import TrainConfig
+from trackmdp.config.learning import file_of_classes
 from trackmdp.config.tree import config_text
 from trackmdp.durable import write_bytes, write_text
 from trackmdp.errors import UserError
@@ -44,8 +45,8 @@ def write_inputs(config: TrainConfig, problem: Problem, folder: Path, *, resumed
         UserError: the run that is resumed was begun with another kernel, other tracks or other classes.
     """
     contents = _contents(problem)
-    classes = cell_classes(getattr(config.algo, "share_cells", None), problem.size)
-    if classes is not None and classes.any():
+    classes = cell_classes(file_of_classes(config.algo), problem.size)
+    if classes is not None:
         contents[CLASSES] = npy_bytes(classes)
     own = folder.absolute() / RECORDING
     # Before anything is written: a run that is refused must keep the inputs that its results belong to. And what was
