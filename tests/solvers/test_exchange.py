@@ -37,6 +37,17 @@ def test_no_cells_value_falls_from_whatever_sets_it_starts(world: World, seed: i
     assert (problem.worth(exchange.exchange(problem, sets, mass), mass) >= worth - 1e-9 * (1.0 + np.abs(worth))).all()
 
 
+def test_one_round_gains_most_of_what_all_of_them_gain() -> None:
+    world = make_world("drift", size=5, t_max=1, cost=0.3, persistence=0.5)
+    start = search.solve(world)
+    before, once, after = (
+        evaluate(world, each).value
+        for each in (start, exchange.improve(world, start, once=True), exchange.improve(world, start))
+    )
+    assert (once >= before - 1e-9).all()
+    assert 0.5 < (once.mean() - before.mean()) / (after.mean() - before.mean()) < 1.0 - 1e-6
+
+
 @settings(max_examples=30, derandomize=True)  # a search, not a proof: these 30 have to come out, others may not
 @given(tiny_worlds(size=2, most_t_max=1))
 def test_tiny_worlds_are_solved_as_brute_force_solves_them(world: World) -> None:

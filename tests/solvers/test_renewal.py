@@ -54,10 +54,11 @@ def test_a_guess_that_is_the_solution_is_kept() -> None:
     assert np.array_equal(system.solve(np.ones(36), found), found)
 
 
-def test_without_an_exit_there_is_no_solution() -> None:
-    never = sparse.csr_array(np.full((4, 4), 0.25))
+@pytest.mark.parametrize("cells", [4, 256])  # as a full matrix and as a sparse one
+def test_without_an_exit_there_is_no_solution(cells: int) -> None:
+    never = sparse.csr_array(np.roll(np.eye(cells), 1, axis=1))
     with pytest.raises(UserError, match="never exits"):
-        accumulate(never, np.ones(4))
+        accumulate(never, np.ones(cells))
 
 
 def _small(t_max: int = 1) -> World:

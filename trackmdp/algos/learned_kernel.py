@@ -84,7 +84,7 @@ class LearnedKernel:
             return self._diagnostics()
         self._estimate.fit(self.cfg.rounds_at_end if last else self.cfg.rounds)
         believed = self._estimate.believed(self._least)
-        # What is only looked at on the way starts from the plan before, which saves half of the time.
+        # What is only looked at on the way is made of the plan before, in one round: a quarter of the time.
         plan = self._plan(believed, None if last or self._chooses else self.actor.sets, exchange.STARTS if last else 0)
         self.actor = as_policy(self.task, plan)
         # Acting on a draw, not on the mean: where the estimate is unsure the draws differ, and so moves get sensed that
@@ -103,7 +103,7 @@ class LearnedKernel:
         if isinstance(world, HiddenWorld):
             return solve_keys(world, start=None if start is None else PolicyTable(self.task, start)).table
         table = None if start is None else PolicyTable(self.task, start)
-        return exchange.solve(world, others) if table is None else exchange.improve(world, table)
+        return exchange.solve(world, others) if table is None else exchange.improve(world, table, once=True)
 
     def _diagnostics(self) -> dict[str, float]:
         """What the last plan is believed to be worth, how sure that is, and what learning has cost so far."""

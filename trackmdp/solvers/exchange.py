@@ -79,15 +79,16 @@ def best_of(
     return exchanged(world, layers, sets, value, go_on=go_on)
 
 
-def improve(world: World, policy: PolicyTable) -> PolicyTable:
-    """What exchange makes of a deterministic `policy`; no cell's value is lower.
+def improve(world: World, policy: PolicyTable, *, once: bool = False) -> PolicyTable:
+    """What exchange, or `once` a first round of it, makes of a deterministic `policy`; no cell's value is lower.
 
     Exchange is of cells, one sensor in each: sets of sensors with footprints ascend, by `search`.
     """
     layers = reachable_layers(world, world.num_choices)
     sets = layer_sets(layers, policy)
-    better = exchanged(world, layers, sets) if world.coverage is None else search.ascended(world, layers, sets)
-    return policy_table(world, layers, better)
+    if world.coverage is not None:
+        return policy_table(world, layers, search.ascended(world, layers, sets))
+    return policy_table(world, layers, exchanged(world, layers, sets, once=once))
 
 
 def exchanged(
@@ -97,6 +98,7 @@ def exchanged(
     value: Array | None = None,
     *,
     go_on: Callable[[], bool] = lambda: True,
+    once: bool = False,
 ) -> list[BoolArray]:
     """Policy iteration by exchange, until the mean value no longer grows; no cell's value is lower than before.
 
@@ -106,6 +108,7 @@ def exchanged(
         sets: where to start, sensed entries of each layer but the first.
         value: `[M]`, that of `sets`, where known.
         go_on: asked before each part whether to look further.
+        once: end after the first round, which gains most of it.
     """
     located, everywhere = np.ones(world.num_cells), np.ones(world.num_cells, dtype=bool)
     value = located_value(world, layers, sets) if value is None else value
@@ -124,6 +127,8 @@ def exchanged(
             return sets
         else:
             tried = everywhere
+        if once:
+            return sets
 
 
 def _changed(layers: list[Layer], before: list[BoolArray], after: list[BoolArray]) -> BoolArray:

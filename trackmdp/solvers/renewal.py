@@ -15,7 +15,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 from scipy.linalg.blas import daxpy
-from scipy.sparse.linalg import SuperLU, splu
+from scipy.linalg.lapack import dgetrf, dgetrs
+from scipy.sparse.linalg import splu
 
 from trackmdp.errors import UserError
 from trackmdp.world.checks import short_indices
@@ -26,6 +27,8 @@ IndexArray: TypeAlias = npt.NDArray[np.integer[Any]]
 DIRECT_CELLS = 20_000
 """Cells up to which systems are factorised. The factors of a grid fill about M^1.4 entries: 75 a cell at M = 16,384."""
 
+# Cells up to which a full matrix is factorised, in a quarter of the time: beliefs that spread leave few zeros.
+_FULL = 200
 # Side of the square blocks that are one cell of the next coarser level, and cells at which a level is factorised.
 _BLOCK = 4
 _COARSEST = 4_096
@@ -66,7 +69,7 @@ class RenewalSystem:
         self._system = short_indices(sparse.csr_array(sparse.eye_array(transition.shape[0], format="csr") - transition))
         self.exact = transition.shape[0] <= direct
         if self.exact:
-            self._factors = _factorise(self._system)
+            self._solve = _factorised(self._system)
             return
         self._precondition: Callable[[Array], Array]
         self._precondition = _Jacobi(self._system) if size is None else _Level(self._system, size)
@@ -79,7 +82,7 @@ class RenewalSystem:
         """
         wanted = np.asarray(gathered, dtype=np.float64)
         if self.exact:
-            total: Array = self._factors.solve(wanted)
+            total = self._solve(wanted)
         else:
             # One right-hand side after the other: together they would share nothing but the reading of the matrix, and
             # need K times the memory.
@@ -188,7 +191,7 @@ class _Level:
         coarse = short_indices(sparse.csr_array(self._blocks.T @ system @ self._blocks))
         small = coarse.shape[0] <= _COARSEST
         self._below = None if small else _Level(coarse, (-(-size[0] // _BLOCK), -(-size[1] // _BLOCK)))
-        self._factors = _factorise(coarse) if small else None
+        self._solve = _factorised(coarse) if small else None
 
     def __call__(self, residual: Array) -> Array:
         """`[KM]`, about the solution of system x = `residual`."""
@@ -203,9 +206,8 @@ class _Level:
     def _corrected(self, residual: Array) -> Array:
         """The solution on the blocks."""
         if self._below is None:
-            assert self._factors is not None
-            solved: Array = self._factors.solve(residual)
-            return solved
+            assert self._solve is not None
+            return self._solve(residual)
         guess = self._below(residual)
         return guess + self._below(residual - self._below._system @ guess)
 
@@ -263,17 +265,28 @@ def row_index(matrix: sparse.csr_array) -> IndexArray:
     return np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
 
 
-def _factorise(system: sparse.csr_array) -> SuperLU:
-    """LU of I - T without pivoting, which a matrix with dominant diagonal does not need: that keeps the fill low."""
+def _factorised(system: sparse.csr_array) -> Callable[[Array], Array]:
+    """Solves with I - T by its LU factors.
+
+    Raises:
+        UserError: the matrix is exactly singular.
+    """
+    if system.shape[0] <= _FULL:
+        factors, pivots, singular = dgetrf(system.toarray(order="F"), overwrite_a=True)
+        if singular:
+            raise UserError(_ENDLESS)
+        return lambda wanted: dgetrs(factors, pivots, wanted)[0]
     try:
-        return splu(
+        # Without pivoting, which a matrix with dominant diagonal does not need: that keeps the fill low.
+        solve: Callable[[Array], Array] = splu(
             sparse.csc_array(system),
             permc_spec="MMD_AT_PLUS_A",
             diag_pivot_thresh=0.0,
             options={"SymmetricMode": True},
-        )
+        ).solve
     except RuntimeError as error:  # SuperLU: the matrix is exactly singular
         raise UserError(_ENDLESS) from error
+    return solve
 
 
 def _blocks(rows: int, columns: int) -> sparse.csr_array:

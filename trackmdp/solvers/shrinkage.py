@@ -53,16 +53,16 @@ def posterior_mean(count: Array, moves: Array) -> Array:
     alpha, beta = _components()
     # They are sorted, so that every 2nd or 3rd of very many is a fair sample of them.
     step = -(-pairs.shape[1] // MOST_PAIRS)
-    likelihood, times = _likelihood(pairs[:, ::step], alpha, beta), step * copies[::step, None]
+    likelihood, times = _likelihood(pairs[:, ::step], alpha, beta), step * copies[::step]
     weight = np.full(len(alpha), 1.0 / len(alpha))
     for _ in range(ROUNDS):
-        share = likelihood * weight
-        share *= times / share.sum(axis=1, keepdims=True)
-        weight = (share.sum(axis=0) + UNDECIDED / len(alpha)) / (times.sum() + UNDECIDED)
+        # A pair's shares are likelihood * weight over their sum: sums over pairs need no array of all shares.
+        share = weight * ((times / (likelihood @ weight)) @ likelihood)
+        weight = (share + UNDECIDED / len(alpha)) / (times.sum() + UNDECIDED)
     mean = np.zeros(pairs.shape[1])
     for first in range(0, len(mean), MOST_PAIRS):
         part = pairs[:, first : first + MOST_PAIRS]
-        share = _likelihood(part, alpha, beta) * weight
+        share = (likelihood if step == 1 else _likelihood(part, alpha, beta)) * weight
         # The posterior of one component is Beta(a + k, b + n - k), of mean (a + k) / (a + b + n).
         means = (part[0][:, None] + alpha) / (part[1][:, None] + alpha + beta)
         mean[first : first + MOST_PAIRS] = (share * means).sum(axis=1) / share.sum(axis=1)
