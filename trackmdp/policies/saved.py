@@ -142,6 +142,8 @@ def _listed(task: Task, content: dict[str, Any]) -> PolicyTable:
     """The policy that `PolicyTable.as_lists` wrote."""
     if content.get("footprints") != (None if task.coverage is None else task.coverage.as_lists()):
         raise ValueError("sets of sensors of other footprints")
+    if content["size"] != list(task.size):  # as many cells in other rows would fit
+        raise ValueError(f"size {content['size']}, rows and columns; expected {list(task.size)}")
     keys, count = content["sets"], task.num_keys
     # Counted first: what a stranger's file says is remembered may make any number of keys.
     if content["t_max"] != task.t_max or len(keys) != count or any(str(key) not in keys for key in range(count)):

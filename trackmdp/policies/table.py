@@ -177,7 +177,7 @@ class PolicyTable:
         return self.sets.toarray().reshape(shape)
 
     def as_lists(self) -> dict[str, Any]:
-        """Plain lists, as `sets.json` has them: for each key the sensors on at n = 0 ... t_max.
+        """Plain lists, as `sets.json` has them: rows and columns, t_max, and each key's sensors on at n = 0 ... t_max.
 
         With `task.memory` "cell" the keys are the located cells; else `memory` says how they are numbered, and
         where a detection tells the mode its kind is "cell", each cell's classes being the modes. Where
@@ -194,7 +194,7 @@ class PolicyTable:
     def _of_task(self) -> dict[str, Any]:
         """What a reader of the lists has to know; what is not there is the paper's."""
         task = self.task
-        told: dict[str, Any] = {"t_max": task.t_max}
+        told: dict[str, Any] = {"size": list(task.size), "t_max": task.t_max}
         if task.coverage is not None:
             told["footprints"] = task.coverage.as_lists()
         if task.keyed:
