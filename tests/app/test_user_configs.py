@@ -82,6 +82,14 @@ def test_aliases_that_unfold_to_too_much_are_refused_at_once(
     assert "more than 100,000 values" in refused(capsys, "train", "--config-dir", "../mine", "experiment=a")
 
 
+@pytest.mark.filterwarnings("default")  # Python's own, which would be lines beside the one
+def test_a_warning_that_a_config_asks_for_is_its_refusal(
+    empty_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for words in (["seed=${oc.deprecated:threads}"], ["hydra.run.dir=r${oc.deprecated:seed}"]):
+        assert "is deprecated" in refused(capsys, "train", *words)
+
+
 def test_hydras_own_settings_still_hold(monkeypatch: pytest.MonkeyPatch, empty_folder: Path) -> None:
     seen: list[Any] = []
     stub(monkeypatch, "train", lambda cfg, folder: seen.append((Path.cwd(), folder, os.environ.get("X_Y"))))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -42,6 +43,8 @@ _stored: dict[tuple[str, str], type[Any]] = {}
 def register() -> None:
     """Make every schema known to Hydra as `base_<name>`, for the `defaults` lists in `conf/`."""
     register_resolvers()
+    # What stands in a config is data: `${oc.deprecated:...}` is refused as it would warn, in lines of its own.
+    warnings.filterwarnings("error", module=r"omegaconf\.resolvers")
     load_plugins()  # installed packages add their choices to `GROUPS`
     # A config typed by a dataclass is what makes Hydra refuse an unknown key or a wrong type while it composes.
     schemas = {("", command): root for command, root in ROOTS.items()}
