@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from trackmdp.signals import Signals, handled
 from trackmdp.solvers import regions
 from trackmdp.solvers.partition import Block, blocks, default_halo, plan_by_blocks, reach, sub_world
 from trackmdp.solvers.solve import run_solver
-from trackmdp.solvers.workers import crew, in_turn
+from trackmdp.solvers.workers import Crew, crew, in_turn
 from trackmdp.world.model import World
 
 
@@ -118,6 +119,20 @@ def test_two_workers_find_the_same_bytes_as_one() -> None:
     assert together is not None
     assert alone.indices.tobytes() == together.indices.tobytes()
     assert alone.indptr.tobytes() == together.indptr.tobytes()
+
+
+def test_no_more_workers_are_started_than_there_are_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+
+    def noted(workers: int, cluster: str | None) -> nullcontext[Crew]:
+        asked.append(workers)
+        return nullcontext(in_turn)
+
+    monkeypatch.setattr("trackmdp.solvers.solve.crew", noted)
+    tm.solve(tm.make_world("random_walk", size=5), block=3, workers=1000)
+    assert asked == [4]
+    with pytest.raises(UserError, match=r"partition.workers=1000000: expected an integer from 1 to 1024"):
+        tm.solve(tm.make_world("random_walk", size=5), block=3, workers=1_000_000)
 
 
 @pytest.mark.slow

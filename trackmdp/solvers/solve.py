@@ -17,7 +17,7 @@ from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.keyed import averaged
 from trackmdp.solvers.keyed_search import solve_keys
-from trackmdp.solvers.partition import narrow_halo, plan_by_blocks
+from trackmdp.solvers.partition import blocks, narrow_halo, plan_by_blocks
 from trackmdp.solvers.regions import settled
 from trackmdp.solvers.solution import SearchProgress, Solution, bracketed
 from trackmdp.solvers.workers import crew
@@ -75,8 +75,7 @@ def solve(
     own = {f"solver.{name}": value for name, value in options.items()}
     named = given({"solver": solver, "solver.nodes": nodes, "solver.time_limit": time_limit})
     of_blocks = {"block": block, "halo": halo, "workers": workers, "sweeps": sweeps}
-    blocks = given({f"partition.{name}": value for name, value in of_blocks.items()})
-    cfg = compose("solve", named | own | blocks)
+    cfg = compose("solve", named | own | given({f"partition.{name}": value for name, value in of_blocks.items()}))
     solution = run_solver(world, cfg.solver, on_progress, cfg.partition)
     if isinstance(world, World) and (said := narrow_halo(world, cfg.partition, solution.upper, solution.evaluation)):
         warnings.warn(said, stacklevel=2)
@@ -100,7 +99,8 @@ def run_solver(
     if partition is not None and partition.block is not None:
         # Other solvers' plans are what they are; what a narrow halo loses stays to be seen, unless asked otherwise.
         sweeps = (_SWEEPS if partition.halo is None else 0) if partition.sweeps is None else partition.sweeps
-        with crew(partition.workers, partition.cluster) as run:
+        workers = min(partition.workers, len(blocks(world.size, partition.block, halo=0)))
+        with crew(workers, partition.cluster) as run:
             table = plan_by_blocks(world, _Planner(choice), partition.block, partition.halo, run)
             if choice.name == "optimal":
                 table = settled(world, table, partition.block, sweeps, run)

@@ -114,7 +114,7 @@ class BlockTrainer:
             # A block hears signals while it learns; here they end what is between two blocks, and all workers.
             opened.enter_context(handled(_stop, *HEARD))
             learner = _BlockLearner(self.config, place.absolute() / "blocks", parts)
-            run = opened.enter_context(crew(cfg.workers, cfg.cluster))
+            run = opened.enter_context(crew(min(cfg.workers, len(parts)), cfg.cluster))
             table = plan_by_blocks(world, learner, side, halo, run)
             with decoded(str(place / "blocks"), "the runs of blocks"):
                 ends = [read_summary(learner.place(number)) for number in range(len(parts))]
