@@ -24,6 +24,7 @@ BEFORE_ALL = (
     "statistics",
     "machine",
     "signals",
+    "cluster",
 )
 
 # What each may import: itself, and all before it.

@@ -7,7 +7,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Self
 
@@ -84,11 +84,6 @@ def handled(handler: Any, *numbers: signal.Signals) -> Iterator[None]:
     finally:
         for number, former in before.items():
             signal.signal(number, former)
-
-
-def kept_sigterm() -> AbstractContextManager[None]:
-    """Around a start of Ray, which installs a handler that exits: the run would end without its checkpoint."""
-    return handled(signal.getsignal(signal.SIGTERM), signal.SIGTERM)
 
 
 class Watch:

@@ -2,11 +2,10 @@ from __future__ import annotations
 
 import signal
 import threading
-from contextlib import nullcontext
 
 import pytest
 
-from trackmdp.signals import Signals, kept_sigterm
+from trackmdp.signals import Signals
 
 
 def test_the_first_signal_is_noted_and_a_later_one_acts_as_before(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -46,19 +45,3 @@ def test_outside_the_main_thread_signals_are_not_touched() -> None:
     thread.start()
     thread.join()
     assert seen == [before]
-
-
-@pytest.mark.parametrize("error", [RuntimeError, None])
-def test_sigterm_that_a_library_took_over_acts_as_before(error: type[Exception] | None) -> None:
-    def begin() -> None:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
-        if error is not None:
-            raise error
-
-    before = signal.getsignal(signal.SIGTERM)
-    try:
-        with pytest.raises(error) if error else nullcontext(), kept_sigterm():
-            begin()
-        assert signal.getsignal(signal.SIGTERM) == before
-    finally:
-        signal.signal(signal.SIGTERM, before)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, ClassVar
 
+from trackmdp.cluster import ADDRESS
 from trackmdp.config.options import BYTES, ChoiceConfig, NodeConfig, Sizes, choice, nested, option, refuse
 
 MOST_FRAMES = 10**12
@@ -216,7 +217,9 @@ class RayWorkersConfig(WorkersConfig):
     large grid partition.cluster.
     """
 
-    address: str | None = option("cluster to join; null = start one on this machine", expects="auto, or host:port")
+    address: str | None = option(
+        "cluster to join; null = start one on this machine", expects="auto, or host:port", pattern=ADDRESS
+    )
     cpus_per_worker: float = option("cores of each worker", unit="cores", gt=0)
     gpus_per_worker: float = option("GPUs of each worker", unit="GPUs", ge=0)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from trackmdp.cluster import ADDRESS
 from trackmdp.config.options import NodeConfig, listed, option, refuse
 
 
@@ -20,11 +21,13 @@ class PartitionConfig(NodeConfig):
         "processes that plan or learn, or with a cluster of our own its cores; on one machine as many as it has cores",
         unit="processes",
         ge=1,
+        le=1024,
     )
     cluster: str | None = option(
         "Ray cluster that works on one large grid, worth it where one machine's cores are not enough; for many runs "
         "take hydra/launcher=ray. local = one on this machine with so many workers, for tests; null = no Ray",
         expects="local, auto, or host:port",
+        pattern=f"local|{ADDRESS}",
     )
 
     def check(self, key: str, root: Any) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
+from trackmdp.cluster import ADDRESS
 from trackmdp.config.options import ChoiceConfig, choice, option
 from trackmdp.errors import UserError, require
 
@@ -136,7 +137,9 @@ class RayConfig(LauncherConfig):
 
     package = extra = "ray"
 
-    address: str | None = option("cluster to join; null = start one here", expects="auto, or host:port")
+    address: str | None = option(
+        "cluster to join; null = start one here", expects="auto, or host:port", pattern=ADDRESS
+    )
     num_cpus: int | None = option("cores of a cluster started here; null = all", unit="cores", ge=1)
     cpus_per_run: float = option("cores of a run", unit="cores", gt=0)
     gpus_per_run: float = option("GPUs of a run", unit="GPUs", ge=0)

@@ -15,8 +15,9 @@ from dataclasses import dataclass
 from types import FrameType
 from typing import Any, Protocol, TypeVar
 
+from trackmdp.cluster import joining
 from trackmdp.errors import Preempted, UserError, require
-from trackmdp.signals import HEARD, handled, kept_sigterm
+from trackmdp.signals import HEARD, handled
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -149,13 +150,9 @@ def _ray(workers: int, cluster: str) -> Iterator[Crew]:
     if cluster == "local":
         where = {"address": "local", "num_cpus": workers, "include_dashboard": False}
     begun = not ray.is_initialized()
-    try:
-        if begun:
-            with kept_sigterm():
-                ray.init(logging_level=logging.ERROR, log_to_driver=False, **where)
-    except (ConnectionError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise UserError(f"partition.cluster={cluster}: expected a Ray cluster ({reason})") from error
+    if begun:
+        with joining("partition.cluster", cluster):
+            ray.init(logging_level=logging.ERROR, log_to_driver=False, **where)
 
     def run(work: Callable[[Job], Result], jobs: Sequence[Job]) -> list[Result]:
         # Ray itself begins a task again whose worker or machine was lost.

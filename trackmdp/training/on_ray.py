@@ -10,9 +10,9 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import BaseCollector
 from torchrl.collectors.distributed import RayCollector
 
+from trackmdp.cluster import joining
 from trackmdp.config.learning import RayWorkersConfig
-from trackmdp.errors import UserError, require
-from trackmdp.signals import kept_sigterm
+from trackmdp.errors import require
 from trackmdp.world.env import TrackEnv
 
 _STORE = 2**30
@@ -36,23 +36,19 @@ def make_ray_collector(
     require("ray", "ray", "collector=ray")
     # RayCollector has no such argument; the collectors that it makes in its workers have.
     register = common.pop("auto_register_policy_transforms")
-    try:
-        with kept_sigterm():  # a scheduler's signal must reach the run
-            made = _Collector(
-                list(envs),
-                policy,
-                sync=True,
-                ray_init_config=_cluster(cfg),
-                # Both are always given: TorchRL asks for 0.2 GPUs by default, and on a cluster without GPUs no worker
-                # would ever start.
-                remote_configs={"num_cpus": cfg.cpus_per_worker, "num_gpus": cfg.gpus_per_worker},
-                collector_kwargs={"auto_register_policy_transforms": register, "track_traj_ids": False},
-                postproc=_rows,
-                **common,
-            )
-    except (ConnectionError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise UserError(f"collector.address={cfg.address}: expected a Ray cluster ({reason})") from error
+    with joining("collector.address", cfg.address):
+        made = _Collector(
+            list(envs),
+            policy,
+            sync=True,
+            ray_init_config=_cluster(cfg),
+            # Both are always given: TorchRL asks for 0.2 GPUs by default, and on a cluster without GPUs no worker
+            # would ever start.
+            remote_configs={"num_cpus": cfg.cpus_per_worker, "num_gpus": cfg.gpus_per_worker},
+            collector_kwargs={"auto_register_policy_transforms": register, "track_traj_ids": False},
+            postproc=_rows,
+            **common,
+        )
     made.update_policy_weights_()
     return made
 

@@ -15,6 +15,7 @@ from typing import Any
 from trackmdp.app.sweep import process
 from trackmdp.app.sweep.plan import Job
 from trackmdp.app.sweep.process import fail, run_job, stop_signal
+from trackmdp.cluster import joining
 from trackmdp.config import TrainConfig
 from trackmdp.config.sweeping import (
     BasicConfig,
@@ -23,8 +24,8 @@ from trackmdp.config.sweeping import (
     SubmititLocalConfig,
     SubmititSlurmConfig,
 )
-from trackmdp.errors import FAILED, UserError
-from trackmdp.signals import handled, kept_sigterm
+from trackmdp.errors import FAILED
+from trackmdp.signals import handled
 
 # Each names the threads of one library (OpenMP, OpenBLAS, MKL), which by default take all cores, in every run at once.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -81,7 +82,7 @@ def run_on_ray(cfg: RayConfig, jobs: Sequence[Job]) -> None:
     """
     import ray
 
-    with kept_sigterm():  # which asks the sweep to stop
+    with joining("hydra.launcher.address", cfg.address):
         _join(cfg, ray)
     try:
         # No retries by Ray: a run that was killed for lack of memory would be again; the sweep launches what is left
@@ -99,12 +100,8 @@ def _join(cfg: RayConfig, ray: Any) -> None:
     if cfg.address is None:
         ray.init(num_cpus=cfg.num_cpus, object_store_memory=_STORE, **quiet)
         return
-    try:
-        # Nothing about memory: Ray refuses `object_store_memory` and `num_cpus` for a cluster that runs already.
-        ray.init(address=cfg.address, logging_level="error")
-    except (ConnectionError, ValueError, RuntimeError) as error:
-        reason = " ".join(str(error).split())
-        raise UserError(f"hydra.launcher.address={cfg.address}: expected a Ray cluster ({reason})") from error
+    # Nothing about memory: Ray refuses `object_store_memory` and `num_cpus` for a cluster that runs already.
+    ray.init(address=cfg.address, logging_level="error")
 
 
 class Submission:
