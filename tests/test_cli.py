@@ -63,6 +63,7 @@ def test_unknown_credit_is_refused(algo: str, bad: str, capsys: pytest.CaptureFi
         ("train --config-dir nowhere", "--config-dir nowhere: no such folder"),
         ("train --experimental-rerun x", "--experimental-rerun: not offered"),
         ("train kernel=table", "kernel.path: missing, expected a path"),
+        ("train ~kernel", "kernel: missing, expected kernel=NAME"),
         ("train kernel=table kernel.path=no.npy", "kernel.path="),
         ("train kernel.exit_probability=0", "kernel=random_support: from cell 0 the target never exits"),
         ("train cost.sensor=no.csv", "cost.sensor="),

@@ -157,7 +157,7 @@ def known_options(schema: type[Any], values: Any, prefix: str = "") -> Iterator[
         if inner is not None and several(schema, name):
             for each, values_of_each in inner.items():
                 yield from known_options(GROUPS[name][each], values_of_each, f"{prefix}{name}.{each}.")
-        elif inner is not None:
+        elif isinstance(inner, dict):  # `~kernel` leaves "???", which is refused as missing
             if name in GROUPS and inner.get("name") not in GROUPS[name]:  # of a file that begins with no choice of ours
                 raise UserError(f"{name}: expected a file that begins with defaults: [{'|'.join(GROUPS[name])}]")
             yield from known_options(GROUPS[name][inner["name"]] if name in GROUPS else item, inner, f"{prefix}{name}.")
