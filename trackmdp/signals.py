@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Self
 
+from trackmdp.errors import Preempted
+
 if TYPE_CHECKING:  # a sweep hears signals without loading torch
     from torchrl.collectors import BaseCollector
 
@@ -84,6 +86,15 @@ def handled(handler: Any, *numbers: signal.Signals) -> Iterator[None]:
     finally:
         for number, former in before.items():
             signal.signal(number, former)
+
+
+def stop(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
+    """What `handled` may let hear a signal: it ends what is under way at once.
+
+    Raises:
+        Preempted: always.
+    """
+    raise Preempted(number)
 
 
 class Watch:

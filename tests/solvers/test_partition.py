@@ -16,8 +16,8 @@ import trackmdp as tm
 from trackmdp.app.cli import main
 from trackmdp.config.compose import compose
 from trackmdp.errors import Preempted, UserError
-from trackmdp.signals import Signals, handled
-from trackmdp.solvers import regions
+from trackmdp.signals import Signals, handled, stop
+from trackmdp.solvers import regions, workers
 from trackmdp.solvers.partition import Block, blocks, default_halo, plan_by_blocks, reach, sub_world
 from trackmdp.solvers.solve import run_solver
 from trackmdp.solvers.workers import Crew, crew, in_turn
@@ -242,6 +242,18 @@ def test_a_signal_ends_all_workers_and_none_begins_another_job(
     # the other worker may have been told before it began
     left = {file.name for file in tmp_path.iterdir()}
     assert left in ({"0 begun", "0 saved"}, {"0 begun", "0 saved", "1 begun", "1 saved"})
+
+
+@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGUSR1, signal.SIGTERM])
+def test_what_comes_while_workers_start_is_heard_afterwards(kind: signal.Signals) -> None:
+    reached = []
+    with handled(stop, kind), pytest.raises(Preempted) as told, workers._starting():
+        signal.raise_signal(kind)
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, [])
+        reached.append(blocked)
+    assert told.value.signal == kind
+    assert reached == [{signal.SIGINT, signal.SIGUSR1}]  # which a worker inherits; by SIGTERM it is ended
+    assert not signal.pthread_sigmask(signal.SIG_BLOCK, [])
 
 
 @pytest.mark.slow

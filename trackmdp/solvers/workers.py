@@ -8,7 +8,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -79,16 +79,14 @@ def crew(workers: int = 1, cluster: str | None = None) -> Iterator[Crew]:
 
 
 def _processes(workers: int) -> Iterator[Crew]:
-    # Spawned, not forked: a fork copies locks that another thread of this process may hold.
-    spawning = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(workers, spawning, _begin)
+    pool = _pool(workers)
 
     def run(work: Callable[[Job], Result], jobs: Sequence[Job]) -> list[Result]:
         nonlocal pool
         results: dict[int, Result] = {}
         for _ in range(_ATTEMPTS):
             left = [number for number in range(len(jobs)) if number not in results]
-            futures = {number: pool.submit(_done, work, jobs[number]) for number in left}
+            futures = {number: _submit(pool, work, jobs[number]) for number in left}
             for number, future in futures.items():
                 # a worker died: what it and the others had not finished is done again
                 with suppress(BrokenProcessPool):
@@ -96,7 +94,7 @@ def _processes(workers: int) -> Iterator[Crew]:
             if len(results) == len(jobs):
                 return [results[number] for number in range(len(jobs))]
             pool.shutdown()
-            pool = ProcessPoolExecutor(workers, spawning, _begin)
+            pool = _pool(workers)
         raise UserError(f"partition.workers={workers}: workers died {_ATTEMPTS} times, expected enough memory for each")
 
     try:
@@ -113,10 +111,34 @@ _ended: list[Preempted] = []
 """In a worker: the signal that ended its last job."""
 
 
-def _begin() -> None:
-    # Ctrl-C goes to the whole group of processes; the parent hears it, and ends its workers.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with_parent()
+def _pool(workers: int) -> ProcessPoolExecutor:
+    with _starting():
+        # Spawned, not forked: a fork copies locks that another thread of this process may hold.
+        return ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), end_with_parent)
+
+
+def _submit(pool: ProcessPoolExecutor, work: Callable[[Job], Result], job: Job) -> Future[Result]:
+    with _starting():
+        return pool.submit(_done, work, job)
+
+
+@contextmanager
+def _starting() -> Iterator[None]:
+    """While workers may be started, which are then deaf to what goes to the whole group of processes.
+
+    This one hears it, and ends them with SIGTERM; what comes meanwhile it hears afterwards.
+    """
+    heard: list[int] = []
+    # Blocked, which a process inherits: one that is told while it still imports would write a traceback. Noted all the
+    # same, since another thread may be the one that is told; a worker left half started writes a traceback as well.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGUSR1})
+    try:
+        with handled(lambda number, _: heard.append(number), *HEARD):
+            yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    for number in heard:
+        signal.raise_signal(number)
 
 
 def _done(work: Callable[[Job], Result], job: Job) -> Result:

@@ -13,7 +13,6 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import FrameType
 
 from rich.console import Console
 
@@ -24,10 +23,10 @@ from trackmdp.config.partition import PartitionConfig
 from trackmdp.config.sensing import MissConfig, PaperCostConfig, PerfectSensorConfig
 from trackmdp.config.world import TableConfig
 from trackmdp.durable import own_folder, write_bytes, write_json
-from trackmdp.errors import Preempted, UserError
+from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.seeding import derive, preserved_global_rng
-from trackmdp.signals import HEARD, handled
+from trackmdp.signals import HEARD, handled, stop
 from trackmdp.solvers.alike import cell_classes
 from trackmdp.solvers.partition import Block, blocks, default_halo, narrow_halo, plan_by_blocks
 from trackmdp.solvers.workers import crew
@@ -112,7 +111,7 @@ class BlockTrainer:
                 write_json(place / "plan.json", {"blocks": len(parts)})  # for those who watch the run
             own_folder(place / "blocks")
             # A block hears signals while it learns; here they end what is between two blocks, and all workers.
-            opened.enter_context(handled(_stop, *HEARD))
+            opened.enter_context(handled(stop, *HEARD))
             learner = _BlockLearner(self.config, place.absolute() / "blocks", parts)
             run = opened.enter_context(crew(min(cfg.workers, len(parts)), cfg.cluster))
             table = plan_by_blocks(world, learner, side, halo, run)
@@ -126,10 +125,6 @@ class BlockTrainer:
         if said := narrow_halo(world, cfg, self.evaluator.upper, score.evaluation):
             self.console.print(f"warning: {said}")
         return score
-
-
-def _stop(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
-    raise Preempted(number)
 
 
 def _resumed(config: TrainConfig, folder: Path) -> bool:

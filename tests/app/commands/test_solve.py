@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ import numpy as np
 import pytest
 
 from tests.solvers.worlds import paper_world
+from tests.typed import ENVIRONMENT
 from trackmdp.app.cli import main
 from trackmdp.policies import saved
 from trackmdp.solvers import bounds
@@ -124,3 +127,33 @@ def test_the_sets_of_a_solution_are_valued_again_by_evaluate(
     assert main(["evaluate", *world, *words, "episodes=20", "log=[mcap]"]) == 0
     assert read(tmp_path / "b", "evaluation.json")["exact"]["aihtr"] == read(tmp_path / "a", "solution.json")["lower"]
     assert (tmp_path / "b" / name).is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM, signal.SIGUSR1])
+def test_a_signal_to_the_group_ends_all_workers_in_one_line(tmp_path: Path, kind: signal.Signals) -> None:
+    words = "solve grid.size=60 grid.t_max=2 cost.sensor=0.22 partition.block=5 partition.workers=2"
+    program = [sys.executable, "-m", "trackmdp.app.cli", *words.split(), f"hydra.run.dir={tmp_path / 'a'}"]
+    with subprocess.Popen(program, stderr=subprocess.PIPE, text=True, start_new_session=True, env=ENVIRONMENT) as run:
+        try:
+            # a worker that still imports would be the first to write a traceback
+            while len(members(run.pid)) < 4 and run.poll() is None:  # with Python's own tracker of semaphores
+                pass
+            os.killpg(run.pid, kind)
+            said = run.stderr.read()  # type: ignore[union-attr]  # until the last of them has ended
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(run.pid, signal.SIGKILL)
+    told = "interrupted" if kind is signal.SIGINT else f"stopped by signal {int(kind)}"
+    assert (run.returncode, said) == (128 + kind, f"trackmdp solve: {told}\n")
+    assert not list(tmp_path.iterdir())
+
+
+def members(group: int) -> list[str]:
+    """The processes of a group that have not ended."""
+    found = []
+    for file in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            state, _, of, *_ = file.read_text().rpartition(")")[2].split()
+            found += [file.parent.name] if int(of) == group and state != "Z" else []
+    return found

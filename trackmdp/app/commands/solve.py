@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ from trackmdp.config import SolveConfig
 from trackmdp.durable import write_json
 from trackmdp.errors import UserError
 from trackmdp.policies.saved import sets_name, write_sets
+from trackmdp.signals import handled, stop
 from trackmdp.solvers import bounds, qmdp
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import regret_per_step
@@ -40,7 +42,9 @@ def run(cfg: SolveConfig, folder: Path, world: Problem) -> float:
     if cfg.grid.max_steps is not None:
         raise UserError(f"grid.max_steps={cfg.grid.max_steps}: only whole episodes are solved, expected null")
     assert not isinstance(world, Recorded)  # they are refused: there is no kernel to solve with
-    with console.status(title := f"solve {cfg.solver.name}") as status:
+    # As Ctrl-C they end the workers in order; by themselves they would end this process alone.
+    told = handled(stop, signal.SIGTERM, signal.SIGUSR1)
+    with told, console.status(title := f"solve {cfg.solver.name}") as status:
         solution = run_solver(world, cfg.solver, _display(console, status, title), cfg.partition)
     # The paper's bounds are on targets without a hidden mode.
     bound = {name: float(each(world).mean()) for name, each in _BOUNDS.items()} if isinstance(world, World) else {}
