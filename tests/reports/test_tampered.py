@@ -82,6 +82,9 @@ SPOILT: dict[str, tuple[Change, str]] = {
     "frames": (resealed(frames="x"), "summary.json: not the summary of a run"),
     "1e308": (resealed(wall_seconds=1e308), "summary.json: not the summary of a run"),
     "no time": (resealed(cpu_seconds=None), "summary.json: not the summary of a run"),
+    "no aihtr": (resealed(policy={"expected_length": 9.0}), "summary.json: not the summary of a run"),
+    "no length": (resealed(policy={"aihtr": 9.0}), "summary.json: not the summary of a run"),
+    "length 0": (resealed(policy={"aihtr": 9.0, "expected_length": 0}), "summary.json: not the summary of a run"),
     "versions": (resealed(versions={"torch": {"a": [1]}}), "summary.json: not the summary of a run"),
     "no files": (resealed(files=None), "summary.json: names no files"),
 }
@@ -102,6 +105,18 @@ def test_a_run_that_was_changed_is_named_and_the_others_are_read(case: str, swee
     (anomaly,) = [each for each in found.anomalies if each.run == "a"]
     assert anomaly.text.startswith(said)
     assert "\n" not in anomaly.text
+
+
+def test_a_folder_that_goes_meanwhile_is_passed_over(sweep: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    listed = os.scandir
+
+    def scandir(path: Any) -> Any:  # a number, where a folder is removed
+        if str(path) == str(sweep / "b"):
+            shutil.rmtree(path, ignore_errors=True)
+        return listed(path)
+
+    monkeypatch.setattr("os.scandir", scandir)
+    assert [run.name for run in gather_runs(sweep).runs] == ["a", "c"]
 
 
 @pytest.mark.parametrize("name", ["policy.npz", "kernel.npz"])

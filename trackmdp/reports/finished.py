@@ -108,6 +108,9 @@ def _figures(summary: Mapping[str, Any]) -> dict[str, float | None]:
     took = {key: _number(key, summary[key]) for key in ("frames", "wall_seconds", "cpu_seconds")}
     raw = took | summary["policy"]
     raw |= {f"{group}_{key}": value for group, values in groups.items() for key, value in (values or {}).items()}
+    _number("aihtr", raw["aihtr"])
+    if not _number("expected_length", raw["expected_length"]) > 0:  # regrets are per step
+        raise ValueError(f"expected_length: {raw['expected_length']}, expected more than 0")
     return {key: None if raw.get(key) is None else _number(key, raw[key]) for key in FIGURES}
 
 

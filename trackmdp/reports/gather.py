@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -97,8 +98,9 @@ def run_folders(folder: Path, plan: Mapping[str, Any] | None) -> list[str]:
     listed = [job["folder"] for job in jobs if isinstance(job, dict) and isinstance(job.get("folder"), str)]
     named = {_relative(folder, name) for name in listed if 0 < len(name) < _LONGEST and "\0" not in name}
     # Any of these makes a folder that of a run: it has begun, failed, or ended.
-    marks = ("config.yaml", FAILED_FILE, SUMMARY)
-    found = {file.parent.relative_to(folder).as_posix() for mark in marks for file in folder.rglob(mark)}
+    marks = {"config.yaml", FAILED_FILE, SUMMARY}
+    # Not rglob, which raises where a folder goes while it is looked through.
+    found = {Path(place).relative_to(folder).as_posix() for place, _, files in os.walk(folder) if marks & {*files}}
     # Resolved, since `..` or a link within a name may lead anywhere.
     root = folder.resolve()
     inside = {name for name in named | found if (folder / name).resolve().is_relative_to(root)}
