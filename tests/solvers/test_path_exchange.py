@@ -7,11 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import sparse
 
 from tests.tracks import by_hand, recorded
 from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers.key_plans import KeyPlans
 from trackmdp.solvers.path_counts import plan_keys
-from trackmdp.solvers.path_exchange import PRIORS, _followed, choose_plan, exchanged_keys, parted
+from trackmdp.solvers.path_exchange import PRIORS, choose_plan, exchanged_keys, parted
 from trackmdp.solvers.path_states import Paths
 from trackmdp.solvers.recorded import replay
 from trackmdp.world.tracks import Recorded, Tracks
@@ -62,9 +64,9 @@ def test_a_round_finds_the_best_plan_of_each_key(seed: int, first: bool) -> None
     """
     tracks = repeated(line_walks(seed), [3] * 4 + [1] * 8)
     task = Recorded(tracks, (1, 2), validation=tracks, held_out=tracks, cost=0.4, safe_cost=0.6, t_max=1)
-    paths, policy = Paths(task, tracks), PolicyTable.from_dense(task, np.full((2, 2, 2), first))
-    followed = _followed(paths, policy, 0.9)
-    found = exchanged_keys(paths, policy, followed, 0.9, 1).dense()
+    paths, sets = Paths(task, tracks), [sparse.csr_array(np.full((2, 2), first))] * 2
+    followed = paths.followed(sets, 0.9)
+    found = np.stack([each.toarray() for each in exchanged_keys(paths, sets, followed, 0.9, 1)], axis=1)
     plans = np.array(list(itertools.product([False, True], repeat=4))).reshape(16, 2, 2)
     for key in range(2):
         states = np.flatnonzero(followed.visited & (paths.key == key))
@@ -75,11 +77,12 @@ def test_a_round_finds_the_best_plan_of_each_key(seed: int, first: bool) -> None
 def test_equal_paths_are_followed_once_and_count_as_often_as_they_are_there() -> None:
     tracks = repeated(line_walks(1), [5, 2, *[1] * 10])
     task = recorded(tracks)
-    paths, policy = Paths(task, tracks), PolicyTable.from_dense(task, np.random.default_rng(0).random((9, 2, 9)) < 0.5)
+    policy = PolicyTable.from_dense(task, np.random.default_rng(0).random((9, 2, 9)) < 0.5)
+    paths = Paths(task, tracks)
     assert paths.states == Paths(task, line_walks(1)).states
     assert paths.copies == pytest.approx(17 / len({tuple(each) for each in np.split(tracks.cells, tracks.first[1:-1])}))
     total = replay(task, tracks, policy).totals[:, 0].sum()
-    assert _followed(paths, policy, 0.9).reward == pytest.approx(total)
+    assert paths.followed(KeyPlans.of_table(policy, paths.seen).sets, 0.9).reward == pytest.approx(total)
 
 
 def test_paths_that_are_there_three_times_say_what_they_say_once_to_three_times_the_weight() -> None:
@@ -94,10 +97,11 @@ def test_paths_that_are_there_three_times_say_what_they_say_once_to_three_times_
 
 def test_rare_keys_keep_their_plans() -> None:
     task = recorded(line_walks(1), memory="displacement", clip=1)
-    paths, policy = Paths(task, task.tracks), PolicyTable.from_dense(task, np.zeros((90, 2, 9), dtype=bool))
-    followed = _followed(paths, policy, 0.9)
-    assert exchanged_keys(paths, policy, followed, 0.9, 10**6) is policy
-    assert exchanged_keys(paths, policy, followed, 0.9, 1).dense().any()
+    paths = Paths(task, task.tracks)
+    sets = [sparse.csr_array((len(paths.seen), 9), dtype=bool)] * 2
+    followed = paths.followed(sets, 0.9)
+    assert exchanged_keys(paths, sets, followed, 0.9, 10**6) is sets
+    assert any(each.nnz for each in exchanged_keys(paths, sets, followed, 0.9, 1))
 
 
 def test_no_recording_learns_and_judges() -> None:
@@ -126,3 +130,19 @@ def test_where_all_paths_are_one_there_is_nothing_to_choose_by() -> None:
     task = recorded(tracks)
     found = choose_plan(task, tracks, discount=0.9, rounds=5)
     assert (found.policy.dense() == plan_keys(task, tracks, prior=10.0, discount=0.9, rounds=5).policy.dense()).all()
+
+
+def test_what_is_asked_for_is_what_the_table_of_all_keys_says() -> None:
+    """Keys that the paths lead to, such that they do not, and some whose sets were replaced."""
+    task = recorded(line_walks(3), memory="two_displacements", clip=1)
+    paths = Paths(task, task.tracks)
+    plans = plan_keys(task, task.tracks, prior=3.0, discount=0.9, rounds=3).plans
+    changed = replace(plans, sets=[sparse.csr_array(np.ones(each.shape, dtype=bool)) for each in plans.sets])
+    for each in (plans, changed, KeyPlans.of_table(plans.table(), paths.seen[::2])):
+        table = each.table().dense()
+        keys = np.random.default_rng(0).permutation(np.concatenate([paths.seen, np.arange(200)]))
+        assert (np.stack([on.toarray() for on in each.of(keys)], axis=1) == table[keys]).all()
+        assert table.any()
+    assert changed.table().dense()[paths.seen].all()
+    unseen = np.delete(np.arange(task.num_keys), paths.seen)
+    assert (changed.table().dense()[unseen] == plans.table().dense()[unseen]).all()

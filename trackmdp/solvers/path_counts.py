@@ -8,21 +8,23 @@ together (`_Shared`); those of a seldom seen class to coarser ones (`KeySpace.co
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy import sparse
 
 from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers.key_plans import KeyPlans, Sensed, sensed_table
 from trackmdp.solvers.path_states import Paths
 from trackmdp.solvers.renewal import IndexArray, per_row
 from trackmdp.world.memory import KeySpace
-from trackmdp.world.model import Array, BoolArray, Task
+from trackmdp.world.model import Array, Task
 from trackmdp.world.tracks import Tracks
 
 _UNVISITED = 0.01
 """Weight of a state that the policy does not get to on its path: it shows what follows a key that is rare, but not as
 the policy itself comes by the key."""
-_CELLS_AT_ONCE, _KEYS_AT_ONCE = 2_048, 16_384
+_KEYS_AT_ONCE = 16_384
 _LIFTED = 30.0
 """A cell's lift is drawn to 1 as if prior² / 30 more detections had been expected, and made; times the copies of each
 path. Where cells have few detections, and large weights serve best, what its few tracks did would else be told of all
@@ -33,19 +35,24 @@ _LITTLE = 1e-9
 
 @dataclass(frozen=True)
 class Planned:
-    """The policy found, and what it earned on the paths that it was counted on.
+    """The plans found, and what they earned on the paths that they were counted on.
 
     Attributes:
-        policy: a set for every key and n.
+        plans: a set for every key and n.
         reward: of all paths together.
         seen: keys that some path may lead to.
         rounds: of policy iteration that raised the reward.
     """
 
-    policy: PolicyTable
+    plans: KeyPlans
     reward: float
     seen: int
     rounds: int
+
+    @cached_property
+    def policy(self) -> PolicyTable:
+        """The plans as a table of all keys."""
+        return self.plans.table()
 
 
 def plan_keys(task: Task, tracks: Tracks, *, prior: float, discount: float, rounds: int) -> Planned:
@@ -76,7 +83,7 @@ def plan_paths(paths: Paths, *, prior: float, discount: float, rounds: int) -> P
         if after.reward <= value.reward:
             break
         best, value, kept = tried, after, kept + 1
-    return Planned(best.table(), value.reward, len(paths.seen), kept)
+    return Planned(best.plans(), value.reward, len(paths.seen), kept)
 
 
 class _Counted:
@@ -109,12 +116,8 @@ class _Counted:
             own, arrived = self._sums(n, paths.of_seen, len(paths.seen), gain[n], weight * alive[-1])
             self._shared.append(_Shared.of(paths, mean, own, arrived, prior))
             self._sets.append(on := self._sets_of_seen(own, arrived))
-            found = np.zeros(paths.states, dtype=bool)
-            near = paths.local[n] < paths.width
-            found[near] = np.asarray(on[paths.of_seen[near], paths.cells[n][near]]).ravel()
-            self.hits[n] = found
-            self.spent[n] = (on.astype(np.float64) @ paths.task.cost)[paths.of_seen]
-            alive[-1] &= paths.inside[n] & ~found
+            self.hits[n], self.spent[n] = paths.sensed(n, on)
+            alive[-1] &= paths.inside[n] & ~self.hits[n]
 
     def _above(self) -> list[IndexArray]:
         """For each shared level, the context above each of its contexts."""
@@ -156,33 +159,32 @@ class _Counted:
             on = inside & (value[key, place] > cost[np.where(inside, cell, -1)])
             parts.append((begin + key[on], cell[on]))
         key, cell = (np.concatenate(part) for part in zip(*parts, strict=True))
-        shape = (len(paths.seen), paths.task.num_cells)
-        return sparse.csr_array((np.ones(len(key), dtype=bool), (key, cell)), shape=shape)
+        return sensed_table(key, cell, (len(paths.seen), paths.task.num_cells))
 
-    def table(self) -> PolicyTable:
+    def plans(self) -> KeyPlans:
         """The sets of all keys: by their own count, or where they were never seen without."""
-        paths = self._paths
-        unseen = np.ones(paths.task.num_keys, dtype=bool)
-        unseen[paths.seen] = False
-        sensed = []
-        for n, sets in enumerate(self._sets):
-            own, (key, cell) = sets.tocoo(), self._unseen(n, unseen)
-            sensed.append((np.concatenate([paths.seen[own.row], key]), np.concatenate([own.col, cell])))
-        return PolicyTable.from_sensed(paths.task, sensed)
+        return KeyPlans(self._paths.task, self._paths.seen, self._sets, self._unseen)
 
-    def _unseen(self, n: int, unseen: BoolArray) -> tuple[IndexArray, IndexArray]:
-        """Keys and cells of the sets of keys that were not seen, a bool for each key."""
-        task, paths, shared = self._paths.task, self._paths, self._shared[n]
-        known, local = np.nonzero(shared.most > task.cost.min())
-        found = []
-        for begin in range(0, task.num_cells, _CELLS_AT_ONCE):
-            start = np.arange(begin, min(begin + _CELLS_AT_ONCE, task.num_cells))[:, None]
-            cell, inside = paths.put_down(start, local)
-            key, value = start * task.keys.num_classes + known, shared.expected(start, known, local)
-            on = inside & unseen[key] & (value > task.cost[np.where(inside, cell, 0)])
-            found.append((key[on], cell[on]))
-        key, cell = (np.concatenate(part) for part in zip(*found, strict=True))
-        return key, cell
+    def _unseen(self, n: int, keys: IndexArray) -> Sensed:
+        """What is on after keys that were not seen."""
+        cost, shared, classes = self._paths.task.cost, self._shared[n], self._paths.task.keys.num_classes
+        start, known = np.divmod(keys, classes)
+        # Keys of one class at a time: few displacements are worth a sensor after it, from whatever cell.
+        order = np.argsort(known.astype(np.min_scalar_type(classes)), kind="stable")
+        ends = np.cumsum(np.bincount(known, minlength=classes))
+        found: list[Sensed] = [(np.zeros(0, dtype=np.int64),) * 2]
+        for each, (high, most) in enumerate(zip(ends, shared.most, strict=True)):
+            at = order[ends[each - 1] if each else 0 : high]
+            wanted = np.flatnonzero(most > cost.min())
+            if not (len(at) and len(wanted)):
+                continue
+            value = shared.of_class(each, start[at], wanted)
+            place, local = np.nonzero(value > cost.min())
+            cell, inside = self._paths.put_down(start[at[place]], wanted[local])
+            on = inside & (value[place, local] > cost[np.where(inside, cell, 0)])
+            found.append((at[place[on]], cell[on]))
+        place, cell = (np.concatenate(part) for part in zip(*found, strict=True))
+        return place, cell
 
 
 @dataclass(frozen=True)
@@ -237,16 +239,19 @@ class _Shared:
         most: Array = self.common * self.lift.max(0) * self.scale.max(0)[:, None]
         return most
 
-    def expected(self, start: IndexArray, known: IndexArray, local: IndexArray) -> Array:
-        """Gains after cells `start`, classes `known` and displacements `local`, broadcast together."""
-        row = self.row[start]
-        gains: Array = self.common[known, local] * self.lift[row, local] * self.scale[row, known]
-        return gains
-
     def after(self, keys: IndexArray, local: IndexArray) -> Array:
         """`[B, W]` gains of displacements `local` `[W]` after `keys` `[B]`."""
-        known = keys % self.keys.num_classes
-        return self.expected(self.keys.cell(keys)[:, None], known[:, None], local)
+        row, known = self.row[self.keys.cell(keys)], keys % self.keys.num_classes
+        gains: Array = self.common[known[:, None], local] * self.lift[row[:, None], local]
+        gains *= self.scale[row, known][:, None]
+        return gains
+
+    def of_class(self, known: int, start: IndexArray, local: IndexArray) -> Array:
+        """`[B, W]` gains of displacements `local` `[W]` after the class `known` and cells `start` `[B]`."""
+        # Each row of the lift once: most cells are never seen, and all those have the last one.
+        row, place = np.unique(self.row[start], return_inverse=True)
+        gains: Array = self.common[known, local] * self.lift[np.ix_(row, local)] * self.scale[row, known][:, None]
+        return gains[place]
 
 
 def _mean(gains: Array, arrived: Array, strength: float, above: Array) -> Array:

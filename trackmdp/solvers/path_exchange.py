@@ -14,11 +14,12 @@ from scipy import sparse
 
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
+from trackmdp.solvers.key_plans import KeyPlans, sensed_table
 from trackmdp.solvers.keyed_exchange import exchange_chains
 from trackmdp.solvers.path_counts import Planned, plan_paths
 from trackmdp.solvers.path_states import AlongPaths, Paths
 from trackmdp.solvers.plans import Chains, ChainStep
-from trackmdp.solvers.renewal import IndexArray, per_row
+from trackmdp.solvers.renewal import IndexArray, per_row, row_index
 from trackmdp.world.model import Task
 from trackmdp.world.tracks import Tracks, draw_parts
 
@@ -63,8 +64,12 @@ def choose_plan(
     def plan(paths: Paths, prior: float | None) -> Planned:
         if prior is None:
             assert learned is not None
-            return Planned(learned, _followed(paths, learned, discount).reward, len(paths.seen), rounds=0)
+            plans = KeyPlans.of_table(learned, paths.seen)
+            return Planned(plans, paths.followed(plans.sets, discount).reward, len(paths.seen), rounds=0)
         return plan_paths(paths, prior=prior, discount=discount, rounds=rounds)
+
+    def score(found: Planned) -> float:
+        return judged.followed(found.plans.of(judged.seen), discount).reward
 
     if not len(judge):  # nothing to choose by
         return plan(Paths(task, tracks), None if learned else _UNJUDGED)
@@ -72,10 +77,10 @@ def choose_plan(
     # A recording that was followed ten times is no more evidence than once.
     priors = [*(prior * paths.copies for prior in PRIORS), *([None] if learned else [])]
     plans = [plan(paths, prior) for prior in priors]
-    scores = [_followed(judged, each.policy, discount).reward for each in plans]
+    scores = [score(each) for each in plans]
     best = int(np.argmax(scores))
     searched = _searched(paths, plans[best], discount)
-    exchange = _followed(judged, searched.policy, discount).reward > scores[best]
+    exchange = score(searched) > scores[best]
     if counted is tracks:
         return searched if exchange else plans[best]
     final = plan(whole := Paths(task, tracks), priors[best])
@@ -91,48 +96,51 @@ def parted(tracks: Tracks, seed: int) -> tuple[Tracks, Tracks]:
 
 def _searched(paths: Paths, plan: Planned, discount: float) -> Planned:
     """Rounds of exchange from `plan`; after one that the paths earn no more by, of keys that come twice as often."""
-    followed, least = _followed(paths, plan.policy, discount), _LEAST
+    plans, least = plan.plans, _LEAST
+    followed = paths.followed(plans.sets, discount)
     for _ in range(_ROUNDS):
-        policy = exchanged_keys(paths, plan.policy, followed, discount, least)
-        if policy is plan.policy:  # no key comes so often
+        sets = exchanged_keys(paths, plans.sets, followed, discount, least)
+        if sets is plans.sets:  # no key comes so often
             break
-        tried = _followed(paths, policy, discount)
+        tried = paths.followed(sets, discount)
         if tried.reward > plan.reward:
-            plan = replace(plan, policy=policy, reward=tried.reward, rounds=plan.rounds + 1)
-            followed = tried
+            plans, followed = replace(plans, sets=sets), tried
+            plan = replace(plan, plans=plans, reward=tried.reward, rounds=plan.rounds + 1)
         else:
             least *= 2
     return plan
 
 
-def exchanged_keys(paths: Paths, policy: PolicyTable, followed: AlongPaths, discount: float, least: int) -> PolicyTable:
-    """One round: the plans of keys that `policy` came by `least` times or more, on what followed them.
+def exchanged_keys(
+    paths: Paths, sets: list[sparse.csr_array], followed: AlongPaths, discount: float, least: int
+) -> list[sparse.csr_array]:
+    """One round: the plans of keys that a policy came by `least` times or more, on what followed them.
 
     Args:
         paths: all states of the recorded paths.
-        policy: deterministic.
+        sets: `[keys seen, M]` bool of the policy for each n; left as they are.
         followed: what it earns on the paths.
         discount: γ of the credit.
         least: keys that came less often keep their plans.
     """
     arrived = np.bincount(paths.of_seen[followed.visited], minlength=len(paths.seen))
     often = np.flatnonzero(arrived >= least)
-    if policy.sets is None or not len(often):
-        return policy
+    if not len(often):
+        return sets
     chains, owners = _trees(paths, followed, often, discount)
-    keys, m = paths.seen[often], paths.task.num_cells
-    before = [policy.on(n, keys[owner // m], owner % m) > 0 for n, owner in enumerate(owners)]
+    m = paths.task.num_cells
+    places = [(often[owner // m], owner % m) for owner in owners]
+    before = [np.asarray(on[place]).ravel() for on, place in zip(sets, places, strict=True)]
     found = exchange_chains(chains, before)
     # The rows of these keys are replaced, those of all others stay.
-    choices = paths.task.num_choices
-    parts = [(keys[o[on] // m] * choices + n, o[on] % m) for n, (o, on) in enumerate(zip(owners, found, strict=True))]
-    rows, cells = (np.concatenate(each) for each in zip(*parts, strict=True))
-    kept = np.ones(policy.sets.shape[0])
-    kept[(keys[:, None] * choices + np.arange(choices)).ravel()] = 0.0
-    new = sparse.csr_array((np.ones(len(rows)), (rows, cells)), shape=policy.sets.shape)
-    table = sparse.csr_array(sparse.diags_array(kept).tocsr() @ policy.sets.astype(np.float64) + new)
-    table.eliminate_zeros()
-    return PolicyTable(paths.task, table.astype(bool))
+    stays = np.ones(len(paths.seen), dtype=bool)
+    stays[often] = False
+    changed = []
+    for old, (keys, cells), on in zip(sets, places, found, strict=True):
+        kept = stays[rows := row_index(old)]
+        rows, columns = (np.concatenate(each) for each in ((rows[kept], keys[on]), (old.indices[kept], cells[on])))
+        changed.append(sensed_table(rows, columns, old.shape))
+    return changed
 
 
 def _trees(paths: Paths, followed: AlongPaths, keys: IndexArray, discount: float) -> tuple[Chains, list[IndexArray]]:
@@ -172,14 +180,3 @@ def _trees(paths: Paths, followed: AlongPaths, keys: IndexArray, discount: float
     forced = task.reward + discount * followed.value[paths.following[-1, at]] - task.safe_cost
     missed = discount * per_row(entry, paths.times[at] * paths.inside[-1, at] * forced, len(mass)) / mass
     return Chains(np.arange(len(keys)), count, steps, missed), owners
-
-
-def _followed(paths: Paths, policy: PolicyTable, discount: float) -> AlongPaths:
-    """What a policy earns on the paths: of each state, whether its plan senses the target, and what its sets cost."""
-    shape = (paths.task.num_choices, paths.states)
-    hits, spent = np.zeros(shape, dtype=bool), np.zeros(shape)
-    for n in range(paths.task.num_choices):
-        there = np.flatnonzero(paths.inside[n])
-        hits[n, there] = policy.on(n, paths.key[there], paths.cells[n, there]) > 0
-        spent[n] = policy.spent(n, paths.task.cost)[paths.key]
-    return paths.follow(hits, spent, discount)

@@ -8,10 +8,12 @@ to be Markov in the key.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy import sparse
 
 from trackmdp.solvers.recorded import Events
 from trackmdp.solvers.renewal import IndexArray
@@ -97,6 +99,18 @@ class Paths:
         column = start % self.task.columns + local % side - self.radius
         inside = (row >= 0) & (row < self.task.rows) & (column >= 0) & (column < self.task.columns)
         return row * self.task.columns + column, inside
+
+    def sensed(self, n: int, sets: sparse.csr_array) -> tuple[BoolArray, Array]:
+        """`[S]` whether `sets` `[keys seen, M]` sense the target after n misses, and `[S]` what they cost."""
+        hits, there = np.zeros(self.states, dtype=bool), np.flatnonzero(self.inside[n])
+        hits[there] = np.asarray(sets[self.of_seen[there], self.cells[n, there]]).ravel()
+        spent: Array = (sets.astype(np.float64) @ self.task.cost)[self.of_seen]
+        return hits, spent
+
+    def followed(self, sets: Sequence[sparse.csr_array], discount: float) -> AlongPaths:
+        """What the `sets` `[keys seen, M]` of each n earn on every path."""
+        hits, spent = zip(*(self.sensed(n, each) for n, each in enumerate(sets)), strict=True)
+        return self.follow(np.stack(hits), np.stack(spent), discount)
 
     def follow(self, hits: BoolArray, spent: Array, discount: float) -> AlongPaths:
         """What a policy earns on every path, given where its plans hit `[T+1, S]` and what they cost `[T+1, S]`."""
