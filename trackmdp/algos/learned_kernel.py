@@ -17,6 +17,7 @@ from scipy import sparse
 from tensordict import TensorDictBase
 
 from trackmdp.algos.common import arrays, tensors
+from trackmdp.algos.path_counts import PathCounts
 from trackmdp.algos.paths import known_as
 from trackmdp.config.counting import LearnedKernelConfig
 from trackmdp.policies.explore import RenewedTable
@@ -35,6 +36,15 @@ from trackmdp.solvers.shrinkage import believed_world, least_worth_planning
 from trackmdp.world.model import Task
 from trackmdp.world.modes import HiddenWorld
 from trackmdp.world.windows import Window
+
+
+def learner(
+    task: Task, cfg: LearnedKernelConfig, *, iterations: int, seed: int, device: torch.device
+) -> LearnedKernel | PathCounts:
+    """What `algo=learned_kernel` stands for: where keys remember detections, these are what is counted by."""
+    if task.order:
+        return PathCounts(task, cfg.of_keys(), iterations=iterations, seed=seed, device=device)
+    return LearnedKernel(task, cfg, iterations=iterations, seed=seed, device=device)
 
 
 class LearnedKernel:

@@ -2,17 +2,47 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any, ClassVar
 
 from trackmdp.config.learning import AlgoConfig, check_classes
 from trackmdp.config.options import BYTES, Sizes, choice, option, refuse
+from trackmdp.config.registry import choice_values
 
 
-@choice("algo", "learned_kernel", makes="trackmdp.algos.learned_kernel:LearnedKernel")
-class LearnedKernelConfig(AlgoConfig):
-    """Estimate the motion from detections, then plan with the estimate; no networks."""
+@choice("algo", "path_counts", makes="trackmdp.algos.path_counts:PathCounts")
+class PathCountsConfig(AlgoConfig):
+    """Collect with all sensors on, then count on those paths what sensing gains after each key; no networks.
+
+    Every path is replayed from its start, so that the keys are as frequent as the policy's own make them.
+    """
 
     credit: ClassVar[str | None] = None
+    remembers: ClassVar[bool] = True
+    prior: float | None = option(
+        "what is known of a key by its cell, and by all but its cell, counts as so many detections; null: chosen, "
+        "as is whether plans are improved by exchange, by a quarter of the paths, which then count as well",
+        ge=0,
+    )
+    gamma: float = option("discount inside the credit; policies are evaluated undiscounted", ge=0, le=1)
+    rounds: int = option("rounds of policy iteration at most", ge=1)
+
+    def needs(self, task: Sizes, root: Any) -> dict[str, int]:
+        """The paths, and for each detection that may be on them what is worked out of it."""
+        per_frame = (task.t_max + 3) ** task.order * (task.t_max + 2) * 12
+        return {"algo.total_frames": root.collector.total_frames * per_frame * BYTES["float64"]}
+
+
+@choice("algo", "learned_kernel", makes="trackmdp.algos.learned_kernel:learner")
+class LearnedKernelConfig(AlgoConfig):
+    """Estimate the motion from detections, then plan with the estimate; no networks.
+
+    Where a policy remembers more than the cell (task.memory), the estimate is that of algo=path_counts, with its
+    options' own values: counts after each key, with back-off. It takes whole paths: 300,000 frames of 100 envs, say.
+    """
+
+    credit: ClassVar[str | None] = None
+    remembers: ClassVar[bool] = True
     told: ClassVar[bool] = True
     knows_footprints: ClassVar[bool] = True
     sensing: str = option("all sensors on, or sets chosen by posterior sampling", choices=("all", "chosen"))
@@ -54,29 +84,19 @@ class LearnedKernelConfig(AlgoConfig):
             raise refuse(f"{key}.share_cells", self.share_cells, "none or null with kernel.reveals=true")
 
     def ignored(self, root: Any) -> dict[str, str]:
-        """With all sensors on throughout, nothing comes before chosen sets."""
+        """With all sensors on throughout, nothing comes before chosen sets; no move is counted by its cell alone."""
+        if root.task.memory != "cell":
+            own = set(vars(self)) - {field.name for field in fields(AlgoConfig)}
+            return dict.fromkeys(sorted(own), f"with task.memory={root.task.memory}; algo=path_counts has options")
         all_on = self.sensing != "chosen"
         return {"warm_up": "with algo.sensing=all"} if all_on else {"plan_every": "with algo.sensing=chosen"}
 
-
-@choice("algo", "path_counts", makes="trackmdp.algos.path_counts:PathCounts")
-class PathCountsConfig(AlgoConfig):
-    """Collect with all sensors on, then count on those paths what sensing gains after each key; no networks.
-
-    Every path is replayed from its start, so that the keys are as frequent as the policy's own make them.
-    """
-
-    credit: ClassVar[str | None] = None
-    remembers: ClassVar[bool] = True
-    prior: float | None = option(
-        "what is known of a key by its cell, and by all but its cell, counts as so many detections; null: chosen, "
-        "as is whether plans are improved by exchange, by a quarter of the paths, which then count as well",
-        ge=0,
-    )
-    gamma: float = option("discount inside the credit; policies are evaluated undiscounted", ge=0, le=1)
-    rounds: int = option("rounds of policy iteration after each batch at most", ge=1)
-
     def needs(self, task: Sizes, root: Any) -> dict[str, int]:
-        """The paths, and for each detection that may be on them what is worked out of it."""
-        per_frame = (task.t_max + 3) ** task.order * (task.t_max + 2) * 12
-        return {"algo.total_frames": root.collector.total_frames * per_frame * BYTES["float64"]}
+        """The paths where more than the cell is remembered; else little."""
+        return self.of_keys().needs(task, root) if root.task.memory != "cell" else {}
+
+    def of_keys(self) -> PathCountsConfig:
+        """What is learned where more than the cell is remembered."""
+        values = choice_values("algo", "path_counts", {})
+        budget = {field.name: getattr(self, field.name) for field in fields(AlgoConfig)}
+        return PathCountsConfig(**{field.name: values[field.name] for field in fields(PathCountsConfig)} | budget)
