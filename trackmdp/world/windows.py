@@ -167,10 +167,16 @@ class Window(nn.Module):
         if classes is not None and (classes != classes[0]).any():
             known = torch.cat([torch.unique(classes, return_inverse=True)[1], classes.new_tensor([-1])])
             return torch.unique(known[self.cells], dim=0, return_inverse=True)[1]
-        row, column = self._row, self._column
-        # Distances to the four borders, up to the radius: all cells farther inside are of one group.
-        margins = torch.stack([row, self.rows - 1 - row, column, self.columns - 1 - column], dim=1)
-        return torch.unique(margins.clamp(max=self.radius), dim=0, return_inverse=True)[1]
+        # Rows, and columns, whose distances to their two borders agree: N numbers are sorted and not all M cells, which
+        # learners that ask for a window in each batch would notice. Each row meets each column.
+        rows, columns = (self._alike(side) for side in (self.rows, self.columns))
+        return (rows[:, None] * (columns.max() + 1) + columns).ravel()
+
+    def _alike(self, side: int) -> Tensor:
+        """`[side]`, equal where the distances to both ends agree up to the radius."""
+        place = torch.arange(side, device=self._row.device)
+        margins = torch.stack([place, side - 1 - place], dim=1).clamp(max=self.radius)
+        return torch.unique(margins, dim=0, return_inverse=True)[1]
 
 
 class Sight:
