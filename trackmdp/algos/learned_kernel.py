@@ -123,8 +123,11 @@ class LearnedKernel:
 
     def _beliefs(self, plan: PolicyTable, kernel: sparse.csr_array) -> dict[str, float]:
         drawn = self._estimate.samples(self._rng, self.cfg.samples)
-        mean, *others = (evaluate(believed_world(self.task, k, self._least), plan).aihtr for k in (kernel, *drawn))
-        return {"believed_aihtr": mean, "believed_deviation": float(np.std(others))}
+        # On a grid too large to factorise each begins with the mean kernel's values, and no more than them is solved for.
+        mean = evaluate(believed_world(self.task, kernel, self._least), plan, per_cell=False)
+        others = (believed_world(self.task, other, self._least) for other in drawn)
+        worth = [evaluate(other, plan, guess=mean.value, per_cell=False).aihtr for other in others]
+        return {"believed_aihtr": mean.aihtr, "believed_deviation": float(np.std(worth))}
 
     def state_dict(self) -> dict[str, Any]:
         """The observations, the estimate, the draws to come and the two tables."""
