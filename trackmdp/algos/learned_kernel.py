@@ -123,7 +123,7 @@ class LearnedKernel:
 
     def _beliefs(self, plan: PolicyTable, kernel: sparse.csr_array) -> dict[str, float]:
         drawn = self._estimate.samples(self._rng, self.cfg.samples)
-        # On a grid too large to factorise each begins with the mean kernel's values, and no more than them is solved for.
+        # Each begins with the mean kernel's values, which counts where the grid is too large to factorise.
         mean = evaluate(believed_world(self.task, kernel, self._least), plan, per_cell=False)
         others = (believed_world(self.task, other, self._least) for other in drawn)
         worth = [evaluate(other, plan, guess=mean.value, per_cell=False).aihtr for other in others]

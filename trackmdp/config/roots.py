@@ -150,7 +150,19 @@ class BenchmarkConfig(WorldConfig):
     knows_modes: ClassVar[bool] = False
     part: str = option(
         "what is measured",
-        choices=("env", "collector", "train", "size", "handoff", "memory", "peers", "log", "regret", "bracket"),
+        choices=(
+            "env",
+            "collector",
+            "train",
+            "size",
+            "handoff",
+            "memory",
+            "peers",
+            "log",
+            "regret",
+            "bracket",
+            "workers",
+        ),
     )
     seed: int = option("every random draw derives from it", ge=0)
     device: str = option("device of environments and networks", expects="cpu, cuda, cuda:N or auto", pattern=DEVICE)
@@ -161,8 +173,14 @@ class BenchmarkConfig(WorldConfig):
     work: list[str] = option("`size`: kinds of work", choices=("solve", "train", "env"))
     # Its own default budget: that of `hindsight` takes hours from N = 40 on, `learned_kernel`'s seconds.
     learner: str = option("`size`: algorithm that trains, with its own budget", choices=tuple(GROUPS["algo"]))
-    blocks: list[int] = option("`handoff`: sides of the blocks", unit="cells", ge=1)
+    blocks: list[int] = option("`handoff`, `workers`: sides of the blocks", unit="cells", ge=1)
     halos: list[int] = option("`handoff`: cells around a block, besides the default", unit="cells", ge=0)
+    workers: list[int] = option(
+        "`workers`: of each row, to plan by blocks of the first of `blocks`", unit="processes", ge=1
+    )
+    cluster: str | None = option(
+        "`workers`: Ray cluster that they are of; null = no Ray", expects="local, auto, or host:port"
+    )
     # Evaluated while this module is imported, before plugins are: only this package's own algorithms.
     algos: list[str] = option("`memory`: algorithms that train", choices=tuple(GROUPS["algo"]))
     seeds: list[int] = option("`peers`, `regret`: seeds that all train with", ge=0)

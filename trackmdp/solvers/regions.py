@@ -189,12 +189,12 @@ def settled(world: World, policy: PolicyTable, side: int, rounds: int, run: Crew
     Blocks that planned without each other's values leave plans that none of them would change: .006 per step at
     c = .22, T_max 2, blocks of 5 and a halo of 4.
     """
-    value = evaluate(world, policy).value
+    value = evaluate(world, policy, per_cell=False).value
     for _ in range(rounds):
         candidate = PolicyTable.from_sensed(
             world, end_to_end(run(_Region.improved, _regions(world, policy, value, side)))
         )
-        after = evaluate(world, candidate).value
+        after = evaluate(world, candidate, guess=value, per_cell=False).value
         # As in `exchange`: no value is lower, so that the sum tells; the margin is rounding.
         if after.sum() <= value.sum() + 1e-12 * np.abs(value).sum():
             break

@@ -20,7 +20,7 @@ from trackmdp.solvers.keyed_search import solve_keys
 from trackmdp.solvers.partition import blocks, narrow_halo, plan_by_blocks
 from trackmdp.solvers.regions import settled
 from trackmdp.solvers.solution import SearchProgress, Solution, bracketed
-from trackmdp.solvers.workers import crew
+from trackmdp.solvers.workers import Crew, crew
 from trackmdp.world.model import World
 from trackmdp.world.modes import HiddenWorld, Modelled
 from trackmdp.world.tracks import Problem
@@ -97,17 +97,24 @@ def run_solver(
         raise UserError(f"partition.block={partition.block}: expected null with sensors that have footprints")
     started = time.monotonic()
     if partition is not None and partition.block is not None:
-        # Other solvers' plans are what they are; what a narrow halo loses stays to be seen, unless asked otherwise.
-        sweeps = (_SWEEPS if partition.halo is None else 0) if partition.sweeps is None else partition.sweeps
         workers = min(partition.workers, len(blocks(world.size, partition.block, halo=0)))
         with crew(workers, partition.cluster) as run:
-            table = plan_by_blocks(world, _Planner(choice), partition.block, partition.halo, run)
-            if choice.name == "optimal":
-                table = settled(world, table, partition.block, sweeps, run)
+            table = by_blocks(world, choice, partition, run)
         return bracketed(world, table, time.monotonic() - started)
     watched = {"on_progress": on_progress} if "on_progress" in signature(maker(choice)).parameters else {}
     made = make(choice, world, **watched)
     return made if isinstance(made, Solution) else bracketed(world, made, time.monotonic() - started)
+
+
+def by_blocks(world: World, choice: BaselineConfig, partition: SweptPartitionConfig, run: Crew) -> PolicyTable:
+    """The policy that `run` plans block by block and, with ``solver=optimal``, settles over the whole grid."""
+    assert partition.block is not None
+    table = plan_by_blocks(world, _Planner(choice), partition.block, partition.halo, run)
+    if choice.name != "optimal":  # other solvers' plans are what they are
+        return table
+    # What a narrow halo loses stays to be seen, unless asked otherwise.
+    sweeps = (_SWEEPS if partition.halo is None else 0) if partition.sweeps is None else partition.sweeps
+    return settled(world, table, partition.block, sweeps, run)
 
 
 @dataclass(frozen=True)

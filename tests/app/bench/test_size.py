@@ -1,4 +1,4 @@
-"""Cost by size: whole commands as a user types them, and the table made of them."""
+"""Cost by size, and shared by workers: whole commands as a user types them, and the table made of them."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+import trackmdp as tm
 from trackmdp.app.bench import handoff, size
 from trackmdp.app.bench.process import Usage, measured
 from trackmdp.app.cli import main
@@ -106,3 +107,20 @@ def test_what_blocks_lose_by_the_width_of_their_halo(tmp_path: Path, monkeypatch
         assert without["loss_per_step"] > 0.1
         assert abs(wide["loss_per_step"]) < 5e-4
         assert wide["gap_per_step"] >= wide["loss_per_step"]
+
+
+@pytest.mark.parametrize("numbers", [[1, 1], pytest.param([1, 2], marks=pytest.mark.slow)])
+def test_what_workers_gain(numbers: list[int], tmp_path: Path) -> None:
+    words = ["grid.size=6", "blocks=[3]", "cost.safe=10", f"workers={numbers}", "cluster=null"]
+    first, second = bench(tmp_path, "part=workers", *words)
+    world = tm.make_world("random_support", size=6, safe_cost=10.0)
+    assert first["aihtr"] == second["aihtr"] == pytest.approx(tm.solve(world, block=3).lower)
+    # One worker is this process, whose work is then all of the worker's.
+    assert (first["driver_seconds"], first["speed_up"], first["allowed"]) == (0, 1, 1)
+    alone = second if numbers[1] == 1 else first
+    assert second["speed_up"] == pytest.approx(alone["wall_seconds"] / second["wall_seconds"])
+    spent = [float(seconds) for seconds in second["worker_seconds"].split(" + ")]
+    total = sum(spent) + second["driver_seconds"]
+    # Printed with three digits.
+    assert second["allowed"] == pytest.approx(total / (second["driver_seconds"] + max(spent)), rel=0.02)
+    assert (second["driver_seconds"] > 0) == (numbers[1] == 2)

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from trackmdp.app.bench import handoff, peers, size, speed, spreading
+from trackmdp.app.bench import handoff, peers, sharing, size, speed, spreading
 from trackmdp.config import BenchmarkConfig
 from trackmdp.durable import write_json
 from trackmdp.training.display import make_console, table
@@ -27,6 +27,7 @@ PARTS: dict[str, Callable[[BenchmarkConfig, World, torch.device], Iterable[dict[
     "log": speed.log_speed,
     "regret": spreading.regret,
     "bracket": spreading.bracket,
+    "workers": sharing.workers,
 }
 
 
