@@ -13,7 +13,7 @@ from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.kernel_estimate import KernelEstimate
 from trackmdp.solvers.shrinkage import least_worth_planning, posterior_mean, unseen, without
 from trackmdp.world.make import make_world
-from trackmdp.world.model import World
+from trackmdp.world.model import World, apart
 
 
 def counts_of(world: World, each: int, seed: int) -> sparse.csr_array:
@@ -117,3 +117,22 @@ def test_nothing_is_sensed_for_the_prior_where_a_miss_is_dear() -> None:
         lost.append((best.upper - found.aihtr) / found.expected_length)
     assert lost[1] < 0.005
     assert lost[0] > 3 * lost[1]
+
+
+def test_far_jumps_are_no_guide_to_steps_nearby() -> None:
+    """Of 6 x 10 cells, each with steps of any probability and three jumps of .1 anywhere: those are found to be alike.
+
+    One mixture for all moves leaves the jumps with .6 of the error of their shares.
+    """
+    rng, cell = np.random.default_rng(0), np.arange(60)
+    far = apart(10, cell[:, None], cell) > 1
+    kernel = ~far * rng.uniform(0.05, 1.0, far.shape)
+    kernel *= 0.7 / kernel.sum(axis=1, keepdims=True)
+    for start in cell:
+        kernel[start, rng.choice(np.flatnonzero(far[start]), 3, replace=False)] = 0.1
+    count = np.stack([rng.multinomial(200, row) for row in kernel])
+    start, end = count.nonzero()
+    estimate = KernelEstimate((6, 10), weight=0.1, exit_weight=1.0)
+    estimate.add_moves(start, end, count[start, end].astype(float))
+    believed, jumps = estimate.believed()[:, :-1].toarray(), far & (count > 0)
+    assert np.abs(believed - 0.1)[jumps].mean() < 0.5 * np.abs(count / 200 - 0.1)[jumps].mean()

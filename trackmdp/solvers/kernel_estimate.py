@@ -19,7 +19,7 @@ from trackmdp.solvers.alike import AlikeCells
 from trackmdp.solvers.censored import ObservedPaths, counted, each_once, expected_moves
 from trackmdp.solvers.renewal import IndexArray, per_row, row_index
 from trackmdp.solvers.shrinkage import posterior_mean, unseen
-from trackmdp.world.model import Array, apart, grid_size
+from trackmdp.world.model import Array, BoolArray, apart, grid_size
 
 OPEN = 0.01
 """Weight, in the first round's kernel, of moves that were not seen yet."""
@@ -27,6 +27,10 @@ LEAST_EXIT = 1e-9
 """Exit probability of a kernel drawn from the posterior, at least."""
 NEGLIGIBLE = 1e-3
 """Expected counts below this are dropped, so that the counts stay sparse."""
+
+
+SELDOM = 0.1
+"""Moves as far as fewer of the pairs of cells that far apart are read as draws from a mixture of their own."""
 
 
 class KernelEstimate:
@@ -150,7 +154,9 @@ class KernelEstimate:
         exits, moved = self._exits(counts), sparse.csr_array(counts[:, :-1])
         moved.eliminate_zeros()
         rows, out = row_index(moved), moved.sum(axis=1)
-        likely = posterior_mean(moved.data, out[rows])
+        likely, seldom = np.zeros_like(moved.data), self._seldom(moved)
+        for group in (seldom, ~seldom):
+            likely[group] = posterior_mean(moved.data[group], out[rows[group]])
         # The shares of a cell add up to 1, which its estimates need not do.
         likely /= per_row(rows, likely, self.num_cells)[rows]
         new, stands_for = unseen(rows, likely, out[rows], self.num_cells)
@@ -262,6 +268,24 @@ class KernelEstimate:
             keep = sparse.csr_array((np.ones(len(without)), (without, without)), shape=near.shape)
             typical, total = typical + keep @ near, np.where(total > 0, total, 1.0)
         return sparse.csr_array(sparse.diags_array(1.0 / total) @ typical)
+
+    def _seldom(self, moved: sparse.csr_array) -> BoolArray:
+        """`[E]` which of the `[M, M]` moves seen go as far as few do, such as jumps to anywhere among steps nearby.
+
+        How likely the others are says nothing about them.
+        """
+        columns, cells = self.columns // self._modes, self.num_cells // self._modes
+        start, end = row_index(moved) // self._modes, moved.indices // self._modes
+        each, place = np.unique(start * cells + end, return_inverse=True)
+        gone, most = apart(columns, *np.divmod(each, cells)), max(self.rows, columns)
+        # Pairs at most d apart: of n rows (2 d + 1) n - d (d + 1), d < n, and as many of the columns for each of them.
+        up_to = np.ones(most + 1)
+        for side in (self.rows, columns):
+            d = np.minimum(np.arange(-1, most), side - 1)
+            up_to *= (2 * d + 1) * side - d * (d + 1)
+        up_to[0] = 0
+        few = np.bincount(gone, minlength=most) < SELDOM * np.diff(up_to)
+        return few[gone][place.ravel()]
 
     def _near(self, reach: int) -> sparse.csr_array:
         """`[M, M]` uniform over the cells up to `reach` rows and columns away."""
