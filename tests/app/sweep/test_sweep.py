@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -62,6 +63,12 @@ def test_a_run_of_a_sweep_is_the_run_typed_alone(here: Path) -> None:
     assert main(["train", *TINY, "seed=3", "quiet=true", "hydra.run.dir=alone"]) == 0
     (row,) = table(here / "all")
     assert float(row["aihtr"]) == json.loads((here / "alone/summary.json").read_text())["policy"]["aihtr"]
+
+
+def test_a_mistake_in_every_run_is_told_once_and_leaves_nothing(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert swept("seed=0,1", "resume=somewhere") == 2
+    assert re.fullmatch(r"trackmdp train: resume=.*somewhere: expected null or auto [^\n]*\n", capsys.readouterr().err)
+    assert not list(here.iterdir())
 
 
 def test_a_mistake_in_one_run_is_told_and_the_others_go_on(

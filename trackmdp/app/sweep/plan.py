@@ -23,8 +23,8 @@ from trackmdp.config.sweeping import BlocksConfig
 from trackmdp.config.tree import fixed_options, key_of
 from trackmdp.errors import UserError
 
-_MOST = 100_000
-"""Runs of a sweep; range(10000000) is a slip."""
+MOST = 100_000
+"""Runs of a sweep, and values of a word; range(10000000) is a slip."""
 
 _UNNAMED = ("experiment", "quiet", "resume")
 """Keys that are left out of a folder's readable name: they do not change a result, or stand for other words."""
@@ -65,8 +65,16 @@ MakeJobs = Callable[..., list[Job]]
 
 
 def grid(cfg: BlocksConfig, words: Sequence[str], folder: Path, planned: MakeJobs) -> list[list[Job]]:  # noqa: ARG001
-    """One batch with the whole grid."""
-    return [planned(combinations(cfg.blocks or [], words))]
+    """One batch with the whole grid.
+
+    Raises:
+        UserError: all of its runs would be refused, for one reason.
+    """
+    jobs = planned(combinations(cfg.blocks or [], words))
+    refusals = {job.refusal for job in jobs}
+    if len(refusals) == 1 and any(refusals):
+        raise UserError(refusals.pop())
+    return [jobs]
 
 
 def combinations(blocks: Sequence[str], typed: Sequence[str]) -> list[list[str]]:
@@ -91,8 +99,8 @@ def combinations(blocks: Sequence[str], typed: Sequence[str]) -> list[list[str]]
             # axes {algo: [algo=a2c, algo=ppo], seed: [seed=0, seed=1]}.
             axes[override.key_or_group] = _values(override)
         # Counted before they are listed: the list might fill the memory.
-        if (runs := math.prod(map(len, axes.values()))) > _MOST:
-            raise UserError(f"a sweep of {runs:,} runs: expected at most {_MOST:,}")
+        if (runs := math.prod(map(len, axes.values()))) > MOST:
+            raise UserError(f"a sweep of {runs:,} runs: expected at most {MOST:,}")
         # A dict, as a set that keeps its order: blocks may overlap, and a run that is in two of them is one run.
         found |= dict.fromkeys(itertools.product(*axes.values()))
     return [list(words) for words in found]
@@ -220,9 +228,9 @@ def _values(override: Override) -> list[str]:
     if not override.is_discrete_sweep():
         raise UserError(f"{override.input_line}: expected values that can be counted; hydra/sweeper=optuna searches")
     try:
-        values = [f"{key}={value}" for value in itertools.islice(override.sweep_string_iterator(), _MOST + 1)]
+        values = [f"{key}={value}" for value in itertools.islice(override.sweep_string_iterator(), MOST + 1)]
     except ValueError as error:  # range(0,1,0)
         raise UserError(f"{override.input_line}: {error}") from error
-    if len(values) > _MOST:
-        raise UserError(f"{override.input_line}: expected at most {_MOST:,} values")
+    if len(values) > MOST:
+        raise UserError(f"{override.input_line}: expected at most {MOST:,} values")
     return values

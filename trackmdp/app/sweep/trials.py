@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -10,7 +11,7 @@ from typing import Any
 
 from hydra.core.override_parser.types import IntervalSweep, Override, RangeSweep
 
-from trackmdp.app.sweep.plan import Job, MakeJobs
+from trackmdp.app.sweep.plan import MOST, Job, MakeJobs
 from trackmdp.app.sweep.sweep import run_scores
 from trackmdp.app.words import parsed
 from trackmdp.config.sweeping import OptunaConfig
@@ -42,6 +43,8 @@ def trials(cfg: OptunaConfig, words: Sequence[str], folder: Path, planned: MakeJ
     fixed = [word for word, each in zip(words, read, strict=True) if not each.is_sweep_override()]
     if not searched:
         raise UserError("hydra/sweeper=optuna: expected a word to search, such as algo.gamma=interval(0.9,0.99)")
+    for key, each in searched.items():
+        _check(key, each.value())
     timed = [each.value() for each in read if each.get_key_element() == "optimal.time_limit"]
     if cfg.objective == "regret_per_step" and any(value is not None for value in timed):
         raise UserError("optimal.time_limit: a regret would be chosen by the clock, expected null (or objective=aihtr)")
@@ -94,6 +97,25 @@ def _sampler(cfg: OptunaConfig, seed: int) -> Any:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ExperimentalWarning)
         return TPESampler(seed=seed, constant_liar=cfg.batch > 1)  # else a batch would be the same run many times
+
+
+def _check(key: str, value: Any) -> None:
+    """Refuse bounds between which there is nothing to draw, or a range that is too long to be listed."""
+    if isinstance(value, IntervalSweep):
+        low, high, log = *_numbers(value.start, value.end), "log" in value.tags
+        if not (0 if log else -math.inf) < low < high < math.inf:
+            raise UserError(f"{key}=interval({low},{high}): expected interval(a,b) with {'0 < ' if log else ''}a < b")
+    if isinstance(value, RangeSweep):
+        start, stop, step = _numbers(value.start, value.stop, value.step)
+        span = stop - start if step > 0 else start - stop
+        if not 0 < span <= MOST * abs(step):
+            given = f"{key}=range({start},{stop},{step})"
+            raise UserError(f"{given}: expected range(a,b,step) of 1 to {MOST:,} values")
+
+
+def _numbers(*bounds: Any) -> tuple[Any, ...]:
+    """The bounds, which Hydra's grammar says are numbers, and its types say may be None."""
+    return bounds
 
 
 def _suggest(trial: Any, key: str, override: Override) -> Any:
