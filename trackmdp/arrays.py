@@ -10,7 +10,7 @@ import io
 import math
 import os
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -67,12 +67,11 @@ def load_npy(stream: Any, size: int) -> npt.NDArray[Any]:
     return flat.reshape(shape, order="F" if fortran else "C")
 
 
-def load_npz(stream: BinaryIO, names: Iterable[str] | None = None) -> dict[str, npt.NDArray[Any]]:
-    """The arrays of an `.npz` file by their names, all or those of `names`.
+def load_npz(stream: BinaryIO) -> dict[str, npt.NDArray[Any]]:
+    """The arrays of an `.npz` file by their names.
 
     Raises:
         ValueError: it is damaged, oversized, encrypted or packed in an unusual way.
-        KeyError: one of `names` is missing.
         Exception: whatever zipfile and NumPy raise over damage; call it inside `untrusted.decoded`.
     """
     packed = size_of(stream)
@@ -88,11 +87,10 @@ def load_npz(stream: BinaryIO, names: Iterable[str] | None = None) -> dict[str, 
             # Bit 0 of the flags: encrypted. NumPy writes stored and deflated members only.
             if member.compress_type not in _METHODS or member.flag_bits & 1:
                 raise ValueError(f"{member.filename!r} is encrypted, or neither stored nor deflated")
-        known = {member.filename.removesuffix(".npy"): member for member in members}
         found = {}
-        for name in known if names is None else names:
-            with archive.open(known[name]) as content:
-                found[name] = load_npy(content, known[name].file_size)
+        for member in members:
+            with archive.open(member) as content:
+                found[member.filename.removesuffix(".npy")] = load_npy(content, member.file_size)
         return found
 
 

@@ -173,7 +173,6 @@ def test_playback_of_another_grid_is_refused() -> None:
 def test_batches_and_ways_of_looking_up_change_nothing(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("trackmdp.episodes.actors._MOST_ROWS", 7)
     monkeypatch.setattr("trackmdp.episodes.actors._DRAWS", 100)
-    monkeypatch.setattr("trackmdp.episodes.actors.Following.most_rows", 7)
     monkeypatch.setattr("trackmdp.episodes.batch._BELIEF", 50)
     monkeypatch.setattr(policies, "_DENSE", 0)
     acting = Policy(WORLD, ACTING[name].sets, probability=ACTING[name].probability, k=ACTING[name].k)

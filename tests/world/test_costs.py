@@ -29,7 +29,8 @@ def costs(cost: list[float]) -> Costs:
 )
 def test_one_step(sensed: bool, forced: bool, in_grid: bool, reward: float) -> None:
     flags = [torch.tensor([flag]) for flag in (sensed, forced, in_grid)]
-    earned = costs([0.1, 0.2, 0.3, 0.4]).pseudo_reward(ACTION, torch.tensor([0]), *flags)
+    prices = costs([0.1, 0.2, 0.3, 0.4])
+    earned = prices.pseudo_reward(prices.sensing_cost(ACTION, torch.tensor([0])), *flags)
     assert earned.shape == (1,)
     assert earned.item() == pytest.approx(reward)
 

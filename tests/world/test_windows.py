@@ -82,11 +82,11 @@ def test_a_local_number_stands_for_the_same_displacement_everywhere() -> None:
     assert view.cells[0].tolist() == [36, 36, 36, 36, 0, 1, 36, 6, 7]
 
 
-def test_spread_puts_local_numbers_on_their_cells() -> None:
+def test_to_global_puts_local_numbers_on_their_cells() -> None:
     view = Window(6, 1)
     on = torch.zeros(36, 2, 9, dtype=torch.bool)
     on[7, 1, 8] = on[0, 0, 0] = True  # the second lies outside
-    spread = view.spread(on)
+    spread = view.to_global(torch.arange(36)[:, None].expand(36, 2), on)
     assert spread.shape == (36, 2, 36)
     assert spread.nonzero().tolist() == [[7, 1, 14]]
 

@@ -189,8 +189,6 @@ class Surrogate(PolicyGradient):
         generator: draws the sensors; None for the expectation.
     """
 
-    old: Tensor
-
     def __init__(
         self, entropy: ScheduleConfig, *, clip_epsilon: float, minibatches: int, generator: torch.Generator | None
     ) -> None:
@@ -199,7 +197,7 @@ class Surrogate(PolicyGradient):
 
     def allocate(self, shape: tuple[int, int, int], device: torch.device) -> None:
         """Room for the old policy's logits."""
-        self.register_buffer("old", torch.zeros(shape, device=device))
+        self.old = nn.Buffer(torch.zeros(shape, device=device))
 
     def prepare(self, update: int, progress: float) -> None:
         """Set β, and whether the old policy is renewed."""

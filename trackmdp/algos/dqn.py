@@ -76,7 +76,7 @@ class DQN(Checkpointed):
     def __init__(self, task: Task, cfg: DqnConfig, *, iterations: int, seed: int, device: torch.device) -> None:
         self.cfg, self.iterations, self.iteration, self.device = cfg, iterations, 0, device
         qvalue = make_qvalue(task, cfg.hidden, cfg.reward_scale).to(device)
-        self.explore = EpsilonFlip(cfg.epsilon.start, task).to(device)
+        self.explore = EpsilonFlip(cfg.epsilon.start).to(device)
         self.policy = TensorDictSequential(qvalue, self.explore)
         self.loss = AdditiveDQNLoss(qvalue)
         self.target = SoftUpdate(self.loss, tau=cfg.target_tau)

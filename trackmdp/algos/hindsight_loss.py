@@ -75,10 +75,6 @@ class HindsightLoss(nn.Module):
             through in parts, a few cells at a time. The losses are the same, up to rounding.
     """
 
-    cost: Tensor
-    clocks: Tensor
-    gain_scale: Tensor
-
     def __init__(
         self,
         task: Task,
@@ -137,7 +133,7 @@ class HindsightLoss(nn.Module):
         cost = torch.as_tensor(task.cost / task.reward, dtype=torch.float32, device=device)
         # [S + 1]: the last one, which there is none of, costs nothing, so that windows cut off by the border need no
         # mask here.
-        self.register_buffer("cost", pad(cost, (0, 1)))
+        self.cost = nn.Buffer(pad(cost, (0, 1)))
         # p_d and p_s [M + 1], known to the learner like the prices; 0 outside, and no state: they are the task's, not
         # the training's.
         detects, locates = (
@@ -146,9 +142,9 @@ class HindsightLoss(nn.Module):
         )
         self._perfect, self._detection = task.perfect, detects
         self._safe_detection = None if task.safe else locates
-        self.register_buffer("clocks", torch.arange(choices, device=device).unsqueeze(-1))
+        self.clocks = nn.Buffer(torch.arange(choices, device=device).unsqueeze(-1))
         # Row 0 for the clocked actor, row 1 for the actor.
-        self.register_buffer("gain_scale", torch.ones(2, choices, device=device))
+        self.gain_scale = nn.Buffer(torch.ones(2, choices, device=device))
 
     def _groups(self, window: Window, alike: Tensor) -> Tensor:
         """`[M]` the groups of located cells, or of keys: those of their cells and of one class."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import ClassVar
 
 import torch
@@ -15,6 +15,7 @@ from torchrl.objectives.value import GAE
 from trackmdp.algos.common import Averages, Checkpointed, clipped_step, explained_variance, set_learning_rate
 from trackmdp.config.learning import ActorCriticConfig
 from trackmdp.policies.actor_critic import make_actor, make_critic
+from trackmdp.seeding import generator
 from trackmdp.world.model import Task
 
 _KEPT = ("action", "action_log_prob", "advantage", "value_target")
@@ -24,11 +25,12 @@ class OnPolicy(Checkpointed):
     """Actor, critic and their optimizer, which learn from rows with a GAE advantage."""
 
     parts: ClassVar[tuple[str, ...]] = ("policy", "critic", "optimizer", "iteration")
-    loss: LossModule
+    make_loss: Callable[..., LossModule]
+    """Makes it of actor, critic and what all losses are told."""
     diagnostics: ClassVar = {"loss_actor": "loss_objective", "loss_critic": "loss_critic", "entropy": "entropy"}
     """What is reported, by its name in `loss`."""
 
-    def __init__(self, task: Task, cfg: ActorCriticConfig, *, iterations: int, device: torch.device) -> None:
+    def __init__(self, task: Task, cfg: ActorCriticConfig, *, iterations: int, seed: int, device: torch.device) -> None:
         self.cfg, self._t_max = cfg, task.t_max
         self.iterations, self.iteration, self.device = iterations, 0, device
         self.policy = make_actor(task, cfg.hidden, cfg.initial_logit).to(device)
@@ -36,6 +38,8 @@ class OnPolicy(Checkpointed):
         self.parameters = [*self.policy.parameters(), *self.critic.parameters()]
         self.optimizer = torch.optim.Adam(self.parameters, lr=cfg.learning_rate.start, eps=1e-5, fused=True)
         self.advantage = GAE(gamma=cfg.gamma, lmbda=cfg.gae_lambda, value_network=self.critic, deactivate_vmap=True)
+        told = {"entropy_coeff": cfg.entropy.start, "critic_coeff": cfg.critic_coef, "loss_critic_type": "l2"}
+        self.loss, self.generator = self.make_loss(self.policy, self.critic, **told), generator(seed, "minibatches")
 
     @property
     def actor(self) -> TensorDictModuleBase:

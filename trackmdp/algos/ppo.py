@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.objectives import ClipPPOLoss
+from tensordict.nn import TensorDictModuleBase
+from torchrl.objectives import ClipPPOLoss, LossModule
 
 from trackmdp.algos.on_policy import OnPolicy
 from trackmdp.config.learning import PpoConfig
-from trackmdp.seeding import generator
-from trackmdp.world.model import Task
 
 
 class PPO(OnPolicy):
@@ -25,18 +24,9 @@ class PPO(OnPolicy):
     parts: ClassVar[tuple[str, ...]] = (*OnPolicy.parts, "generator")
     diagnostics: ClassVar = OnPolicy.diagnostics | {"approx_kl": "kl_approx", "clip_fraction": "clip_fraction"}
 
-    def __init__(self, task: Task, cfg: PpoConfig, *, iterations: int, seed: int, device: torch.device) -> None:
-        super().__init__(task, cfg, iterations=iterations, device=device)
-        self.generator = generator(seed, "minibatches")
-        self.loss = ClipPPOLoss(
-            self.policy,
-            self.critic,
-            clip_epsilon=cfg.clip_epsilon,
-            entropy_coeff=cfg.entropy.start,
-            critic_coeff=cfg.critic_coef,
-            loss_critic_type="l2",
-            normalize_advantage=False,
-        )
+    def make_loss(self, *nets: TensorDictModuleBase, **told: Any) -> LossModule:
+        """The clipped surrogate."""
+        return ClipPPOLoss(*nets, clip_epsilon=self.cfg.clip_epsilon, normalize_advantage=False, **told)
 
     def minibatches(self, data: TensorDictBase) -> Iterator[TensorDictBase]:
         """The rows of each gradient step."""

@@ -5,7 +5,7 @@ The log, the web page, the picture and the simulated figures of an evaluation ar
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -66,42 +66,24 @@ def resimulate(problem: Problem, policy: PolicyLike | Playback, seeds: Sequence[
 
 
 class _Draws:
-    """Uniform draws of many episodes, each from generators of its own: for the moves, the choices and the reports."""
+    """Draws of many episodes, each from a generator of its own, `_BLOCK` steps at a time."""
 
-    def __init__(self, source: Source, seeds: Sequence[int], per_choice: int, *, certain: bool) -> None:
-        self._source, self._per_choice = source, per_choice
+    _block: Tensor
+
+    def __init__(self, seeds: Sequence[int], draw: Callable[[int, torch.Generator], Tensor]) -> None:
         # A generator for each episode, not one for the batch: what an episode draws must not depend on how many others
-        # run beside it, nor on when they end. Moves and choices apart, so that two policies with one seed meet the
-        # same target.
-        self._of_moves = [torch.Generator().manual_seed(seed) for seed in seeds]
-        self._moves = torch.zeros(len(seeds), _BLOCK, dtype=torch.float64)
-        if per_choice:
-            self._of_choices = [torch.Generator().manual_seed(derive(seed, "policy")) for seed in seeds]
-        self._choices = torch.zeros(len(seeds), _BLOCK, per_choice)
-        self._seen: Tensor | None = None
-        if not certain:
-            self._of_reports = [torch.Generator().manual_seed(derive(seed, "report")) for seed in seeds]
-            self._seen = torch.zeros(len(seeds), _BLOCK, dtype=torch.float64)
+        # run beside it, nor on when they end.
+        self.generators, self._draw = [torch.Generator().manual_seed(seed) for seed in seeds], draw
 
-    def starts(self) -> Tensor:
-        """`[B]` places; taken before any move."""
-        numbers = [torch.randint(self._source.starts, (1,), generator=rng) for rng in self._of_moves]
-        return self._source.begin(torch.cat(numbers))
-
-    def at(self, step: int, rows: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Draws of moves `[R]`, choices `[R, per_choice]` and reports `[R]` of the episodes `rows` `[R]` at a step."""
-        place = step % _BLOCK
+    def at(self, states: States) -> Tensor:
+        """`[R, ...]`, those of the running episodes at their step."""
+        place = states.step % _BLOCK
         # At steps 0, 256, 512, ...: all running episodes are at the same step, and refill together; ended ones draw no
         # more.
         if place == 0:
-            for row in rows.tolist():
-                self._moves[row] = self._source.draw(_BLOCK, self._of_moves[row])
-                if self._per_choice:
-                    self._choices[row] = torch.rand(_BLOCK, self._per_choice, generator=self._of_choices[row])
-                if self._seen is not None:
-                    self._seen[row] = torch.rand(_BLOCK, dtype=torch.float64, generator=self._of_reports[row])
-        seen = None if self._seen is None else self._seen[rows, place]
-        return self._moves[rows, place], self._choices[rows, place], seen
+            drawn = torch.stack([self._draw(_BLOCK, self.generators[row]) for row in states.row.tolist()])
+            self._block = drawn if states.step == 0 else self._block.index_copy(0, states.row, drawn)
+        return self._block[states.row, place]
 
 
 class _Batch:
@@ -114,12 +96,23 @@ class _Batch:
         self._costs, self._reports = rules
         # What a policy remembers is its own; whatever else acts knows the cell.
         self._keys = (actor.policy.task if actor.policy else problem.remembering()).keys
-        self._draws = _Draws(source, seeds, actor.num_draws, certain=self._reports.certain)
+        # Moves, choices and reports apart, so that two policies with one seed meet the same target.
+        self._moves, self._choices, self._seen = _Draws(seeds, source.draw), None, None
+        if size := actor.num_draws:
+            seeds_of_choices = [derive(seed, "policy") for seed in seeds]
+            self._choices = _Draws(seeds_of_choices, lambda count, rng: torch.rand(count, size, generator=rng))
+        if not self._reports.certain:
+            seeds_of_reports = [derive(seed, "report") for seed in seeds]
+            self._seen = _Draws(
+                seeds_of_reports, lambda count, rng: torch.rand(count, dtype=torch.float64, generator=rng)
+            )
         self._steps = Steps(len(seeds))
 
     def run(self) -> Steps:
         """Step until the last episode has ended."""
-        place = self._draws.starts()
+        # Before any move.
+        starts = [torch.randint(self._source.starts, (1,), generator=rng) for rng in self._moves.generators]
+        place = self._source.begin(torch.cat(starts))
         start, mode = self._source.cell(place), self._source.mode(place)
         self._steps.begin(start, mode)
         key = self._keys.start(start, mode)
@@ -130,17 +123,17 @@ class _Batch:
 
     def _step(self, at: States) -> States:
         """One step of `TrackEnv`, of the episodes still running; the same order of events, the same arithmetic."""
-        moves, choices, seen = self._draws.at(at.step, at.row)
-        choice = self._actor.decide(at, choices)
-        place = self._source.move(at.place, moves)
+        choice = self._actor.decide(at, None if self._choices is None else self._choices.at(at))
+        place = self._source.move(at.place, self._moves.at(at))
         target = self._source.cell(place)
         in_grid = target < self._task.num_cells
         # A target that exited is at M, which is no column: it looks up the last cell, and `& in_grid` clears the
         # answer.
         sensed = choice.sensed(target.clamp_max(self._task.num_cells - 1)) & in_grid
         forced = at.misses > self._task.t_max
+        seen = None if self._seen is None else self._seen.at(at)
         located = (sensed | forced) & in_grid & self._reports.seen(target, forced, seen)
-        reward = self._costs.reward_of(choice.spent, located, forced, in_grid)
+        reward = self._costs.pseudo_reward(choice.spent, located, forced, in_grid)
         # An exit on the last step allowed is an exit (terminated), not a truncation.
         truncated = self._truncated(place, at.step) & in_grid
         mode = self._source.mode(place)

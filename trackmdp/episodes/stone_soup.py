@@ -262,7 +262,7 @@ def follow(manager: PolicySensorManager, path: GroundTruthPath) -> Followed:
     # A path that ends with an exit has one more step, in which there is no target.
     for truth in [*path[1:], *([None] if _exits(path) else [])]:
         time = track[-1].timestamp + places.step if truth is None else truth.timestamp
-        last, misses = manager.known(track)
+        _, misses = manager.known(track)
         (switched,) = manager.choose_actions({track}, time)
         for sensor, actions in switched.items():
             sensor.add_actions(actions)
@@ -272,7 +272,7 @@ def follow(manager: PolicySensorManager, path: GroundTruthPath) -> Followed:
         located, forced, in_grid = (
             torch.tensor([each]) for each in (bool(found), misses > task.t_max, truth is not None)
         )
-        reward = costs.pseudo_reward(torch.as_tensor(action)[None], torch.tensor([last]), located, forced, in_grid)
+        reward = costs.pseudo_reward(costs.price_of(torch.as_tensor(action)[None]), located, forced, in_grid)
         taken.append((action, bool(found), reward.item()))
         if truth is not None:
             track.append(_update(found[0]) if found else StatePrediction(track[-1].state_vector, timestamp=time))

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
+from torch import nn
 
 from trackmdp.policies.lookup import in_window
 from trackmdp.policies.table import PolicyTable
@@ -31,8 +31,6 @@ class RenewedTable(TensorDictModuleBase):
     """
 
     out_keys: ClassVar = ["action"]
-    bits: Tensor
-    _place: Tensor
 
     def __init__(self, task: Task, device: torch.device | str = "cpu", *, on: bool = False) -> None:
         super().__init__()
@@ -40,9 +38,9 @@ class RenewedTable(TensorDictModuleBase):
         self.in_keys = ["key" if task.keyed else "last_cell", "steps_since_detection"]
         # Row key (t_max + 1) + n, as in `PolicyTable`; 8 sensors per byte: 10 x 10 cells take 13 bytes a row.
         shape = (task.num_keys * task.num_choices, -(-task.num_sensors // 8))
-        self.register_buffer("bits", torch.full(shape, 255 * on, dtype=torch.uint8, device=device))
+        self.bits = nn.Buffer(torch.full(shape, 255 * on, dtype=torch.uint8, device=device))
         # numpy.packbits puts the first of eight entries into the highest bit.
-        self.register_buffer("_place", torch.arange(7, -1, -1, device=device), persistent=False)
+        self._place = nn.Buffer(torch.arange(7, -1, -1, device=device), persistent=False)
 
     def renew(self, policy: PolicyTable) -> None:
         """Act as the deterministic `policy` from now on."""
@@ -69,11 +67,9 @@ class Exploring(RenewedTable):
     from there are like, however the table chooses.
     """
 
-    explore: Tensor
-
     def __init__(self, task: Task, device: torch.device | str = "cpu") -> None:
         super().__init__(task, device)
-        self.register_buffer("explore", torch.ones((), device=device))
+        self.explore = nn.Buffer(torch.ones((), device=device))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action` `[*B, K]`."""

@@ -7,6 +7,7 @@ from typing import ClassVar
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import nn
 
 
 class RandomSubset(TensorDictModuleBase):
@@ -18,7 +19,7 @@ class RandomSubset(TensorDictModuleBase):
     def __init__(self, num_cells: int, generator: torch.Generator) -> None:
         super().__init__()
         self.num_cells, self.generator = num_cells, generator
-        self.register_buffer("_shifts", torch.arange(63, device=generator.device))
+        self._shifts = nn.Buffer(torch.arange(63, device=generator.device))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action` `[B, M]`: the bits of random 63-bit words."""

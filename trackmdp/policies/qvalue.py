@@ -26,8 +26,6 @@ class AdditiveQ(nn.Module):
     q_j counts in units of the sensor's price.
     """
 
-    unit: Tensor
-
     def __init__(self, task: Task, hidden: int, scale: float) -> None:
         super().__init__()
         self.t_max = task.t_max
@@ -40,7 +38,7 @@ class AdditiveQ(nn.Module):
         self.window = Window.of(task) if task.window is not None else None
         # What lies outside the grid, cell M, has no price: there q_j is 0, and the sensor off.
         unit = price if self.window is None else nn.functional.pad(price, (0, 1))
-        self.register_buffer("unit", scale * unit)
+        self.unit = nn.Buffer(scale * unit)
 
     def forward(
         self, last_cell: Tensor, steps_since_detection: Tensor, action_history: Tensor, *key: Tensor
@@ -62,27 +60,25 @@ def joint_value(values: TensorDictBase, action: Tensor) -> Tensor:
 class EpsilonFlip(TensorDictModuleBase):
     """The greedy subset {j : q_j > 0}; while exploring, each sensor is flipped with probability epsilon.
 
+    Sensors without a value stay off: those outside the grid, and all where the safe action is forced.
+
     Args:
         epsilon: that probability.
-        task: with `grid.window`, sensors of its window that lie outside the grid stay off.
     """
 
+    in_keys: ClassVar = ["sensor_value"]
     out_keys: ClassVar = ["action"]
-    epsilon: Tensor
 
-    def __init__(self, epsilon: float, task: Task | None = None) -> None:
+    def __init__(self, epsilon: float) -> None:
         super().__init__()
-        self.window = Window.of(task) if task is not None and task.window is not None else None
-        self.in_keys = ["sensor_value"] if self.window is None else ["sensor_value", "last_cell"]
-        self.register_buffer("epsilon", torch.tensor(epsilon))
+        self.epsilon = nn.Buffer(torch.tensor(epsilon))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action` `[*B, K]`."""
-        greedy = tensordict["sensor_value"] > 0
+        value = tensordict["sensor_value"]
+        greedy = value > 0
         if exploration_type() is ExplorationType.RANDOM:
-            greedy = greedy ^ (torch.rand(greedy.shape, device=greedy.device) < self.epsilon)
-            if self.window is not None:
-                greedy = greedy & self.window.inside(tensordict["last_cell"].reshape(-1)).view(greedy.shape)
+            greedy = greedy ^ (torch.rand(value.shape, device=value.device) < self.epsilon) & (value != 0)
         return tensordict.set("action", greedy)
 
 

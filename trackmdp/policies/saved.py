@@ -27,8 +27,8 @@ LISTED_CELLS = 20_000
 """Cells up to which sets and values are written as JSON."""
 
 _TASK = ("size", "cost", "t_max", "safe_cost", "reward", "max_steps", "window", "markov")
-_SENSORS = ("detection", "safe_detection")
-"""Written where a sensor or the safe action may miss."""
+_SENSORS, _KNOWN = ("detection", "safe_detection"), ("memory", "clip", "revealed")
+"""Written where a sensor or the safe action may miss; where more than the cell is known at a detection."""
 
 
 def save_policy(file: Path, policy: PolicyTable, value: Array | None = None, **more: Array) -> None:
@@ -159,24 +159,16 @@ def _number(value: Any) -> npt.NDArray[Any]:
     return np.asarray(np.nan if value is None else value)
 
 
+def _plain(array: npt.NDArray[Any]) -> Any:
+    """What `_number` made an array of."""
+    return array if array.ndim else None if array != array else array.item()
+
+
 def _task(content: dict[str, npt.NDArray[Any]]) -> Task:
-    given = {name: content[f"task_{name}"] for name in _TASK}
+    given = {name: _plain(content[f"task_{name}"]) for name in _TASK}
+    given |= {name: _plain(content[f"task_{name}"]) for name in (*_SENSORS, *_KNOWN) if f"task_{name}" in content}
     rows, columns = map(int, given["size"])
-    return Task(
-        (rows, columns),
-        cost=given["cost"],
-        t_max=int(given["t_max"]),
-        safe_cost=float(given["safe_cost"]),
-        reward=float(given["reward"]),
-        max_steps=None if np.isnan(given["max_steps"]) else int(given["max_steps"]),
-        window=None if np.isnan(given["window"]) else int(given["window"]),
-        markov=bool(given["markov"]),
-        **{name: content[f"task_{name}"] for name in _SENSORS if f"task_{name}" in content},
-        coverage=_read_footprints(content, rows * columns),
-        memory=str(content.get("task_memory", "cell")),
-        clip=int(content.get("task_clip", 2)),
-        revealed=int(content.get("task_revealed", 1)),
-    )
+    return Task(**given, coverage=_read_footprints(content, rows * columns))
 
 
 def _footprints(coverage: Coverage) -> dict[str, Any]:

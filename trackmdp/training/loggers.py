@@ -21,20 +21,36 @@ from trackmdp.training.evaluator import figures
 from trackmdp.untrusted import decoded, opened
 
 
-class CsvLogger(Callback):
-    """`metrics.csv`: one row per logged iteration; the columns are those of the first row.
-
-    A value that is not there, or not finite, leaves its field empty. Numbers read back exactly.
+class RowLogger(Callback):
+    """Writes the rows of the iterations that are due.
 
     Args:
-        cfg: how often.
+        cfg: how often, and where to.
         folder: of the run.
     """
 
-    name = "csv"
+    _cfg: RowsConfig
 
     def __init__(self, cfg: RowsConfig, folder: Path) -> None:
-        self._every, self._path, self._position = cfg.every, folder / "metrics.csv", 0
+        self._cfg, self._folder = cfg, folder
+
+    def on_update(self, trainer: Training, row: Row) -> None:
+        """Write the row where it is due."""
+        if trainer.due(self._cfg.every):
+            self.write(row)
+
+    def write(self, row: Row) -> None:
+        """Append `row`."""
+
+
+class CsvLogger(RowLogger):
+    """`metrics.csv`: one row per logged iteration; the columns are those of the first row.
+
+    A value that is not there, or not finite, leaves its field empty. Numbers read back exactly.
+    """
+
+    name = "csv"
+    _position = 0  # bytes that an earlier process left
 
     def on_start(self, trainer: Training) -> None:  # noqa: ARG002
         """Open the file; what an earlier process wrote after its last checkpoint is cut off.
@@ -42,6 +58,7 @@ class CsvLogger(Callback):
         Raises:
             UserError: the file is a link, or not the one that the earlier process left.
         """
+        self._path = self._folder / "metrics.csv"
         # The columns are read and checked before the file is opened for writing: a file that is refused
         # stays as it was.
         names = _names(self._path, self._position) if self._position else None
@@ -54,11 +71,6 @@ class CsvLogger(Callback):
             # stand there twice.
             self._file.truncate(self._position)
             self._file.seek(0, os.SEEK_END)
-
-    def on_update(self, trainer: Training, row: Row) -> None:
-        """Write the row where it is due."""
-        if trainer.due(self._every):
-            self.write(row)
 
     def write(self, row: Row) -> None:
         """Append `row`; it is on its way to the disk at once."""
@@ -87,35 +99,26 @@ class CsvLogger(Callback):
         self._position = state["position"]
 
 
-class TensorboardLogger(Callback):
-    """TensorBoard event files in `tensorboard/`, the same figures over frames.
-
-    Args:
-        cfg: how often.
-        folder: of the run.
-    """
+class TensorboardLogger(RowLogger):
+    """TensorBoard event files in `tensorboard/`, the same figures over frames."""
 
     name = "tensorboard"
-
-    def __init__(self, cfg: RowsConfig, folder: Path) -> None:
-        self._every, self._folder = cfg.every, folder / "tensorboard"
 
     def on_start(self, trainer: Training) -> None:
         """Open a file; an earlier process's events after its last checkpoint are hidden."""
         from torch.utils.tensorboard import SummaryWriter  # optional dependency, a second to import
 
-        own_folder(self._folder)
-        frames = trainer.position.frames
+        folder, frames = self._folder / "tensorboard", trainer.position.frames
+        own_folder(folder)
         # TensorBoard reads all event files of a folder together and cannot be told to drop a part of one; a
         # new file with purge_step hides the events of that step and later ones.
-        self._events = SummaryWriter(self._folder, purge_step=frames + 1 if frames else None)
+        self._events = SummaryWriter(folder, purge_step=frames + 1 if frames else None)
         self._events.add_text("config", f"```yaml\n{to_yaml(trainer.config)}\n```", frames)
 
-    def on_update(self, trainer: Training, row: Row) -> None:
-        """Write the row where it is due."""
-        if trainer.due(self._every):
-            for key, value in known(row).items():
-                self._events.add_scalar(key, value, trainer.position.frames)
+    def write(self, row: Row) -> None:
+        """Add the figures of `row`."""
+        for key, value in known(row).items():
+            self._events.add_scalar(key, value, row["frames"])
 
     def on_end(self, trainer: Training) -> None:
         """Write the final figures, and close the file."""
@@ -159,22 +162,29 @@ def _names(file: Path, position: int) -> list[str]:
     return names
 
 
-class WandbLogger(Callback):
+class _Tracker(RowLogger):
+    """Logs to a run that has an id of its own, under which a resumed one goes on."""
+
+    _id = ""  # until the run is begun
+
+    def state_dict(self) -> dict[str, Any]:
+        """The id of the run."""
+        return {"id": self._id}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on with the run of that id."""
+        self._id = str(state["id"])
+
+
+class WandbLogger(_Tracker):
     """Weights & Biases through TorchRL's logger: config, a row per logged iteration over frames, final figures.
 
     A resumed run goes on under the same id. Offline each process leaves a folder `wandb/offline-run-*` of its own;
     `wandb sync` puts them together.
-
-    Args:
-        cfg: how often, and where to.
-        folder: of the run.
     """
 
     name = "wandb"
-
-    def __init__(self, cfg: WandbConfig, folder: Path) -> None:
-        self._cfg, self._folder = cfg, folder
-        self._id = secrets.token_hex(4)
+    _cfg: WandbConfig
 
     def on_start(self, trainer: Training) -> None:
         """Begin the run, or go on with it.
@@ -189,6 +199,7 @@ class WandbLogger(Callback):
         from torchrl.record.loggers.wandb import WandbLogger as TorchrlLogger
 
         own_folder(self._folder / "wandb")
+        self._id = self._id or secrets.token_hex(4)
         # No console capture, machine statistics or code: what is logged is the run's figures.
         quiet: dict[str, Any] = dict.fromkeys(("silent", "x_disable_stats", "disable_code", "disable_git"), True)
         quiet |= {"console": "off", "x_save_requirements": False}
@@ -205,42 +216,26 @@ class WandbLogger(Callback):
                 settings=wandb.Settings(**quiet),
             )
 
-    def on_update(self, trainer: Training, row: Row) -> None:
-        """Log the row where it is due."""
-        if trainer.due(self._cfg.every):
-            self._logger.log_metrics(known(row), step=trainer.position.frames, override_global_step=True)
+    def write(self, row: Row) -> None:
+        """Log the row."""
+        self._logger.log_metrics(known(row), step=row["frames"], override_global_step=True)
 
     def on_end(self, trainer: Training) -> None:
         """Leave the final figures in the run's summary, and close it."""
         self._logger.experiment.summary.update(final_figures(trainer))
         self._logger.experiment.finish(exit_code=0 if trainer.error is None else 1)
 
-    def state_dict(self) -> dict[str, Any]:
-        """The id of the run."""
-        return {"id": self._id}
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on with the run of that id."""
-        self._id = str(state["id"])
-
-
-class MlflowLogger(Callback):
+class MlflowLogger(_Tracker):
     """MLflow: the options as parameters, a row per logged iteration over frames, final figures.
 
     By MLflow's client itself, for TorchRL's logger always begins another run. A resumed run goes on with the same one;
     rows that an earlier process logged after its last checkpoint are not logged twice.
-
-    Args:
-        cfg: how often, and where to.
-        folder: of the run.
     """
 
     name = "mlflow"
-
-    def __init__(self, cfg: MlflowConfig, folder: Path) -> None:
-        self._cfg, self._folder = cfg, folder
-        self._id = ""  # until the run is begun
-        self._logged = -1  # frames of the last row that is there
+    _cfg: MlflowConfig
+    _logged = -1  # frames of the last row that is there
 
     def on_start(self, trainer: Training) -> None:
         """Begin the run, or go on with it.
@@ -281,10 +276,11 @@ class MlflowLogger(Callback):
         for begin in range(0, len(options), 100):  # no more are taken at a time
             self._client.log_batch(self._id, params=options[begin : begin + 100])
 
-    def on_update(self, trainer: Training, row: Row) -> None:
-        """Log the row where it is due."""
-        if trainer.due(self._cfg.every) and trainer.position.frames > self._logged:
-            self._log(known(row), trainer.position.frames)
+    def write(self, row: Row) -> None:
+        """Log the row, unless it is there."""
+        measured = known(row)
+        if measured["frames"] > self._logged:
+            self._log(measured, int(measured["frames"]))
 
     def _log(self, row: Mapping[str, float], frames: int) -> None:
         from mlflow.entities import Metric
@@ -300,14 +296,6 @@ class MlflowLogger(Callback):
             self._log(final, trainer.position.frames)
         ended = "FINISHED" if error is None else "KILLED" if isinstance(error, Preempted) else "FAILED"
         self._client.set_terminated(self._id, ended)
-
-    def state_dict(self) -> dict[str, Any]:
-        """The id of the run."""
-        return {"id": self._id}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on with the run of that id."""
-        self._id = str(state["id"])
 
 
 @contextmanager

@@ -43,20 +43,6 @@ class Costs:
             return action.view(torch.uint8).sum(-1, dtype=torch.int32) * self.sensor[0]  # a bool sum converts first
         return (action.to(self._steps.dtype) @ self._steps[:-1]).to(self.sensor.dtype)
 
-    def pseudo_reward(
-        self, action: Tensor, last_cell: Tensor, sensed: Tensor, forced: Tensor, in_grid: Tensor
-    ) -> Tensor:
-        """`[B]` reward of one step: r·1[sensed] - c·|a|, where forced r·1[sensed] - D; 0 on the exit step.
-
-        Args:
-            action: `[B, K]` sensors on.
-            last_cell: `[B]` where the target was located last; a window's sensors are around it.
-            sensed: `[B]` the target is reported, by its cell's sensor or, where forced, by the safe action.
-            forced: `[B]` the safe action replaces `action`.
-            in_grid: `[B]` the target is still in the grid after its move.
-        """
-        return self.reward_of(self.sensing_cost(action, last_cell), sensed, forced, in_grid)
-
     def of_sets(self, sets: sparse.csr_array) -> Tensor:
         """`[R]` price of each row of `sets` `[R, M]`, to the bit that of `price_of` for the row written out."""
         count = torch.as_tensor(np.diff(sets.indptr), dtype=torch.int32, device=self.sensor.device)
@@ -65,8 +51,15 @@ class Costs:
         exact = sets.astype(np.float64) @ self._steps[:-1].cpu().numpy()  # whatever the order of the sum
         return torch.as_tensor(exact, device=self.sensor.device).to(self.sensor.dtype)
 
-    def reward_of(self, spent: Tensor, sensed: Tensor, forced: Tensor, in_grid: Tensor) -> Tensor:
-        """`pseudo_reward` where the price `spent` `[B]` of the sensors on is known."""
+    def pseudo_reward(self, spent: Tensor, sensed: Tensor, forced: Tensor, in_grid: Tensor) -> Tensor:
+        """`[B]` reward of one step: r·1[sensed] - c·|a|, where forced r·1[sensed] - D; 0 on the exit step.
+
+        Args:
+            spent: `[B]` price of the sensors on, c·|a|.
+            sensed: `[B]` the target is reported, by its cell's sensor or, where forced, by the safe action.
+            forced: `[B]` the safe action replaces the sensors.
+            in_grid: `[B]` the target is still in the grid after its move.
+        """
         # Costs are zeroed on the exit step together with the reward (eq. reward_func multiplies all of it).
         chosen = self.reward * sensed - spent
         safe: Tensor | float = self.reward - self.safe_cost

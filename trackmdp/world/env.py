@@ -251,14 +251,14 @@ class TrackEnv(EnvBase):
         # n = t_max + 1: the policy's action does not count any more.
         forced = n > self.t_max
         located = (sensed | forced) & in_grid & self._reports.seen(target, forced, reports)
-        missed = in_grid & ~located
+        missed, spent = in_grid & ~located, self._costs.sensing_cost(action, last)
         following = moved | {
             # On the exit step `last` stays: the spec has no cell M for it, and done ends the row anyway.
             "last_cell": torch.where(located, target, last),
             # n + 1 on a miss, 0 on a detection and on the exit step; the clock stands still if the safe action misses.
             "steps_since_detection": (n + 1 if self._safe else (n + 1).clamp_max(self.t_max + 1)) * missed,
             "action_history": self._remember(state["action_history"], action, n, missed),
-            "reward": self._costs.pseudo_reward(action, last, located, forced, in_grid).unsqueeze(-1),
+            "reward": self._costs.pseudo_reward(spent, located, forced, in_grid).unsqueeze(-1),
         }
         if self._keys:
             # As with `last_cell`, what is worked out for a target that has exited is thrown away.

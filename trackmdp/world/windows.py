@@ -32,14 +32,7 @@ class Window(nn.Module):
         width: K = (2W + 1)², or M without a radius.
     """
 
-    _row: Tensor
-    _column: Tensor
     _cells: Tensor | None
-    _slots: Tensor
-    _code: Tensor
-    _corner: Tensor
-    _groups: Tensor
-    _inside: Tensor
 
     def __init__(self, size: Task | Size, radius: int | None, device: torch.device | str = "cpu") -> None:
         super().__init__()
@@ -47,8 +40,8 @@ class Window(nn.Module):
         self.num_cells, self.radius = self.rows * self.columns, radius
         self.width = self.num_cells if radius is None else (2 * radius + 1) ** 2
         cell = torch.arange(self.num_cells, device=device)
-        self.register_buffer("_row", cell // self.columns, persistent=False)
-        self.register_buffer("_column", cell % self.columns, persistent=False)
+        self._row = nn.Buffer(cell // self.columns, persistent=False)
+        self._column = nn.Buffer(cell % self.columns, persistent=False)
         self.register_buffer("_cells", None, persistent=False)
         self._find_tables(device)
 
@@ -65,18 +58,18 @@ class Window(nn.Module):
         place = torch.arange(side * line, device=device)
         local = torch.where(place % line < side, place // line * side + place % line, k)
         outside = torch.full((1,), k, device=device)
-        self.register_buffer("_slots", torch.cat([outside, local, outside]), persistent=False)
+        self._slots = nn.Buffer(torch.cat([outside, local, outside]), persistent=False)
         code, exited = line * self._row + self._column, 4 * line * (self.rows + side)  # which lies behind every line
-        self.register_buffer("_code", torch.cat([code, code.new_tensor([exited])]), persistent=False)
+        self._code = nn.Buffer(torch.cat([code, code.new_tensor([exited])]), persistent=False)
         # + 1: place 0 of the table stands for all that lies before it
         corner = code - radius * (line + 1) - 1
         # A path may go on from M once its target has exited: it has the place of cell 0, told apart by callers.
-        self.register_buffer("_corner", torch.cat([corner, corner[:1]]), persistent=False)
+        self._corner = nn.Buffer(torch.cat([corner, corner[:1]]), persistent=False)
         groups = self.groups()
         first = torch.full((int(groups.max()) + 1,), self.num_cells, device=device)
         first.scatter_reduce_(0, groups, torch.arange(self.num_cells, device=device), "amin")
-        self.register_buffer("_groups", groups, persistent=False)
-        self.register_buffer("_inside", self.around(first) < self.num_cells, persistent=False)
+        self._groups = nn.Buffer(groups, persistent=False)
+        self._inside = nn.Buffer(self.around(first) < self.num_cells, persistent=False)
 
     @classmethod
     def of(cls, task: Task, device: torch.device | str = "cpu") -> Window:
@@ -152,12 +145,6 @@ class Window(nn.Module):
         around = self.around(start)
         inside = around < self.num_cells
         return everywhere.gather(-1, around.clamp_max(self.num_cells - 1)) * inside
-
-    def spread(self, on: Tensor) -> Tensor:
-        """`[M, C, M]` bool over all cells, from `on` `[M, C, K]` over the window of each cell."""
-        m, choices, _ = on.shape
-        start = torch.arange(m, device=on.device)
-        return self.to_global(start[:, None].expand(m, choices), on)
 
     def groups(self, classes: Tensor | None = None) -> Tensor:
         """`[M]` int64 group of each cell: equal where the distances to the four borders agree up to the radius.
