@@ -12,11 +12,11 @@ from omegaconf import OmegaConf
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from trackmdp.algos.common import make_algorithm
 from trackmdp.config import GROUPS, EvaluateConfig, TrainConfig, options
 from trackmdp.config.compose import compose
 from trackmdp.config.registry import conf_file
 from trackmdp.config.world import BORDERS
-from trackmdp.training.make import make_algorithm
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.model import Array, World
 from trackmdp.world.modes import HiddenWorld, heading_kernel

@@ -20,12 +20,12 @@ import torch
 import trackmdp as tm
 from tests.helpers import train_config
 from tests.training.runs import BUDGET, QUICK, SMALL, assert_same_run, at_iteration, rows, train
+from trackmdp.algos.common import make_algorithm
 from trackmdp.errors import Preempted, RunError, UserError
 from trackmdp.signals import Watch
 from trackmdp.training import checkpoint
 from trackmdp.training.callbacks import Callback, Training
 from trackmdp.training.lock import locked
-from trackmdp.training.make import make_algorithm
 from trackmdp.training.state import _weights
 from trackmdp.world.make import build_world
 

@@ -12,6 +12,10 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
+from trackmdp.config import TrainConfig
+from trackmdp.config.registry import maker
+from trackmdp.world.model import Task
+
 
 class Algorithm(Protocol):
     """One learning method. An iteration is one collected batch, if frames are left, and then some learning."""
@@ -39,6 +43,14 @@ class Algorithm(Protocol):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`."""
         ...
+
+
+def make_algorithm(cfg: TrainConfig, task: Task, device: torch.device) -> Algorithm:
+    """The learner that a config names; it is given the task, never the motion."""
+    # Rounded up: 100,001 frames in batches of 10,000 are 11 iterations, the last one whole as well.
+    batches = -(-cfg.collector.total_frames // cfg.collector.frames_per_batch)
+    made: Algorithm = maker(cfg.algo)(task.task, cfg.algo, iterations=batches, seed=cfg.seed, device=device)
+    return made
 
 
 class Checkpointed:

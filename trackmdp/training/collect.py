@@ -11,12 +11,22 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import BaseCollector, Collector, MultiAsyncCollector, MultiSyncCollector
 
+from trackmdp.config import TrainConfig
 from trackmdp.config.learning import CollectorConfig, RayWorkersConfig, WorkersConfig
+from trackmdp.config.registry import maker
 from trackmdp.seeding import derive
 from trackmdp.solvers.workers import end_with_parent
 from trackmdp.training.machine import make_device
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.tracks import Problem
+
+
+def make_collector(
+    cfg: TrainConfig, problem: Problem, policy: TensorDictModuleBase, device: torch.device, *, done: int = 0
+) -> BaseCollector:
+    """The source of the frames that are left after the first `done`, made by what the config names."""
+    made: BaseCollector = maker(cfg.collector)(problem, policy, cfg.collector, seed=cfg.seed, device=device, done=done)
+    return made
 
 
 def single(

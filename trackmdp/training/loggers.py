@@ -12,13 +12,23 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from trackmdp.config import MlflowConfig, WandbConfig, to_dict, to_yaml
+from trackmdp.config import CsvConfig, MlflowConfig, TrainConfig, WandbConfig, to_dict, to_yaml
 from trackmdp.config.loggers import RowsConfig
+from trackmdp.config.registry import maker
 from trackmdp.durable import own_folder, reopen, sync
 from trackmdp.errors import Preempted, RunError
 from trackmdp.training.callbacks import Callback, Row, Training
 from trackmdp.training.evaluator import figures
 from trackmdp.untrusted import decoded, opened
+
+
+def make_loggers(cfg: TrainConfig, folder: Path) -> list[Callback]:
+    """What the run writes of itself while it learns, each made by what its choice names."""
+    # metrics.csv is written whatever the log is: reports and `Run.metrics` read it. `csv` stays first, with the options
+    # of its own where it is chosen.
+    chosen = {"csv": CsvConfig(every=1)} | cfg.log
+    # Each is imported by the name in its schema, since the packages it may need (mcap) are not to load without it.
+    return [maker(node)(node, folder) for node in chosen.values()]
 
 
 class RowLogger(Callback):

@@ -13,6 +13,7 @@ import torch
 from rich.console import Console
 from tensordict import TensorDictBase
 
+from trackmdp.algos.common import make_algorithm
 from trackmdp.config import TrainConfig
 from trackmdp.durable import write_json
 from trackmdp.errors import Preempted, RunError
@@ -20,11 +21,12 @@ from trackmdp.policies.policy import Policy, actor_table
 from trackmdp.seeding import seed_global
 from trackmdp.signals import Signals, Watch
 from trackmdp.training.callbacks import Callback, Row
+from trackmdp.training.collect import make_collector
 from trackmdp.training.display import Display
 from trackmdp.training.evaluator import Score, make_evaluator, while_collecting
 from trackmdp.training.inputs import write_inputs
+from trackmdp.training.loggers import make_loggers
 from trackmdp.training.machine import check_memory, make_device
-from trackmdp.training.make import make_algorithm, make_collector, make_loggers
 from trackmdp.training.saving import Checkpoints
 from trackmdp.training.state import Position, find, restore, take_weights
 from trackmdp.untrusted import decoded

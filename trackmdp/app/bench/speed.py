@@ -11,6 +11,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 
+from trackmdp.algos.common import make_algorithm
 from trackmdp.app.bench.process import rate
 from trackmdp.config import GROUPS, BenchmarkConfig, to_yaml
 from trackmdp.config.compose import compose
@@ -19,11 +20,11 @@ from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.episodes.simulate import simulate
 from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.policies.actor_critic import make_actor
-from trackmdp.policies.fixed import RandomSubset
+from trackmdp.policies.explore import RandomSubset
 from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.seeding import generator
 from trackmdp.solvers import qmdp
-from trackmdp.training.make import make_algorithm, make_collector
+from trackmdp.training.collect import make_collector
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.model import World
 

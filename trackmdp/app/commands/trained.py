@@ -6,12 +6,12 @@ from pathlib import Path
 
 import torch
 
+from trackmdp.algos.common import make_algorithm
 from trackmdp.config import load_run_config
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy, actor_table
 from trackmdp.training import checkpoint
 from trackmdp.training.inputs import check_inputs
-from trackmdp.training.make import make_algorithm
 from trackmdp.training.run import load_run
 from trackmdp.training.state import load_learned
 from trackmdp.world.make import make_problem

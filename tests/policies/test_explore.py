@@ -7,8 +7,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from trackmdp.policies.explore import Exploring, RenewedTable
-from trackmdp.policies.fixed import RandomSubset
+from trackmdp.policies.explore import Exploring, RandomSubset, RenewedTable
 from trackmdp.policies.policy import Policy
 from trackmdp.world.model import BoolArray, Task
 
