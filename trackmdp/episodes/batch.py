@@ -6,16 +6,14 @@ Figures are means over episodes, each with its standard error.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, overload
 
 import numpy as np
 import numpy.typing as npt
 import torch
-from torch import Tensor
 
-from trackmdp.episodes.actors import Choice
 from trackmdp.episodes.belief import beliefs
 from trackmdp.episodes.episode import Episode, Floats, Integers, last_cells
 from trackmdp.errors import UserError
@@ -48,49 +46,6 @@ class Simulation:
     sensors_per_step: MeanEstimate
     safe_per_episode: MeanEstimate
     expected_length: MeanEstimate
-
-
-class Steps:
-    """The steps of a batch as they are taken, those of all running episodes at a time.
-
-    Args:
-        episodes: B.
-    """
-
-    def __init__(self, episodes: int) -> None:
-        self._episodes = episodes
-        self._taken: dict[str, list[npt.NDArray[Any]]] = {}
-
-    def begin(self, start: Tensor, mode: Tensor | None) -> None:
-        """Note the cells `[B]` in which the targets start, and their modes `[B]`, if they have any."""
-        self.start = start.numpy().copy()
-        self.start_mode = np.zeros_like(self.start) if mode is None else mode.numpy().copy()
-
-    def add(self, row: Tensor, choice: Choice, **columns: Tensor) -> None:
-        """Note one step of the episodes `row`; the columns are `[R]`."""
-        step = {name: _narrow(column.numpy()) for name, column in columns.items()}
-        step |= {"row": _narrow(row.numpy()), "sensors": _narrow(choice.count.numpy())}
-        if choice.action is not None:
-            step["bits"] = np.packbits(choice.action.numpy(), axis=-1)
-        for name, column in step.items():
-            self._taken.setdefault(name, []).append(column)
-
-    def by_episode(self) -> dict[str, npt.NDArray[Any]]:
-        """The columns `[S, ...]` with the steps of one episode after those of another, and `length` `[B]`."""
-        columns = {name: np.concatenate(parts) for name, parts in self._taken.items()}
-        row = columns.pop("row")
-        # Steps were taken in order of time; a stable sort by episode leaves them so within each. Example: the rows 0 1
-        # 2, then 0 2, then 2 (episode 1 ended first): the order is 0 3 1 2 4 5, the sorted rows are 0 0 1 2 2 2,
-        # `length` is 2 1 3.
-        order = np.argsort(row, kind="stable")
-        return {name: column[order] for name, column in columns.items()} | {
-            "length": np.bincount(row, minlength=self._episodes)
-        }
-
-
-def _narrow(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """A copy, since an expanded tensor has no memory of its own; cells and counts fit into 32 bits."""
-    return column.astype(np.int32) if column.dtype == np.int64 else column.copy()
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,23 +87,23 @@ class Episodes(Sequence[Episode]):
     start_mode: Integers | None = None
 
     @classmethod
-    def of(cls, problem: Problem, policy: Policy | None, seeds: Sequence[int], batches: Sequence[Steps]) -> Episodes:
-        """The episodes of some batches, in their order."""
-        parts = [batch.by_episode() for batch in batches]
-        columns = {name: np.concatenate([part[name] for part in parts]) for name in (parts[0] if parts else ())}
-        if not parts:
-            none = np.zeros(0, dtype=np.int32)
-            # No episode: columns of length 0, of the types that they have otherwise.
-            columns = dict.fromkeys(("misses", "target", "sensors", "length"), none)
-            columns |= {"located": none > 0, "truncated": none > 0, "reward": none.astype(np.float32)}
-        start, start_mode = (
-            np.concatenate([np.zeros(0, dtype=np.int64), *(getattr(batch, name) for batch in batches)])
-            for name in ("start", "start_mode")
-        )
+    def of(
+        cls,
+        problem: Problem,
+        policy: Policy | None,
+        seeds: Sequence[int],
+        batches: Sequence[Mapping[str, npt.NDArray[Any]]],
+    ) -> Episodes:
+        """The episodes of some batches, in their order; each has the columns, and the `length` of its episodes."""
+        none = np.zeros(0, dtype=np.int32)
+        # No episode: columns of length 0, of the types that they have otherwise.
+        empty: dict[str, npt.NDArray[Any]] = dict.fromkeys(("misses", "target", "sensors", "length"), none)
+        empty |= dict.fromkeys(("start", "start_mode"), none.astype(np.int64))
+        empty |= {"located": none > 0, "truncated": none > 0, "reward": none.astype(np.float32)}
+        columns = {name: np.concatenate([each[name] for each in batches or [empty]]) for name in (*batches, empty)[0]}
         # Lengths 2 1 3 begin at 0 2 3, and end at 6: episode i has the steps first[i] ... first[i + 1] - 1.
         first = np.concatenate([[0], np.cumsum(columns.pop("length"))])
-        bits = columns.pop("bits", None)
-        return cls(problem, policy, list(seeds), start, first, bits=bits, start_mode=start_mode, **columns)
+        return cls(problem, policy, list(seeds), first=first, bits=columns.pop("bits", None), **columns)
 
     def __len__(self) -> int:
         return len(self.seeds)

@@ -6,12 +6,15 @@ The log, the web page, the picture and the simulated figures of an evaluation ar
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from trackmdp.episodes.actors import Actor, States, actor_of
-from trackmdp.episodes.batch import Episodes, Steps
+from trackmdp.episodes.batch import Episodes
 from trackmdp.policies.playback import Playback
 from trackmdp.policies.policy import PolicyLike
 from trackmdp.seeding import derive, preserved_global_rng
@@ -82,7 +85,10 @@ class _Draws:
         # more.
         if place == 0:
             drawn = torch.stack([self._draw(_BLOCK, self.generators[row]) for row in states.row.tolist()])
-            self._block = drawn if states.step == 0 else self._block.index_copy(0, states.row, drawn)
+            if states.step:
+                self._block[states.row] = drawn
+            else:
+                self._block = drawn
         return self._block[states.row, place]
 
 
@@ -106,20 +112,26 @@ class _Batch:
             self._seen = _Draws(
                 seeds_of_reports, lambda count, rng: torch.rand(count, dtype=torch.float64, generator=rng)
             )
-        self._steps = Steps(len(seeds))
+        self._taken: list[dict[str, npt.NDArray[Any]]] = []
 
-    def run(self) -> Steps:
-        """Step until the last episode has ended."""
+    def run(self) -> dict[str, npt.NDArray[Any]]:
+        """Step until the last episode has ended; the columns of `Episodes`, those of one episode after another's."""
         # Before any move.
         starts = [torch.randint(self._source.starts, (1,), generator=rng) for rng in self._moves.generators]
         place = self._source.begin(torch.cat(starts))
         start, mode = self._source.cell(place), self._source.mode(place)
-        self._steps.begin(start, mode)
         key = self._keys.start(start, mode)
         at = States(torch.arange(len(start)), place, start, key, torch.zeros_like(start), step=0)
         while len(at.row):
             at = self._step(at)
-        return self._steps
+        columns = {name: np.concatenate([step[name] for step in self._taken]) for name in self._taken[0]}
+        row = columns.pop("row")
+        # Steps were taken in order of time; a stable sort by episode leaves them so within each. Example: the rows 0 1
+        # 2, then 0 2, then 2 (episode 1 ended first): the order is 0 3 1 2 4 5, the sorted rows are 0 0 1 2 2 2,
+        # `length` is 2 1 3.
+        order = np.argsort(row, kind="stable")
+        begun = {"start": start.numpy(), "start_mode": (0 * start if mode is None else mode).numpy()}
+        return {name: column[order] for name, column in columns.items()} | begun | {"length": np.bincount(row)}
 
     def _step(self, at: States) -> States:
         """One step of `TrackEnv`, of the episodes still running; the same order of events, the same arithmetic."""
@@ -140,7 +152,9 @@ class _Batch:
         columns = {"key": at.key} if self._keys.num_classes > 1 else {}
         columns |= {} if mode is None else {"mode": mode}
         columns |= {"misses": at.misses, "target": target, "located": located, "reward": reward}
-        self._steps.add(at.row, choice, truncated=truncated, **columns)
+        columns |= {"row": at.row, "sensors": choice.count, "truncated": truncated}
+        bits = {} if choice.action is None else {"bits": np.packbits(choice.action.numpy(), axis=-1)}
+        self._taken.append({name: _narrow(column.numpy()) for name, column in columns.items()} | bits)
         # `[R']`, the positions of those still running: only they are carried over, so that a step's cost falls as
         # episodes end.
         going_on = (in_grid & ~truncated).nonzero().squeeze(-1)
@@ -157,3 +171,8 @@ class _Batch:
             return torch.ones_like(place, dtype=torch.bool)
         stops = self._source.stops(place)
         return torch.zeros_like(place, dtype=torch.bool) if stops is None else stops
+
+
+def _narrow(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """A copy, since an expanded tensor has no memory of its own; cells and counts fit into 32 bits."""
+    return column.astype(np.int32) if column.dtype == np.int64 else column.copy()
