@@ -19,12 +19,7 @@ from trackmdp.world.modes import HiddenWorld
 
 Indices: TypeAlias = npt.NDArray[np.int64]
 
-_COLUMNS = (
-    {"track", "cell"},
-    {"track", "step", "cell"},
-    {"track", "row", "column"},
-    {"track", "step", "row", "column"},
-)
+_COLUMNS = ({"track", "cell"}, {"track", "row", "column"})
 _FORMAT = "track, cell (or row, column) and, if wanted, step"
 
 
@@ -149,7 +144,7 @@ def read_tracks(path: str | Path, size: Size, *, exits: bool) -> Tracks:
 def _read(path: str | Path, size: tuple[int, int], exits: bool) -> Tracks:
     """See `read_tracks`."""
     source, columns = f"kernel.path={path}", read_columns("kernel.path", path)
-    if set(columns) not in _COLUMNS:
+    if set(columns) - {"step"} not in _COLUMNS:
         raise UserError(f"{source}: columns {', '.join(columns)}, expected {_FORMAT}")
     if not len(columns["track"]):
         raise UserError(f"{source}: no tracks, expected at least two")
