@@ -23,7 +23,7 @@ from trackmdp.app.sweep.plan import Job
 from trackmdp.app.sweep.process import stop_signal
 from trackmdp.app.sweep.sweep import sweep, write_table
 from trackmdp.durable import write_sealed
-from trackmdp.errors import Preempted, RunError
+from trackmdp.errors import Preempted, RunError, UserError
 from trackmdp.training.folders import RunState, read_plan, run_of, runs_of
 from trackmdp.training.lock import locked
 
@@ -216,6 +216,18 @@ def test_states_of_a_run(tmp_path: Path) -> None:
     assert run_of(folder).state == "failed"
     write_sealed(folder / "summary.json", {"policy": {}})
     assert run_of(folder).state == "done"
+
+
+def test_a_launcher_that_is_refused_is_not_asked_again(tmp_path: Path) -> None:
+    asked: list[str] = []
+
+    def launch(jobs: Sequence[Job]) -> None:
+        asked.extend(job.name for job in jobs)
+        raise UserError("hydra.launcher.address=x:1: expected a Ray cluster")
+
+    with pytest.raises(UserError, match="expected a Ray cluster"):
+        sweep(tmp_path, "train", "a line", [[Job("train", tmp_path, "one", (), None)]], launch, Console(quiet=True))
+    assert asked == ["one"]
 
 
 def test_a_signal_is_told_to_the_runs_and_ends_the_sweep(tmp_path: Path) -> None:

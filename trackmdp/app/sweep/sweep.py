@@ -45,7 +45,7 @@ def sweep(
         console: where the table is shown.
 
     Raises:
-        UserError: the folder is in use.
+        UserError: the folder is in use, or a cluster to launch runs on is not there.
         Preempted: a signal ended the sweep; it can go on.
     """
     # By name, since a search may come upon a run that an earlier batch had.
@@ -107,6 +107,8 @@ def _launch(jobs: Sequence[Job], launch: Launch, stop: _Stop) -> None:
             return
         try:
             launch(jobs)
+        except UserError:  # no such cluster, which the next round would not find either
+            raise
         except Exception as error:
             reason = f"the launcher broke down: {type(error).__name__}: {' '.join(str(error).split())}"
             sys.stderr.write(f"{reason}\n")
