@@ -40,7 +40,8 @@ def load_npy(stream: Any, size: int) -> npt.NDArray[Any]:
     """The array of the next `size` bytes of `stream`, which are an `.npy` file.
 
     Raises:
-        ValueError: they are something else, hold Python objects, or are more or fewer than their header claims.
+        ValueError: they are something else, hold Python objects or complex numbers, or are more or fewer than their
+            header claims.
         Exception: whatever NumPy raises over a header; call it inside `untrusted.decoded`.
     """
     content = stream.read(size + 1)  # to the very end, where zipfile compares the checksum
@@ -53,8 +54,8 @@ def load_npy(stream: Any, size: int) -> npt.NDArray[Any]:
     if version not in readers:
         raise ValueError("an .npy file of another version than 1.0 and 2.0")
     shape, fortran, dtype = readers[version](head, max_header_size=_HEADER)
-    # Objects would be unpickled, which runs code; V is structured or raw, which no file of ours is.
-    if dtype.hasobject or dtype.kind == "V":
+    # Objects would be unpickled, which runs code; no file of ours is structured or raw (V), or complex (c).
+    if dtype.hasobject or dtype.kind in "Vc":
         raise ValueError(f"an array of {dtype}")
     if any(length < 0 for length in shape):
         raise ValueError(f"a shape of {shape}")

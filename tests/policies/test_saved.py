@@ -111,6 +111,7 @@ def test_the_file_made_here_is_a_policy(tmp_path: Path) -> None:
         stored(task_size=np.array([4, 1, 5])),
         stored(task_size=np.array([4, 4])),
         stored(indices=np.tile(np.arange(1, 5, dtype=np.int32), 4)),
+        stored(indices=np.tile(np.arange(4.0), 4)),
         stored(indptr=np.array([0, 99, 8, 12, 16])),
         stored(indptr=np.array([-4, 4, 8, 12, 16])),
         stored(value=np.zeros(3)),
@@ -118,6 +119,7 @@ def test_the_file_made_here_is_a_policy(tmp_path: Path) -> None:
         stored(data=np.full(16, np.nan)),
         stored(probability=np.array(2.0)),
         stored(k=np.array(5)),
+        stored(task_cost=np.full(4, 1j)),
         stored(task_cost=np.array([{}, {}, {}, {}], dtype=object)),
     ],
 )

@@ -62,7 +62,9 @@ def test_a_sparse_matrix_comes_back_from_a_file(tmp_path: Path) -> None:
         ({"indices": np.array([0, 9])}, "not a table of numbers"),
         ({"indptr": np.array([0, 2, 1])}, "not a table of numbers"),
         ({"indptr": np.array([0, 2])}, "not a table of numbers"),
-        ({"data": np.array([1 + 1j, 0])}, "other things than numbers"),
+        ({"data": np.array([1 + 1j, 0])}, "an array of complex"),
+        ({"data": np.array(["x", "y"])}, "other things than numbers"),
+        ({"indices": np.array([0.0, 1.0])}, "other things than whole numbers"),
         ({"format": np.array(b"csc")}, "another format than csr"),
     ],
 )

@@ -91,7 +91,7 @@ def csr_of(arrays: Mapping[str, np.ndarray]) -> sparse.csr_array:
     data, indices, indptr, shape = (np.asarray(arrays[name]) for name in ("data", "indices", "indptr", "shape"))
     if str(np.asarray(arrays.get("format", "csr")).astype(str)) != "csr":
         raise ValueError("a sparse matrix of another format than csr")
-    if data.dtype.kind not in "biuf" or any(each.dtype.kind not in "iu" for each in (indices, indptr, shape)):
+    if data.dtype.kind not in "biuf" or shape.dtype.kind not in "iu":
         raise ValueError("a sparse matrix of other things than numbers")
     rows, columns = (int(side) for side in shape)  # ValueError where there are not two
     return whole_csr(data.astype(np.float64), indices, indptr, (rows, columns))
@@ -103,6 +103,8 @@ def whole_csr(data: Any, indices: Any, indptr: Any, shape: tuple[int, int]) -> s
     Raises:
         ValueError: they do not fit together, or lead out of `shape`.
     """
+    if any(np.asarray(each).dtype.kind not in "iu" for each in (indices, indptr)):  # SciPy would cut them to integers
+        raise ValueError("a sparse matrix whose indices are other things than whole numbers")
     matrix = sparse.csr_array((data, indices, indptr), shape=shape)
     matrix.check_format(full_check=True)
     return matrix
