@@ -169,27 +169,35 @@ def exchange(
 
 
 def _chains(problem: InnerProblem, mass: Array, cells: IndexArray) -> tuple[Chains, Sequence[IndexArray]]:
-    """The searches from the located `cells`, and which entries of each layer but the first are theirs."""
+    """The searches from the located `cells`, in order, and which entries of each layer but the first are theirs."""
     world, layers = problem.world, problem.layers
-    place = np.full(world.num_cells, -1)
-    place[cells] = np.arange(len(cells))
-    kept = [np.flatnonzero(place[layer.rows] >= 0) for layer in layers]
+    # Entries are in order of their located cells: looking at no others, all parts of a grid together see each once.
+    low, high = cells[0], cells[-1] + 1
+    place = np.full(high - low, -1)
+    place[cells - low] = np.arange(len(cells))
+    spans = [slice(*np.searchsorted(layer.rows, (low, high))) for layer in layers]
+    theirs = [place[layer.rows[span] - low] for layer, span in zip(layers, spans, strict=True)]
+    kept = [span.start + np.flatnonzero(row >= 0) for span, row in zip(spans, theirs, strict=True)]
+    rows = [row[row >= 0] for row in theirs]
     steps = []
-    for origin, before, layer, entries in zip(layers, kept, layers[1:], kept[1:], strict=False):
-        there = layer.cells[entries]
+    for t, layer in enumerate(layers[1:], start=1):
+        entries, there, before = kept[t], layer.cells[kept[t]], kept[t - 1]
+        number = np.cumsum(theirs[t] >= 0) - 1
+        moves = layer.moves[before]  # to entries of the same located cells, which are all kept
+        renamed = (moves.data, number[moves.indices - spans[t].start], moves.indptr)
         steps.append(
             ChainStep(
-                place[layer.rows[entries]],
-                sparse.csr_array(layer.moves[before][:, entries]),
+                rows[t],
+                sparse.csr_array(renamed, shape=(len(before), len(entries))),
                 problem.detected[there],
                 np.broadcast_to(world.detects(there), there.shape),
                 world.cost[there],
-                world.stay_probability[origin.cells[before]],
+                world.stay_probability[layers[t - 1].cells[before]],
                 allowed=layer.allowed[entries] if problem.windowed and layer.allowed is not None else None,
             )
         )
     missed = problem.missed[layers[-1].cells[kept[-1]]]
-    return Chains(place[layers[0].rows[kept[0]]], mass[kept[0]], steps, missed), kept[1:]
+    return Chains(rows[0], mass[kept[0]], steps, missed), kept[1:]
 
 
 def revealed(problem: InnerProblem, mass: Array) -> Array:
