@@ -73,6 +73,9 @@ class AlikeCells:
     def _told_apart(self, counts: sparse.csr_array) -> BoolArray:
         """`[G]` whether the moves seen out of the cells of a group differ by more than chance, in Pearson's test."""
         expected = self.pooled(counts)
+        # Misses leave traces of moves that nobody may have made, and 1 / E of a millionth would be a million below.
+        made = expected >= 1.0
+        counts, expected = (sparse.csr_array(each.multiply(made)) for each in (counts, expected))
         out, together = counts.sum(axis=1), expected.sum(axis=1)
         # E = n_x (the group's share of the move). The sum of (O - E)² / E over entries is that of O² / E less that of
         # O, and entries of the group that were not seen out of a cell take part with O = 0.
