@@ -111,3 +111,23 @@ def table(title: str, columns: list[str], rows: list[list[str]]) -> Table:
     for row in rows:
         made.add_row(*row)
     return made
+
+
+def show_held_out(console: Console, subject: str, report: dict[str, Any]) -> None:
+    """The figures of a policy beside those of the references, with their intervals."""
+    shown: dict[str, tuple[Any, ...]] = {"aihtr": ("AIHTR", 2), "reward_per_step": ("reward per step", 4)}
+    shown |= {"accuracy": ("accuracy", 2, 100.0, " %"), "sensors_per_step": ("sensors per step", 2)}
+    rows = []
+    # Figure by figure, policies under each other: side by side the intervals would be wider than 80 columns.
+    for key, (label, *form) in shown.items():
+        rows.append([label, ""])
+        for name, figures in report["figures"].items():
+            rows.append([f"  {subject if name == 'policy' else name}", with_interval(figures[key], *form)])
+    console.print(table(f"{report['tracks']} held-out tracks", ["", "mean (95 % interval)"], rows))
+
+
+def with_interval(interval: dict[str, float | None], digits: int, scale: float = 1.0, unit: str = "") -> str:
+    """A mean with its interval in brackets."""
+    known = [interval[key] for key in ("mean", "low", "high")]
+    mean, low, high = ("–" if value is None else f"{scale * value:,.{digits}f}" for value in known)
+    return f"{mean}{unit} ({low} ... {high})"

@@ -20,7 +20,6 @@ import pytest
 from tests.config.cases import composed
 from tests.reads import record_reads, unread
 from trackmdp.app.cli import main
-from trackmdp.app.commands.playback import reissued
 from trackmdp.app.prepare import Prepared
 from trackmdp.config import world_of
 from trackmdp.episodes import schema
@@ -31,7 +30,9 @@ from trackmdp.episodes.limits import LoggedRun
 from trackmdp.episodes.log import EpisodeLog
 from trackmdp.episodes.player import Playing
 from trackmdp.episodes.reader import EpisodeReader
+from trackmdp.episodes.simulate import resimulate
 from trackmdp.episodes.writer import EpisodeWriter
+from trackmdp.policies.playback import Playback
 
 ROOT = Path(__file__).parents[3]
 WORLD = ["grid.size=4", "kernel.exit_probability=0.05", "cost.sensor=0.3"]
@@ -267,7 +268,8 @@ def test_playback_issues_the_actions_again(log: Path, tmp_path: Path) -> None:
     said = json.loads((tmp_path / "evaluation.json").read_text())
     with EpisodeReader(log) as reader:
         episode = reader.read(6)
-        again = reissued(reader.world(), episode)
+        actions = Playback(reader.world(), episode.action)
+        (again,) = resimulate(reader.world(), actions, [episode.seed]).complete()
     assert first_difference(episode, again) is None
     assert said["return"] == said["logged_return"] == episode.returns[-1]
     assert said["simulated"]["episodes"] == 50

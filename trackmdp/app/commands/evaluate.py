@@ -12,26 +12,29 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from trackmdp.app.commands import held_out, playback
 from trackmdp.app.commands.trained import trained
 from trackmdp.config import EvaluateConfig, FalseAlarmConfig, McapConfig, PlaybackConfig, load_run_config, to_yaml
 from trackmdp.durable import write_json, write_text
 from trackmdp.episodes.batch import Simulation
 from trackmdp.episodes.filtered import simulate_filter
 from trackmdp.episodes.log import EpisodeLog
-from trackmdp.episodes.simulate import simulate
+from trackmdp.episodes.reader import EpisodeReader
+from trackmdp.episodes.simulate import resimulate, simulate
 from trackmdp.errors import UserError
+from trackmdp.policies.playback import Playback
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import sets_name, write_sets
+from trackmdp.reports.held_out import recorded_page
 from trackmdp.reports.picture import draw_picture
 from trackmdp.solvers import bounds, estimator
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.solve import baseline_policy
-from trackmdp.training.display import make_console, table
-from trackmdp.training.evaluator import figures, make_evaluator
+from trackmdp.training.display import make_console, show_held_out, table, with_interval
+from trackmdp.training.evaluator import CELL_ALONE, HeldOutEvaluator, figures, make_evaluator
 from trackmdp.training.folders import SUMMARY, check_files, read_summary
 from trackmdp.training.machine import make_device
 from trackmdp.untrusted import decoded
+from trackmdp.world.gridding import said
 from trackmdp.world.model import World
 from trackmdp.world.modes import Modelled
 from trackmdp.world.sensors import false_alarm
@@ -57,7 +60,7 @@ def run(cfg: EvaluateConfig, folder: Path, problem: Problem) -> float:
     torch.set_num_threads(cfg.threads)
     device = make_device(cfg.device)
     if cfg.run is None and isinstance(cfg.baseline, PlaybackConfig) and not isinstance(cfg.sensor, FalseAlarmConfig):
-        return playback.run(cfg, folder, problem, console)
+        return _played_back(cfg, cfg.baseline, problem, folder, console)
     if cfg.run:
         world, policy, subject = trained(cfg.run, device)
     else:
@@ -67,7 +70,7 @@ def run(cfg: EvaluateConfig, folder: Path, problem: Problem) -> float:
         return _believing(cfg, world, policy, subject, folder, console)
     # Recorded tracks have no kernel, hence no exact value and no bound: figures come from the held-out tracks.
     if isinstance(world, Recorded):
-        return held_out.run(world, policy, subject, folder, console, cfg.seed)
+        return _held_out(world, policy, subject, folder, console, cfg.seed)
     return _exact(cfg, world, policy, subject, folder, console)
 
 
@@ -113,6 +116,66 @@ def _exact(cfg: EvaluateConfig, world: Modelled, policy: Policy, subject: str, f
         shares = ", ".join(f"{name} {100 * share:.2f} %" for name, share in said.items())
         console.print(f"positions of missed steps estimated right:\n  {shares}")
     return score.evaluation.aihtr
+
+
+def _played_back(cfg: EvaluateConfig, chosen: PlaybackConfig, world: Problem, folder: Path, console: Console) -> float:
+    """Value the actions of a logged episode, on its own target and on others; returns the simulated AIHTR.
+
+    Such a policy ignores what it observes, so that it has no table and no exact value.
+    """
+    with EpisodeReader(chosen.file) as reader:
+        if reader.run.size != world.size:
+            recorded, expected = (str(r) if r == c else f"[{r},{c}]" for r, c in (reader.run.size, world.size))
+            recorded = f"baseline.file={chosen.file}: recorded on a grid of size {recorded}"
+            raise UserError(f"{recorded}, expected grid.size={expected}")
+        logged = reader.read(chosen.episode)
+    actions = Playback(world, logged.action)
+    # The logged episode's own seed gives its own target again, so that both returns agree where nothing has changed
+    # since.
+    again = resimulate(world, actions, [logged.seed])[0]
+    simulation = simulate(world, actions, cfg.episodes, seed=cfg.seed).figures()
+    report = {
+        "policy": chosen.name,
+        "file": Path(chosen.file).name,
+        "episode": logged.number,
+        "logged_return": float(logged.returns[-1]),
+        "return": float(again.returns[-1]),
+        "simulated": asdict(simulation),
+    }
+    write_json(folder / "evaluation.json", report)
+    rows = [
+        ["logged", f"{report['logged_return']:,.4f}"],
+        ["again, on the same target", f"{report['return']:,.4f}"],
+        [f"on {cfg.episodes} other targets", f"{simulation.aihtr.mean:,.4f} ± {simulation.aihtr.standard_error:.4f}"],
+    ]
+    console.print(table(f"actions of episode {logged.number}", ["", "return"], rows))
+    console.print(f"results in {folder}")
+    return simulation.aihtr.mean
+
+
+def _held_out(world: Recorded, policy: Policy, subject: str, folder: Path, console: Console, seed: int) -> float:
+    """Evaluate on held-out tracks: `evaluation.json`, `sets.json`, `picture.txt`, `tracks.html`.
+
+    Returns:
+        The mean reward of a track.
+    """
+    if world.loaded:
+        console.print(f"loaded: {said(world.loaded)}")
+    evaluator = HeldOutEvaluator(world)
+    report = evaluator.report(policy)
+    value = evaluator.evaluate(policy).value
+    content = {"policy": subject, "held_out": report} | write_sets(folder, policy, value=value)
+    content |= dict.fromkeys(("regret_per_step", "regret_per_step_lower"))
+    write_json(folder / "evaluation.json", content)
+    compared = {"policy": policy, **{n: p for n, p in evaluator.references.items() if n == CELL_ALONE}}
+    # With one seed all of them meet the same targets.
+    episodes = {name: simulate(world, each, _FOR_THE_PICTURE, seed=seed) for name, each in compared.items()}
+    write_text(folder / "picture.txt", draw_picture(episodes["policy"], world))
+    replayed = {name: evaluator.replayed(each) for name, each in compared.items()}
+    write_text(folder / "tracks.html", recorded_page(world, subject, report, replayed, episodes).html())
+    show_held_out(console, subject, report)
+    console.print(f"results in {folder}; the page is tracks.html")
+    return float(report["figures"]["policy"]["aihtr"]["mean"])
 
 
 def _tell(line: str) -> None:
@@ -186,7 +249,7 @@ def _believing(cfg: EvaluateConfig, problem: Problem, policy: Policy, subject: s
     write_json(folder / "evaluation.json", report)
     rows = []
     for key in ("aihtr", "accuracy", "sensors_per_step"):
-        played = held_out.with_interval(filtered[key], 4) if wanted else ""
+        played = with_interval(filtered[key], 4) if wanted else ""
         rows.append([_FIGURES[key], f"{told[key]:,.4f}", f"{plain[key]:,.4f}", played])
     heads = ["figure", f"p_f = {sensor.p_f:g}, exact", "p_f = 0", f"Bayes filter, {wanted} episodes, 95 %"]
     at.print(table(f"{subject}, each report taken for the truth", heads, rows))

@@ -6,18 +6,18 @@ from pathlib import Path
 
 from rich.console import Console
 
-from trackmdp.app.commands.held_out import show_held_out, show_loaded
 from trackmdp.config import TrainConfig
 from trackmdp.errors import RunError
 from trackmdp.policies.policy import Policy
 from trackmdp.training.blocks import make_trainer
 from trackmdp.training.callbacks import Learning
-from trackmdp.training.display import make_console, table
+from trackmdp.training.display import make_console, show_held_out, table
 from trackmdp.training.folders import SUMMARY, finished
 from trackmdp.training.lock import locked
 from trackmdp.training.run import Run, complete
+from trackmdp.world.gridding import said
 from trackmdp.world.make import make_problem
-from trackmdp.world.tracks import Problem
+from trackmdp.world.tracks import Problem, Recorded
 
 
 def run(cfg: TrainConfig, folder: Path, problem: Problem | None = None) -> float:
@@ -55,7 +55,8 @@ def _run(cfg: TrainConfig, folder: Path, problem: Problem | None) -> float:
         # done.
         (folder / SUMMARY).unlink(missing_ok=True)
     problem = problem or make_problem(cfg)
-    show_loaded(console, problem)
+    if isinstance(problem, Recorded) and problem.loaded:
+        console.print(f"loaded: {said(problem.loaded)}")
     trainer = make_trainer(problem, cfg, folder=folder, console=console)
     done = complete(trainer)
     if done.summary["held_out"] is None:
