@@ -100,9 +100,9 @@ def test_modules_import_only_from_the_left_of_the_arrow() -> None:
 
 def test_the_arrow_test_sees_a_broken_arrow() -> None:
     for module, source, found in (
-        ("trackmdp.world.env", "from trackmdp.algos import ppo", ["trackmdp.algos.ppo"]),
+        ("trackmdp.world.env", "from trackmdp.algos import on_policy", ["trackmdp.algos.on_policy"]),
         ("trackmdp.config.tree", "def f():\n    import trackmdp.app.cli", ["trackmdp.app.cli"]),
-        ("trackmdp.algos.ppo", "from trackmdp.world.model import Task\nimport torch", []),
+        ("trackmdp.algos.on_policy", "from trackmdp.world.model import Task\nimport torch", []),
     ):
         assert against_the_arrow(module, ast.parse(source)) == found
 

@@ -11,7 +11,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 import trackmdp as tm
-from trackmdp.policies.actor_critic import SubsetDistribution
+from trackmdp.policies.nets import SubsetDistribution
 
 KEYS = ["last_cell", "steps_since_detection"]
 FRAMES, BATCH = 60_000, 2_000

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tests.helpers import algorithm, collect, small_world
-from trackmdp.policies.actor_critic import SubsetDistribution
+from trackmdp.policies.nets import SubsetDistribution
 
 
 def test_one_step_descends_the_printed_loss() -> None:

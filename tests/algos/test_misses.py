@@ -14,8 +14,7 @@ from trackmdp.algos.actor_loss import Decision
 from trackmdp.algos.gains import chain_returns
 from trackmdp.algos.hindsight_loss import HindsightLoss
 from trackmdp.algos.learned_kernel import observed_paths
-from trackmdp.algos.moves import MoveBuffer
-from trackmdp.algos.paths import report_weights
+from trackmdp.algos.moves import MoveBuffer, report_weights
 from trackmdp.algos.segments import SegmentBuffer
 from trackmdp.episodes.simulate import simulate
 from trackmdp.errors import UserError

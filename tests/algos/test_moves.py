@@ -8,7 +8,7 @@ from tensordict import TensorDict
 
 from tests.helpers import collect, small_world
 from trackmdp.algos.moves import MoveBuffer, sensed_moves
-from trackmdp.policies.explore import Exploring
+from trackmdp.policies.acting import Exploring
 from trackmdp.policies.policy import Policy
 from trackmdp.world.model import World
 

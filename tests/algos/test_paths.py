@@ -6,7 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trackmdp.algos.paths import CellIndex, cell_dtype, stratified_starts
+from trackmdp.algos.moves import CellIndex, cell_dtype, stratified_starts
 
 
 def test_the_places_of_a_cell_are_cut_evenly() -> None:

@@ -11,7 +11,7 @@ from scipy import stats
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from trackmdp.algos.prioritized import PrioritizedSampler
+from trackmdp.algos.dqn import PrioritizedSampler
 
 
 def buffer(alpha: float = 0.5, beta: float = 1.0, *, capacity: int = 6, seed: int = 0) -> TensorDictReplayBuffer:

@@ -15,12 +15,12 @@ import pytest
 from tests.typed import refused
 from trackmdp.app.cli import main
 from trackmdp.episodes.episode import Episode, first_difference
-from trackmdp.episodes.frame import mode_words
 from trackmdp.episodes.grids import grid_messages
-from trackmdp.episodes.limits import LoggedRun
 from trackmdp.episodes.messages import decode, row_of, step_messages
+from trackmdp.episodes.player import mode_words
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.episodes.recover import recover
+from trackmdp.episodes.schema import LoggedRun
 from trackmdp.episodes.simulate import simulate
 from trackmdp.episodes.verify import verify
 from trackmdp.errors import UserError

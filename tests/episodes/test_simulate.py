@@ -16,18 +16,18 @@ from tests.episodes.logs import WORLD, policy, recorded
 from tests.helpers import hop_world, limited, random_kernel, small_world
 from tests.tracks import by_hand
 from tests.tracks import recorded as recorded_tracks
+from trackmdp.episodes.belief import BeliefFilter
 from trackmdp.episodes.episode import Episode, first_difference
 from trackmdp.episodes.simulate import episode_seeds, resimulate, simulate
 from trackmdp.errors import UserError
 from trackmdp.policies import policy as policies
-from trackmdp.policies.playback import Playback
+from trackmdp.policies.acting import Playback
 from trackmdp.policies.policy import Policy
 from trackmdp.seeding import derive
-from trackmdp.world.belief import BeliefFilter
-from trackmdp.world.costs import Costs
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.model import World
-from trackmdp.world.motion import Motion
+from trackmdp.world.outcomes import Costs
+from trackmdp.world.targets import Motion
 
 ACTING = {
     "table": policy(),

@@ -19,8 +19,7 @@ from tests.episodes.logs import policy, recorded, write
 from tests.helpers import limited
 from trackmdp.episodes import grids
 from trackmdp.episodes.episode import first_difference
-from trackmdp.episodes.grids import WHOLE_CELLS
-from trackmdp.episodes.layout import layout
+from trackmdp.episodes.grids import WHOLE_CELLS, layout
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.episodes.schema import SCHEMAS
 from trackmdp.episodes.simulate import simulate

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from tests.solvers.worlds import paper_world
+from trackmdp.episodes.belief import BeliefFilter
 from trackmdp.paper import histories, theorems
 from trackmdp.paper.theorems import Check, changed, corner, dearer
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import optimal
 from trackmdp.solvers.solution import Solution
-from trackmdp.world.belief import BeliefFilter
 from trackmdp.world.model import Task, World
 
 WORLDS = (corner(paper_world(5, 0.16, 1)), dearer(corner(paper_world(5, 0.22, 2))))

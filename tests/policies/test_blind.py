@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from tests.helpers import ALGORITHMS, algorithm, random_state, small_world
-from trackmdp.policies.explore import RandomSubset
+from trackmdp.policies.acting import RandomSubset
 from trackmdp.policies.policy import Policy
 
 WORLD = small_world(t_max=1)

@@ -7,7 +7,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from trackmdp.policies.explore import Exploring, RandomSubset, RenewedTable
+from trackmdp.policies.acting import Exploring, RandomSubset, RenewedTable
 from trackmdp.policies.policy import Policy
 from trackmdp.world.model import BoolArray, Task
 
@@ -54,7 +54,7 @@ def test_random_subsets_are_fair_coins_of_their_own_generator() -> None:
 
 @pytest.mark.parametrize("window", [None, 1])
 def test_a_renewed_table_acts_as_its_policy(window: int | None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("trackmdp.policies.explore._ROWS_AT_ONCE", 7)  # blocks begin between the rows of a cell
+    monkeypatch.setattr("trackmdp.policies.acting._ROWS_AT_ONCE", 7)  # blocks begin between the rows of a cell
     task = Task((4, 5), cost=0.1, t_max=1, window=window)
     near = np.ones((20, 2, 20), dtype=bool) if window is None else all_in_reach(task)
     policy = Policy.from_dense(task, near & (np.random.default_rng(0).random((20, 2, 20)) < 0.5))

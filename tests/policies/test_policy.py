@@ -18,7 +18,7 @@ from tests.helpers import ALGORITHMS, algorithm, random_kernel, random_state, sm
 from trackmdp.episodes.simulate import simulate
 from trackmdp.errors import UserError
 from trackmdp.policies import lookup, policy
-from trackmdp.policies.actor_critic import SubsetDistribution
+from trackmdp.policies.nets import SubsetDistribution
 from trackmdp.policies.policy import Policy, actor_table, as_policy
 from trackmdp.policies.unroll import STATE_KEYS
 from trackmdp.solvers.evaluate import evaluate

@@ -11,8 +11,7 @@ import pytest
 
 from tests.episodes.browser import CHROMIUM, Browser
 from tests.reports.sweeps import write_run
-from trackmdp.paper.calibration import candidates, sensitivity
-from trackmdp.paper.openings import Openings, checks
+from trackmdp.paper.calibration import Openings, candidates, checks, sensitivity
 from trackmdp.paper.sections import accuracy_table, sections
 from trackmdp.paper.worlds import pairs
 from trackmdp.reports.gather import gather_runs

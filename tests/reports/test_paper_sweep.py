@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from trackmdp.app.cli import main
-from trackmdp.paper.calibration import chosen
-from trackmdp.paper.openings import load_openings
+from trackmdp.paper.calibration import chosen, load_openings
 from trackmdp.paper.worlds import PRINTED_QMDP, pairs
 from trackmdp.reports.grouping import Study, study
 from trackmdp.reports.results import is_stored, load_results, save_results

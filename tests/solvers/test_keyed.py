@@ -18,8 +18,7 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.bounds import clocked
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.keyed import KeyedPairs, averaged, visits_of_keys
-from trackmdp.solvers.keyed_proof import told_bound
-from trackmdp.solvers.keyed_search import cell_bound, mode_bound, solve_keys
+from trackmdp.solvers.keyed_search import cell_bound, mode_bound, solve_keys, told_bound
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.model import World
 from trackmdp.world.modes import HiddenWorld, heading_kernel

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy import sparse
 
 from tests.helpers import random_kernel, small_world
-from trackmdp.world.belief import BeliefFilter
+from trackmdp.episodes.belief import BeliefFilter
 from trackmdp.world.env import TrackEnv
 
 KERNEL = sparse.csr_array([[0.2, 0.3, 0.4, 0.0], [0.5, 0.0, 0.0, 0.25], [0.0, 0.0, 0.5, 0.5], [0.1, 0.1, 0.1, 0.1]])

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from trackmdp.world.costs import Costs
 from trackmdp.world.model import Task
+from trackmdp.world.outcomes import Costs
 
 ACTION = torch.tensor([[True, False, True, False]])
 

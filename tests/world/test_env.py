@@ -10,7 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs.utils import check_env_specs
 
 from tests.helpers import Watched, hop_world, limited, small_world
-from trackmdp.policies.explore import RandomSubset
+from trackmdp.policies.acting import RandomSubset
 from trackmdp.seeding import generator
 from trackmdp.world.env import TrackEnv
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from tensordict import TensorDict, TensorDictBase
 
 from tests.helpers import limited, random_state, small_world, worlds
-from trackmdp.policies.explore import RandomSubset
+from trackmdp.policies.acting import RandomSubset
 from trackmdp.seeding import generator
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.model import World

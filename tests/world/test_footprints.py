@@ -20,8 +20,8 @@ from trackmdp.policies.saved import load_policy, read_sets, save_policy, write_s
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.world.coverage import Coverage, discs
 from trackmdp.world.env import TrackEnv
+from trackmdp.world.make import footprint
 from trackmdp.world.model import World
-from trackmdp.world.sensors import footprint
 
 LINE = np.diag(np.full(3, 0.9), 1)
 COVERAGE = np.array([[1, 1, 1, 0], [0, 0, 1, 0]])

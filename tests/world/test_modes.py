@@ -21,8 +21,16 @@ from trackmdp.errors import UserError
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.make import make_problem
 from trackmdp.world.model import World
-from trackmdp.world.modes import HiddenWorld, check_revealed, heading_kernel, regimes
-from trackmdp.world.velocity import constant_velocity, coordinated_turn, dithered, steps_of
+from trackmdp.world.modes import (
+    HiddenWorld,
+    check_revealed,
+    constant_velocity,
+    coordinated_turn,
+    dithered,
+    heading_kernel,
+    regimes,
+    steps_of,
+)
 
 WALK = {"kernel": "random_walk", "stay": 0.6, "diagonal": False, "exit_probability": 0.1, "border": "clip"}
 DRIFT = {"kernel": "drift", "direction": 0, "persistence": 1.0, "exit_probability": 0.0, "border": "clip"}

@@ -11,7 +11,7 @@ from scipy import sparse, stats
 
 from tests.helpers import random_kernel
 from trackmdp.errors import UserError
-from trackmdp.world.motion import Motion
+from trackmdp.world.targets import Motion
 
 LARGEST = 1.0 - 2.0**-40
 """Draws lie on a grid of 2^-40."""

@@ -221,7 +221,7 @@ def test_a_parquet_file_that_unfolds_to_too_much_is_refused(tmp_path: Path, monk
     """A column of one value takes a few bytes, however long it is."""
     zeros = np.zeros(200_000)
     pd.DataFrame({"id": zeros, "t": zeros, "x": zeros, "y": zeros}).to_parquet(tmp_path / "t.parquet")
-    monkeypatch.setattr("trackmdp.world.position_files.LONGEST", 100_000)
+    monkeypatch.setattr("trackmdp.world.positions.LONGEST", 100_000)
     assert (tmp_path / "t.parquet").stat().st_size < 100_000
     with pytest.raises(UserError, match=r"not a table of positions \([\d,]+ bytes once unfolded, expected"):
         read_positions(tmp_path / "t.parquet", "points")
@@ -230,7 +230,7 @@ def test_a_parquet_file_that_unfolds_to_too_much_is_refused(tmp_path: Path, monk
 def test_one_long_text_in_all_rows_of_a_parquet_file_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("trackmdp.world.position_files.LONGEST", 100_000)
+    monkeypatch.setattr("trackmdp.world.positions.LONGEST", 100_000)
     numbers = {name: np.arange(1000.0) for name in ("t", "x", "y")}
     for size, fine in ((50, True), (150, False)):
         pd.DataFrame({"id": "v" * size, **numbers}).to_parquet(tmp_path / "t.parquet")

@@ -11,7 +11,7 @@ from torchrl.envs.utils import check_env_specs
 
 from tests.helpers import Watched, limited, small_world
 from tests.tracks import by_hand, drawn, recorded
-from trackmdp.policies.explore import RandomSubset
+from trackmdp.policies.acting import RandomSubset
 from trackmdp.seeding import generator
 from trackmdp.world.env import TrackEnv
 

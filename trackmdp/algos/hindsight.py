@@ -24,13 +24,12 @@ from trackmdp.algos.common import Averages, Checkpointed, set_learning_rate
 from trackmdp.algos.exchanged import exchanged_sets
 from trackmdp.algos.hindsight_loss import HindsightLoss
 from trackmdp.algos.inferred import InferredMoves
-from trackmdp.algos.moves import MoveBuffer
-from trackmdp.algos.paths import report_weights
+from trackmdp.algos.moves import MoveBuffer, report_weights
 from trackmdp.algos.replay import Replay
 from trackmdp.algos.segments import SegmentBuffer
 from trackmdp.config.per_sensor import PerSensorConfig
 from trackmdp.errors import UserError
-from trackmdp.policies.explore import Exploring
+from trackmdp.policies.acting import Exploring
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import generator

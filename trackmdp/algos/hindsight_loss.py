@@ -14,7 +14,7 @@ from trackmdp.algos.gains import chain_returns, clocked_advantage, sensing_gain
 from trackmdp.algos.in_view import SensorsInView
 from trackmdp.algos.replay import Replay
 from trackmdp.algos.tables import gather, scatter_add
-from trackmdp.policies.chain_table import CellClockNet
+from trackmdp.policies.nets import CellClockNet
 from trackmdp.solvers.renewal import IndexArray
 from trackmdp.world.model import Task
 from trackmdp.world.windows import Window

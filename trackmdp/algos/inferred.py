@@ -13,8 +13,7 @@ from torch import Tensor
 
 from trackmdp.algos.common import arrays, tensors
 from trackmdp.algos.learned_kernel import observed_paths
-from trackmdp.algos.moves import MoveBuffer
-from trackmdp.algos.paths import CellIndex
+from trackmdp.algos.moves import CellIndex, MoveBuffer
 from trackmdp.solvers.kernel_estimate import KernelEstimate
 from trackmdp.solvers.renewal import row_index
 from trackmdp.world.model import Task

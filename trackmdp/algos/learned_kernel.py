@@ -17,10 +17,10 @@ from scipy import sparse
 from tensordict import TensorDictBase
 
 from trackmdp.algos.common import arrays, tensors
+from trackmdp.algos.moves import known_as
 from trackmdp.algos.path_counts import PathCounts
-from trackmdp.algos.paths import known_as
 from trackmdp.config.counting import LearnedKernelConfig
-from trackmdp.policies.explore import RenewedTable
+from trackmdp.policies.acting import RenewedTable
 from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.policies.saved import packed, unpacked_policy
 from trackmdp.policies.table import PolicyTable

@@ -1,12 +1,110 @@
-"""Replay buffer of sensed moves, and paths drawn from it, for targets whose motion is Markov in the cell."""
+"""Replay buffer of sensed moves, and paths drawn from it, for targets whose motion is Markov in the cell.
+
+And what the buffers of sensed paths share: which steps count, and how paths are drawn from each cell alike. Where a
+policy knows more at a detection than the cell, paths are of keys: with all sensors on, a key says where the target is
+and what is known of how it came there. All that is said of cells and M holds for keys and their number.
+"""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.nn.functional import pad
 
-from trackmdp.algos.paths import CellIndex, cell_dtype, known_as, sensed_steps, stratified_starts
+from trackmdp.world.model import Task
+
+
+def cell_dtype(num_cells: int) -> torch.dtype:
+    """The smallest integers that hold all cells and M: 16 bits on grids of up to 181 x 181 cells."""
+    return torch.int16 if num_cells <= torch.iinfo(torch.int16).max else torch.int32
+
+
+class CellIndex(NamedTuple):
+    """Row pointer of entries sorted by the cell they start in.
+
+    Attributes:
+        first: `[M + 1]` int64, place of the first entry of each cell; for a cell without entries, the place after all.
+        share: `[M + 1]` float, number of entries of each cell, at least one, and slightly reduced (see `of`).
+        sums: `[K + 1]` float64, running sums of the entries' weights, from 0 on; None where all weigh the same.
+    """
+
+    first: Tensor
+    share: Tensor
+    sums: Tensor | None = None
+
+    @classmethod
+    def of(cls, start: Tensor, num_cells: int, weights: Tensor | None = None) -> CellIndex:
+        """Index entries `[K]` by the cells they start in; their `weights` `[K]` come in the order of the cells."""
+        seen = torch.bincount(start, minlength=num_cells + 1)
+        # Starts 0 0 2 on 3 cells: seen 2 0 1 0, first 0 3 2 3, the last one for M. A cell without entries leads to
+        # place 3, where the buffers keep an exit.
+        first = torch.where(seen > 0, seen.cumsum(0) - seen, len(start))
+        # Half a float's spacing below the count, so that a draw close to 1 does not round up to the next cell's.
+        share = seen.clamp(min=1).float() * (1.0 - 2.0**-24)
+        return cls(first, share, None if weights is None else pad(weights.double().cumsum(0), (1, 0)))
+
+    def pick(self, cells: Tensor, draws: Tensor) -> Tensor:
+        """Places of entries of `cells`, one for each draw from [0, 1), in proportion to their weights."""
+        if self.sums is not None:
+            first = self.first.index_select(0, cells)
+            # `ceil` undoes the reduction. A cell without entries has one place behind all of them, and keeps it.
+            last = (first + self.share.index_select(0, cells).ceil().long()).clamp_max(len(self.sums) - 1)
+            begin, end = self.sums[first], self.sums[last]
+            place = torch.searchsorted(self.sums, begin + draws * (end - begin), right=True) - 1
+            return torch.where(first < last, place.clamp(first, last - 1), first)
+        return (draws * self.share.index_select(0, cells)).long() + self.first.index_select(0, cells)
+
+
+def report_weights(task: Task, device: torch.device) -> Tensor | None:
+    """`[M + 1]` 1 / p_d of a path's step to each cell (or key), 1 for the exit; None where no sensor misses.
+
+    A path is known only where it was reported at every step, with probability Π p_d(x_k): weighted by the inverse of
+    that, those known stand for all (Horvitz and Thompson 1952).
+    """
+    if task.perfect:
+        return None
+    weights = (1.0 / torch.as_tensor(task.detection, device=device)).repeat_interleave(task.keys.num_classes)
+    return pad(weights, (0, 1), value=1.0)
+
+
+def stratified_starts(count: int, steps: int, num_cells: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Cells `[count]` that paths start in, all equally often, and the draws `[steps, count]` that pick their moves.
+
+    The draws of the first step are stratified: those of one cell are spread evenly over [0, 1).
+    """
+    device, m = generator.device, num_cells
+    order = torch.arange(count, device=device)
+    offset = torch.randint(m, (1,), generator=generator, device=device)
+    draws = torch.rand(steps, count, generator=generator, device=device)
+    # 10 paths on 4 cells: 3, 3, 2 and 2 of them start in cells 0, 1, 2 and 3 (up to the offset). The i-th of k draws
+    # from [i/k, (i+1)/k).
+    same_start = (m - 1 + count - order % m).div(m, rounding_mode="floor")
+    draws[0] = (order // m + draws[0]) / same_start
+    return (order + offset) % m, draws
+
+
+def known_as(batch: TensorDictBase) -> str:
+    """The name of what a detection leaves in a collected batch: `key` where there is one, else `last_cell`."""
+    return "key" if "key" in batch.keys() else "last_cell"  # noqa: SIM118 (no dict)
+
+
+def sensed_steps(batch: TensorDictBase, num_cells: int, name: str = "last_cell") -> tuple[Tensor, Tensor]:
+    """Which steps of a collected batch `[B, time]` count, and the cell (or `key`) after each of those, M for outside.
+
+    Fully sensed steps of a located target count. Read is only what the tracker saw: where it located the target, and
+    that it left the grid. Steps that did not sense every cell are passed over, also where they detected: to keep the
+    detections alone would favour the sensed cells.
+    """
+    after = batch["next"]
+    exited = after["terminated"].squeeze(-1)
+    located = (after["steps_since_detection"] == 0) | exited
+    # `all(-1)` is decided before the move, so that steps are not selected by where the target goes; with all M sensors
+    # on, a step ends located or exited.
+    whole = batch["action"].all(-1) & (batch["steps_since_detection"] == 0) & located
+    return whole, torch.where(exited, num_cells, after[name])
 
 
 class MoveBuffer:

@@ -1,20 +1,24 @@
-"""What A2C and PPO have in common: actor, critic, advantage."""
+"""A2C and PPO over subsets of sensors, the joint advantage of the paper.
+
+Advantage actor-critic is the learner of the paper (Section VII; Mnih et al. 2016); proximal policy optimisation is
+after Schulman et al. 2017. They have actor, critic and advantage in common.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.objectives import LossModule
+from torchrl.objectives import A2CLoss, ClipPPOLoss, LossModule
 from torchrl.objectives.value import GAE
 
 from trackmdp.algos.common import Averages, Checkpointed, clipped_step, explained_variance, set_learning_rate
-from trackmdp.config.learning import ActorCriticConfig
-from trackmdp.policies.actor_critic import make_actor, make_critic
+from trackmdp.config.learning import ActorCriticConfig, PpoConfig
+from trackmdp.policies.nets import make_actor, make_critic
 from trackmdp.seeding import generator
 from trackmdp.world.model import Task
 
@@ -97,3 +101,30 @@ def _normalised(advantage: Tensor, misses: Tensor, t_max: int) -> Tensor:
         if len(chosen) > 1:
             normalised[counted] = (chosen - chosen.mean()) / (chosen.std() + 1e-8)
     return normalised
+
+
+class A2C(OnPolicy):
+    """One gradient step per batch: log-probability of the whole subset times its advantage."""
+
+    make_loss = A2CLoss
+
+
+class PPO(OnPolicy):
+    """Each batch is passed over `epochs` times in `minibatches` parts, the probability ratio clipped.
+
+    One Bernoulli per sensor; ratio and advantage belong to the whole subset.
+    """
+
+    cfg: PpoConfig
+    parts: ClassVar[tuple[str, ...]] = (*OnPolicy.parts, "generator")
+    diagnostics: ClassVar = OnPolicy.diagnostics | {"approx_kl": "kl_approx", "clip_fraction": "clip_fraction"}
+
+    def make_loss(self, *nets: TensorDictModuleBase, **told: Any) -> LossModule:
+        """The clipped surrogate."""
+        return ClipPPOLoss(*nets, clip_epsilon=self.cfg.clip_epsilon, normalize_advantage=False, **told)
+
+    def minibatches(self, data: TensorDictBase) -> Iterator[TensorDictBase]:
+        """The rows of each gradient step."""
+        for _ in range(self.cfg.epochs):
+            order = torch.randperm(len(data), generator=self.generator)
+            yield from (data[rows] for rows in order.chunk(self.cfg.minibatches))

@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.functional import pad
 
-from trackmdp.algos.paths import CellIndex, cell_dtype, sensed_steps, stratified_starts
+from trackmdp.algos.moves import CellIndex, cell_dtype, sensed_steps, stratified_starts
 from trackmdp.solvers.path_exchange import parted
 from trackmdp.world.memory import KeySpace
 from trackmdp.world.tracks import Tracks, ends_of

@@ -123,7 +123,7 @@ class SetsConfig(BaselineConfig):
     file: str = option("the sets", expects="a sets.json, or a sets.npz or policy.npz", path=True)
 
 
-@choice("baseline", "playback", makes="trackmdp.policies.playback:Playback")
+@choice("baseline", "playback", makes="trackmdp.policies.acting:Playback")
 class PlaybackConfig(BaselineConfig):
     """The actions of a logged episode again, step by step, whatever is observed; none on after the last."""
 

@@ -86,12 +86,12 @@ class ActorCriticConfig(NetworkConfig):
     initial_logit: float = option("actor's output bias at the start", unit="logits", ge=-20, le=20)
 
 
-@choice("algo", "a2c", makes="trackmdp.algos.a2c:A2C")
+@choice("algo", "a2c", makes="trackmdp.algos.on_policy:A2C")
 class A2cConfig(ActorCriticConfig):
     """Advantage actor-critic, one Bernoulli per sensor, one joint advantage."""
 
 
-@choice("algo", "ppo", makes="trackmdp.algos.ppo:PPO")
+@choice("algo", "ppo", makes="trackmdp.algos.on_policy:PPO")
 class PpoConfig(ActorCriticConfig):
     """Proximal policy optimisation, one Bernoulli per sensor, one joint advantage."""
 

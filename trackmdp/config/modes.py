@@ -114,12 +114,12 @@ class VelocityConfig(HiddenKernelConfig):
             raise refuse(f"{key}.spacing", self.spacing, expected)
 
 
-@choice("kernel", "constant_velocity", makes="trackmdp.world.velocity:constant_velocity")
+@choice("kernel", "constant_velocity", makes="trackmdp.world.modes:constant_velocity")
 class ConstantVelocityConfig(VelocityConfig):
     """Nearly constant velocity, the mode, in metres and seconds; displacements have its mean exactly, never rounded."""
 
 
-@choice("kernel", "coordinated_turn", makes="trackmdp.world.velocity:coordinated_turn")
+@choice("kernel", "coordinated_turn", makes="trackmdp.world.modes:coordinated_turn")
 class CoordinatedTurnConfig(VelocityConfig):
     """As constant_velocity, but the target turns left, right or not at all; turn and velocity are the mode."""
 

@@ -56,7 +56,7 @@ class SensorConfig(ChoiceConfig):
         return grid.num_cells
 
 
-@choice("sensor", "perfect", makes="trackmdp.world.sensors:perfect")
+@choice("sensor", "perfect", makes="trackmdp.world.make:perfect")
 class PerfectSensorConfig(SensorConfig):
     """The paper's sensors: one that is on always locates the target in its cell."""
 
@@ -67,7 +67,7 @@ def _chance(help: str) -> Any:
     return option(help, expects=expects, path=True)
 
 
-@choice("sensor", "miss", makes="trackmdp.world.sensors:miss")
+@choice("sensor", "miss", makes="trackmdp.world.make:miss")
 class MissConfig(SensorConfig):
     """Sensors that miss: one that is on reports the target in its cell with probability p_d, and never another cell."""
 
@@ -84,7 +84,7 @@ class MissConfig(SensorConfig):
         _check_chance(f"{key}.p_s", self.p_s, root.grid)
 
 
-@choice("sensor", "false_alarm", makes="trackmdp.world.sensors:false_alarm")
+@choice("sensor", "false_alarm", makes="trackmdp.world.make:false_alarm")
 class FalseAlarmConfig(SensorConfig):
     """For evaluate alone: sensors that also report targets that are not there; a policy believes each report."""
 
@@ -106,7 +106,7 @@ class FalseAlarmConfig(SensorConfig):
         _check_chance(f"{key}.p_d", self.p_d, root.grid)
 
 
-@choice("sensor", "footprint", makes="trackmdp.world.sensors:footprint")
+@choice("sensor", "footprint", makes="trackmdp.world.make:footprint")
 class FootprintConfig(SensorConfig):
     """Wide sensors: each covers several cells, and if on it always locates the target in any of them, never misses."""
 

@@ -18,11 +18,11 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from trackmdp.policies.playback import Playback
+from trackmdp.policies.acting import Playback
 from trackmdp.policies.policy import Policy, PolicyLike, as_policy, looked_up, rule_of
 from trackmdp.policies.unroll import STATE_KEYS, DrawsError, Rule, acting, kept_keys, module_action
-from trackmdp.world.costs import Costs
 from trackmdp.world.model import Task
+from trackmdp.world.outcomes import Costs
 from trackmdp.world.windows import Sight, Window
 
 _MOST_ROWS = 4096  # episodes stepped together: their generators take 5 kB each

@@ -12,7 +12,7 @@ from typing import Any
 from trackmdp.config import McapConfig
 from trackmdp.config.tree import config_text
 from trackmdp.episodes.batch import Episodes
-from trackmdp.episodes.layout import write_layout
+from trackmdp.episodes.grids import write_layout
 from trackmdp.episodes.recover import taken_over
 from trackmdp.episodes.simulate import simulate
 from trackmdp.episodes.writer import EpisodeWriter

@@ -10,8 +10,7 @@ import numpy as np
 
 from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.grids import read_grids
-from trackmdp.episodes.limits import LoggedRun
-from trackmdp.episodes.schema import tick_of, time_of
+from trackmdp.episodes.schema import LoggedRun, tick_of, time_of
 from trackmdp.errors import UserError
 
 _WORDS = ("false", "true")

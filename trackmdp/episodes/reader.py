@@ -17,8 +17,8 @@ from trackmdp.arrays import load_npy
 from trackmdp.episodes import schema
 from trackmdp.episodes.container import Container, Damaged, Message
 from trackmdp.episodes.episode import Episode
-from trackmdp.episodes.limits import LoggedRun
 from trackmdp.episodes.messages import decode
+from trackmdp.episodes.schema import LoggedRun
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.untrusted import reason

@@ -12,8 +12,8 @@ from typing import Any
 
 from trackmdp.episodes import container, schema
 from trackmdp.episodes.container import Damaged
-from trackmdp.episodes.limits import LoggedRun
 from trackmdp.episodes.messages import decode
+from trackmdp.episodes.schema import LoggedRun
 from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.errors import UserError
 from trackmdp.untrusted import reason

@@ -15,12 +15,11 @@ from torch import Tensor
 
 from trackmdp.episodes.actors import Actor, States, actor_of
 from trackmdp.episodes.batch import Episodes
-from trackmdp.policies.playback import Playback
+from trackmdp.policies.acting import Playback
 from trackmdp.policies.policy import PolicyLike
 from trackmdp.seeding import derive, preserved_global_rng
-from trackmdp.world.costs import Costs
 from trackmdp.world.modes import check_revealed
-from trackmdp.world.reports import Reports
+from trackmdp.world.outcomes import Costs, Reports
 from trackmdp.world.targets import Source, held_out_source
 from trackmdp.world.tracks import Problem
 

@@ -18,8 +18,8 @@ import torch
 from trackmdp.episodes.episode import Episode
 from trackmdp.errors import UserError, require
 from trackmdp.policies.policy import Policy
-from trackmdp.world.costs import Costs
 from trackmdp.world.model import BoolArray, Task
+from trackmdp.world.outcomes import Costs
 from trackmdp.world.tracks import Tracks, ends_of
 
 require("stonesoup", "stonesoup", "trackmdp.episodes.stone_soup")

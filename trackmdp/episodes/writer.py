@@ -17,8 +17,7 @@ from trackmdp.durable import create, sync, sync_folder
 from trackmdp.episodes import messages, schema
 from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.grids import grid_messages
-from trackmdp.episodes.limits import LoggedRun
-from trackmdp.episodes.schema import time_of
+from trackmdp.episodes.schema import LoggedRun, time_of
 from trackmdp.policies.policy import Policy
 from trackmdp.world.coverage import Coverage
 from trackmdp.world.files import csr_bytes, csr_in

@@ -94,7 +94,7 @@ def filtered(world: World, solved: HistoryQ, state: tuple[int, History]) -> Arra
     """`[M]` the belief filter's prediction at a history."""
     import torch  # only here: solving needs none
 
-    from trackmdp.world.belief import BeliefFilter
+    from trackmdp.episodes.belief import BeliefFilter
 
     x, history = state
     filter_ = BeliefFilter(world.kernel)

@@ -10,8 +10,7 @@ import numpy as np
 
 from trackmdp.episodes.episode import Episode
 from trackmdp.reports.page import Report, Section
-from trackmdp.reports.prose import paragraphs
-from trackmdp.reports.tables import Cell, Column, Table
+from trackmdp.reports.tables import Cell, Column, Table, paragraphs
 from trackmdp.solvers.recorded import ReplayedTracks
 from trackmdp.world.gridding import said
 from trackmdp.world.model import Array

@@ -8,10 +8,9 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.reports.policy import Sensed
-from trackmdp.reports.prose import paragraphs
 from trackmdp.reports.results import MotionTable
 from trackmdp.reports.style import INK, LINE, Axes, Canvas, Figure, draw_figure
-from trackmdp.reports.tables import Cell, Column, Table
+from trackmdp.reports.tables import Cell, Column, Table, paragraphs
 from trackmdp.world.model import Array, BoolArray
 
 BELIEF, TARGET = "#0072b2", "#d55e01"

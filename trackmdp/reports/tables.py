@@ -1,4 +1,7 @@
-"""One table, three forms: HTML that sorts, CSV to the last digit, LaTeX to be pasted."""
+"""One table, three forms: HTML that sorts, CSV to the last digit, LaTeX to be pasted.
+
+The paragraphs of reports stand in text files: a line with what each is called, then the paragraph itself.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +9,20 @@ import html
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
 from typing import Any, TypeAlias
 
 from trackmdp.durable import csv_text
 from trackmdp.untrusted import no_formula, printable
+
+
+@cache
+def paragraphs(package: str, file: str = "prose.txt") -> dict[str, str]:
+    """Name -> paragraph of a text file in a package; what stands in braces is filled in by `str.format`."""
+    text = files(package).joinpath(file).read_text(encoding="utf-8")
+    return {name: " ".join(lines) for name, *lines in map(str.splitlines, text.split("\n\n"))}
+
 
 Cell: TypeAlias = "float | int | str | bool | None"
 

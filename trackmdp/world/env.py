@@ -14,9 +14,8 @@ from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from trackmdp.errors import UserError
-from trackmdp.world.costs import Costs
+from trackmdp.world.outcomes import Costs, Reports
 from trackmdp.world.render import PICTURE_LEGEND, pixels, text_rows
-from trackmdp.world.reports import Reports
 from trackmdp.world.targets import make_targets
 from trackmdp.world.tracks import Problem
 from trackmdp.world.windows import Sight, Window

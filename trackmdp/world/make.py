@@ -1,4 +1,4 @@
-"""From names and options, or from a config, to a world or to recorded tracks."""
+"""From names and options, or from a config, to a world or to recorded tracks; and what the group `sensor` offers."""
 
 from __future__ import annotations
 
@@ -15,8 +15,11 @@ from trackmdp.config import WorldConfig
 from trackmdp.config.compose import compose, default, given
 from trackmdp.config.options import options, refuse
 from trackmdp.config.registry import make, maker
-from trackmdp.world.checks import PRICES, canonical_kernel, check_kernel
-from trackmdp.world.files import per_cell
+from trackmdp.config.sensing import lattice
+from trackmdp.errors import UserError
+from trackmdp.world.checks import PRICES, PROBABILITIES, canonical_kernel, check_kernel
+from trackmdp.world.coverage import Coverage, discs
+from trackmdp.world.files import per_cell, read_matrix
 from trackmdp.world.model import Size, World, grid_size
 from trackmdp.world.modes import HiddenWorld, Modelled
 from trackmdp.world.track_files import read_recording, read_track_file
@@ -257,3 +260,46 @@ def of_task(cfg: WorldConfig) -> dict[str, Any]:
     costs: dict[str, Any] = make(cfg.cost, cfg.grid.size, **told)
     limits = {"t_max": cfg.grid.t_max, "max_steps": cfg.grid.max_steps, "window": cfg.grid.window}
     return costs | sensors | limits | cfg.remembered
+
+
+def perfect(size: Size) -> dict[str, Any]:  # noqa: ARG001
+    """No sensor misses, which is what a `Task` takes for granted."""
+    return {}
+
+
+def miss(size: Size, *, p_d: float | list[float] | str, p_s: float | list[float] | str) -> dict[str, Any]:
+    """p_d of the sensors and p_s of the safe action.
+
+    Raises:
+        UserError: a file is missing or malformed, or does not have one probability per cell.
+    """
+    return {
+        "detection": per_cell("sensor.p_d", p_d, size, PROBABILITIES),
+        "safe_detection": per_cell("sensor.p_s", p_s, size, PROBABILITIES),
+    }
+
+
+def false_alarm(size: Size, *, p_d: float | list[float] | str, p_f: float) -> dict[str, Any]:  # noqa: ARG001
+    """p_d of the sensors; p_f is no matter of the task, which policies are made for, but of their evaluation.
+
+    Raises:
+        UserError: as `miss`.
+    """
+    return {"detection": per_cell("sensor.p_d", p_d, size, PROBABILITIES)}
+
+
+def footprint(size: Size, *, radius: float, spacing: int, path: str | None) -> dict[str, Any]:
+    """Discs of `radius` around the places of a lattice, or the footprints in a file.
+
+    Raises:
+        UserError: the file is missing or malformed, or holds no footprints on this grid.
+    """
+    rows, columns = grid_size(size)
+    if path is not None:
+        table = read_matrix("sensor.path", path, name="coverage")
+        try:
+            return {"coverage": Coverage.of(table, rows * columns)}
+        except UserError as error:  # the option at fault is told with it
+            raise UserError(f"sensor.path={path}: {str(error).removeprefix('coverage: ')}") from error
+    places = np.stack(np.meshgrid(lattice(rows, spacing), lattice(columns, spacing), indexing="ij"), axis=-1)
+    return {"coverage": Coverage.of(discs((rows, columns), places.reshape(-1, 2), radius), rows * columns)}

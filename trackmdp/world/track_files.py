@@ -13,8 +13,7 @@ from trackmdp.errors import UserError, require
 from trackmdp.untrusted import decoded, opened
 from trackmdp.world.files import column_names, once
 from trackmdp.world.gridding import Gridding, to_tracks
-from trackmdp.world.position_files import geojson, gpx, mot, position_table, sumo
-from trackmdp.world.positions import ALIASES, LONGEST, Positions
+from trackmdp.world.positions import ALIASES, LONGEST, Positions, geojson, gpx, mot, position_table, sumo
 from trackmdp.world.tracks import Recorded, Tracks, check_tracks, read_tracks
 
 _GAP = 3

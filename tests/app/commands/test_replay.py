@@ -24,15 +24,14 @@ from trackmdp.app.prepare import Prepared
 from trackmdp.config import world_of
 from trackmdp.episodes import schema
 from trackmdp.episodes.episode import Episode, first_difference
-from trackmdp.episodes.frame import frame, sentence
-from trackmdp.episodes.layout import layout as layout_of
-from trackmdp.episodes.limits import LoggedRun
+from trackmdp.episodes.grids import layout as layout_of
 from trackmdp.episodes.log import EpisodeLog
-from trackmdp.episodes.player import Playing
+from trackmdp.episodes.player import Playing, frame, sentence
 from trackmdp.episodes.reader import EpisodeReader
+from trackmdp.episodes.schema import LoggedRun
 from trackmdp.episodes.simulate import resimulate
 from trackmdp.episodes.writer import EpisodeWriter
-from trackmdp.policies.playback import Playback
+from trackmdp.policies.acting import Playback
 
 ROOT = Path(__file__).parents[3]
 WORLD = ["grid.size=4", "kernel.exit_probability=0.05", "cost.sensor=0.3"]

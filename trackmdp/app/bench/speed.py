@@ -19,8 +19,8 @@ from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.episodes.simulate import simulate
 from trackmdp.episodes.writer import EpisodeWriter
-from trackmdp.policies.actor_critic import make_actor
-from trackmdp.policies.explore import RandomSubset
+from trackmdp.policies.acting import RandomSubset
+from trackmdp.policies.nets import make_actor
 from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.seeding import generator
 from trackmdp.solvers import qmdp

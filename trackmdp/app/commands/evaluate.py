@@ -21,7 +21,7 @@ from trackmdp.episodes.log import EpisodeLog
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.episodes.simulate import resimulate, simulate
 from trackmdp.errors import UserError
-from trackmdp.policies.playback import Playback
+from trackmdp.policies.acting import Playback
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import sets_name, write_sets
 from trackmdp.reports.held_out import recorded_page
@@ -35,9 +35,9 @@ from trackmdp.training.folders import SUMMARY, check_files, read_summary
 from trackmdp.training.machine import make_device
 from trackmdp.untrusted import decoded
 from trackmdp.world.gridding import said
+from trackmdp.world.make import false_alarm
 from trackmdp.world.model import World
 from trackmdp.world.modes import Modelled
-from trackmdp.world.sensors import false_alarm
 from trackmdp.world.tracks import Problem, Recorded
 
 _FOR_THE_PICTURE = 16  # episodes simulated where none are asked for

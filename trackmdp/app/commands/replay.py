@@ -8,7 +8,7 @@ from pathlib import Path
 from rich.console import Console
 
 from trackmdp.config import ReplayConfig, TableConfig, world_of
-from trackmdp.episodes.layout import write_layout
+from trackmdp.episodes.grids import write_layout
 from trackmdp.episodes.page import write_page
 from trackmdp.episodes.player import play
 from trackmdp.episodes.reader import EpisodeReader

@@ -10,7 +10,7 @@ from rich.text import Text
 from trackmdp.config import ReportConfig
 from trackmdp.durable import write_bytes, write_text
 from trackmdp.errors import require
-from trackmdp.paper.openings import compute, load_openings, save_openings
+from trackmdp.paper.calibration import compute, load_openings, save_openings
 from trackmdp.paper.sections import sections
 from trackmdp.paper.worlds import PRINTED_QMDP, pairs
 from trackmdp.reports import style, watch

@@ -1,4 +1,8 @@
-"""Policies for collecting frames: random subsets, a table replaced during learning, one that at random senses all."""
+"""What acts without being a finished policy: while frames are collected, in benchmarks, or as an episode is recorded.
+
+A table replaced during learning, one that at random senses everything, random subsets, and the actions of a recorded
+episode, issued again whatever is observed.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +14,10 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
+from trackmdp.errors import UserError
 from trackmdp.policies.lookup import in_window
 from trackmdp.policies.table import PolicyTable
-from trackmdp.world.model import Task
+from trackmdp.world.model import BoolArray, Task
 
 _ROWS_AT_ONCE = 2**12
 
@@ -99,3 +104,28 @@ class Exploring(RenewedTable):
         everything = (torch.rand(n.shape, device=n.device) < self.explore) & (n == 0)
         action = super().forward(tensordict)["action"]
         return tensordict.set("action", action | everything.unsqueeze(-1))
+
+
+class Playback:
+    """An open-loop policy: the action depends on the step of the episode alone.
+
+    It is therefore no table, and has no exact value; it can be simulated. After the last recorded action no sensor is
+    on, and the safe action locates the target.
+
+    Args:
+        task: grid, costs and limits.
+        actions: `[T, S]` bool, in their order.
+
+    Raises:
+        UserError: the actions are those of another grid.
+    """
+
+    def __init__(self, task: Task, actions: BoolArray) -> None:
+        if actions.shape[1:] != (task.total_sensors,):
+            raise UserError(f"playback: actions of {actions.shape[1:]} sensors, expected {task.total_sensors}")
+        self.task = task
+        self.actions = torch.as_tensor(actions, dtype=torch.bool)
+
+    def at(self, step: int) -> Tensor:
+        """`[S]` bool, the action of a step."""
+        return self.actions[step] if step < len(self.actions) else torch.zeros_like(self.actions[0])

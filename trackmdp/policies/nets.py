@@ -1,0 +1,348 @@
+"""Networks of a Track-MDP: encoder of its state, subset policies with one Bernoulli per sensor, values, additive Q.
+
+The encoder is a linear layer that never multiplies by the zeros of a one-hot. `CellClockNet` is over (last cell, steps
+since detection), which is what a deterministic policy depends on: after a miss the next state is known in advance, so
+along its own path the action history follows from these two. It is a table of chains, one per located cell, and a net
+may be run on all of its rows at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torch import Tensor, nn
+from torch import distributions as dist
+from torchrl.envs.utils import ExplorationType, exploration_type
+from torchrl.modules import ProbabilisticActor, ValueOperator
+
+from trackmdp.policies.unroll import state_keys
+from trackmdp.world.model import Task
+from trackmdp.world.windows import Window
+
+_PAIRS = 2**16  # of cells, once for each class of keys, whose displacements are kept; 16 x 16 cells have as many
+
+
+class StateEncoder(nn.Module):
+    """`[..., hidden]` features of (last_cell, steps_since_detection, action_history), and of `key` where there is one.
+
+    Equal to a linear layer on the one-hot cell, the one-hot n, their product and the history bits, followed by ReLU.
+    Embeddings stand for the one-hots, and the history is multiplied only where n > 0 (most rows have none). What a key
+    shares with others (`KeySpace.contexts`), and the key, have each an embedding of the product with n: seldom seen
+    keys are known by their cell and by their displacement or mode.
+    """
+
+    def __init__(self, task: Task, hidden: int, *, scale: float = 0.1, history_scale: float = 0.1) -> None:
+        super().__init__()
+        self.stages = task.t_max + 2
+        self.cell = nn.Embedding(task.num_cells, hidden)
+        self.stage = nn.Embedding(self.stages, hidden)
+        self.cell_and_stage = nn.Embedding(task.num_cells * self.stages, hidden)
+        self.history = nn.Linear(task.num_choices * task.num_sensors, hidden)
+        self.keys = task.keys
+        # The first context is of all keys alike, as is `stage`.
+        counts = [count for _, count in task.keys.contexts(torch.zeros(1))[1:]] if task.keyed else []
+        self.known = nn.ModuleList(nn.Embedding(count * self.stages, hidden) for count in counts)
+        for table in (self.cell, self.stage, self.cell_and_stage, *self.known):
+            nn.init.normal_(table.weight, std=scale)
+        nn.init.normal_(self.history.weight, std=history_scale)
+        nn.init.zeros_(self.history.bias)
+
+    def forward(
+        self, last_cell: Tensor, steps_since_detection: Tensor, action_history: Tensor, key: Tensor | None = None
+    ) -> Tensor:
+        """Features of a batch of any shape `[...]`; `action_history` is `[..., t_max+1, K]`."""
+        shape = last_cell.shape
+        cell, n = last_cell.reshape(-1), steps_since_detection.reshape(-1)
+        features = self.cell(cell) + self.stage(n) + self.cell_and_stage(cell * self.stages + n)
+        if key is not None:
+            contexts = self.keys.contexts(key.reshape(-1))[1:]
+            for table, (context, _) in zip(self.known, contexts, strict=True):
+                features = features + table(context * self.stages + n)
+        missed = n.nonzero().squeeze(-1)
+        bits = action_history.reshape(len(cell), -1)[missed].to(features.dtype)
+        features = features.index_add(0, missed, bits @ self.history.weight.T) + self.history.bias
+        return torch.relu(features).reshape(*shape, -1)
+
+
+class StateNetwork(nn.Module):
+    """A `StateEncoder` with a linear head on top."""
+
+    def __init__(self, task: Task, hidden: int, head: nn.Linear) -> None:
+        super().__init__()
+        self.encoder, self.head = StateEncoder(task, hidden), head
+
+    def forward(self, *state: Tensor) -> Tensor:
+        """`[..., head.out_features]` of a batch of states of shape `[...]`, the arguments those of the encoder."""
+        return self.head(self.encoder(*state))
+
+
+class RelativeBias(nn.Module):
+    """A number per sensor by n and by where the sensor stands, as seen from the last located cell; zero at first.
+
+    It is shared by all cells: that sensors far away are of no use is learned once, not once per cell. (The name is that
+    of the relative position bias of Shaw et al. 2018.) Where a policy knows more than the cell, each class of keys has
+    numbers of its own: that a target with this heading goes there is learned once as well.
+
+    With `grid.window` the K sensors of the window are the displacements, and the table is `[C (t_max+2), K]`. Without
+    one there are (2 rows - 1)(2 columns - 1) displacements, of which each cell sees M.
+    """
+
+    _code: Tensor | None
+    _index: Tensor | None
+
+    def __init__(self, task: Task) -> None:
+        super().__init__()
+        side, places = 2 * task.columns - 1, (2 * task.rows - 1) * (2 * task.columns - 1)
+        # Sensors with footprints stand at no cell: each has a number of its own, whatever the cell.
+        self._whole = task.window is None and task.coverage is None
+        self.classes, self.stages = task.keys.num_classes, task.t_max + 2
+        self.table = nn.Parameter(torch.zeros(self.classes * self.stages, places if self._whole else task.num_sensors))
+        # Displacements (row, column) from (1 - rows, 1 - columns) to (rows - 1, columns - 1), row by row; (0, 0) is the
+        # one in the middle. On 3 x 3, side 5, from cell 4 (code 6) to cell 5 (code 7): 7 - 6 + 12, right of the middle.
+        cell = torch.arange(task.num_cells if self._whole else 0)
+        code = cell // task.columns * side + cell % task.columns
+        # On a small grid the places of all pairs of cells are kept, so that a state looks up one row of M numbers; on a
+        # large one, where M² is more than a batch has, each state's places are worked out.
+        few = self._whole and self.classes * len(code) ** 2 <= _PAIRS
+        kept = code - code.unsqueeze(-1) + places // 2 if few else None
+        self.register_buffer("_index", kept, persistent=False)
+        self.register_buffer("_code", code if self._whole and kept is None else None, persistent=False)
+
+    def forward(self, last_cell: Tensor, steps_since_detection: Tensor, key: Tensor | None = None) -> Tensor:
+        """`[..., K]` of a batch of any shape `[...]`."""
+        row = steps_since_detection if key is None else key % self.classes * self.stages + steps_since_detection
+        if self._index is not None:
+            m = len(self._index)
+            rows = self.table[:, self._index].view(-1, m)
+            return nn.functional.embedding(row * m + last_cell, rows)
+        if self._code is None:
+            return nn.functional.embedding(row, self.table)
+        places = self.table.shape[1]
+        middle = row * places + places // 2 - self._code[last_cell]
+        return self.table.view(-1)[middle.unsqueeze(-1) + self._code]
+
+
+# A logit whose sigmoid is 0 in float32: no draw from [0, 1) is below it, and log-probability and entropy are 0.
+_NEVER = -200.0
+
+
+class SubsetDistribution(dist.Independent):  # type: ignore[type-arg]
+    """Independent sensors, each on with probability sigmoid(logit); samples are `[..., K]` bool."""
+
+    def __init__(self, logits: Tensor) -> None:
+        super().__init__(dist.Bernoulli(logits=logits, validate_args=False), 1, validate_args=False)
+
+    def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:
+        """A subset; compares uniform draws, which is three times as fast as torch.bernoulli."""
+        shape = self._extended_shape(torch.Size(sample_shape))
+        probability = torch.sigmoid(self.base_dist.logits.detach()).expand(shape)
+        return torch.rand(shape, device=probability.device) < probability
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """`[...]` log-probability of the subset `value` `[..., K]`: Σ_j log σ(±z_j)."""
+        logits = self.base_dist.logits
+        return nn.functional.logsigmoid(torch.where(value, logits, -logits)).sum(-1)
+
+    def entropy(self) -> Tensor:
+        """`[...]` Σ_j [softplus(z_j) - z_j σ(z_j)]."""
+        logits = self.base_dist.logits
+        return (nn.functional.softplus(logits) - logits * torch.sigmoid(logits)).sum(-1)
+
+    @property
+    def mode(self) -> Tensor:
+        """The most likely subset: sensors with a positive logit."""
+        return self.base_dist.logits > 0
+
+    deterministic_sample = mode
+
+
+def make_actor(task: Task, hidden: int, initial_logit: float) -> ProbabilisticActor:
+    """State -> `logits` `[B, K]` -> `action` `[B, K]` bool, with `action_log_prob` `[B]`.
+
+    K = M, or with `grid.window` the sensors around `last_cell`; those outside the grid are never on.
+    """
+    head = nn.Linear(hidden, task.num_sensors)
+    nn.init.orthogonal_(head.weight, gain=0.01)
+    nn.init.constant_(head.bias, initial_logit)
+    window = None if task.window is None else Window.of(task)
+    network = _Logits(StateNetwork(task, hidden, head), RelativeBias(task), window)
+    return ProbabilisticActor(
+        TensorDictModule(network, in_keys=state_keys(task), out_keys=["logits"]),
+        in_keys=["logits"],
+        distribution_class=SubsetDistribution,
+        return_log_prob=True,
+    )
+
+
+class _Logits(nn.Module):
+    """A network's logits on top of those that all cells share."""
+
+    def __init__(self, network: StateNetwork, shared: RelativeBias, window: Window | None) -> None:
+        super().__init__()
+        self.network, self.shared, self.window = network, shared, window
+
+    def forward(self, last_cell: Tensor, steps_since_detection: Tensor, action_history: Tensor, *key: Tensor) -> Tensor:
+        own = self.network(last_cell, steps_since_detection, action_history, *key)
+        logits = own + self.shared(last_cell, steps_since_detection, *key)
+        if self.window is None:
+            return logits
+        inside = self.window.inside(last_cell.reshape(-1)).view(logits.shape)
+        return logits.masked_fill(~inside, _NEVER)
+
+
+def make_critic(task: Task, hidden: int) -> ValueOperator:
+    """State -> `state_value` `[B, 1]`."""
+    head = nn.Linear(hidden, 1)
+    nn.init.orthogonal_(head.weight)
+    nn.init.zeros_(head.bias)
+    return ValueOperator(StateNetwork(task, hidden, head), in_keys=state_keys(task))
+
+
+_ALL_ON = 0.5  # sensors start a little above zero: what can be left out is learned, not what must be found
+
+
+class AdditiveQ(nn.Module):
+    """Q(s, a) = V(s) + Σ_j (a_j - 1[q_j(s) > 0]) q_j(s): a dueling network over sensors.
+
+    V(s) is the value of the best subset {j : q_j > 0}, and only sensors that differ from it contribute, so that the
+    targets' noise reaches q_j through the few sensors flipped for exploration alone (after Wang et al. 2016).
+    q_j counts in units of the sensor's price.
+    """
+
+    def __init__(self, task: Task, hidden: int, scale: float) -> None:
+        super().__init__()
+        self.t_max = task.t_max
+        self.encoder = StateEncoder(task, hidden, scale=1.0, history_scale=0.03)
+        self.base, self.sensor = nn.Linear(hidden, 1), nn.Linear(hidden, task.num_sensors)
+        for head, start in ((self.base, 0.0), (self.sensor, _ALL_ON)):
+            nn.init.orthogonal_(head.weight, gain=0.01)
+            nn.init.constant_(head.bias, start)
+        price = torch.as_tensor(task.cost, dtype=torch.float32).clamp_min(0.01 * task.reward)
+        self.window = Window.of(task) if task.window is not None else None
+        # What lies outside the grid, cell M, has no price: there q_j is 0, and the sensor off.
+        unit = price if self.window is None else nn.functional.pad(price, (0, 1))
+        self.unit = nn.Buffer(scale * unit)
+
+    def forward(
+        self, last_cell: Tensor, steps_since_detection: Tensor, action_history: Tensor, *key: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """V `[..., 1]` and q `[..., K]`, the latter 0 where the safe action is forced and outside the grid."""
+        features = self.encoder(last_cell, steps_since_detection, action_history, *key)
+        free = (steps_since_detection <= self.t_max).unsqueeze(-1)
+        unit = self.unit if self.window is None else self.unit[self.window.around(last_cell)]
+        return self.base(features), unit * self.sensor(features) * free
+
+
+def joint_value(values: TensorDictBase, action: Tensor) -> Tensor:
+    """`[...]` Q(s, a) of `action` `[..., K]` from the `base` and `sensor_value` of a network."""
+    sensor = values["sensor_value"]
+    flipped = action.to(sensor.dtype) - (sensor > 0).to(sensor.dtype)
+    return values["base"].squeeze(-1) + (sensor * flipped).sum(-1)
+
+
+class EpsilonFlip(TensorDictModuleBase):
+    """The greedy subset {j : q_j > 0}; while exploring, each sensor is flipped with probability epsilon.
+
+    Sensors without a value stay off: those outside the grid, and all where the safe action is forced.
+
+    Args:
+        epsilon: that probability.
+    """
+
+    in_keys: ClassVar = ["sensor_value"]
+    out_keys: ClassVar = ["action"]
+
+    def __init__(self, epsilon: float) -> None:
+        super().__init__()
+        self.epsilon = nn.Buffer(torch.tensor(epsilon))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write `action` `[*B, K]`."""
+        value = tensordict["sensor_value"]
+        greedy = value > 0
+        if exploration_type() is ExplorationType.RANDOM:
+            greedy = greedy ^ (torch.rand(value.shape, device=value.device) < self.epsilon) & (value != 0)
+        return tensordict.set("action", greedy)
+
+
+def make_qvalue(task: Task, hidden: int, scale: float) -> TensorDictModule:
+    """State -> `base` `[B, 1]`, `sensor_value` `[B, K]`, for rewards multiplied by `scale`."""
+    return TensorDictModule(AdditiveQ(task, hidden, scale), in_keys=state_keys(task), out_keys=["base", "sensor_value"])
+
+
+class CellClockNet(nn.Module):
+    """One hidden layer over embeddings of the cell, of the clock and of the pair, added up; or a plain table.
+
+    A hidden layer's decoder learns from all rows what belongs together; a table of outputs has a number for each row
+    and output, and takes a hundredth of the time.
+
+    With `classes` a cell has as many rows, numbered cell · C + class as keys are (`KeySpace`). Then cell and class have
+    each an embedding of their own with the clock, beside that of the key: keys that are seldom seen are known by these.
+
+    Args:
+        num_cells: M; with classes M · C.
+        num_clocks: values the clock takes, 0 ... num_clocks - 1.
+        hidden: hidden units; 0: a table.
+        outputs: numbers per row.
+        bias: value of the outputs' bias at the start.
+        generator: draws the initial weights, on its device.
+        groups: int64 `[M]`, the group of each cell, numbered from 0; cells of one group share all weights. None: each
+            cell is its own.
+        classes: C.
+    """
+
+    groups: Tensor | None
+
+    def __init__(
+        self,
+        num_cells: int,
+        num_clocks: int,
+        *,
+        hidden: int,
+        outputs: int,
+        bias: float,
+        generator: torch.Generator,
+        groups: Tensor | None = None,
+        classes: int = 1,
+    ) -> None:
+        super().__init__()
+        self.register_buffer("groups", groups, persistent=False)
+        if groups is not None:
+            num_cells = int(groups.max()) + 1
+
+        if not hidden:
+            shape = (num_cells, num_clocks, outputs)
+            self.table = nn.Parameter(torch.full(shape, bias, device=generator.device))
+            return
+
+        def normal(*shape: int, std: float) -> nn.Parameter:
+            return nn.Parameter(std * torch.randn(shape, generator=generator, device=generator.device))
+
+        # [M, 1, H] + [C, H] + [M, C, H] broadcast to [M, C, H]: cell and clock share what they can, the pair learns the
+        # rest.
+        self.cell = normal(num_cells, 1, hidden, std=0.3)
+        self.clock = normal(num_clocks, hidden, std=0.3)
+        self.pair = normal(num_cells, num_clocks, hidden, std=0.3)
+        # Std 1 / sqrt(H) keeps the outputs' size independent of the width.
+        self.weight = normal(hidden, outputs, std=hidden**-0.5)
+        self.bias = nn.Parameter(torch.full((outputs,), bias, device=generator.device))
+        if classes > 1:
+            self.located = normal(num_cells // classes, 1, num_clocks, hidden, std=0.3)
+            self.known = normal(classes, num_clocks, hidden, std=0.3)
+
+    def forward(self, cells: slice = slice(None)) -> Tensor:
+        """`[M, num_clocks, outputs]`, the outputs of every row, or of the rows of some `cells` alone."""
+        if hasattr(self, "table"):
+            return self.table[cells] if self.groups is None else self.table[self.groups[cells]]
+        embedding = self.cell + self.clock + self.pair
+        if hasattr(self, "known"):
+            embedding = embedding + (self.located + self.known).flatten(0, 1)
+        # With groups the embedding has a row per group and not per cell; the wanted cells are picked at the end.
+        if self.groups is None and cells != slice(None):
+            embedding = embedding[cells]
+        rows = embedding.relu() @ self.weight + self.bias
+        return rows if self.groups is None else rows.index_select(0, self.groups[cells])
