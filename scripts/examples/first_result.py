@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import trackmdp as tm
-from trackmdp.reports.picture import draw_picture
+from trackmdp.episodes.player import draw_picture
 
 
 def main() -> None:

@@ -15,9 +15,8 @@ import pytest
 from tests.episodes.logs import CONFIG, WORLD, policy, recorded, write
 from trackmdp.episodes import container
 from trackmdp.episodes.episode import Episode, first_difference
-from trackmdp.episodes.reader import EpisodeReader
+from trackmdp.episodes.reader import EpisodeReader, verify
 from trackmdp.episodes.recover import recover
-from trackmdp.episodes.verify import verify
 from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.errors import UserError
 

@@ -13,10 +13,9 @@ from tests.helpers import small_world
 from trackmdp.app.cli import main
 from trackmdp.episodes.log import EpisodeLog
 from trackmdp.episodes.page import page
-from trackmdp.episodes.reader import EpisodeReader
+from trackmdp.episodes.reader import EpisodeReader, verify
 from trackmdp.episodes.recover import recover
 from trackmdp.episodes.simulate import simulate
-from trackmdp.episodes.verify import verify
 from trackmdp.policies.policy import Policy
 from trackmdp.world.coverage import discs
 from trackmdp.world.model import World

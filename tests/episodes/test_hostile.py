@@ -20,9 +20,8 @@ from mcap.writer import Writer
 from tests.episodes.logs import recorded, write
 from trackmdp.episodes import container, schema
 from trackmdp.episodes.container import Damaged
-from trackmdp.episodes.reader import EpisodeReader
+from trackmdp.episodes.reader import EpisodeReader, verify
 from trackmdp.episodes.recover import recover
-from trackmdp.episodes.verify import verify
 from trackmdp.errors import UserError
 
 RUN, END, POLICY, INDEX = schema.RUN, schema.END, f"{schema.POLICY}.0", "episodes.json"

@@ -16,9 +16,8 @@ from tests.episodes.test_simulate import WINDOWED
 from trackmdp.episodes import schema, writer
 from trackmdp.episodes.episode import first_difference
 from trackmdp.episodes.page import page
-from trackmdp.episodes.reader import EpisodeReader
+from trackmdp.episodes.reader import EpisodeReader, verify
 from trackmdp.episodes.recover import recover
-from trackmdp.episodes.verify import verify
 from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy

@@ -18,11 +18,10 @@ from trackmdp.episodes.episode import Episode, first_difference
 from trackmdp.episodes.grids import grid_messages
 from trackmdp.episodes.messages import decode, row_of, step_messages
 from trackmdp.episodes.player import mode_words
-from trackmdp.episodes.reader import EpisodeReader
+from trackmdp.episodes.reader import EpisodeReader, verify
 from trackmdp.episodes.recover import recover
 from trackmdp.episodes.schema import LoggedRun
 from trackmdp.episodes.simulate import simulate
-from trackmdp.episodes.verify import verify
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.world.modes import HiddenWorld, heading_kernel

@@ -16,8 +16,7 @@ from trackmdp.reports import figures, maps
 from trackmdp.reports.figures import Panel
 from trackmdp.reports.gather import gather_runs
 from trackmdp.reports.grouping import Study, study
-from trackmdp.reports.policy import Sensed
-from trackmdp.reports.results import MotionTable, Results
+from trackmdp.reports.results import MotionTable, Results, Sensed
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from trackmdp.durable import write_json
 from trackmdp.errors import UserError
 from trackmdp.policies.saved import save_policy
 from trackmdp.policies.table import PolicyTable
-from trackmdp.reports import policy, results
+from trackmdp.reports import finished, results
 from trackmdp.reports.finished import MOST_POINTS
 from trackmdp.reports.gather import gather_runs
 from trackmdp.reports.results import Results
@@ -70,7 +70,7 @@ def test_one_policy_per_group_is_kept_that_of_the_run_in_the_middle(whole: Path)
     for name, kept in found.policies.items():
         group = [run for run in found.runs if run.name.rsplit("-", 1)[0] == name.rsplit("-", 1)[0]]
         assert kept.value.mean() == pytest.approx(np.median([run.figure("aihtr") for run in group]))
-        assert not (kept.sets != policy.read(whole / name / "policy.npz", _alike).sets).nnz
+        assert not (kept.sets != finished.read_sensed(whole / name / "policy.npz", _alike).sets).nnz
 
 
 def _alike(table: PolicyTable) -> Array:
@@ -85,8 +85,8 @@ def test_plans_of_one_cell_are_averaged_by_how_often_each_occurs(tmp_path: Path)
     visits[0, 7], visits[1] = 3.0, 5.0
     table = PolicyTable(task, sparse.csr_array(sets.reshape(40, 2)))
     save_policy(tmp_path / "policy.npz", table, np.zeros(2))
-    found = policy.read(tmp_path / "policy.npz", lambda _: visits.ravel())
-    for read in (found, policy.unpack_all(policy.pack_all({"a": found}))["a"]):
+    found = finished.read_sensed(tmp_path / "policy.npz", lambda _: visits.ravel())
+    for read in (found, results.unpack_policies(results.pack_policies({"a": found}))["a"]):
         assert read.choices == 2
         assert read.averaged
         assert read.on(0).nnz == 0
@@ -96,7 +96,7 @@ def test_plans_of_one_cell_are_averaged_by_how_often_each_occurs(tmp_path: Path)
 def test_of_sensors_with_footprints_the_cells_that_they_cover_are_kept(tmp_path: Path) -> None:
     task = Task((1, 3), cost=0.1, t_max=0, safe_cost=1.0, coverage=[[1, 1, 0], [0, 1, 1]])
     save_policy(tmp_path / "policy.npz", PolicyTable.from_dense(task, np.eye(3, 2, dtype=bool)[:, None]), np.zeros(3))
-    found = policy.read(tmp_path / "policy.npz", _alike)
+    found = finished.read_sensed(tmp_path / "policy.npz", _alike)
     assert found.on(0).toarray().tolist() == [[True, True, False], [False, True, True], [False, False, False]]
 
 

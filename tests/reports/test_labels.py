@@ -11,8 +11,7 @@ from scipy import sparse
 
 from trackmdp.reports.idea import idea_figure, scenes
 from trackmdp.reports.labels import label_lines, spread
-from trackmdp.reports.policy import Sensed
-from trackmdp.reports.results import MotionTable
+from trackmdp.reports.results import MotionTable, Sensed
 from trackmdp.reports.style import LOOKS, canvas, looks_of
 
 

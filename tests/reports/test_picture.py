@@ -7,9 +7,9 @@ from scipy import sparse
 
 from trackmdp.episodes.batch import Episodes
 from trackmdp.episodes.episode import Episode
+from trackmdp.episodes.player import draw_picture
 from trackmdp.episodes.simulate import simulate
 from trackmdp.policies.policy import Policy
-from trackmdp.reports.picture import draw_picture
 from trackmdp.world.model import World
 from trackmdp.world.render import PICTURE_LEGEND
 

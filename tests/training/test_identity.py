@@ -16,9 +16,9 @@ from torchrl.collectors import Collector
 
 from tests.training.runs import assert_same_run, at_iteration, tensors, train
 from trackmdp.algos.moves import MoveBuffer
-from trackmdp.app.commands.trained import trained
 from trackmdp.errors import Preempted, RunError, UserError
 from trackmdp.training import checkpoint, state
+from trackmdp.training.run import trained
 
 CPU = torch.device("cpu")
 

@@ -1,7 +1,8 @@
-"""One logged episode as a web page of its own: no network, no other file."""
+"""An episode as a web page, and episodes as tables."""
 
 from __future__ import annotations
 
+import csv
 import html
 import json
 from importlib.resources import files
@@ -12,6 +13,7 @@ import numpy as np
 
 from trackmdp.durable import write_text
 from trackmdp.episodes.episode import Episode
+from trackmdp.episodes.messages import step_messages
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.solvers import bounds
 from trackmdp.solvers.keyed_search import cell_bound
@@ -88,3 +90,29 @@ def _sparse(belief: Any) -> list[int]:
     cells = np.sort(np.argsort(-share, kind="stable")[:MOST_CELLS])
     cells = cells[share[cells] > 0]
     return np.stack([cells, share[cells]], axis=1).ravel().tolist()
+
+
+_STEP = ("episode", "t", "n", "last_cell", "active", "n_active", "forced", "target", "obs", "reward", "ep_return")
+
+
+def write_tables(reader: EpisodeReader, folder: Path, number: int | None = None) -> list[Path]:
+    """Write `steps.csv` and `episodes.csv` of all episodes, or of one; returns the files.
+
+    Cells are numbers, -1 for none; `active` holds the numbers of the sensors on, separated by blanks.
+    """
+    rows = [reader.row(number)] if number is not None else reader.rows
+    folder.mkdir(parents=True, exist_ok=True)
+    files = [folder / "steps.csv", folder / "episodes.csv"]
+    with files[0].open("w", newline="", encoding="utf-8") as stream:
+        columns = [*_STEP, "mode"] if reader.run.modes else _STEP
+        table = csv.DictWriter(stream, columns, extrasaction="ignore")
+        table.writeheader()
+        for row in rows:
+            for message in step_messages(reader.read(row["episode"]), reader.run):
+                step = json.loads(message)
+                table.writerow(step | {"active": " ".join(map(str, step["active"]))})
+    with files[1].open("w", newline="", encoding="utf-8") as stream:
+        table = csv.DictWriter(stream, list(reader.rows[0]) if reader.rows else ["episode"])
+        table.writeheader()
+        table.writerows(rows)
+    return files

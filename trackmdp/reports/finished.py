@@ -5,18 +5,23 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy import sparse
 
 from trackmdp.config.tree import plain_mapping
 from trackmdp.config.untrusted import MAX_BYTES
 from trackmdp.errors import UserError
-from trackmdp.reports.results import FIGURES, Anomaly, CurvePoint, FinishedRun
+from trackmdp.policies.saved import load_policy
+from trackmdp.policies.table import PolicyTable
+from trackmdp.reports.results import FIGURES, Anomaly, CurvePoint, FinishedRun, Sensed
+from trackmdp.solvers.renewal import IndexArray, per_row
 from trackmdp.training.folders import FAILED_FILE, SUMMARY, check_files, read_summary, run_of
 from trackmdp.untrusted import decoded, known_object, printable, read_text
+from trackmdp.world.model import Array
 
 MOST_POINTS = 16
 """Points kept of a learning curve: evenly spaced in the logarithm of the iteration."""
@@ -151,3 +156,43 @@ def _points(text: str) -> list[CurvePoint]:
             raise ValueError("a number out of range")
         points.append(point)
     return points
+
+
+def read_sensed(file: Path, visits: Callable[[PolicyTable], Array]) -> Sensed:
+    """Read a policy back.
+
+    Args:
+        file: of a run.
+        visits: `[keys]` of a policy that remembers or is told more than the cell, how often it comes to each key: its
+            plans for one cell are averaged with these weights.
+
+    Raises:
+        UserError: the file is missing or damaged, or holds something else.
+    """
+    table, value = load_policy(file)
+    if value is None:
+        raise UserError(f"{file}: not the policy of a run (it has no values)")
+    if not table.deterministic:
+        raise UserError("policy: draws its sets at random, so that there is no table of them")
+    task = table.task
+    # One probability for all sensors is written out: all of them on, on a grid small enough, or none.
+    shape = (task.num_keys * task.num_choices, task.total_sensors)
+    sets = table.sets
+    if sets is None:
+        sets = sparse.csr_array(table.dense().reshape(shape) if table.probability else shape, dtype=bool)
+    sets = sets if task.coverage is None else task.coverage.seen(sets)
+    return Sensed(_averaged(table, sets, visits(table)) if task.keyed else sets, value)
+
+
+def _averaged(policy: PolicyTable, sets: sparse.csr_array, visits: Array) -> sparse.csr_array:
+    """`[M (t_max + 1), M]`, means of `sets` `[keys (t_max + 1), M]` over the keys of each cell."""
+    task = policy.task
+    keys: IndexArray = np.arange(task.num_keys)
+    cells = task.keys.cell(keys)
+    # no cell without visits: episodes start anywhere
+    share = visits / per_row(cells, visits, task.num_cells)[cells]
+    means = sparse.csr_array((share, (cells, keys)), shape=(task.num_cells, task.num_keys))
+    # Row x (t_max + 1) + n of the result is that of the keys at the same n.
+    found = sparse.kron(means, sparse.eye_array(task.num_choices), format="csr") @ sets.astype(np.float64)
+    found.sort_indices()
+    return sparse.csr_array(found)

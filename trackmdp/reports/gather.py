@@ -20,11 +20,10 @@ from trackmdp.config import TableConfig, WorldConfig, world_of
 from trackmdp.config.registry import make
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
-from trackmdp.reports import policy
-from trackmdp.reports.finished import plain_config, read_curve, read_run
+from trackmdp.reports.finished import plain_config, read_curve, read_run, read_sensed
 from trackmdp.reports.grouping import Study, study, world_key
 from trackmdp.reports.maps import MOST_MAP_CELLS
-from trackmdp.reports.results import Anomaly, FinishedRun, MotionTable, Results
+from trackmdp.reports.results import Anomaly, FinishedRun, MotionTable, Results, Sensed
 from trackmdp.solvers import bounds, qmdp
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.keyed import averaged, visits_of_keys
@@ -173,9 +172,9 @@ def _missing_seeds(grouped: Study) -> list[Anomaly]:
     return found
 
 
-def _policies(folder: Path, grouped: Study) -> tuple[dict[str, policy.Sensed], list[Anomaly]]:
+def _policies(folder: Path, grouped: Study) -> tuple[dict[str, Sensed], list[Anomaly]]:
     """Of each world and method the policy of the run in the middle, or of the one next to it that can be read."""
-    found: dict[str, policy.Sensed] = {}
+    found: dict[str, Sensed] = {}
     anomalies = []
     for runs in grouped.groups.values():
         settings = runs[0].settings
@@ -189,9 +188,9 @@ def _policies(folder: Path, grouped: Study) -> tuple[dict[str, policy.Sensed], l
         for _, run in sorted(enumerate(ranked), key=lambda item: abs(item[0] - middle)):
             try:
                 # Against the summary's digest: a policy copied from another run would be drawn under this one's name.
-                check_files(folder / run.name, read_summary(folder / run.name), policy.POLICY_FILE)
+                check_files(folder / run.name, read_summary(folder / run.name), "policy.npz")
                 place = folder / run.name
-                found[run.name] = policy.read(place / policy.POLICY_FILE, partial(_visits, place))
+                found[run.name] = read_sensed(place / "policy.npz", partial(_visits, place))
                 break
             except UserError as error:
                 anomalies.append(Anomaly(run.name, str(error).removeprefix(f"{folder / run.name}/")))
@@ -225,7 +224,7 @@ def _modelled(cfg: WorldConfig) -> Modelled:
 
 
 def _visits(place: Path, table: PolicyTable) -> Array:
-    """`[keys]`, see `policy.read`."""
+    """`[keys]`, see `read_sensed`."""
     return visits_of_keys(_modelled(_world_config(place)), table)
 
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from trackmdp.reports.policy import Sensed
-from trackmdp.reports.results import MotionTable
+from trackmdp.reports.results import MotionTable, Sensed
 from trackmdp.reports.style import INK, LINE, Axes, Canvas, Figure, draw_figure
 from trackmdp.reports.tables import Cell, Column, Table, paragraphs
 from trackmdp.world.model import Array, BoolArray

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trackmdp.reports.policy import Sensed
-from trackmdp.reports.results import MotionTable
+from trackmdp.reports.results import MotionTable, Sensed
 from trackmdp.reports.style import INK, LINE, Axes, Canvas, Figure, draw_figure, power
 from trackmdp.reports.tables import Cell, Column, Table
 from trackmdp.world.model import Array, BoolArray

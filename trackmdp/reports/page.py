@@ -12,8 +12,7 @@ from typing import Any, TypeAlias
 
 from trackmdp.reports import figures, idea, maps, summaries
 from trackmdp.reports.grouping import Study, study
-from trackmdp.reports.policy import Sensed
-from trackmdp.reports.results import MotionTable, Results
+from trackmdp.reports.results import MotionTable, Results, Sensed
 from trackmdp.reports.style import Figure
 from trackmdp.reports.tables import Table, paragraphs
 from trackmdp.world.model import grid_size

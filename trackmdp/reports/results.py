@@ -10,7 +10,7 @@ import csv
 import hashlib
 import io
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,6 @@ from scipy import sparse
 from trackmdp.arrays import load_npz, npz_bytes
 from trackmdp.durable import csv_text, write_bytes, write_text
 from trackmdp.errors import UserError
-from trackmdp.reports.policy import Sensed, joined, pack_all, taken_apart, unpack_all
 from trackmdp.untrusted import decoded, read_bytes, read_object, read_text, sealed, unsealed
 from trackmdp.world.files import whole_csr
 from trackmdp.world.model import Array
@@ -94,6 +93,34 @@ class Anomaly:
 
 
 @dataclass(frozen=True, eq=False)
+class Sensed:
+    """What a deterministic policy senses, and what that earns.
+
+    Attributes:
+        sets: `[M (t_max + 1), M]` bool, row x (t_max + 1) + n the cells sensed at n misses after the target was located
+            in x; a share of the detections there, where the policy remembers or is told more than the cell.
+        value: `[M]`, expected reward of an episode from each start cell, exactly.
+    """
+
+    sets: sparse.csr_array
+    value: Array
+
+    @property
+    def choices(self) -> int:
+        """t_max + 1."""
+        return int(self.sets.shape[0] // self.sets.shape[1])
+
+    @property
+    def averaged(self) -> bool:
+        """Whether `sets` are shares."""
+        return bool(self.sets.dtype != np.bool_)
+
+    def on(self, n: int) -> sparse.csr_array:
+        """`[M, M]`, the cells sensed at n misses after the target was located in each cell."""
+        return self.sets[n :: self.choices]
+
+
+@dataclass(frozen=True, eq=False)
 class MotionTable:
     """A world's motion and two references.
 
@@ -162,8 +189,7 @@ def save_results(results: Results, folder: Path) -> None:
         for point in curve
     ]
     write_text(folder / "curves.csv", csv_text(["run", "iteration", "frames", "seconds", "aihtr"], points))
-    # Sorted: the same results give the same bytes, whatever order they were read in.
-    write_bytes(folder / "policies.npz", pack_all({name: results.policies[name] for name in sorted(results.policies)}))
+    write_bytes(folder / "policies.npz", pack_policies(results.policies))
     write_bytes(folder / "worlds.npz", _pack_motions(results.motions))
     manifest = {
         "format": RESULTS_FORMAT,
@@ -200,7 +226,7 @@ def load_results(folder: Path) -> Results:
         for row in _rows(folder / "curves.csv"):
             point = CurvePoint(int(row["iteration"]), int(row["frames"]), float(row["seconds"]), float(row["aihtr"]))
             curves.setdefault(runs[int(row["run"])].name, []).append(point)
-        policies = unpack_all(read_bytes(folder / "policies.npz", most=LARGEST))
+        policies = unpack_policies(read_bytes(folder / "policies.npz", most=LARGEST))
         motions = _unpack_motions(read_bytes(folder / "worlds.npz", most=LARGEST))
     return Results(runs, curves, policies, motions, anomalies, manifest)
 
@@ -248,32 +274,81 @@ def _value(text: str) -> Any:
         return text
 
 
+def pack_policies(policies: Mapping[str, Sensed]) -> bytes:
+    """The bytes of a file with many policies, each under a name; sorted, so that the same ones give the same bytes."""
+    names = sorted(policies)
+    sets = [policies[name].sets for name in names]
+    # All in one row of arrays, one after the other: a file with four arrays for each would be mostly headers. A CSR
+    # matrix of m rows has m + 1 row pointers, which begin anew at 0 for each. Every entry stored is a sensor on, or
+    # with `shares` that share.
+    packed = {
+        "names": np.array(names, dtype=np.str_),
+        # `reshape`: no policy at all is still a table of three columns.
+        "shapes": np.array([(*each.shape, each.nnz) for each in sets], dtype=np.int64).reshape(-1, 3),
+        "indices": _joined((each.indices for each in sets), np.int32),
+        "indptr": _joined((each.indptr for each in sets), np.int64),
+        "values": _joined(policies[name].value for name in names),
+    }
+    averaged = np.array([policies[name].averaged for name in names])
+    if averaged.any():
+        packed |= {"shares": _joined((each.data for each in sets), np.float32), "averaged": averaged}
+    return npz_bytes(packed)
+
+
+def unpack_policies(content: bytes) -> dict[str, Sensed]:
+    """What `pack_policies` packed.
+
+    Raises:
+        Exception: the bytes are something else; call it inside `untrusted.decoded`.
+    """
+    stored = load_npz(io.BytesIO(content))
+    names, shapes = stored["names"], stored["shapes"]
+    stored = {"shares": np.ones(len(stored["indices"])), "averaged": np.zeros(len(names))} | stored
+    entries = shapes[:, 2]
+    parts = _apart(stored, indices=entries, shares=entries, indptr=shapes[:, 0] + 1, values=shapes[:, 1])
+    return {
+        str(name): Sensed(whole_csr(share.astype(float if mean else bool), cells, pointer, tuple(shape[:2])), value)
+        for name, shape, mean, (cells, share, pointer, value) in zip(
+            names, shapes.tolist(), stored["averaged"], parts, strict=False
+        )
+    }
+
+
 def _pack_motions(motions: Mapping[str, MotionTable]) -> bytes:
     names = sorted(motions)
     each = [motions[name] for name in names]
-    # All worlds in one row of arrays, one after the other: a file with four arrays per world would be mostly headers.
-    # A CSR matrix of m rows has m + 1 row pointers, which begin anew at 0 for each world.
     packed = {
         "runs": np.array(names, dtype=np.str_),
         "cells": np.array([len(m.qmdp) for m in each], dtype=np.int64),
         "entries": np.array([m.kernel.nnz for m in each], dtype=np.int64),
-        "data": joined(m.kernel.data for m in each),
-        "indices": joined(m.kernel.indices for m in each).astype(np.int32),
-        "indptr": joined(m.kernel.indptr for m in each).astype(np.int32),
-        "qmdp": joined(m.qmdp for m in each),
-        "clocked": joined(m.clocked for m in each),
+        "data": _joined(m.kernel.data for m in each),
+        "indices": _joined((m.kernel.indices for m in each), np.int32),
+        "indptr": _joined((m.kernel.indptr for m in each), np.int32),
+        "qmdp": _joined(m.qmdp for m in each),
+        "clocked": _joined(m.clocked for m in each),
     }
     return npz_bytes(packed)
 
 
 def _unpack_motions(content: bytes) -> dict[str, MotionTable]:
-    stored, streams = load_npz(io.BytesIO(content)), ("data", "indices", "indptr", "qmdp", "clocked")
+    stored = load_npz(io.BytesIO(content))
     cells, entries = stored["cells"], stored["entries"]
-    parts = taken_apart((stored[key] for key in streams), (entries, entries, cells + 1, cells, cells))
+    parts = _apart(stored, data=entries, indices=entries, indptr=cells + 1, qmdp=cells, clocked=cells)
     return {
         str(name): MotionTable(whole_csr(data, indices, indptr, (m, m)), qmdp, clocked)
         for name, m, (data, indices, indptr, qmdp, clocked) in zip(stored["runs"], cells.tolist(), parts, strict=False)
     }
+
+
+def _joined(parts: Iterable[np.ndarray], kind: Any = np.float64) -> np.ndarray:
+    """Arrays `[K_i]` end to end, the form in which many small ones are stored; `[0]` of none."""
+    return np.concatenate([np.zeros(0), *parts]).astype(kind)
+
+
+def _apart(stored: Mapping[str, np.ndarray], **sizes: np.ndarray) -> Iterator[tuple[Any, ...]]:
+    """Of each item its part of every stream of `_joined`, in which item i takes `sizes[i]` places."""
+    # The last sum is the end of the stream, not a place to cut.
+    return zip(*(np.split(stored[name], np.cumsum(size)[:-1]) for name, size in sizes.items()), strict=True)
 
 
 def _rows(file: Path) -> list[dict[str, str]]:

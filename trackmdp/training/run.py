@@ -12,23 +12,30 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from trackmdp import __version__
+from trackmdp.algos.common import make_algorithm
 from trackmdp.arrays import LARGE
+from trackmdp.config import load_run_config
 from trackmdp.config.tree import config_digest
 from trackmdp.errors import UserError
-from trackmdp.policies.policy import Policy
+from trackmdp.policies.policy import Policy, actor_table
 from trackmdp.policies.saved import load_policy
 from trackmdp.solvers import optimal
 from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.solution import Solution
+from trackmdp.training import checkpoint
 from trackmdp.training.callbacks import Callback, Learning, Row, Training
 from trackmdp.training.evaluator import Score, figures, while_collecting
 from trackmdp.training.folders import SUMMARY, check_files, read_summary, write_summary
+from trackmdp.training.inputs import check_inputs
 from trackmdp.training.machine import machine
+from trackmdp.training.state import load_learned
 from trackmdp.untrusted import decoded, read_text
+from trackmdp.world.make import make_problem
 from trackmdp.world.model import Array, World
-from trackmdp.world.tracks import Recorded
+from trackmdp.world.tracks import Problem, Recorded
 
 _PACKAGES = ("torch", "torchrl", "tensordict", "hydra-core", "numpy", "scipy")
 Metrics = dict[str, list[float | int | None]]
@@ -199,3 +206,28 @@ def summarize(
         "machine": machine(),
         "config_sha256": config_digest(config, trainer.folder),
     }
+
+
+def trained(run: str, device: torch.device, *, best: bool = False) -> tuple[Problem, Policy, str]:
+    """Where a run learned, the policy of its newest checkpoint, or of the best one, and what to call it.
+
+    Of a run by blocks it is the run's own.
+
+    Raises:
+        UserError: that is no run, or the checkpoint is missing, damaged or another run's.
+    """
+    cfg, folder = load_run_config(run), Path(run)
+    world = make_problem(cfg)
+    if cfg.partition.block is not None:
+        if best:
+            raise UserError(
+                f"checkpoint=best: expected newest for run={run}, whose blocks have checkpoints of their own"
+            )
+        check_inputs(world, folder)
+        return world, load_run(folder).policy, f"{cfg.algo.name}, by blocks"
+    algorithm = make_algorithm(cfg, world, device)
+    file = folder / "checkpoints" / checkpoint.BEST if best else checkpoint.newest(folder)
+    load_learned(algorithm, cfg, file, device)
+    check_inputs(world, folder)
+    policy = actor_table(world.task, algorithm.actor, device=device)
+    return world, policy, f"{cfg.algo.name}, {file.name}"

@@ -14,7 +14,7 @@ import torch
 
 from tests.training.runs import train
 from trackmdp.app.cli import main
-from trackmdp.app.commands.trained import trained
+from trackmdp.training.run import trained
 from trackmdp.world.model import BoolArray
 
 PROGRAMS = {

@@ -12,12 +12,12 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from trackmdp.app.commands.trained import trained
 from trackmdp.config import EvaluateConfig, FalseAlarmConfig, McapConfig, PlaybackConfig, load_run_config, to_yaml
 from trackmdp.durable import write_json, write_text
 from trackmdp.episodes.batch import Simulation
 from trackmdp.episodes.filtered import simulate_filter
 from trackmdp.episodes.log import EpisodeLog
+from trackmdp.episodes.player import draw_picture
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.episodes.simulate import resimulate, simulate
 from trackmdp.errors import UserError
@@ -25,7 +25,6 @@ from trackmdp.policies.acting import Playback
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import sets_name, write_sets
 from trackmdp.reports.held_out import recorded_page
-from trackmdp.reports.picture import draw_picture
 from trackmdp.solvers import bounds, estimator
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.solve import baseline_policy
@@ -33,6 +32,7 @@ from trackmdp.training.display import make_console, show_held_out, table, with_i
 from trackmdp.training.evaluator import CELL_ALONE, HeldOutEvaluator, figures, make_evaluator
 from trackmdp.training.folders import SUMMARY, check_files, read_summary
 from trackmdp.training.machine import make_device
+from trackmdp.training.run import trained
 from trackmdp.untrusted import decoded
 from trackmdp.world.gridding import said
 from trackmdp.world.make import false_alarm

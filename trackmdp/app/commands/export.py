@@ -15,13 +15,13 @@ import torch
 from torch import Tensor, nn
 
 from trackmdp import __version__
-from trackmdp.app.commands.trained import trained
 from trackmdp.config import ExportConfig
 from trackmdp.durable import write_bytes
 from trackmdp.errors import UserError, require
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import sets_name, write_sets
 from trackmdp.training.display import make_console
+from trackmdp.training.run import trained
 from trackmdp.world.model import BoolArray
 
 FILES = {"torch_export": "policy.pt2", "onnx": "policy.onnx", "sets": "sets.json"}

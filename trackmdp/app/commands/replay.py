@@ -9,13 +9,11 @@ from rich.console import Console
 
 from trackmdp.config import ReplayConfig, TableConfig, world_of
 from trackmdp.episodes.grids import write_layout
-from trackmdp.episodes.page import write_page
+from trackmdp.episodes.page import write_page, write_tables
 from trackmdp.episodes.player import play
-from trackmdp.episodes.reader import EpisodeReader
+from trackmdp.episodes.reader import EpisodeReader, verify
 from trackmdp.episodes.recover import recover
 from trackmdp.episodes.schema import versions_apart
-from trackmdp.episodes.tables import write_tables
-from trackmdp.episodes.verify import verify
 from trackmdp.errors import RunError, UserError
 from trackmdp.training.display import make_console, table
 from trackmdp.world.make import make_problem
