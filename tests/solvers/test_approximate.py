@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 
 from tests.solvers.worlds import all_plans, paper_world, renewal, tiny_worlds
-from trackmdp.solvers import clocked, fcr, lookahead, optimal, qmdp
+from trackmdp.solvers import clocked, lookahead, optimal, qmdp
 from trackmdp.solvers.bounds import clocked_table
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.world.model import World
@@ -23,11 +23,11 @@ def line_world(price: float, t_max: int) -> World:
 
 def test_fcr_by_hand() -> None:
     """From 0: step 1 has 0.6 at 1 and 0.3 at 2; step 2 has 0.81 at 3; step 3 has 0.729 at 0, misses or not."""
-    chains = fcr.solve(line_world(0.5, 2))
+    chains = qmdp.fcr(line_world(0.5, 2))
     assert [np.flatnonzero(on).tolist() for on in chains.dense()[0]] == [[1], [3], [0]]
-    chains = fcr.solve(line_world(0.75, 2))
+    chains = qmdp.fcr(line_world(0.75, 2))
     assert [np.flatnonzero(on).tolist() for on in chains.dense()[0]] == [[], [3], []]
-    in_grid = fcr.solve(line_world(0.75, 2), in_grid=True)
+    in_grid = qmdp.fcr(line_world(0.75, 2), in_grid=True)
     assert [np.flatnonzero(on).tolist() for on in in_grid.dense()[0]] == [[], [3], [0]]
 
 
@@ -37,7 +37,7 @@ def test_fcr_takes_no_notice_of_misses_and_qmdp_does() -> None:
     kernel = world.kernel.toarray()
     kernel[1] = [0.0, 0.9, 0.0, 0.0]
     world = World(kernel, 2, cost=world.cost, safe_cost=world.safe_cost, t_max=1)
-    assert np.flatnonzero(fcr.solve(world).dense()[0, 1]).tolist() == [1]
+    assert np.flatnonzero(qmdp.fcr(world).dense()[0, 1]).tolist() == [1]
     assert np.flatnonzero(qmdp.solve(world).dense()[0, 1]).tolist() == [3]
 
 

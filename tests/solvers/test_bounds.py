@@ -14,7 +14,7 @@ from tests.solvers.worlds import (
     reference_world,
     tiny_worlds,
 )
-from trackmdp.solvers import bounds, clocked, myopic, qmdp
+from trackmdp.solvers import bounds, clocked, qmdp
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.world.model import World
 
@@ -65,8 +65,8 @@ def test_a_probability_equal_to_the_threshold_is_sensed_whatever_its_rounding() 
     kernel[1, 1] = np.nextafter(0.15, 0)
     world = World(kernel, 2, cost=np.full(4, 0.15), safe_cost=0.6, t_max=0)
     assert qmdp.solve(world).dense()[:, 0].tolist() == [[False, True, True, False]] * 4
-    assert myopic.solve(world, threshold=0.15).dense()[:, 0].tolist() == [[False, True, True, False]] * 4
-    assert myopic.solve(world, threshold=0.2).dense()[:, 0].tolist() == [[False, False, True, False]] * 4
+    assert qmdp.myopic(world, threshold=0.15).dense()[:, 0].tolist() == [[False, True, True, False]] * 4
+    assert qmdp.myopic(world, threshold=0.2).dense()[:, 0].tolist() == [[False, False, True, False]] * 4
 
 
 def test_the_in_grid_threshold_senses_what_the_printed_one_leaves() -> None:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from tests.solvers.worlds import best_of_all, tiny_worlds, value_of
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers import bounds, fcr, lookahead, optimal, qmdp
+from trackmdp.solvers import bounds, lookahead, optimal, qmdp
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.recorded import replay
 from trackmdp.solvers.search import located_value
@@ -63,7 +63,7 @@ def test_the_certified_optimum_is_that_of_all_chains(world: World) -> None:
     assert found.value == pytest.approx(best, abs=1e-7)
     assert (bounds.clocked(world) >= best - 1e-9).all()
     assert (bounds.valid(world) >= bounds.clocked(world) - 1e-9).all()
-    for planned in (lookahead.solve(world), qmdp.solve(world), fcr.solve(world)):
+    for planned in (lookahead.solve(world), qmdp.solve(world), qmdp.fcr(world)):
         assert (evaluate(world, planned).value <= best + 1e-9).all()
 
 

@@ -64,7 +64,7 @@ class RandomKConfig(BaselineConfig):
             raise refuse(f"{key}.k", self.k, expected)
 
 
-@choice("baseline", "myopic", makes="trackmdp.solvers.myopic:solve")
+@choice("baseline", "myopic", makes="trackmdp.solvers.qmdp:myopic")
 class MyopicConfig(BaselineConfig):
     """Sense the cells whose belief, conditioned on the misses so far, exceeds a threshold."""
 
@@ -77,8 +77,8 @@ class ClockedConfig(BaselineConfig):
     """Sets read off the clocked bound."""
 
 
-@choice("baseline", "fcr", makes="trackmdp.solvers.fcr:solve")
-@choice("solver", "fcr", makes="trackmdp.solvers.fcr:solve")
+@choice("baseline", "fcr", makes="trackmdp.solvers.qmdp:fcr")
+@choice("solver", "fcr", makes="trackmdp.solvers.qmdp:fcr")
 class FcrConfig(BaselineConfig):
     """First cost reduction: decide as if nothing were observed any more."""
 

@@ -1,11 +1,17 @@
-"""Q_MDP (Littman, Cassandra and Kaelbling 1995): act as if the position were known after every action."""
+"""Rules of thumb, each a threshold on where the target is predicted to be: Q_MDP, first cost reduction, myopic.
+
+Q_MDP (Littman, Cassandra and Kaelbling 1995) acts as if the position were known after every action, and first cost
+reduction (Fuemmeler and Veeravalli 2008, 2011) as if nothing were observed any more.
+"""
 
 from __future__ import annotations
+
+import numpy as np
 
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.cover import Offer
 from trackmdp.solvers.prediction import Prediction, unroll
-from trackmdp.world.model import World
+from trackmdp.world.model import Array, World
 
 
 def solve(world: World, *, in_grid: bool = False) -> PolicyTable:
@@ -18,10 +24,35 @@ def solve(world: World, *, in_grid: bool = False) -> PolicyTable:
         world: the problem.
         in_grid: charge sensors like the reward does, only while the target is in the grid: p_d p_j r >= c_j p_in.
     """
+    # multiplied by the probability of the misses, which need not be divided by then
+    return unroll(world, lambda seen: _offer(world, seen, seen.inside if in_grid else seen.before))
 
-    def worth_it(seen: Prediction) -> Offer:
-        # multiplied by the probability of the misses, which need not be divided by then
-        charged = seen.inside if in_grid else seen.before
-        return Offer(seen.mass * world.detects(seen.cells) * world.reward, world.cost, charged, ties=True)
 
-    return unroll(world, worth_it)
+def fcr(world: World, *, in_grid: bool = False) -> PolicyTable:
+    """Sense j at n misses iff p_d(j) (e_x P^(n+1))_j r >= c_j: the prediction takes no notice of the misses.
+
+    Args:
+        world: the problem.
+        in_grid: charge sensors only while the target is in the grid: p_d p_j r >= c_j p_in.
+    """
+    # seen.mass is e_x P^(n+1) itself: since nothing is taken away at a miss, no probability of misses has to be divided
+    # by.
+    always = np.ones(world.num_cells)
+    return unroll(world, lambda seen: _offer(world, seen, seen.inside if in_grid else always), learns=False)
+
+
+def myopic(world: World, *, threshold: float | None = None) -> PolicyTable:
+    """Sense j iff the probability that it reports the target, given the misses so far, is at least `threshold`.
+
+    Without one, sense where the sensor earns its price in this very step: p_d(j) p_j r >= c_j p_in.
+    """
+    if threshold is None:
+        return solve(world, in_grid=True)
+    # The threshold is as a price, the same of all sensors.
+    limit = np.full(world.total_sensors, threshold)
+    return unroll(world, lambda seen: Offer(seen.mass * world.detects(seen.cells), limit, seen.before, ties=True))
+
+
+def _offer(world: World, seen: Prediction, charged: Array) -> Offer:
+    """What sensing earns at once, and its price where it is `charged`."""
+    return Offer(seen.mass * world.detects(seen.cells) * world.reward, world.cost, charged, ties=True)
