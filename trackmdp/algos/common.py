@@ -49,8 +49,7 @@ def make_algorithm(cfg: TrainConfig, task: Task, device: torch.device) -> Algori
     """The learner that a config names; it is given the task, never the motion."""
     # Rounded up: 100,001 frames in batches of 10,000 are 11 iterations, the last one whole as well.
     batches = -(-cfg.collector.total_frames // cfg.collector.frames_per_batch)
-    made: Algorithm = maker(cfg.algo)(task.task, cfg.algo, iterations=batches, seed=cfg.seed, device=device)
-    return made
+    return maker(cfg.algo)(task.task, cfg.algo, iterations=batches, seed=cfg.seed, device=device)
 
 
 class Checkpointed:

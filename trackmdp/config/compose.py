@@ -65,8 +65,7 @@ def from_hydra(cfg: DictConfig, root: type[C], folder: Path) -> C:
         UserError: an unknown key (even one added with `+`), a missing value, a wrong type, or a broken rule.
     """
     values = composed_values(cfg, root)
-    typed: C = _typed(values, dict(known_options(root, values)), root, folder)
-    return typed
+    return _typed(values, dict(known_options(root, values)), root, folder)
 
 
 def composed_values(cfg: DictConfig, schema: type[Any]) -> dict[str, Any]:

@@ -90,5 +90,4 @@ def _posterior(world: World, predicted: Array, on: BoolArray, reports: BoolArray
     evidence = np.where(reports, report, (1.0 - world.detection) / (1.0 - false_alarm))
     weight = predicted * np.where(on, evidence, 1.0)
     # An exit leaves nothing that could be told of the cell; the episode ends, and the row is not read.
-    posterior: Array = weight / np.maximum(weight.sum(axis=1, keepdims=True), 1e-300)
-    return posterior
+    return weight / np.maximum(weight.sum(axis=1, keepdims=True), 1e-300)

@@ -104,8 +104,7 @@ def _parts(episode: Episode, size: tuple[int, int]) -> list[list[float]]:
     seen = np.where(episode.target == rows * columns, before, episode.target)
     middles = np.stack(np.divmod(seen, columns), axis=1) // _STEP * _STEP + _STEP / 2
     half = np.minimum(size, PART) / 2
-    parts: list[list[float]] = np.clip(middles, half, np.array(size) - half).tolist()
-    return parts
+    return np.clip(middles, half, np.array(size) - half).tolist()
 
 
 def _boxes(used: BoolArray) -> Iterator[tuple[int, int, int, int]]:

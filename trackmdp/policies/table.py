@@ -135,8 +135,7 @@ class PolicyTable:
         if self.sets is None:
             every = np.zeros(self.task.num_cells, dtype=np.int64)
             return used.sum() * self.on(0, every, np.arange(self.task.num_cells))
-        seen: Array = used @ self.seen
-        return seen
+        return used @ self.seen
 
     @cached_property
     def seen(self) -> sparse.csr_array:

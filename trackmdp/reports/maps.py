@@ -161,8 +161,7 @@ def binned(values: Array, size: tuple[int, int]) -> Array:
     begins = [np.arange(0, length, _side(size)) for length in size]
     sums = np.add.reduceat(np.add.reduceat(values.reshape(size), begins[0], axis=0), begins[1], axis=1)
     rows, columns = (np.diff([*begin, length]) for begin, length in zip(begins, size, strict=True))
-    means: Array = sums / (rows[:, None] * columns)
-    return means
+    return sums / (rows[:, None] * columns)
 
 
 def _said(layers: Mapping[str, Array], size: tuple[int, int]) -> str:

@@ -364,8 +364,7 @@ class Tree:
             self._leaves[x] = [*sets_left_out(origin, int(place)), moved.indices[last][left[last]]]
 
     def _hopeful(self, start: IndexArray, bound: Array) -> BoolArray:
-        hopeful: BoolArray = bound > self.best[start] + self._slack
-        return hopeful
+        return bound > self.best[start] + self._slack
 
     def _push(self, choices: Choices) -> None:
         choices = choices.pick(self._hopeful(choices.start, choices.bound))

@@ -142,8 +142,7 @@ class Covering:
 
     def seen(self, on: BoolArray) -> BoolArray:
         """`[E]`, the entries that the pairs `on` `[P]` see."""
-        found: BoolArray = on.astype(np.float64) @ self.covers > 0
-        return found
+        return on.astype(np.float64) @ self.covers > 0
 
     def price(self, cost: Array, charge: Array) -> Array:
         """`[P]`, from the sensors' prices `[S]` and what they are multiplied by `[M]`."""

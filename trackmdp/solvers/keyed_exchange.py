@@ -66,8 +66,7 @@ def _of_pairs(pairs: KeyedPairs, value: Array, visits: Array) -> tuple[Chains, l
 def _entries(chains: Chains) -> IndexArray:
     """`[K]` the most entries that each row has at a step."""
     rows = int(chains.rows.max(initial=-1)) + 1
-    most: IndexArray = np.max([np.bincount(step.rows, minlength=rows) for step in chains.steps], axis=0)
-    return most
+    return np.max([np.bincount(step.rows, minlength=rows) for step in chains.steps], axis=0)
 
 
 def _cut(chains: Chains, part: slice) -> tuple[Chains, list[IndexArray]]:

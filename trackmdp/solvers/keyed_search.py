@@ -43,8 +43,7 @@ def told_bound(pairs: KeyedPairs, value: Array) -> Array | None:
     for choice in range(2**sensors):
         best = np.maximum(best, _worth(pairs, value, [(choice >> number) & 1 for number in numbers]))
     more = max(0.0, float((best - value).max()))
-    bound: Array = value + more * accumulate(pairs.world.kernel, np.ones(pairs.count))
-    return bound
+    return value + more * accumulate(pairs.world.kernel, np.ones(pairs.count))
 
 
 def _numbered(pairs: KeyedPairs) -> tuple[list[IndexArray], int]:
@@ -116,8 +115,7 @@ def cell_bound(world: HiddenWorld) -> Array:
 
 def _of_cells(world: HiddenWorld, bound: Array) -> Array:
     """`[M]` of a bound `[M · H, t_max + 2]`, at n = 0."""
-    mean: Array = bound[:, 0].reshape(world.num_cells, world.modes).mean(axis=1)
-    return mean
+    return bound[:, 0].reshape(world.num_cells, world.modes).mean(axis=1)
 
 
 def solve_keys(world: HiddenWorld, *, start: PolicyTable | None = None, steps: int = 12, rounds: int = 20) -> Solution:

@@ -84,8 +84,7 @@ class Events:
             return at
         # Of (g, g') the gap g becomes the earlier one: with G = 4 and 1 miss, code 2 · 4 + 3 becomes 2 · 4 + 2.
         oldest = self.keys.t_max + 3
-        following: IndexArray = at + gap * (codes // oldest) + states % codes // oldest
-        return following
+        return at + gap * (codes // oldest) + states % codes // oldest
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,7 @@ def make_collector(
     cfg: TrainConfig, problem: Problem, policy: TensorDictModuleBase, device: torch.device, *, done: int = 0
 ) -> BaseCollector:
     """The source of the frames that are left after the first `done`, made by what the config names."""
-    made: BaseCollector = maker(cfg.collector)(problem, policy, cfg.collector, seed=cfg.seed, device=device, done=done)
-    return made
+    return maker(cfg.collector)(problem, policy, cfg.collector, seed=cfg.seed, device=device, done=done)
 
 
 def single(

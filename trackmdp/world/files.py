@@ -146,8 +146,7 @@ def once(read: Callable[..., T], path: str | Path, *how: Hashable) -> T:
     """`read(path, *how)`, kept until the file changes: a run is checked before its folder is made, and asks again."""
     file = Path(path)
     stamp = (file.stat().st_mtime_ns, file.stat().st_size, file.stat().st_ino) if file.is_file() else None
-    found: T = _kept(read, path, how, stamp)
-    return found
+    return _kept(read, path, how, stamp)
 
 
 @lru_cache(maxsize=1)

@@ -130,8 +130,7 @@ def _one_low(count: int, low: float, exit_probability: float) -> Array:
 
 def _in_grid(grid: tuple[int, int], cells: npt.NDArray[np.int64], offsets: _Offsets) -> BoolArray:
     position = np.stack(np.divmod(cells, grid[1]), axis=-1) + offsets
-    inside: BoolArray = np.all((position >= 0) & (position < grid), axis=-1)
-    return inside
+    return np.all((position >= 0) & (position < grid), axis=-1)
 
 
 def _place(

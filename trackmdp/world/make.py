@@ -155,8 +155,7 @@ def make_problem(cfg: WorldConfig) -> Problem:
         return _hidden(cfg)
     if cfg.kernel.is_motion:
         return build_world(cfg)
-    tracks: Recorded = make(cfg.kernel, cfg.grid.size, **of_task(cfg))
-    return tracks
+    return make(cfg.kernel, cfg.grid.size, **of_task(cfg))
 
 
 def _hidden(cfg: WorldConfig) -> HiddenWorld:

@@ -356,5 +356,4 @@ def _expected_excess(t: Array, deviation: float) -> Array:
     scaled = np.clip(t / deviation, -_TAIL, _TAIL)
     density = (np.exp(-0.5 * scaled**2) - math.exp(-0.5 * _TAIL**2)) / math.sqrt(2.0 * math.pi)
     inside = (scaled * (ndtr(scaled) - ndtr(-_TAIL)) + density) / (ndtr(_TAIL) - ndtr(-_TAIL))
-    found: Array = deviation * inside + np.maximum(t - _TAIL * deviation, 0.0)
-    return found
+    return deviation * inside + np.maximum(t - _TAIL * deviation, 0.0)
