@@ -79,14 +79,10 @@ def exchanged_sets(
     if _moves_of_plans(world) > MOST_MOVES:
         return sets
     if isinstance(world, HiddenWorld):
-        best = solve_keys(world, start=PolicyTable(task, sets)).table.sets
-        assert best is not None
-        return best
+        return solve_keys(world, start=PolicyTable(task, sets)).table.sets
     found = [exchange.improve(world, PolicyTable(task, sets)), *([exchange.solve(world)] if anew else [])]
     worth = [evaluate(world, policy).aihtr for policy in found]
-    best = found[int(np.argmax(worth))].sets
-    assert best is not None
-    return best
+    return found[int(np.argmax(worth))].sets
 
 
 def _moves_of_plans(world: Modelled) -> float:

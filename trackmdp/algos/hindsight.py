@@ -179,9 +179,7 @@ class Hindsight:
         if self._buffer.judge is None:
             return sets
         paths, judge = self._buffer.tracks(), self._buffer.judge
-        found = choose_plan(task, paths, learned=PolicyTable(task, sets), discount=cfg.gamma, seed=judge).policy.sets
-        assert found is not None
-        return found
+        return choose_plan(task, paths, learned=PolicyTable(task, sets), discount=cfg.gamma, seed=judge).policy.sets
 
     def _make_learner(self, reach: int) -> _Learner:
         loss = HindsightLoss(

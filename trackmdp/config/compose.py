@@ -75,8 +75,7 @@ def composed_values(cfg: DictConfig, schema: type[Any]) -> dict[str, Any]:
     for key, value in values.items():
         if not isinstance(value, dict) or key not in options(schema):
             continue
-        node = cfg._get_node(key)
-        assert isinstance(node, DictConfig)
+        node: Any = cfg._get_node(key)
         if several(schema, key):
             for name in value:
                 # An entry that no file of the group made, such as that of `+log.mcap.every=2`.

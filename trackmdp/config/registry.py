@@ -49,8 +49,7 @@ def maker(node: ChoiceConfig | type[ChoiceConfig]) -> Callable[..., Any]:
     except (ImportError, AttributeError) as error:
         # A missing third-party module inside ours is a bug or a missing extra, and keeps its own message.
         raise UserError(f"{node.name}: cannot be made, {node.makes}: {error}") from error
-    made: Callable[..., Any] = found
-    return made
+    return found
 
 
 def make(node: ChoiceConfig, *args: Any, **more: Any) -> Any:
@@ -172,9 +171,8 @@ def read_values(name: str) -> dict[str, Any]:
 
 @lru_cache(maxsize=128)  # parsing is nine tenths of composing
 def _load(file: Path, stamp: int) -> dict[str, Any]:  # noqa: ARG001  (the stamp tells a file from what it was before)
-    plain = OmegaConf.to_container(OmegaConf.load(file))
+    plain: Any = OmegaConf.to_container(OmegaConf.load(file))
     # YAML keys may be numbers; dataclass fields are named by texts.
-    assert isinstance(plain, dict), file
     return {str(key): value for key, value in plain.items()}
 
 

@@ -38,7 +38,6 @@ def parse_yaml(text: str | bytes, source: str) -> DictConfig:
         raise UserError(f"{source}: not a config ({said[:200]})") from error
     if key := names_code(plain):
         raise UserError(f"{source}: {key}: a config is data, and names no code to call")
-    assert isinstance(config, DictConfig)
     return config
 
 

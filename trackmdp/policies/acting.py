@@ -70,7 +70,6 @@ class RenewedTable(TensorDictModuleBase):
 
     def renew(self, policy: PolicyTable) -> None:
         """Act as the deterministic `policy` from now on."""
-        assert policy.sets is not None
         sets = in_window(self.task, policy.sets)
         for begin in range(0, len(self.bits), _ROWS_AT_ONCE):
             rows = sets[begin : begin + _ROWS_AT_ONCE].toarray()

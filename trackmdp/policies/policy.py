@@ -201,7 +201,6 @@ class Policy(TensorDictModuleBase, PolicyTable):
 
     def lookup(self, device: torch.device) -> DenseTable | SparseTable:
         """The rows of `sets` on a device."""
-        assert self.sets is not None
         if self._lookup is None or self._lookup.device != device:
             self._lookup = looked_up(self.sets, device)
         return self._lookup

@@ -140,7 +140,6 @@ class PolicyTable:
     @cached_property
     def seen(self) -> sparse.csr_array:
         """`[keys * (t_max + 1), M]`, which cells the sets see, or with what probability: `sets`, but for footprints."""
-        assert self.sets is not None
         return self.sets if self.task.coverage is None else self.task.coverage.seen(self.sets)
 
     @cached_property
