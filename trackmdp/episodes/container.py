@@ -12,6 +12,7 @@ from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from io import BytesIO
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -158,15 +159,11 @@ class Container:
             raise Damaged(f"{kind} {name}")
         return content
 
-    def chunks_between(self, begin: int, end: int) -> list[ChunkIndex]:
+    def chunks_between(self, begin: int, end: int) -> Iterator[ChunkIndex]:
         """The chunks with messages from log time `begin` to `end`, in their order; logs are in order of time."""
         # Chunks follow each other in time, so that the first one that ends at `begin` or later is found by bisection.
-        found = []
-        for chunk in self.chunks[bisect_left(self._ends, begin) :]:
-            if chunk.message_start_time > end:
-                break
-            found.append(chunk)
-        return found
+        later = self.chunks[bisect_left(self._ends, begin) :]
+        return takewhile(lambda chunk: chunk.message_start_time <= end, later)
 
     def messages(self, chunk: ChunkIndex) -> list[Message]:
         """All messages of a chunk, its checksum checked."""

@@ -7,7 +7,7 @@ import json
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -139,37 +139,32 @@ def _repeated(runs: Iterable[FinishedRun]) -> list[Anomaly]:
     ]
 
 
-def _mixed(runs: Sequence[FinishedRun], summaries: Sequence[Mapping[str, Any]]) -> list[Anomaly]:
+def _mixed(runs: Sequence[FinishedRun], summaries: Sequence[Mapping[str, Any]]) -> Iterator[Anomaly]:
     """Runs made with other versions than most."""
     # Exact results are compared to many digits, and other versions of NumPy or torch round and draw otherwise.
     texts = [json.dumps(summary.get("versions", {}), sort_keys=True) for summary in summaries]
     if len(set(texts)) < 2:
-        return []
+        return
     usual = json.loads(Counter(texts).most_common(1)[0][0])
-    found = []
     for run, text in zip(runs, texts, strict=True):
         own = json.loads(text)
         other = [f"{k} {own.get(k, 'unknown')}, most have {usual.get(k)}" for k in usual if own.get(k) != usual.get(k)]
         if other:
-            found.append(Anomaly(run.name, f"other versions: {'; '.join(other)}"))
-    return found
+            yield Anomaly(run.name, f"other versions: {'; '.join(other)}")
 
 
-def _missing_seeds(grouped: Study) -> list[Anomaly]:
+def _missing_seeds(grouped: Study) -> Iterator[Anomaly]:
     """Seeds, or all runs, that a method has in one world and not in another."""
-    found = []
     for method in grouped.methods:
         groups = {world: grouped.of(world, method) for world in grouped.worlds}
         seeds = {run.seed for runs in groups.values() for run in runs}
         for world, runs in groups.items():
             missing = sorted(seeds - {run.seed for run in runs})
             if runs and missing:
-                found.append(Anomaly(f"{method}, {world}", f"seed {', '.join(map(str, missing))} missing"))
+                yield Anomaly(f"{method}, {world}", f"seed {', '.join(map(str, missing))} missing")
         without = [world for world, runs in groups.items() if not runs]
         if without:
-            text = f"no run in {len(without)} of {len(groups)} worlds: {'; '.join(without)}"
-            found.append(Anomaly(method, text))
-    return found
+            yield Anomaly(method, f"no run in {len(without)} of {len(groups)} worlds: {'; '.join(without)}")
 
 
 def _policies(folder: Path, grouped: Study) -> tuple[dict[str, Sensed], list[Anomaly]]:

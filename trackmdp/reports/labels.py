@@ -6,7 +6,7 @@ Lines that cannot be told apart, because they coincide, are named one under the 
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -87,9 +87,8 @@ def spread(wanted: Sequence[float], tall: Array) -> Array:
     return np.clip(fitted, min(bottom, top), top) - close
 
 
-def _named(axes: Axes) -> list[_Named]:
+def _named(axes: Axes) -> Iterator[_Named]:
     """The lines of the axes that end in sight."""
-    found = []
     for handle, name in zip(*axes.get_legend_handles_labels(), strict=True):
         # an errorbar's first part is its line
         line: Any = handle[0] if isinstance(handle, tuple) else handle
@@ -102,11 +101,10 @@ def _named(axes: Axes) -> list[_Named]:
         end = to_parts.transform(known[-1:])[0, 1]
         if -0.01 <= end <= 1.01:  # else in the other part of broken axes
             heights[-1] = end
-            found.append(_Named(axes, name, line.get_color(), heights, (float(known[-1, 0]), float(known[-1, 1]))))
-    return found
+            yield _Named(axes, name, line.get_color(), heights, (float(known[-1, 0]), float(known[-1, 1])))
 
 
-def _groups(lines: Sequence[_Named], first: Sequence[str]) -> list[list[_Named]]:
+def _groups(lines: Iterable[_Named], first: Sequence[str]) -> list[list[_Named]]:
     """The lines from the highest end to the lowest, those that coincide all the way together."""
     groups: list[list[_Named]] = []
     for named in sorted(lines, key=lambda line: line.name not in first):

@@ -7,6 +7,8 @@ solves a linear system as V(x) does without false alarms. The safe action confir
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from scipy import sparse
 
@@ -85,11 +87,10 @@ def check_alarms(world: Problem, false_alarm: float) -> World:
     return world
 
 
-def _ranked(world: World, policy: PolicyTable) -> list[tuple[IndexArray, IndexArray]]:
+def _ranked(world: World, policy: PolicyTable) -> Iterator[tuple[IndexArray, IndexArray]]:
     """For each n the sets as (row pointer `[M + 1]`, cells), in each row the likeliest cell first."""
     m = world.num_cells
     rows, cells = np.divmod(np.arange(m * m), m)
-    ranked = []
     for seen in followed(world, policy):
         on = policy.on(seen.n, rows, cells) > 0
         mass = np.zeros((m, m))
@@ -97,8 +98,7 @@ def _ranked(world: World, policy: PolicyTable) -> list[tuple[IndexArray, IndexAr
         entry = np.flatnonzero(on)
         order = entry[np.lexsort((cells[entry], -mass.ravel()[entry], rows[entry]))]
         pointer = np.concatenate([[0], np.cumsum(np.bincount(rows[entry], minlength=m))])
-        ranked.append((pointer, cells[order]))
-    return ranked
+        yield pointer, cells[order]
 
 
 def _reports(

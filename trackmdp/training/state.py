@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -182,14 +182,12 @@ def _check(state: Mapping[str, Any], cfg: TrainConfig, file: Path) -> None:
             raise ValueError(f"parts {sorted(map(str, state.keys() ^ _PARTS))} missing or too many")
 
 
-def _weights(state: Mapping[str, Any], prefix: str = "") -> list[tuple[str, torch.Tensor]]:
+def _weights(state: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, torch.Tensor]]:
     """The floating-point tensors of an algorithm's state that belong to networks."""
-    found: list[tuple[str, torch.Tensor]] = []
     for name, value in state.items():
         if name in _NOT_WEIGHTS:
             continue
         if isinstance(value, Mapping):
-            found += _weights(value, f"{prefix}{name}.")
+            yield from _weights(value, f"{prefix}{name}.")
         elif isinstance(value, torch.Tensor) and value.is_floating_point():
-            found.append((f"{prefix}{name}", value))
-    return found
+            yield f"{prefix}{name}", value

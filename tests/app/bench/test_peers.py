@@ -46,9 +46,9 @@ def learned(*regrets: float) -> Learned:
 def test_settled_is_when_the_regret_stays_at_the_goal_and_first_when_it_was_there_once() -> None:
     way = learned(0.5, 0.01, 0.3, 0.02, 0.01)
     assert (way.reached(settled=False), way.reached(settled=True)) == ((2.0, 10), (4.0, 30))
-    assert learned(0.01, 0.03).reached(settled=True) is None
+    assert learned(0.01, 0.03).reached(settled=True) == (None, None)
     assert learned(0.01, 0.03).reached(settled=False) == (1.0, 0)
-    assert learned(0.4).reached(settled=False) is None
+    assert learned(0.4).reached(settled=False) == (None, None)
 
 
 @pytest.mark.slow

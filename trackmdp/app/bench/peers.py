@@ -6,7 +6,7 @@ import math
 import sys
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,13 +33,13 @@ class Learned:
     curve: Sequence[tuple[float, int, float]]
     usage: Usage
 
-    def reached(self, *, settled: bool) -> tuple[float, int] | None:
-        """Seconds and env steps at which the regret was `GOAL` or less: at first, or `settled` to the end."""
+    def reached(self, *, settled: bool) -> tuple[float, int] | tuple[None, None]:
+        """Seconds and env steps at which the regret was `GOAL` or less: first, or `settled` to the end. Or neither."""
         within = [regret <= GOAL for _, _, regret in self.curve]
         # "Settled": no later policy is worse than the goal. A curve that touches the goal once by luck has not
         # learned.
         places = [place for place, found in enumerate(within) if (all(within[place:]) if settled else found)]
-        return self.curve[places[0]][:2] if places else None
+        return self.curve[places[0]][:2] if places else (None, None)
 
 
 def peers(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[dict[str, Any]]:
@@ -125,24 +125,17 @@ def _from_start(points: Sequence[tuple[float, int, float]], usage: Usage) -> lis
 
 
 def _row(run: Learned, ours: Learned) -> dict[str, Any]:
-    def seconds(of: Learned, settled: bool) -> float | None:
-        found = of.reached(settled=settled)
-        return None if found is None else found[0]
-
-    settled = run.reached(settled=True)
-    mine, theirs = seconds(ours, True), seconds(run, True)
+    mine, (theirs, steps) = ours.reached(settled=True)[0], run.reached(settled=True)
     return {
         "part": "peers",
         "learner": run.learner,
         "seed": run.seed,
         "goal": GOAL,
-        "first_seconds": seconds(run, False),
+        "first_seconds": run.reached(settled=False)[0],
         "settled_seconds": theirs,
-        "settled_steps": None if settled is None else settled[1],
+        "settled_steps": steps,
         "times_ours": theirs / mine if mine and theirs else None,
         "last_regret": run.curve[-1][2],
-        "wall_seconds": run.usage.wall_seconds,
-        "cpu_seconds": run.usage.cpu_seconds,
-        "peak_mib": run.usage.peak_mib,
+        **asdict(run.usage),
         "curve": {"seconds": [row[0] for row in run.curve], "regret": [row[2] for row in run.curve]},
     }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -32,9 +33,8 @@ Row = dict[str, Any]
 _EPISODES = 100
 
 
-def env_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[Row]:
+def env_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator[Row]:
     """Steps with random subsets drawn inside the loop, resets included, nothing stored; `grid.window` as it is set."""
-    rows = []
     for envs in cfg.batch_sizes:
         env = TrackEnv(world, envs, seed=cfg.seed, device=device)
         policy = RandomSubset(world.num_sensors, generator(cfg.seed, "benchmark", device=device))
@@ -48,18 +48,16 @@ def env_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[
                 _, state = env.step_and_maybe_reset(policy(state))
             return 20 * env.num_envs
 
-        rows.append({"part": "env", "envs": envs, **rate(step, cfg.seconds, device)})
-    return rows
+        yield {"part": "env", "envs": envs, **rate(step, cfg.seconds, device)}
 
 
-def collector_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[Row]:
+def collector_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator[Row]:
     """Frames of the collector that training uses, 32 steps a batch, for policies from free to a network."""
     policies: dict[str, TensorDictModuleBase] = {
         "random": RandomSubset(world.num_sensors, generator(cfg.seed, "benchmark", device=device)),
         "all_on": Policy.all_on(world),
         "actor": make_actor(world.task, 128, 0.0).to(device),
     }
-    rows = []
     for name, policy in policies.items():
         for envs in (64, 1024):
             env = TrackEnv(world, envs, seed=cfg.seed, device=device)
@@ -81,17 +79,15 @@ def collector_speed(cfg: BenchmarkConfig, world: World, device: torch.device) ->
 
             figures = rate(batch, cfg.seconds, device)
             collector.shutdown()
-            rows.append({"part": "collector", "policy": name, "envs": envs, **figures})
-    return rows
+            yield {"part": "collector", "policy": name, "envs": envs, **figures}
 
 
-def train_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[Row]:
+def train_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator[Row]:
     """Frames per second of collecting and learning, for each algorithm as its config stands.
 
     Each is run for five times `seconds`, or to its end where that comes first (`whole`): then the updates that follow
     the last frame count as well.
     """
-    rows = []
     for name in GROUPS["algo"]:
         train = compose("train", {"algo": name, "seed": cfg.seed, "threads": cfg.threads})
         # Every algorithm in the world of this benchmark, with its own options as shipped.
@@ -108,14 +104,12 @@ def train_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> lis
         spent, used = time.perf_counter() - wall, time.process_time() - cpu
         collector.shutdown()
         figures = {"per_second": frames / spent, "cpu_us_each": 1e6 * used / frames}
-        rows.append({"part": "train", "algo": name, "whole": done == algorithm.iterations, **figures})
-    return rows
+        yield {"part": "train", "algo": name, "whole": done == algorithm.iterations, **figures}
 
 
-def log_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[dict[str, Any]]:
+def log_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator[Row]:
     """Steps per second of recording, writing, reading and decoding; bytes of a step; belief and policy are in it."""
     policies = {"qmdp": as_policy(world, qmdp.solve(world)), "random_k": Policy.random_k(world, 5)}
-    rows = []
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "episodes.mcap"
         for name, policy in policies.items():
@@ -127,7 +121,12 @@ def log_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[
             episodes = list(simulate(world, policy, _EPISODES, seed=cfg.seed).complete())
 
             def write(policy: Policy = policy, episodes: list[Episode] = episodes) -> int:
-                return _write(file, cfg, world, policy, episodes)
+                writer = EpisodeWriter.of(file, world, facts={"seed": str(cfg.seed)}, config=to_yaml(cfg))
+                writer.add_policy({"label": "benchmark"}, policy)
+                for episode in episodes:
+                    writer.add(episode)
+                writer.finish()
+                return sum(map(len, episodes))
 
             def read() -> int:
                 with EpisodeReader(file) as reader:
@@ -138,14 +137,4 @@ def log_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[
             size = file.stat().st_size / steps
             for what, work in (("record", record), ("write", write), ("read", read)):
                 figures = rate(work, cfg.seconds, device)
-                rows.append({"part": "log", "policy": name, "what": what, "bytes_per_step": size, **figures})
-    return rows
-
-
-def _write(file: Path, cfg: BenchmarkConfig, world: World, policy: Policy, episodes: list[Episode]) -> int:
-    writer = EpisodeWriter.of(file, world, facts={"seed": str(cfg.seed)}, config=to_yaml(cfg))
-    writer.add_policy({"label": "benchmark"}, policy)
-    for episode in episodes:
-        writer.add(episode)
-    writer.finish()
-    return sum(map(len, episodes))
+                yield {"part": "log", "policy": name, "what": what, "bytes_per_step": size, **figures}
