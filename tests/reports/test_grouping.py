@@ -9,7 +9,7 @@ import pytest
 
 from tests.helpers import train_config
 from trackmdp.config import to_dict
-from trackmdp.reports.finished import flatten
+from trackmdp.config.tree import flatten
 from trackmdp.reports.grouping import study, world_key
 from trackmdp.reports.results import FIGURES, FinishedRun
 from trackmdp.reports.summaries import methods_table, runs_table

@@ -13,6 +13,7 @@ from hydra.plugins.config_source import ConfigLoadError, ConfigResult, ConfigSou
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 
+from trackmdp.config.tree import at_key
 from trackmdp.config.untrusted import MAX_BYTES, parse_yaml
 from trackmdp.errors import UserError
 from trackmdp.untrusted import read_text
@@ -116,8 +117,5 @@ def _refuse_settings(config: DictConfig, package: str, file: Path) -> None:
     for name in reversed(prefix):
         plain = {name: plain}
     for key, why in _FORBIDDEN.items():
-        found: object = plain
-        for name in key.split("."):
-            found = found.get(name) if isinstance(found, dict) else None
-        if found:
+        if at_key(plain, key):
             raise UserError(f"{file}: sets {key}, which is not taken from a file ({why})")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -106,9 +107,7 @@ class Default:
         self.key, self.command = key, command
 
     def __repr__(self) -> str:
-        value = compose(self.command)
-        for name in self.key.split("."):
-            value = getattr(value, name)
+        value = attrgetter(self.key)(compose(self.command))
         return repr(getattr(value, "name", value))
 
 

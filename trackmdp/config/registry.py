@@ -22,6 +22,7 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -42,14 +43,11 @@ def maker(node: ChoiceConfig | type[ChoiceConfig]) -> Callable[..., Any]:
     """
     module, _, attribute = node.makes.partition(":")
     try:
-        found: Any = importlib.import_module(module)
         # The attribute may be a method: `trackmdp.policies.policy:Policy.random_k`.
-        for name in attribute.split("."):
-            found = getattr(found, name)
+        return attrgetter(attribute)(importlib.import_module(module))
     except (ImportError, AttributeError) as error:
         # A missing third-party module inside ours is a bug or a missing extra, and keeps its own message.
         raise UserError(f"{node.name}: cannot be made, {node.makes}: {error}") from error
-    return found
 
 
 def make(node: ChoiceConfig, *args: Any, **more: Any) -> Any:

@@ -48,6 +48,14 @@ def to_dict(cfg: Any, *, named: bool = True) -> dict[str, Any]:
     return plain
 
 
+def flatten(plain: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
+    """Every option by its dotted key."""
+    found: dict[str, Any] = {}
+    for key, value in plain.items():
+        found |= flatten(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return found
+
+
 def to_yaml(cfg: Any) -> str:
     """The text of a run's `config.yaml`."""
     return OmegaConf.to_yaml(OmegaConf.create(to_dict(cfg)))
@@ -226,7 +234,7 @@ def continued(cfg: TrainConfig, folder: Path, words: Sequence[str]) -> TrainConf
         if not any(key == allowed or key.startswith(f"{allowed}.") for allowed in CHANGEABLE):
             old, new = ("null" if each is None else each for each in (old, new))
             raise UserError(f"{key}: the run has {old}, typed was {new}; it cannot change on resume")
-        _put(saved, key, _look(typed, key))
+        _put(saved, key, at_key(typed, key))
     # Once more: a new budget may break a rule against an option that was not typed, such as frames per batch.
     resumed: TrainConfig = build_config(saved, TrainConfig)
     validate(resumed)
@@ -239,8 +247,8 @@ def key_of(word: str) -> str:
     return word.lstrip("+~").split("=", 1)[0].split("@")[0].replace("/", ".")
 
 
-def _look(plain: Any, key: str) -> Any:
-    """The value at a dotted key; None where the run chose another option of a group, which has no such key."""
+def at_key(plain: Any, key: str) -> Any:
+    """The value at a dotted key of nested dicts; None where there is no such key, as of another choice of a group."""
     for name in key.split("."):
         plain = plain.get(name) if isinstance(plain, dict) else None
     return plain
@@ -265,7 +273,7 @@ def _put(plain: dict[str, Any], key: str, value: Any) -> None:
 
 def _told(plain: dict[str, Any], key: str) -> Any:
     """The value at a dotted key, of choices their names: their own options are compared where those are typed."""
-    value = _look(plain, key)
+    value = at_key(plain, key)
     if isinstance(value, dict) and several(TrainConfig, key):
         return listed(value)
     return value["name"] if isinstance(value, dict) and "name" in value else value

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from trackmdp.config.tree import plain_mapping
+from trackmdp.config.tree import flatten, plain_mapping
 from trackmdp.config.untrusted import MAX_BYTES
 from trackmdp.errors import UserError
 from trackmdp.policies.saved import load_policy
@@ -68,14 +68,6 @@ def plain_config(place: Path) -> Mapping[str, Any]:
     """
     file = place / "config.yaml"
     return plain_mapping(read_text(file, most=MAX_BYTES), str(file))
-
-
-def flatten(plain: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
-    """Every option by its dotted key."""
-    found: dict[str, Any] = {}
-    for key, value in plain.items():
-        found |= flatten(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
-    return found
 
 
 def _check_settings(settings: Mapping[str, Any]) -> None:

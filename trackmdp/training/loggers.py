@@ -15,6 +15,7 @@ from typing import Any
 from trackmdp.config import CsvConfig, MlflowConfig, TrainConfig, WandbConfig, to_dict, to_yaml
 from trackmdp.config.loggers import RowsConfig
 from trackmdp.config.registry import maker
+from trackmdp.config.tree import flatten
 from trackmdp.durable import own_folder, reopen, sync
 from trackmdp.errors import Preempted, RunError
 from trackmdp.training.callbacks import Callback, Row, Training
@@ -282,7 +283,7 @@ class MlflowLogger(_Tracker):
         number = found.experiment_id if found else self._client.create_experiment(self._cfg.experiment, place)
         run = self._client.create_run(number, run_name=self._folder.resolve().name)
         self._id = run.info.run_id
-        options = [Param(key, str(value)) for key, value in _flat(to_dict(trainer.config))]
+        options = [Param(key, str(value)) for key, value in flatten(to_dict(trainer.config)).items()]
         for begin in range(0, len(options), 100):  # no more are taken at a time
             self._client.log_batch(self._id, params=options[begin : begin + 100])
 
@@ -316,12 +317,3 @@ def _answering(name: str) -> Iterator[None]:
     except Exception as error:  # whatever the package, its network or its database raises
         reason = " ".join(str(error).split()) or type(error).__name__
         raise RunError(f"log=[{name}]: {reason}") from error
-
-
-def _flat(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Options by their dotted names."""
-    for key, value in node.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
