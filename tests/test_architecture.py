@@ -20,7 +20,6 @@ BEFORE_ALL = (
     "seeding",
     "durable",
     "untrusted",
-    "arrays",
     "statistics",
     "machine",
     "signals",

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from trackmdp import untrusted
-from trackmdp.arrays import load_npy
 from trackmdp.durable import create, own_folder, reopen, whole_file
 from trackmdp.errors import UserError
+from trackmdp.world.files import load_npy
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from tensordict import TensorDict
 
-from trackmdp.arrays import load_npy
 from trackmdp.episodes import schema
 from trackmdp.episodes.container import Container, Damaged, Message
 from trackmdp.episodes.episode import Episode, first_difference
@@ -24,7 +23,7 @@ from trackmdp.episodes.simulate import resimulate
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.untrusted import reason
-from trackmdp.world.files import csr_in
+from trackmdp.world.files import csr_in, load_npy
 from trackmdp.world.model import BoolArray, World
 from trackmdp.world.modes import HiddenWorld, Modelled
 

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from mcap.writer import Writer
 
-from trackmdp.arrays import npy_bytes
 from trackmdp.durable import create, sync, sync_folder
 from trackmdp.episodes import messages, schema
 from trackmdp.episodes.episode import Episode
@@ -20,7 +19,7 @@ from trackmdp.episodes.grids import grid_messages
 from trackmdp.episodes.schema import LoggedRun, time_of
 from trackmdp.policies.policy import Policy
 from trackmdp.world.coverage import Coverage
-from trackmdp.world.files import csr_bytes, csr_in
+from trackmdp.world.files import csr_bytes, csr_in, npy_bytes
 from trackmdp.world.modes import HiddenWorld, Modelled
 
 FLUSH_STEPS = 100

@@ -14,13 +14,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from trackmdp.arrays import LARGE, load_npz, npz_bytes
 from trackmdp.durable import write_bytes, write_json
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.untrusted import decoded, opened, read_object
 from trackmdp.world.coverage import Coverage
-from trackmdp.world.files import whole_csr
+from trackmdp.world.files import LARGE, load_npz, npz_bytes, whole_csr
 from trackmdp.world.model import Array, Task
 
 LISTED_CELLS = 20_000

@@ -18,11 +18,10 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from trackmdp.arrays import load_npz, npz_bytes
 from trackmdp.durable import csv_text, write_bytes, write_text
 from trackmdp.errors import UserError
 from trackmdp.untrusted import decoded, read_bytes, read_object, read_text, sealed, unsealed
-from trackmdp.world.files import whole_csr
+from trackmdp.world.files import load_npz, npz_bytes, whole_csr
 from trackmdp.world.model import Array
 
 # Counted up when a file changes its meaning: results of another format are then not taken for stored results.

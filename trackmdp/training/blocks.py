@@ -16,7 +16,6 @@ from tempfile import TemporaryDirectory
 
 from rich.console import Console
 
-from trackmdp.arrays import npy_bytes
 from trackmdp.config import TrainConfig, load_run_config
 from trackmdp.config.learning import AlgoConfig, file_of_classes
 from trackmdp.config.partition import PartitionConfig
@@ -40,6 +39,7 @@ from trackmdp.training.run import complete, load_run
 from trackmdp.training.state import Position, identity
 from trackmdp.training.trainer import Trainer
 from trackmdp.untrusted import decoded
+from trackmdp.world.files import npy_bytes
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Problem
 

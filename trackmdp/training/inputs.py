@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from trackmdp.arrays import LARGE, npy_bytes
 from trackmdp.config import TrainConfig
 from trackmdp.config.learning import file_of_classes
 from trackmdp.config.tree import config_text
@@ -18,7 +17,7 @@ from trackmdp.durable import write_bytes, write_text
 from trackmdp.errors import UserError
 from trackmdp.solvers.alike import cell_classes
 from trackmdp.untrusted import parse_json, read_bytes
-from trackmdp.world.files import csr_bytes
+from trackmdp.world.files import LARGE, csr_bytes, npy_bytes
 from trackmdp.world.model import Array
 from trackmdp.world.track_files import recording_bytes
 from trackmdp.world.tracks import Problem, Recorded

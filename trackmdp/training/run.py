@@ -16,7 +16,6 @@ import torch
 
 from trackmdp import __version__
 from trackmdp.algos.common import make_algorithm
-from trackmdp.arrays import LARGE
 from trackmdp.config import load_run_config
 from trackmdp.config.tree import config_digest
 from trackmdp.errors import UserError
@@ -33,6 +32,7 @@ from trackmdp.training.inputs import check_inputs
 from trackmdp.training.machine import machine
 from trackmdp.training.state import load_learned
 from trackmdp.untrusted import decoded, read_text
+from trackmdp.world.files import LARGE
 from trackmdp.world.make import make_problem
 from trackmdp.world.model import Array, World
 from trackmdp.world.tracks import Problem, Recorded

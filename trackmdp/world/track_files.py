@@ -8,10 +8,9 @@ from typing import Any, BinaryIO, TypeAlias
 
 import numpy as np
 
-from trackmdp.arrays import LARGE, load_npz, npz_bytes
 from trackmdp.errors import UserError, require
 from trackmdp.untrusted import decoded, opened
-from trackmdp.world.files import column_names, once
+from trackmdp.world.files import LARGE, column_names, load_npz, npz_bytes, once
 from trackmdp.world.gridding import Gridding, to_tracks
 from trackmdp.world.positions import ALIASES, LONGEST, Positions, geojson, gpx, mot, position_table, sumo
 from trackmdp.world.tracks import Recorded, Tracks, check_tracks, read_tracks
