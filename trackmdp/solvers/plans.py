@@ -157,10 +157,9 @@ class Plans:
             mass = self.pushed(plan, step)
             first = plan[step - 1] ^ FLIPPED[self.ranks(step, plan, mass)]
             # The sets before the flip are held in these sweeps, so that they need no more than the mass that is left.
-            later = [np.repeat(on, first.shape[1], axis=1) for on in plan[step:]]
-            later = self.ascend(later, self.missing(step, first, mass), step, LATER_SWEEPS)
-            held = [np.repeat(on, first.shape[1], axis=1) for on in plan[: step - 1]]
-            plan, worth = self.better(plan, worth, self.ascend([*held, first, *later], self.mass, 0, ALL_SWEEPS))
+            later = self.ascend(plan[step:], self.missing(step, first, mass), step, LATER_SWEEPS)
+            candidates = self.ascend([*plan[: step - 1], first, *later], self.mass, 0, ALL_SWEEPS)
+            plan, worth = self.better(plan, worth, candidates)
         return [self._together(t, on)[:, 0] > 0 for t, on in enumerate(plan, start=1)]
 
     def better(self, plan: list[BoolArray], worth: Array, candidates: list[BoolArray]) -> tuple[list[BoolArray], Array]:
@@ -169,9 +168,10 @@ class Plans:
         best = found.argmax(axis=1)[:, None]
         reached = np.take_along_axis(found, best, axis=1)
         gains = reached > worth + 1e-10 * (1.0 + np.abs(worth))
+        each = (np.broadcast_to(on, (len(on), found.shape[1])) for on in candidates)
         chosen = [
             np.where(gains[rows], np.take_along_axis(on, best[rows], axis=1), old)
-            for on, old, rows in zip(candidates, plan, self.rows[1:], strict=True)
+            for on, old, rows in zip(each, plan, self.rows[1:], strict=True)
         ]
         return chosen, np.where(gains, reached, worth)
 
@@ -184,7 +184,7 @@ class Plans:
 
     def ranks(self, step: int, plan: list[BoolArray], mass: Array) -> IndexArray:
         """`[E]` how near its group's choice at `step` is to the other one, 0 the nearest; SINGLES: never."""
-        gain = self.reports[step] * (self.detected[step] - self.undetected(plan[step:], step)[0])
+        gain = self.gains(plan[step - 1 :], step - 1)[0]
         gained, there = self._together(step, mass * gain), self._together(step, mass)
         row = self.rows[step][self.first[step]]
         price = self.price[step] * (self.sums[step] @ mass)[row]
@@ -196,15 +196,26 @@ class Plans:
             possible &= allowed[:, 0]
         return np.where(possible, np.minimum(rank, SINGLES), SINGLES)[self.group[step]]
 
-    def undetected(self, sets: list[BoolArray], since: int) -> list[Array]:
-        """W_t `[E, C]` per layer from `since` on: what follows when the target is there, missed, and `sets` go on."""
+    def undetected(self, t: int, on: BoolArray, later: Array, gain: Array) -> Array:
+        """W_t `[E, C]` on the layer before step t, when the set `on` is followed by `later`, W_t+1, where it misses."""
         # The recursion of `InnerProblem.undetected`, for a column of each candidate.
-        later = [self.missed]
-        for t, on in zip(range(self.length, since, -1), reversed(sets), strict=True):
-            paid = self.sums[t] @ (on * self.cost[t])
-            gross = self.moves[t] @ (later[0] + np.where(on, self.reports[t] * (self.detected[t] - later[0]), 0.0))
-            later.insert(0, gross - paid[self.rows[t - 1]] * self.stay[t - 1])
-        return later
+        paid = self.sums[t] @ (on * self.cost[t])
+        gross = self.moves[t] @ (later + np.where(on, gain, 0.0))
+        worth: Array = gross - paid[self.rows[t - 1]] * self.stay[t - 1]
+        return worth
+
+    def gain(self, t: int, later: Array) -> Array:
+        """`[E, C]` what sensing a target that is there at step t gains over `later`."""
+        gained: Array = self.reports[t] * (self.detected[t] - later)
+        return gained
+
+    def gains(self, sets: list[BoolArray], since: int) -> list[Array]:
+        """`gain` at each step after `since`, when `sets` go on; the first of these is not looked at."""
+        later, gains = self.missed, [self.gain(self.length, self.missed)]
+        for t, on in zip(range(self.length, since + 1, -1), reversed(sets), strict=False):
+            later = self.undetected(t, on, later, gains[0])
+            gains.insert(0, self.gain(t - 1, later))
+        return gains
 
     def missing(self, t: int, on: BoolArray, mass: Array) -> Array:
         """`[E, C]` the `mass` at step t that is still undetected after the set `on`."""
@@ -212,22 +223,25 @@ class Plans:
 
     def worth(self, sets: list[BoolArray]) -> Array:
         """`[K, C]` what whole plans earn from each located cell."""
-        return self.sums[0] @ (self.mass * self.undetected(sets, 0)[0])
+        later = self.missed
+        for t, on in zip(range(self.length, 0, -1), reversed(sets), strict=True):
+            later = self.undetected(t, on, later, self.gain(t, later))
+        return self.sums[0] @ (self.mass * later)
 
     def ascend(self, sets: list[BoolArray], mass: Array, since: int, sweeps: int) -> list[BoolArray]:
         """At most `sweeps` times, the best set at each step after `since` given the others; see `InnerProblem.ascend`.
 
         Args:
-            sets: `[E, C]` per step after `since`.
+            sets: `[E, C]` or, where all candidates have the same, `[E, 1]` per step after `since`.
             mass: `[E, C]` or `[E, 1]`, undetected mass on the layer `since`.
             since: the step whose set, and those before it, are held.
             sweeps: passes over the steps.
         """
         for _ in range(sweeps):
-            later, now, chosen = self.undetected(sets, since), mass, []
-            for t in range(since + 1, self.length + 1):
+            now, chosen = mass, []
+            for t, gain in enumerate(self.gains(sets, since), start=since + 1):
                 now = self.back[t] @ now
-                on = self.best(t, now, self.reports[t] * (self.detected[t] - later[t - since]))
+                on = self.best(t, now, gain)
                 chosen.append(on)
                 now = self.missing(t, on, now)
             if all((new == old).all() for new, old in zip(chosen, sets, strict=True)):
