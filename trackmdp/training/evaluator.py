@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
@@ -21,8 +20,7 @@ from trackmdp.solvers.keyed import averaged
 from trackmdp.solvers.keyed_search import mode_bound
 from trackmdp.solvers.path_exchange import choose_plan
 from trackmdp.solvers.recorded import ReplayedTracks, replay
-from trackmdp.statistics import MeanInterval
-from trackmdp.world.model import Task, World
+from trackmdp.world.model import World
 from trackmdp.world.modes import HiddenWorld, Modelled
 from trackmdp.world.tracks import Problem, Recorded, Tracks
 
@@ -60,7 +58,7 @@ class Score:
         return f"regret per step {low} to the best policy known, {high} to the upper bound"
 
 
-class Evaluator(ABC):
+class Evaluator:
     """Scores learned, fixed and solved policies alike.
 
     Attributes:
@@ -71,15 +69,15 @@ class Evaluator(ABC):
         qmdp: figures of the Q_MDP policy; None where there is no motion model to plan with.
     """
 
-    world: Task
-    upper: float
-    lower: float
-    bounds: dict[str, float | None]
-    qmdp: Evaluation | None
+    def __init__(self, world: Problem) -> None:
+        self.world = world
+        self.qmdp: Evaluation | None = None
+        self.upper = self.lower = math.nan
+        self.bounds: dict[str, float | None] = dict.fromkeys(("paper", "valid", "clocked"))
 
-    @abstractmethod
     def evaluate(self, policy: PolicyTable) -> Evaluation:
-        """Figures of a policy."""
+        """Figures of a policy: exact, or those on the held-out tracks."""
+        return evaluate(self.world, policy, per_cell=False)
 
     def score(self, policy: PolicyTable) -> Score:
         """Figures and the regret per step, by which a policy may be chosen: while learning, for best.pt."""
@@ -108,12 +106,8 @@ class ExactEvaluator(Evaluator):
         world: the task and the motion. The paper's bound knows no `max_steps` and is None where the world has one.
     """
 
-    world: Modelled
-    qmdp: Evaluation
-
     def __init__(self, world: Modelled) -> None:
-        self.world = world
-        self.bounds = dict.fromkeys(("paper", "valid", "clocked"))
+        super().__init__(world)
         if isinstance(world, HiddenWorld):
             self.upper = float(mode_bound(world)[:, 0].mean())
             self.qmdp = evaluate(world, qmdp.solve(averaged(world)))
@@ -123,10 +117,6 @@ class ExactEvaluator(Evaluator):
             self.bounds["valid"], self.upper = float(bounds.valid(world).mean()), float(bounds.clocked(world).mean())
             self.qmdp = evaluate(world, qmdp.solve(world))
         self.bounds["clocked"], self.lower = self.upper, self.qmdp.aihtr
-
-    def evaluate(self, policy: PolicyTable) -> Evaluation:
-        """Exact figures of a policy."""
-        return evaluate(self.world, policy, per_cell=False)
 
 
 def make_evaluator(problem: Problem) -> Evaluator:
@@ -148,22 +138,12 @@ class HeldOutEvaluator(Evaluator):
     world: Recorded
 
     def __init__(self, world: Recorded) -> None:
-        self.world = world
+        super().__init__(world)
         self.tracks = world.held_out.limited(world.max_steps)
-        self.upper, self.lower, self.qmdp = math.nan, math.nan, None
-        self.bounds = dict.fromkeys(("paper", "valid", "clocked"))
-
-    def evaluate(self, policy: PolicyTable) -> Evaluation:
-        """Figures of a policy on the held-out tracks."""
-        return evaluate(self.world, policy)
 
     def score(self, policy: PolicyTable) -> Score:
         """Figures of a policy on the validation tracks."""
         return Score(evaluate(self.world.selection, policy), math.nan, math.nan)
-
-    def intervals(self, policy: PolicyTable) -> dict[str, MeanInterval]:
-        """Figure -> its mean over the held-out tracks with a 95 % confidence interval."""
-        return self.replayed(policy).intervals(self.tracks.names)
 
     def replayed(self, policy: PolicyTable) -> ReplayedTracks:
         """What a policy did on the held-out tracks."""
@@ -188,10 +168,8 @@ class HeldOutEvaluator(Evaluator):
     def report(self, policy: PolicyTable) -> dict[str, Any]:
         """What is written of a policy: its figures on the held-out tracks beside those of the references."""
         policies = {"policy": policy, **self.references}
-        figures = {
-            name: {figure: asdict(interval) for figure, interval in self.intervals(each).items()}
-            for name, each in policies.items()
-        }
+        found = {name: self.replayed(each).intervals(self.tracks.names) for name, each in policies.items()}
+        figures = {name: {key: asdict(interval) for key, interval in each.items()} for name, each in found.items()}
         counts = {"learned_from": self.world.tracks, "validation": self.world.validation, "tracks": self.tracks}
         return {name: len(part) for name, part in counts.items()} | {"figures": figures}
 

@@ -40,8 +40,6 @@ class RowLogger(Callback):
         folder: of the run.
     """
 
-    _cfg: RowsConfig
-
     def __init__(self, cfg: RowsConfig, folder: Path) -> None:
         self._cfg, self._folder = cfg, folder
 

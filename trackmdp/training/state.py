@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -16,7 +16,7 @@ from torchrl.collectors import BaseCollector, Collector
 from trackmdp.algos.common import Algorithm
 from trackmdp.config import TrainConfig
 from trackmdp.config.checks import own_paths
-from trackmdp.config.tree import fixed_options
+from trackmdp.config.tree import fixed_options, flatten
 from trackmdp.errors import UserError
 from trackmdp.training import checkpoint
 from trackmdp.untrusted import decoded
@@ -25,7 +25,7 @@ _EXACT = ("torch", "torchrl", "tensordict", "numpy", "scipy", "hydra-core", "tra
 _PARTS = {"format", "iteration", "identity", "versions", "algorithm", "collector", "random", "position", "callbacks"}
 """Of the state of a run: what `capture` takes, and the two that `checkpoint.save` adds."""
 
-_NOT_WEIGHTS = ("optimizer", "buffer", "generator")
+_NOT_WEIGHTS = {"optimizer", "buffer", "generator"}
 
 
 @dataclass(frozen=True)
@@ -182,12 +182,7 @@ def _check(state: Mapping[str, Any], cfg: TrainConfig, file: Path) -> None:
             raise ValueError(f"parts {sorted(map(str, state.keys() ^ _PARTS))} missing or too many")
 
 
-def _weights(state: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, torch.Tensor]]:
+def _weights(state: Mapping[str, Any]) -> list[tuple[str, torch.Tensor]]:
     """The floating-point tensors of an algorithm's state that belong to networks."""
-    for name, value in state.items():
-        if name in _NOT_WEIGHTS:
-            continue
-        if isinstance(value, Mapping):
-            yield from _weights(value, f"{prefix}{name}.")
-        elif isinstance(value, torch.Tensor) and value.is_floating_point():
-            yield f"{prefix}{name}", value
+    named = ((name, value) for name, value in flatten(state).items() if not _NOT_WEIGHTS & {*name.split(".")})
+    return [(name, value) for name, value in named if isinstance(value, torch.Tensor) and value.is_floating_point()]

@@ -26,12 +26,9 @@ _MODES = {"ansi": "text", "rgb_array": "rgb_array"}
 class _Tracking:
     """What the single and the vector environment share: the problem, its seeding, its picture."""
 
-    world: Problem
-    render_mode: str | None
     observation_space: Any
     np_random: Any
     _np_random: Any
-    _env: TrackEnv
 
     def _make(
         self, world: Problem | None, options: dict[str, Any], render_mode: str | None, shape: tuple[int, ...]
