@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import re
@@ -220,7 +221,8 @@ def test_a_folders_name_is_a_name_everywhere(sweep: Path, capsys: pytest.Capture
         shutil.copytree(sweep / "a", sweep / name)
         (sweep / f"failed {name}").mkdir()
         (sweep / f"failed {name}/failed.json").write_text(json.dumps({"reason": name}))
-    report = build(gather_runs(sweep))
+    found = gather_runs(sweep)
+    report = build(dataclasses.replace(found, manifest=found.manifest | {"line": "".join(EVIL)}))
     page = report.html()
     assert "<script>alert" not in page
     assert page.count("</body>") == 1
@@ -232,6 +234,19 @@ def test_a_folders_name_is_a_name_everywhere(sweep: Path, capsys: pytest.Capture
     said = capsys.readouterr().out
     assert "\x1b" not in said
     assert "[x]: done" in said
+
+
+def test_a_setting_is_a_text_everywhere(sweep: Path, tmp_path: Path) -> None:
+    config = sweep / "a/config.yaml"
+    evil = json.dumps("\x1b]0;t\x07")
+    config.write_text(config.read_text().replace("border: renormalize", f"border: {evil}\n  {evil}: 1"))
+    write_summary(sweep / "a", {key: value for key, value in read_summary(sweep / "a").items() if key != "files"})
+    found = gather_runs(sweep)
+    assert found.runs[0].settings["kernel.border"] == "\\x1b]0;t\\x07"
+    assert "kernel.\\x1b]0;t\\x07" in found.runs[0].settings
+    changed = dataclasses.replace(found.runs[0], settings={**found.runs[0].settings, "kernel.border": "\x1b"})
+    save_results(dataclasses.replace(found, runs=[changed, *found.runs[1:]]), tmp_path)
+    assert load_results(tmp_path).runs[0].settings["kernel.border"] == "\\x1b"
 
 
 def test_latex_letters_are_letters() -> None:

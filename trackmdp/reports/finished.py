@@ -17,7 +17,7 @@ from trackmdp.config.untrusted import MAX_BYTES
 from trackmdp.errors import UserError
 from trackmdp.policies.saved import load_policy
 from trackmdp.policies.table import PolicyTable
-from trackmdp.reports.results import FIGURES, Anomaly, CurvePoint, FinishedRun, Sensed
+from trackmdp.reports.results import FIGURES, Anomaly, CurvePoint, FinishedRun, Sensed, printable_settings
 from trackmdp.solvers.renewal import IndexArray, per_row
 from trackmdp.training.folders import FAILED_FILE, SUMMARY, check_files, read_summary, run_of
 from trackmdp.untrusted import decoded, known_object, printable, read_text
@@ -48,7 +48,7 @@ def read_run(folder: Path, name: str) -> tuple[FinishedRun, Mapping[str, Any]] |
     try:
         summary = read_summary(place)
         check_files(place, summary, "config.yaml")
-        settings = flatten(plain_config(place))
+        settings = printable_settings(flatten(plain_config(place)))
         # A config of another version may lack what runs are grouped by: that is told of this run, and the others are
         # used.
         with decoded(str(place / "config.yaml"), "the config of a run"):

@@ -15,6 +15,7 @@ from trackmdp.reports.grouping import Study, study
 from trackmdp.reports.results import MotionTable, Results, Sensed
 from trackmdp.reports.style import Figure
 from trackmdp.reports.tables import Table, paragraphs
+from trackmdp.untrusted import printable
 from trackmdp.world.model import grid_size
 
 PROSE = paragraphs("trackmdp.reports")
@@ -76,7 +77,7 @@ class Report:
         body = "\n".join(section.html() for section in self.sections)
         texts = {"@TITLE@": html.escape(self.title), "@ABOUT@": self.about, "@NAV@": nav, "@BODY@": body}
         # in one pass: what is put in may hold a mark itself, as a folder's name
-        return re.sub("|".join(texts), lambda mark: texts[mark[0]], page)
+        return printable(re.sub("|".join(texts), lambda mark: texts[mark[0]], page))
 
 
 def build(

@@ -20,7 +20,7 @@ from scipy import sparse
 
 from trackmdp.durable import csv_text, write_bytes, write_text
 from trackmdp.errors import UserError
-from trackmdp.untrusted import decoded, read_bytes, read_object, read_text, sealed, unsealed
+from trackmdp.untrusted import decoded, printable, read_bytes, read_object, read_text, sealed, unsealed
 from trackmdp.world.files import load_npz, npz_bytes, whole_csr
 from trackmdp.world.model import Array
 
@@ -71,6 +71,11 @@ class FinishedRun:
         """A figure, nan where the run has none."""
         value = self.figures[name]
         return float("nan") if value is None else value
+
+
+def printable_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of a run of somebody else's: labels, and so figures and the terminal, have their texts in them."""
+    return {printable(key): printable(value) if isinstance(value, str) else value for key, value in settings.items()}
 
 
 @dataclass(frozen=True)
@@ -241,7 +246,7 @@ def _run(row: Mapping[str, str], common: Mapping[str, Any], hashes: Mapping[str,
     algo = own.get("algo.name") or next(iter(common))
     # The other half of what `save_results` does to a name that looks like a formula.
     name = str(_value(row["run"])) if row["run"].startswith('"') else row["run"]
-    return FinishedRun(name, {**common[algo], **own, "algo.name": algo}, figures, hashes[name])
+    return FinishedRun(name, printable_settings({**common[algo], **own, "algo.name": algo}), figures, hashes[name])
 
 
 def _common(runs: Iterable[FinishedRun]) -> dict[str, dict[str, Any]]:
