@@ -188,14 +188,14 @@ def _key(descriptor: int, timeout: float | None) -> str:
 
 
 MARGIN = "   "
-WIDE = 21
-"""Rows and columns of a grid that are drawn at most."""
+PICTURE_WIDE = 21
+"""Rows and columns of a grid that are drawn at most in each frame of a picture."""
 
 
 def draw_picture(episodes: Sequence[Episode], task: Task, *, steps: int = 6) -> str:
     """The first `steps` steps of an episode, side by side, under the legend.
 
-    Of a grid larger than `WIDE` only the part around the target.
+    Of a grid larger than `PICTURE_WIDE` only the part around the target.
 
     Args:
         episodes: drawn is the first of them with so many steps in the grid, or the longest.
@@ -208,7 +208,7 @@ def draw_picture(episodes: Sequence[Episode], task: Task, *, steps: int = 6) -> 
     way = np.divmod(np.array([cell for cell, _ in shown], dtype=np.int64), task.columns)
     # around the middle of its way
     middle = [(int(each.min()) + int(each.max())) // 2 if len(each) else 0 for each in way]
-    rows, columns = (around(place, length, WIDE) for place, length in zip(middle, task.size, strict=True))
+    rows, columns = (around(place, length, PICTURE_WIDE) for place, length in zip(middle, task.size, strict=True))
     part = slice(rows.start, rows.stop), slice(columns.start, columns.stop)
     frames = (symbols(task.size, cell, on, found=bool(on[cell]))[part] for cell, on in shown)
     pieces = [[f"step {k}", *map(" ".join, frame)] for k, frame in enumerate(frames, start=1)]
