@@ -220,13 +220,13 @@ def test_sets_of_other_modes_are_refused(
 ) -> None:
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    sets = {"t_max": 1, "memory": {"kind": "cell", "clip": 2, "classes": 2, "revealed": 2}}
+    sets = {"size": [3, 3], "t_max": 1, "memory": {"kind": "cell", "clip": 2, "classes": 2, "revealed": 2}}
     (tmp_path / "s.json").write_text(json.dumps(sets | {"sets": {str(key): [[], []] for key in range(18)}}))
     words = [*WORLD, "baseline=sets", f"baseline.file={tmp_path}/s.json", "quiet=true", f"hydra.run.dir={tmp_path}/run"]
     told = refused(capsys, "evaluate", *words)
     assert told == "policy: made for targets with 2 modes; expected 8"
     many = {"kind": "cell", "clip": 2, "classes": 2, "revealed": 10**15}
-    (tmp_path / "s.json").write_text(json.dumps({"t_max": 1, "memory": many, "sets": {}}))
+    (tmp_path / "s.json").write_text(json.dumps({"size": [3, 3], "t_max": 1, "memory": many, "sets": {}}))
     told = refused(capsys, "evaluate", *words)
     assert "0 plans, t_max 1; expected 9000000000000000" in told
     with pytest.raises(UserError):

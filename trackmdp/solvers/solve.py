@@ -109,12 +109,10 @@ def run_solver(
 def by_blocks(world: World, choice: BaselineConfig, partition: SweptPartitionConfig, run: Crew) -> PolicyTable:
     """The policy that `run` plans block by block and, with ``solver=optimal``, settles over the whole grid."""
     assert partition.block is not None
-    table = plan_by_blocks(world, _Planner(choice), partition.block, partition.halo, run)
-    if choice.name != "optimal":  # other solvers' plans are what they are
-        return table
-    # What a narrow halo loses stays to be seen, unless asked otherwise.
+    # Other solvers' plans are what they are; what a narrow halo loses stays to be seen, unless asked otherwise.
     sweeps = (_SWEEPS if partition.halo is None else 0) if partition.sweeps is None else partition.sweeps
-    return settled(world, table, partition.block, sweeps, run)
+    table = plan_by_blocks(world, _Planner(choice), partition.block, partition.halo, run)
+    return settled(world, table, partition.block, sweeps, run) if choice.name == "optimal" else table
 
 
 @dataclass(frozen=True)
