@@ -39,7 +39,8 @@ def main(file: Path, size: tuple[int, int], price: float, safe: float, t_max: in
     for memory in MEMORIES:
         tracks = tm.load_tracks(file, size, t_max=t_max, cost=price, safe_cost=safe, memory=memory, **position)
         policy = choose_plan(tracks.task, tracks.tracks, judge=tracks.validation, discount=0.9).policy
-        reward = HeldOutEvaluator(tracks).intervals(policy)["reward_per_step"]
+        held_out = HeldOutEvaluator(tracks)
+        reward = held_out.replayed(policy).intervals(held_out.tracks.names)["reward_per_step"]
         found[memory] = (evaluate(tracks.selection, policy).aihtr, reward)
     best = max(found, key=lambda memory: found[memory][0])
     for memory, (_, reward) in found.items():

@@ -87,6 +87,7 @@ def different(first: Any, second: Any) -> list[str]:
 
 VARIANTS = dict.fromkeys(ALGORITHMS, ()) | {
     "dqn-prioritized": ("algo.prioritized.enabled=true", "algo.n_step=3"),
+    "path_counts": ("algo.total_frames=1024",),  # a plan in each of four iterations
     "hindsight-mixed": ("algo.collect=mixed", "algo.updates=3", "algo.updates_per_iteration=1"),
     "ppo_per_sensor-sampled": ("algo.surrogate=sampled",),
 }

@@ -36,7 +36,7 @@ class PathCounts:
 
     def __init__(self, task: Task, cfg: PathCountsConfig, *, iterations: int, seed: int, device: torch.device) -> None:
         if not (task.perfect and task.safe):
-            raise UserError("counts of paths: with sensors that may miss, expected another algorithm")
+            raise UserError("sensor: expected perfect where paths are counted: path_counts, learned_kernel with memory")
         self.task, self.cfg, self.iterations, self.device = task, cfg, iterations, device
         self._paths, self._seed = SensedPaths(task.num_cells), seed
         self._iteration, self._every = 0, max(1, iterations // _PLANS)
