@@ -41,12 +41,12 @@ def killed() -> None:
     raise Killed
 
 
-def cut(folder: Path, monkeypatch: pytest.MonkeyPatch, *, closes: bool) -> None:
-    """A run that ends once iteration 6 is recorded, before its checkpoint."""
+def cut(folder: Path, monkeypatch: pytest.MonkeyPatch, *, closes: bool, iteration: int = 6) -> None:
+    """A run that ends once an iteration is recorded, before its checkpoint."""
     with monkeypatch.context() as patch, pytest.raises(Killed):
         if not closes:
             patch.setattr(EpisodeLog, "close", lambda self: self._writer.abandon())  # the file stays as it is
-        at_iteration(patch, 6, killed)
+        at_iteration(patch, iteration, killed)
         train(folder, *LOGGED)
 
 
@@ -64,6 +64,16 @@ def test_it_is_cut_back_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     logs = sorted(file.name for file in (tmp_path / "cut").glob("episodes*"))
     assert logs == ["episodes.mcap"]
     assert count(whole / "episodes.mcap") == 15
+    assert (tmp_path / "cut/episodes.mcap").read_bytes() == (whole / "episodes.mcap").read_bytes()
+
+
+def test_it_begins_anew_where_nothing_is_saved_yet(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: Path
+) -> None:
+    cut(tmp_path / "cut", monkeypatch, closes=False, iteration=1)
+    assert (tmp_path / "cut/episodes.mcap.part").is_file()
+    train(tmp_path / "cut", *LOGGED, "resume=auto")
+    assert sorted(file.name for file in (tmp_path / "cut").glob("episodes*")) == ["episodes.mcap"]
     assert (tmp_path / "cut/episodes.mcap").read_bytes() == (whole / "episodes.mcap").read_bytes()
 
 

@@ -36,7 +36,7 @@ class EpisodeLog:
         config: text of the run's `config.yaml`.
         layout: write a viewer's layout next to the log.
         policies: resume the log of an earlier process after so many of its policies, and drop what it wrote later; None
-            to begin a new log.
+            to begin a new log beside it.
         tell: called with one line where logging is over, or goes on in another file.
     """
 
@@ -67,6 +67,9 @@ class EpisodeLog:
     def _take_over(self, policies: int) -> None:
         """Resume the log of an earlier process, which was killed (`.part`) or ended in order."""
         part = self.file.with_name(f"{self.file.name}.part")
+        if not policies:  # killed before its first checkpoint: the run begins anew, and all of it is recorded again
+            part.unlink(missing_ok=True)
+            return
         earlier = self.file.with_name(f"{self.file.name}.earlier")
         written = part if part.exists() else self.file
         if not written.exists():
@@ -155,7 +158,7 @@ class EpisodeLogger(Callback):
             seed=trainer.config.seed,
             config=config_text(trainer.config, trainer.folder),
             layout=self._cfg.layout,
-            policies=self._policies or None,
+            policies=self._policies,
             tell=tell,
         )
 
