@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+import trackmdp as tm
 from tests.reports.sweeps import write_run
 from trackmdp.durable import write_sealed
 from trackmdp.errors import UserError
@@ -234,6 +235,16 @@ def test_a_folders_name_is_a_name_everywhere(sweep: Path, capsys: pytest.Capture
     said = capsys.readouterr().out
     assert "\x1b" not in said
     assert "[x]: done" in said
+
+
+@pytest.mark.parametrize(("other", "value"), [({"size": 4}, 1.0), ({"size": 3, "t_max": 3}, 1.0), ({"size": 3}, 1e308)])
+def test_a_policy_of_another_grid_is_not_drawn(other: dict[str, Any], value: float, sweep: Path) -> None:
+    policy = tm.Policy.all_on(tm.make_world("random_walk", **other))
+    policy.save(sweep / "a/policy.npz", np.full(policy.task.num_cells, value))
+    write_summary(sweep / "a", {key: value for key, value in read_summary(sweep / "a").items() if key != "files"})
+    found = gather_runs(sweep)
+    assert "a" not in found.policies
+    assert any(each.run == "a" and "not the policy of" in each.text for each in found.anomalies)
 
 
 def test_a_setting_is_a_text_everywhere(sweep: Path, tmp_path: Path) -> None:

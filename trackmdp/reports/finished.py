@@ -164,6 +164,8 @@ def read_sensed(file: Path, visits: Callable[[PolicyTable], Array]) -> Sensed:
     table, value = load_policy(file)
     if value is None:
         raise UserError(f"{file}: not the policy of a run (it has no values)")
+    if not (np.abs(value) < _LARGE).all():
+        raise UserError(f"{file}: not the policy of a run (a value out of range)")
     if not table.deterministic:
         raise UserError("policy: draws its sets at random, so that there is no table of them")
     task = table.task

@@ -33,7 +33,7 @@ from trackmdp.training.folders import FAILED_FILE, PLAN, SUMMARY, check_files, r
 from trackmdp.untrusted import known_object, printable
 from trackmdp.world.checks import canonical_kernel
 from trackmdp.world.make import build_world, of_task
-from trackmdp.world.model import Array
+from trackmdp.world.model import Array, grid_size
 from trackmdp.world.modes import HiddenWorld, Modelled
 
 _LONGEST = 4096
@@ -185,7 +185,12 @@ def _policies(folder: Path, grouped: Study) -> tuple[dict[str, Sensed], list[Ano
                 # Against the summary's digest: a policy copied from another run would be drawn under this one's name.
                 check_files(folder / run.name, read_summary(folder / run.name), "policy.npz")
                 place = folder / run.name
-                found[run.name] = read_sensed(place / "policy.npz", partial(_visits, place))
+                sensed = read_sensed(place / "policy.npz", partial(_visits, place))
+                rows, columns = grid_size(settings["grid.size"])
+                cells = rows * columns
+                if sensed.sets.shape != (cells * (settings["grid.t_max"] + 1), cells):
+                    raise UserError("policy.npz: not the policy of this run (of another grid or t_max)")
+                found[run.name] = sensed
                 break
             except UserError as error:
                 anomalies.append(Anomaly(run.name, str(error).removeprefix(f"{folder / run.name}/")))
