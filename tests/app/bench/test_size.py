@@ -57,7 +57,7 @@ def test_one_table_of_cost_by_size(tmp_path: Path) -> None:
     assert [row["what"] for row in rows][:4] == [
         "solve, c = 0.16",
         "solve, c = 0.22",
-        "train learned_kernel",
+        "train learned_kernel, window 2",
         "env, B = 1024",
     ]
     for row in rows[:3]:

@@ -49,8 +49,10 @@ def _rows(cfg: BenchmarkConfig, device: torch.device) -> Iterator[dict[str, Any]
                 n, f"solve, c = {cost:g}", "regret_per_step", "solution.json", "solve", *at, f"cost.sensor={cost}"
             )
         if "train" in cfg.work:
-            algo = f"algo={cfg.learner}"
-            yield _row(n, f"train {cfg.learner}", "regret_per_step", "summary.json", "train", *at, *own, algo)
+            # Actions over all cells would make a budget per cell one of M² numbers.
+            learner = [f"algo={cfg.learner}", f"grid.window={WINDOW}"]
+            what = f"train {cfg.learner}, window {WINDOW}"
+            yield _row(n, what, "regret_per_step", "summary.json", "train", *at, *own, *learner)
         if "env" not in cfg.work:
             continue
         # A benchmark within the benchmark, so that each size has a process, and a peak memory, of its own.
