@@ -10,8 +10,8 @@ from scipy import sparse
 
 from tests.solvers.worlds import paper_world, random_tiny_world
 from trackmdp.solvers import delayed, optimal
+from trackmdp.solvers.choices import LeftOut
 from trackmdp.solvers.delayed import Delayed
-from trackmdp.solvers.joint import LeftOut
 from trackmdp.solvers.renewal import forced_worth
 from trackmdp.world.model import Array, World
 

@@ -31,8 +31,9 @@ from dataclasses import replace
 import numpy as np
 from scipy import sparse
 
+from trackmdp.solvers.choices import Choices, Frontier, LeftOut, Origin, sets_left_out
 from trackmdp.solvers.delayed import Delayed
-from trackmdp.solvers.joint import Choices, Frontier, Joint, LeftOut, Origin, sets_left_out
+from trackmdp.solvers.joint import Joint
 from trackmdp.solvers.layers import within_window
 from trackmdp.solvers.renewal import IndexArray, per_row, row_index
 from trackmdp.solvers.search import InnerProblem

@@ -27,7 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from trackmdp.solvers.joint import LeftOut
+from trackmdp.solvers.choices import LeftOut
 from trackmdp.solvers.renewal import IndexArray, per_row, row_index
 from trackmdp.world.model import Array, World
 

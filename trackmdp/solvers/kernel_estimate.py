@@ -30,7 +30,7 @@ NEGLIGIBLE = 1e-3
 
 
 SELDOM = 0.1
-"""Moves as far as fewer of the pairs of cells that far apart are read as draws from a mixture of their own."""
+"""Where a smaller share of the pairs so far apart was seen as moves, those moves come from a mixture of their own."""
 
 
 class KernelEstimate:
