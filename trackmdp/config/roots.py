@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
+from trackmdp.cluster import ADDRESS
 from trackmdp.config import counting, modes, per_sensor, sweeping  # noqa: F401  (more to choose from)
 from trackmdp.config.baselines import BaselineConfig
 from trackmdp.config.learning import DEVICE, AlgoConfig, CollectorConfig
@@ -179,7 +180,9 @@ class BenchmarkConfig(WorldConfig):
         "`workers`: of each row, to plan by blocks of the first of `blocks`", unit="processes", ge=1
     )
     cluster: str | None = option(
-        "`workers`: Ray cluster that they are of; null = no Ray", expects="local, auto, or host:port"
+        "`workers`: Ray cluster that they are of; null = no Ray",
+        expects="local, auto, or host:port",
+        pattern=f"local|{ADDRESS}",
     )
     # Evaluated while this module is imported, before plugins are: only this package's own algorithms.
     algos: list[str] = option("`memory`: algorithms that train", choices=tuple(GROUPS["algo"]))

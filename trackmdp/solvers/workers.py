@@ -59,19 +59,20 @@ class Made(Sequence[Job]):
 
 
 @contextmanager
-def crew(workers: int = 1, cluster: str | None = None) -> Iterator[Crew]:
+def crew(workers: int = 1, cluster: str | None = None, key: str = "partition.cluster") -> Iterator[Crew]:
     """Workers that stay from one call to the next; what an error or a signal leaves of them is ended.
 
     Args:
         workers: processes; one: this one.
         cluster: ``local``: a Ray cluster of so many workers on this machine; ``auto`` or host:port: one to join, which
             has as many as it has cores. None: no Ray.
+        key: option that `cluster` was given by, for messages.
 
     Raises:
         UserError: Ray is not installed or there is no such cluster.
     """
     if cluster is not None:
-        yield from _ray(workers, cluster)
+        yield from _ray(workers, cluster, key)
     elif workers == 1:
         yield in_turn
     else:
@@ -164,8 +165,8 @@ def end_with_parent() -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
-def _ray(workers: int, cluster: str) -> Iterator[Crew]:
-    require("ray", "ray", f"partition.cluster={cluster}")
+def _ray(workers: int, cluster: str, key: str) -> Iterator[Crew]:
+    require("ray", "ray", f"{key}={cluster}")
     import ray
 
     where: dict[str, Any] = {"address": cluster}
@@ -173,7 +174,7 @@ def _ray(workers: int, cluster: str) -> Iterator[Crew]:
         where = {"address": "local", "num_cpus": workers, "include_dashboard": False}
     begun = not ray.is_initialized()
     if begun:
-        with joining("partition.cluster", cluster):
+        with joining(key, cluster):
             ray.init(logging_level=logging.ERROR, log_to_driver=False, **where)
 
     def run(work: Callable[[Job], Result], jobs: Sequence[Job]) -> list[Result]:
@@ -186,7 +187,7 @@ def _ray(workers: int, cluster: str) -> Iterator[Crew]:
         except ray.exceptions.RayTaskError as error:  # an error of the work itself, as it would be raised here
             raise error.cause from None
         except ray.exceptions.RayError as error:
-            raise UserError(f"partition.cluster={cluster}: a worker was lost {_ATTEMPTS} times ({error})") from error
+            raise UserError(f"{key}={cluster}: a worker was lost {_ATTEMPTS} times ({error})") from error
 
     try:
         yield run

@@ -54,7 +54,7 @@ def workers(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterato
     alone = None
     for number in cfg.workers:
         options = compose("solve", {"partition.block": cfg.blocks[0], "partition.workers": number})
-        with crew(number, cfg.cluster) as run:
+        with crew(number, cfg.cluster, "cluster") as run:
             watched, used, began = _Watched(run), time.process_time(), time.perf_counter()
             found = bracketed(world, by_blocks(world, options.solver, options.partition, watched), 0.0)
             wall, driver = time.perf_counter() - began, time.process_time() - used
