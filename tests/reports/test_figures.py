@@ -17,6 +17,8 @@ from trackmdp.reports.figures import Panel
 from trackmdp.reports.gather import gather_runs
 from trackmdp.reports.grouping import Study, study
 from trackmdp.reports.results import MotionTable, Results, Sensed
+from trackmdp.reports.style import draw_figure
+from trackmdp.reports.tables import Column, Table
 
 
 @pytest.fixture(scope="module")
@@ -198,6 +200,12 @@ def test_the_same_figure_has_the_same_bytes_and_no_date(grouped: Study, panel: P
     assert (one.svg, one.png) == (two.svg, two.png)
     assert b"date" not in one.svg.lower()
     assert one.png.startswith(b"\x89PNG")
+
+
+def test_letters_that_the_font_lacks_stay_letters_without_a_warning() -> None:
+    table = Table("f", "caption", [Column("x")], [[1]])
+    drawn = draw_figure("f", "title", "text", table, 1.0, lambda figure: figure.text(0.5, 0.5, "a\tb \u65e5"))
+    assert "a\tb \u65e5" in drawn.svg.decode()
 
 
 def test_in_the_page_a_figure_has_a_text_alternative_and_the_colours_of_the_page(grouped: Study, panel: Panel) -> None:

@@ -6,6 +6,7 @@ import html
 import io
 import math
 import re
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -146,7 +147,9 @@ def draw_figure(
 
     # Both from one drawing. The metadata are emptied: a date or a version would change the bytes each time.
     svg, png = io.BytesIO(), io.BytesIO()
-    with canvas(height, name) as figure:
+    with warnings.catch_warnings(), canvas(height, name) as figure:
+        # A name may have letters that the font lacks, as of Chinese, or a tab: text in the SVG, boxes in the PNG.
+        warnings.filterwarnings("ignore", "Glyph .* missing from font", UserWarning)
         paint(figure)
         # Lets the layout engine settle, which it does while drawing.
         figure.draw_without_rendering()
