@@ -17,7 +17,7 @@ from trackmdp.errors import Preempted, UserError
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.training.callbacks import Callback
 from trackmdp.training.lock import locked
-from trackmdp.training.saving import Checkpoints
+from trackmdp.training.state import Checkpoints
 from trackmdp.world.model import World
 
 SMALL: dict[str, Any] = {

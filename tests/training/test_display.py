@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from trackmdp.training.callbacks import Position
 from trackmdp.training.display import Display
-from trackmdp.training.state import Position
 
 
 def shown(width: int, *, terminal: bool) -> list[str]:

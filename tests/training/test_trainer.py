@@ -13,9 +13,9 @@ from tests.training.runs import BUDGET, QUICK, rows, train
 from trackmdp.app.commands.train import run
 from trackmdp.config import CheckpointConfig
 from trackmdp.solvers.evaluate import evaluate
+from trackmdp.training.callbacks import Position
 from trackmdp.training.evaluator import ExactEvaluator
-from trackmdp.training.saving import Checkpoints
-from trackmdp.training.state import Position
+from trackmdp.training.state import Checkpoints
 from trackmdp.world.make import build_world
 
 

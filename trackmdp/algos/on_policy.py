@@ -116,7 +116,6 @@ class PPO(OnPolicy):
     """
 
     cfg: PpoConfig
-    objective: ClassVar = ClipPPOLoss
     parts: ClassVar[tuple[str, ...]] = (*OnPolicy.parts, "generator")
     diagnostics: ClassVar = OnPolicy.diagnostics | {"approx_kl": "kl_approx", "clip_fraction": "clip_fraction"}
 

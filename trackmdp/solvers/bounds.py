@@ -83,8 +83,7 @@ def _free(world: World, gain: Array, charge: Array) -> Array:
 def one_set(world: World, detected: Array, missed: Array) -> Array:
     """`[M]` the most that one set is worth from a known position: r + V (`detected`, `[M]`), or else `missed` `[M]`."""
     gain = world.kernel.data * world.detects(world.kernel.indices) * (detected - missed)[world.kernel.indices]
-    most: Array = world.kernel @ missed + _free(world, gain, world.stay_probability)
-    return most
+    return world.kernel @ missed + _free(world, gain, world.stay_probability)
 
 
 @lru_cache(maxsize=1)

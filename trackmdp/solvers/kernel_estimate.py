@@ -197,8 +197,7 @@ class KernelEstimate:
     @property
     def visits(self) -> Array:
         """`[M]` moves seen out of each cell, censored ones at their expectation."""
-        visits: Array = self.counts.sum(axis=1)
-        return visits
+        return self.counts.sum(axis=1)
 
     def _kernel(self, moves: sparse.csr_array, leave: Array) -> sparse.csr_array:
         """`[M, M + 1]` from weights of the moves and `[M]` exit probabilities."""

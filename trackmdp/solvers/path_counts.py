@@ -236,15 +236,12 @@ class _Shared:
     @property
     def most(self) -> Array:
         """`[C, K]`, no less than is expected from any cell."""
-        most: Array = self.common * self.lift.max(0) * self.scale.max(0)[:, None]
-        return most
+        return self.common * self.lift.max(0) * self.scale.max(0)[:, None]
 
     def after(self, keys: IndexArray, local: IndexArray) -> Array:
         """`[B, W]` gains of displacements `local` `[W]` after `keys` `[B]`."""
         row, known = self.row[self.keys.cell(keys)], keys % self.keys.num_classes
-        gains: Array = self.common[known[:, None], local] * self.lift[row[:, None], local]
-        gains *= self.scale[row, known][:, None]
-        return gains
+        return self.common[known[:, None], local] * self.lift[row[:, None], local] * self.scale[row, known][:, None]
 
     def of_class(self, known: int, start: IndexArray, local: IndexArray) -> Array:
         """`[B, W]` gains of displacements `local` `[W]` after the class `known` and cells `start` `[B]`."""
@@ -257,5 +254,4 @@ class _Shared:
 def _mean(gains: Array, arrived: Array, strength: float, above: Array) -> Array:
     """`[C, K]` gains per arrival, `strength` arrivals of what is above added."""
     total = np.maximum(arrived + strength, 1e-12)
-    mean: Array = (gains + strength * above) / total[:, None]
-    return mean
+    return (gains + strength * above) / total[:, None]

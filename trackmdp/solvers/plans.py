@@ -201,13 +201,11 @@ class Plans:
         # The recursion of `InnerProblem.undetected`, for a column of each candidate.
         paid = self.sums[t] @ (on * self.cost[t])
         gross = self.moves[t] @ (later + np.where(on, gain, 0.0))
-        worth: Array = gross - paid[self.rows[t - 1]] * self.stay[t - 1]
-        return worth
+        return gross - paid[self.rows[t - 1]] * self.stay[t - 1]
 
     def gain(self, t: int, later: Array) -> Array:
         """`[E, C]` what sensing a target that is there at step t gains over `later`."""
-        gained: Array = self.reports[t] * (self.detected[t] - later)
-        return gained
+        return self.reports[t] * (self.detected[t] - later)
 
     def gains(self, sets: list[BoolArray], since: int) -> list[Array]:
         """`gain` at each step after `since`, when `sets` go on; the first of these is not looked at."""

@@ -163,8 +163,7 @@ class _Jacobi:
         self._diagonal = system.diagonal()
 
     def __call__(self, right: Array) -> Array:
-        found: Array = right / self._diagonal
-        return found
+        return right / self._diagonal
 
 
 class _Level:

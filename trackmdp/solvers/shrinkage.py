@@ -66,8 +66,7 @@ def posterior_mean(count: Array, moves: Array) -> Array:
         # The posterior of one component is Beta(a + k, b + n - k), of mean (a + k) / (a + b + n).
         means = (part[0][:, None] + alpha) / (part[1][:, None] + alpha + beta)
         mean[first : first + MOST_PAIRS] = (share * means).sum(axis=1) / share.sum(axis=1)
-    found: Array = mean[place.ravel()]
-    return found
+    return mean[place.ravel()]
 
 
 def _components() -> tuple[Array, Array]:
@@ -87,8 +86,7 @@ def _likelihood(pairs: Array, alpha: Array, beta: Array) -> Array:
     """`[P, C]` of k in n moves under each component, up to a factor for each pair."""
     count, rest = pairs[0][:, None], (pairs[1] - pairs[0])[:, None]
     log = betaln(count + alpha, rest + beta) - betaln(alpha, beta)
-    scaled: Array = np.exp(log - log.max(axis=1, keepdims=True))
-    return scaled
+    return np.exp(log - log.max(axis=1, keepdims=True))
 
 
 def unseen(rows: IndexArray, probability: Array, moves: Array, cells: int) -> tuple[Array, Array]:

@@ -29,14 +29,14 @@ from trackmdp.signals import HEARD, handled, stop
 from trackmdp.solvers.alike import cell_classes
 from trackmdp.solvers.partition import Block, blocks, default_halo, narrow_halo, plan_by_blocks
 from trackmdp.solvers.workers import crew
-from trackmdp.training.callbacks import Callback, Learning
+from trackmdp.training.callbacks import Callback, Learning, Position
 from trackmdp.training.display import make_console
 from trackmdp.training.evaluator import Evaluator, Score, make_evaluator
 from trackmdp.training.folders import SUMMARY, finished, read_summary
 from trackmdp.training.inputs import CLASSES, short, write_inputs
 from trackmdp.training.lock import locked
 from trackmdp.training.run import complete, load_run
-from trackmdp.training.state import Position, identity
+from trackmdp.training.state import identity
 from trackmdp.training.trainer import Trainer
 from trackmdp.untrusted import decoded
 from trackmdp.world.files import npy_bytes

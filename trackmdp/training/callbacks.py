@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -16,11 +17,20 @@ if TYPE_CHECKING:  # the display of a planner is no reason to load torch
     from trackmdp.config import TrainConfig
     from trackmdp.policies.policy import Policy
     from trackmdp.training.evaluator import Evaluator, Score
-    from trackmdp.training.state import Position
     from trackmdp.world.tracks import Problem
 
 Row = Mapping[str, float | int | None]
 """Figures of one iteration by their names, as `metrics.csv` has them; None for what was not measured."""
+
+
+@dataclass(frozen=True)
+class Position:
+    """How far a run is: iterations done, frames collected, seconds spent, and the sum of the frames' rewards."""
+
+    iteration: int = 0
+    frames: int = 0
+    seconds: float = 0.0
+    reward: float = 0.0
 
 
 class Learning(Protocol):

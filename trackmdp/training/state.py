@@ -1,11 +1,11 @@
-"""The whole state of a run: taken between two iterations, put back exactly, or refused."""
+"""The whole state of a run: when it is saved, between two iterations, and how it is put back, exactly, or refused."""
 
 from __future__ import annotations
 
 import hashlib
 import math
+import time
 from collections.abc import Mapping
-from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -14,11 +14,14 @@ import torch
 from torchrl.collectors import BaseCollector, Collector
 
 from trackmdp.algos.common import Algorithm
-from trackmdp.config import TrainConfig
+from trackmdp.config import CheckpointConfig, TrainConfig
 from trackmdp.config.checks import own_paths
 from trackmdp.config.tree import fixed_options, flatten
-from trackmdp.errors import UserError
+from trackmdp.errors import Preempted, UserError
+from trackmdp.policies.policy import Policy
 from trackmdp.training import checkpoint
+from trackmdp.training.callbacks import Callback, Position, Row, Training
+from trackmdp.training.evaluator import Score
 from trackmdp.untrusted import decoded
 
 _EXACT = ("torch", "torchrl", "tensordict", "numpy", "scipy", "hydra-core", "trackmdp")
@@ -26,16 +29,7 @@ _PARTS = {"format", "iteration", "identity", "versions", "algorithm", "collector
 """Of the state of a run: what `capture` takes, and the two that `checkpoint.save` adds."""
 
 _NOT_WEIGHTS = {"optimizer", "buffer", "generator"}
-
-
-@dataclass(frozen=True)
-class Position:
-    """How far a run is: iterations done, frames collected, seconds spent, and the sum of the frames' rewards."""
-
-    iteration: int = 0
-    frames: int = 0
-    seconds: float = 0.0
-    reward: float = 0.0
+_SAVING = 50  # seconds of training to one of saving, at least
 
 
 def identity(cfg: TrainConfig, folder: Path) -> str:
@@ -44,34 +38,23 @@ def identity(cfg: TrainConfig, folder: Path) -> str:
     return hashlib.sha256(repr(fixed_options(own_paths(cfg, folder))).encode()).hexdigest()
 
 
-def capture(
-    cfg: TrainConfig,
-    folder: Path,
-    algorithm: Algorithm,
-    collector: BaseCollector,
-    at: Position,
-    callbacks: Mapping[str, Mapping[str, Any]],
-) -> dict[str, Any]:
+def capture(trainer: Training, folder: Path) -> dict[str, Any]:
     """Everything that the next iteration depends on, and what has been written so far.
 
-    Args:
-        cfg: the run's config.
-        folder: of the run.
-        algorithm: networks, optimizers, schedules, buffers.
-        collector: rows in mid-episode and the environment's generators.
-        at: how far the run is.
-        callbacks: states of the callbacks by their names, such as how many bytes of `metrics.csv` there are.
+    Networks, optimizers, schedules and buffers; rows in mid-episode and the environment's generators; how far the run
+    is; states of the callbacks by their names, such as how many bytes of `metrics.csv` there are.
     """
+    collector = trainer.collector
     cuda = torch.cuda.get_rng_state_all() if torch.cuda.is_available() else []
     return {
-        "identity": identity(cfg, folder),
+        "identity": identity(trainer.config, folder),
         "versions": {name: version(name) for name in _EXACT},
-        "algorithm": algorithm.state_dict(),
+        "algorithm": trainer.algorithm.state_dict(),
         # None for collectors in worker processes, whose environments cannot be asked: they begin new episodes.
         "collector": {"environment": collector.env.snapshot()} if isinstance(collector, Collector) else None,
         "random": {"cpu": torch.get_rng_state(), "cuda": cuda},
-        "position": vars(at),
-        "callbacks": dict(callbacks),
+        "position": vars(trainer.position),
+        "callbacks": {each.name: each.state_dict() for each in trainer.callbacks if each.name},
     }
 
 
@@ -186,3 +169,100 @@ def _weights(state: Mapping[str, Any]) -> list[tuple[str, torch.Tensor]]:
     """The floating-point tensors of an algorithm's state that belong to networks."""
     named = ((name, value) for name, value in flatten(state).items() if not _NOT_WEIGHTS & {*name.split(".")})
     return [(name, value) for name, value in named if isinstance(value, torch.Tensor) and value.is_floating_point()]
+
+
+class Checkpoints(Callback):
+    """Saves the run by frames and by time, at its end, and where a signal asks for its end.
+
+    Args:
+        cfg: how often, and how many checkpoints are kept.
+        folder: of the checkpoints.
+    """
+
+    name = "checkpoints"
+
+    def __init__(self, cfg: CheckpointConfig, folder: Path) -> None:
+        self._cfg, self._folder = cfg, folder
+        self._best, self._rest = -math.inf, 0.0
+        self._is_best = False
+        self._evaluated: tuple[int, float] = (-1, -math.inf)
+
+    def on_start(self, trainer: Training) -> None:
+        """Intervals count from where the run is.
+
+        The process that wrote the checkpoint may have been killed before last.pt and best.pt were the same file.
+        """
+        self._saved = trainer.position
+        file = checkpoint.named(self._folder, trainer.position.iteration)
+        if trainer.position.iteration and file.is_file():
+            checkpoint.point(file, best=self._is_best)
+
+    def on_evaluation(self, trainer: Training, policy: Policy, score: Score) -> None:  # noqa: ARG002
+        """Remember what the policy of this iteration attains."""
+        self._evaluated = trainer.position.iteration, score.evaluation.aihtr
+
+    def on_update(self, trainer: Training, row: Row) -> None:  # noqa: ARG002
+        """Save after the last iteration, and where it is due."""
+        if self._is_planned(trainer) or self.due(trainer.position):
+            self.save(trainer)
+
+    def on_end(self, trainer: Training) -> None:
+        """Save where a signal ended the run: that is the one error that leaves a state between two iterations."""
+        if isinstance(trainer.error, Preempted) and trainer.position != self._saved:
+            self.save(trainer)
+
+    def due(self, at: Position) -> bool:
+        """Whether to save at `at`.
+
+        By time not before training took 50 times as long as the last saving, which would else take too much of it.
+        """
+        seconds = self._cfg.seconds is not None and at.seconds - self._saved.seconds >= max(
+            self._cfg.seconds, self._rest
+        )
+        return self._passes_multiple(at) or seconds
+
+    def _passes_multiple(self, at: Position) -> bool:
+        # Multiples that were passed, since batches seldom end on one: every=30,000 with batches of 20,000 saves at
+        # 40,000, 60,000 and 100,000.
+        every = self._cfg.every
+        return every > 0 and at.frames // every > self._saved.frames // every
+
+    def _is_planned(self, trainer: Training) -> bool:
+        """Whether this iteration is saved in every run of this config, cut or not."""
+        return trainer.position.iteration == trainer.iterations or self._passes_multiple(trainer.position)
+
+    def save(self, trainer: Training) -> None:
+        """Save the run as it is, and tell the callbacks."""
+        begin = time.monotonic()
+        # Where checkpoints are counted in frames, one that a signal or the clock asked for is none of the candidates:
+        # else which one is the best would depend on where the run was cut.
+        aihtr = self._attained(trainer) if not self._cfg.every or self._is_planned(trainer) else -math.inf
+        self._is_best, self._best = aihtr > self._best, max(self._best, aihtr)
+        # `_best` and `_is_best` are part of the state, so they are set before it is taken. The logs are called before
+        # this callback: the lengths of files in their states include this iteration's row and episodes.
+        state = capture(trainer, self._folder.parent)
+        file = checkpoint.save(self._folder, trainer.position.iteration, state, keep=self._cfg.keep, best=self._is_best)
+        # Measured, since saving a large replay buffer to a slow disk may take longer than the interval asked for.
+        self._saved, self._rest = trainer.position, _SAVING * (time.monotonic() - begin)
+        for callback in trainer.callbacks:
+            callback.on_checkpoint(trainer, file)
+
+    def _attained(self, trainer: Training) -> float:
+        """AIHTR of the very policy that is saved.
+
+        That of the last evaluation may be of an earlier policy, and of another one in a run that was resumed in
+        between: best.pt would depend on where a run was cut.
+        """
+        iteration, aihtr = self._evaluated
+        if iteration == trainer.position.iteration:
+            return aihtr
+        # Evaluating draws from no generator of the run, so that saving more often leaves the run as it is.
+        return trainer.evaluator.score(trainer.policy()).evaluation.aihtr
+
+    def state_dict(self) -> dict[str, Any]:
+        """The highest AIHTR of the checkpoints that count, and whether it is this one's."""
+        return {"best": self._best, "is_best": self._is_best}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from a `state_dict`."""
+        self._best, self._is_best = float(state["best"]), state["is_best"] is True

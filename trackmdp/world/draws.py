@@ -44,9 +44,6 @@ class Draw:
             return torch.ops.trackmdp.draw(self._number, rows, self._turn, self._dtype)
         return self._draw(rows)
 
-    def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__
-
     def __setstate__(self, state: dict[str, Any]) -> None:
         # A copy has a generator of its own, and so needs a number of its own: by the old one a compiled function would
         # draw from the original's.
