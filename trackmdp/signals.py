@@ -6,8 +6,8 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Self
 
@@ -22,7 +22,24 @@ _ONE = 2.0
 """Seconds in which two count as one: `timeout` and some schedulers signal the process, and then its group once more."""
 
 
-class Signals:
+@contextmanager
+def handled(handler: Any, *numbers: signal.Signals) -> Iterator[Mapping[signal.Signals, Any]]:
+    """Let `handler` hear signals inside; afterwards those that did before, whatever the body installs meanwhile.
+
+    Given are those that did before. Outside the main thread nothing is changed.
+    """
+    # Python allows signal.signal in the main thread alone; `train` called from another one runs without.
+    main = threading.current_thread() is threading.main_thread()
+    before = {number: signal.signal(number, handler) for number in numbers if main}
+    try:
+        yield before
+    finally:
+        for number, former in before.items():
+            if former is not None:  # a handler in C, which Python cannot put back
+                signal.signal(number, former)
+
+
+class Signals(ExitStack):
     """While entered, SIGTERM, SIGINT and SIGUSR1 are noted in `received` instead of ending the process.
 
     A second signal of the same kind has its former effect: Ctrl-C immediately, the others if they come at least two
@@ -30,16 +47,13 @@ class Signals:
     """
 
     def __init__(self) -> None:
+        super().__init__()
         self.received = 0
         self._first: dict[signal.Signals, float] = {}
 
     def __enter__(self) -> Self:
-        self._before = _installed(self._note, HEARD)
+        self._before = self.enter_context(handled(self._note, *HEARD))
         return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
 
     def heard(self) -> bool:
         """Whether a signal came, or comes within a moment.
@@ -66,28 +80,6 @@ class Signals:
             os.kill(os.getpid(), number)
 
 
-def _installed(handler: Any, numbers: Iterable[signal.Signals]) -> dict[signal.Signals, Any]:
-    """Let `handler` hear signals; returns those that did before."""
-    # Python allows signal.signal in the main thread alone; `train` called from another one runs without.
-    if threading.current_thread() is not threading.main_thread():
-        return {}
-    return {number: signal.signal(number, handler) for number in numbers}
-
-
-@contextmanager
-def handled(handler: Any, *numbers: signal.Signals) -> Iterator[None]:
-    """Let `handler` hear signals inside; afterwards those that did before, whatever the body installs meanwhile.
-
-    Outside the main thread nothing is changed.
-    """
-    before = _installed(handler, numbers)
-    try:
-        yield
-    finally:
-        for number, former in before.items():
-            signal.signal(number, former)
-
-
 def stop(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
     """What `handled` may let hear a signal: it ends what is under way at once.
 
@@ -97,7 +89,7 @@ def stop(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
     raise Preempted(number)
 
 
-class Watch:
+class Watch(ExitStack):
     """While entered, the end of a worker process of `collector` interrupts the call that waits for it.
 
     TorchRL looks for dead workers where it waits for a batch, but waits for ever where one should acknowledge new
@@ -105,19 +97,15 @@ class Watch:
     """
 
     def __init__(self, collector: BaseCollector) -> None:
+        super().__init__()
         # TorchRL keeps them as `procs`; a collector in this process, or on Ray, has none.
         self._processes: list[Any] = list(getattr(collector, "procs", ()))
         self._waiting = False
 
-    def __enter__(self) -> Watch:
-        self._before: Any = None
-        if self._processes and threading.current_thread() is threading.main_thread():
-            self._before = signal.signal(signal.SIGCHLD, self._heard)
+    def __enter__(self) -> Self:
+        if self._processes:
+            self.enter_context(handled(self._heard, signal.SIGCHLD))
         return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._before is not None:
-            signal.signal(signal.SIGCHLD, self._before)
 
     @contextmanager
     def waiting(self) -> Iterator[None]:

@@ -55,7 +55,9 @@ def peers(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[dict
     Raises:
         UserError: `peers` is no folder with such scripts.
     """
-    scripts = _scripts(cfg)
+    scripts = sorted(Path(cfg.peers).glob("*_peer.py"))
+    if not scripts:
+        raise UserError(f"peers={cfg.peers}: expected a folder with scripts called <name>_peer.py")
     evaluator = ExactEvaluator(world)
     runs = []
     with on_one_core(), tempfile.TemporaryDirectory() as folder:
@@ -72,21 +74,9 @@ def peers(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[dict
         # Seed by seed, all learners in turn: a machine that slows down in between slows all of them.
         for seed in cfg.seeds:
             runs.append(_ours(cfg, seed, device))
-            runs += [_peer(script, python, instance, seed, cfg, evaluator) for script, python in scripts]
+            runs += [_peer(script, instance, seed, cfg, evaluator) for script in scripts]
     # `_ours` comes first of each seed, and is what the others are compared with.
     return [_row(run, next(each for each in runs if each.seed == run.seed)) for run in runs]
-
-
-def _scripts(cfg: BenchmarkConfig) -> list[tuple[Path, str]]:
-    folder = Path(cfg.peers)
-    scripts = sorted(folder.glob("*_peer.py"))
-    if not scripts:
-        raise UserError(f"peers={cfg.peers}: expected a folder with scripts called <name>_peer.py")
-    own = [folder / f".venv-{script.stem.removesuffix('_peer')}/bin/python" for script in scripts]
-    return [
-        (s, str(python.absolute()) if python.exists() else sys.executable)
-        for s, python in zip(scripts, own, strict=True)
-    ]
 
 
 def _ours(cfg: BenchmarkConfig, seed: int, device: torch.device) -> Learned:
@@ -97,10 +87,10 @@ def _ours(cfg: BenchmarkConfig, seed: int, device: torch.device) -> Learned:
     return Learned("trackmdp hindsight", seed, _from_start(points, usage), usage)
 
 
-def _peer(
-    script: Path, python: str, instance: Path, seed: int, cfg: BenchmarkConfig, evaluator: ExactEvaluator
-) -> Learned:
-    record = instance.with_name("record.npz")
+def _peer(script: Path, instance: Path, seed: int, cfg: BenchmarkConfig, evaluator: ExactEvaluator) -> Learned:
+    name, record = script.stem.removesuffix("_peer"), instance.with_name("record.npz")
+    own = script.parent / f".venv-{name}/bin/python"
+    python = str(own.absolute()) if own.exists() else sys.executable
     words = [str(instance), str(record), "--seed", str(seed), "--seconds", str(cfg.peers_seconds)]
     usage = measured(*words, script=str(script), python=python, quiet=True)
     task = evaluator.world
@@ -113,7 +103,7 @@ def _peer(
         times, steps = stored["seconds"].tolist(), stored["steps"].tolist()
     regrets = [evaluator.score(Policy.from_dense(task, table)).regret_per_step for table in tables]
     points = list(zip(times, steps, regrets, strict=True))
-    return Learned(f"{script.stem.removesuffix('_peer')} ppo", seed, _from_start(points, usage), usage)
+    return Learned(f"{name} ppo", seed, _from_start(points, usage), usage)
 
 
 def _from_start(points: Sequence[tuple[float, int, float]], usage: Usage) -> list[tuple[float, int, float]]:

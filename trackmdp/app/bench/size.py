@@ -24,6 +24,7 @@ from trackmdp.world.model import World
 COSTS = (0.16, 0.22)
 """Prices: at the first beliefs hardly spread, at the second all probabilities lie below c/r."""
 WINDOW, ENVS = 2, 1024
+RESULTS = {"solve": "solution.json", "train": "summary.json", "benchmark": "benchmark.json"}
 MEMORY_SIZES, MEMORY_FRAMES = (5, 10, 20), 300_000
 
 
@@ -45,21 +46,16 @@ def _rows(cfg: BenchmarkConfig, device: torch.device) -> Iterator[dict[str, Any]
     for n in cfg.sizes:
         at = [*typed("kernel", "grid.t_max", "cost.safe"), f"grid.size={n}"]
         for cost in COSTS if "solve" in cfg.work else ():
-            yield _row(
-                n, f"solve, c = {cost:g}", "regret_per_step", "solution.json", "solve", *at, f"cost.sensor={cost}"
-            )
+            yield _row(n, f"solve, c = {cost:g}", "solve", *at, f"cost.sensor={cost}")
         if "train" in cfg.work:
             # Actions over all cells would make a budget per cell one of M² numbers.
             learner = [f"algo={cfg.learner}", f"grid.window={WINDOW}"]
-            what = f"train {cfg.learner}, window {WINDOW}"
-            yield _row(n, what, "regret_per_step", "summary.json", "train", *at, *own, *learner)
-        if "env" not in cfg.work:
-            continue
-        # A benchmark within the benchmark, so that each size has a process, and a peak memory, of its own.
-        steps = ["benchmark", "part=env", f"batch_sizes=[{ENVS}]", f"seconds={cfg.seconds}", *at, *own]
-        yield _row(n, f"env, B = {ENVS}", "per_second", "benchmark.json", *steps)
-        window = f"env, B = {ENVS}, window {WINDOW}"
-        yield _row(n, window, "per_second", "benchmark.json", *steps, f"grid.window={WINDOW}")
+            yield _row(n, f"train {cfg.learner}, window {WINDOW}", "train", *at, *own, *learner)
+        if "env" in cfg.work:
+            # A benchmark within the benchmark, so that each size has a process, and a peak memory, of its own.
+            steps = ["part=env", f"batch_sizes=[{ENVS}]", f"seconds={cfg.seconds}", *at, *own]
+            yield _row(n, f"env, B = {ENVS}", "benchmark", *steps)
+            yield _row(n, f"env, B = {ENVS}, window {WINDOW}", "benchmark", *steps, f"grid.window={WINDOW}")
 
 
 def _growth(before: dict[str, Any] | None, row: dict[str, Any]) -> dict[str, float | None]:
@@ -73,19 +69,19 @@ def _growth(before: dict[str, Any] | None, row: dict[str, Any]) -> dict[str, flo
     return found
 
 
-def _row(n: int, what: str, figure: str, file: str, *words: str) -> dict[str, Any]:
+def _row(n: int, what: str, command: str, *words: str) -> dict[str, Any]:
     row: dict[str, Any] = {"part": "size", "N": n, "what": what, "wall_seconds": None, "cpu_seconds": None}
     row |= {"peak_mib": None, "regret_per_step": None, "per_second": None}
     with tempfile.TemporaryDirectory() as folder:
         try:
-            usage = asdict(measured(*words, "quiet=true", f"hydra.run.dir={folder}/run"))
+            usage = asdict(measured(command, *words, "quiet=true", f"hydra.run.dir={folder}/run"))
         # Refused for lack of memory: that is a result as well, and the larger sizes are still of interest.
         except subprocess.CalledProcessError:
             return row
-        result = json.loads(Path(folder, "run", file).read_text())
+        result = json.loads(Path(folder, "run", RESULTS[command]).read_text())
     if "rows" in result:  # a rate: of the process only its memory is of interest
-        result, usage = result["rows"][0], {"peak_mib": usage["peak_mib"]}
-    return row | usage | {figure: result[figure]}
+        return row | {"peak_mib": usage["peak_mib"], "per_second": result["rows"][0]["per_second"]}
+    return row | usage | {"regret_per_step": result["regret_per_step"]}
 
 
 def memory(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator[dict[str, Any]]:  # noqa: ARG001

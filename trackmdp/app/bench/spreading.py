@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -20,7 +21,8 @@ from trackmdp.training.train import train
 from trackmdp.world.make import make_world
 from trackmdp.world.model import Array, World
 
-Maker: TypeAlias = Callable[[], World]
+Maker: TypeAlias = Callable[[], Any]
+"""Makes a `World`: none of these kernels has modes."""
 
 ALGOS = ("hindsight", "learned_kernel")
 STARTS, KICKS, KICKED = 32, 16, 0.05
@@ -39,12 +41,7 @@ def worlds(size: int, t_max: int) -> dict[str, Maker]:
     """By name, worlds on `size` x `size` cells."""
 
     def made(kernel: str, cost: float | list[float], **options: Any) -> Maker:
-        def world() -> World:
-            found = make_world(kernel, size=size, t_max=t_max, cost=cost, **options)
-            assert isinstance(found, World)  # none of these kernels has modes
-            return found
-
-        return world
+        return partial(make_world, kernel, size=size, t_max=t_max, cost=cost, **options)
 
     def table(kernel: Array, cost: float) -> Maker:
         return lambda: World(kernel, size, cost=cost, t_max=t_max)

@@ -131,7 +131,7 @@ class _Stop(Signals):
         self._file.unlink(missing_ok=True)
         return super().__enter__()
 
-    def __exit__(self, *raised: object) -> None:
+    def __exit__(self, *raised: Any) -> None:
         super().__exit__(*raised)
         if raised[0] is None:  # else jobs elsewhere may still be about to look
             self._file.unlink(missing_ok=True)

@@ -9,7 +9,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import optuna
 from hydra.core.override_parser.types import IntervalSweep, Override, RangeSweep
+from optuna.exceptions import ExperimentalWarning
+from optuna.samplers import RandomSampler, TPESampler
+from optuna.trial import TrialState
 
 from trackmdp.app.sweep.plan import MOST, Job, MakeJobs
 from trackmdp.app.sweep.sweep import run_scores
@@ -54,7 +58,7 @@ def trials(cfg: OptunaConfig, words: Sequence[str], folder: Path, planned: MakeJ
 
     with _study(cfg, folder) as study:
         # The words are kept with each trial: Optuna's own parameters would have to be put into Hydra's notation again.
-        told = [trial.user_attrs.get(_WORDS, []) for trial in study.trials if trial.state == _states().COMPLETE]
+        told = [trial.user_attrs.get(_WORDS, []) for trial in study.trials if trial.state == TrialState.COMPLETE]
         earlier = [job_of(chosen) for chosen in told]
         # Handed over as a batch of its own: the sweep finds them done, and they stand in its table.
         if here := [job for job in earlier if run_of(job.folder).state == "done"]:
@@ -64,7 +68,7 @@ def trials(cfg: OptunaConfig, words: Sequence[str], folder: Path, planned: MakeJ
         failed = 0
         # `n_trials` is the whole study's, so that a call that was interrupted and is repeated comes to the same
         # number; Optuna's own `optimize` would add so many each time.
-        while missing := max(0, cfg.n_trials - _count(study, "COMPLETE") - failed):
+        while missing := max(0, cfg.n_trials - _completed(study) - failed):
             asked = [_ask(cfg, study, searched, place) for place in range(min(cfg.batch, missing))]
             jobs = [job_of(chosen) for _, chosen in asked]
             # A sampler may propose the same values twice within a batch: one run, whose result both trials are told.
@@ -78,7 +82,7 @@ def _ask(cfg: OptunaConfig, study: Any, searched: dict[str, Override], place: in
     """The next trial and its words. Draws depend on the seed and on the results known, not on interruptions."""
     # A sampler's state is not kept in the storage. Seeded anew from what is known, the choice after an interruption is
     # the one that would have come without it. 2^32: NumPy takes no larger seed.
-    study.sampler = _sampler(cfg, derive(cfg.seed, "optuna", _count(study, "COMPLETE"), place) % 2**32)
+    study.sampler = _sampler(cfg, derive(cfg.seed, "optuna", _completed(study), place) % 2**32)
     trial = study.ask()
     try:
         words = [f"{key}={_suggest(trial, key, override)}" for key, override in searched.items()]
@@ -89,9 +93,6 @@ def _ask(cfg: OptunaConfig, study: Any, searched: dict[str, Override], place: in
 
 
 def _sampler(cfg: OptunaConfig, seed: int) -> Any:
-    from optuna.exceptions import ExperimentalWarning
-    from optuna.samplers import RandomSampler, TPESampler
-
     if cfg.sampler == "random":
         return RandomSampler(seed)
     with warnings.catch_warnings():
@@ -149,15 +150,13 @@ def _tell(cfg: OptunaConfig, study: Any, trial: Any, job: Job) -> int:
         return 0
     # Done without a figure counts as failed, as where the regret is searched on recorded tracks, which have no bound.
     if run.state in ("done", "failed"):
-        study.tell(trial, state=_states().FAIL)
+        study.tell(trial, state=TrialState.FAIL)
         return 1
     return 0
 
 
 @contextmanager
 def _study(cfg: OptunaConfig, folder: Path) -> Iterator[Any]:
-    import optuna
-
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     try:
         storage = optuna.storages.RDBStorage(cfg.storage or f"sqlite:///{folder / STUDY}")
@@ -178,24 +177,18 @@ def _study(cfg: OptunaConfig, folder: Path) -> Iterator[Any]:
 
 def _enqueue_interrupted(study: Any) -> None:
     """Ask first for the trials of an earlier call that were interrupted or failed."""
-    done = [trial.params for trial in study.trials if trial.state == _states().COMPLETE]
-    queued = [trial.system_attrs.get("fixed_params") for trial in study.trials if trial.state == _states().WAITING]
+    done = [trial.params for trial in study.trials if trial.state == TrialState.COMPLETE]
+    queued = [trial.system_attrs.get("fixed_params") for trial in study.trials if trial.state == TrialState.WAITING]
     for trial in study.trials:
         # The process that asked for it is gone; nobody would ever tell its result.
-        if trial.state == _states().RUNNING:
-            study.tell(trial.number, state=_states().FAIL)
+        if trial.state == TrialState.RUNNING:
+            study.tell(trial.number, state=TrialState.FAIL)
         # `trial.state` is the state as listed above, so that a trial just told to have failed is still among those
         # here.
-        if trial.state in (_states().RUNNING, _states().FAIL) and trial.params not in [*done, *queued]:
+        if trial.state in (TrialState.RUNNING, TrialState.FAIL) and trial.params not in [*done, *queued]:
             study.enqueue_trial(trial.params)
             queued.append(trial.params)
 
 
-def _count(study: Any, *names: str) -> int:
-    return len(study.get_trials(deepcopy=False, states=[_states()[name] for name in names]))
-
-
-def _states() -> Any:
-    from optuna.trial import TrialState
-
-    return TrialState
+def _completed(study: Any) -> int:
+    return len(study.get_trials(deepcopy=False, states=[TrialState.COMPLETE]))
