@@ -10,6 +10,7 @@ import struct
 import zlib
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from io import BytesIO
 from itertools import takewhile
@@ -45,6 +46,21 @@ class Damaged(Exception):
     """A checksum or a structure that is not as it should be; the message says where."""
 
 
+@contextmanager
+def reading(file: Path) -> Iterator[None]:
+    """Whatever damage makes raise inside ends in one line.
+
+    Raises:
+        UserError: something was damaged.
+    """
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:  # whatever mcap, JSON, NumPy and base64 raise over what a hostile log says
+        raise UserError(f"file={file}: damaged ({reason(error)}); recover=true saves what can be read") from error
+
+
 @dataclass(frozen=True)
 class Message:
     """One message."""
@@ -63,15 +79,11 @@ class Container:
 
     def __init__(self, file: Path) -> None:
         self.file = file
-        self.stream = opened_log(file)
-        try:
+        with ExitStack() as opened, reading(file):
+            self.stream = opened.enter_context(opened_log(file))
             self.profile, self.made_by = self._header()
             self._summary()
-        except BaseException as error:
-            self.stream.close()
-            if isinstance(error, UserError) or not isinstance(error, Exception):
-                raise
-            raise UserError(f"file={file}: damaged ({reason(error)}); recover=true saves what can be read") from error
+            opened.pop_all()  # from here on it stays open
 
     def _header(self) -> tuple[str, str]:
         """Profile and library, the two strings of the header record."""

@@ -6,6 +6,7 @@ import io
 import json
 from bisect import bisect_left
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import groupby, pairwise
 from pathlib import Path
@@ -15,14 +16,13 @@ import numpy as np
 from tensordict import TensorDict
 
 from trackmdp.episodes import schema
-from trackmdp.episodes.container import Container, Damaged, Message
+from trackmdp.episodes.container import Container, Damaged, Message, reading
 from trackmdp.episodes.episode import Episode, first_difference
 from trackmdp.episodes.messages import decode
 from trackmdp.episodes.schema import LoggedRun, versions_apart
 from trackmdp.episodes.simulate import resimulate
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
-from trackmdp.untrusted import reason
 from trackmdp.world.files import csr_in, load_npy
 from trackmdp.world.model import BoolArray, World
 from trackmdp.world.modes import HiddenWorld, Modelled
@@ -45,28 +45,26 @@ class EpisodeReader:
         self.file = Path(file)
         self._container = Container(self.file)
         self._built: Modelled | None = None
-        try:
+        # A constructor that raises leaves nobody to close the file.
+        with ExitStack() as opened, reading(self.file):
+            opened.callback(self.close)
             self._open()
-        except BaseException:
-            # A constructor that raises leaves nobody to close the file.
-            self.close()
-            raise
+            opened.pop_all()
 
     def _open(self) -> None:
         file, container = self.file, self._container
         if container.profile or schema.RUN not in container.metadata:
             kind = f"profile {container.profile!r}" if container.profile else f"it has no metadata {schema.RUN}"
             raise UserError(f"file={file}: not a log of trackmdp ({kind})")
-        self.run = LoggedRun.of(file, self._checked(self._told, schema.RUN))
+        self.run = LoggedRun.of(file, self._told(schema.RUN))
         # No checksum that is read here covers the header: it is held against the sealed metadata.
         if container.made_by != f"trackmdp {self.run.said['trackmdp']}":
-            raise self._damage("the header")
+            raise Damaged("the header")
         if schema.END not in container.metadata:
             # Written last: without it the log was finished by another program, or a part was cut out.
-            raise self._damage(f"no metadata {schema.END}")
-        self.end = self._checked(self._told, schema.END)
-        index = self.attachment("episodes.json", self.end.get("episodes.json.sha256", ""))
-        self._checked(self._index, index)
+            raise Damaged(f"no metadata {schema.END}")
+        self.end = self._told(schema.END)
+        self._index(self.attachment("episodes.json", self.end.get("episodes.json.sha256", "")))
         # Short episodes share a chunk: read one after another, the chunk is decompressed once.
         self._held: tuple[int, list[Message]] = (-1, [])
 
@@ -128,14 +126,14 @@ class EpisodeReader:
     def read(self, number: int) -> Episode:
         """Episode `number`."""
         row = self.row(number)
-        begin, end = int(row["start_time"]), int(row["end_time"])
         mine: dict[str, list[bytes]] = {"/step": [], "/grid": [], "/episode": []}
-        for message in self._checked(self._between, begin, end):
-            mine.setdefault(message.topic, []).append(message.data)
-        # The index at the end and the message at the episode's own place say the same, or one of them was changed.
-        if self._checked(lambda: [json.loads(text) for text in mine["/episode"]]) != [row]:
-            raise self._damage(f"episode {number} is not what the index says")
-        return self._checked(decode, row, mine["/step"], mine["/grid"], self.run)
+        with reading(self.file):
+            for message in self._between(int(row["start_time"]), int(row["end_time"])):
+                mine.setdefault(message.topic, []).append(message.data)
+            # The index at the end and the message at the episode's own place say the same, or one of them was changed.
+            if [json.loads(text) for text in mine["/episode"]] != [row]:
+                raise Damaged(f"episode {number} is not what the index says")
+            return decode(row, mine["/step"], mine["/grid"], self.run)
 
     def _between(self, begin: int, end: int) -> list[Message]:
         """The messages from one log time to another; the chunk read last is kept, for the episode after."""
@@ -148,9 +146,10 @@ class EpisodeReader:
 
     def attachment(self, name: str, sha256: str | None = None) -> bytes:
         """An attachment, its digest checked; that of `trackmdp.run` unless given."""
-        content = self._checked(self._container.attachment, name)
-        if schema.digest(content) != (self.run.said.get(f"{name}.sha256") if sha256 is None else sha256):
-            raise self._damage(f"attachment {name} is not what was written")
+        with reading(self.file):
+            content = self._container.attachment(name)
+            if schema.digest(content) != (self.run.said.get(f"{name}.sha256") if sha256 is None else sha256):
+                raise Damaged(f"attachment {name} is not what was written")
         return content
 
     def policy_table(self, number: int) -> bytes | None:
@@ -172,46 +171,48 @@ class EpisodeReader:
             return Policy.random_k(task, int(facts["k"]))
         if facts["kind"] != "chains" or table is None:
             raise UserError(f"file={self.file}: policy {number} is a {facts['kind']!r}, expected chains or random_k")
-        if self.run.sparse:
-            return Policy(task, self._checked(csr_in, table))
-        return Policy.from_dense(task, self._checked(self._unpacked, table, task.num_keys))
+        with reading(self.file):
+            if self.run.sparse:
+                return Policy(task, csr_in(table))
+            return Policy.from_dense(task, self._unpacked(table, task.num_keys))
 
     def _unpacked(self, table: bytes, keys: int) -> BoolArray:
         sensors, bits = self.run.sensors, _loaded(".npy", table)
         if bits.dtype != np.uint8 or bits.shape != (keys, self.run.t_max + 1, -(-sensors // 8)):
             raise Damaged("the table of a policy")
         # `[keys, t_max+1, ceil(S/8)]` to `[keys, t_max+1, S]`; `count` drops the bits that fill the last byte.
-        return np.unpackbits(bits.astype(np.uint8), axis=-1, count=sensors).astype(bool)
+        return np.unpackbits(bits, axis=-1, count=sensors).astype(bool)
 
     def world(self) -> Modelled:
         """The world in which the episodes were recorded."""
         # Kept, since every episode that becomes a TensorDict needs it.
         if self._built is None:
-            self._built = self._checked(self._world)
+            with reading(self.file):
+                self._built = self._world()
         return self._built
 
     def _world(self) -> Modelled:
         run = self.run
-        # Kernel and prices; where sensors may miss `[2, M]`, p_d and p_s; where they have footprints `[S, M]`.
-        names = run.tables[1:]
-        kernel, cost, *more = (_loaded(name, self.attachment(name)) for name in names)
-        sensors = dict(zip(names[2:], more, strict=True))
-        chances = sensors.get("sensors.npy")
-        may_miss = {} if chances is None else dict(zip(("detection", "safe_detection"), chances, strict=True))
-        if "footprints.npz" in sensors and sensors["footprints.npz"].shape[0] != run.sensors:
+        config, kernel, *_ = run.tables
+        tables = {name: _loaded(name, self.attachment(name)) for name in run.tables if name != config}
+        # `[2, M]`, p_d and p_s, where sensors may miss; `[S, M]` where they have footprints.
+        chances, footprints = tables.get("sensors.npy"), tables.get("footprints.npz")
+        if footprints is not None and footprints.shape[0] != run.sensors:
             raise Damaged("how many sensors there are")
-        of_task: dict[str, Any] = may_miss | {
-            "coverage": sensors.get("footprints.npz"),
-            "cost": cost,
+        of_task: dict[str, Any] = {
+            **({} if chances is None else dict(zip(("detection", "safe_detection"), chances, strict=True))),
+            "coverage": footprints,
+            "cost": tables["cost.npy"],
             **{name: getattr(run, name) for name in ("size", "safe_cost", "t_max", "reward", "max_steps", "window")},
         }
         if run.modes:
-            return HiddenWorld(kernel, modes=run.modes, revealed=run.revealed, **of_task)
-        return World(kernel, **of_task)
+            return HiddenWorld(tables[kernel], modes=run.modes, revealed=run.revealed, **of_task)
+        return World(tables[kernel], **of_task)
 
     def check_all(self) -> None:
         """Check every byte of the file, those without meaning to this reader included."""
-        self._checked(self._container.check_data)
+        with reading(self.file):
+            self._container.check_data()
         for name in self.run.tables:
             self.attachment(name)
         for number in range(len(self.policies)):
@@ -222,18 +223,6 @@ class EpisodeReader:
         if content is None:
             raise Damaged(f"metadata {name} is not what was written")
         return content
-
-    def _checked(self, work: Any, *arguments: Any) -> Any:
-        """What `work` returns; whatever damage makes it raise ends in one line."""
-        try:
-            return work(*arguments)
-        except UserError:
-            raise
-        except Exception as error:  # whatever JSON, NumPy and base64 raise over what a hostile log says
-            raise self._damage(reason(error)) from error
-
-    def _damage(self, what: str) -> UserError:
-        return UserError(f"file={self.file}: damaged ({what}); recover=true saves what can be read")
 
 
 def _loaded(name: str, content: bytes) -> Any:
