@@ -110,7 +110,7 @@ def test_every_figure_has_a_text_alternative_its_numbers_and_its_n(report: Repor
             found = re.search(rf'<{name} id="{re.escape(mark)}">(.+?)</{name}>', text)
             assert found, mark
     for figure in report.figures:
-        assert re.search(r"\bn = \d", figure.title), figure.name
+        assert re.search(r"\bn = \d", figure.title), figure.table.name
         assert figure.table.rows
 
 
@@ -148,7 +148,7 @@ def test_runs_on_recorded_tracks_have_neither_bound_nor_regret(tmp_path: Path) -
     assert not found.anomalies
     assert not found.motions
     made = build(found)
-    assert [figure.name for figure in made.figures] == ["aihtr-tracks-z-5"]
+    assert [figure.table.name for figure in made.figures] == ["aihtr-tracks-z-5"]
     table = next(table for table in made.tables if table.name == "methods")
     assert "nan" not in table.html()
 

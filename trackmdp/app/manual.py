@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 import re
 import textwrap
@@ -216,4 +215,4 @@ def _values(group: str, name: str, typed: dict[str, str]) -> dict[str, Any]:
 
 
 def _about(schema: type[Any]) -> str:
-    return " ".join(inspect.cleandoc(schema.__doc__ or "").split())
+    return " ".join((schema.__doc__ or "").split())

@@ -69,7 +69,7 @@ def calibration_figure(every: Sequence[Candidate]) -> Figure:
     title = f"Candidate kernels by their distance to the printed Q_MDP accuracy, n = {len(every) // 3} for each Z"
     best = {c.support_size: c for c in every if seeds[c.support_size] == c.seed}
     text = "; ".join(f"Z = {z}: seed {c.seed}, {c.deviation:.2f} points" for z, c in sorted(best.items()))
-    return draw_figure("calibration", title, f"Chosen, {text}.", candidates_table(every), 2.8, paint)
+    return draw_figure(title, f"Chosen, {text}.", candidates_table(every), 2.8, paint)
 
 
 def fit_table(settings: Sequence[Setting]) -> Table:
@@ -143,7 +143,7 @@ def _ranges(
     columns = [Column("border"), Column("T_max"), Column("Z"), Column("median", 2), Column("low", 2), Column("high", 2)]
     numbers: list[list[Cell]] = [[s.border, s.t_max, s.support_size, *astuple(of(s))] for s in settings]
     table = Table(f"sensitivity-{name}", title, columns, numbers)
-    return draw_figure(f"sensitivity-{name}", title, text, table, 4.2, paint)
+    return draw_figure(title, text, table, 4.2, paint)
 
 
 def sections(study: Study, openings: Openings) -> list[Section]:

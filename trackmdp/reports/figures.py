@@ -58,8 +58,9 @@ def panels(study: Study) -> list[Panel]:
 
 def against_cost(study: Study, panel: Panel) -> Figure:
     """AIHTR against c: the learned policies with their intervals, Q_MDP, the bounds, the optimum."""
-    exact = {"Q_MDP": _exact(study, panel, "qmdp_aihtr")}
-    exact |= {label: _exact(study, panel, key) for label, key in BOUNDS.items()}
+    # None depends on the run: of those found the best is taken.
+    keys = {"Q_MDP": "qmdp_aihtr"} | BOUNDS
+    exact = {name: [max(study.known(w, key), default=math.nan) for w in panel.worlds] for name, key in keys.items()}
     # A bound that no run has, as where no optimum was solved for, gets no empty entry in the legend.
     exact = {label: values for label, values in exact.items() if not all(map(math.isnan, values))}
     drawn = _Against.of(study, panel, exact, regret=False)
@@ -85,7 +86,7 @@ def against_cost(study: Study, panel: Panel) -> Figure:
 
     table = drawn.table("aihtr", "AIHTR", digits=3)
     text = drawn.spoken(digits=1) + (" The axis is broken between the groups of values." if split else "")
-    return draw_figure(table.name, drawn.titled("AIHTR against the price of a sensor"), text, table, 3.9, paint)
+    return draw_figure(drawn.titled("AIHTR against the price of a sensor"), text, table, 3.9, paint)
 
 
 def regret_against_cost(study: Study, panel: Panel, threshold: float | None) -> Figure:
@@ -111,7 +112,7 @@ def regret_against_cost(study: Study, panel: Panel, threshold: float | None) -> 
 
     table = drawn.table("regret", "regret per step", digits=5)
     title = drawn.titled("Regret per step to the proved upper bound")
-    return draw_figure(table.name, title, drawn.spoken(digits=4), table, 3.4, paint)
+    return draw_figure(title, drawn.spoken(digits=4), table, 3.4, paint)
 
 
 @dataclass(frozen=True)
@@ -179,14 +180,6 @@ class _Against:
         counts = {method: sorted({e.n for e in row if e.n}) for method, row in self.learned.items()}
         seeds = ", ".join(f"{m} n = {'–'.join(map(str, (c[0], c[-1])[: len(c)]))}" for m, c in counts.items())
         return f"{what}, {self.panel.title}; seeds per point: {seeds}"
-
-
-def _exact(study: Study, panel: Panel, key: str) -> list[float]:
-    """A figure that does not depend on the run; the best of those found."""
-    return [
-        max((value for run in study.in_world(world) if (value := run.figures[key]) is not None), default=math.nan)
-        for world in panel.worlds
-    ]
 
 
 def _drawn(row: Sequence[MeanInterval], floor: float) -> Array:
@@ -273,7 +266,7 @@ def curves(study: Study, points: Mapping[str, Sequence[CurvePoint]], by: str) ->
     title = f"Regret while learning against {unit}: mean over worlds and seeds with 95 % interval; {counts}"
     ends = ", ".join(f"{m} {row[-1].mean:.4f} after {grid[-1]:,.0f}" for m, (grid, row) in found.items())
     table = Table(f"learning-{by}", title, columns, rows)
-    return draw_figure(f"learning-{by}", title, f"Regret per step at the end: {ends} {unit}.", table, 3.3, paint)
+    return draw_figure(title, f"Regret per step at the end: {ends} {unit}.", table, 3.3, paint)
 
 
 def _averaged(
@@ -339,7 +332,7 @@ def profiles(study: Study, threshold: float | None) -> Figure | None:
     columns = [Column("method"), Column("n"), *(Column(f"≤ {mark:g}", 2) for mark in marks)]
     rows: list[list[Cell]] = [[m, len(v), *(float((v <= mark).mean()) for mark in marks)] for m, v in regrets.items()]
     said = [f"{m}: half of the runs at most {np.median(v):.4f}, all at most {v.max():.4f}" for m, v in regrets.items()]
-    return draw_figure("profiles", title, "; ".join(said) + ".", Table("profiles", title, columns, rows), 3.3, paint)
+    return draw_figure(title, "; ".join(said) + ".", Table("profiles", title, columns, rows), 3.3, paint)
 
 
 def _steps(study: Study, run: FinishedRun, world: str, curves: Mapping[str, Sequence[CurvePoint]], by: str) -> Array:

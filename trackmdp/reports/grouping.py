@@ -45,23 +45,25 @@ class Study:
         """All runs in a world."""
         return [run for method in self.methods for run in self.of(world, method)]
 
+    def known(self, world: str, *names: str) -> list[float]:
+        """The figures of these names that the runs in a world have."""
+        found = [run.figures[name] for run in self.in_world(world) for name in names]
+        return [value for value in found if value is not None]
+
     def upper(self, world: str) -> float:
         """The best proved upper bound on the AIHTR in a world; nan where there is none, as on recorded tracks."""
         # A bound holds for the world, whichever run found it: the least of all is the tightest.
-        found = [run.figures[key] for run in self.in_world(world) for key in ("optimal_upper", "bound_clocked")]
-        return min((value for value in found if value is not None), default=math.nan)
+        return min(self.known(world, "optimal_upper", "bound_clocked"), default=math.nan)
 
     def lower(self, world: str) -> float | None:
         """The best AIHTR that the solver attained in a world."""
-        found = [run.figures["optimal_lower"] for run in self.in_world(world)]
-        return max((value for value in found if value is not None), default=None)
+        return max(self.known(world, "optimal_lower"), default=None)
 
     def best(self, world: str) -> float:
         """The AIHTR of the best policy known in a world, the solver's or a run's; nan where no bound is known."""
-        keys = ("optimal_lower", "qmdp_aihtr", "aihtr")
-        found = [run.figures[key] for run in self.in_world(world) for key in keys]
-        known = not math.isnan(self.upper(world))
-        return max((value for value in found if value is not None), default=math.nan) if known else math.nan
+        if math.isnan(self.upper(world)):
+            return math.nan
+        return max(self.known(world, "optimal_lower", "qmdp_aihtr", "aihtr"), default=math.nan)
 
     def regret(self, run: FinishedRun, world: str, aihtr: float | None = None) -> float:
         """Distance per step to the best proved upper bound, of the run's policy or of one that earns `aihtr`."""

@@ -88,7 +88,7 @@ def idea_figure(policy: Sensed, motion: MotionTable, size: tuple[int, int], wher
     columns = [Column("moment"), Column("row"), Column("column"), Column("probability", 3), Column("sensed")]
     title = f"The idea in one figure, {where}"
     text = paragraphs("trackmdp.reports")["idea"]
-    return draw_figure("story", f"{title}. {text}", text, Table("story", title, columns, rows), 4.6, paint)
+    return draw_figure(f"{title}. {text}", text, Table("story", title, columns, rows), 4.6, paint)
 
 
 def _window(story: list[Scene], size: tuple[int, int]) -> tuple[int, int, int, int]:

@@ -83,7 +83,7 @@ def policy_map(name: str, where: str, policy: Sensed, motion: MotionTable, size:
         for n in shown
     )
     text += _AVERAGED if policy.averaged else ""
-    return draw_figure(f"sets-{name}", title, text, table, 0.4 + 3.9 * len(shown), paint)
+    return draw_figure(title, text, table, 0.4 + 3.9 * len(shown), paint)
 
 
 def _intensity_map(name: str, where: str, policy: Sensed, size: tuple[int, int]) -> Figure:
@@ -99,9 +99,8 @@ def _intensity_map(name: str, where: str, policy: Sensed, size: tuple[int, int])
             axes.set_title(_AFTER[n])
 
     title = f"Cells sensed, by where the target was located, {where}"
-    return draw_figure(
-        f"sets-{name}", title, _said(layers, size), _tiles_table(f"sets-{name}", title, means, size), 3.2, paint
-    )
+    table = _tiles_table(f"sets-{name}", title, means, size)
+    return draw_figure(title, _said(layers, size), table, 3.2, paint)
 
 
 VALUE, MISSING, OF_QMDP = "value V(x)", "missing to the clocked bound", "the same, Q_MDP"
@@ -145,7 +144,7 @@ def value_map(
 
     title = f"Value of each start cell, and what is missing of the clocked bound, {where}"
     table = _tiles_table(f"value-{name}", title, means, size)
-    return draw_figure(f"value-{name}", title, _said(layers, size), table, 2.1, paint)
+    return draw_figure(title, _said(layers, size), table, 2.1, paint)
 
 
 def _side(size: tuple[int, int]) -> int:

@@ -19,8 +19,7 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.durable import csv_text, write_bytes, write_text
-from trackmdp.errors import UserError
-from trackmdp.untrusted import decoded, printable, read_bytes, read_object, read_text, sealed, unsealed
+from trackmdp.untrusted import decoded, known_object, printable, read_bytes, read_object, read_text, sealed, unsealed
 from trackmdp.world.files import load_npz, npz_bytes, whole_csr
 from trackmdp.world.model import Array
 
@@ -162,10 +161,7 @@ class Results:
 
 def is_stored(folder: Path) -> bool:
     """Whether `folder` holds what `save_results` writes, rather than the folders of runs."""
-    try:
-        return bool(read_object(folder / MANIFEST).get("format") == RESULTS_FORMAT)
-    except UserError:
-        return False
+    return bool(known_object(folder / MANIFEST).get("format") == RESULTS_FORMAT)
 
 
 def save_results(results: Results, folder: Path) -> None:
@@ -253,11 +249,8 @@ def _common(runs: Iterable[FinishedRun]) -> dict[str, dict[str, Any]]:
     """Algorithm -> the options that have one value in all of its runs."""
     found: dict[str, dict[str, Any]] = {}
     for run in runs:
-        if run.algo not in found:
-            found[run.algo] = dict(run.settings)
-        else:
-            shared = found[run.algo]
-            found[run.algo] = {k: v for k, v in shared.items() if k in run.settings and run.settings[k] == v}
+        shared = found.get(run.algo, run.settings)
+        found[run.algo] = {k: v for k, v in shared.items() if k in run.settings and run.settings[k] == v}
     # With several algorithms each row has to name its own, by which the rest of its options is found.
     several = len(found) > 1
     return {algo: {k: v for k, v in found[algo].items() if k != "algo.name" or not several} for algo in sorted(found)}

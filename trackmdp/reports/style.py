@@ -91,14 +91,12 @@ class Figure:
     """A finished figure.
 
     Attributes:
-        name: of its files.
         title: heading; says what n is.
         text: what the figure shows, in words, for who cannot see it.
-        table: its numbers.
+        table: its numbers, by whose name its files are called.
         svg, png: contents of the files.
     """
 
-    name: str
     title: str
     text: str
     table: Table
@@ -107,9 +105,9 @@ class Figure:
 
     def html(self) -> str:
         """For the page: the drawing in the page's colours, its text alternative, its numbers."""
-        drawing = _inline(self.svg.decode(), self.name, self.title, self.text)
+        drawing = _inline(self.svg.decode(), self.table.name, self.title, self.text)
         return (
-            f'<figure id="{self.name}">{drawing}<figcaption>{html.escape(self.title)}</figcaption>'
+            f'<figure id="{self.table.name}">{drawing}<figcaption>{html.escape(self.title)}</figcaption>'
             f"<details><summary>Numbers</summary>{self.table.html()}</details></figure>"
         )
 
@@ -127,27 +125,25 @@ def looks_of(labels: Sequence[str]) -> dict[str, Look]:
 
 
 @contextmanager
-def canvas(height: float, name: str, width: float = WIDTH) -> Iterator[Canvas]:
-    """An empty figure, `width` x `height` inches; `name` keeps the ids of several in one page apart."""
+def canvas(height: float, name: str) -> Iterator[Canvas]:
+    """An empty figure, `WIDTH` x `height` inches; `name` keeps the ids of several in one page apart."""
     import matplotlib
     from matplotlib.figure import Figure as New
 
     # Only inside: whoever calls this from a notebook keeps their own settings. `Figure` without pyplot needs no
     # display, and is let go of when it is no longer used.
     with matplotlib.rc_context(_settings(name)):
-        yield New(figsize=(width, height), dpi=_DPI, layout="constrained")
+        yield New(figsize=(WIDTH, height), dpi=_DPI, layout="constrained")
 
 
-def draw_figure(
-    name: str, title: str, text: str, table: Table, height: float, paint: Callable[[Canvas], None]
-) -> Figure:
+def draw_figure(title: str, text: str, table: Table, height: float, paint: Callable[[Canvas], None]) -> Figure:
     """Paint and write one figure."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     # Both from one drawing. The metadata are emptied: a date or a version would change the bytes each time.
     svg, png = io.BytesIO(), io.BytesIO()
-    with warnings.catch_warnings(), canvas(height, name) as figure:
+    with warnings.catch_warnings(), canvas(height, table.name) as figure:
         # A name may have letters that the font lacks, as of Chinese, or a tab: text in the SVG, boxes in the PNG.
         warnings.filterwarnings("ignore", "Glyph .* missing from font", UserWarning)
         paint(figure)
@@ -157,7 +153,7 @@ def draw_figure(
         # savefig would lay out and draw twice more each time
         FigureCanvasAgg(figure).print_png(png, metadata={"Software": None})  # type: ignore[no-untyped-call]
         FigureCanvasSVG(figure).print_svg(svg, metadata={"Date": None, "Creator": None})  # type: ignore[no-untyped-call]
-    return Figure(name, title, text, table, svg.getvalue(), png.getvalue())
+    return Figure(title, text, table, svg.getvalue(), png.getvalue())
 
 
 def tidy(axes: Axes) -> None:

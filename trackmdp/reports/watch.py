@@ -5,8 +5,9 @@ from __future__ import annotations
 import csv
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -57,13 +58,23 @@ def watch(sweep: Path, console: Console, every: float) -> int:
     Raises:
         UserError: there are no runs.
     """
-    found = statuses(sweep)
+    looks = _looks(sweep, every)
+    found = first = next(looks)
     if not found:
         raise UserError(f"sweep={sweep}: no runs in there, expected the folder of a sweep")
     if console.is_terminal:
-        found = _live(sweep, console, every, found)
+        # `auto_refresh=False`: a thread of rich's would draw between two looks at the disk, where nothing is new.
+        with Live(_table(found, console.height), console=console, auto_refresh=False) as live:
+            for found in looks:
+                live.update(_table(found, console.height), refresh=True)
     else:
-        found = _lines(sweep, console, every, found)
+        said: dict[str, str] = {}  # name -> the state last told
+        for found in chain([first], looks):
+            for status in found:
+                if status.state != WAITING and said.get(status.name) != status.state:
+                    said[status.name] = status.state
+                    console.print(printable(_line(status)), markup=False)
+        console.print(_counts(found), markup=False)
     return sum(status.state == DONE for status in found)
 
 
@@ -72,30 +83,13 @@ def statuses(sweep: Path) -> list[Status]:
     return [_status(sweep / name, name) for name in run_folders(sweep, planned(sweep))]
 
 
-def _live(sweep: Path, console: Console, every: float, found: list[Status]) -> list[Status]:
-    # `auto_refresh=False`: a thread of rich's would draw between two looks at the disk, where nothing is new.
-    with Live(_table(found, console.height), console=console, auto_refresh=False) as live:
-        while _going(sweep, found):
-            time.sleep(every)
-            found = statuses(sweep)
-            live.update(_table(found, console.height), refresh=True)
-    return found
-
-
-def _lines(sweep: Path, console: Console, every: float, found: list[Status]) -> list[Status]:
-    # Name -> the state last told.
-    said: dict[str, str] = {}
+def _looks(sweep: Path, every: float) -> Iterator[list[Status]]:
+    """The runs, again and again until nothing is left to wait for."""
     while True:
-        for status in found:
-            if status.state != WAITING and said.get(status.name) != status.state:
-                said[status.name] = status.state
-                console.print(printable(_line(status)), markup=False)
+        yield (found := statuses(sweep))
         if not _going(sweep, found):
-            break
+            return
         time.sleep(every)
-        found = statuses(sweep)
-    console.print(_counts(found), markup=False)
-    return found
 
 
 def _going(sweep: Path, found: Sequence[Status]) -> bool:

@@ -64,9 +64,10 @@ def _write(report: Report, folder: Path) -> None:
     for name in ("figures", "tables"):
         (folder / name).mkdir(exist_ok=True)
     for figure in report.figures:
-        write_bytes(folder / "figures" / f"{figure.name}.svg", figure.svg)
-        write_bytes(folder / "figures" / f"{figure.name}.png", figure.png)
-        write_text(folder / "figures" / f"{figure.name}.csv", figure.table.csv())
+        file = folder / "figures" / figure.table.name
+        write_bytes(file.with_suffix(".svg"), figure.svg)
+        write_bytes(file.with_suffix(".png"), figure.png)
+        write_text(file.with_suffix(".csv"), figure.table.csv())
     for table in report.tables:
         write_text(folder / "tables" / f"{table.name}.csv", table.csv())
         write_text(folder / "tables" / f"{table.name}.tex", table.latex())

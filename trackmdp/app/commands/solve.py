@@ -66,15 +66,10 @@ def run(cfg: SolveConfig, folder: Path, world: Problem) -> float:
 
 
 def _report(cfg: SolveConfig, solution: Solution, bound: dict[str, float]) -> dict[str, Any]:
+    own = ("lower", "upper", "certified", "interrupted", "timed_out", "seconds", "nodes")
     return {
         "solver": cfg.solver.name,
-        "lower": solution.lower,
-        "upper": solution.upper,
-        "certified": solution.certified,
-        "interrupted": solution.interrupted,
-        "timed_out": solution.timed_out,
-        "seconds": solution.seconds,
-        "nodes": solution.nodes,
+        **{name: getattr(solution, name) for name in own},
         "regret_per_step": regret_per_step(solution.upper, solution.evaluation),
         "figures": figures(solution.evaluation),
         "bounds": bound,

@@ -16,14 +16,7 @@ from trackmdp.app.sweep import process
 from trackmdp.app.sweep.plan import Job
 from trackmdp.app.sweep.process import fail, run_job, stop_signal
 from trackmdp.cluster import joining
-from trackmdp.config import TrainConfig
-from trackmdp.config.sweeping import (
-    BasicConfig,
-    JoblibConfig,
-    RayConfig,
-    SubmititLocalConfig,
-    SubmititSlurmConfig,
-)
+from trackmdp.config import TrainConfig, sweeping
 from trackmdp.errors import FAILED
 from trackmdp.signals import handled
 
@@ -55,13 +48,13 @@ def threads_of(jobs: Sequence[Job]) -> Iterator[None]:
             os.environ.pop(name, None)
 
 
-def run_basic(cfg: BasicConfig, jobs: Sequence[Job]) -> None:  # noqa: ARG001
+def run_basic(cfg: sweeping.BasicConfig, jobs: Sequence[Job]) -> None:  # noqa: ARG001
     """One after the other."""
     for job in jobs:
         run_job(job)
 
 
-def run_joblib(cfg: JoblibConfig, jobs: Sequence[Job]) -> None:
+def run_joblib(cfg: sweeping.JoblibConfig, jobs: Sequence[Job]) -> None:
     """In threads: each only waits for the process of its run."""
     from joblib import Parallel, delayed
 
@@ -74,7 +67,7 @@ def run_joblib(cfg: JoblibConfig, jobs: Sequence[Job]) -> None:
     Parallel(n_jobs=at_once, backend="threading", batch_size=1)(delayed(run_job)(job) for job in jobs)
 
 
-def run_on_ray(cfg: RayConfig, jobs: Sequence[Job]) -> None:
+def run_on_ray(cfg: sweeping.RayConfig, jobs: Sequence[Job]) -> None:
     """Run `jobs` as tasks of a Ray cluster, which is left, or ended where it was started here.
 
     Raises:
@@ -82,8 +75,12 @@ def run_on_ray(cfg: RayConfig, jobs: Sequence[Job]) -> None:
     """
     import ray
 
+    # Of a cluster that runs already Ray takes no word about its memory and processors.
+    said: dict[str, Any] = {"address": cfg.address, "logging_level": "error"}
+    if cfg.address is None:
+        said |= {"num_cpus": cfg.num_cpus, "object_store_memory": _STORE, "include_dashboard": False}
     with joining("hydra.launcher.address", cfg.address):
-        _join(cfg, ray)
+        ray.init(**said)
     try:
         # No retries by Ray: a run that was killed for lack of memory would be again; the sweep launches what is left
         # itself.
@@ -93,15 +90,6 @@ def run_on_ray(cfg: RayConfig, jobs: Sequence[Job]) -> None:
             _, left = ray.wait(left, num_returns=1)
     finally:
         ray.shutdown()
-
-
-def _join(cfg: RayConfig, ray: Any) -> None:
-    quiet: dict[str, Any] = {"logging_level": "error", "include_dashboard": False}
-    if cfg.address is None:
-        ray.init(num_cpus=cfg.num_cpus, object_store_memory=_STORE, **quiet)
-        return
-    # Nothing about memory: Ray refuses `object_store_memory` and `num_cpus` for a cluster that runs already.
-    ray.init(address=cfg.address, logging_level="error")
 
 
 class Submission:
@@ -126,7 +114,7 @@ class Submission:
         return DelayedSubmission(self, job)
 
 
-def run_here(cfg: SubmititLocalConfig, jobs: Sequence[Job]) -> None:
+def run_here(cfg: sweeping.SubmititLocalConfig, jobs: Sequence[Job]) -> None:
     """As processes of this machine."""
     import submitit
 
@@ -147,7 +135,7 @@ def run_here(cfg: SubmititLocalConfig, jobs: Sequence[Job]) -> None:
     _wait(running)
 
 
-def run_on_slurm(cfg: SubmititSlurmConfig, jobs: Sequence[Job]) -> None:
+def run_on_slurm(cfg: sweeping.SubmititSlurmConfig, jobs: Sequence[Job]) -> None:
     """As one array job."""
     import submitit
 

@@ -74,16 +74,6 @@ def sweep(
     return status_of(runs)
 
 
-def _run(jobs: Sequence[Job], launch: Launch, stop: _Stop) -> None:
-    for job in jobs:
-        # A launcher's worker may die before its run begins; an old result would then be taken for the new one.
-        for name in (FAILED_FILE, DONE, SUMMARY):
-            (job.folder / name).unlink(missing_ok=True)
-    # Here and not in each launcher: the fork server, worker processes and their children all inherit the environment.
-    with threads_of(jobs):
-        _launch(jobs, launch, stop)
-
-
 def _is_finished(job: Job) -> bool:
     """Whether the run is done already, with the very config that is asked for."""
     # Other commands leave no config to compare with, so that they are done again.
@@ -97,8 +87,12 @@ def _is_finished(job: Job) -> bool:
         return False
 
 
-def _launch(jobs: Sequence[Job], launch: Launch, stop: _Stop) -> None:
+def _run(jobs: Sequence[Job], launch: Launch, stop: _Stop) -> None:
     """Launch `jobs`, and once more what a launcher that broke down left undone."""
+    for job in jobs:
+        # A launcher's worker may die before its run begins; an old result would then be taken for the new one.
+        for name in (FAILED_FILE, DONE, SUMMARY):
+            (job.folder / name).unlink(missing_ok=True)
     reason = "it was launched, and left nothing"
     # A pool whose worker was killed gives up all that it still had to do. What is done stands in the folders, so that
     # the rest can simply be launched again.
@@ -106,7 +100,10 @@ def _launch(jobs: Sequence[Job], launch: Launch, stop: _Stop) -> None:
         if not jobs or stop.received:
             return
         try:
-            launch(jobs)
+            # Here and not in each launcher: the fork server, worker processes and their children all inherit the
+            # environment.
+            with threads_of(jobs):
+                launch(jobs)
         except UserError:  # no such cluster, which the next round would not find either
             raise
         except Exception as error:
@@ -114,9 +111,7 @@ def _launch(jobs: Sequence[Job], launch: Launch, stop: _Stop) -> None:
             sys.stderr.write(f"{reason}\n")
         # Not "running": another process holds that folder, and is at it.
         jobs = [job for job in jobs if run_of(job.folder).state in ("cut", "waiting")]
-    if stop.received:
-        return
-    for job in jobs:
+    for job in jobs if not stop.received else ():
         fail(job, Outcome(FAILED, reason=reason))
 
 
@@ -151,11 +146,11 @@ def show_runs(console: Console, runs: Sequence[RunState], skipped: Collection[Pa
     names = [run.folder.name.rpartition("-")[0] for run in runs]
     if len(set(names)) < len(names):
         names = [run.folder.name for run in runs]
-    rows = [[name, _state(run, skipped), *_short(run), run.reason] for name, run in zip(names, runs, strict=True)]
+    states = ["skipped" if run.folder in skipped and run.state == "done" else run.state for run in runs]
+    rows = [[name, state, *_short(run), run.reason] for name, state, run in zip(names, states, runs, strict=True)]
     made = table(f"{len(runs)} runs", ["run", "state", "AIHTR", "regret per step", "reason"], rows)
     made.columns[1].justify = made.columns[4].justify = "left"
     console.print(made)
-    states = [_state(run, skipped) for run in runs]
     counts = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states))
     # `markup=False`: a folder named "[red]" is a name, not an order to rich.
     console.print(f"{counts}; {shown(sweep) / TABLE}")
@@ -196,10 +191,6 @@ def status_of(runs: Sequence[RunState]) -> int:
     # A run that is neither done nor failed is nobody's mistake, and 2 would tell a script not to try again.
     unfinished = any(run.state not in ("done", "failed") for run in runs)
     return FAILED if unfinished or any(status != USER_MISTAKE for status in statuses) else USER_MISTAKE
-
-
-def _state(run: RunState, skipped: Collection[Path]) -> str:
-    return "skipped" if run.folder in skipped and run.state == "done" else run.state
 
 
 def run_scores(run: RunState) -> dict[str, Any]:
