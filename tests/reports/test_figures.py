@@ -204,7 +204,7 @@ def test_the_same_figure_has_the_same_bytes_and_no_date(grouped: Study, panel: P
 
 def test_letters_that_the_font_lacks_stay_letters_without_a_warning() -> None:
     table = Table("f", "caption", [Column("x")], [[1]])
-    drawn = draw_figure("f", "title", "text", table, 1.0, lambda figure: figure.text(0.5, 0.5, "a\tb \u65e5"))
+    drawn = draw_figure("title", "text", table, 1.0, lambda figure: figure.text(0.5, 0.5, "a\tb \u65e5"))
     assert "a\tb \u65e5" in drawn.svg.decode()
 
 
