@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -102,26 +103,17 @@ class HindsightLoss(nn.Module):
         if classes is not None:
             groups = self._groups(Window(task, choices * reach, device), torch.as_tensor(classes, device=device))
 
-        def net(clocks: int, outputs: int, bias: float, groups: Tensor | None = None) -> CellClockNet:
-            return CellClockNet(
-                m,
-                clocks,
-                hidden=hidden,
-                outputs=outputs,
-                bias=bias,
-                generator=generator,
-                groups=groups,
-                classes=self._classes,
-            )
+        net = partial(CellClockNet, m, hidden=hidden, generator=generator, classes=self._classes)
 
         def decisions(seen: Window, sensors: SensorsInView) -> CellClockNet:
-            # Where the window is the whole grid an output stands for a cell, and cannot be shared.
-            return net(choices, sensors.width, -1.0, groups if seen.is_local else None)
+            # Where the window is the whole grid an output stands for a cell, and cannot be shared. Bias -1 starts all
+            # sensors off (z > 0 is on).
+            return net(choices, outputs=sensors.width, bias=-1.0, groups=groups if seen.is_local else None)
 
-        # Bias -1 starts all sensors off (z > 0 is on). U has T + 2 clocks: also n = T + 1, where the safe action is
-        # forced. V has a second one, L, only where that may have to be repeated.
-        self.actor, self.critic = decisions(self.view, self.sensors), net(1 if task.safe else 2, 1, 0.0)
-        self.clocked_actor, self.clocked_critic = decisions(self.near, self.nearby), net(choices + 1, 1, 0.0)
+        # U has T + 2 clocks: also n = T + 1, where the safe action is forced. V has a second one, L, only where that
+        # may have to be repeated.
+        self.actor, self.critic = decisions(self.view, self.sensors), net(1 if task.safe else 2, outputs=1)
+        self.clocked_actor, self.clocked_critic = decisions(self.near, self.nearby), net(choices + 1, outputs=1)
         actor_loss.allocate((m, choices, self.sensors.width), device)
         self.actor_loss = actor_loss
         self.discount, self.safe_cost = discount, task.safe_cost / task.reward

@@ -12,7 +12,7 @@ import types
 import typing
 from collections.abc import Iterator
 from dataclasses import Field, dataclass
-from typing import Any, ClassVar, Protocol, TypeVar, dataclass_transform
+from typing import Any, ClassVar, TypeVar, dataclass_transform
 
 from trackmdp.errors import UserError
 
@@ -148,47 +148,34 @@ def nested(help: str) -> Any:
 
 
 BYTES = {"float32": 4, "int64": 8, "float64": 8, "int16": 2, "bool": 1}
-"""Bytes of one number of each kind, for `memory`."""
+"""Bytes of one number of each kind, for `needs`."""
 
 
-class Sizes(Protocol):
-    """What `memory` may know of a task: a `trackmdp.world.model.Task` is one."""
+@dataclass(frozen=True)
+class Sizes:
+    """What `needs` may know of a task, as `trackmdp.world.model.Task` has it.
 
-    @property
-    def num_cells(self) -> int:
-        """M."""
+    Attributes:
+        num_cells: M.
+        num_sensors: K.
+        t_max: T_max.
+        num_choices: t_max + 1.
+        num_keys: plans of a policy.
+        keyed: whether a key is more than the cell.
+        order: detections before the last one that are remembered.
+        markov: whether moves of different paths combine.
+        pair_bytes: that exact evaluation over pairs of a key and a mode takes; 0 where there is none.
+    """
 
-    @property
-    def num_choices(self) -> int:
-        """t_max + 1."""
-
-    @property
-    def num_sensors(self) -> int:
-        """K."""
-
-    @property
-    def t_max(self) -> int:
-        """T_max."""
-
-    @property
-    def num_keys(self) -> int:
-        """Plans of a policy."""
-
-    @property
-    def keyed(self) -> bool:
-        """Whether a key is more than the cell."""
-
-    @property
-    def pair_bytes(self) -> int:
-        """Bytes that exact evaluation over pairs of a key and a mode takes; 0 where there is none."""
-
-    @property
-    def order(self) -> int:
-        """Detections before the last one that are remembered."""
-
-    @property
-    def markov(self) -> bool:
-        """Whether moves of different paths combine."""
+    num_cells: int
+    num_sensors: int
+    t_max: int
+    num_choices: int
+    num_keys: int
+    keyed: bool
+    order: int
+    markov: bool
+    pair_bytes: int
 
 
 @dataclass_transform(kw_only_default=True, field_specifiers=(option, nested))

@@ -145,25 +145,16 @@ class VerifyConfig(WorldConfig):
             raise refuse("sensor", self.sensor.name, "perfect or miss; the theorems are on sensors of one cell")
 
 
+_PARTS = ("env", "collector", "train", "size", "handoff", "memory", "peers", "log", "regret", "bracket", "workers")
+
+
 class BenchmarkConfig(WorldConfig):
     """Measure time and memory on this machine; how good the policies are, sweeps and reports say."""
 
     knows_modes: ClassVar[bool] = False
     part: str = option(
         "what is measured",
-        choices=(
-            "env",
-            "collector",
-            "train",
-            "size",
-            "handoff",
-            "memory",
-            "peers",
-            "log",
-            "regret",
-            "bracket",
-            "workers",
-        ),
+        choices=_PARTS,
     )
     seed: int = option("every random draw derives from it", ge=0)
     device: str = option("device of environments and networks", expects="cpu, cuda, cuda:N or auto", pattern=DEVICE)

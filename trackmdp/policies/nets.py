@@ -304,8 +304,8 @@ class CellClockNet(nn.Module):
         *,
         hidden: int,
         outputs: int,
-        bias: float,
         generator: torch.Generator,
+        bias: float = 0.0,
         groups: Tensor | None = None,
         classes: int = 1,
     ) -> None:

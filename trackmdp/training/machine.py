@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+from dataclasses import fields
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import torch
 
 from trackmdp.config import TrainConfig
-from trackmdp.config.options import nodes
+from trackmdp.config.options import Sizes, nodes
 from trackmdp.errors import UserError
 from trackmdp.machine import free_bytes, gib
 from trackmdp.world.model import Task
@@ -53,8 +54,9 @@ def check_memory(cfg: TrainConfig, task: Task, device: torch.device) -> str:
 def needs(cfg: TrainConfig, task: Task) -> dict[str, int]:
     """Bytes of the replay buffer, of collected batches and of networks, by the option that they grow with."""
     parts: dict[str, int] = {}
+    sizes = Sizes(**{field.name: getattr(task, field.name) for field in fields(Sizes)})
     for _, node in nodes(cfg):
-        parts |= node.needs(task, cfg)
+        parts |= node.needs(sizes, cfg)
     return parts
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 from weakref import WeakValueDictionary
 
 import torch
 from torch import Tensor, library
+
+from trackmdp.seeding import generator
 
 _DRAWS: WeakValueDictionary[int, Draw] = WeakValueDictionary()
 """Number -> what draws: a graph can hold a number, but no generator."""
@@ -49,6 +51,33 @@ class Draw:
         # draw from the original's.
         self.__dict__.update(state)
         self._enter()
+
+
+class Streams:
+    """Random generators that draw for whoever inherits from this.
+
+    Args:
+        device: where they draw.
+        names: of the generators.
+    """
+
+    def __init__(self, device: torch.device, *names: str) -> None:
+        self.device, self._called = device, names
+        self.generators: dict[str, torch.Generator] = {}
+
+    def seed(self, seed: int, stream: str) -> None:
+        """Begin the draws of the generators called (`stream`, NAME)."""
+        self.generators = {name: generator(seed, stream, name, device=self.device) for name in self._called}
+
+    def state(self) -> dict[str, Tensor]:
+        """State of the generators, for a checkpoint."""
+        return {name: rng.get_state() for name, rng in self.generators.items()}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Go on where `state` was taken."""
+        for name, rng in self.generators.items():
+            # A checkpoint read for a GPU has all its tensors there; a generator's state is on the CPU at all times.
+            rng.set_state(state[name].cpu())
 
 
 # `turn` is never written to. That it might be keeps the compiler from merging, dropping or swapping two draws.

@@ -186,11 +186,6 @@ def recorded(
     *,
     path: str,
     format: str | None,
-    step: float | None,
-    cell: float | None,
-    max_gap: float | None,
-    origin: list[float] | None,
-    crs: str | None,
     ends: str,
     starts: str,
     held_out: float,
@@ -198,7 +193,7 @@ def recorded(
     seed: int,
     min_length: int | None,
     markov: bool,
-    **of_task: Any,
+    **others: Any,
 ) -> Recorded:
     """The recorded tracks in a file, in their three parts; see `TracksConfig` for the options.
 
@@ -207,13 +202,13 @@ def recorded(
     Raises:
         UserError: the file is missing or malformed, a track is too short, or one of the three parts would be empty.
     """
-    of_task |= {"markov": markov, "anywhere": starts == "anywhere"}
+    gridding = {name: others.pop(name) for name in ("step", "cell", "max_gap", "origin", "crs")}
+    of_task = others | {"markov": markov, "anywhere": starts == "anywhere"}
     if (kept := read_recording(path, math.prod(grid_size(size)))) is not None:
         return Recorded(kept[0], size, validation=kept[1], held_out=kept[2], **of_task)
     # A located cell, t_max + 1 free choices and the forced step: t_max + 3 cells, the segment that hindsight learns
     # from.
     shortest = max(min_length or of_task["t_max"] + 3, 1 if ends == "exit" else 2)  # a cut track of one has no step
-    gridding = {"step": step, "cell": cell, "max_gap": max_gap, "origin": origin, "crs": crs}
     tracks, loaded = read_track_file(path, grid_size(size), ends == "exit", shortest, format, gridding)
     mine, chosen, judged = split(tracks, held_out, validation, seed)
     return Recorded(mine, size, validation=chosen, held_out=judged, loaded=loaded, **of_task)

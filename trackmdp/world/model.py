@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 from typing import Any, Required, TypeAlias, TypedDict, Unpack
 
@@ -44,7 +44,13 @@ class TaskOptions(TypedDict, total=False):
     revealed: int
 
 
-@dataclass(frozen=True, eq=False, init=False)
+_NULLABLE = ("max_steps", "window")
+_GIVEN: Any = 1.0
+_SUM: Any = None
+"""Defaults of a task that its constructor makes arrays and a price of."""
+
+
+@dataclass(frozen=True, eq=False)
 class Task:
     """What the tracker knows: the grid, the rewards, the costs and the limits, but not the motion.
 
@@ -77,67 +83,44 @@ class Task:
     """
 
     size: tuple[int, int]
+    _: KW_ONLY
     cost: Array
     t_max: int
-    safe_cost: float
-    reward: float
-    max_steps: int | None
-    window: int | None
-    detection: Array
-    safe_detection: Array
-    coverage: Coverage | None
-    markov: bool
-    memory: str
-    clip: int
-    revealed: int
+    safe_cost: float = _SUM
+    reward: float = 1.0
+    max_steps: int | None = None
+    window: int | None = None
+    detection: Array = _GIVEN
+    safe_detection: Array = _GIVEN
+    coverage: Coverage | None = None
+    markov: bool = True
+    memory: str = "cell"
+    clip: int = 2
+    revealed: int = 1
 
-    def __init__(
-        self,
-        size: Size,
-        *,
-        cost: npt.ArrayLike,
-        t_max: int,
-        safe_cost: float | None = None,
-        reward: float = 1.0,
-        max_steps: int | None = None,
-        window: int | None = None,
-        detection: npt.ArrayLike = 1.0,
-        safe_detection: npt.ArrayLike = 1.0,
-        coverage: Any = None,
-        markov: bool = True,
-        memory: str = "cell",
-        clip: int = 2,
-        revealed: int = 1,
-    ) -> None:
-        if memory not in MEMORIES:
-            raise UserError(f"memory={memory}: expected one of {', '.join(MEMORIES)}")
-        rows, columns = grid_size(size)
-        footprints = Coverage.of(coverage, rows * columns)
+    def __post_init__(self) -> None:
+        if self.memory not in MEMORIES:
+            raise UserError(f"memory={self.memory}: expected one of {', '.join(MEMORIES)}")
+        size = rows, columns = grid_size(self.size)
+        footprints = Coverage.of(self.coverage, rows * columns)
         count, each = (rows * columns, "cell") if footprints is None else (footprints.num_sensors, "sensor")
-        prices = one_each("cost", cost, count, each, PRICES)
-        values = {
-            "size": (rows, columns),
-            "cost": prices,
-            "t_max": _at_least(0, "t_max", t_max),
-            "safe_cost": _price("safe_cost", prices.sum() if safe_cost is None else safe_cost, LARGEST * prices.size),
-            "reward": _price("reward", reward),
-            "max_steps": None if max_steps is None else _at_least(1, "max_steps", max_steps),
-            "window": None if window is None else _at_least(0, "window", window),
-            "detection": one_each("detection", detection, rows * columns, "cell", PROBABILITIES),
-            "safe_detection": one_each("safe_detection", safe_detection, rows * columns, "cell", PROBABILITIES),
-            "coverage": footprints,
-            "markov": markov,
-            "memory": memory,
-            "clip": _at_least(1, "clip", clip),
-            "revealed": _at_least(1, "revealed", revealed),
-        }
-        for name, value in values.items():
+        prices = one_each("cost", self.cost, count, each, PRICES)
+        safe = prices.sum() if self.safe_cost is _SUM else self.safe_cost
+        checked: dict[str, Any] = {"size": size, "cost": prices, "coverage": footprints}
+        checked["safe_cost"] = _price("safe_cost", safe, LARGEST * prices.size)
+        checked["reward"] = _price("reward", self.reward)
+        for name in ("detection", "safe_detection"):
+            checked[name] = one_each(name, getattr(self, name), rows * columns, "cell", PROBABILITIES)
+        for name, lowest in (("t_max", 0), ("max_steps", 1), ("window", 0), ("clip", 1), ("revealed", 1)):
+            value = getattr(self, name)
+            checked[name] = None if value is None and name in _NULLABLE else _at_least(lowest, name, value)
+        for name, value in checked.items():
             object.__setattr__(self, name, value)  # the dataclass is frozen
         # Keys are counted up to t_max + 1 misses, and a safe action that misses is repeated.
-        if memory != "cell" and not self.safe:
-            raise UserError(f"memory={memory}: with a safe action that may miss, expected cell")
-        if memory != "cell" and revealed > 1:
-            raise UserError(f"memory={memory}: where a detection tells the mode, expected cell")
+        if self.memory != "cell" and not self.safe:
+            raise UserError(f"memory={self.memory}: with a safe action that may miss, expected cell")
+        if self.memory != "cell" and self.revealed > 1:
+            raise UserError(f"memory={self.memory}: where a detection tells the mode, expected cell")
         if footprints is not None:
             self._check_footprints()
 
@@ -266,7 +249,7 @@ class World(Task):
         size: Size,
         **of_task: Unpack[TaskOptions],
     ) -> None:
-        super().__init__(size, **of_task)
+        super().__init__(size, **of_task)  # type: ignore[arg-type]  # which makes arrays of them
         # Checked after it is canonical: duplicates are added up and zeros dropped, so that the checks see what solvers
         # will.
         canonical = canonical_kernel(kernel)

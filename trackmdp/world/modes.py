@@ -69,7 +69,7 @@ class HiddenWorld(Task):
         **of_task: Unpack[TaskOptions],
     ) -> None:
         # Where a detection tells the mode, what comes next depends on what it tells alone.
-        super().__init__(size, **(of_task | {"markov": of_task.get("revealed", 1) == modes}))
+        super().__init__(size, **(of_task | {"markov": of_task.get("revealed", 1) == modes}))  # type: ignore[arg-type]  # as in `World`
         if not self.safe:
             raise UserError("kernel: with a hidden mode the safe action must not miss")
         if self.revealed not in (1, modes):

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from trackmdp.errors import UserError
 from trackmdp.seeding import generator
-from trackmdp.world.draws import Draw
+from trackmdp.world.draws import Draw, Streams
 from trackmdp.world.modes import HiddenWorld, Modelled
 from trackmdp.world.tracks import Problem, Recorded, Tracks
 
@@ -181,7 +181,7 @@ def held_out_source(problem: Problem) -> Source:
     return Sampled(problem, cpu)
 
 
-class Targets:
+class Targets(Streams):
     """A batch of targets that start uniformly over the places, and move as the kernel says.
 
     Their places are in the environment's state; this object holds only the generators.
@@ -195,34 +195,20 @@ class Targets:
     """
 
     def __init__(self, source: Source, key: str) -> None:
+        super().__init__(source.device, "motion", "start")
         self.source, self._key = source, key
         self._starts = Draw(self._start_of, torch.int64, source.device)
         self.draw = Draw(self._draw_of, torch.float64, source.device)
 
-    def seed(self, seed: int, stream: str) -> None:
-        """Begin the draws of the generators called (`stream`, "motion") and (`stream`, "start")."""
-        device = self.source.device
-        self._generators = {name: generator(seed, stream, name, device=device) for name in ("motion", "start")}
-
-    def state(self) -> dict[str, Tensor]:
-        """State of the generators, for a checkpoint."""
-        return {name: rng.get_state() for name, rng in self._generators.items()}
-
-    def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Go on where `state` was taken."""
-        for name, rng in self._generators.items():
-            # A checkpoint read for a GPU has all its tensors there; a generator's state is on the CPU at all times.
-            rng.set_state(state[name].cpu())
-
     def _start_of(self, rows: Tensor) -> Tensor:
         """`[B]` places of fresh targets, of which the mask `rows` `[B]` is used."""
         # For all rows, so that what a row gets does not depend on the others.
-        rng, device = self._generators["start"], self.source.device
+        rng, device = self.generators["start"], self.source.device
         return torch.randint(self.source.starts, rows.shape, generator=rng, device=device)
 
     def _draw_of(self, rows: Tensor) -> Tensor:
         """The random numbers for the next move of the targets `rows` `[B]`."""
-        return self.source.draw(len(rows), self._generators["motion"])
+        return self.source.draw(len(rows), self.generators["motion"])
 
     def start(self, rows: Tensor) -> dict[str, Tensor]:
         """`target`, and what else a move depends on, `[B]` of fresh targets, of which the mask `rows` `[B]` is used."""

@@ -108,7 +108,7 @@ class Recorded(Task):
         loaded: Mapping[str, int] | None = None,
         **of_task: Unpack[TaskOptions],
     ) -> None:
-        super().__init__(size, **of_task)
+        super().__init__(size, **of_task)  # type: ignore[arg-type]  # as in `World`
         parts = {"tracks": tracks, "validation": validation, "held_out": held_out}
         own: dict[str, object] = {**parts, "anywhere": anywhere, "loaded": loaded or {}}
         for name, value in own.items():
