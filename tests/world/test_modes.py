@@ -218,6 +218,16 @@ def test_a_target_that_stays_for_ever_is_named() -> None:
             ["kernel.spacing=0.1"],
             r"kernel\.spacing=0\.1: expected more: with kernel\.speed=10 these are 40,401 velocit",
         ),
+        (["kernel.spacing=1e-300"], "these are inf velocities"),
+        (
+            ["kernel.cell=1e-5"],
+            r"kernel\.speed=10.*: expected less: with kernel\.step=10 that is 1e\+07 cells, 1,000,000",
+        ),
+        (
+            ["kernel.noise=1e308"],
+            r"kernel\.noise=1e\+308: expected less: .* inf times kernel\.spacing, 1,000,000 at most",
+        ),
+        (["kernel.step=1e308"], r"kernel\.step=1e\+308: expected a number > 0 and <= 1e9 \(s\)"),
         (
             ["kernel.reveals=true", "task.memory=displacement"],
             r"task\.memory=displacement: expected cell with kernel\.rev",

@@ -13,6 +13,9 @@ from trackmdp.config.world import KernelConfig
 MOST_MODES = 1_000
 """Velocities, or velocities and turns; the states of a target are as many times the cells."""
 
+_FARTHEST = 1_000_000
+"""Cells, or velocities, from one step to the next: of much larger numbers rounding leaves no probabilities."""
+
 
 class HiddenKernelConfig(KernelConfig):
     """Base of the kernels with a mode; what a choice makes returns a kernel on (cell, mode), and the number of modes.
@@ -91,7 +94,7 @@ class VelocityConfig(HiddenKernelConfig):
     """
 
     cell: float = option("side of a cell", unit="m", gt=0)
-    step: float = option("time from one step to the next", unit="s", gt=0)
+    step: float = option("time from one step to the next", unit="s", gt=0, le=1e9)
     speed: float = option("greatest speed along rows, and along columns; a faster target has that", unit="m/s", gt=0)
     spacing: float = option("velocities are told apart by so much: the modes are multiples of it", unit="m/s", gt=0)
     noise: float = option(
@@ -103,15 +106,23 @@ class VelocityConfig(HiddenKernelConfig):
     exit_probability: float = option("probability of leaving the grid", unit="per step", gt=0, lt=1)
 
     def check(self, key: str, root: Any) -> None:
-        """Some velocities, and not too many."""
+        """Some velocities, and not too many; a step that is not out of all proportion to them and to the cells."""
         super().check(key, root)
         if self.spacing > self.speed:
             raise refuse(f"{key}.spacing", self.spacing, f"at most {key}.speed={self.speed:g}")
-        if (modes := (2 * self.speed / self.spacing + 1) ** 2) > MOST_MODES:
+        levels = 2 * self.speed / self.spacing + 1
+        if (modes := levels * levels) > MOST_MODES:  # not **, which raises where it overflows
             expected = (
                 f"more: with {key}.speed={self.speed:g} these are {modes:,.0f} velocities, {MOST_MODES:,} at most"
             )
             raise refuse(f"{key}.spacing", self.spacing, expected)
+        for name, ratio, of in (
+            ("speed", self.speed * self.step / self.cell, "cells"),
+            ("noise", self.noise * self.step / self.spacing, f"times {key}.spacing"),
+        ):
+            if not ratio <= _FARTHEST:  # nan as well
+                expected = f"less: with {key}.step={self.step:g} that is {ratio:.3g} {of}, {_FARTHEST:,} at most"
+                raise refuse(f"{key}.{name}", getattr(self, name), expected)
 
 
 @choice("kernel", "constant_velocity", makes="trackmdp.world.modes:constant_velocity")
