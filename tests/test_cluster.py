@@ -4,16 +4,24 @@ from __future__ import annotations
 
 import signal
 import socket
+import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
+from importlib.util import find_spec
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
+from tests.helpers import train_config
 from tests.typed import refused
+from trackmdp.app.sweep import launchers
 from trackmdp.cluster import joining
+from trackmdp.config.learning import RayWorkersConfig
+from trackmdp.config.sweeping import RayConfig
 from trackmdp.errors import UserError
+from trackmdp.training import on_ray
 
 BLOCKS = "solve grid.size=4 partition.block=2"
 
@@ -89,6 +97,34 @@ def test_what_is_no_address_leaves_no_folder(
     words: str, key: str, given: str, empty_folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert f"{key}={given}: expected" in refused(capsys, *words.split(), f"{key}='{given}'")
+
+
+@pytest.mark.skipif(find_spec("ray") is None, reason="ray is not installed")
+@pytest.mark.parametrize(
+    "words",
+    [
+        f"{BLOCKS} partition.cluster",
+        "train grid.size=4 partition.block=2 partition.cluster",
+        "train collector=ray collector.address",
+        "train -m seed=0,1 hydra/launcher=ray hydra.launcher.address",
+    ],
+)
+def test_without_its_cluster_a_command_leaves_no_folder(
+    words: str, empty_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "expected a Ray cluster" in refused(capsys, *f"{words}=127.0.0.1:99999 quiet=true".split())
+
+
+def test_a_cluster_of_our_own_is_none_that_runs_already(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ray's default is to join one that it finds on this machine."""
+    cfg = train_config("collector=ray").collector
+    assert isinstance(cfg, RayWorkersConfig)
+    assert on_ray._cluster(cfg)["address"] == "local"
+    ray = Mock(**{"init.side_effect": ValueError})
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    with pytest.raises(UserError):
+        launchers.run_on_ray(RayConfig(address=None, num_cpus=1, cpus_per_run=1.0, gpus_per_run=0.0), [])
+    assert ray.init.call_args.kwargs["address"] == "local"
 
 
 @pytest.mark.parametrize("error", [RuntimeError, OSError, None])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-from trackmdp.cluster import ADDRESS
+from trackmdp.cluster import ADDRESS, joining
 from trackmdp.config.options import ChoiceConfig, choice, option
 from trackmdp.errors import UserError, require
 
@@ -143,3 +143,9 @@ class RayConfig(LauncherConfig):
     num_cpus: int | None = option("cores of a cluster started here; null = all", unit="cores", ge=1)
     cpus_per_run: float = option("cores of a run", unit="cores", gt=0)
     gpus_per_run: float = option("GPUs of a run", unit="GPUs", ge=0)
+
+    def check(self, key: str, root: Any) -> None:
+        """The cluster is there: joining it would fail only after the sweep's folder has been made."""
+        super().check(key, root)
+        with joining(f"{key}.address", self.address):
+            pass

@@ -106,14 +106,16 @@ class BlockTrainer:
         parts = blocks(world.size, side, halo)
         with ExitStack() as opened:
             place = self.folder or Path(opened.enter_context(TemporaryDirectory()))
-            if self.folder is not None:
-                write_inputs(self.config, world, place, resumed=_resumed(self.config, place))
-                write_json(place / "plan.json", {"blocks": len(parts)})  # for those who watch the run
-            own_folder(place / "blocks")
+            resumed = self.folder is not None and _resumed(self.config, place)
             # A block hears signals while it learns; here they end what is between two blocks, and all workers.
             opened.enter_context(handled(stop, *HEARD))
-            learner = _BlockLearner(self.config, place.absolute() / "blocks", parts)
+            # Before anything is written: where there is no such cluster, no run has begun.
             run = opened.enter_context(crew(min(cfg.workers, len(parts)), cfg.cluster))
+            if self.folder is not None:
+                write_inputs(self.config, world, place, resumed=resumed)
+                write_json(place / "plan.json", {"blocks": len(parts)})  # for those who watch the run
+            own_folder(place / "blocks")
+            learner = _BlockLearner(self.config, place.absolute() / "blocks", parts)
             table = plan_by_blocks(world, learner, side, halo, run)
             with decoded(str(place / "blocks"), "the runs of blocks"):
                 ends = [read_summary(learner.place(number)) for number in range(len(parts))]

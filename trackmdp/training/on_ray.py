@@ -78,4 +78,6 @@ def _cluster(cfg: RayWorkersConfig) -> dict[str, Any]:
         # started.
         return {"address": cfg.address, **quiet}
     cpus = max(1, round(cfg.workers * cfg.cpus_per_worker))
-    return {"num_cpus": cpus, "object_store_memory": _STORE, "include_dashboard": False, **quiet}
+    # "local": without an address Ray would join a cluster that runs here, or the one that RAY_ADDRESS names.
+    started = {"address": "local", "num_cpus": cpus, "object_store_memory": _STORE, "include_dashboard": False}
+    return started | quiet

@@ -78,7 +78,9 @@ def run_on_ray(cfg: sweeping.RayConfig, jobs: Sequence[Job]) -> None:
     # Of a cluster that runs already Ray takes no word about its memory and processors.
     said: dict[str, Any] = {"address": cfg.address, "logging_level": "error"}
     if cfg.address is None:
-        said |= {"num_cpus": cfg.num_cpus, "object_store_memory": _STORE, "include_dashboard": False}
+        # Without an address Ray would join a cluster that runs here, or the one that RAY_ADDRESS names.
+        said |= {"address": "local", "num_cpus": cfg.num_cpus, "object_store_memory": _STORE}
+        said["include_dashboard"] = False
     with joining("hydra.launcher.address", cfg.address):
         ray.init(**said)
     try:
