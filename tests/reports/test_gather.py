@@ -70,7 +70,7 @@ def test_one_policy_per_group_is_kept_that_of_the_run_in_the_middle(whole: Path)
     for name, kept in found.policies.items():
         group = [run for run in found.runs if run.name.rsplit("-", 1)[0] == name.rsplit("-", 1)[0]]
         assert kept.value.mean() == pytest.approx(np.median([run.figure("aihtr") for run in group]))
-        assert not (kept.sets != finished.read_sensed(whole / name / "policy.npz", _alike).sets).nnz
+        assert not (kept.sets != finished.read_sensed(whole / name / "policy.npz", (3, 3), 1, _alike).sets).nnz
 
 
 def _alike(table: PolicyTable) -> Array:
@@ -85,7 +85,7 @@ def test_plans_of_one_cell_are_averaged_by_how_often_each_occurs(tmp_path: Path)
     visits[0, 7], visits[1] = 3.0, 5.0
     table = PolicyTable(task, sparse.csr_array(sets.reshape(40, 2)))
     save_policy(tmp_path / "policy.npz", table, np.zeros(2))
-    found = finished.read_sensed(tmp_path / "policy.npz", lambda _: visits.ravel())
+    found = finished.read_sensed(tmp_path / "policy.npz", (1, 2), 1, lambda _: visits.ravel())
     for read in (found, results.unpack_policies(results.pack_policies({"a": found}))["a"]):
         assert read.choices == 2
         assert read.averaged
@@ -93,10 +93,22 @@ def test_plans_of_one_cell_are_averaged_by_how_often_each_occurs(tmp_path: Path)
         assert read.on(1).toarray() == pytest.approx(np.array([[0.0, 4 / 12], [0.0, 0.0]]))
 
 
+def test_a_policy_of_another_grid_is_refused_before_its_visits_are_counted(tmp_path: Path) -> None:
+    task = Task((1, 4), cost=0.1, t_max=1, safe_cost=1.0, memory="displacement", clip=1)
+    save_policy(tmp_path / "policy.npz", PolicyTable.all_on(task), np.zeros(4))
+
+    def visits(table: PolicyTable) -> Array:
+        raise AssertionError(f"visits of {table.task.num_keys} keys")
+
+    for size, t_max in (((2, 2), 1), ((1, 4), 2), ((1, 4), None)):
+        with pytest.raises(UserError, match="of another grid or t_max"):
+            finished.read_sensed(tmp_path / "policy.npz", size, t_max, visits)
+
+
 def test_of_sensors_with_footprints_the_cells_that_they_cover_are_kept(tmp_path: Path) -> None:
     task = Task((1, 3), cost=0.1, t_max=0, safe_cost=1.0, coverage=[[1, 1, 0], [0, 1, 1]])
     save_policy(tmp_path / "policy.npz", PolicyTable.from_dense(task, np.eye(3, 2, dtype=bool)[:, None]), np.zeros(3))
-    found = finished.read_sensed(tmp_path / "policy.npz", _alike)
+    found = finished.read_sensed(tmp_path / "policy.npz", (1, 3), 0, _alike)
     assert found.on(0).toarray().tolist() == [[True, True, False], [False, True, True], [False, False, False]]
 
 

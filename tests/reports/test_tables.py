@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Iterator
 
-from trackmdp.reports.tables import Column, Table
+from trackmdp.reports.tables import Cell, Column, Table
 
 TABLE = Table(
     "a",
@@ -36,6 +37,27 @@ def test_html_escapes_what_it_shows_and_sorts_by_what_it_hides() -> None:
     assert text.count('<th scope="col"') == text.count('<button type="button">') == 5
     assert "<td>yes</td>" in text
     assert "<caption>Policies &amp; &lt;prices&gt;</caption>" in text
+
+
+class Counted(list[list[Cell]]):
+    """Rows that count how often somebody goes through all of them."""
+
+    passes = 0
+
+    def __iter__(self) -> Iterator[list[Cell]]:
+        self.passes += 1
+        return super().__iter__()
+
+
+def test_a_table_is_written_in_a_time_that_grows_with_its_rows() -> None:
+    passes = []
+    for count in (3, 30):
+        rows = Counted([["a", 1.0]] * count)
+        table = Table("t", "", [Column("x"), Column("y")], rows)
+        assert len(table.html()) > count
+        assert len(table.latex()) > count
+        passes.append(rows.passes)
+    assert passes[0] == passes[1]
 
 
 def test_latex_escapes_and_has_as_many_cells_as_columns() -> None:

@@ -163,9 +163,11 @@ def test_a_plan_does_not_lead_out_of_the_sweep(folder: str, sweep: Path) -> None
 
 
 @pytest.mark.parametrize(
-    "jobs", [3, [1], [{}], [{"folder": 3}], [{"folder": "a\0b"}], [{"folder": "x" * 9000}], [{"folder": "²"}]]
+    "jobs",
+    [3, [1], [{}], *([{"folder": name}] for name in (3, "a\0b", "x" * 9000, "x" * 300, "²", "\ud800", "loop"))],
 )
 def test_a_plan_of_rubbish_is_passed_over(jobs: Any, sweep: Path) -> None:
+    (sweep / "loop").symlink_to("loop")
     (sweep / "sweep.json").write_text(json.dumps({"command": "train", "line": [1], "jobs": jobs}))
     assert len(gather_runs(sweep).runs) == 3
     assert watch.watch(sweep, Console(quiet=True), 0.01) == 3

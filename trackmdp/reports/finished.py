@@ -150,18 +150,23 @@ def _points(text: str) -> list[CurvePoint]:
     return points
 
 
-def read_sensed(file: Path, visits: Callable[[PolicyTable], Array]) -> Sensed:
+def read_sensed(file: Path, size: tuple[int, int], t_max: Any, visits: Callable[[PolicyTable], Array]) -> Sensed:
     """Read a policy back.
 
     Args:
         file: of a run.
+        size: rows and columns of the run's grid.
+        t_max: of the run, as its config has it.
         visits: `[keys]` of a policy that remembers or is told more than the cell, how often it comes to each key: its
             plans for one cell are averaged with these weights.
 
     Raises:
-        UserError: the file is missing or damaged, or holds something else.
+        UserError: the file is missing or damaged, or holds something else, as the policy of another grid or t_max.
     """
     table, value = load_policy(file)
+    # First of all: a table of one size and visits of another would be taken together below, at any length.
+    if (table.task.size, table.task.t_max) != (size, t_max):
+        raise UserError(f"{file}: not the policy of this run (of another grid or t_max)")
     if value is None:
         raise UserError(f"{file}: not the policy of a run (it has no values)")
     if not (np.abs(value) < _LARGE).all():

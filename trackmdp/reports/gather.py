@@ -36,8 +36,8 @@ from trackmdp.world.make import build_world, of_task
 from trackmdp.world.model import Array, grid_size
 from trackmdp.world.modes import HiddenWorld, Modelled
 
-_LONGEST = 4096
-"""Characters of the longest path of a plan that is looked at."""
+_LONGEST, _LONGEST_NAME = 4096, 255
+"""Bytes of the longest path of a plan that is looked at, and of a name in it: asked for longer ones, systems raise."""
 
 
 def gather_runs(folder: Path) -> Results:
@@ -95,17 +95,30 @@ def run_folders(folder: Path, plan: Mapping[str, Any] | None) -> list[str]:
     jobs = plan["jobs"] if plan else []
     # The plan may have been written by somebody else, so that every entry is looked at before it is used.
     listed = [job["folder"] for job in jobs if isinstance(job, dict) and isinstance(job.get("folder"), str)]
-    named = {_relative(folder, name) for name in listed if 0 < len(name) < _LONGEST and "\0" not in name}
+    root = os.path.realpath(folder)
+    named = {_relative((root, folder), name) for name in listed if _is_path(name)}
     # Any of these makes a folder that of a run: it has begun, failed, or ended.
     marks = {"config.yaml", FAILED_FILE, SUMMARY}
     # Not rglob, which raises where a folder goes while it is looked through.
     found = {Path(place).relative_to(folder).as_posix() for place, _, files in os.walk(folder) if marks & {*files}}
-    # Resolved, since `..` or a link within a name may lead anywhere.
-    root = folder.resolve()
-    inside = {name for name in named | found if (folder / name).resolve().is_relative_to(root)}
+    inside = {name for name in named | found if _is_inside(root, name)}
     # `.` is the sweep's own folder, which is no run of it, unless it is the folder of a run itself.
     none = set() if (folder / "config.yaml").is_file() else {"."}
     return sorted((name for name in inside - none if not _is_block(folder / name)), key=_natural)
+
+
+def _is_path(text: str) -> bool:
+    try:
+        path = os.fsencode(text)
+    except UnicodeEncodeError:  # half of a surrogate pair, which JSON may hold and no path does
+        return False
+    return 0 < len(path) < _LONGEST and b"\0" not in path and max(map(len, path.split(b"/"))) <= _LONGEST_NAME
+
+
+def _is_inside(root: str, name: str) -> bool:
+    # With links followed, since `..` or a link within a name may lead anywhere. Not Path.resolve, which takes twice as
+    # long, a matter of seconds in a plan of 100,000 runs, and raises at a link that leads to itself.
+    return Path(os.path.realpath(f"{root}/{name}")).is_relative_to(root)
 
 
 def _is_block(place: Path) -> bool:
@@ -113,13 +126,15 @@ def _is_block(place: Path) -> bool:
     return place.parent.name == "blocks" and (place.parent.parent / "config.yaml").is_file()
 
 
-def _relative(folder: Path, name: str) -> str:
+def _relative(sweep: Iterable[str | Path], name: str) -> str:
     path = Path(name)
+    if not path.is_absolute():
+        return path.as_posix()
     # A plan may name folders absolutely, and the sweep's own may be given through a link.
-    for base in (folder.resolve(), folder):
-        if path.is_absolute() and path.is_relative_to(base):
+    for base in sweep:
+        if path.is_relative_to(base):
             return path.relative_to(base).as_posix()
-    return path.as_posix() if not path.is_absolute() else path.name or "."
+    return path.name or "."
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
@@ -185,12 +200,8 @@ def _policies(folder: Path, grouped: Study) -> tuple[dict[str, Sensed], list[Ano
                 # Against the summary's digest: a policy copied from another run would be drawn under this one's name.
                 check_files(folder / run.name, read_summary(folder / run.name), "policy.npz")
                 place = folder / run.name
-                sensed = read_sensed(place / "policy.npz", partial(_visits, place))
-                rows, columns = grid_size(settings["grid.size"])
-                cells = rows * columns
-                if sensed.sets.shape != (cells * (settings["grid.t_max"] + 1), cells):
-                    raise UserError("policy.npz: not the policy of this run (of another grid or t_max)")
-                found[run.name] = sensed
+                size, t_max = grid_size(settings["grid.size"]), settings.get("grid.t_max")
+                found[run.name] = read_sensed(place / "policy.npz", size, t_max, partial(_visits, place))
                 break
             except UserError as error:
                 anomalies.append(Anomaly(run.name, str(error).removeprefix(f"{folder / run.name}/")))

@@ -9,7 +9,7 @@ import html
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from importlib.resources import files
 from typing import Any, TypeAlias
 
@@ -133,9 +133,14 @@ class Table:
         return "" if self._is_text(place) else ' class="n"'
 
     def _is_text(self, place: int) -> bool:
+        return self._texts[place]
+
+    @cached_property
+    def _texts(self) -> list[bool]:
+        """Whether each column is one of words; made once, as every cell asks."""
+        known = [[row[place] for row in self.rows if row[place] is not None] for place in range(len(self.columns))]
         # a column in which nothing is known stands as its numbers would
-        known = [row[place] for row in self.rows if row[place] is not None]
-        return bool(known) and all(isinstance(value, (str, bool)) for value in known)
+        return [bool(values) and all(isinstance(value, (str, bool)) for value in values) for values in known]
 
 
 def _plain(value: Cell) -> Any:
