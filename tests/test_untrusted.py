@@ -6,6 +6,7 @@ import io
 import json
 import os
 import tracemalloc
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 from trackmdp import untrusted
-from trackmdp.durable import create, own_folder, reopen, whole_file
+from trackmdp.durable import create, own_folder, reopen, whole_file, write_text
 from trackmdp.errors import UserError
 from trackmdp.world.files import load_npy
 
@@ -146,3 +147,29 @@ def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(UserError, match="pipe: a pipe or a device"):
         reopen(tmp_path / "pipe", "r+")
+
+
+def test_two_who_write_one_file_take_turns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "file"
+    with ExitStack() as first:
+        first.enter_context(whole_file(file)).write(b"first")
+        # The second waits for as long as the first writes: here until it has looked once.
+        monkeypatch.setattr("time.sleep", lambda _: first.close())
+        write_text(file, "second")
+    assert file.read_text() == "second"
+    assert [each.name for each in tmp_path.iterdir()] == ["file"]
+
+
+def test_who_waits_for_a_file_in_vain_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("time.sleep", lambda _: None)
+    with whole_file(tmp_path / "file") as first, pytest.raises(UserError, match="part: another process is writing it"):
+        first.write(b"first")
+        write_text(tmp_path / "file", "second")
+    assert (tmp_path / "file").read_text() == "first"
+
+
+def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
+    (tmp_path / "file.part").write_text("half of what")
+    write_text(tmp_path / "file", "whole")
+    assert (tmp_path / "file").read_text() == "whole"
+    assert [each.name for each in tmp_path.iterdir()] == ["file"]

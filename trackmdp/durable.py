@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import errno
+import fcntl
 import io
 import json
 import math
@@ -15,8 +16,9 @@ import os
 import shutil
 import stat
 import sys
+import time
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from io import BufferedRandom
 from pathlib import Path
 from typing import IO, Any
@@ -29,34 +31,87 @@ UNSUPPORTED = (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errn
 
 _NO_LINKS = (*UNSUPPORTED, errno.EPERM, errno.EXDEV, errno.EMLINK)
 _said: set[str] = set()
+_TRIES, _BETWEEN = 1200, 0.05
+"""A minute: more than a file takes that two processes happen to write at once."""
 
 
 @contextmanager
 def whole_file(file: Path) -> Iterator[BufferedRandom]:
     """Write to `file`, which appears under its name only once its bytes are on the disk; a failure leaves no trace.
 
+    Processes that write it at once take turns, and the last one's is kept.
+
     Where `file` is a symbolic link, the link is replaced, and what it leads to stays as it is.
     """
     # In the same folder, since a rename is atomic within one file system only.
     part = file.with_name(f"{file.name}.part")
-    try:
-        with create(part) as stream:
+    with _begin(part) as stream:
+        try:
             yield stream
             sync(stream, part)
-        # After the sync: a rename may reach the disk before the bytes do, and a power failure would leave an empty
-        # file under the final name.
-        part.replace(file)
-    # Ctrl-C as well, which is no Exception.
-    except BaseException:
+            # After the sync: a rename may reach the disk before the bytes do, and a power failure would leave an empty
+            # file under the final name. Before the closing, which lets go of the lock: the name is ours until then.
+            part.replace(file)
+        # Ctrl-C as well, which is no Exception.
+        except BaseException:
+            part.unlink(missing_ok=True)
+            raise
+
+
+def _begin(part: Path) -> BufferedRandom:
+    """A new file, open and locked, so that of several processes one at a time writes it; a killed one's is removed.
+
+    Raises:
+        UserError: another process goes on writing it.
+    """
+    for _ in range(_TRIES):
+        _remove_left(part)
+        # FileExistsError: another process was faster.
+        with suppress(FileExistsError):
+            stream = _new(part)
+            if _is_ours(stream.fileno(), part):
+                return stream
+            stream.close()
+        time.sleep(_BETWEEN)
+    raise UserError(f"{part}: another process is writing it")
+
+
+def _remove_left(part: Path) -> None:
+    """Remove what has this name, unless a process is writing it."""
+    try:
+        descriptor = os.open(part, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+    except OSError:  # nothing, or what is not ours, such as a link
         part.unlink(missing_ok=True)
+        return
+    try:
+        if _is_ours(descriptor, part):
+            part.unlink()
+    finally:
+        os.close(descriptor)
+
+
+def _is_ours(descriptor: int, file: Path) -> bool:
+    """Whether the open file is now locked and still has its name; true on a file system without locks."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        # Between our opening and locking it, another process may have removed it and begun one of its own.
+        return os.path.samestat(os.fstat(descriptor), file.lstat())
+    except OSError as error:
+        if error.errno in UNSUPPORTED:
+            return True
+        if error.errno in (errno.EAGAIN, errno.EACCES, errno.ENOENT):
+            return False
         raise
 
 
 def create(file: Path) -> BufferedRandom:
     """A new file, open for writing and reading; whatever had its name, a link included, is removed, not followed."""
     file.unlink(missing_ok=True)
-    # O_EXCL: if somebody puts a link under this name after the unlink, the call fails instead of writing where it
-    # leads.
+    return _new(file)
+
+
+def _new(file: Path) -> BufferedRandom:
+    # O_EXCL: if somebody puts a link under this name meanwhile, the call fails instead of writing where it leads.
     return os.fdopen(os.open(file, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666), "w+b")
 
 

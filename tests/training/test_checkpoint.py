@@ -169,7 +169,7 @@ def test_the_reason_of_a_failed_write_is_not_lost_in_torch(tmp_path: Path, monke
                 raise OSError(28, "No space left on device")
             return super().write(piece)
 
-    monkeypatch.setattr(durable, "create", lambda file: Full(io.FileIO(file, "x+")))
+    monkeypatch.setattr(durable, "_new", lambda file: Full(io.FileIO(file, "x+")))
     with pytest.raises(OSError, match="No space left"):
         checkpoint.save(tmp_path, 1, state(), keep=1)
 

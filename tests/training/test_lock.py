@@ -8,6 +8,7 @@ import json
 import os
 import socket
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,15 @@ def test_a_folder_is_held_once(tmp_path: Path) -> None:
         with pytest.raises(UserError, match="another process is running in this folder"), locked(tmp_path):
             pass
     assert not list(tmp_path.iterdir())
+
+
+def test_who_may_wait_has_the_folder_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with ExitStack() as first:
+        first.enter_context(locked(tmp_path))
+        looks = iter(range(100))
+        monkeypatch.setattr(time, "sleep", lambda _: first.close() if next(looks) == 50 else None)
+        with locked(tmp_path, wait=60.0):
+            assert is_locked(tmp_path)
 
 
 @pytest.mark.usefixtures("lockless")

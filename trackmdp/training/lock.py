@@ -27,21 +27,19 @@ _SETTLE = 0.2
 
 
 @contextmanager
-def locked(folder: Path, key: str = "hydra.run.dir") -> Iterator[None]:
+def locked(folder: Path, key: str = "hydra.run.dir", *, wait: float = 0.0) -> Iterator[None]:
     """Lock the folder, which the option `key` names; the system releases the lock when the process ends, in any way.
 
-    Where the file system has no locks, a file names the owner and is touched every few seconds. Where nothing else was
-    written, the lock's files are gone afterwards as well.
+    For up to `wait` seconds it waits for another process, if the file system has locks. Where it has none, a file names
+    the owner and is touched every few seconds. Where nothing else was written, the lock's files are gone afterwards as
+    well.
 
     Raises:
         UserError: another process holds it, or the lock is no ordinary file.
     """
     file = folder / _LOCK
-    # Never emptied or replaced while in use: flock belongs to the open file, and a new file of the same name would
-    # have a lock of its own.
-    descriptor = reopen(file, "r+")
+    descriptor, taken = _opened(file, wait)
     try:
-        taken = _take(descriptor, file)
         if taken is False:
             raise UserError(f"{key}={folder}: another process is running in this folder")
         try:
@@ -54,6 +52,20 @@ def locked(folder: Path, key: str = "hydra.run.dir") -> Iterator[None]:
             if folder.is_dir() and [each.name for each in folder.iterdir()] == [file.name]:
                 file.unlink()
     finally:
+        os.close(descriptor)
+
+
+def _opened(file: Path, wait: float) -> tuple[int, bool | None]:
+    """The descriptor of the lock, and what `_take` says of it."""
+    until = time.monotonic() + wait
+    while True:
+        # Never emptied or replaced while in use: flock belongs to the open file, and a new file of the same name would
+        # have a lock of its own.
+        descriptor = reopen(file, "r+")
+        taken = _take(descriptor, file)
+        if taken is not False or time.monotonic() >= until:
+            return descriptor, taken
+        # Opened anew, since its owner may have removed the file: ours would then be one without a name.
         os.close(descriptor)
 
 

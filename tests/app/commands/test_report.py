@@ -12,8 +12,11 @@ import pytest
 from tests.reports.sweeps import write_sweep
 from tests.typed import refused
 from trackmdp.app.cli import main
+from trackmdp.app.commands import report
 from trackmdp.errors import adding
 from trackmdp.reports.gather import run_folders
+from trackmdp.reports.results import Results
+from trackmdp.training.lock import is_locked
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +55,18 @@ def test_a_report_holds_page_figures_tables_and_what_it_was_made_from(
     assert capsys.readouterr().out == ""
     assert contents(Path("two")) == made
     assert len(run_folders(sweep, None)) == 12  # the report that lies there is no run
+
+
+def test_one_report_at_a_time_is_written_to_a_folder(sweep: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, held = report.save_results, list[bool]()
+
+    def saved(found: Results, folder: Path) -> None:
+        held.append(is_locked(folder))
+        whole(found, folder)
+
+    monkeypatch.setattr(report, "save_results", saved)
+    assert main(["report", f"sweep={sweep}", "hydra.run.dir=one", "quiet=true"]) == 0
+    assert held == [True]
 
 
 def test_what_is_missing_is_said_in_one_line_and_in_the_page(

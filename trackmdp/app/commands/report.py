@@ -19,7 +19,11 @@ from trackmdp.reports.grouping import study
 from trackmdp.reports.page import Report, Section, build
 from trackmdp.reports.results import Results, is_stored, load_results, save_results
 from trackmdp.training.display import make_console
+from trackmdp.training.lock import locked
 from trackmdp.untrusted import printable
+
+_WAIT = 600.0
+"""Seconds that a report waits for another one in its folder."""
 
 
 def run(cfg: ReportConfig, folder: Path) -> float:
@@ -32,7 +36,8 @@ def run(cfg: ReportConfig, folder: Path) -> float:
     if cfg.watch:
         return float(watch.watch(sweep, console, cfg.every))
     require("matplotlib", "report", "report")
-    with console.status("reading runs") as status:
+    # Its files belong together: of several reports at once in one folder, each waits for its turn.
+    with locked(folder, wait=_WAIT), console.status("reading runs") as status:
 
         def say(line: str) -> None:
             # `Text`: a label may hold square brackets, which rich would take for markup.
