@@ -11,10 +11,10 @@ from trackmdp.algos.gains import chain_returns, clocked_advantage, sensing_gain
 
 def test_sensing_gain_by_hand() -> None:
     clocked, own = torch.tensor([4.0]), torch.tensor([2.0])
-    assert sensing_gain(clocked, reward=1.0, discount=0.5).item() == 3.0
-    assert sensing_gain(clocked, own, reward=1.0, discount=0.5, blend=0.0).item() == 3.0
-    assert sensing_gain(clocked, own, reward=1.0, discount=0.5, blend=1.0).item() == 2.0
-    assert sensing_gain(clocked, own, reward=1.0, discount=0.5, blend=0.25).item() == 2.75
+    assert sensing_gain(clocked, discount=0.5).item() == 3.0
+    assert sensing_gain(clocked, own, discount=0.5, blend=0.0).item() == 3.0
+    assert sensing_gain(clocked, own, discount=0.5, blend=1.0).item() == 2.0
+    assert sensing_gain(clocked, own, discount=0.5, blend=0.25).item() == 2.75
 
 
 def test_clocked_advantage_compares_each_clock_with_a_detection() -> None:

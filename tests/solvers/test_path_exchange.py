@@ -11,10 +11,9 @@ from scipy import sparse
 
 from tests.tracks import by_hand, recorded
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers.key_plans import KeyPlans
 from trackmdp.solvers.path_counts import plan_keys
 from trackmdp.solvers.path_exchange import PRIORS, choose_plan, exchanged_keys, parted
-from trackmdp.solvers.path_states import Paths
+from trackmdp.solvers.path_states import KeyPlans, Paths
 from trackmdp.solvers.recorded import replay
 from trackmdp.world.tracks import Recorded, Tracks
 

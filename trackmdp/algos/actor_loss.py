@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import logsigmoid, softplus
 
-from trackmdp.algos.tables import gather, scatter_add
+from trackmdp.algos.gains import gather, scatter_add
 from trackmdp.config.learning import ScheduleConfig
 
 # σ(20) differs from 1 by 2e-9: no probability is told from certainty beyond. e^6 = 403: gains up to 403 times the cost

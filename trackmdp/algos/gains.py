@@ -2,7 +2,8 @@
 
 The motion is exogenous, so on a fully sensed path every policy can be replayed, its misses included. At an info state
 with n misses, the target moving to cell y next, the sensor of y gains what a detection is worth more than a miss, no
-other sensor gains anything, and each sensor that is on costs its c.
+other sensor gains anything, and each sensor that is on costs its c. Gains are gathered from and added up in tables over
+(cell, clock, sensor).
 """
 
 from __future__ import annotations
@@ -11,10 +12,8 @@ import torch
 from torch import Tensor
 
 
-def sensing_gain(
-    clocked: Tensor, own: Tensor | None = None, *, reward: float, discount: float, blend: float = 0.0
-) -> Tensor:
-    """The gain of having the target's sensor on: r + γ[(1-λ)(U(y,0) - U(y,n+1)) + λ(V(y) - G_{n+1})].
+def sensing_gain(clocked: Tensor, own: Tensor | None = None, *, discount: float, blend: float = 0.0) -> Tensor:
+    """The gain, in units of r, of having the target's sensor on: 1 + γ[(1-λ)(U(y,0) - U(y,n+1)) + λ(V(y) - G_{n+1})].
 
     At λ = 0 the clocked values say it, which are optimistic about what follows a miss; at λ = 1 the policy's own
     continuation does. Taking λ slowly from 0 to 1 leads past optima that no change of a single sensor improves.
@@ -23,13 +22,12 @@ def sensing_gain(
         clocked: U(y,0) - U(y,n+1), any shape.
         own: V(y) - G_{n+1}, same shape, where G_{n+1} is the return of the policy's own chain from n + 1 misses on, the
             target truly being at y; not needed at λ = 0.
-        reward: r.
         discount: γ of the credit.
         blend: λ.
     """
     # lerp(a, b, λ) = a + λ (b - a).
     advantage = clocked if own is None else torch.lerp(clocked, own, blend)
-    return reward + discount * advantage
+    return 1.0 + discount * advantage
 
 
 def clocked_advantage(clocked: Tensor) -> Tensor:
@@ -82,3 +80,13 @@ def chain_returns(
         outcome = torch.lerp(discount * returns[-1], found[n], hits[n].to(found.dtype)) - set_cost[n]
         returns.append(outcome * inside[n])
     return torch.stack(returns[::-1])
+
+
+def gather(table: Tensor, index: Tensor) -> Tensor:
+    """`table.flatten()[index]`, the fastest way."""
+    return table.reshape(-1).index_select(0, index.reshape(-1)).view(index.shape)
+
+
+def scatter_add(values: Tensor, index: Tensor, length: int) -> Tensor:
+    """`[length]`, the sums of the `values` that share an `index`."""
+    return values.new_zeros(length).scatter_add_(0, index.reshape(-1), values.reshape(-1))

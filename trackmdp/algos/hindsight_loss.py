@@ -11,10 +11,9 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from trackmdp.algos.actor_loss import ActorLoss, SensorCredit, decision_loss
-from trackmdp.algos.gains import chain_returns, clocked_advantage, sensing_gain
+from trackmdp.algos.gains import chain_returns, clocked_advantage, gather, scatter_add, sensing_gain
 from trackmdp.algos.in_view import SensorsInView
 from trackmdp.algos.replay import Replay
-from trackmdp.algos.tables import gather, scatter_add
 from trackmdp.policies.nets import CellClockNet
 from trackmdp.solvers.renewal import IndexArray
 from trackmdp.world.model import Task
@@ -202,7 +201,7 @@ class HindsightLoss(nn.Module):
         # The gain depends on the end y and the clock alone, so moves are counted by y: [T + 1, M] @ [M].
         arrived = torch.bincount(end, minlength=advantage.shape[1])[:-1].float()
         seen = arrived * self._detection[:-1]
-        gain = sensing_gain(advantage[:, :-1], reward=1.0, discount=self.discount)
+        gain = sensing_gain(advantage[:, :-1], discount=self.discount)
         return arrived.sum(), gain.abs() @ seen
 
     def _clocked(self, moves: Tensor, rows: slice, advantage: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
@@ -228,7 +227,7 @@ class HindsightLoss(nn.Module):
         # advantage[:, ends] is [T + 1, x, C H]: transposed to the layout [x, T + 1, C H]. A sensor that is on reports
         # p_d of the moves to its cell; what it misses goes on like what is not sensed.
         seen = moved if self._perfect else moved * self._detection[ends].unsqueeze(1)
-        gain = seen * sensing_gain(advantage[:, ends].transpose(0, 1), reward=1.0, discount=self.discount)
+        gain = seen * sensing_gain(advantage[:, ends].transpose(0, 1), discount=self.discount)
         # All moves to a key have the same gain, so its sign says whether it is part of its cell's G⁺ or G⁻.
         plus, minus = (part.unflatten(-1, (k, h)).sum(-1) for part in (gain.clamp(min=0), gain.clamp(max=0).neg()))
         chosen, cost = logits.detach() > 0, self.cost[self._of_keys(self.nearby.numbers, rows)].unsqueeze(1)
@@ -312,7 +311,7 @@ class HindsightLoss(nn.Module):
         clocked = gather(advantage, self.clocks * (m + 1) + end)
         # V(y) - G_{n+1}: located at y now, against the plan's return on the rest of this very path. The target's true
         # cell is known because it was sensed, not because the simulator tells it.
-        gain = sensing_gain(clocked, located[:-1] - returns[1:], reward=1.0, discount=discount, blend=blend)
+        gain = sensing_gain(clocked, located[:-1] - returns[1:], discount=discount, blend=blend)
         # Clock n is reached if no earlier set of the plan reported; other rows are not states of this policy. The move
         # has to stay in the grid, too: an exit step earns and costs nothing.
         alive = inside[:-1].float()

@@ -14,7 +14,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from trackmdp.algos.tables import gather
+from trackmdp.algos.gains import gather
 from trackmdp.world.memory import KeySpace
 from trackmdp.world.windows import Window
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import fields
 from typing import Any, ClassVar
 
-from trackmdp.config.learning import AlgoConfig, check_classes
+from trackmdp.config.learning import AlgoConfig, EveryTaskConfig, check_classes
 from trackmdp.config.options import BYTES, Sizes, choice, option, refuse
 from trackmdp.config.registry import choice_values
 
@@ -34,7 +34,7 @@ class PathCountsConfig(AlgoConfig):
 
 
 @choice("algo", "learned_kernel", makes="trackmdp.algos.learned_kernel:learner")
-class LearnedKernelConfig(AlgoConfig):
+class LearnedKernelConfig(EveryTaskConfig):
     """Estimate the motion from detections, then plan with the estimate; no networks.
 
     Where a policy remembers more than the cell (task.memory), the estimate is that of algo=path_counts, with its
@@ -42,9 +42,6 @@ class LearnedKernelConfig(AlgoConfig):
     """
 
     credit: ClassVar[str | None] = None
-    remembers: ClassVar[bool] = True
-    told: ClassVar[bool] = True
-    knows_footprints: ClassVar[bool] = True
     sensing: str = option("all sensors on, or sets chosen by posterior sampling", choices=("all", "chosen"))
     warm_up: int = option("with chosen sets: env steps with all sensors on before them", unit="frames", ge=0)
     prior: float = option(

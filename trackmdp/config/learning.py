@@ -60,12 +60,17 @@ class AlgoConfig(ChoiceConfig):
     envs: int = option("environments stepped together", ge=1)
 
 
-class NetworkConfig(AlgoConfig):
-    """What the algorithms have in common that learn networks from what they sense themselves."""
+class EveryTaskConfig(AlgoConfig):
+    """Base of the algorithms that learn whatever is remembered, told and covered."""
 
     remembers: ClassVar[bool] = True
     told: ClassVar[bool] = True
     knows_footprints: ClassVar[bool] = True
+
+
+class NetworkConfig(EveryTaskConfig):
+    """What the algorithms have in common that learn networks from what they sense themselves."""
+
     gamma: float = option("discount while learning; policies are evaluated undiscounted", ge=0, le=1)
     learning_rate: ScheduleConfig = nested(LEARNING_RATE)
     max_grad_norm: float = option("gradients are clipped to this norm", gt=0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-from trackmdp.config.learning import ENTROPY, LEARNING_RATE, AlgoConfig, ScheduleConfig, check_classes, networks
+from trackmdp.config.learning import ENTROPY, LEARNING_RATE, EveryTaskConfig, ScheduleConfig, check_classes, networks
 from trackmdp.config.options import BYTES, SELECTORS, Selector, Sizes, choice, nested, option, refuse
 
 SELECTORS["credit"] = Selector(
@@ -17,7 +17,7 @@ SELECTORS["credit"] = Selector(
 )
 
 
-class PerSensorConfig(AlgoConfig):
+class PerSensorConfig(EveryTaskConfig):
     """What the algorithms with a credit per sensor have in common.
 
     `explore`, read with `collect=mixed`: the probability of sensing everything where the target is located, in the
@@ -25,9 +25,6 @@ class PerSensorConfig(AlgoConfig):
     """
 
     credit: ClassVar[str | None] = "per_sensor"
-    knows_footprints: ClassVar[bool] = True
-    remembers: ClassVar[bool] = True
-    told: ClassVar[bool] = True
     effort: ClassVar[float] = 1.0
     collect: str = option(
         "all sensors on; or mixed with the policy learned so far, which costs less and shows less",

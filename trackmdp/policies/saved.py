@@ -18,7 +18,6 @@ from trackmdp.durable import write_bytes, write_json
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.untrusted import decoded, opened, read_object
-from trackmdp.world.coverage import Coverage
 from trackmdp.world.files import LARGE, load_npz, npz_bytes, whole_csr
 from trackmdp.world.model import Array, Task
 
@@ -41,8 +40,9 @@ def save_policy(file: Path, policy: PolicyTable, value: Array | None = None, **m
     """
     names = _TASK if policy.task.perfect and policy.task.safe else (*_TASK, *_SENSORS)
     content: dict[str, Any] = {f"task_{name}": _number(getattr(policy.task, name)) for name in names}
-    if policy.task.coverage is not None:
-        content |= _footprints(policy.task.coverage)
+    if policy.task.coverage is not None:  # the cells of each sensor, one sensor after another, and where each begins
+        cells = policy.task.coverage.matrix
+        content |= {"footprint_cells": cells.indices.astype(np.int32), "footprint_begin": cells.indptr.astype(np.int64)}
     if policy.task.memory != "cell":  # what is not there is the paper's
         content |= {"task_memory": np.str_(policy.task.memory), "task_clip": np.int64(policy.task.clip)}
     if policy.task.revealed > 1:
@@ -170,14 +170,8 @@ def _task(content: dict[str, npt.NDArray[Any]]) -> Task:
     return Task(**given, coverage=_read_footprints(content, rows * columns))
 
 
-def _footprints(coverage: Coverage) -> dict[str, Any]:
-    """The cells of each sensor, one sensor after another, and where each begins."""
-    matrix = coverage.matrix
-    return {"footprint_cells": matrix.indices.astype(np.int32), "footprint_begin": matrix.indptr.astype(np.int64)}
-
-
 def _read_footprints(content: dict[str, npt.NDArray[Any]], cells: int) -> sparse.csr_array | None:
-    """`[S, M]` bool of what `_footprints` wrote; None where it wrote nothing."""
+    """`[S, M]` bool of what `save_policy` wrote; None where it wrote nothing."""
     if "footprint_cells" not in content:
         return None
     indices, indptr = content["footprint_cells"], content["footprint_begin"]

@@ -17,7 +17,7 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.evaluation import Evaluation, pooled
 from trackmdp.solvers.prediction import followed
 from trackmdp.solvers.renewal import IndexArray, RenewalSystem, per_row, row_index
-from trackmdp.world.model import Array, World
+from trackmdp.world.model import World
 from trackmdp.world.tracks import Problem
 
 _MOST_CELLS = 144
@@ -51,7 +51,9 @@ def believed(world: Problem, policy: PolicyTable, false_alarm: float) -> Evaluat
         before, moved = silent.sum(axis=1), sparse.csr_array(silent @ world.kernel)
         reports, silent = _reports(world, moved, believes, ranked, false_alarm)
         onward = onward + reports
-        inside, right = moved.sum(axis=1), _right(reports, m)
+        # True reports lead to pairs (y, y), whose numbers are multiples of M + 1.
+        true = reports.data * (reports.indices % (m + 1) == 0)
+        inside, right = moved.sum(axis=1), per_row(row_index(reports), true, m * m)
         reward = world.reward * right - policy.spent(n, world.cost)[believes] * inside
         sensors = policy.spent(n, np.ones(m))[believes] * inside
         gathered += np.stack([reward, inside, right, sensors, np.zeros(m * m), before], axis=1)
@@ -135,9 +137,3 @@ def _reports(
     silent.eliminate_zeros()
     after.eliminate_zeros()
     return after, silent
-
-
-def _right(reports: sparse.csr_array, m: int) -> Array:
-    """`[M²]` probability of a report that is true: of pairs (y, y), whose numbers are multiples of M + 1."""
-    true = reports.indices % (m + 1) == 0
-    return per_row(row_index(reports), reports.data * true, m * m)

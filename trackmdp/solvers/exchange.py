@@ -185,17 +185,12 @@ def _chains(problem: InnerProblem, mass: Array, cells: IndexArray) -> tuple[Chai
         number = np.cumsum(theirs[t] >= 0) - 1
         moves = layer.moves[before]  # to entries of the same located cells, which are all kept
         renamed = (moves.data, number[moves.indices - spans[t].start], moves.indptr)
-        steps.append(
-            ChainStep(
-                rows[t],
-                sparse.csr_array(renamed, shape=(len(before), len(entries))),
-                problem.detected[there],
-                np.broadcast_to(world.detects(there), there.shape),
-                world.cost[there],
-                world.stay_probability[layers[t - 1].cells[before]],
-                allowed=layer.allowed[entries] if problem.windowed and layer.allowed is not None else None,
-            )
-        )
+        kept_moves = sparse.csr_array(renamed, shape=(len(before), len(entries)))
+        chance = np.broadcast_to(world.detects(there), there.shape)
+        stay = world.stay_probability[layers[t - 1].cells[before]]
+        allowed = layer.allowed[entries] if problem.windowed and layer.allowed is not None else None
+        worth, price = problem.detected[there], world.cost[there]
+        steps.append(ChainStep(rows[t], kept_moves, worth, chance, price, stay, allowed=allowed))
     missed = problem.missed[layers[-1].cells[kept[-1]]]
     return Chains(rows[0], mass[kept[0]], steps, missed), kept[1:]
 

@@ -36,26 +36,20 @@ def solve(world: World, *, depth: int = 2, tail: Tail = "clocked") -> PolicyTabl
     """
     if world.coverage is not None:
         raise UserError("solver=lookahead: plans for sensors that each cover one cell; expected clocked or optimal")
-    table = _tail_table(world, tail)
+    # [M, t_max + 2], worth of the target being known in a cell after n misses
+    tails = np.repeat(valid(world)[:, None], world.t_max + 2, axis=1) if tail == "qmdp" else clocked_table(world).table
     layers = reachable_layers(world, world.num_choices)
     sets: list[BoolArray] = []
     mass = np.ones(world.num_cells)
     for n in range(world.num_choices):
         # the safe action ends every plan: n + ahead is at most t_max + 1
         ahead = min(depth, world.num_choices - n)
-        # table[:, n + ahead]: after `ahead` misses more the clock reads n + ahead, and the tail's value is that of this
+        # tails[:, n + ahead]: after `ahead` misses more the clock reads n + ahead, and the tail's value is that of this
         # column.
-        problem = InnerProblem(world, layers[n : n + ahead + 1], world.reward + table[:, 0], table[:, n + ahead])
+        problem = InnerProblem(world, layers[n : n + ahead + 1], world.reward + tails[:, 0], tails[:, n + ahead])
         sets.append(_first_set(problem, layers, mass))
         mass = (mass @ layers[n + 1].moves) * (1.0 - sets[-1] * world.detects(layers[n + 1].cells))
     return policy_table(world, layers, sets)
-
-
-def _tail_table(world: World, tail: Tail) -> Array:
-    """`[M, t_max + 2]` worth of the target being known in a cell after n misses."""
-    if tail == "clocked":
-        return clocked_table(world).table
-    return np.repeat(valid(world)[:, None], world.t_max + 2, axis=1)
 
 
 def _first_set(problem: InnerProblem, layers: list[Layer], mass: Array) -> BoolArray:

@@ -14,8 +14,7 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers.key_plans import KeyPlans, Sensed, sensed_table
-from trackmdp.solvers.path_states import Paths
+from trackmdp.solvers.path_states import KeyPlans, Paths, Sensed, sensed_table
 from trackmdp.solvers.renewal import IndexArray, per_row
 from trackmdp.world.memory import KeySpace
 from trackmdp.world.model import Array, Task

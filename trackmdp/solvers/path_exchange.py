@@ -14,10 +14,9 @@ from scipy import sparse
 
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
-from trackmdp.solvers.key_plans import KeyPlans, sensed_table
 from trackmdp.solvers.keyed_exchange import exchange_chains
 from trackmdp.solvers.path_counts import Planned, plan_paths
-from trackmdp.solvers.path_states import AlongPaths, Paths
+from trackmdp.solvers.path_states import AlongPaths, KeyPlans, Paths, sensed_table
 from trackmdp.solvers.plans import Chains, ChainStep
 from trackmdp.solvers.renewal import IndexArray, per_row, row_index
 from trackmdp.world.model import Task

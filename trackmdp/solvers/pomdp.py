@@ -63,7 +63,8 @@ class FiniteMdp:
             better = best > worth[choice] + 1e-12 * (1.0 + np.abs(value).max())
             if not better.any():
                 return value, worth
-            choice = np.where(better, _first_best(worth, best, state, first), choice)
+            attained = np.flatnonzero(worth >= best[state])  # of each state the first row that does counts
+            choice = np.where(better, attained[np.searchsorted(attained, first)], choice)
             value = accumulate(moves[choice], reward[choice])
 
 
@@ -75,12 +76,6 @@ def solve(world: World, *, most_beliefs: int = 50_000) -> BeliefSolution:
     """
     problem, count = _enumerate(world, most_beliefs)
     return BeliefSolution(problem.solve(count)[0][: world.num_cells], count)
-
-
-def _first_best(worth: Array, best: Array, state: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """`[S]` the first row of each state that attains its best."""
-    attained = np.flatnonzero(worth >= best[state])
-    return attained[np.searchsorted(attained, first)]
 
 
 def _enumerate(world: World, most_beliefs: int) -> tuple[FiniteMdp, int]:
@@ -98,9 +93,11 @@ def _enumerate(world: World, most_beliefs: int) -> tuple[FiniteMdp, int]:
             continue
         for action in _subsets(predicted > 0):
             found = np.where(action, predicted * world.detection, 0.0)
-            after, missed = _miss(predicted - found)
+            left = predicted - found
+            missed = float(left.sum())  # probability of no detection and no exit
             targets, probability = _sparse(found)
             if missed > 0:
+                after = left / missed  # eq. belief_up
                 key = _key(after, n + 1)
                 if key not in index:
                     index[key] = len(beliefs)
@@ -129,12 +126,6 @@ def _safe_action(world: World, kernel: Array) -> tuple[Array, Array]:
     repeated = np.linalg.inv(np.eye(world.num_cells) - kernel * (1.0 - world.safe_detection))
     price: Array = world.safe_cost * (repeated @ kernel.sum(axis=1))
     return repeated @ (kernel * world.safe_detection), price
-
-
-def _miss(left: Array) -> tuple[Array, float]:
-    """Eq. belief_up given no detection and no exit, from what the sensors leave `[M]`, and the probability of that."""
-    missed = float(left.sum())
-    return (left / missed if missed else left), missed
 
 
 def _sparse(vector: Array) -> tuple[list[int], list[float]]:

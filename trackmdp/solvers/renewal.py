@@ -71,8 +71,10 @@ class RenewalSystem:
         if self.exact:
             self._solve = _factorised(self._system)
             return
+        # The inverse of the diagonal, 40 products, where states are pairs of many classes that share their cells.
+        diagonal = self._system.diagonal()
         self._precondition: Callable[[Array], Array]
-        self._precondition = _Jacobi(self._system) if size is None else _Level(self._system, size)
+        self._precondition = (lambda right: right / diagonal) if size is None else _Level(self._system, size)
 
     def solve(self, gathered: Array, guess: Array | None = None) -> Array:
         """`[M]` or `[M, K]`, as `gathered` is; `guess`, of the same shape, is where an iteration starts.
@@ -154,16 +156,6 @@ class RenewalSystem:
             daxpy(moved, residual, a=-omega)
             products += 2
         return solution, products
-
-
-class _Jacobi:
-    """The inverse of the diagonal: where states are pairs of many classes that share their cells, 40 products do."""
-
-    def __init__(self, system: sparse.csr_array) -> None:
-        self._diagonal = system.diagonal()
-
-    def __call__(self, right: Array) -> Array:
-        return right / self._diagonal
 
 
 class _Level:

@@ -26,8 +26,8 @@ from scipy import sparse
 from scipy.special import betaln
 
 from trackmdp.solvers.renewal import IndexArray, per_row, row_index
-from trackmdp.world.model import Array, Task
-from trackmdp.world.modes import Modelled, with_motion
+from trackmdp.world.model import Array, Task, World
+from trackmdp.world.modes import HiddenWorld, Modelled
 
 PRECISIONS = (30.0, 300.0, 3000.0)
 """a + b of the Beta(a, b) of the mixture: what stands for broad and for narrow groups of probabilities."""
@@ -131,7 +131,10 @@ def least_worth_planning(task: Task) -> float:
 def believed_world(task: Task, kernel: sparse.csr_array, least: float) -> Modelled:
     """The task with the motion of a `[M, M + 1]` kernel, the last column its exit, without moves below `least`."""
     # Plans on several moves grow with a power of the number of moves, most of which the prior may have added.
-    return with_motion(task, without(sparse.csr_array(kernel[:, :-1]), least))
+    moves = without(sparse.csr_array(kernel[:, :-1]), least)
+    if task.revealed > 1:  # of (cell, mode)
+        return HiddenWorld(moves, modes=task.revealed, **task.given)
+    return World.of(task, moves, max_steps=None)
 
 
 def without(moves: sparse.csr_array, least: float) -> sparse.csr_array:

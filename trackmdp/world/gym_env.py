@@ -40,7 +40,12 @@ class _Tracking:
         if render_mode is not None and render_mode not in _MODES:
             raise UserError(f"render_mode={render_mode}: expected one of {', '.join(_MODES)}")
         self._env = TrackEnv(self.world, shape)
-        return _spaces(self._env)
+        # Those of the environment's specs, without its batch.
+        seen: dict[str, spaces.Space[Any]] = {
+            key: spaces.MultiBinary(spec.shape[-2:]) if isinstance(spec, Binary) else spaces.Discrete(spec.space.n)
+            for key, spec in self._env.observation_spec.items()
+        }
+        return spaces.Dict(seen), spaces.MultiBinary(self._env.num_sensors)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -145,15 +150,6 @@ class TrackVector(_Tracking, VectorEnv[Observation, npt.NDArray[np.int8], npt.ND
             final[row] = {key: value[row] for key, value in seen.items()}
         info = {"target": np.where(done, self._env.target.numpy(), 0), "_target": done}
         return {"final_obs": final, "_final_obs": done, "final_info": info, "_final_info": done}
-
-
-def _spaces(env: TrackEnv) -> tuple[spaces.Dict, spaces.MultiBinary]:
-    """Those of the environment's specs, without its batch."""
-    seen: dict[str, spaces.Space[Any]] = {
-        key: spaces.MultiBinary(spec.shape[-2:]) if isinstance(spec, Binary) else spaces.Discrete(spec.space.n)
-        for key, spec in env.observation_spec.items()
-    }
-    return spaces.Dict(seen), spaces.MultiBinary(env.num_sensors)
 
 
 def _acting(action: npt.ArrayLike, shape: tuple[int, ...]) -> TensorDict:

@@ -154,7 +154,10 @@ def _place(
     row = np.nonzero(inside)[0]
     # (row, column) . (columns, 1) = row * columns + column, the cell's number.
     target = position[inside] @ (grid[1], 1)
-    rows = _summed(row, target, weights[inside], (len(cells), grid[0] * grid[1]))
+    # Entries of one place are added up in the order given: `lexsort` is stable, SciPy's `sum_duplicates` is not.
+    order = np.lexsort((target, row))
+    row, target, total = merged(row[order], target[order], weights[inside][order])
+    rows = sparse.csr_array((total, (row, target)), shape=(len(cells), grid[0] * grid[1]))
     if border in ("renormalize", "inside"):
         empty = np.flatnonzero(np.diff(rows.indptr) == 0)
         stays = sparse.csr_array((np.ones(len(empty)), (empty, cells[empty])), shape=rows.shape)
@@ -162,15 +165,6 @@ def _place(
         # All of a row by one factor, so that the exit keeps its probability and the positions their proportions.
         rows.data *= np.repeat(totals / pairwise_row_sums(rows), np.diff(rows.indptr))
     return rows
-
-
-def _summed(
-    row: npt.NDArray[np.int64], column: npt.NDArray[np.int64], values: Array, shape: tuple[int, int]
-) -> sparse.csr_array:
-    """The matrix with these entries; entries of one place are added up in the order given."""
-    order = np.lexsort((column, row))  # stable, which `sum_duplicates` of SciPy is not
-    row, column, total = merged(row[order], column[order], values[order])
-    return sparse.csr_array((total, (row, column)), shape=shape)
 
 
 def _homogeneous(

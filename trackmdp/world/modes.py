@@ -132,13 +132,6 @@ Modelled: TypeAlias = World | HiddenWorld
 """A task with a motion model."""
 
 
-def with_motion(task: Task, kernel: sparse.csr_array) -> Modelled:
-    """The world of a task with a kernel on its cells, or on (cell, mode) where a detection tells the mode."""
-    if task.revealed > 1:
-        return HiddenWorld(kernel, modes=task.revealed, **task.given)
-    return World.of(task, kernel, max_steps=None)
-
-
 def check_revealed(problem: Task, told: int) -> None:
     """See that a policy that knows `told` modes apart at a detection can act in `problem`; 1 where it knows none.
 

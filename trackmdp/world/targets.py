@@ -18,7 +18,7 @@ from torch import Tensor
 from trackmdp.errors import UserError
 from trackmdp.seeding import generator
 from trackmdp.world.draws import Draw, Streams
-from trackmdp.world.modes import HiddenWorld, Modelled
+from trackmdp.world.modes import HiddenWorld
 from trackmdp.world.tracks import Problem, Recorded, Tracks
 
 _RESOLUTION = 2**40
@@ -38,10 +38,21 @@ class Motion:
     [x · 2^40, (x + 1) · 2^40), and of it each successor the share that is its probability. One binary search of
     x · 2^40 + u · 2^40 therefore finds the successor, whatever the support of the row; being a search among integers it
     is exact for every cell of a large grid. The exit is cell number M, and stays there.
+
+    With H modes what is said of cells holds for places, cell · H + mode; all of them are starts.
+
+    Args:
+        kernel: `[M, M]`, or with modes `[M · H, M · H]`.
+        device: where the tensors live.
+        modes: H.
+
+    Attributes:
+        starts: how many places to start in there are.
     """
 
-    def __init__(self, kernel: sparse.csr_array, device: torch.device | str = "cpu") -> None:
+    def __init__(self, kernel: sparse.csr_array, device: torch.device | str = "cpu", modes: int = 1) -> None:
         m = kernel.shape[0]
+        self.starts, self.device, self._modes = m, torch.device(device), modes
         if m > _MOST_CELLS:
             raise UserError(f"kernel: {m:,} cells, expected at most {_MOST_CELLS:,}")
         # Worked example, two cells, in units of 2^40: P_01 = .5, P_10 = .25, P_11 = .5. The ends within the rows are .5
@@ -83,30 +94,6 @@ class Motion:
             return self._successors.index_select(0, first.add_(passed.sum(0)))
         return self._successors[torch.searchsorted(self._edges, place, right=True)]
 
-
-def _running_sums(kernel: sparse.csr_array) -> npt.NDArray[np.float64]:
-    """`[nnz]` for each entry the sum of its row up to and with it, added from left to right."""
-    sums, lengths = kernel.data.astype(np.float64), np.diff(kernel.indptr)
-    # One pass for each place in a row: a running sum over all entries at once would round differently in each row.
-    for place in range(1, int(lengths.max(initial=0))):
-        entry = kernel.indptr[:-1][lengths > place] + place
-        sums[entry] += sums[entry - 1]
-    return sums
-
-
-class Sampled(Motion):
-    """Targets that move as the kernel says; a place is a cell, or with modes cell · H + mode. All are starts.
-
-    Attributes:
-        starts: how many places to start in there are.
-        device: where the tensors live.
-    """
-
-    def __init__(self, world: Modelled, device: torch.device) -> None:
-        super().__init__(world.kernel, device)
-        self.starts, self.device = world.kernel.shape[0], device
-        self._modes = world.modes if isinstance(world, HiddenWorld) else 1
-
     def begin(self, numbers: Tensor) -> Tensor:
         """`[B]` places of the starts `numbers` `[B]`."""
         return numbers
@@ -124,8 +111,18 @@ class Sampled(Motion):
         return None
 
 
+def _running_sums(kernel: sparse.csr_array) -> npt.NDArray[np.float64]:
+    """`[nnz]` for each entry the sum of its row up to and with it, added from left to right."""
+    sums, lengths = kernel.data.astype(np.float64), np.diff(kernel.indptr)
+    # One pass for each place in a row: a running sum over all entries at once would round differently in each row.
+    for place in range(1, int(lengths.max(initial=0))):
+        entry = kernel.indptr[:-1][lengths > place] + place
+        sums[entry] += sums[entry - 1]
+    return sums
+
+
 class Replayed:
-    """Targets that go along recorded tracks; methods as those of `Sampled`.
+    """Targets that go along recorded tracks; methods as those of `Motion`.
 
     A place is a point of the line that all tracks, each closed by the exit, form end to end. Starts are the first cells
     of the tracks, or with `anywhere` all recorded points.
@@ -147,38 +144,37 @@ class Replayed:
         )
 
     def begin(self, numbers: Tensor) -> Tensor:
-        """See `Sampled`."""
+        """See `Motion`."""
         return self._begins[numbers]
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:  # noqa: ARG002
-        """See `Sampled`."""
+        """See `Motion`."""
         return torch.zeros(count, dtype=torch.float64, device=self.device)  # a recorded path needs none
 
     def move(self, place: Tensor, draws: Tensor) -> Tensor:  # noqa: ARG002
-        """See `Sampled`."""
+        """See `Motion`."""
         return self._following[place]
 
     def cell(self, place: Tensor) -> Tensor:
-        """See `Sampled`."""
+        """See `Motion`."""
         return self._cells[place]
 
     def mode(self, place: Tensor) -> None:
-        """See `Sampled`."""
+        """See `Motion`."""
 
     def stops(self, place: Tensor) -> Tensor:
-        """See `Sampled`."""
+        """See `Motion`."""
         return self._stops[place]
 
 
-Source: TypeAlias = Sampled | Replayed
+Source: TypeAlias = Motion | Replayed
 
 
 def held_out_source(problem: Problem) -> Source:
     """What a policy is judged by: the motion of a world, or the held-out ones of recorded tracks."""
-    cpu = torch.device("cpu")
     if isinstance(problem, Recorded):
-        return Replayed(problem.held_out, problem.num_cells, cpu)
-    return Sampled(problem, cpu)
+        return Replayed(problem.held_out, problem.num_cells, torch.device("cpu"))
+    return Motion(problem.kernel, modes=problem.modes if isinstance(problem, HiddenWorld) else 1)
 
 
 class Targets(Streams):
@@ -280,4 +276,6 @@ def make_targets(problem: Problem, device: torch.device) -> Targets:
     """The targets of a world or of recorded tracks."""
     if isinstance(problem, Recorded):
         return RecordedTargets(Replayed(problem.tracks, problem.num_cells, device, anywhere=problem.anywhere), "place")
-    return Targets(Sampled(problem, device), "place" if isinstance(problem, HiddenWorld) else "target")
+    if isinstance(problem, HiddenWorld):
+        return Targets(Motion(problem.kernel, device, problem.modes), "place")
+    return Targets(Motion(problem.kernel, device), "target")
