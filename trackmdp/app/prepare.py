@@ -13,18 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from trackmdp.config import (
-    ROOTS,
-    CommandConfig,
-    EvaluateConfig,
-    ExportConfig,
-    FalseAlarmConfig,
-    ReplayConfig,
-    ReportConfig,
-    TrainConfig,
-    WorldConfig,
-    load_run_config,
-)
+from trackmdp import config
+from trackmdp.config import CommandConfig, TrainConfig, WorldConfig, load_run_config
 from trackmdp.config.checks import refuse_ignored
 from trackmdp.config.compose import from_hydra
 from trackmdp.config.learning import file_of_classes
@@ -45,7 +35,7 @@ def typed_config(command: str, cfg: DictConfig, folder: Path) -> CommandConfig:
     Raises:
         UserError: an option is unknown or not allowed.
     """
-    typed = from_hydra(cfg, ROOTS[command], folder)
+    typed = from_hydra(cfg, config.ROOTS[command], folder)
     # A run that is resumed has a config of its own, which says what is read; `prepare` looks once it is known.
     if not getattr(typed, "resume", None):
         _refuse_ignored(typed, cfg)
@@ -141,7 +131,7 @@ def announce(command: str, cfg: CommandConfig, folder: Path, label: str = "") ->
         return
     label = f"({label}) " if label else ""
     what = next((getattr(cfg, name).name for name in ("algo", "baseline", "solver") if getattr(cfg, name, None)), "")
-    if isinstance(cfg, EvaluateConfig) and cfg.run is not None:
+    if isinstance(cfg, config.EvaluateConfig) and cfg.run is not None:
         say(f"{label}evaluate {cfg.run} -> {shown(folder)}")
         return
     rows, columns = cfg.grid.sides
@@ -176,23 +166,23 @@ def _check_files(cfg: CommandConfig, words: Sequence[str]) -> None:
         from trackmdp.solvers.alike import cell_classes  # imports scipy, as a world does
 
         cell_classes(classes, cfg.grid.sides)
-    if isinstance(cfg, EvaluateConfig) and cfg.run is not None:
+    if isinstance(cfg, config.EvaluateConfig) and cfg.run is not None:
         for word in words:
             group = key_of(word).split(".")[0]
-            if group == "sensor" and isinstance(cfg.sensor, FalseAlarmConfig):
+            if group == "sensor" and isinstance(cfg.sensor, config.FalseAlarmConfig):
                 continue  # how a trained policy stands up to them is what they are for
             if group in WORLD_KEYS:
                 raise UserError(f"{word}: not together with run={cfg.run}, whose own world is used")
         load_run_config(cfg.run)
-    elif isinstance(cfg, ExportConfig):
+    elif isinstance(cfg, config.ExportConfig):
         load_run_config(cfg.run)
-    elif isinstance(cfg, ReportConfig) and not Path(cfg.sweep).is_dir():
+    elif isinstance(cfg, config.ReportConfig) and not Path(cfg.sweep).is_dir():
         raise UserError(f"sweep={cfg.sweep}: no such folder")
-    elif isinstance(cfg, ReplayConfig):
+    elif isinstance(cfg, config.ReplayConfig):
         _check_outputs(cfg)
 
 
-def _check_outputs(cfg: ReplayConfig) -> None:
+def _check_outputs(cfg: config.ReplayConfig) -> None:
     """Refuse an output that is a folder where a file is to be written, or the other way round."""
     for key in ("html", "layout"):
         named = getattr(cfg, key)

@@ -6,6 +6,7 @@ What is computed stands beside the results as `paper.json`.
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -23,6 +24,7 @@ from trackmdp.solvers import bounds, optimal, qmdp
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.untrusted import decoded, read_object
 from trackmdp.world.kernels import Border
+from trackmdp.world.model import Array
 
 BORDER: Border = "renormalize"
 T_MAX = 1
@@ -85,61 +87,58 @@ class Setting:
 
 
 def candidates(
-    support_size: int, *, border: Border = BORDER, t_max: int = T_MAX, seeds: Iterable[int] = SEEDS
+    support_size: int, *, border: Border = BORDER, t_max: int = T_MAX, seeds: Sequence[int] = SEEDS
 ) -> list[Candidate]:
     """Every draw, the best first; ties go to the lower seed."""
-    found = [_candidate(support_size, seed, border, t_max) for seed in seeds]
-    return sorted(found, key=lambda candidate: (candidate.deviation, candidate.seed))
+    accuracy = _figures(border, t_max, support_size, seeds)[:, :, 0]
+    deviations = _deviations(support_size, accuracy)
+    rows = zip(seeds, map(tuple, accuracy.tolist()), deviations.tolist(), strict=True)
+    return sorted((Candidate(support_size, *row) for row in rows), key=_rank)
+
+
+def _rank(candidate: Candidate) -> tuple[float, int]:
+    """The smallest deviation comes first, then the lowest seed."""
+    return candidate.deviation, candidate.seed
 
 
 def chosen(every: Iterable[Candidate]) -> dict[int, int]:
     """Z -> the seed the rule gives: smallest deviation, then lowest seed."""
     # The best comes last, and overwrites the others of its Z.
-    ordered = sorted(every, key=lambda candidate: (candidate.deviation, candidate.seed), reverse=True)
+    ordered = sorted(every, key=_rank, reverse=True)
     return dict(sorted({candidate.support_size: candidate.seed for candidate in ordered}.items()))
 
 
 def sensitivity(draws: Sequence[int] = DRAWS) -> Iterator[Setting]:
     """Every border rule with every T_max, for each pair of the paper."""
-    for border in BORDERS:
-        for t_max in HORIZONS:
-            for support_size in SUPPORTS:
-                yield from _settings(border, t_max, support_size, draws)
+    for border, t_max, support_size in itertools.product(BORDERS, HORIZONS, SUPPORTS):
+        figures = _figures(border, t_max, support_size, draws)
+        # Over all four prices at once, hence one number for Z that every price's `Setting` repeats.
+        deviation = float(_deviations(support_size, figures[:, :, 0]).min())
+        # `[prices, figures, (median, low, high)]`
+        spreads = np.stack([np.median(figures, axis=0), figures.min(axis=0), figures.max(axis=0)], axis=2)
+        for cost, spread in zip(COSTS, spreads.tolist(), strict=True):
+            accuracy, simple, clocked = (Spread(*each) for each in spread)
+            yield Setting(border, t_max, support_size, cost, accuracy, simple, clocked, deviation)
 
 
-def _candidate(support_size: int, seed: int, border: Border, t_max: int) -> Candidate:
-    kernel = paper_kernel(support_size, seed, border)
-    # One kernel for all four prices, as in Table II: the price changes what is sensed, never how the target moves.
-    worlds = [paper_world(kernel, cost, t_max) for cost in COSTS]
-    accuracy = tuple(100.0 * evaluate(world, qmdp.solve(world)).accuracy for world in worlds)
-    return Candidate(support_size, seed, accuracy, _deviation(support_size, accuracy))
-
-
-def _deviation(support_size: int, accuracy: Iterable[float]) -> float:
-    printed = [PRINTED_QMDP[support_size, cost] for cost in COSTS]
-    # The largest of the four, not their mean, which could trade a poor fit at c = 0.22 (54.3 for Z = 5) for good ones
-    # elsewhere.
-    return max(abs(mine - theirs) for mine, theirs in zip(accuracy, printed, strict=True))
-
-
-def _settings(border: Border, t_max: int, support_size: int, draws: Sequence[int]) -> Iterator[Setting]:
-    # `[draws, prices, (accuracy, AIHTR of Q_MDP, clocked bound)]`
+def _figures(border: Border, t_max: int, support_size: int, draws: Sequence[int]) -> Array:
+    """`[draws, prices, 3]`, accuracy of Q_MDP in per cent, its AIHTR, and the clocked bound."""
     figures = np.empty((len(draws), len(COSTS), 3))
     for row, seed in enumerate(draws):
+        # One kernel for all four prices, as in Table II: the price changes what is sensed, never how the target moves.
         kernel = paper_kernel(support_size, seed, border)
         for column, cost in enumerate(COSTS):
             world = paper_world(kernel, cost, t_max)
             value = evaluate(world, qmdp.solve(world))
             figures[row, column] = 100.0 * value.accuracy, value.aihtr, bounds.clocked(world).mean()
-    # Over all four prices at once, hence one number for Z that every price's `Setting` repeats.
-    deviation = min(_deviation(support_size, accuracy) for accuracy in figures[:, :, 0])
-    for column, cost in enumerate(COSTS):
-        accuracy, simple, clocked = (_spread(figures[:, column, which]) for which in range(3))
-        yield Setting(border, t_max, support_size, cost, accuracy, simple, clocked, deviation)
+    return figures
 
 
-def _spread(values: np.ndarray) -> Spread:
-    return Spread(float(np.median(values)), float(values.min()), float(values.max()))
+def _deviations(support_size: int, accuracy: Array) -> Array:
+    """`[draws]`, how far accuracies `[draws, prices]` are from the printed ones."""
+    # The largest of the four, not their mean, which could trade a poor fit at c = 0.22 (54.3 for Z = 5) for good ones
+    # elsewhere.
+    return np.abs(accuracy - [PRINTED_QMDP[support_size, cost] for cost in COSTS]).max(axis=1)
 
 
 OPENINGS_FILE = "paper.json"
@@ -210,9 +209,7 @@ def _rounded(value: Any) -> Any:
 def _unpacked(plain: dict[str, Any]) -> Openings:
     return Openings(
         [Candidate(*row) for row in plain["candidates"]],
-        [
-            Setting(border, t_max, z, cost, Spread(*accuracy), Spread(*qmdp), Spread(*clocked), deviation)
-            for border, t_max, z, cost, accuracy, qmdp, clocked, deviation in plain["settings"]
-        ],
+        # border, T_max, Z and c, then three spreads, then the deviation
+        [Setting(*row[:4], *(Spread(*each) for each in row[4:7]), row[7]) for row in plain["settings"]],
         [Check(name, said, float(deviation), *rest) for name, said, deviation, *rest in plain["checks"]],
     )

@@ -9,18 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from trackmdp.paper.calibration import (
-    BORDER,
-    DRAWS,
-    HARDEST,
-    SEEDS,
-    T_MAX,
-    Candidate,
-    Openings,
-    Setting,
-    Spread,
-    chosen,
-)
+from trackmdp.paper import calibration
+from trackmdp.paper.calibration import DRAWS, Candidate, Openings, Setting, Spread, chosen
 from trackmdp.paper.theorems import Check
 from trackmdp.paper.worlds import COSTS, PRINTED_QMDP, PRINTED_TMDP, SUPPORTS, pairs
 from trackmdp.reports.grouping import Study
@@ -190,7 +180,8 @@ def _worlds(openings: Openings) -> Section:
     border, t_max, *_, worst = best.rows[0]
     told = paragraphs("trackmdp.paper")
     fit = told["fit"].format(border=border, t_max=t_max, worst=worst, draws=len(DRAWS))
-    rule = told["rule"].format(first=SEEDS[0], last=SEEDS[-1], t_max=T_MAX, border=BORDER)
+    first, *_, last = calibration.SEEDS
+    rule = told["rule"].format(first=first, last=last, t_max=calibration.T_MAX, border=calibration.BORDER)
     drawn = sensitivity_figures(openings.settings)
     figure = calibration_figure(openings.candidates)
     parts: list[Part] = [f"<p>{rule}</p>", [figure], f"<p>{fit}</p>", best, drawn]
@@ -211,7 +202,8 @@ def checks_table(found: Iterable[Check]) -> Table:
         for c in found
     ]
     columns = [Column("theorem"), Column("statement"), Column("largest deviation"), Column("verdict"), Column("note")]
-    return Table("theorems", f"The paper's statements on the world with Z = {HARDEST}, c = {COSTS[0]}", columns, rows)
+    caption = f"The paper's statements on the world with Z = {calibration.HARDEST}, c = {COSTS[0]}"
+    return Table("theorems", caption, columns, rows)
 
 
 def bounds_table(study: Study, pairs: Mapping[tuple[int, float], str]) -> Table:
