@@ -14,6 +14,7 @@ from typing import Any
 
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.utils import configure_log, run_job
+from hydra.experimental.callback import Callback
 from hydra.types import HydraContext
 from omegaconf import DictConfig, OmegaConf, read_write
 
@@ -83,21 +84,12 @@ def _run_in_hydra(cfg: DictConfig, ready: Prepared) -> None:
         cfg,
         job_dir_key="hydra.run.dir",
         job_subdir_key=None,
-        hydra_context=HydraContext(loader, _NoCallbacks()),  # type: ignore[arg-type]
+        # Hydra's base class, which does nothing, in place of callbacks that a config would name by `_target_`.
+        hydra_context=HydraContext(loader, Callback()),  # type: ignore[arg-type]
     )
     # Only now, after Hydra has restored the environment and the current folder.
     if raised:
         raise raised[0]
-
-
-class _NoCallbacks:
-    """In place of Hydra's callbacks, which a config would name by `_target_`."""
-
-    def on_job_start(self, **_: Any) -> None:
-        """Nothing."""
-
-    def on_job_end(self, **_: Any) -> None:
-        """Nothing."""
 
 
 def _sweep(compose: Composer) -> int:

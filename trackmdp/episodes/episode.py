@@ -107,8 +107,7 @@ class Episode:
         current |= {"action": action, **_ends(len(self), terminated=False, truncated=False)}
         following = {key: value[1:] for key, value in states.items()}
         following |= {"reward": self.reward[:, None], **_ends(len(self), self.terminated, self.truncated)}
-        made, nested = ({key: torch.as_tensor(each) for key, each in part.items()} for part in (current, following))
-        return TensorDict({**made, "next": TensorDict(nested, [len(self)])}, [len(self)])
+        return TensorDict({**current, "next": following}, [len(self)])
 
 
 def _history(action: BoolArray, misses: Integers, located: BoolArray, t_max: int) -> BoolArray:

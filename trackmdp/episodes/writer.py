@@ -77,7 +77,7 @@ class EpisodeWriter:
         footprints = csr_in(tables["footprints.npz"]) if "footprints.npz" in tables else None
         self._coverage = Coverage.of(footprints, run.cells)
         self.file, self.part = file, file.with_name(f"{file.name}.part")
-        self._lock, self._process = threading.Lock(), os.getpid()
+        self._lock, self._process = threading.RLock(), os.getpid()
         self._rows: list[dict[str, Any]] = []
         self.policies = self._unflushed = self._tick = 0
         # Opened here and not by the Writer, which closes a file of its own in finish(), before it could be synced.
@@ -92,7 +92,7 @@ class EpisodeWriter:
         for name, content in tables.items():
             self._attach(name, content)
         # In the file at once: a log that is cut off later can be recovered only with what it starts with.
-        self._flush()
+        self.flush()
 
     def _register(self, topic: str, more: dict[str, Any]) -> int:
         name, description = schema.SCHEMAS[topic]
@@ -125,7 +125,7 @@ class EpisodeWriter:
             self._tell(f"{schema.POLICY}.{self.policies}", {**facts, "table.sha256": sha256})
             if table is not None:
                 self._attach(self.run.policy_file(self.policies), table)
-            self._flush()
+            self.flush()
             self.policies += 1
             return self.policies - 1
 
@@ -148,7 +148,7 @@ class EpisodeWriter:
             self._tick = tick + len(episode) + schema.GAP
             self._unflushed += len(episode)
             if self._unflushed >= FLUSH_STEPS:
-                self._flush()
+                self.flush()
 
     def _add_messages(self, episode: Episode, tick: int, row: dict[str, Any]) -> None:
         if episode.belief is None or episode.probability is None:
@@ -171,20 +171,24 @@ class EpisodeWriter:
 
     def flush(self) -> None:
         """Close the chunk and hand it to the operating system: it then survives a kill of this process."""
+        # The first flush closes the chunk of the Writer, the second empties Python's buffer; neither reaches the disk:
+        # the bytes survive the end of this process, not a power failure.
         with self._lock:
-            self._flush()
+            self._writer.flush()
+            self._stream.flush()
+            self._unflushed = 0
 
     def sync(self) -> None:
         """Close the chunk and put it on the disk: it then survives a power failure as well."""
         with self._lock:
-            self._flush()
+            self.flush()
             sync(self._stream, self.part)
 
     def finish(self) -> Path:
         """Complete the file and give it its name; returns it."""
         with self._lock:
             index = json.dumps(self._rows, allow_nan=False, separators=(",", ":")).encode()
-            self._flush()
+            self.flush()
             self._attach("episodes.json", index)
             steps = sum(row["length"] for row in self._rows)
             counts = {"episodes": str(len(self._rows)), "steps": str(steps), "policies": str(self.policies)}
@@ -206,13 +210,6 @@ class EpisodeWriter:
         except OSError:
             # close() writes what is buffered, which fails again on a full disk, and would leave the descriptor open.
             self._stream.raw.close()
-
-    def _flush(self) -> None:
-        # The first flush closes the chunk of the Writer, the second empties Python's buffer; neither reaches the disk:
-        # the bytes survive the end of this process, not a power failure.
-        self._writer.flush()
-        self._stream.flush()
-        self._unflushed = 0
 
     def _tell(self, name: str, content: dict[str, str]) -> None:
         self._writer.add_metadata(name, schema.seal(name, content))

@@ -209,7 +209,9 @@ def _rounded(value: Any) -> Any:
 def _unpacked(plain: dict[str, Any]) -> Openings:
     return Openings(
         [Candidate(*row) for row in plain["candidates"]],
-        # border, T_max, Z and c, then three spreads, then the deviation
-        [Setting(*row[:4], *(Spread(*each) for each in row[4:7]), row[7]) for row in plain["settings"]],
+        [
+            Setting(border, t_max, z, cost, Spread(*accuracy), Spread(*qmdp), Spread(*clocked), deviation)
+            for border, t_max, z, cost, accuracy, qmdp, clocked, deviation in plain["settings"]
+        ],
         [Check(name, said, float(deviation), *rest) for name, said, deviation, *rest in plain["checks"]],
     )

@@ -90,17 +90,9 @@ def _intensity_map(name: str, where: str, policy: Sensed, size: tuple[int, int])
     """How many cells are sensed after no miss and after one, by where the target was located."""
     shown = range(min(policy.choices, 2))
     layers = {f"cells sensed at n = {n}": policy.on(n).sum(axis=1).astype(np.float64) for n in shown}
-    means = {label: binned(number, size) for label, number in layers.items()}
-
-    def paint(figure: Canvas) -> None:
-        every = list(np.atleast_1d(figure.subplots(1, len(shown))))
-        _shade(figure, every, list(means.values()), Scale("viridis", 0.0, _ends(list(means.values()))[1]))
-        for axes, n in zip(every, shown, strict=True):
-            axes.set_title(_AFTER[n])
-
+    scale = Scale("viridis", 0.0, _ends([binned(number, size) for number in layers.values()])[1])
     title = f"Cells sensed, by where the target was located, {where}"
-    table = _tiles_table(f"sets-{name}", title, means, size)
-    return draw_figure(title, _said(layers, size), table, 3.2, paint)
+    return _shaded_map(f"sets-{name}", title, layers, _AFTER, size, 3.2, [(slice(None), scale)])
 
 
 VALUE, MISSING, OF_QMDP = "value V(x)", "missing to the clocked bound", "the same, Q_MDP"
@@ -129,22 +121,34 @@ def value_map(
     name: str, where: str, policy: Sensed, motion: MotionTable, size: tuple[int, int], scales: tuple[Scale, Scale]
 ) -> Figure:
     """Exact value per start cell, and what the policy and Q_MDP, where it was valued, miss to the clocked bound."""
-    layers = _layers(policy, motion)
+    # Two scales of colour: values and what is missing are not to be compared by shade. Bright is good in both, much in
+    # viridis and little in magma_r.
+    parts = [(slice(1), scales[0]), (slice(1, None), scales[1])]
+    title = f"Value of each start cell, and what is missing of the clocked bound, {where}"
+    heads = (VALUE, "below the bound", "Q_MDP's")
+    return _shaded_map(f"value-{name}", title, _layers(policy, motion), heads, size, 2.1, parts)
+
+
+def _shaded_map(
+    name: str,
+    title: str,
+    layers: Mapping[str, Array],
+    heads: Sequence[str],
+    size: tuple[int, int],
+    height: float,
+    parts: Sequence[tuple[slice, Scale]],
+) -> Figure:
+    """Layers of one number a cell side by side, under their `heads`; those in each of the `parts` share a scale."""
     means = {label: binned(values, size) for label, values in layers.items()}
 
     def paint(figure: Canvas) -> None:
-        # Two scales of colour: values and what is missing are not to be compared by shade. Bright is good in both, much
-        # in viridis and little in magma_r.
-        first, *missing = figure.subplots(1, len(means))
-        value, *short = means.values()
-        _shade(figure, [first], [value], scales[0])
-        _shade(figure, missing, short, scales[1])
-        for axes, label in zip((first, *missing), (VALUE, "below the bound", "Q_MDP's"), strict=False):
-            axes.set_title(label)
+        every = list(np.atleast_1d(figure.subplots(1, len(means))))
+        for part, scale in parts:
+            _shade(figure, every[part], list(means.values())[part], scale)
+        for axes, head in zip(every, heads, strict=False):
+            axes.set_title(head)
 
-    title = f"Value of each start cell, and what is missing of the clocked bound, {where}"
-    table = _tiles_table(f"value-{name}", title, means, size)
-    return draw_figure(title, _said(layers, size), table, 2.1, paint)
+    return draw_figure(title, _said(layers, size), _tiles_table(name, title, means, size), height, paint)
 
 
 def _side(size: tuple[int, int]) -> int:
