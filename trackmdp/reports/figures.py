@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,7 +63,7 @@ def against_cost(study: Study, panel: Panel) -> Figure:
     exact = {name: [max(study.known(w, key), default=math.nan) for w in panel.worlds] for name, key in keys.items()}
     # A bound that no run has, as where no optimum was solved for, gets no empty entry in the legend.
     exact = {label: values for label, values in exact.items() if not all(map(math.isnan, values))}
-    drawn = _Against.of(study, panel, exact, regret=False)
+    drawn = _Against.of(study, panel, exact, lambda *pair: [run.figure("aihtr") for run in study.of(*pair)])
     learned = [[e.mean for e in row] for row in drawn.learned.values()]
     # Q_MDP falls far below 0 where only the safe action senses (Z = 5, c = 0.22); on one axis the learned policies
     # would become one line.
@@ -93,7 +93,7 @@ def regret_against_cost(study: Study, panel: Panel, threshold: float | None) -> 
     """Regret per step against c, logarithmic, so that the best are told apart; a line at the `threshold`."""
     first = {world: study.in_world(world)[0] for world in panel.worlds}
     exact = {"Q_MDP": [study.regret(run, world, run.figure("qmdp_aihtr")) for world, run in first.items()]}
-    drawn = _Against.of(study, panel, exact, regret=True)
+    drawn = _Against.of(study, panel, exact, study.regrets)
 
     def paint(figure: Canvas) -> None:
         axes = figure.subplots()
@@ -132,14 +132,13 @@ class _Against:
     exact: Mapping[str, Sequence[float]]
 
     @classmethod
-    def of(cls, study: Study, panel: Panel, exact: Mapping[str, Sequence[float]], *, regret: bool) -> _Against:
-        """The AIHTR or the regret of every method of a study, beside `exact`."""
+    def of(
+        cls, study: Study, panel: Panel, exact: Mapping[str, Sequence[float]], values: Callable[..., Sequence[float]]
+    ) -> _Against:
+        """What `values` gives of each (world, method) of a study, beside `exact`."""
         found = {}
         for method in study.methods:
-            groups = [
-                study.regrets(world, method) if regret else [run.figure("aihtr") for run in study.of(world, method)]
-                for world in panel.worlds
-            ]
+            groups = [values(world, method) for world in panel.worlds]
             if any(groups):
                 found[method] = [mean_over_groups([group]) for group in groups]
         return cls(panel, looks_of(study.methods), found, exact)

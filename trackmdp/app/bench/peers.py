@@ -117,7 +117,6 @@ def _from_start(points: Sequence[tuple[float, int, float]], usage: Usage) -> lis
 def _row(run: Learned, ours: Learned) -> dict[str, Any]:
     mine, (theirs, steps) = ours.reached(settled=True)[0], run.reached(settled=True)
     return {
-        "part": "peers",
         "learner": run.learner,
         "seed": run.seed,
         "goal": GOAL,

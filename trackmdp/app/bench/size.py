@@ -70,7 +70,7 @@ def _growth(before: dict[str, Any] | None, row: dict[str, Any]) -> dict[str, flo
 
 
 def _row(n: int, what: str, command: str, *words: str) -> dict[str, Any]:
-    row: dict[str, Any] = {"part": "size", "N": n, "what": what, "wall_seconds": None, "cpu_seconds": None}
+    row: dict[str, Any] = {"N": n, "what": what, "wall_seconds": None, "cpu_seconds": None}
     row |= {"peak_mib": None, "regret_per_step": None, "per_second": None}
     with tempfile.TemporaryDirectory() as folder:
         try:
@@ -93,4 +93,4 @@ def memory(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator
         # What the check before a run adds up, without Python and torch, which `peak_mib` includes.
         expected = sum(needs(train, build_world(train).task).values())
         _, usage = timed_training(*words, f"threads={cfg.threads}", f"device={device}")
-        yield {"part": "memory", "algo": algo, "N": size, "expected_mib": expected / 2**20, "peak_mib": usage.peak_mib}
+        yield {"algo": algo, "N": size, "expected_mib": expected / 2**20, "peak_mib": usage.peak_mib}

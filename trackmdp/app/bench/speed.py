@@ -48,7 +48,7 @@ def env_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> Itera
                 _, state = env.step_and_maybe_reset(policy(state))
             return 20 * env.num_envs
 
-        yield {"part": "env", "envs": envs, **rate(step, cfg.seconds, device)}
+        yield {"envs": envs, **rate(step, cfg.seconds, device)}
 
 
 def collector_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator[Row]:
@@ -79,7 +79,7 @@ def collector_speed(cfg: BenchmarkConfig, world: World, device: torch.device) ->
 
             figures = rate(batch, cfg.seconds, device)
             collector.shutdown()
-            yield {"part": "collector", "policy": name, "envs": envs, **figures}
+            yield {"policy": name, "envs": envs, **figures}
 
 
 def train_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator[Row]:
@@ -104,7 +104,7 @@ def train_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> Ite
         spent, used = time.perf_counter() - wall, time.process_time() - cpu
         collector.shutdown()
         figures = {"per_second": frames / spent, "cpu_us_each": 1e6 * used / frames}
-        yield {"part": "train", "algo": name, "whole": done == algorithm.iterations, **figures}
+        yield {"algo": name, "whole": done == algorithm.iterations, **figures}
 
 
 def log_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator[Row]:
@@ -137,4 +137,4 @@ def log_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> Itera
             size = file.stat().st_size / steps
             for what, work in (("record", record), ("write", write), ("read", read)):
                 figures = rate(work, cfg.seconds, device)
-                yield {"part": "log", "policy": name, "what": what, "bytes_per_step": size, **figures}
+                yield {"policy": name, "what": what, "bytes_per_step": size, **figures}

@@ -137,7 +137,6 @@ def regret(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator
             found = max(found, _best_found(here, best.table))
         for algo, each in earned.items():
             yield {
-                "part": "regret",
                 "world": name,
                 "T_max": world.t_max,
                 "algo": algo,
@@ -169,7 +168,6 @@ def bracket(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterato
         started = time.process_time()
         found = optimal.solve(make(), nodes=cfg.nodes)
         yield {
-            "part": "bracket",
             "world": name,
             "N": size,
             "T_max": t_max,

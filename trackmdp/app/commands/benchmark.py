@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from trackmdp.app.bench import handoff, peers, sharing, size, speed, spreading
+from trackmdp.app.bench import blocks, peers, size, speed, spreading
 from trackmdp.config import BenchmarkConfig
 from trackmdp.durable import write_json
 from trackmdp.training.display import make_console, table
@@ -21,13 +21,13 @@ PARTS: dict[str, Callable[[BenchmarkConfig, World, torch.device], Iterable[dict[
     "collector": speed.collector_speed,
     "train": speed.train_speed,
     "size": size.size,
-    "handoff": handoff.handoff,
+    "handoff": blocks.handoff,
     "memory": size.memory,
     "peers": peers.peers,
     "log": speed.log_speed,
     "regret": spreading.regret,
     "bracket": spreading.bracket,
-    "workers": sharing.workers,
+    "workers": blocks.workers,
 }
 
 
@@ -41,7 +41,7 @@ def run(cfg: BenchmarkConfig, folder: Path, world: Problem) -> None:
     assert isinstance(world, World)  # recorded tracks are refused
     with console.status(f"measuring {cfg.part}") as status:
         for row in PARTS[cfg.part](cfg, world, device):
-            rows.append(row)
+            rows.append({"part": cfg.part} | row)
             write_json(folder / "benchmark.json", {"machine": where, "rows": rows})
             status.update(f"measuring {cfg.part}: {len(rows)} rows so far, in {folder}")
     shown = [key for key in rows[0] if not isinstance(rows[0][key], dict)]

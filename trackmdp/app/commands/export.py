@@ -6,7 +6,6 @@ A deterministic policy is a table: the sensors to switch on n steps after the ta
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,6 @@ from trackmdp.training.display import make_console
 from trackmdp.training.run import trained
 from trackmdp.world.model import BoolArray
 
-FILES = {"torch_export": "policy.pt2", "onnx": "policy.onnx", "sets": "sets.json"}
 _INPUTS = ("last_cell", "steps_since_detection")
 _LARGEST = 2**31  # entries, a byte each
 
@@ -40,7 +38,7 @@ def run(cfg: ExportConfig, folder: Path) -> None:
         UserError: there is no such run, or a package that `cfg.format` needs is missing.
     """
     world, policy, subject = trained(cfg.run, torch.device("cpu"), best=cfg.checkpoint == "best")
-    task, file = world.task, folder / FILES[cfg.format]
+    task = world.task
     about = {"trackmdp": __version__, "policy": subject, "grid_size": str(task.rows), "t_max": str(task.t_max)}
     if task.keyed:
         about |= {"memory": task.memory, "clip": str(task.clip), "classes": str(task.keys.num_classes)}
@@ -48,8 +46,9 @@ def run(cfg: ExportConfig, folder: Path) -> None:
         file = folder / sets_name(task)
         write_sets(folder, policy)
     else:
-        forms: dict[str, Callable[[Policy, dict[str, str]], bytes]] = {"torch_export": to_torch, "onnx": to_onnx}
-        write_bytes(file, forms[cfg.format](policy, about))
+        name, written = ("policy.onnx", to_onnx) if cfg.format == "onnx" else ("policy.pt2", to_torch)
+        file = folder / name
+        write_bytes(file, written(policy, about))
     make_console(cfg.quiet).print(f"{subject} -> {file}")
 
 
