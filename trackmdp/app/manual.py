@@ -84,11 +84,10 @@ def _all(command: str, values: dict[str, Any]) -> Iterator[str]:
     yield from ("", "Options")
     chosen = {key: name for each in values["defaults"] if isinstance(each, dict) for key, name in each.items()}
     schema = options(ROOTS[command])
-    for key, item in schema.items():
+    # those of the command itself before its groups
+    for key, item in sorted(schema.items(), key=lambda each: not isinstance(each[1], Option)):
         if isinstance(item, Option):
             yield from _entry(key, item, values.get(key))
-    for key, item in schema.items():
-        if isinstance(item, Option):
             continue
         if key not in GROUPS:
             yield from ("", *_wrapped(f"{key}: {_about(item)}"), *_entries(item, values.get(key), f"{key}."))

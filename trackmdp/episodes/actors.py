@@ -130,10 +130,7 @@ def _following(policy: Policy, costs: Costs) -> Callable[[States, Tensor | None]
     sets, coverage, alike = policy.sets, policy.task.coverage, policy.sets is None
     if sets is None:
         sets = sparse.csr_array(np.full((1, policy.task.total_sensors), policy.probability == 1.0))
-        seen = sets if coverage is None else coverage.seen(sets)
-    else:
-        seen = policy.seen
-    cpu = torch.device("cpu")
+    seen, cpu = sets if coverage is None else coverage.seen(sets), torch.device("cpu")
     table = policy.lookup(cpu) if seen is policy.sets else looked_up(seen, cpu)
     # A CSR matrix's indptr says where each row's entries begin: 0 2 2 5 are rows of 2, 0 and 3 sensors.
     count, spent = torch.as_tensor(np.diff(sets.indptr).astype(np.int64)), costs.of_sets(sets)

@@ -67,18 +67,14 @@ class _Found:
         return [data for time, data in self.held[topic].items() if begin <= time <= end]
 
 
-def recovered_name(file: Path) -> Path:
-    """`runs/episodes.recovered.mcap` for `runs/episodes.mcap` and for `runs/episodes.mcap.part`."""
-    return file.with_name(f"{Path(file.name.removesuffix('.part')).stem}.recovered.mcap")
-
-
 def recover(file: Path) -> Recovered:
-    """Write every whole episode of `file` to `recovered_name(file)`; `file` stays as it is.
+    """Write every whole episode of `file` to a new one beside it; `file` stays as it is.
 
     Raises:
         UserError: not a log of this format, or its first part is lost, or the new file already exists.
     """
-    target = recovered_name(file)
+    # `runs/episodes.recovered.mcap` for `runs/episodes.mcap` and for `runs/episodes.mcap.part`
+    target = file.with_name(f"{Path(file.name.removesuffix('.part')).stem}.recovered.mcap")
     # Not overwritten: it may be the result of an earlier recovery, and `file` may have been damaged further.
     if target.exists():
         raise UserError(f"file={file}: {target} already exists")

@@ -29,7 +29,7 @@ class Study:
         runs: all of them.
         worlds: labels, in order.
         methods: labels, in order.
-        groups: (world, method) -> its runs, by seed.
+        groups: (world, method) -> its runs, by seed; in the order of worlds, then of methods.
     """
 
     runs: Sequence[FinishedRun]

@@ -132,13 +132,9 @@ def _strip(problem: Recorded, episode: Episode, part: tuple[tuple[int, int], tup
             line = f'<path d="M{x} {y}L{before % problem.columns + 0.5} {before // problem.columns + 0.5}"/>'
             disc = f'<circle cx="{x}" cy="{y}" r=".3" fill="var(--{"vermilion" if episode.located[t] else "page"})"/>'
             body += f'<g stroke="var(--vermilion)" stroke-width=".12">{line}{disc}</g>'
-        what = (
-            "left"
-            if cell == problem.num_cells
-            else "safe action"
-            if forced[t]
-            else f"{int(episode.action[t].sum())} on"
-        )
+            what = "safe action" if forced[t] else f"{int(episode.action[t].sum())} on"
+        else:
+            what = "left"
         frames.append(f'<div>{_svg(part[0], body, part[1])}<span class="faint">{t + 1}: {what}</span></div>')
     style = "display:grid;gap:10px;grid-template-columns:repeat(auto-fill,minmax(120px,1fr))"
     return f'<div style="{style}">{"".join(frames)}</div>'

@@ -155,9 +155,7 @@ def _learning(results: Results, grouped: Study, threshold: float | None) -> list
 
 def _idea(results: Results, grouped: Study) -> list[Section]:
     """An example of a miss, by the first policy that is kept and allows for one."""
-    methods = [(world, method) for world in grouped.worlds for method in grouped.methods]
-    every = ((world, method, run) for world, method in methods for run in grouped.of(world, method))
-    for world, method, run in every:
+    for (world, method), run in ((group, run) for group, runs in grouped.groups.items() for run in runs):
         if run.name in results.policies and run.name in results.motions:
             size, where = grid_size(run.settings["grid.size"]), f"{method}, {world}, seed {run.seed} (n = 1)"
             if drawn := idea.idea_figure(results.policies[run.name], results.motions[run.name], size, where):

@@ -9,7 +9,7 @@ import numpy as np
 from trackmdp.config.compose import compose
 from trackmdp.errors import UserError
 from trackmdp.reports.grouping import Study
-from trackmdp.reports.results import Anomaly, FinishedRun
+from trackmdp.reports.results import Anomaly
 from trackmdp.reports.tables import Cell, Column, Table
 from trackmdp.statistics import MeanInterval, iqm, mean_over_groups
 
@@ -74,7 +74,7 @@ def shortened(study: Study) -> list[str]:
 def groups_table(study: Study, threshold: float | None) -> Table:
     """Each method in each world, its seeds together."""
     rows: list[list[Cell]] = []
-    for (world, method), runs in _groups(study):
+    for (world, method), runs in study.groups.items():
         regrets = study.regrets(world, method)
         earned = mean_over_groups([[run.figure("aihtr") for run in runs]])
         rest = [float(np.mean([run.figure(key) for run in runs])) for key in ("accuracy", "sensors_per_step")]
@@ -89,7 +89,7 @@ def groups_table(study: Study, threshold: float | None) -> Table:
 def runs_table(study: Study) -> Table:
     """Every finished run."""
     rows: list[list[Cell]] = []
-    for (world, method), runs in _groups(study):
+    for (world, method), runs in study.groups.items():
         for run in runs:
             aihtr, accuracy, sensors = (run.figure(key) for key in ("aihtr", "accuracy", "sensors_per_step"))
             times = [run.figure(key) for key in ("wall_seconds", "cpu_seconds")]
@@ -106,12 +106,6 @@ def missing_table(anomalies: Sequence[Anomaly]) -> Table:
     """What is missing, mixed or damaged."""
     rows = [[anomaly.run, anomaly.text] for anomaly in anomalies]
     return Table("missing", "What is missing or not like the rest", [Column("run"), Column("what")], rows)
-
-
-def _groups(study: Study) -> list[tuple[tuple[str, str], Sequence[FinishedRun]]]:
-    """(world, method) and its runs, worlds first."""
-    keys = [(world, method) for world in study.worlds for method in study.methods]
-    return [(key, study.groups[key]) for key in keys if key in study.groups]
 
 
 def _within_column(threshold: float | None) -> list[Column]:
