@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -72,18 +73,26 @@ class Choice:
     action: Tensor | None = None
 
 
+Decides: TypeAlias = Callable[[States, Tensor | None], Choice]
+"""In B states, given `[B, num_draws]` draws, uniform in [0, 1); None where none are taken."""
+Acts: TypeAlias = Callable[[States, Tensor | None], Tensor]
+"""The same, giving the action `[B, S]` itself."""
+Asks: TypeAlias = Callable[[States, Tensor], Tensor]
+"""Given the history `[B, t_max + 1, S]`."""
+
+
 @dataclass(frozen=True)
 class Actor:
     """Anything that acts.
 
     Attributes:
-        decide: the decisions in B states, given `[B, num_draws]` draws, uniform in [0, 1); None where it takes none.
+        decide: the decisions.
         most_rows: episodes it can be asked for at a time.
         policy: from which a step's action and its probabilities follow, where it is a `Policy`.
         num_draws: uniform draws that one decision takes from the episode's own generator.
     """
 
-    decide: Callable[[States, Tensor | None], Choice]
+    decide: Decides
     most_rows: int
     policy: Policy | None = None
     num_draws: int = 0
@@ -111,9 +120,7 @@ def actor_of(task: Task, policy: PolicyLike | Playback, costs: Costs) -> Actor:
     return Actor(drawing, max(1, min(256, _DRAWS // made.num_draws)), made, made.num_draws)
 
 
-def _writing(
-    task: Task, costs: Costs, action_of: Callable[[States, Tensor | None], Tensor]
-) -> Callable[[States, Tensor | None], Choice]:
+def _writing(task: Task, costs: Costs, action_of: Acts) -> Decides:
     """The decisions of what writes its actions `[B, S]` out over all sensors."""
     sight = Sight(task, everywhere=True)
 
@@ -125,7 +132,7 @@ def _writing(
     return decide
 
 
-def _following(policy: Policy, costs: Costs) -> Callable[[States, Tensor | None], Choice]:
+def _following(policy: Policy, costs: Costs) -> Decides:
     """A deterministic policy: a row of its table for each state, or one for all where all sensors are on, or none."""
     sets, coverage, alike = policy.sets, policy.task.coverage, policy.sets is None
     if sets is None:
@@ -142,7 +149,7 @@ def _following(policy: Policy, costs: Costs) -> Callable[[States, Tensor | None]
     return decide
 
 
-def _issuing(playback: Playback) -> Callable[[States, Tensor | None], Tensor]:
+def _issuing(playback: Playback) -> Acts:
     """Recorded actions, one a step."""
     window = Window.of(playback.task)
 
@@ -155,9 +162,7 @@ def _issuing(playback: Playback) -> Callable[[States, Tensor | None], Tensor]:
     return action_of
 
 
-def _with_history(
-    task: Task, ask: Callable[[States, Tensor], Tensor], most_rows: int
-) -> Callable[[States, Tensor | None], Tensor]:
+def _with_history(task: Task, ask: Asks, most_rows: int) -> Acts:
     """A function or module that draws from a source of its own, asked at every step with the history of its actions."""
     window, slots = Window.of(task), torch.arange(task.num_choices)
     kept = torch.zeros(most_rows, task.num_choices, task.num_sensors, dtype=torch.bool)
@@ -173,11 +178,11 @@ def _with_history(
     return action_of
 
 
-def _asking(rule: Rule) -> Callable[[States, Tensor], Tensor]:
+def _asking(rule: Rule) -> Asks:
     return lambda states, history: rule(states.last_cell, states.misses, history)
 
 
-def _remembering(task: Task, module: TensorDictModuleBase, most_rows: int) -> Callable[[States, Tensor], Tensor]:
+def _remembering(task: Task, module: TensorDictModuleBase, most_rows: int) -> Asks:
     """A recurrent module; what it keeps from step to step is kept for each episode. At the first step it is None."""
     kept = dict[str, Tensor]()
 

@@ -97,9 +97,8 @@ def beliefs(world: Modelled, episodes: Sequence[Episode]) -> list[Floats]:
             seen = exact.detect(at * modes + mode[step] * located[step])
         else:  # what was predicted of the cell's modes
             seen = exact.miss(predicted, cell != at[:, None])
-        belief = torch.where(
-            located[step, None], seen, exact.miss(predicted, action[step].repeat_interleave(modes, -1))
-        )
+        missed = exact.miss(predicted, action[step].repeat_interleave(modes, -1))
+        belief = torch.where(located[step, None], seen, missed)
     return [part.numpy() for part in found.split(lengths.tolist())]
 
 

@@ -75,9 +75,8 @@ def decode(row: dict[str, Any], steps: list[bytes], grids: list[bytes], run: Log
     number, count = row["episode"], row["length"]
     said = [json.loads(step) for step in steps]
     # Lengths first: what a row claims is no length to count up to.
-    if (len(said), len(grids)) != (count, count) or any(
-        (each["episode"], each["t"]) != (number, t) for t, each in enumerate(said)
-    ):
+    steps_of = ((each["episode"], each["t"]) for each in said)
+    if not len(said) == len(grids) == count or any(each != (number, t) for t, each in enumerate(steps_of)):
         raise UserError(f"episode={number}: its steps do not fit together")
     run.check_steps(said)
     belief, probability = read_grids(grids, run.size)

@@ -59,18 +59,15 @@ def mode_words(world: HiddenWorld, mode: int) -> str:
 def sentence(episode: Episode, t: int, task: Task) -> str:
     """A step in one line; with the target's mode, where `task` is a world of targets that have one."""
     state = outcome(episode, t, task)
-    words = {
-        "exited": "the target has left the grid",
-        "forced": f"safe action forced, target located in {where(int(episode.target[t]), task.columns)}",
-        "detected": f"target detected in {where(int(episode.target[t]), task.columns)}",
-        "missed": f"target missed in {where(int(episode.target[t]), task.columns)}",
-    }
+    place = where(int(episode.target[t]), task.columns)
+    words = {"exited": "the target has left the grid", "forced": f"safe action forced, target located in {place}"}
+    what = words.get(state, f"target {state} in {place}")
     on = "" if state == "forced" else f"{int(episode.action[t].sum())} sensors on, "
     mode = ""
     if isinstance(task, HiddenWorld) and episode.mode is not None and episode.mode[t] >= 0:
         mode = f" in {mode_words(task, int(episode.mode[t]))}"
     return (
-        f"step {t + 1} of {len(episode)}: {words[state]}{mode}; {on}{int(episode.misses[t])} misses before; "
+        f"step {t + 1} of {len(episode)}: {what}{mode}; {on}{int(episode.misses[t])} misses before; "
         f"reward {episode.reward[t]:.2f}, total {episode.returns[t]:.2f}"
     )
 

@@ -81,9 +81,8 @@ class EpisodeReader:
             raise Damaged("the index of episodes")
         # Increasing, for the bisection in `row`; not consecutive, since a recovered log lacks the episodes that were
         # damaged.
-        if any(b <= a for a, b in pairwise(self._numbers)) or any(
-            row["policy"] >= len(self.policies) for row in self.rows
-        ):
+        unknown = any(row["policy"] >= len(self.policies) for row in self.rows)
+        if unknown or any(b <= a for a, b in pairwise(self._numbers)):
             raise Damaged("the order of the episodes, or a policy that is not there")
 
     def __enter__(self) -> EpisodeReader:

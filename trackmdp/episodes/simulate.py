@@ -108,9 +108,8 @@ class _Batch:
             self._choices = _Draws(seeds_of_choices, lambda count, rng: torch.rand(count, size, generator=rng))
         if not self._reports.certain:
             seeds_of_reports = [derive(seed, "report") for seed in seeds]
-            self._seen = _Draws(
-                seeds_of_reports, lambda count, rng: torch.rand(count, dtype=torch.float64, generator=rng)
-            )
+            double = torch.float64
+            self._seen = _Draws(seeds_of_reports, lambda count, rng: torch.rand(count, dtype=double, generator=rng))
         self._taken: list[dict[str, npt.NDArray[Any]]] = []
 
     def run(self) -> dict[str, npt.NDArray[Any]]:

@@ -176,13 +176,9 @@ class CellSensor(Sensor):
 
     def measure(self, ground_truths: set[GroundTruthState], noise: Any = False, **_: Any) -> set[TrueDetection]:  # noqa: ARG002
         """The reports of those that are in its cell, none while it is off; there is no noise."""
+        centre, model = self.places.centre(self.cell), self.measurement_model
         return {
-            TrueDetection(
-                self.places.centre(self.cell),
-                measurement_model=self.measurement_model,
-                timestamp=truth.timestamp,
-                groundtruth_path=truth,
-            )
+            TrueDetection(centre, measurement_model=model, timestamp=truth.timestamp, groundtruth_path=truth)
             for truth in ground_truths
             if self.on and self.places.cell(truth) == self.cell
         }
@@ -204,9 +200,8 @@ class PolicySensorManager(SensorManager):
         task = self.policy.task
         perfect = task.perfect and task.safe and task.coverage is None
         if not self.policy.deterministic or task.order or not perfect:
-            raise UserError(
-                "policy: expected a deterministic one of the last cell, and one sensor a cell without misses"
-            )
+            expected = "a deterministic one of the last cell, and one sensor a cell without misses"
+            raise UserError(f"policy: expected {expected}")
 
     def known(self, track: Track) -> tuple[int, int]:
         """The cell in which a track's target was last located, and the misses since then."""
@@ -269,9 +264,8 @@ def follow(manager: PolicySensorManager, path: GroundTruthPath) -> Followed:
             sensor.act(time)
         found = [report for sensor in sensors if truth is not None for report in sensor.measure({truth})]
         action = np.array([sensor.on for sensor in sensors])
-        located, forced, in_grid = (
-            torch.tensor([each]) for each in (bool(found), misses > task.t_max, truth is not None)
-        )
+        became = (bool(found), misses > task.t_max, truth is not None)
+        located, forced, in_grid = (torch.tensor([each]) for each in became)
         reward = costs.pseudo_reward(costs.price_of(torch.as_tensor(action)[None]), located, forced, in_grid)
         taken.append((action, bool(found), reward.item()))
         if truth is not None:
@@ -286,10 +280,9 @@ def _exits(path: GroundTruthPath) -> bool:
 
 def _update(detection: TrueDetection) -> StateUpdate:
     # What was predicted does not matter: a report is certain.
-    prediction = StatePrediction(detection.state_vector, timestamp=detection.timestamp)
-    return StateUpdate(
-        detection.state_vector, hypothesis=SingleHypothesis(prediction, detection), timestamp=detection.timestamp
-    )
+    place, time = detection.state_vector, detection.timestamp
+    hypothesis = SingleHypothesis(StatePrediction(place, timestamp=time), detection)
+    return StateUpdate(place, hypothesis=hypothesis, timestamp=time)
 
 
 def gospa(tracks: Sequence[Track], paths: Sequence[GroundTruthPath], *, c: float = 2.0, p: float = 2.0) -> Any:

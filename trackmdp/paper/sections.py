@@ -84,9 +84,8 @@ def sensitivity_table(settings: Sequence[Setting]) -> Table:
         [s.border, s.t_max, s.support_size, s.cost, *astuple(s.accuracy), *astuple(s.qmdp), *astuple(s.clocked)]
         for s in settings
     ]
-    return Table(
-        "sensitivity", f"Median and range over {len(DRAWS)} draws of the kernel, by setting and pair", columns, rows
-    )
+    caption = f"Median and range over {len(DRAWS)} draws of the kernel, by setting and pair"
+    return Table("sensitivity", caption, columns, rows)
 
 
 def sensitivity_figures(settings: Sequence[Setting]) -> list[Figure]:

@@ -169,9 +169,8 @@ def _track_property(world: World, solution: Solution) -> Iterator[Check]:
     # Theorem tracking_property: Pr(X_{k+1} = b | s_k) > c/r is sensed.
     layers = list(_gains(world, solution.table))
     # -inf stands for "no case": max(initial=-inf) leaves it where no cell is left unsensed.
-    printed, sharp = np.max(
-        [[gain[~on].max(initial=-np.inf) for gain in gains] for gains, on, _ in layers], axis=0, initial=-np.inf
-    )
+    unsensed = [[gain[~on].max(initial=-np.inf) for gain in gains] for gains, on, _ in layers]
+    printed, sharp = np.max(unsensed, axis=0, initial=-np.inf)
     note = f"{sum(states for _, _, states in layers)} info states"
     yield Check("Theorem 1", "p_j > c/r is sensed: largest p_j r - c left unsensed", float(printed), note=note)
     statement = "p_j > c p_in / r is sensed: largest p_j r - c p_in left unsensed"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import chain, product
 from typing import Any
 
 import numpy as np
@@ -21,21 +22,18 @@ SIZE, REWARD = 10, 1.0
 RADIUS, LOW_PROBABILITY, EXIT_PROBABILITY = 1, 0.15, 0.005
 """Of the motion; T_max, the border rule and the draw of the kernel the paper does not say."""
 
-PRINTED_QMDP: Mapping[tuple[int, float], float] = {
-    **{(3, c): 90.74 for c in COSTS},
-    **{(4, c): 88.82 for c in COSTS},
-    # The drop at c = 0.22: all probabilities lie below c/r, and Q_MDP senses only when it is forced (remark on Figure
-    # z_5).
-    **{(5, c): 89.95 for c in COSTS[:3]},
-    (5, 0.22): 54.3,
-}
+
+def _printed(*rows: tuple[float, float, float, float]) -> Mapping[tuple[int, float], float]:
+    """By (Z, c), what is printed for each Z, one number a price."""
+    return dict(zip(product(SUPPORTS, COSTS), chain(*rows), strict=True))
+
+
+# The drop at Z = 5, c = 0.22: all probabilities lie below c/r, and Q_MDP senses only when it is forced (remark on
+# Figure z_5).
+PRINTED_QMDP = _printed((90.74, 90.74, 90.74, 90.74), (88.82, 88.82, 88.82, 88.82), (89.95, 89.95, 89.95, 54.3))
 """Table II, accuracy of Q_MDP in per cent, by (Z, c)."""
 
-PRINTED_TMDP: Mapping[tuple[int, float], float] = {
-    **dict(zip([(3, c) for c in COSTS], (92.39, 92.06, 93.23, 87.18), strict=True)),
-    **dict(zip([(4, c) for c in COSTS], (94.28, 95.56, 89.7, 88.85), strict=True)),
-    **dict(zip([(5, c) for c in COSTS], (93.75, 94.94, 92.45, 90.21), strict=True)),
-}
+PRINTED_TMDP = _printed((92.39, 92.06, 93.23, 87.18), (94.28, 95.56, 89.7, 88.85), (93.75, 94.94, 92.45, 90.21))
 """Table II, accuracy of the paper's learned policy in per cent, by (Z, c)."""
 
 _FIXED = {

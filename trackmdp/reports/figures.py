@@ -49,11 +49,8 @@ def panels(study: Study) -> list[Panel]:
             rest = ", ".join(part for part in world.split(", ") if not part.startswith("c="))
             groups.setdefault(rest, []).append((float(price), world))
     # One price is a point, not a curve; the tables show it.
-    found = [(title, sorted(entries)) for title, entries in groups.items() if len(entries) > 1]
-    return [
-        Panel(slug(title), title, [cost for cost, _ in entries], [world for _, world in entries])
-        for title, entries in found
-    ]
+    found = {title: dict(sorted(entries)) for title, entries in groups.items() if len(entries) > 1}
+    return [Panel(slug(title), title, list(priced), list(priced.values())) for title, priced in found.items()]
 
 
 def against_cost(study: Study, panel: Panel) -> Figure:

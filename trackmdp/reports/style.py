@@ -160,10 +160,8 @@ def tidy(axes: Axes) -> None:
     """Light grid, no box around the axes, and tick labels for logarithmic axes of any range."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, StrMethodFormatter
 
-    for axis, scale, (low, high) in (
-        (axes.xaxis, axes.get_xscale(), axes.get_xlim()),
-        (axes.yaxis, axes.get_yscale(), axes.get_ylim()),
-    ):
+    for axis in (axes.xaxis, axes.yaxis):
+        scale, (low, high) = axis.get_scale(), axis.get_view_interval()
         # Over more than about two powers of ten the powers alone are labels enough.
         if scale == "log" and high > 50 * low:
             axis.set_major_formatter(FuncFormatter(power))

@@ -222,9 +222,8 @@ def _believing(cfg: EvaluateConfig, problem: Problem, policy: Policy, subject: s
     if not isinstance(problem, World):
         raise UserError("sensor=false_alarm: needs a motion model of cells alone, without modes; not recorded tracks")
     # A trained policy's world is that of its run, with the sensors asked for.
-    world = World.of(
-        problem, problem.kernel, safe_detection=1.0, **false_alarm(problem.size, p_d=sensor.p_d, p_f=sensor.p_f)
-    )
+    sensors = false_alarm(problem.size, p_d=sensor.p_d, p_f=sensor.p_f)
+    world = World.of(problem, problem.kernel, safe_detection=1.0, **sensors)
     silent, alarmed = evaluate(world, policy), evaluate(world, policy, false_alarm=sensor.p_f)
     # A window is about the last located cell, and the filter is never sure of one.
     wanted = cfg.episodes if world.window is None else 0
@@ -253,7 +252,6 @@ def _believing(cfg: EvaluateConfig, problem: Problem, policy: Policy, subject: s
         rows.append([_FIGURES[key], f"{told[key]:,.4f}", f"{plain[key]:,.4f}", played])
     heads = ["figure", f"p_f = {sensor.p_f:g}, exact", "p_f = 0", f"Bayes filter, {wanted} episodes, 95 %"]
     at.print(table(f"{subject}, each report taken for the truth", heads, rows))
-    at.print(
-        f"upper bound (valid, of p_f = 0) {bound:,.4f}; {loss:.4f} a step lost to false alarms; results in {folder}"
-    )
+    lost = f"{loss:.4f} a step lost to false alarms"
+    at.print(f"upper bound (valid, of p_f = 0) {bound:,.4f}; {lost}; results in {folder}")
     return alarmed.aihtr

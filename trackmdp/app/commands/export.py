@@ -91,9 +91,8 @@ def to_onnx(policy: Policy, about: dict[str, str]) -> bytes:
         [helper.make_tensor_value_info("action", TensorProto.BOOL, ["batch", table.shape[2]])],
         [numpy_helper.from_array(value, name) for name, value in constants.items()],
     )
-    model = helper.make_model(
-        graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8, producer_name="trackmdp"
-    )
+    opsets = [helper.make_opsetid("", 17)]
+    model = helper.make_model(graph, opset_imports=opsets, ir_version=8, producer_name="trackmdp")
     helper.set_model_props(model, about)
     onnx.checker.check_model(model, full_check=True)
     return bytes(model.SerializeToString())

@@ -164,9 +164,8 @@ def _study(cfg: OptunaConfig, folder: Path) -> Iterator[Any]:
         reason = " ".join(str(error).split())
         raise UserError(f"hydra.sweeper.storage={cfg.storage}: expected a data base's URL ({reason})") from error
     try:
-        study = optuna.create_study(
-            study_name=cfg.study, storage=storage, direction=_DIRECTIONS[cfg.objective], load_if_exists=True
-        )
+        way = _DIRECTIONS[cfg.objective]
+        study = optuna.create_study(study_name=cfg.study, storage=storage, direction=way, load_if_exists=True)
         _enqueue_interrupted(study)
         yield study
     finally:
