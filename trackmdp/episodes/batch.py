@@ -6,9 +6,9 @@ Figures are means over episodes, each with its standard error.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, overload
+from typing import Any, TypeAlias, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +22,9 @@ from trackmdp.world.model import Array, BoolArray
 from trackmdp.world.tracks import Problem, Recorded
 
 _BELIEF = 25_600  # cells, or hidden states, of the beliefs updated together: memory stays bounded on large grids
+
+
+Columns: TypeAlias = dict[str, npt.NDArray[Any]]
 
 
 @dataclass(frozen=True)
@@ -87,17 +90,11 @@ class Episodes(Sequence[Episode]):
     start_mode: Integers | None = None
 
     @classmethod
-    def of(
-        cls,
-        problem: Problem,
-        policy: Policy | None,
-        seeds: Sequence[int],
-        batches: Sequence[Mapping[str, npt.NDArray[Any]]],
-    ) -> Episodes:
+    def of(cls, problem: Problem, policy: Policy | None, seeds: Sequence[int], batches: Sequence[Columns]) -> Episodes:
         """The episodes of some batches, in their order; each has the columns, and the `length` of its episodes."""
         none = np.zeros(0, dtype=np.int32)
         # No episode: columns of length 0, of the types that they have otherwise.
-        empty: dict[str, npt.NDArray[Any]] = dict.fromkeys(("misses", "target", "sensors", "length"), none)
+        empty: Columns = dict.fromkeys(("misses", "target", "sensors", "length"), none)
         empty |= dict.fromkeys(("start", "start_mode"), none.astype(np.int64))
         empty |= {"located": none > 0, "truncated": none > 0, "reward": none.astype(np.float32)}
         columns = {name: np.concatenate([each[name] for each in batches or [empty]]) for name in (*batches, empty)[0]}

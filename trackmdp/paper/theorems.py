@@ -258,18 +258,9 @@ def corner(world: World) -> World:
     kernel *= 0.99 / np.maximum(kernel.sum(axis=1, keepdims=True), 0.99)
     # D = N^2 c by default, so it shrinks with the number of sensors.
     share = len(cells) / world.num_cells
-    return World.of(
-        world,
-        kernel,
-        size=(len(cells) // columns, columns),
-        cost=world.cost[cells],
-        safe_cost=world.safe_cost * share,
-        t_max=min(world.t_max, 2),
-        max_steps=None,
-        window=None,
-        detection=world.detection[cells],
-        safe_detection=world.safe_detection[cells],
-    )
+    sensors = {name: getattr(world, name)[cells] for name in ("cost", "detection", "safe_detection")}
+    size, t_max, safe_cost = (len(cells) // columns, columns), min(world.t_max, 2), world.safe_cost * share
+    return World.of(world, kernel, size=size, t_max=t_max, safe_cost=safe_cost, max_steps=None, window=None, **sensors)
 
 
 def dearer(world: World) -> World:

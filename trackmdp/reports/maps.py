@@ -5,8 +5,9 @@ Of a large grid the number of sensors in place of the sets, and means over squar
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
@@ -22,6 +23,10 @@ MOST_TILES = 60
 """Tiles of a map in each direction: a square of 3 pixels on a page, and 3,600 rows of its table."""
 LEVELS = 24
 """Shades of a colour scale."""
+_Size: TypeAlias = tuple[int, int]
+"""Rows and columns of a grid."""
+_Layers: TypeAlias = dict[str, Array]
+"""Numbers `[M]`, one for each cell, by what they are called."""
 ON, OFF, IDLE = "#0072b2", "#dcebf4", "#d55e01"
 _AFTER = ("just located (n = 0)", "after one miss (n = 1)")
 _SIDE = 0.92
@@ -39,7 +44,7 @@ class Scale:
     log: bool = False
 
 
-def policy_map(name: str, where: str, policy: Sensed, motion: MotionTable, size: tuple[int, int]) -> Figure:
+def policy_map(name: str, where: str, policy: Sensed, motion: MotionTable, size: _Size) -> Figure:
     """Around each located cell, the sensors that are on after no miss and after one; of a large grid how many are.
 
     Where the first set leaves nothing out, a miss cannot happen, and nothing is drawn for it.
@@ -86,20 +91,20 @@ def policy_map(name: str, where: str, policy: Sensed, motion: MotionTable, size:
     return draw_figure(title, text, table, 0.4 + 3.9 * len(shown), paint)
 
 
-def _intensity_map(name: str, where: str, policy: Sensed, size: tuple[int, int]) -> Figure:
+def _intensity_map(name: str, where: str, policy: Sensed, size: _Size) -> Figure:
     """How many cells are sensed after no miss and after one, by where the target was located."""
     shown = range(min(policy.choices, 2))
     layers = {f"cells sensed at n = {n}": policy.on(n).sum(axis=1).astype(np.float64) for n in shown}
     scale = Scale("viridis", 0.0, _ends([binned(number, size) for number in layers.values()])[1])
     title = f"Cells sensed, by where the target was located, {where}"
-    return _shaded_map(f"sets-{name}", title, layers, _AFTER, size, 3.2, [(slice(None), scale)])
+    return _shaded_map(f"sets-{name}", title, layers, _AFTER, size, 3.2, {scale: slice(None)})
 
 
 VALUE, MISSING, OF_QMDP = "value V(x)", "missing to the clocked bound", "the same, Q_MDP"
 """Layers of a value map."""
 
 
-def _layers(policy: Sensed, motion: MotionTable) -> dict[str, Array]:
+def _layers(policy: Sensed, motion: MotionTable) -> _Layers:
     # Both against the clocked bound, which is the optimum wherever a policy attains it.
     layers = {VALUE: policy.value, MISSING: _rounded(motion.clocked - policy.value)}
     if np.isfinite(motion.qmdp).all():
@@ -118,32 +123,26 @@ def value_scales(every: Iterable[tuple[Sensed, MotionTable]]) -> tuple[Scale, Sc
 
 
 def value_map(
-    name: str, where: str, policy: Sensed, motion: MotionTable, size: tuple[int, int], scales: tuple[Scale, Scale]
+    name: str, where: str, policy: Sensed, motion: MotionTable, size: _Size, scales: tuple[Scale, Scale]
 ) -> Figure:
     """Exact value per start cell, and what the policy and Q_MDP, where it was valued, miss to the clocked bound."""
     # Two scales of colour: values and what is missing are not to be compared by shade. Bright is good in both, much in
     # viridis and little in magma_r.
-    parts = [(slice(1), scales[0]), (slice(1, None), scales[1])]
+    parts = dict(zip(scales, (slice(1), slice(1, None)), strict=True))
     title = f"Value of each start cell, and what is missing of the clocked bound, {where}"
     heads = (VALUE, "below the bound", "Q_MDP's")
     return _shaded_map(f"value-{name}", title, _layers(policy, motion), heads, size, 2.1, parts)
 
 
 def _shaded_map(
-    name: str,
-    title: str,
-    layers: Mapping[str, Array],
-    heads: Sequence[str],
-    size: tuple[int, int],
-    height: float,
-    parts: Sequence[tuple[slice, Scale]],
+    name: str, title: str, layers: _Layers, heads: Sequence[str], size: _Size, height: float, scales: dict[Scale, slice]
 ) -> Figure:
-    """Layers of one number a cell side by side, under their `heads`; those in each of the `parts` share a scale."""
+    """Layers of one number a cell side by side, under their `heads`; each scale is that of some of them."""
     means = {label: binned(values, size) for label, values in layers.items()}
 
     def paint(figure: Canvas) -> None:
         every = list(np.atleast_1d(figure.subplots(1, len(means))))
-        for part, scale in parts:
+        for scale, part in scales.items():
             _shade(figure, every[part], list(means.values())[part], scale)
         for axes, head in zip(every, heads, strict=False):
             axes.set_title(head)
@@ -151,12 +150,12 @@ def _shaded_map(
     return draw_figure(title, _said(layers, size), _tiles_table(name, title, means, size), height, paint)
 
 
-def _side(size: tuple[int, int]) -> int:
+def _side(size: _Size) -> int:
     """Cells of a tile in each direction: as few as `MOST_TILES` allows, one on most grids."""
     return -(-max(size) // MOST_TILES)
 
 
-def binned(values: Array, size: tuple[int, int]) -> Array:
+def binned(values: Array, size: _Size) -> Array:
     """Means of `values` `[M]` over square tiles, `[rows of tiles, columns of tiles]`.
 
     150 rows and columns make tiles of 3 x 3 cells, 50 in each direction; those at the end may be cut off.
@@ -167,7 +166,7 @@ def binned(values: Array, size: tuple[int, int]) -> Array:
     return sums / (rows[:, None] * columns)
 
 
-def _said(layers: Mapping[str, Array], size: tuple[int, int]) -> str:
+def _said(layers: _Layers, size: _Size) -> str:
     """Mean and range of each layer, over cells, and what is drawn."""
     text = "; ".join(
         f"{label}: mean {values.mean():.2f}, from {values.min():.2f} to {values.max():.2f}"
@@ -177,7 +176,7 @@ def _said(layers: Mapping[str, Array], size: tuple[int, int]) -> str:
     return f"{text}." if side == 1 else f"{text}. Drawn are means over tiles of {side} x {side} cells."
 
 
-def _tiles_table(name: str, title: str, means: Mapping[str, Array], size: tuple[int, int]) -> Table:
+def _tiles_table(name: str, title: str, means: _Layers, size: _Size) -> Table:
     """A row for each tile, called by its first cell."""
     side, layers = _side(size), list(means.values())
     first = "" if side == 1 else "first "
@@ -243,7 +242,7 @@ def _possible(chains: Sequence[Array], motion: MotionTable, steps: int) -> list[
     return found
 
 
-def _tiles(axes: Axes, on: Array, possible: BoolArray, size: tuple[int, int], reach: int) -> None:
+def _tiles(axes: Axes, on: Array, possible: BoolArray, size: _Size, reach: int) -> None:
     """Draw one tile per located cell.
 
     Args:

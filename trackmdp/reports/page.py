@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from typing import Any, TypeAlias
@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 from trackmdp.reports import figures, idea, maps, summaries
 from trackmdp.reports.grouping import Study, study
 from trackmdp.reports.results import MotionTable, Results, Sensed
-from trackmdp.reports.style import Figure
+from trackmdp.reports.style import Figure, Say
 from trackmdp.reports.tables import Table, paragraphs
 from trackmdp.untrusted import printable
 from trackmdp.world.model import grid_size
@@ -81,10 +81,7 @@ class Report:
 
 
 def build(
-    results: Results,
-    threshold: float | None = None,
-    extra: Sequence[Section] = (),
-    say: Callable[[str], None] = lambda line: None,
+    results: Results, threshold: float | None = None, extra: Sequence[Section] = (), say: Say = lambda line: None
 ) -> Report:
     """The report of stored results.
 

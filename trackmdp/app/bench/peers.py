@@ -63,14 +63,8 @@ def peers(cfg: BenchmarkConfig, world: World, device: torch.device) -> list[dict
     with on_one_core(), tempfile.TemporaryDirectory() as folder:
         instance = Path(folder, "instance.npz")
         # A peer gets the world as plain arrays, since it runs without this package.
-        np.savez_compressed(
-            instance,
-            kernel=world.kernel.toarray(),
-            cost=world.cost,
-            safe_cost=world.safe_cost,
-            reward=world.reward,
-            t_max=world.t_max,
-        )
+        arrays = {name: getattr(world, name) for name in ("cost", "safe_cost", "reward", "t_max")}
+        np.savez_compressed(instance, kernel=world.kernel.toarray(), **arrays)
         # Seed by seed, all learners in turn: a machine that slows down in between slows all of them.
         for seed in cfg.seeds:
             runs.append(_ours(cfg, seed, device))

@@ -14,10 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.override_parser.types import Override
-from omegaconf import DictConfig
 
 from trackmdp.app.prepare import typed_config
-from trackmdp.app.words import parsed
+from trackmdp.app.words import Compose, parsed
 from trackmdp.config import CommandConfig, TrainConfig, to_dict
 from trackmdp.config.sweeping import BlocksConfig
 from trackmdp.config.tree import fixed_options, key_of
@@ -107,11 +106,7 @@ def combinations(blocks: Sequence[str], typed: Sequence[str]) -> list[list[str]]
 
 
 def plan(
-    command: str,
-    sweep: Path,
-    compose: Callable[[Sequence[str]], DictConfig],
-    grid: Sequence[Sequence[str]],
-    naming: Collection[str] = (),
+    command: str, sweep: Path, compose: Compose, grid: Sequence[Sequence[str]], naming: Collection[str] = ()
 ) -> list[Job]:
     """The jobs of a sweep, without duplicates.
 
