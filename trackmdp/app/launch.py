@@ -76,17 +76,11 @@ def _run_in_hydra(cfg: DictConfig, ready: Prepared) -> None:
         except Exception as error:
             raised.append(error)
 
-    loader = GlobalHydra.instance().config_loader()
+    # Hydra's base class, which does nothing, in place of callbacks that a config would name by `_target_`.
+    context = HydraContext(GlobalHydra.instance().config_loader(), Callback())  # type: ignore[arg-type]
     # Hydra's public call below its command line: it makes `.hydra`, changes folder and sets the environment, as a user
     # of Hydra expects, without its own parsing of sys.argv and its handling of errors.
-    run_job(
-        task,
-        cfg,
-        job_dir_key="hydra.run.dir",
-        job_subdir_key=None,
-        # Hydra's base class, which does nothing, in place of callbacks that a config would name by `_target_`.
-        hydra_context=HydraContext(loader, Callback()),  # type: ignore[arg-type]
-    )
+    run_job(task, cfg, job_dir_key="hydra.run.dir", job_subdir_key=None, hydra_context=context)
     # Only now, after Hydra has restored the environment and the current folder.
     if raised:
         raise raised[0]

@@ -182,10 +182,8 @@ class Container:
         found, content = unpacked(self._record(CHUNK, chunk.chunk_start_offset, chunk.chunk_length))
         # A chunk's checksum covers its content alone; its head is held against the summary, which has its own.
         same = ("message_start_time", "message_end_time", "uncompressed_size", "compression")
-        if (
-            any(getattr(found, name) != getattr(chunk, name) for name in same)
-            or len(found.data) != chunk.compressed_size
-        ):
+        differs = any(getattr(found, name) != getattr(chunk, name) for name in same)
+        if differs or len(found.data) != chunk.compressed_size:
             raise Damaged(f"the chunk at byte {chunk.chunk_start_offset}")
         # A copy, since a chunk may repeat the definitions of channels, which are added to what is handed over.
         return list(messages_of(content, dict(self.channels)))

@@ -87,8 +87,7 @@ def decode(row: dict[str, Any], steps: list[bytes], grids: list[bytes], run: Log
     return Episode(
         number=number,
         seed=int(row["seed"]),
-        policy=row["policy"],
-        start=row["start"],
+        **{name: row[name] for name in ("policy", "start", "terminated", "truncated")},
         misses=np.array([each["n"] for each in said], dtype=np.int64),
         action=action,
         belief=belief,
@@ -96,8 +95,6 @@ def decode(row: dict[str, Any], steps: list[bytes], grids: list[bytes], run: Log
         target=np.where(target < 0, run.cells, target),
         located=np.array([each["obs"] >= 0 for each in said]),
         reward=np.array([each["reward"] for each in said], dtype=np.float32),
-        terminated=row["terminated"],
-        truncated=row["truncated"],
         first_tick=tick_of(int(row["start_time"])),
         mode=np.array([each["mode"] for each in said], dtype=np.int64) if run.modes else None,
         start_mode=row["start_mode"] if run.modes else 0,

@@ -19,8 +19,8 @@ COSTS = (0.16, 0.18, 0.2, 0.22)
 """c, the price of a sensor for one step."""
 SIZE, REWARD = 10, 1.0
 """N, and r."""
-RADIUS, LOW_PROBABILITY, EXIT_PROBABILITY = 1, 0.15, 0.005
-"""Of the motion; T_max, the border rule and the draw of the kernel the paper does not say."""
+_MOTION: dict[str, Any] = {"radius": 1, "low_probability": 0.15, "exit_probability": 0.005}
+"""Of the kernel; T_max, the border rule and the draw of the kernel the paper does not say."""
 
 
 def _printed(*rows: tuple[float, float, float, float]) -> Mapping[tuple[int, float], float]:
@@ -41,9 +41,7 @@ _FIXED = {
     "grid.max_steps": None,
     "grid.window": None,
     "kernel.name": "random_support",
-    "kernel.radius": RADIUS,
-    "kernel.low_probability": LOW_PROBABILITY,
-    "kernel.exit_probability": EXIT_PROBABILITY,
+    **{f"kernel.{name}": value for name, value in _MOTION.items()},
     "cost.reward": REWARD,
     "cost.safe": None,
 }
@@ -52,15 +50,7 @@ _FIXED = {
 
 def paper_kernel(support_size: int, seed: int, border: Border) -> Array:
     """`[100, 100]` one draw of the paper's kernel with Z = `support_size`."""
-    return random_support(
-        SIZE,
-        support_size=support_size,
-        radius=RADIUS,
-        low_probability=LOW_PROBABILITY,
-        exit_probability=EXIT_PROBABILITY,
-        border=border,
-        seed=seed,
-    )
+    return random_support(SIZE, support_size=support_size, border=border, seed=seed, **_MOTION)
 
 
 def paper_world(kernel: Array, cost: float, t_max: int) -> World:

@@ -143,19 +143,10 @@ def run_on_slurm(cfg: sweeping.SubmititSlurmConfig, jobs: Sequence[Job]) -> None
 
     folder = jobs[0].sweep / SUBMISSIONS
     executor = submitit.AutoExecutor(folder, cluster="slurm", slurm_max_num_timeout=cfg.max_num_timeout)
-    executor.update_parameters(
-        name=f"trackmdp_{jobs[0].command}",
-        timeout_min=cfg.timeout_min,
-        cpus_per_task=cfg.cpus_per_task,
-        mem_gb=cfg.mem_gb,
-        gpus_per_node=cfg.gpus_per_node,
-        slurm_array_parallelism=cfg.array_parallelism,
-        slurm_signal_delay_s=cfg.signal_delay_s,
-        slurm_partition=cfg.partition,
-        slurm_account=cfg.account,
-        slurm_setup=cfg.setup,
-        slurm_additional_parameters=cfg.additional_parameters,
-    )
+    asked = {name: getattr(cfg, name) for name in ("timeout_min", "cpus_per_task", "mem_gb", "gpus_per_node")}
+    of_slurm = ("array_parallelism", "signal_delay_s", "partition", "account", "setup", "additional_parameters")
+    asked |= {f"slurm_{name}": getattr(cfg, name) for name in of_slurm}
+    executor.update_parameters(name=f"trackmdp_{jobs[0].command}", **asked)
     # One array job, of which the scheduler runs `array_parallelism` at once; one job each would flood its queue.
     _wait(executor.map_array(Submission(), list(jobs)))
 
