@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml  # type: ignore[import-untyped]  # a dependency of OmegaConf
 from omegaconf import OmegaConf
 
 from tests.config.cases import COMBINATIONS, composed, files_of
@@ -199,6 +200,14 @@ def test_a_config_file_with_a_missing_key_is_refused(change: str, message: str, 
     assert message in str(caught.value)
 
 
+@pytest.mark.parametrize("part", ["grid", "sensor", "algo", "optimal"])
+def test_a_config_file_with_a_part_that_is_null_is_refused(part: str, tmp_path: Path) -> None:
+    plain = yaml.safe_load(to_yaml(composed("train"))) | {part: None}
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(plain), encoding="utf-8")
+    with pytest.raises(UserError, match=f"config\\.yaml: {part}=None: expected a mapping"):
+        load_config(tmp_path / "config.yaml", TrainConfig)
+
+
 @pytest.mark.parametrize("text", ["[1, 2]", "just words", "a: [", "seed: 3", ""])
 def test_a_file_that_is_no_config_is_refused(text: str, tmp_path: Path) -> None:
     file = tmp_path / "config.yaml"
@@ -229,5 +238,8 @@ def test_the_budget_grows_with_the_number_of_cells(choice: str, size: int, frame
 
 
 def test_bytes_that_are_no_text_are_no_config() -> None:
+    for text in ("a: !!binary aGk=", "a: [{!!binary aGk=: 1}]"):
+        with pytest.raises(UserError, match=r"^config.yaml: not a config \("):
+            world_of(text)
     with pytest.raises(UserError, match=r"^config.yaml: not a config \('utf-8' codec"):
         world_of(b"\xff\xfe\xfa")

@@ -249,6 +249,17 @@ def test_a_policy_of_another_grid_is_not_drawn(other: dict[str, Any], value: flo
     assert any(each.run == "a" and "not the policy of" in each.text for each in found.anomalies)
 
 
+def test_what_has_no_form_in_utf_8_is_shown_with_escapes(sweep: Path, tmp_path: Path) -> None:
+    (sweep / os.fsdecode(b"r\xff")).mkdir()
+    shutil.copy(sweep / "a/config.yaml", sweep / os.fsdecode(b"r\xff"))
+    resealed(versions={"torch": "\ud800"})(sweep / "b")
+    save_results(gather_runs(sweep), tmp_path)
+    found = load_results(tmp_path)
+    assert [run.name for run in found.runs] == ["a", "b", "c"]
+    assert ("r\\udcff", "its folder's name is not UTF-8") in {(each.run, each.text) for each in found.anomalies}
+    assert "torch \\ud800" in build(found).html()
+
+
 def test_a_setting_is_a_text_everywhere(sweep: Path, tmp_path: Path) -> None:
     config = sweep / "a/config.yaml"
     evil = json.dumps("\x1b]0;t\x07")

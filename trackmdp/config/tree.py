@@ -11,7 +11,17 @@ from typing import Any, TypeVar
 from omegaconf import OmegaConf
 
 from trackmdp.config.checks import absolute_paths, check_choice, own_paths, suggestion, validate
-from trackmdp.config.options import GROUPS, SELECTORS, ChoiceConfig, Option, as_float, listed, options, several
+from trackmdp.config.options import (
+    GROUPS,
+    SELECTORS,
+    ChoiceConfig,
+    Option,
+    as_float,
+    listed,
+    optional,
+    options,
+    several,
+)
 from trackmdp.config.roots import CommandConfig, TrainConfig, WorldConfig
 from trackmdp.config.untrusted import MAX_BYTES, parse_yaml
 from trackmdp.errors import UserError
@@ -152,7 +162,7 @@ def build_config(plain: Any, schema: type[Any], prefix: str = "", group: str = "
             values[key] = {
                 name: build_config(each, described, f"{inner}{name}.", key, str(name)) for name, each in value.items()
             }
-        elif value is not None or several(schema, key):
+        elif value is not None or not optional(schema, key):
             values[key] = build_config(value, described, inner, key)
     return schema(**values)
 

@@ -33,6 +33,9 @@ def parse_yaml(text: str | bytes, source: str) -> DictConfig:
         config: Any = OmegaConf.create(text)
         # Not resolved: `${oc.env:NAME}` would copy a variable of the reader's environment into the config.
         plain = OmegaConf.to_container(config, resolve=False)
+        # `!!binary aGk=`, which has no form in JSON, and so in no digest, label or summary.
+        if any(isinstance(each, bytes) for _, key, value in entries(plain) for each in (key, value)):
+            raise ValueError("bytes, expected text and numbers")
     except (yaml.YAMLError, OmegaConfBaseException, ValueError, RecursionError, AttributeError, TypeError) as error:
         said = " ".join(str(error).split()) or type(error).__name__
         raise UserError(f"{source}: not a config ({said[:200]})") from error

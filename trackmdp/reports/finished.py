@@ -36,6 +36,8 @@ _LARGE = 1e15
 def read_run(folder: Path, name: str) -> tuple[FinishedRun, Mapping[str, Any]] | Anomaly:
     """A run and its summary, or why there is none."""
     place = folder / name
+    if name.encode(errors="replace").decode() != name:  # in the tables it has to be text
+        return Anomaly(name, "its folder's name is not UTF-8")
     if (place / FAILED_FILE).is_file():
         reason = known_object(place / FAILED_FILE).get("reason", "no reason given")
         return Anomaly(name, f"failed: {printable(str(reason))}")

@@ -94,6 +94,11 @@ class Anomaly:
     run: str
     text: str
 
+    def __post_init__(self) -> None:
+        """Both are shown, and may be those of somebody else: a folder's name need not even be UTF-8."""
+        for name in ("run", "text"):
+            object.__setattr__(self, name, printable(getattr(self, name)))  # the dataclass is frozen
+
 
 @dataclass(frozen=True, eq=False)
 class Sensed:
@@ -200,7 +205,8 @@ def save_results(results: Results, folder: Path) -> None:
     }
     # Last, over the files as they are on the disk; `sealed` adds a digest of the manifest itself.
     manifest["files"] = {name: _digest(folder / name) for name in FILES}
-    write_text(folder / MANIFEST, json.dumps(sealed(manifest), indent=1, ensure_ascii=False) + "\n")
+    # In ASCII: half a surrogate pair, which a version in somebody's summary may hold, has no form in UTF-8.
+    write_text(folder / MANIFEST, json.dumps(sealed(manifest), indent=1) + "\n")
 
 
 def load_results(folder: Path) -> Results:
