@@ -73,7 +73,7 @@ def test_a_mixture_collects_with_the_exchanged_policy() -> None:
     for batch in batches(world)[:8]:
         learner.step(batch)
     learned = Policy(world, learner._learner.sets(world))
-    expected = exchanged_sets(world.task, *learner._buffer.moves(), learned.sets, anew=False)
+    expected = exchanged_sets(counted_world(world.task, *learner._buffer.moves()), learned.sets, anew=False)
     assert np.array_equal(policy(learner, world).dense(), Policy(world, expected).dense())
     assert (expected != learned.sets).nnz > 0
     assert learner.policy.bits.sum() == torch.as_tensor(np.packbits(Policy(world, expected).dense(), axis=-1)).sum()
@@ -123,7 +123,7 @@ def test_plans_too_large_to_be_exchanged_are_left_as_learned(monkeypatch: pytest
     sets = Policy.from_dense(world, np.zeros((25, 2, 25), dtype=bool)).sets
     for limit, left in ((750, False), (749, True)):
         monkeypatch.setattr(exchanged, "MOST_MOVES", limit)
-        found = exchanged_sets(world.task, *moves, sets)
+        found = exchanged_sets(counted_world(world.task, *moves), sets)
         assert (found is sets) == left
 
 

@@ -60,17 +60,7 @@ class PrioritizedSampler(Sampler):
         """Give new items the largest priority, so that each is seen at least once."""
         self._mass[index] = self._largest**self.alpha
 
-    def add(self, index: int) -> None:
-        """As `extend`, for one item."""
-        self.extend(torch.tensor([index]))
-
-    def update_priority(
-        self,
-        index: Tensor | int,
-        priority: Tensor | float,
-        *,
-        storage: Storage | None = None,  # noqa: ARG002  TorchRL passes it
-    ) -> None:
+    def update_priority(self, index: Tensor | int, priority: Tensor | float, **_: Any) -> None:
         """Set the priorities of `index` to |priority|."""
         value = torch.as_tensor(priority, dtype=torch.float64, device=self._mass.device).abs() + _SMALLEST
         self._largest = torch.maximum(self._largest, value.max())

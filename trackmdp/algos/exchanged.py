@@ -54,33 +54,20 @@ def counted_world(
     return believed_world(task, estimate.believed(least), least)
 
 
-def exchanged_sets(
-    task: Task,
-    start: Tensor,
-    end: Tensor,
-    sets: sparse.csr_array,
-    *,
-    classes: IndexArray | None = None,
-    anew: bool = True,
-    count: Tensor | None = None,
-) -> sparse.csr_array:
-    """`[keys (t_max + 1), S]`, what exchange on the counts makes of learned `sets`.
+def exchanged_sets(world: Modelled, sets: sparse.csr_array, *, anew: bool = True) -> sparse.csr_array:
+    """`[keys (t_max + 1), S]`, what exchange in the counted `world` makes of learned `sets`.
 
     Args:
-        task: grid, rewards and costs.
-        start: `[K]`, the cell before each sensed move, or the key.
-        end: `[K]`, the one after it, M for outside.
+        world: see `counted_world`.
         sets: `[keys (t_max + 1), S]`.
-        classes: see `counted_world`.
         anew: whether to start from `search` as well: from one start alone, regrets of .003 were left.
-        count: see `counted_world`.
     """
-    world = counted_world(task, start, end, classes=classes, count=count)
     if _moves_of_plans(world) > MOST_MOVES:
         return sets
+    learned = PolicyTable(world, sets)
     if isinstance(world, HiddenWorld):
-        return solve_keys(world, start=PolicyTable(task, sets)).table.sets
-    found = [exchange.improve(world, PolicyTable(task, sets)), *([exchange.solve(world)] if anew else [])]
+        return solve_keys(world, start=learned).table.sets
+    found = [exchange.improve(world, learned), *([exchange.solve(world)] if anew else [])]
     worth = [evaluate(world, policy).aihtr for policy in found]
     return found[int(np.argmax(worth))].sets
 

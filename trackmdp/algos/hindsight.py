@@ -21,7 +21,7 @@ from torch import Tensor
 
 from trackmdp.algos.actor_loss import ActorLoss, Decision
 from trackmdp.algos.common import Averages, Checkpointed, set_learning_rate
-from trackmdp.algos.exchanged import exchanged_sets
+from trackmdp.algos.exchanged import counted_world, exchanged_sets
 from trackmdp.algos.hindsight_loss import HindsightLoss
 from trackmdp.algos.learned_kernel import InferredMoves
 from trackmdp.algos.moves import MoveBuffer, report_weights
@@ -173,9 +173,9 @@ class Hindsight:
         if not cfg.exchange or not (last or acts):
             return sets
         if isinstance(self._buffer, MoveBuffer):
-            start, end = self._buffer.moves()
             counts = self._buffer.counts()
-            return exchanged_sets(task, start, end, sets, classes=self._classes, anew=last, count=counts)
+            world = counted_world(task, *self._buffer.moves(), classes=self._classes, count=counts)
+            return exchanged_sets(world, sets, anew=last)
         if self._buffer.judge is None:
             return sets
         paths, judge = self._buffer.tracks(), self._buffer.judge

@@ -102,11 +102,7 @@ def _tables(task: Task, window: Window) -> dict[str, IndexArray]:
 
 
 def _lists(
-    matrix: sparse.csr_array,
-    place: tuple[IndexArray, IndexArray],
-    names: IndexArray,
-    shape: tuple[int, ...],
-    none: int,
+    matrix: sparse.csr_array, place: tuple[IndexArray, IndexArray], names: IndexArray, shape: tuple[int, ...], none: int
 ) -> IndexArray:
     """`[*shape, D]`, at `place` the `names` of the columns of each row of `matrix`, filled up with `none`."""
     row = row_index(matrix)

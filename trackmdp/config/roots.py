@@ -152,10 +152,7 @@ class BenchmarkConfig(WorldConfig):
     """Measure time and memory on this machine; how good the policies are, sweeps and reports say."""
 
     knows_modes: ClassVar[bool] = False
-    part: str = option(
-        "what is measured",
-        choices=_PARTS,
-    )
+    part: str = option("what is measured", choices=_PARTS)
     seed: int = option("every random draw derives from it", ge=0)
     device: str = option("device of environments and networks", expects="cpu, cuda, cuda:N or auto", pattern=DEVICE)
     threads: int = option("torch threads", unit="threads", ge=1, le=256)

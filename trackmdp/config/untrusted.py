@@ -10,6 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from trackmdp.errors import UserError
+from trackmdp.untrusted import reason
 
 MAX_BYTES = 2**20
 """Bytes of the largest config file that is read."""
@@ -37,8 +38,7 @@ def parse_yaml(text: str | bytes, source: str) -> DictConfig:
         if any(isinstance(each, bytes) for _, key, value in entries(plain) for each in (key, value)):
             raise ValueError("bytes, expected text and numbers")
     except (yaml.YAMLError, OmegaConfBaseException, ValueError, RecursionError, AttributeError, TypeError) as error:
-        said = " ".join(str(error).split()) or type(error).__name__
-        raise UserError(f"{source}: not a config ({said[:200]})") from error
+        raise UserError(f"{source}: not a config ({reason(error)})") from error
     if key := names_code(plain):
         raise UserError(f"{source}: {key}: a config is data, and names no code to call")
     return config

@@ -48,11 +48,7 @@ def tables(
 
 
 def planted(
-    problem: InnerProblem,
-    lower: Array,
-    slack: float,
-    run: Callable[[Tree], None],
-    mass: sparse.csr_array | None = None,
+    problem: InnerProblem, lower: Array, slack: float, run: Callable[[Tree], None], mass: sparse.csr_array | None = None
 ) -> Tree:
     """The tree of a `problem`, not searched yet, with the tightest tables there are; `run` makes them, see `Tree`."""
     delayed = Delayed.of(problem.world, problem.detected, problem.missed, problem.length)

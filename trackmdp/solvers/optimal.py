@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -82,7 +83,10 @@ def solve(
     """
     if world.max_steps is not None:
         raise UserError(f"grid.max_steps={world.max_steps}: only whole episodes are solved, expected null")
-    run = _Run(world, Budget(nodes, time_limit), tolerance, start, on_progress, region_side(world, memory))
+    side = region_side(world, memory)
+    # Sensors with footprints have no tree, and so no regions.
+    side = side if world.coverage is None else None
+    run = _Run(world, Budget(nodes, time_limit), tolerance, start, on_progress, side)
     interrupted = False
     try:
         run.search()
@@ -91,27 +95,24 @@ def solve(
     return run.solution(interrupted)
 
 
+@dataclass(eq=False)
 class _Run:
     """One search: the policy and the bracket so far."""
 
-    def __init__(
-        self,
-        world: World,
-        budget: Budget,
-        tolerance: float,
-        start: PolicyTable | None,
-        on_progress: Callable[[SearchProgress], None] | None,
-        side: int | None,
-    ) -> None:
-        self.world, self.tolerance, self.on_progress, self.budget = world, tolerance, on_progress, budget
-        # Sensors with footprints have no tree, and so no regions.
-        self.start, self.side = start, side if world.coverage is None else None
-        self.restarted = False
-        self.found: PolicyTable | None = None
+    world: World
+    budget: Budget
+    tolerance: float
+    start: PolicyTable | None
+    on_progress: Callable[[SearchProgress], None] | None
+    side: int | None
+    restarted: bool = False
+    found: PolicyTable | None = None
+
+    def __post_init__(self) -> None:
         # U(x, 0) >= V*(x) before anything is searched; `tighten` only lowers it.
-        self.bound = exact_clocked_table(world).value
-        self.policy = clocked.solve(world)
-        self.evaluation: Evaluation = evaluate(world, self.policy, guess=self.bound, per_cell=False)
+        self.bound = exact_clocked_table(self.world).value
+        self.policy = clocked.solve(self.world)
+        self.evaluation: Evaluation = evaluate(self.world, self.policy, guess=self.bound, per_cell=False)
 
     @property
     def value(self) -> Array:

@@ -203,12 +203,7 @@ def settled(world: World, policy: PolicyTable, side: int, rounds: int, run: Crew
 
 
 def proved(
-    world: World,
-    policy: PolicyTable,
-    value: Array,
-    side: int,
-    slack: float,
-    run: Callable[[int, int, Tree], None],
+    world: World, policy: PolicyTable, value: Array, side: int, slack: float, run: Callable[[int, int, Tree], None]
 ) -> tuple[Array, PolicyTable]:
     """Search the plans of all located cells that may not be the best by branch and bound, region by region.
 

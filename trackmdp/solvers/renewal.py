@@ -270,10 +270,7 @@ def _factorised(system: sparse.csr_array) -> Callable[[Array], Array]:
     try:
         # Without pivoting, which a matrix with dominant diagonal does not need: that keeps the fill low.
         solve: Callable[[Array], Array] = splu(
-            sparse.csc_array(system),
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
+            sparse.csc_array(system), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
         ).solve
     except RuntimeError as error:  # SuperLU: the matrix is exactly singular
         raise UserError(_ENDLESS) from error

@@ -50,13 +50,7 @@ def short_indices(matrix: sparse.csr_array) -> sparse.csr_array:
     return sparse.csr_array((matrix.data, *pointers), shape=matrix.shape)
 
 
-def one_each(
-    source: str,
-    given: npt.ArrayLike,
-    count: int,
-    each: str,
-    allowed: Range,
-) -> npt.NDArray[np.float64]:
+def one_each(source: str, given: npt.ArrayLike, count: int, each: str, allowed: Range) -> npt.NDArray[np.float64]:
     """`[count]` numbers, from one for all or from one for each.
 
     Args:

@@ -141,11 +141,7 @@ def read_numbers(key: str, path: str | Path, *, name: str) -> Array:
 
 
 def per_cell(
-    key: str,
-    given: float | list[float] | str,
-    size: Size,
-    allowed: Range,
-    sensors: int | None = None,
+    key: str, given: float | list[float] | str, size: Size, allowed: Range, sensors: int | None = None
 ) -> Array:
     """`[M]` one number per cell, or `[S]` per sensor: one for all, a list, or what is in a file.
 

@@ -215,12 +215,7 @@ def recorded(
 
 
 def paper_cost(
-    size: Size,
-    *,
-    reward: float,
-    sensor: float | list[float] | str,
-    safe: float | None,
-    sensors: int | None = None,
+    size: Size, *, reward: float, sensor: float | list[float] | str, safe: float | None, sensors: int | None = None
 ) -> dict[str, Any]:
     """r, c and D as arguments of `Task`; `sensors` is their number where there is not one in each cell.
 

@@ -72,15 +72,7 @@ class Positions:
 
 
 def table_of(
-    ids: Any,
-    times: Any,
-    x: Any,
-    y: Any,
-    piece: Any = None,
-    *,
-    geographic: bool = False,
-    downwards: bool = False,
-    dropped: Mapping[str, int] | None = None,
+    ids: Any, times: Any, x: Any, y: Any, piece: Any = 0, *, dropped: Mapping[str, int] | None = None, **are: Any
 ) -> Positions:
     """`Positions` of columns as a file has them, in any order, some of them perhaps empty.
 
@@ -89,18 +81,17 @@ def table_of(
         times: seconds, or texts such as 2024-05-01T12:00:00Z.
         x: to the right, or degrees of longitude.
         y: upwards, or degrees of latitude.
-        piece: numbers of the pieces that the file itself keeps apart; None: each target's path is one.
-        geographic: whether x and y are degrees.
-        downwards: whether y grows downwards.
+        piece: numbers of the pieces that the file itself keeps apart; 0: each target's path is one.
         dropped: what was left out before.
+        are: `geographic` and `downwards`, as of `Positions`.
     """
     import pandas as pd
 
     frame = pd.DataFrame({"id": ids, "time": _seconds(pd.Series(times)), "x": _number(x), "y": _number(y)})
-    frame["piece"] = 0 if piece is None else piece
+    frame["piece"] = piece
     # inf is no position either; AIS says 91 and 181 degrees where the receiver of a ship knows none.
     good = np.isfinite(frame[["time", "x", "y"]].to_numpy(dtype=np.float64)).all(axis=1) & frame["id"].notna()
-    good &= ((frame["x"].abs() <= 180) & (frame["y"].abs() <= 90)) | (not geographic)
+    good &= ((frame["x"].abs() <= 180) & (frame["y"].abs() <= 90)) | (not are.get("geographic"))
     kept = frame[good].copy()
     kept["track"] = np.unique(kept["id"].astype(str), return_inverse=True)[1]
     # By several columns pandas sorts stably: of two reports at one time the one that comes first in the file counts.
@@ -111,7 +102,7 @@ def table_of(
     kept["piece"] = kept[["track", "piece"]].ne(kept[["track", "piece"]].shift()).any(axis=1).cumsum() - 1
     kinds = dict.fromkeys(("track", "piece"), np.int64) | dict.fromkeys(("time", "x", "y"), np.float64)
     columns = {name: kept[name].to_numpy(kind) for name, kind in kinds.items()}
-    return Positions(**columns, geographic=geographic, downwards=downwards, dropped={**(dropped or {}), **counts})
+    return Positions(**columns, **are, dropped={**(dropped or {}), **counts})
 
 
 def _number(column: Any) -> Any:
