@@ -105,7 +105,7 @@ def test_memory_decides_on_the_side_of_a_region() -> None:
     assert regions.region_side(small) is None
     large = make_world("random_support", size=150, support_size=5, radius=2)
     side = regions.region_side(large)
-    assert side == regions.LARGEST == regions.region_side(large, "64GiB")
+    assert side == regions.LARGEST_SIDE == regions.region_side(large, "64GiB")
     narrow = regions.region_side(large, "125MiB")
     assert narrow is not None and 1 <= narrow < side
     # the sizes add up: what all of it takes is below the limit

@@ -105,7 +105,7 @@ class LearnedKernel:
         self._estimate.fit(self.cfg.rounds_at_end if last else self.cfg.rounds)
         believed = self._estimate.believed(self._least)
         # What is only looked at on the way is made of the plan before, in one round: a quarter of the time.
-        plan = self._plan(believed, None if last or self._chooses else self.actor.sets, exchange.STARTS if last else 0)
+        plan = self._plan(believed, None if last or self._chooses else self.actor.sets, exchange.OTHERS if last else 0)
         self.actor = as_policy(self.task, plan)
         # Acting on a draw, not on the mean: where the estimate is unsure the draws differ, and so moves get sensed that
         # the mean may leave out for good.

@@ -16,7 +16,7 @@ from trackmdp.config.options import GROUPS, SELECTORS, Option, choices_of, leave
 from trackmdp.config.registry import conf_file
 from trackmdp.errors import UserError
 
-T = TypeVar("T")
+_T = TypeVar("_T")
 
 RENAMED: dict[str, str] = {
     "algo.average": "algo.ema_decay",
@@ -140,7 +140,7 @@ def absolute_paths(cfg: Any, folder: Path) -> None:
     _each_path(cfg, lambda path: str(folder / path))  # `path` itself where that is absolute
 
 
-def own_paths(cfg: T, folder: Path) -> T:
+def own_paths(cfg: _T, folder: Path) -> _T:
     """A copy in which what lies in `folder`, that of the run, is named relative to it: a run may be moved."""
     copied, place = copy.deepcopy(cfg), folder.absolute()
 

@@ -22,7 +22,7 @@ from trackmdp.config.roots import ROOTS, CommandConfig
 from trackmdp.config.tree import build_config
 from trackmdp.errors import UserError
 
-C = TypeVar("C", bound=CommandConfig)
+_C = TypeVar("_C", bound=CommandConfig)
 
 
 def compose(command: str, overrides: Mapping[str, Any] | None = None, *, folder: Path | None = None) -> Any:
@@ -59,7 +59,7 @@ def compose(command: str, overrides: Mapping[str, Any] | None = None, *, folder:
     return cfg
 
 
-def from_hydra(cfg: DictConfig, root: type[C], folder: Path) -> C:
+def from_hydra(cfg: DictConfig, root: type[_C], folder: Path) -> _C:
     """The typed, checked config of what Hydra composed; relative paths are resolved against `folder`.
 
     Raises:

@@ -16,7 +16,7 @@ from typing import Any, ClassVar, TypeVar, dataclass_transform
 
 from trackmdp.errors import UserError
 
-T = TypeVar("T")
+_T = TypeVar("_T")
 
 GROUPS: dict[str, dict[str, type[Any]]] = {}
 """Group -> option of the group -> its dataclass, for example ``GROUPS["kernel"]["drift"]``."""
@@ -253,7 +253,7 @@ def several(schema: type[Any], name: str) -> bool:
     return _element_of(_strip_none(typing.get_type_hints(schema).get(name))[0]) is not None
 
 
-def choice(group: str, name: str, *, makes: str) -> typing.Callable[[type[T]], type[T]]:
+def choice(group: str, name: str, *, makes: str) -> typing.Callable[[type[_T]], type[_T]]:
     """Class decorator: make a dataclass the choice `name` of a config group.
 
     Args:
@@ -266,7 +266,7 @@ def choice(group: str, name: str, *, makes: str) -> typing.Callable[[type[T]], t
         UserError: another schema has this name.
     """
 
-    def register(schema: type[T]) -> type[T]:
+    def register(schema: type[_T]) -> type[_T]:
         # setdefault keeps the first comer, so that a plugin cannot replace a choice by registering its name
         # once more; registering the very same class twice (a module imported again) does no harm.
         known = GROUPS.setdefault(group, {}).setdefault(name, schema)

@@ -9,7 +9,7 @@ from trackmdp.config.options import GROUPS, ChoiceConfig, Option, choice, listed
 from trackmdp.config.world import GridConfig
 from trackmdp.errors import UserError
 
-LARGEST = 1e15
+LARGEST_PRICE = 1e15
 """Of a price or a reward: sums of them over cells and steps, and squares of those in a loss, stay far from overflow."""
 
 
@@ -24,7 +24,7 @@ class CostConfig(ChoiceConfig):
 class PaperCostConfig(CostConfig):
     """The paper's rewards: r for a detection, c per sensor switched on, D for the safe action."""
 
-    reward: float = option("r, earned by a detection", unit="reward", ge=1 / LARGEST, le=LARGEST)
+    reward: float = option("r, earned by a detection", unit="reward", ge=1 / LARGEST_PRICE, le=LARGEST_PRICE)
     sensor: Any = option(
         "c, price of one sensor switched on for one step, for all sensors or for each",
         unit="reward per sensor-step",
@@ -32,12 +32,12 @@ class PaperCostConfig(CostConfig):
         path=True,
     )
     safe: float | None = option(
-        "D, price of the safe action; null = the sum of all sensors' prices", unit="reward", ge=0, le=LARGEST
+        "D, price of the safe action; null = the sum of all sensors' prices", unit="reward", ge=0, le=LARGEST_PRICE
     )
 
     def check(self, key: str, root: Any) -> None:
         """One price for all sensors, or one for each; a file is read later."""
-        price = Option("", ge=0, le=LARGEST, kind=float)
+        price = Option("", ge=0, le=LARGEST_PRICE, kind=float)
         count, each = root.sensor.count(root.grid), "sensor" if root.sensor.covers else "cell"
         _check_per_cell(f"{key}.sensor", self.sensor, count, price, "number from 0 to 1e15", each)
 

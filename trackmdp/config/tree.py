@@ -41,7 +41,7 @@ CHANGEABLE = (
 )
 """Options, or groups of them, that may differ on resume: budget, solving, logging, saving, workers and devices."""
 
-C = TypeVar("C", bound=CommandConfig)
+_C = TypeVar("_C", bound=CommandConfig)
 
 
 def to_dict(cfg: Any, *, named: bool = True) -> dict[str, Any]:
@@ -71,7 +71,7 @@ def to_yaml(cfg: Any) -> str:
     return OmegaConf.to_yaml(OmegaConf.create(to_dict(cfg)))
 
 
-def load_config(file: Path, root: type[C]) -> C:
+def load_config(file: Path, root: type[_C]) -> _C:
     """Read back a `config.yaml` written by `to_yaml`, with all checks.
 
     Raises:
@@ -79,7 +79,7 @@ def load_config(file: Path, root: type[C]) -> C:
     """
     plain = plain_mapping(read_text(file, most=MAX_BYTES), str(file))
     try:
-        typed: C = build_config(plain, root)
+        typed: _C = build_config(plain, root)
         validate(typed)
     except UserError as error:
         raise UserError(f"{file}: {error}") from error

@@ -34,7 +34,7 @@ from trackmdp.world.model import Array, World
 STEPS = 6
 """Subgradient steps. On a walk (c = .3, T_max 3) the tables by themselves leave .059 per step open after one of them,
 .056 after six and .055 after forty, of the .19 of the clocked bound."""
-MOST_NUMBERS = 2**18
+_MOST_NUMBERS = 2**18
 """Numbers in one array, 2 MB."""
 WIDEST, MOST_WORK = 8, 2e8
 """Successors of a cell, and worths z_j T_h(j, L) of one table, above which the tables are left alone: a second for each
@@ -123,8 +123,8 @@ class _Moves:
         """`[M, 2^Z]` G_h, from `worth` `[M, 2^Z]` T_h and `ends` `[M]` R_{h-1}; `separable`: h is 1."""
         m, sets = worth.shape
         table = np.empty_like(worth)
-        cells = max(1, MOST_NUMBERS // (self._mass.shape[2] * sets * sets))
-        states = max(1, MOST_NUMBERS // (self._mass.shape[2] * sets))
+        cells = max(1, _MOST_NUMBERS // (self._mass.shape[2] * sets * sets))
+        states = max(1, _MOST_NUMBERS // (self._mass.shape[2] * sets))
         for first in range(0, m, cells):
             part = slice(first, first + cells)
             for lowest in range(0, sets, states):

@@ -22,7 +22,7 @@ from trackmdp.solvers.renewal import IndexArray, accumulate, per_row
 from trackmdp.solvers.search import InnerProblem
 from trackmdp.world.model import Array, BoolArray, World
 
-MOST_NODES = 100_000
+_MOST_NODES = 100_000
 """Choices looked at per table; where it ends early, W is an upper bound, and the exact form is exact all the same."""
 
 
@@ -73,7 +73,7 @@ def positions(world: World, policy: PolicyTable, value: Array) -> list[PositionE
     """
     layers = reachable_layers(world, world.num_choices)
     # W after n + 1 misses, best play from a known position: there are t_max - n sets left then.
-    later = tables(InnerProblem.of(world, layers, value), slack=1e-9, run=up_to(MOST_NODES))[::-1]
+    later = tables(InnerProblem.of(world, layers, value), slack=1e-9, run=up_to(_MOST_NODES))[::-1]
     mass, estimates = np.ones(world.num_cells), []
     for n, sensed in enumerate(layer_sets(layers, policy)):
         predicted = mass @ layers[n + 1].moves

@@ -26,14 +26,14 @@ from trackmdp.solvers.renewal import IndexArray, per_row
 from trackmdp.solvers.search import InnerProblem, located_value
 from trackmdp.world.model import Array, BoolArray, World
 
-STARTS, PRICES_OFF, STEPS, MOST_STARTED = 4, 0.2, 5, 500
+OTHERS, PRICES_OFF, _STEPS, MOST_STARTED = 4, 0.2, 5, 500
 """Other searches from t_max 2 on, how far the prices that lead them are off (standard deviation of their logarithms),
 the steps of their homotopies, and the cells up to which they are made. On nine worlds of 9 x 9 and 10 x 10 cells four
 gained up to .0007 per step, on diagonal walks .002 to .007, twelve as much again or less; prices .1 or .4 off gained no
 more, nor did moves that are off, or 30 steps, for twice the time."""
 
 
-def solve(world: World, starts: int = STARTS) -> PolicyTable:
+def solve(world: World, starts: int = OTHERS) -> PolicyTable:
     """The policy of `search`, improved by exchange, and from t_max 2 on by what `starts` other searches find."""
     found = search.solve(world)
     if world.coverage is not None:
@@ -50,7 +50,7 @@ def other_starts(world: World, layers: list[Layer], count: int) -> Iterator[list
     rng = np.random.default_rng(derive(0, "exchange", "starts"))
     for _ in range(count if world.num_cells <= MOST_STARTED else 0):
         other = replace(world, cost=world.cost * np.exp(PRICES_OFF * rng.standard_normal(world.num_cells)))
-        yield search.follow_credit(other, layers, layer_sets(layers, clocked.solve(other)), STEPS)
+        yield search.follow_credit(other, layers, layer_sets(layers, clocked.solve(other)), _STEPS)
 
 
 def best_of(

@@ -31,7 +31,7 @@ from trackmdp.world.model import Array, BoolArray, World
 
 MOST_ENTRIES = 1 << 15
 """Entries b_ji handled at once: what is a quarter of a megabyte stays in the cache."""
-WIDEST = 1 << 13
+_WIDEST = 1 << 13
 """Pairs (cell, next cell) of one state above which it is not looked at: the sums would take longer than they save."""
 
 
@@ -80,7 +80,7 @@ class Joint:
         rank = np.zeros_like(ranked)
         np.cumsum(ranked[:, 1:] != ranked[:, :-1], axis=1, out=rank[:, 1:])
         width = int(rank.max(initial=0)) + 1
-        if cells.shape[1] * width > WIDEST:
+        if cells.shape[1] * width > _WIDEST:
             return None
         place = np.empty_like(rank)
         np.put_along_axis(place, order, rank, axis=1)

@@ -21,7 +21,7 @@ from trackmdp.solvers.renewal import IndexArray, per_row, row_index
 from trackmdp.solvers.shrinkage import posterior_mean, unseen
 from trackmdp.world.model import Array, BoolArray, apart, grid_size
 
-OPEN = 0.01
+_OPEN = 0.01
 """Weight, in the first round's kernel, of moves that were not seen yet."""
 LEAST_EXIT = 1e-9
 """Exit probability of a kernel drawn from the posterior, at least."""
@@ -129,7 +129,7 @@ class KernelEstimate:
         # Policies repeat themselves: equal paths have equal expectations, and are worked out once.
         paths, copies = each_once(ObservedPaths.of(self._censored, self.num_cells))
         for first in [True, *[False] * (rounds - 1)]:
-            kernel = (1.0 - OPEN) * self.mean() + OPEN * self._open_moves(paths) if first else self.mean()
+            kernel = (1.0 - _OPEN) * self.mean() + _OPEN * self._open_moves(paths) if first else self.mean()
             self.counts = self.direct + expected_moves(kernel, paths, copies, self._detection)
         counts = self.counts.copy()
         counts.data[counts.data < NEGLIGIBLE] = 0.0

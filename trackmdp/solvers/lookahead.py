@@ -21,8 +21,8 @@ from trackmdp.world.model import Array, BoolArray, World
 
 Tail: TypeAlias = Literal["qmdp", "clocked"]
 
-SLACK = 1e-9
-MOST_NODES = 2_000_000
+_SLACK = 1e-9
+_MOST_NODES = 2_000_000
 """Choices looked at per plan; a count, not a time, so that the same world gives the same policy."""
 
 
@@ -55,13 +55,13 @@ def solve(world: World, *, depth: int = 2, tail: Tail = "clocked") -> PolicyTabl
 def _first_set(problem: InnerProblem, layers: list[Layer], mass: Array) -> BoolArray:
     """`[E]` the first set of the best plan from each located cell, on the second layer of `problem`."""
     # R of a known position is that of the first layers, which begin in each cell.
-    world, run, start = problem.world, up_to(MOST_NODES), replace(problem, layers=layers[: problem.length + 1])
-    known = tables(start, slack=SLACK, run=run)
+    world, run, start = problem.world, up_to(_MOST_NODES), replace(problem, layers=layers[: problem.length + 1])
+    known = tables(start, slack=_SLACK, run=run)
     sets = exchange(problem, first_guess(problem, known, mass), mass)
     origin = problem.layers[0]
     # one problem per located cell: its undetected mass after the sets carried out so far
     here = sparse.csr_array((mass, (origin.rows, origin.cells)), shape=(world.num_cells, world.num_cells))
     here.eliminate_zeros()
-    tree = Tree(problem, known, problem.worth(sets, mass), SLACK, here)
+    tree = Tree(problem, known, problem.worth(sets, mass), _SLACK, here)
     run(tree)
     return (adopted(problem, sets, tree, mass) or sets)[0]

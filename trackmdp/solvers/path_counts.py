@@ -14,7 +14,7 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers.path_states import KeyPlans, Paths, Sensed, sensed_table
+from trackmdp.solvers.path_states import KeyPlans, Paths, SensorsOn, sensed_table
 from trackmdp.solvers.renewal import IndexArray, per_row
 from trackmdp.world.memory import KeySpace
 from trackmdp.world.model import Array, Task
@@ -164,14 +164,14 @@ class _Counted:
         """The sets of all keys: by their own count, or where they were never seen without."""
         return KeyPlans(self._paths.task, self._paths.seen, self._sets, self._unseen)
 
-    def _unseen(self, n: int, keys: IndexArray) -> Sensed:
+    def _unseen(self, n: int, keys: IndexArray) -> SensorsOn:
         """What is on after keys that were not seen."""
         cost, shared, classes = self._paths.task.cost, self._shared[n], self._paths.task.keys.num_classes
         start, known = np.divmod(keys, classes)
         # Keys of one class at a time: few displacements are worth a sensor after it, from whatever cell.
         order = np.argsort(known.astype(np.min_scalar_type(classes)), kind="stable")
         ends = np.cumsum(np.bincount(known, minlength=classes))
-        found: list[Sensed] = [(np.zeros(0, dtype=np.int64),) * 2]
+        found: list[SensorsOn] = [(np.zeros(0, dtype=np.int64),) * 2]
         for each, (high, most) in enumerate(zip(ends, shared.most, strict=True)):
             at = order[ends[each - 1] if each else 0 : high]
             wanted = np.flatnonzero(most > cost.min())

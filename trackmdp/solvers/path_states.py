@@ -28,7 +28,7 @@ from trackmdp.world.tracks import Tracks
 _IN_VIEW = 0.999
 """Share of the displacements until the last free choice that are looked after; rare leaps are not."""
 
-Sensed: TypeAlias = tuple[IndexArray, IndexArray]
+SensorsOn: TypeAlias = tuple[IndexArray, IndexArray]
 """Sensors that are on: places in an array of keys, and cells, `[Q]` each."""
 
 
@@ -188,7 +188,7 @@ class KeyPlans:
     task: Task
     keys: IndexArray
     sets: list[sparse.csr_array]
-    others: Callable[[int, IndexArray], Sensed]
+    others: Callable[[int, IndexArray], SensorsOn]
 
     @classmethod
     def of_table(cls, policy: PolicyTable, keys: IndexArray) -> KeyPlans:
@@ -199,7 +199,7 @@ class KeyPlans:
         def rows(n: int, keys: IndexArray) -> sparse.csr_array:
             return sparse.csr_array(table[keys * choices + n])
 
-        def others(n: int, keys: IndexArray) -> Sensed:
+        def others(n: int, keys: IndexArray) -> SensorsOn:
             return _entries(rows(n, keys))
 
         return cls(policy.task, keys, [rows(n, keys) for n in range(choices)], others)
@@ -213,7 +213,7 @@ class KeyPlans:
         """The sets of all keys there are."""
         return PolicyTable.from_sensed(self.task, self._sensed(np.arange(self.task.num_keys)))
 
-    def _sensed(self, keys: IndexArray) -> list[Sensed]:
+    def _sensed(self, keys: IndexArray) -> list[SensorsOn]:
         place = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
         known = self.keys[place] == keys
         mine, rest = np.flatnonzero(known), np.flatnonzero(~known)
@@ -229,6 +229,6 @@ def sensed_table(rows: IndexArray, cells: IndexArray, shape: tuple[int, int]) ->
     return sparse.csr_array((np.ones(len(rows), dtype=bool), (rows, cells)), shape=shape)
 
 
-def _entries(sets: sparse.csr_array) -> Sensed:
+def _entries(sets: sparse.csr_array) -> SensorsOn:
     listed = sets.tocoo()
     return listed.row.astype(np.int64), listed.col.astype(np.int64)

@@ -32,7 +32,7 @@ from trackmdp.solvers.search import InnerProblem
 from trackmdp.solvers.workers import Crew, Made, in_turn
 from trackmdp.world.model import Array, BoolArray, World
 
-ROOM, SMALLEST, LARGEST = 2**28, 32, 128
+ROOM, SMALLEST_SIDE, LARGEST_SIDE = 2**28, 32, 128
 """Bytes of a region, and its located cells in each direction, unless there is less memory. Wider ones have a smaller
 share of halo, 13 % at 128 cells, R = 2 and T_max = 1; in narrow ones most of the work is for the halo."""
 
@@ -101,8 +101,8 @@ def region_side(world: World, memory: str | None = None) -> int | None:
     whole, limit = _whole_bytes(world), free_bytes() if memory is None else parse_bytes(memory)
     if world.num_cells <= DIRECT_CELLS and whole + _region_bytes(world, max(world.size)) <= limit:
         return None
-    room, smallest = (ROOM, SMALLEST) if memory is None else (min(ROOM, limit - whole), 1)
-    fits = [side for side in range(smallest, LARGEST + 1) if _region_bytes(world, side) <= room]
+    room, smallest = (ROOM, SMALLEST_SIDE) if memory is None else (min(ROOM, limit - whole), 1)
+    fits = [side for side in range(smallest, LARGEST_SIDE + 1) if _region_bytes(world, side) <= room]
     side = max(fits, default=smallest)
     if (needed := whole + _region_bytes(world, side)) > limit:
         said = f"{gib(limit)} are available" if memory is None else "expected at least that"

@@ -19,7 +19,7 @@ from trackmdp.cluster import joining
 from trackmdp.errors import Preempted, UserError, require
 from trackmdp.signals import HEARD, handled
 
-Job = TypeVar("Job")
+Piece = TypeVar("Piece")
 Result = TypeVar("Result")
 
 _ATTEMPTS = 3
@@ -29,7 +29,7 @@ _ATTEMPTS = 3
 class Crew(Protocol):
     """Who does jobs."""
 
-    def __call__(self, work: Callable[[Job], Result], jobs: Sequence[Job]) -> list[Result]:
+    def __call__(self, work: Callable[[Piece], Result], jobs: Sequence[Piece]) -> list[Result]:
         """Some work done to each of the jobs, in their order; both are pickled where there are workers.
 
         Raises:
@@ -37,17 +37,17 @@ class Crew(Protocol):
         """
 
 
-def in_turn(work: Callable[[Job], Result], jobs: Sequence[Job]) -> list[Result]:
+def in_turn(work: Callable[[Piece], Result], jobs: Sequence[Piece]) -> list[Result]:
     """A `Crew` of this process alone."""
     return [work(job) for job in jobs]
 
 
 @dataclass(frozen=True)
-class Made(Sequence[Job]):
+class Made(Sequence[Piece]):
     """Jobs that are made when asked for, so that not all of them are there at once."""
 
     size: int
-    make: Callable[[int], Job]
+    make: Callable[[int], Piece]
 
     def __len__(self) -> int:
         return self.size
@@ -82,7 +82,7 @@ def crew(workers: int = 1, cluster: str | None = None, key: str = "partition.clu
 def _processes(workers: int) -> Iterator[Crew]:
     pool = _pool(workers)
 
-    def run(work: Callable[[Job], Result], jobs: Sequence[Job]) -> list[Result]:
+    def run(work: Callable[[Piece], Result], jobs: Sequence[Piece]) -> list[Result]:
         nonlocal pool
         results: dict[int, Result] = {}
         for _ in range(_ATTEMPTS):
@@ -118,7 +118,7 @@ def _pool(workers: int) -> ProcessPoolExecutor:
         return ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), end_with_parent)
 
 
-def _submit(pool: ProcessPoolExecutor, work: Callable[[Job], Result], job: Job) -> Future[Result]:
+def _submit(pool: ProcessPoolExecutor, work: Callable[[Piece], Result], job: Piece) -> Future[Result]:
     with _starting():
         return pool.submit(_done, work, job)
 
@@ -142,7 +142,7 @@ def _starting() -> Iterator[None]:
         signal.raise_signal(number)
 
 
-def _done(work: Callable[[Job], Result], job: Job) -> Result:
+def _done(work: Callable[[Piece], Result], job: Piece) -> Result:
     """`work` of `job` in a worker, to which the pool hands one job more than it can take back."""
     if _ended:
         raise _ended[0]
@@ -177,7 +177,7 @@ def _ray(workers: int, cluster: str, key: str) -> Iterator[Crew]:
         with joining(key, cluster):
             ray.init(logging_level=logging.ERROR, log_to_driver=False, **where)
 
-    def run(work: Callable[[Job], Result], jobs: Sequence[Job]) -> list[Result]:
+    def run(work: Callable[[Piece], Result], jobs: Sequence[Piece]) -> list[Result]:
         # Ray itself begins a task again whose worker or machine was lost.
         task: Any = ray.remote(num_cpus=1, max_retries=_ATTEMPTS - 1)(lambda job: work(job))
         tasks = [task.remote(job) for job in jobs]

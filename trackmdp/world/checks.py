@@ -10,14 +10,14 @@ import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse.csgraph import breadth_first_order
 
-from trackmdp.config.sensing import LARGEST
+from trackmdp.config.sensing import LARGEST_PRICE
 from trackmdp.errors import UserError
 from trackmdp.world.rows import pairwise_row_sums
 
 Range: TypeAlias = tuple[Callable[[npt.NDArray[np.float64]], npt.NDArray[np.bool_]], str]
 """Which of some numbers are allowed, and in words; a nan is in no range."""
 
-PRICES: Range = (lambda price: (price >= 0) & (price <= LARGEST), "a number from 0 to 1e15")
+PRICES: Range = (lambda price: (price >= 0) & (price <= LARGEST_PRICE), "a number from 0 to 1e15")
 PROBABILITIES: Range = (lambda p: (p > 0) & (p <= 1), "a probability above 0, at most 1")
 
 

@@ -123,7 +123,7 @@ _LONGEST_TEXT, _LONGEST_HEAD = 2**30, 2**16
 """Bytes of the longest .csv file, a recording of some eighty million steps, and of its first line."""
 
 
-T = TypeVar("T")
+_T = TypeVar("_T")
 
 _CSR = {"data", "indices", "indptr", "shape"}
 
@@ -236,7 +236,7 @@ def read_columns(key: str, path: str | Path) -> dict[str, Array]:
     return {name: column.astype(np.float64) for name, column in columns.items()}
 
 
-def once(read: Callable[..., T], path: str | Path, *how: Hashable) -> T:
+def once(read: Callable[..., _T], path: str | Path, *how: Hashable) -> _T:
     """`read(path, *how)`, kept until the file changes: a run is checked before its folder is made, and asks again."""
     file = Path(path)
     stamp = (file.stat().st_mtime_ns, file.stat().st_size, file.stat().st_ino) if file.is_file() else None

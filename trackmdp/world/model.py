@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from trackmdp.config.sensing import LARGEST
+from trackmdp.config.sensing import LARGEST_PRICE
 from trackmdp.config.world import MEMORIES
 from trackmdp.errors import UserError
 from trackmdp.world.checks import PRICES, PROBABILITIES, canonical_kernel, check_kernel, one_each
@@ -107,7 +107,7 @@ class Task:
         prices = one_each("cost", self.cost, count, each, PRICES)
         safe = prices.sum() if self.safe_cost is _SUM else self.safe_cost
         checked: dict[str, Any] = {"size": size, "cost": prices, "coverage": footprints}
-        checked["safe_cost"] = _price("safe_cost", safe, LARGEST * prices.size)
+        checked["safe_cost"] = _price("safe_cost", safe, LARGEST_PRICE * prices.size)
         checked["reward"] = _price("reward", self.reward)
         for name in ("detection", "safe_detection"):
             checked[name] = one_each(name, getattr(self, name), rows * columns, "cell", PROBABILITIES)
@@ -292,7 +292,7 @@ def grid_size(size: Size) -> tuple[int, int]:
     return int(pair[0]), int(pair[1])
 
 
-def _price(name: str, value: float, most: float = LARGEST) -> float:
+def _price(name: str, value: float, most: float = LARGEST_PRICE) -> float:
     if not 0 <= value <= most:
         raise UserError(f"{name}={value}: expected a number from 0 to {most:g}")
     return float(value)

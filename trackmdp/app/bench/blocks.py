@@ -17,7 +17,7 @@ from trackmdp.config.compose import compose
 from trackmdp.solvers.partition import default_halo
 from trackmdp.solvers.solution import bracketed
 from trackmdp.solvers.solve import by_blocks, run_solver
-from trackmdp.solvers.workers import Crew, Job, Result, crew
+from trackmdp.solvers.workers import Crew, Piece, Result, crew
 from trackmdp.world.model import World
 
 COSTS, T_MAX = (0.16, 0.22), (1, 2)
@@ -67,7 +67,7 @@ class _Watched:
     run: Crew
     seconds: dict[int, float] = field(default_factory=dict)
 
-    def __call__(self, work: Callable[[Job], Result], jobs: Sequence[Job]) -> list[Result]:
+    def __call__(self, work: Callable[[Piece], Result], jobs: Sequence[Piece]) -> list[Result]:
         done = self.run(_Timed(work), jobs)
         for process, seconds, _ in done:
             self.seconds[process] = max(seconds, self.seconds.get(process, 0.0))
