@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -52,6 +53,11 @@ def report(results: Results, openings: Openings) -> Report:
 
 def test_the_paper_s_worlds_are_found_by_z_and_price(results: Results) -> None:
     assert list(pairs(study(results.runs))) == list(PAIRS)
+
+
+def test_a_price_for_each_cell_is_none_of_the_paper_s(results: Results) -> None:
+    runs = [replace(run, settings={**run.settings, "cost.sensor": [0.22] * 100}) for run in results.runs]
+    assert not pairs(study(runs))
 
 
 def test_runs_are_counted_up_to_the_threshold_where_one_is_given(results: Results) -> None:

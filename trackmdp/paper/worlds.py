@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from trackmdp.reports.grouping import Study
-from trackmdp.reports.results import FinishedRun
 from trackmdp.world.kernels import Border, random_support
 from trackmdp.world.model import Array, World
 
@@ -59,15 +58,6 @@ def paper_world(kernel: Array, cost: float, t_max: int) -> World:
     return World(kernel, SIZE, cost=np.full(m, cost), safe_cost=m * cost, t_max=t_max, reward=REWARD)
 
 
-def pair_of(settings: Mapping[str, Any]) -> tuple[int, float] | None:
-    """(Z, c) of a run in one of the paper's worlds, else None."""
-    # T_max, border and seed of the kernel are not compared: the paper does not give them.
-    if any(settings.get(key) != value for key, value in _FIXED.items()):
-        return None
-    pair = settings.get("kernel.support_size"), settings.get("cost.sensor")
-    return pair if pair in PRINTED_QMDP else None  # type: ignore[return-value]
-
-
 def pairs(study: Study) -> dict[tuple[int, float], str]:
     """The paper's (Z, c) -> the label of the world that stands for it, in the order of the figures.
 
@@ -75,8 +65,12 @@ def pairs(study: Study) -> dict[tuple[int, float], str]:
     """
     found: dict[tuple[int, float], str] = {}
     for world in study.worlds:
-        runs: list[FinishedRun] = study.in_world(world)
-        pair = pair_of(runs[0].settings)
-        if pair is not None and (pair not in found or len(study.in_world(found[pair])) < len(runs)):
+        runs = study.in_world(world)
+        settings = runs[0].settings
+        pair: Any = settings.get("kernel.support_size"), settings.get("cost.sensor")
+        # T_max, border and seed of the kernel are not compared: the paper does not give them.
+        if any(settings.get(key) != value for key, value in _FIXED.items()) or pair not in [*PRINTED_QMDP]:
+            continue  # a list, as prices may be a list, which has no hash
+        if pair not in found or len(study.in_world(found[pair])) < len(runs):
             found[pair] = world
     return dict(sorted(found.items()))
