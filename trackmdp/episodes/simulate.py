@@ -72,9 +72,10 @@ class _Draws:
 
     _block: Tensor
 
-    def __init__(self, seeds: Sequence[int], draw: Callable[[int, torch.Generator], Tensor]) -> None:
+    def __init__(self, seeds: Sequence[int], draw: Callable[[int, torch.Generator], Tensor], *names: str) -> None:
         # A generator for each episode, not one for the batch: what an episode draws must not depend on how many others
         # run beside it, nor on when they end.
+        seeds = [derive(seed, *names) for seed in seeds] if names else seeds
         self.generators, self._draw = [torch.Generator().manual_seed(seed) for seed in seeds], draw
 
     def at(self, states: States) -> Tensor:
@@ -104,12 +105,10 @@ class _Batch:
         # Moves, choices and reports apart, so that two policies with one seed meet the same target.
         self._moves, self._choices, self._seen = _Draws(seeds, source.draw), None, None
         if size := actor.num_draws:
-            seeds_of_choices = [derive(seed, "policy") for seed in seeds]
-            self._choices = _Draws(seeds_of_choices, lambda count, rng: torch.rand(count, size, generator=rng))
+            self._choices = _Draws(seeds, lambda count, rng: torch.rand(count, size, generator=rng), "policy")
         if not self._reports.certain:
-            seeds_of_reports = [derive(seed, "report") for seed in seeds]
             double = torch.float64
-            self._seen = _Draws(seeds_of_reports, lambda count, rng: torch.rand(count, dtype=double, generator=rng))
+            self._seen = _Draws(seeds, lambda count, rng: torch.rand(count, dtype=double, generator=rng), "report")
         self._taken: list[dict[str, npt.NDArray[Any]]] = []
 
     def run(self) -> dict[str, npt.NDArray[Any]]:

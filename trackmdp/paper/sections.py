@@ -227,7 +227,9 @@ def bounds_table(study: Study, pairs: Mapping[tuple[int, float], str]) -> Table:
 
 def _points(study: Study, table: Table, pairs: Mapping[tuple[int, float], str], found: Sequence[Check]) -> str:
     """The headings and paragraphs of `critique.txt`, in the order of the paper, with the figures of this sweep."""
-    facts = _exit_price(table, found) | _theorem_three(found) | _hardest(study, pairs)
+    forms = ("as printed", "exact form")
+    printed, exact = (next(each for each in found if each.name == f"Theorem 3, {form}") for form in forms)
+    facts = _exit_price(table, found) | {"printed": printed, "exact": exact} | _hardest(study, pairs)
     points = ((head, text.format(**facts)) for head, text in paragraphs("trackmdp.paper", "critique.txt").items())
     return "".join(f"<h3>{html.escape(head)}</h3><p>{html.escape(body)}</p>" for head, body in points)
 
@@ -236,18 +238,8 @@ def _exit_price(table: Table, found: Sequence[Check]) -> dict[str, Any]:
     # `is True`: the last column is None where no optimum is known.
     exceeded = [f"(Z = {row[0]}, c = {row[1]:g})" for row in table.rows if row[-1] is True]
     remark = next((check.note for check in found if check.name == "the printed bound"), "")
-    return {
-        "exceeded": len(exceeded),
-        "pairs": len(table.rows),
-        "where": ", ".join(exceeded) or "none",
-        "remark": remark,
-    }
-
-
-def _theorem_three(found: Sequence[Check]) -> dict[str, Any]:
-    forms = ("as printed", "exact form")
-    printed, exact = (next(each for each in found if each.name == f"Theorem 3, {form}") for form in forms)
-    return {"printed": printed, "exact": exact}
+    where = ", ".join(exceeded) or "none"
+    return {"exceeded": len(exceeded), "pairs": len(table.rows), "where": where, "remark": remark}
 
 
 def _hardest(study: Study, pairs: Mapping[tuple[int, float], str]) -> dict[str, Any]:

@@ -50,7 +50,7 @@ def run(cfg: SolveConfig, folder: Path, world: Problem) -> float:
     bound = {name: float(each(world).mean()) for name, each in _BOUNDS.items()} if isinstance(world, World) else {}
     arrays = write_sets(folder, solution.table, value=solution.value, upper_value=solution.bound)
     write_json(folder / "solution.json", _report(cfg, solution, bound) | arrays)
-    _show(console, cfg, world, solution, bound, folder)
+    _show(console, cfg.solver.name, world, solution, bound, folder)
     found = solution.evaluation
     if isinstance(world, World) and (said := narrow_halo(world, cfg.partition, solution.upper, found)):
         console.print(f"warning: {said}")
@@ -76,10 +76,8 @@ def _report(cfg: SolveConfig, solution: Solution, bound: dict[str, float]) -> di
     }
 
 
-def _show(
-    console: Console, cfg: SolveConfig, world: Modelled, solution: Solution, bound: dict[str, float], folder: Path
-) -> None:
-    found = {cfg.solver.name: solution.evaluation}
+def _show(at: Console, name: str, world: Modelled, solution: Solution, bound: dict[str, float], folder: Path) -> None:
+    found = {name: solution.evaluation}
     # Where it senses little it is a matter of minutes on a large grid; `evaluate baseline=qmdp` values it there.
     if isinstance(world, World) and world.num_cells <= DIRECT_CELLS:
         found["Q_MDP"] = evaluate(world, qmdp.solve(world))
@@ -91,9 +89,9 @@ def _show(
     called = {"paper": "printed"}  # as reports call it
     rows += [[f"{called.get(name, name)} bound", f"{value:,.6f}", "", "", ""] for name, value in bound.items()]
     columns = ["policy", "AIHTR", "accuracy", "sensors per step", "safe per episode"]
-    console.print(table("exact values", columns, rows))
+    at.print(table("exact values", columns, rows))
     regret = max(regret_per_step(solution.upper, solution.evaluation), 0.0)
-    console.print(
+    at.print(
         f"{solution.ended}: bracket {solution.lower:,.6f} ... {solution.upper:,.6f}, {regret:.2g} per step, after "
         f"{solution.seconds:.1f} s and {solution.nodes:,} nodes; results in {folder}, sets in {sets_name(world)}"
     )
