@@ -108,12 +108,8 @@ def versions() -> dict[str, str]:
 
 def versions_apart(logged: dict[str, str]) -> str:
     """The versions in which a log's metadata differs from here, in words; empty if in none."""
-    here = versions()
-    return ", ".join(
-        f"{name} {logged.get(name, 'unknown')} (here {value})"
-        for name, value in here.items()
-        if logged.get(name) != value
-    )
+    apart = {name: here for name, here in versions().items() if logged.get(name) != here}
+    return ", ".join(f"{name} {logged.get(name, 'unknown')} (here {here})" for name, here in apart.items())
 
 
 _MOST = 10**9

@@ -302,7 +302,5 @@ def gospa(tracks: Sequence[Track], paths: Sequence[GroundTruthPath], *, c: float
     manager.add_data({"tracks": tracks, "truths": paths})
     (metric,) = manager.generate_metrics()[generator.generator_name].values()
     steps = metric.value if isinstance(metric.value, list) else [metric]
-    return {
-        name: float(np.mean([step.value[name] for step in steps]))
-        for name in ("distance", "localisation", "missed", "false")
-    }
+    names = ("distance", "localisation", "missed", "false")
+    return {name: float(np.mean([step.value[name] for step in steps])) for name in names}

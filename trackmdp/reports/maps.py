@@ -168,10 +168,8 @@ def binned(values: Array, size: _Size) -> Array:
 
 def _said(layers: _Layers, size: _Size) -> str:
     """Mean and range of each layer, over cells, and what is drawn."""
-    text = "; ".join(
-        f"{label}: mean {values.mean():.2f}, from {values.min():.2f} to {values.max():.2f}"
-        for label, values in layers.items()
-    )
+    said = [f"{label}: mean {v.mean():.2f}, from {v.min():.2f} to {v.max():.2f}" for label, v in layers.items()]
+    text = "; ".join(said)
     side = _side(size)
     return f"{text}." if side == 1 else f"{text}. Drawn are means over tiles of {side} x {side} cells."
 

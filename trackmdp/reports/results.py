@@ -176,16 +176,14 @@ def save_results(results: Results, folder: Path) -> None:
     # Most options are the same in all runs: they go to the manifest once, and only the others are columns.
     common = _common(results.runs)
     varied = sorted({key for run in results.runs for key in run.settings if key not in common[run.algo]})
-    rows = [
-        [
-            json.dumps(run.name) if run.name.startswith(_FORMULA) else run.name,
-            # An empty field says that the run has no such option; an option that is null is written as `null`.
-            *(_cell(run.settings[key]) if key in run.settings else "" for key in varied),
-            # `repr` gives the shortest text that is read back as the same float.
-            *("" if run.figures[key] is None else repr(run.figures[key]) for key in FIGURES),
-        ]
-        for run in results.runs
-    ]
+    rows = []
+    for run in results.runs:
+        name = json.dumps(run.name) if run.name.startswith(_FORMULA) else run.name
+        # An empty field says that the run has no such option; an option that is null is written as `null`.
+        own = (_cell(run.settings[key]) if key in run.settings else "" for key in varied)
+        # `repr` gives the shortest text that is read back as the same float.
+        figures = ("" if run.figures[key] is None else repr(run.figures[key]) for key in FIGURES)
+        rows.append([name, *own, *figures])
     write_text(folder / "runs.csv", csv_text(["run", *varied, *FIGURES], rows))
     points = [
         # Curves are drawn, not computed with: 7 digits of the AIHTR are more than a figure shows.
@@ -309,11 +307,10 @@ def unpack_policies(content: bytes) -> dict[str, Sensed]:
     stored = {"shares": np.ones(len(stored["indices"])), "averaged": np.zeros(len(names))} | stored
     entries = shapes[:, 2]
     parts = _apart(stored, indices=entries, shares=entries, indptr=shapes[:, 0] + 1, values=shapes[:, 1])
+    rows = zip(names, shapes.tolist(), stored["averaged"], parts, strict=False)
     return {
         str(name): Sensed(whole_csr(share.astype(float if mean else bool), cells, pointer, tuple(shape[:2])), value)
-        for name, shape, mean, (cells, share, pointer, value) in zip(
-            names, shapes.tolist(), stored["averaged"], parts, strict=False
-        )
+        for name, shape, mean, (cells, share, pointer, value) in rows
     }
 
 

@@ -107,11 +107,8 @@ def _table(size: int, seed: int, *, reach: int, successors: int, far: int = 0, j
 
 def _chosen(cfg: BenchmarkConfig, size: int, t_max: int) -> dict[str, Maker]:
     """Those whose names hold one of `cfg.worlds`; all, where there is none of these."""
-    return {
-        name: make
-        for name, make in worlds(size, t_max).items()
-        if not cfg.worlds or any(word in name for word in cfg.worlds)
-    }
+    made = worlds(size, t_max)
+    return {name: made[name] for name in made if not cfg.worlds or any(word in name for word in cfg.worlds)}
 
 
 def regret(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator[dict[str, Any]]:

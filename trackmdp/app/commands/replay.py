@@ -105,25 +105,18 @@ def _kernel_difference(reader: EpisodeReader) -> str | None:
 
 
 def _list(console: Console, reader: EpisodeReader) -> None:
-    steps = sum(row["length"] for row in reader.rows)
+    total = sum(row["length"] for row in reader.rows)
     (rows, columns), seed = reader.run.size, reader.run.said.get("seed", "")
     grid = f"{rows}x{columns} grid"
-    console.print(f"{len(reader)} episodes, {steps:,} steps on a {grid}, T_max {reader.run.t_max}, seed {seed}")
+    console.print(f"{len(reader)} episodes, {total:,} steps on a {grid}, T_max {reader.run.t_max}, seed {seed}")
     labels = [reader.policies[row["policy"]].get("label", "") for row in reader.rows]
     one = len(set(labels)) == 1
     if one:
         console.print(f"policy: {labels[0]}")
-    entries = [
-        [
-            str(row["episode"]),
-            *([] if one else [label]),
-            str(row["length"]),
-            f"{row['return']:,.2f}",
-            str(row["detections"]),
-            str(row["forced"]),
-            "exited" if row["terminated"] else "truncated",
-        ]
-        for label, row in zip(labels, reader.rows, strict=True)
-    ]
+    entries = []
+    for label, row in zip(labels, reader.rows, strict=True):
+        number, steps, located, forced = (str(row[name]) for name in ("episode", "length", "detections", "forced"))
+        end = "exited" if row["terminated"] else "truncated"
+        entries.append([number, *([] if one else [label]), steps, f"{row['return']:,.2f}", located, forced, end])
     names = ["episode", *([] if one else ["policy"]), "steps", "return", "located", "forced", "end"]
     console.print(table(str(reader.file), names, entries))
