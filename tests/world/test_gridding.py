@@ -178,6 +178,11 @@ AT_SEA = seen((0, 0, 1, 1), geographic=True)
         (seen((0, 0, 1, 1), (0, 5, 40, 1), geographic=True), {}, "here: from 1.4 to 39.6 degrees of longitude, at "),
         (seen((0, 0, 1, 88), geographic=True), {}, "here: from 1.0 to 1.0 degrees of longitude, at latitude 88.0"),
         (seen((0, 0, 5, 5), (0, 9e9, 5, 5)), {"max_gap": 1e10}, "kernel.step=5: makes 1.8e+09 steps of it, expected "),
+        (
+            seen((0, 0, 5, 5), (0, 1, 5, 5)),
+            {"step": 5e-324},
+            "kernel.step=4.94066e-324: makes inf steps of it, expected ",
+        ),
         (seen((0, 0, 5, 5), (0, 5, 7, 5)), {"cell": 5e-324}, "here: no track of at least 1 cells"),
     ],
 )

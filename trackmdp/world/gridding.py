@@ -148,7 +148,8 @@ def _sampled(positions: Positions, grid: Gridding) -> tuple[np.ndarray, Array, A
     start = np.flatnonzero(_breaks(positions, grid))
     end = np.concatenate([start[1:], [len(positions.time)]]) - 1
     length = positions.time[end] - positions.time[start]
-    whole = np.floor(length / grid.step + 1e-6) + 1
+    with np.errstate(over="ignore"):  # inf is too many, and refused as such
+        whole = np.floor(length / grid.step + 1e-6) + 1
     if whole.sum() > _MOST:
         raise UserError(f"kernel.step={grid.step:g}: makes {whole.sum():.3g} steps of it, expected at most {_MOST:,}")
     count = whole.astype(np.int64)
