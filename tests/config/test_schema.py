@@ -147,6 +147,7 @@ def test_kernel_seed_follows_the_support_size() -> None:
 
 RULES = [
     ("train", "kernel.support_size=10", "kernel.support_size=10: expected an integer from 1 to 9"),
+    ("train", "grid.window=2147483648", "grid.window=2147483648: expected an integer from 0 to 1024 or null (cells)"),
     ("train", "kernel.low_probability=0.995", "kernel.low_probability=0.995: expected less than"),
     ("train", "cost.sensor=[1,2,3]", "cost.sensor: 3 values, expected one number or 100"),
     ("train", "cost.sensor=-0.1", "cost.sensor=-0.1: expected a number from 0 to 1e15"),

@@ -28,6 +28,7 @@ class GridConfig(NodeConfig):
         "window are never seen; null = all",
         unit="cells",
         ge=0,
+        le=1024,
     )
 
     @property
