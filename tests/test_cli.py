@@ -25,6 +25,18 @@ pytestmark = pytest.mark.usefixtures("empty_folder")
 LONG = "a" * 300  # longer than a name may be
 
 
+@pytest.mark.parametrize(("given", "found"), [(None, "1"), ("3", "3")])
+def test_exact_figures_do_not_depend_on_the_number_of_cores(
+    given: str | None, found: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """NumPy reads the variable when it is imported; as soon as it shares a sum out, the sum rounds differently."""
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", given or "")
+    if given is None:
+        monkeypatch.delenv("OPENBLAS_NUM_THREADS")
+    assert main(["--version"]) == 0
+    assert os.environ["OPENBLAS_NUM_THREADS"] == found
+
+
 @pytest.mark.parametrize("group", [group for group in GROUPS if "/" not in group])
 def test_unknown_choices_are_refused_naming_the_known_ones(group: str, capsys: pytest.CaptureFixture[str]) -> None:
     command = next(command for command, root in ROOTS.items() if group in options(root))

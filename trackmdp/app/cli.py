@@ -37,8 +37,11 @@ _OF_FILES = {
 def main(argv: list[str] | None = None) -> int:
     """Run one command; returns the exit status: 0, or one of `trackmdp.errors`, or 128 + the signal that ended it."""
     words = sys.argv[1:] if argv is None else argv
-    # Set before TorchRL is imported, which reads it then.
+    # Set before TorchRL and NumPy are imported, which read them then.
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL reports every buffer it makes
+    # Shared out to more threads, by default to all cores, sums round differently: the last digits of exact figures
+    # would depend on the machine. `threads` is about torch alone.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         status = _dispatch(words)
         # Now, not at the interpreter's end: there a closed pipe could no longer be answered by an exit status.
