@@ -36,8 +36,7 @@ def test_weights_are_the_inverse_of_the_probability_of_being_known() -> None:
 
 def test_moves_are_drawn_in_proportion_to_their_weights() -> None:
     """Out of cell 0: 4 times to 0, 2 to 1 (each counts 2), 1 to 2 (counts 4), 4 exits: all four alike."""
-    rng, weights = torch.Generator().manual_seed(0), report_weights(TASK, torch.device("cpu"))
-    buffer = MoveBuffer(3, 100, rng, weights)
+    buffer = MoveBuffer(TASK, 100, torch.Generator().manual_seed(0))
     start, end = [0] * 11 + [2], [0] * 4 + [1] * 2 + [2] + [3] * 4 + [2]
     buffer.load_state_dict({"moves": torch.tensor([start, end])})
     first, second = buffer.paths(12_000, 1)
@@ -48,8 +47,7 @@ def test_moves_are_drawn_in_proportion_to_their_weights() -> None:
 
 def test_segments_count_by_all_their_reports() -> None:
     """From 0: 0 1 1 (2 · 2), 0 2 1 (4 · 2), 0 1 M (2): 4 to 8 to 2 of 14."""
-    rng, weights = torch.Generator().manual_seed(0), report_weights(TASK, torch.device("cpu"))
-    buffer = SegmentBuffer(3, 2, 100, rng, weights)
+    buffer = SegmentBuffer(TASK, 2, 100, torch.Generator().manual_seed(0))
     cells = torch.tensor([[0, 1, 1], [0, 2, 1], [0, 1, 3]])
     steps = torch.stack([cells[:, :-1], cells[:, 1:], 1 * (cells[:, 1:] == 3)])
     buffer.load_state_dict({"judge": None, "paths": {"steps": steps}})

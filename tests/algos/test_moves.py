@@ -13,6 +13,7 @@ from trackmdp.policies.policy import Policy
 from trackmdp.world.model import World
 
 M = 9
+TASK = small_world()
 
 
 def batch(start: list[int], end: list[int], **changed: list[bool]) -> TensorDict:
@@ -43,7 +44,7 @@ def batch(start: list[int], end: list[int], **changed: list[bool]) -> TensorDict
 
 
 def filled(start: list[int], end: list[int], *, capacity: int = 100, seed: int = 0) -> MoveBuffer:
-    buffer = MoveBuffer(M, capacity, torch.Generator().manual_seed(seed))
+    buffer = MoveBuffer(TASK, capacity, torch.Generator().manual_seed(seed))
     for before, after in zip(start, end, strict=True):
         buffer.extend(batch([before], [after], exited=[after == M]))
     return buffer
@@ -150,7 +151,7 @@ def test_paths_are_made_of_moves_seen(moves: int, count: int, steps: int, seed: 
 
 
 def test_a_saved_buffer_draws_the_same_paths() -> None:
-    buffer, other = filled([0, 0, 1], [1, 2, 0], seed=3), MoveBuffer(M, 100, torch.Generator().manual_seed(3))
+    buffer, other = filled([0, 0, 1], [1, 2, 0], seed=3), MoveBuffer(TASK, 100, torch.Generator().manual_seed(3))
     other.load_state_dict(buffer.state_dict())
     assert torch.equal(buffer.paths(50, 4), other.paths(50, 4))
 
@@ -158,7 +159,7 @@ def test_a_saved_buffer_draws_the_same_paths() -> None:
 def test_however_moves_come_they_are_kept_in_order() -> None:
     rng = torch.Generator().manual_seed(0)
     start, end = (torch.randint(M, (60,), generator=rng).tolist() for _ in range(2))
-    one = MoveBuffer(M, 50, torch.Generator())
+    one = MoveBuffer(TASK, 50, torch.Generator())
     for size, begin in ((1, 0), (2, 1), (40, 3), (17, 43)):
         one.extend(batch(start[begin : begin + size], end[begin : begin + size]))
         assert len(one) == min(begin + size, 50)

@@ -24,7 +24,7 @@ SETTING = recorded(drawn(small_world(exit_probability=0.2).kernel, 300))
 
 
 def buffer(steps: int = 3, capacity: int = 10_000, seed: int = 0) -> SegmentBuffer:
-    return SegmentBuffer(M, steps, capacity, torch.Generator().manual_seed(seed))
+    return SegmentBuffer(SETTING, steps, capacity, torch.Generator().manual_seed(seed))
 
 
 def segments(made: SegmentBuffer) -> list[tuple[int, ...]]:
@@ -71,7 +71,7 @@ def test_segments_of_keys_are_those_of_the_environment(memory: str) -> None:
     """With all sensors on, step by step; a part of a batch makes the same."""
     world = headings(memory=memory)
     batch = collect(world, Policy.all_on(world), 8, 30)
-    made = SegmentBuffer(9, 2, 10_000, torch.Generator(), keys=world.keys)
+    made = SegmentBuffer(world, 2, 10_000, torch.Generator())
     for part in batch.split(7, dim=1):
         made.extend(part)
     key, after, done = batch["key"], batch["next", "key"], batch["next", "done"].squeeze(-1)
@@ -149,7 +149,7 @@ def test_a_recording_has_one_name_however_often_it_is_followed() -> None:
 
 def test_what_judges_is_not_learned_from() -> None:
     batch = collect(SETTING, Policy.all_on(SETTING), 16, 40)
-    whole, learned = buffer(), SegmentBuffer(M, 3, 10_000, torch.Generator().manual_seed(0), judge=1)
+    whole, learned = buffer(), SegmentBuffer(SETTING, 3, 10_000, torch.Generator().manual_seed(0), judge=1)
     for made in (whole, learned):
         made.extend(batch)
     left, judging = parted(learned.tracks(), 1)

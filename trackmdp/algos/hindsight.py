@@ -24,7 +24,7 @@ from trackmdp.algos.common import Averages, Checkpointed, set_learning_rate
 from trackmdp.algos.exchanged import counted_world, exchanged_sets
 from trackmdp.algos.hindsight_loss import HindsightLoss
 from trackmdp.algos.learned_kernel import InferredMoves
-from trackmdp.algos.moves import MoveBuffer, report_weights
+from trackmdp.algos.moves import MoveBuffer
 from trackmdp.algos.replay import Replay
 from trackmdp.algos.segments import SegmentBuffer
 from trackmdp.config.per_sensor import PerSensorConfig
@@ -221,10 +221,9 @@ def _buffer(task: Task, capacity: int, rng: torch.Generator, judge: int | None) 
             return InferredMoves(task, rng)
         cell = int(task.coverage.degree.argmin())
         raise UserError(f"sensor: none covers cell {cell}, expected one for each cell with kernel.markov=false")
-    weights = report_weights(task, rng.device)
     if task.markov and not task.order:
-        return MoveBuffer(task.num_keys, capacity, rng, weights)
-    return SegmentBuffer(task.num_cells, Replay.steps(task.keys), capacity, rng, weights, judge, task.keys)
+        return MoveBuffer(task, capacity, rng)
+    return SegmentBuffer(task, Replay.steps(task.keys), capacity, rng, judge)
 
 
 def _classes(task: Task, cfg: PerSensorConfig) -> IndexArray | None:

@@ -213,7 +213,7 @@ class InferredMoves(MoveBuffer):
     """
 
     def __init__(self, task: Task, generator: torch.Generator) -> None:
-        super().__init__(task.num_cells, 0, generator)
+        super().__init__(task, 0, generator)
         self._task, self._estimate = task, KernelEstimate(task.size, weight=1.0, exit_weight=1.0)
         self._inferred: tuple[Tensor, Tensor, Tensor] | None = None
 

@@ -114,18 +114,16 @@ class MoveBuffer:
     depends on the cell alone. So a path that is rare as a whole is still drawn as often as it should be.
 
     Args:
-        num_cells: M.
+        task: its cells, or keys, and their `report_weights`, by which a move to each counts.
         capacity: moves kept; the oldest go first.
         generator: draws the paths; the buffer lives on its device.
-        weights: `[M + 1]`, how much a move to each cell counts; None: all alike. See `report_weights`.
     """
 
-    def __init__(
-        self, num_cells: int, capacity: int, generator: torch.Generator, weights: Tensor | None = None
-    ) -> None:
-        self.num_cells, self._capacity, self._generator, self._weights = num_cells, capacity, generator, weights
+    def __init__(self, task: Task, capacity: int, generator: torch.Generator) -> None:
+        self.num_cells, self._capacity, self._generator = task.num_keys, capacity, generator
+        self._weights = report_weights(task, generator.device)
         # Oldest first; those of the last batches wait to be appended, which copies all that is there.
-        self._moves = torch.empty(2, 0, dtype=cell_dtype(num_cells), device=generator.device)
+        self._moves = torch.empty(2, 0, dtype=cell_dtype(self.num_cells), device=generator.device)
         self._fresh: list[Tensor] = []
         self._index: tuple[Tensor, CellIndex] | None = None
 

@@ -10,9 +10,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.functional import pad
 
-from trackmdp.algos.moves import CellIndex, cell_dtype, sensed_steps, stratified_starts
+from trackmdp.algos.moves import CellIndex, cell_dtype, report_weights, sensed_steps, stratified_starts
 from trackmdp.solvers.path_exchange import parted
-from trackmdp.world.memory import KeySpace
+from trackmdp.world.model import Task
 from trackmdp.world.tracks import Tracks, ends_of
 
 _TELLING = 8
@@ -112,31 +112,21 @@ class SegmentBuffer:
     step that is followed by enough others, or by the exit; which these are says nothing about where the target went.
 
     Args:
-        num_cells: M.
+        task: its cells, and their `report_weights`, by which each step to a cell multiplies what a segment counts.
+            Where a policy remembers detections, segments are of the keys with all sensors on.
         steps: steps of a segment.
         capacity: sensed steps kept; the oldest go first.
         generator: draws the paths; the index lives on its device.
-        weights: `[M + 1]`, by which each step to a cell multiplies what a segment counts; None: all count alike. See
-            `report_weights`.
         judge: seed by which recordings are kept from the segments, to judge what is learned by; None: none is.
-        keys: of policies that remember detections, to which segments are then of the keys with all sensors on; None, or
-            with a memory of the cell alone, they are of cells.
     """
 
     def __init__(
-        self,
-        num_cells: int,
-        steps: int,
-        capacity: int,
-        generator: torch.Generator,
-        weights: Tensor | None = None,
-        judge: int | None = None,
-        keys: KeySpace | None = None,
+        self, task: Task, steps: int, capacity: int, generator: torch.Generator, judge: int | None = None
     ) -> None:
-        self.num_cells, self.steps, self._generator, self._weights = num_cells, steps, generator, weights
-        self.judge, self._keys = judge, keys if keys and keys.order else None
-        self._outside = self._keys.num_keys if self._keys else num_cells
-        self._paths = SensedPaths(num_cells, capacity)
+        self.num_cells, self.steps, self.judge, self._generator = task.num_cells, steps, judge, generator
+        self._weights, self._keys = report_weights(task, generator.device), task.keys if task.order else None
+        self._outside = self._keys.num_keys if self._keys else task.num_cells
+        self._paths = SensedPaths(task.num_cells, capacity)
         self._index: tuple[Tensor, CellIndex] | None = None
 
     def __len__(self) -> int:

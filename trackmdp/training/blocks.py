@@ -31,7 +31,7 @@ from trackmdp.solvers.partition import Block, blocks, default_halo, narrow_halo,
 from trackmdp.solvers.workers import crew
 from trackmdp.training.callbacks import Callback, Learning, Position
 from trackmdp.training.display import make_console
-from trackmdp.training.evaluator import Evaluator, Score, make_evaluator
+from trackmdp.training.evaluator import Score, make_evaluator
 from trackmdp.training.folders import SUMMARY, finished, read_summary
 from trackmdp.training.inputs import CLASSES, short, write_inputs
 from trackmdp.training.lock import locked
@@ -61,34 +61,17 @@ def make_trainer(
         return Trainer(problem, config, folder=folder, callbacks=callbacks, console=console)
     if callbacks:
         raise UserError("callbacks: expected none with partition.block, whose blocks may learn in other processes")
-    assert isinstance(problem, World)  # the config refuses all others
-    return BlockTrainer(problem, config, folder=folder, console=console)
+    return BlockTrainer(problem, config, folder, console)
 
 
-class BlockTrainer:
+class BlockTrainer(Learning):
     """A training run by blocks, begun anew or resumed.
 
-    Args:
-        problem: the world. Learners are given the tasks of their blocks alone.
-        config: the checked config of `trackmdp train`.
-        folder: where the whole is written, and each block's run to `blocks/NUMBER`; None to keep nothing.
-        console: where progress is shown; None for nowhere.
+    Learners are given the tasks of their blocks alone. Each block's run is written to `blocks/NUMBER` in the folder.
 
     Attributes:
         position: after `run`, the frames of all blocks and what they have earned there.
     """
-
-    problem: Problem
-    evaluator: Evaluator
-
-    def __init__(
-        self, problem: World, config: TrainConfig, *, folder: Path | None = None, console: Console | None = None
-    ) -> None:
-        self.problem = self._world = problem
-        self.config, self.folder = config, folder
-        self.console = console or Console(quiet=True)
-        self.callbacks: list[Callback] = []
-        self.start, self.position = Position(), Position()
 
     def policy(self) -> Policy:
         """The policy put together from all blocks, once `run` has ended."""
@@ -100,7 +83,8 @@ class BlockTrainer:
         Raises:
             UserError, Preempted, RunError: as `Trainer.run` of a block.
         """
-        world, cfg, began = self._world, self.config.partition, time.monotonic()
+        world, cfg, began = self.problem, self.config.partition, time.monotonic()
+        assert isinstance(world, World)  # the config refuses all others
         halo, side = default_halo(world) if cfg.halo is None else cfg.halo, cfg.block
         assert side is not None
         parts = blocks(world.size, side, halo)

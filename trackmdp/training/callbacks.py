@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
 
 if TYPE_CHECKING:  # the display of a planner is no reason to load torch
     import torch
-    from rich.console import Console
     from tensordict import TensorDictBase
     from torchrl.collectors import BaseCollector
 
@@ -33,26 +34,40 @@ class Position:
     reward: float = 0.0
 
 
-class Learning(Protocol):
-    """A run that learns, of the whole grid or by blocks; it is described there, in `trainer` and `blocks`."""
+class Learning:
+    """A run that learns, of the whole grid or by blocks.
 
-    problem: Problem
-    config: TrainConfig
-    folder: Path | None
-    console: Console
+    Args:
+        problem: the world, or recorded tracks. A learner is given its task alone.
+        config: the checked config of `trackmdp train`.
+        folder: what the run writes to; None to write nothing.
+        console: where progress is shown; None for nowhere.
+
+    Attributes:
+        evaluator: gives figures of policies, and upper bounds. From the start of `run` on.
+        callbacks: what is told of the run.
+        start: where an earlier process left the run.
+        position: how far the run is.
+    """
+
     evaluator: Evaluator
-    callbacks: list[Callback]
-    start: Position
-    position: Position
+
+    def __init__(self, problem: Problem, config: TrainConfig, folder: Path | None, console: Console | None) -> None:
+        self.problem, self.config, self.folder = problem, config, folder
+        self.console = console or Console(quiet=True)
+        self.callbacks: list[Callback] = []
+        self.start, self.position = Position(), Position()
 
     def run(self) -> Score:
         """Learn to the end; the score of the last policy."""
+        raise NotImplementedError
 
     def policy(self) -> Policy:
         """The policy as it is now."""
+        raise NotImplementedError
 
 
-class Training(Learning, Protocol):
+class Training(Learning):
     """What a callback may read of the run: the trainer, `trackmdp.training.trainer.Trainer`, which describes each."""
 
     device: torch.device
@@ -60,14 +75,16 @@ class Training(Learning, Protocol):
     collector: BaseCollector
     collecting: float
     score: Score
-    error: BaseException | None
+    error: BaseException | None = None
 
     @property
     def iterations(self) -> int:
         """Iterations of the whole run."""
+        return self.algorithm.iterations
 
     def due(self, every: int) -> bool:
         """Whether this iteration is a multiple of `every`, or the last one."""
+        return self.position.iteration == self.iterations or self.position.iteration % every == 0
 
 
 class Callback:

@@ -20,7 +20,7 @@ from trackmdp.errors import Preempted, RunError
 from trackmdp.policies.policy import Policy, actor_table
 from trackmdp.seeding import seed_global
 from trackmdp.signals import Signals, Watch
-from trackmdp.training.callbacks import Callback, Position, Row
+from trackmdp.training.callbacks import Callback, Position, Row, Training
 from trackmdp.training.collect import make_collector
 from trackmdp.training.display import Display
 from trackmdp.training.evaluator import Score, make_evaluator, while_collecting
@@ -32,15 +32,15 @@ from trackmdp.untrusted import decoded
 from trackmdp.world.tracks import Problem
 
 
-class Trainer:
+class Trainer(Training):
     """One training run, begun anew or resumed from a checkpoint in its folder.
 
     Args:
-        problem: the world, or recorded tracks. The learner is given its task alone.
-        config: the checked config of `trackmdp train`.
+        problem: see `Learning`, as for `config` and `console`.
+        config: see there.
         folder: where inputs, logs and checkpoints are written; None to write nothing.
         callbacks: are called after the logs that the config names, before the checkpoints.
-        console: where progress is shown; None for nowhere.
+        console: see there.
 
     Attributes:
         algorithm: the learner; its `actor` is evaluated. From the start of `run` on, as the following ones.
@@ -64,8 +64,7 @@ class Trainer:
         callbacks: Sequence[Callback] = (),
         console: Console | None = None,
     ) -> None:
-        self.problem, self.config, self.folder = problem, config, folder
-        self.console = console or Console(quiet=True)
+        super().__init__(problem, config, folder, console)
         self.device = make_device(config.device)
         self.callbacks = [*callbacks, Display(self.console, f"{config.algo.name} seed {config.seed}")]
         if folder is not None:
@@ -73,18 +72,7 @@ class Trainer:
             # so that they must have written this iteration's row before it is saved; the display shows it afterwards.
             self.callbacks[-1:-1] = [Checkpoints(config.checkpoint, folder / "checkpoints")]
             self.callbacks[:0] = make_loggers(config, folder)
-        self.start, self.position = Position(), Position()
-        self.error: BaseException | None = None
         self.console.print(check_memory(config, problem, self.device))
-
-    @property
-    def iterations(self) -> int:
-        """Iterations of the whole run."""
-        return self.algorithm.iterations
-
-    def due(self, every: int) -> bool:
-        """Whether this iteration is a multiple of `every`, or the last one."""
-        return self.position.iteration == self.iterations or self.position.iteration % every == 0
 
     def policy(self) -> Policy:
         """The policy as it is now; asking for it does not disturb the run."""
