@@ -173,19 +173,9 @@ def _lines(size: tuple[int, int]) -> list[dict[str, Any]]:
     count = -(-max(size) // side)
     # from the first to the last place that the square has along either side
     corners = (np.linspace([0, 0], np.array(size) - side, count).round() + side / 2).tolist()
-    return [
-        {
-            "layerId": "foxglove.Grid",
-            "visible": True,
-            "frameId": "grid",
-            "size": side,
-            "divisions": side,
-            "lineWidth": 1,
-            "color": "#80808080",
-            "position": [x, y, 0.005],
-        }
-        for y, x in corners
-    ]
+    same = {"layerId": "foxglove.Grid", "visible": True, "frameId": "grid", "size": side, "divisions": side}
+    same |= {"lineWidth": 1, "color": "#80808080"}
+    return [same | {"position": [x, y, 0.005]} for y, x in corners]
 
 
 def write_layout(file: Path, size: tuple[int, int]) -> None:

@@ -49,17 +49,15 @@ def tick_of(log_time: int) -> int:
 _FIELDS = json.loads(files("trackmdp.episodes").joinpath("schemas.json").read_text(encoding="utf-8"))
 """Name of a schema -> its properties, in the order in which messages have them."""
 
+_GRID, _ROWS = "foxglove.Grid", "; the first row is the lowest"
 _TOPICS = {
     "/step": ("trackmdp.Step", "One step: what was known and chosen before the move, what came of it after"),
     "/grid": (
         "foxglove.Grid",
-        "belief and policy of every cell, of large grids of the part where they are not 0; the first row is the lowest",
+        f"belief and policy of every cell, of large grids of the part where they are not 0{_ROWS}",
     ),
-    "/active": (
-        "foxglove.Grid",
-        "the cells sensed, in the smallest rectangle around them; the first row is the lowest",
-    ),
-    "/target": ("foxglove.Grid", "the true cell of the target; the first row is the lowest"),
+    "/active": (_GRID, f"the cells sensed, in the smallest rectangle around them{_ROWS}"),
+    "/target": (_GRID, f"the true cell of the target{_ROWS}"),
     "/part": ("foxglove.FrameTransform", "the middle of the part of a large grid that the target is in"),
     "/episode": ("trackmdp.Episode", "One episode, at the time of its last step"),
 }

@@ -51,13 +51,10 @@ def recorded_page(
     shares = {name: each.watched / max(each.totals[:, 1].sum(), 1) for name, each in replayed.items()}
     most = max(float(share.max()) for share in shares.values())
     maps = [_figure(_recording(problem), "The held-out tracks, on the cells they visit (stronger: more often).")]
-    maps += [
-        _figure(
-            _svg(problem.size, _shaded(problem, share / (most or 1.0))),
-            f"{names[name]}: share of steps in which a cell is sensed, at most {share.max():.1%}; same shades in all.",
-        )
-        for name, share in shares.items()
-    ]
+    for name, share in shares.items():
+        about_it = f"share of steps in which a cell is sensed, at most {share.max():.1%}; same shades in all."
+        drawing = _svg(problem.size, _shaded(problem, share / (most or 1.0)))
+        maps.append(_figure(drawing, f"{names[name]}: {about_it}"))
     chosen = {name: max(each, key=lambda one: len(np.unique(one.target[:_STEPS]))) for name, each in episodes.items()}
     part = _part(problem, chosen.values())
     strips = [f"<h3>{html.escape(names[name])}</h3>{_strip(problem, each, part)}" for name, each in chosen.items()]

@@ -28,15 +28,8 @@ Cell: TypeAlias = "float | int | str | bool | None"
 
 LONG = 60
 """A cell of more characters than this may be broken over lines."""
-_LATEX = {
-    "\\": r"\textbackslash{}",
-    "{": r"\{",
-    "}": r"\}",
-    "$": r"\$",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-}
-_LATEX |= {"&": r"\&", "%": r"\%", "#": r"\#", "_": r"\_", "≤": r"$\le$", "±": r"$\pm$", "–": "--", "²": "$^2$"}
+_LATEX = {letter: f"\\{letter}" for letter in "{}$&%#_"} | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}"}
+_LATEX |= {"^": r"\textasciicircum{}", "≤": r"$\le$", "±": r"$\pm$", "–": "--", "²": "$^2$"}
 
 
 @dataclass(frozen=True)
