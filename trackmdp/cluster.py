@@ -30,8 +30,8 @@ def joining(key: str, address: str | None) -> Iterator[None]:
         with handled(signal.getsignal(signal.SIGTERM), signal.SIGTERM):
             yield
     except (ConnectionError, ValueError, RuntimeError) as error:  # RuntimeError: of another version of Ray
-        reason = " ".join(str(error).split())
-        raise UserError(f"{key}={address}: expected a Ray cluster ({reason})") from error
+        given, reason = "null" if address is None else address, " ".join(str(error).split())
+        raise UserError(f"{key}={given}: expected a Ray cluster ({reason})") from error
 
 
 def _answers(address: str | None) -> None:
