@@ -12,7 +12,7 @@ from tests.solvers.worlds import paper_world, tiny_worlds
 from trackmdp.paper import theorems, worlds
 from trackmdp.paper.theorems import Check
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers import bounds, clocked, optimal, qmdp
+from trackmdp.solvers import bounds, optimal, qmdp
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.solution import Solution
 from trackmdp.world.kernels import random_walk
@@ -83,7 +83,7 @@ def test_the_remark_on_worlds_where_qmdp_is_optimal() -> None:
 def test_the_printed_bound_is_exceeded() -> None:
     (row,) = [row for row in theorems.check_remarks(1e-9) if row.name == "the printed bound"]
     world = worlds.paper_world(worlds.paper_kernel(5, 5, "inside"), 0.16, 5)
-    attained = evaluate(world, clocked.solve(world)).aihtr
+    attained = evaluate(world, qmdp.clocked_policy(world)).aihtr
     assert attained > bounds.paper(world).mean() + 0.5
     assert attained <= bounds.valid(world).mean()
     assert not row.holds

@@ -15,7 +15,7 @@ from tests.helpers import train_config
 from trackmdp.config import PaperCostConfig, TrainConfig
 from trackmdp.config.tree import config_digest, config_text
 from trackmdp.policies.policy import Policy
-from trackmdp.solvers import clocked
+from trackmdp.solvers import qmdp
 from trackmdp.training.evaluator import ExactEvaluator, figures
 from trackmdp.training.folders import write_summary
 from trackmdp.world.make import build_world
@@ -44,7 +44,7 @@ def write_run(
     cfg.cost.sensor, cfg.seed = cost, seed
     world = build_world(cfg)
     evaluator = ExactEvaluator(world)
-    chains = clocked.solve(world).dense()
+    chains = qmdp.clocked_policy(world).dense()
     rng = np.random.default_rng(cfg.seed)
     chains.flat[rng.choice(chains.size, wrong, replace=False)] ^= True
     score = evaluator.score(Policy.from_dense(world, chains))

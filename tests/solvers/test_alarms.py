@@ -15,7 +15,7 @@ from trackmdp.app.cli import main
 from trackmdp.episodes.filtered import _declared, _posterior, simulate_filter
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers import bounds, clocked
+from trackmdp.solvers import bounds, qmdp
 from trackmdp.solvers.alarms import believed
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.world.make import make_world
@@ -123,7 +123,7 @@ def test_the_bound_holds_for_the_best_trees_of_reports(seed: int, t_max: int) ->
 def test_the_filter_without_false_alarms_is_the_clocked_policy() -> None:
     """Then a report is certain, and what is left of the belief after a miss is what the policy takes it for."""
     world = replace(small_world(4, exit_probability=0.05), detection=np.full(16, 0.9))
-    exact, played = evaluate(world, clocked.solve(world)), simulate_filter(world, 0.0, 4000)
+    exact, played = evaluate(world, qmdp.clocked_policy(world)), simulate_filter(world, 0.0, 4000)
     error = played.totals[:, 0].std() / 4000**0.5
     assert abs(played.totals[:, 0].mean() - exact.aihtr) <= 3 * error
     found = played.intervals(np.arange(4000))
@@ -157,7 +157,7 @@ def test_weighing_reports_is_no_worse_than_believing_them() -> None:
     given = make_world("random_support", size=4, support_size=5, cost=0.16, t_max=1, seed=100)
     world = World.of(given, given.kernel, detection=np.full(16, 0.95))
     played = simulate_filter(world, 0.05, 1000).totals[:, 0]
-    exact = evaluate(world, clocked.solve(world), false_alarm=0.05).aihtr
+    exact = evaluate(world, qmdp.clocked_policy(world), false_alarm=0.05).aihtr
     assert played.mean() - exact > 2 * played.std() / 1000**0.5
 
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 
 from tests.solvers.worlds import all_plans, paper_world, renewal, tiny_worlds
-from trackmdp.solvers import clocked, lookahead, optimal, qmdp
+from trackmdp.solvers import lookahead, optimal, qmdp
 from trackmdp.solvers.bounds import clocked_table
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.world.model import World
@@ -44,7 +44,7 @@ def test_fcr_takes_no_notice_of_misses_and_qmdp_does() -> None:
 @given(tiny_worlds(most_t_max=2))
 def test_one_set_ahead_is_qmdp_or_the_clocked_policy(world: World) -> None:
     """But for ties, which the value does not see."""
-    for tail, other in (("qmdp", qmdp.solve(world, in_grid=True)), ("clocked", clocked.solve(world))):
+    for tail, other in (("qmdp", qmdp.solve(world, in_grid=True)), ("clocked", qmdp.clocked_policy(world))):
         ahead = lookahead.solve(world, depth=1, tail=tail)
         np.testing.assert_allclose(evaluate(world, ahead).value, evaluate(world, other).value, rtol=1e-9, atol=1e-9)
 
@@ -55,7 +55,7 @@ def test_sets_ahead_close_the_gap(depth: int, expected: float) -> None:
     world = paper_world(5, 0.22, 2)
     earned = evaluate(world, lookahead.solve(world, depth=depth, tail="clocked")).aihtr
     assert earned == pytest.approx(expected, abs=1e-9)
-    assert evaluate(world, clocked.solve(world)).aihtr < -23.0
+    assert evaluate(world, qmdp.clocked_policy(world)).aihtr < -23.0
     assert earned <= optimal.solve(world).upper
 
 

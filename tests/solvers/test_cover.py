@@ -12,7 +12,7 @@ from tests.helpers import random_kernel, small_world
 from tests.solvers.footprints import best_of_chains, tiny_world, value_of_chains
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers import bounds, clocked, lookahead, optimal, qmdp
+from trackmdp.solvers import bounds, lookahead, optimal, qmdp
 from trackmdp.solvers.cover import Covering
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.layers import policy_table, reachable_layers
@@ -25,7 +25,7 @@ from trackmdp.world.coverage import Coverage
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Tracks
 
-PLANNERS = (clocked.solve, qmdp.solve, qmdp.fcr, qmdp.myopic)
+PLANNERS = (qmdp.clocked_policy, qmdp.solve, qmdp.fcr, qmdp.myopic)
 
 
 def _turned(world: World) -> World:

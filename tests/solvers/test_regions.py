@@ -12,7 +12,7 @@ from hypothesis import given, settings
 import trackmdp as tm
 from tests.solvers.worlds import best_of_all, tiny_worlds
 from trackmdp.errors import UserError
-from trackmdp.solvers import clocked, optimal, regions
+from trackmdp.solvers import optimal, qmdp, regions
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.exchange import exchange
 from trackmdp.solvers.layers import layer_sets, policy_table, reachable_layers
@@ -48,7 +48,7 @@ def test_every_chain_of_tiny_worlds_tried(world: World) -> None:
 def test_regions_end_where_the_whole_grid_does(options: dict, monkeypatch: pytest.MonkeyPatch) -> None:
     world = _world(10, **options)
     whole = optimal.solve(world)
-    assert float(evaluate(world, clocked.solve(world)).aihtr) < whole.lower - 1e-3  # there is something to search
+    assert float(evaluate(world, qmdp.clocked_policy(world)).aihtr) < whole.lower - 1e-3  # there is something to search
     found = by_regions(world, 5, monkeypatch)
     assert whole.certified and found.certified
     assert found.lower == pytest.approx(whole.lower, rel=2e-6)
@@ -57,7 +57,7 @@ def test_regions_end_where_the_whole_grid_does(options: dict, monkeypatch: pytes
 
 def test_a_round_is_the_round_of_the_whole_grid_whatever_the_side() -> None:
     world = _world(11)
-    policy = clocked.solve(world)
+    policy = qmdp.clocked_policy(world)
     value = evaluate(world, policy).value
     layers, located = reachable_layers(world, world.num_choices), np.ones(world.num_cells)
     problem = InnerProblem.of(world, layers, value)
@@ -70,7 +70,7 @@ def test_a_round_is_the_round_of_the_whole_grid_whatever_the_side() -> None:
 
 def test_what_is_proved_of_a_plan_holds_for_each_cell() -> None:
     world = _world(8)
-    policy = clocked.solve(world)
+    policy = qmdp.clocked_policy(world)
     value = evaluate(world, policy).value
     short, better = regions.proved(world, policy, value, 3, 1e-9, lambda _, __, tree: tree.run(lambda _: True))
     # One step of policy iteration gains no more than is proved, at no cell, and closes it where trees are closed.

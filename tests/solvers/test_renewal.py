@@ -11,7 +11,7 @@ from scipy import sparse
 import trackmdp as tm
 from tests.helpers import random_kernel
 from trackmdp.errors import UserError
-from trackmdp.solvers import clocked, renewal
+from trackmdp.solvers import qmdp, renewal
 from trackmdp.solvers.bounds import clocked_table
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.optimal import solve
@@ -71,18 +71,18 @@ def test_all_figures_and_bounds_of_a_large_world_are_those_of_the_factorisation(
 ) -> None:
     """As if 36 cells were too many to factorise: same policy, same figures, errors stated and kept."""
     world, again = _small(), _small()
-    exact, solution = evaluate(world, clocked.solve(world)), solve(world)
+    exact, solution = evaluate(world, qmdp.clocked_policy(world)), solve(world)
     table = clocked_table(world)
     assert exact.error == table.error == 0.0
     monkeypatch.setattr(RenewalSystem.__init__, "__kwdefaults__", {"direct": 0})
-    iterated = evaluate(again, clocked.solve(again))
+    iterated = evaluate(again, qmdp.clocked_policy(again))
     assert 0.0 < iterated.error < 1e-9
     assert np.abs(iterated.value - exact.value).max() <= iterated.error
     for figure in ("accuracy", "sensors_per_step", "safe_per_episode", "expected_length"):
         assert getattr(iterated, figure) == pytest.approx(getattr(exact, figure), rel=1e-10)
     for each in ("steps", "detections", "sensors", "safe_actions"):
         np.testing.assert_allclose(getattr(iterated, each), getattr(exact, each), rtol=1e-9, atol=1e-12)
-    pooled = evaluate(again, clocked.solve(again), per_cell=False)
+    pooled = evaluate(again, qmdp.clocked_policy(again), per_cell=False)
     assert pooled.sensors is None
     assert pooled.sensors_per_step == pytest.approx(exact.sensors_per_step, rel=1e-10)
     loose = clocked_table(again)

@@ -71,8 +71,8 @@ class MyopicConfig(BaselineConfig):
     threshold: float | None = option("predicted probability from which a cell is sensed; null = c·p_in/r", ge=0, le=1)
 
 
-@choice("baseline", "clocked", makes="trackmdp.solvers.clocked:solve")
-@choice("solver", "clocked", makes="trackmdp.solvers.clocked:solve")
+@choice("baseline", "clocked", makes="trackmdp.solvers.qmdp:clocked_policy")
+@choice("solver", "clocked", makes="trackmdp.solvers.qmdp:clocked_policy")
 class ClockedConfig(BaselineConfig):
     """Sets read off the clocked bound."""
 

@@ -271,9 +271,7 @@ def as_policy(task: Task, policy: PolicyLike) -> Policy:
                 return Policy(known, chances)
             return Policy._unrolled(known, rule_of(known, policy), where, check=True)
     policy.check_fits(task)
-    if isinstance(policy, Policy):
-        return policy
-    return Policy.from_table(policy)
+    return policy if isinstance(policy, Policy) else Policy.from_table(policy)
 
 
 def actor_table(task: Task, actor: TensorDictModuleBase, *, device: torch.device, check: bool = True) -> Policy:

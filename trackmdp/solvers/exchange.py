@@ -18,7 +18,7 @@ from scipy import sparse
 
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
-from trackmdp.solvers import clocked, search
+from trackmdp.solvers import qmdp, search
 from trackmdp.solvers.bounds import one_set
 from trackmdp.solvers.layers import Layer, layer_sets, policy_table, reachable_layers
 from trackmdp.solvers.plans import Chains, ChainStep, exchanged_parts, parts
@@ -50,7 +50,7 @@ def other_starts(world: World, layers: list[Layer], count: int) -> Iterator[list
     rng = np.random.default_rng(derive(0, "exchange", "starts"))
     for _ in range(count if world.num_cells <= MOST_STARTED else 0):
         other = replace(world, cost=world.cost * np.exp(PRICES_OFF * rng.standard_normal(world.num_cells)))
-        yield search.follow_credit(other, layers, layer_sets(layers, clocked.solve(other)), _STEPS)
+        yield search.follow_credit(other, layers, layer_sets(layers, qmdp.clocked_policy(other)), _STEPS)
 
 
 def best_of(

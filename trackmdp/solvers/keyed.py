@@ -54,8 +54,7 @@ class KeyedPairs:
             self.cells.append(layer.cells // h)
             self.following.append(self.after(self.key[layer.rows], n, layer.cells))
         codes = [self.key[layer.rows] * world.num_cells + cell for layer, cell in zip(self.layers, self.cells)]  # noqa: B905
-        found = [np.unique(code, return_inverse=True) for code in codes[:-1]]
-        self.groups, self.group = [each[0] for each in found], [each[1] for each in found]
+        self.groups, self.group = zip(*(np.unique(code, return_inverse=True) for code in codes[:-1]), strict=True)
         modes, cells = np.arange(h), np.arange(world.num_cells)[:, None]
         # [M, H], the pairs in which episodes start: any cell and mode alike
         self.first = keys.start(cells, modes) if of_key == 1 else keys.start(cells) * h + modes

@@ -19,14 +19,13 @@ import numpy as np
 
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers import clocked
+from trackmdp.solvers import qmdp
 from trackmdp.solvers.bounds import exact_clocked_table
 from trackmdp.solvers.branch import Tree
-from trackmdp.solvers.budget import Budget, Shares
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.exchange import best_of, exchanged, other_starts
-from trackmdp.solvers.known import planted
+from trackmdp.solvers.known import Budget, Shares, planted
 from trackmdp.solvers.layers import Layer, layer_sets, policy_table, reachable_layers
 from trackmdp.solvers.regions import adopted, improved, proved, region_side
 from trackmdp.solvers.renewal import RenewalSystem, expected_steps
@@ -111,7 +110,7 @@ class _Run:
     def __post_init__(self) -> None:
         # U(x, 0) >= V*(x) before anything is searched; `tighten` only lowers it.
         self.bound = exact_clocked_table(self.world).value
-        self.policy = clocked.solve(self.world)
+        self.policy = qmdp.clocked_policy(self.world)
         self.evaluation: Evaluation = evaluate(self.world, self.policy, guess=self.bound, per_cell=False)
 
     @property

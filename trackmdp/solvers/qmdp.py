@@ -1,4 +1,4 @@
-"""Rules of thumb, each a threshold on where the target is predicted to be: Q_MDP, first cost reduction, myopic.
+"""Rules of thumb, thresholds on where the target is predicted to be: Q_MDP, first cost reduction, myopic, clocked.
 
 Q_MDP (Littman, Cassandra and Kaelbling 1995) acts as if the position were known after every action, and first cost
 reduction (Fuemmeler and Veeravalli 2008, 2011) as if nothing were observed any more.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers.bounds import clocked_table
 from trackmdp.solvers.cover import Offer
 from trackmdp.solvers.prediction import Prediction, unroll
 from trackmdp.world.model import Array, World
@@ -51,6 +52,23 @@ def myopic(world: World, *, threshold: float | None = None) -> PolicyTable:
     # The threshold is as a price, the same of all sensors.
     limit = np.full(world.total_sensors, threshold)
     return unroll(world, lambda seen: Offer(seen.mass * world.detects(seen.cells), limit, seen.before, ties=True))
+
+
+def clocked_policy(world: World) -> PolicyTable:
+    """The policy that senses j iff p_d m_j (r + U(j, 0) - U(j, n + 1)) > c_j sum(m), m the predicted undetected mass.
+
+    Where sensors have footprints, the set whose cells gain most of that.
+
+    Optimal, with sensors that never miss, wherever at most one cell of positive probability is left unsensed: then a
+    miss tells where the target is, as the bound assumes.
+    """
+    table = clocked_table(world).table
+
+    def gains(seen: Prediction) -> Offer:
+        credit = world.reward + table[seen.cells, 0] - table[seen.cells, seen.n + 1]
+        return Offer(seen.mass * world.detects(seen.cells) * credit, world.cost, seen.inside)
+
+    return unroll(world, gains)
 
 
 def _offer(world: World, seen: Prediction, charged: Array) -> Offer:

@@ -19,7 +19,7 @@ from scipy import sparse
 from trackmdp.errors import UserError
 from trackmdp.machine import free_bytes, gib, parse_bytes
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers import clocked
+from trackmdp.solvers import qmdp
 from trackmdp.solvers.branch import Tree
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.exchange import exchange, revealed
@@ -130,7 +130,7 @@ def _predicted(world: World) -> float:
         return 0.0
     rows, columns = (range(max(side - PATCH, 0) // 2, min(side + PATCH, 2 * side) // 2) for side in world.size)
     patch = sub_world(world, (rows, columns))
-    return max(len(seen.rows) for seen in followed(patch, clocked.solve(patch))) / patch.num_cells
+    return max(len(seen.rows) for seen in followed(patch, qmdp.clocked_policy(patch))) / patch.num_cells
 
 
 def _region_bytes(world: World, side: int) -> int:

@@ -16,7 +16,7 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers import clocked
+from trackmdp.solvers import qmdp
 from trackmdp.solvers.bounds import clocked_table
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.layers import Layer, layer_sets, policy_table, reachable_layers
@@ -127,7 +127,7 @@ def solve(world: World, *, steps: int = 30, sweeps: int = 3) -> PolicyTable:
     The better one of it and the clocked policy, so that it is never worse than that.
     """
     layers = reachable_layers(world, world.num_choices)
-    first = layer_sets(layers, clocked.solve(world))
+    first = layer_sets(layers, qmdp.clocked_policy(world))
     sets = follow_credit(world, layers, first, steps, sweeps)
     # The homotopy follows a credit that changes, so that it may end below the clocked policy it began with.
     found, simple = (located_value(world, layers, each) for each in (sets, first))
