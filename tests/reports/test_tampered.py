@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
+import hashlib
 import json
 import os
 import re
@@ -17,7 +19,7 @@ from rich.console import Console
 
 import trackmdp as tm
 from tests.reports.sweeps import write_run
-from trackmdp.durable import write_sealed
+from trackmdp.durable import csv_text, write_sealed
 from trackmdp.errors import UserError
 from trackmdp.reports import watch
 from trackmdp.reports.gather import gather_runs
@@ -25,7 +27,7 @@ from trackmdp.reports.page import build
 from trackmdp.reports.results import is_stored, load_results, save_results
 from trackmdp.reports.tables import Column, Table
 from trackmdp.training.folders import read_summary, write_summary
-from trackmdp.untrusted import sealed
+from trackmdp.untrusted import read_object, sealed
 
 Change = Callable[[Path], Any]
 
@@ -207,13 +209,29 @@ def test_stored_results_that_were_changed_are_refused(sweep: Path, tmp_path: Pat
             load_results(stored)
         (stored / name).write_bytes(content)
     manifest = json.loads(whole["manifest.json"])
-    for facts in ({"settings": 3}, {"problems": [{"a": 1}]}, {"files": []}, {"config_sha256": None}):
+    spoilt: list[dict[str, Any]] = [{"settings": 3}, {"problems": [{"a": 1}]}, {"files": []}, {"config_sha256": None}]
+    spoilt += [{"line": [1]}, {"planned": "x"}, {"cpu_seconds": []}, {"versions": "x"}, {"machines": [{"a": 1}]}]
+    for facts in spoilt:
         plain = {key: value for key, value in {**manifest, **facts}.items() if key != "sha256"}
         (stored / "manifest.json").write_text(json.dumps(sealed(plain)))
         with pytest.raises(UserError, match="not stored results that can be read"):
             load_results(stored)
     (stored / "manifest.json").write_text("[" * 10**5)
     assert not is_stored(stored)
+
+
+@pytest.mark.parametrize(("column", "value"), [("seed", "x"), ("aihtr", ""), ("frames", "nan"), ("qmdp_aihtr", "1e99")])
+def test_stored_figures_of_another_kind_are_refused(column: str, value: str, sweep: Path, tmp_path: Path) -> None:
+    save_results(gather_runs(sweep), tmp_path)
+    rows = list(csv.DictReader((tmp_path / "runs.csv").read_text().splitlines()))
+    rows[1][column] = value
+    (tmp_path / "runs.csv").write_text(csv_text(rows[0], [list(row.values()) for row in rows]))
+    manifest = read_object(tmp_path / "manifest.json")
+    manifest["files"]["runs.csv"] = hashlib.sha256((tmp_path / "runs.csv").read_bytes()).hexdigest()
+    del manifest["sha256"]
+    (tmp_path / "manifest.json").write_text(json.dumps(sealed(manifest)))
+    with pytest.raises(UserError, match="not stored results that can be read"):
+        load_results(tmp_path)
 
 
 EVIL = ["=<script>alert(1)<@BODY@", "@$x^{$\\input{x}{}~^&%#_", "\x1b]0;t\x07a\nb\u202e", "[x]"]

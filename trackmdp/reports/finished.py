@@ -17,6 +17,7 @@ from trackmdp.config.untrusted import MAX_BYTES
 from trackmdp.errors import UserError
 from trackmdp.policies.saved import load_policy
 from trackmdp.policies.table import PolicyTable
+from trackmdp.reports.checks import LARGE, check_origin, checked_figures, checked_settings
 from trackmdp.reports.results import FIGURES, Anomaly, CurvePoint, FinishedRun, Sensed, printable_settings
 from trackmdp.solvers.renewal import IndexArray, per_row
 from trackmdp.training.folders import FAILED_FILE, SUMMARY, check_files, read_summary, run_of
@@ -28,9 +29,6 @@ MOST_POINTS = 16
 
 _TABLE = 2**28
 """Bytes of the longest `metrics.csv`: two million rows."""
-
-_LARGE = 1e15
-"""No figure of a run is as large, and sums and squares of smaller ones stay finite."""
 
 
 def read_run(folder: Path, name: str) -> tuple[FinishedRun, Mapping[str, Any]] | Anomaly:
@@ -54,9 +52,12 @@ def read_run(folder: Path, name: str) -> tuple[FinishedRun, Mapping[str, Any]] |
         # A config of another version may lack what runs are grouped by: that is told of this run, and the others are
         # used.
         with decoded(str(place / "config.yaml"), "the config of a run"):
-            _check_settings(settings)
+            checked_settings(settings)
         with decoded(str(place / SUMMARY), "the summary of a run"):
-            _check_origin(summary)
+            if not isinstance(summary["config_sha256"], str):
+                raise TypeError("config_sha256: expected a digest")
+            for key in ("versions", "machine"):
+                check_origin(key, summary.get(key, {}))
             return FinishedRun(name, settings, _figures(summary), summary["config_sha256"]), summary
     except UserError as error:
         return Anomaly(name, str(error).replace(f"{place}/", ""))
@@ -72,52 +73,12 @@ def plain_config(place: Path) -> Mapping[str, Any]:
     return plain_mapping(read_text(file, most=MAX_BYTES), str(file))
 
 
-def _check_settings(settings: Mapping[str, Any]) -> None:
-    """Check presence and types of the options that runs are grouped by; all others are only shown.
-
-    Raises:
-        Exception: one is missing or of another type; call it inside `untrusted.decoded`.
-    """
-    for key in ("algo.name", "kernel.name"):
-        if not isinstance(settings[key], str):
-            raise TypeError(f"{key}: expected a name")
-    # `type(...) is`: True is an int to `isinstance`, and no seed.
-    if type(settings["seed"]) is not int or type(settings["grid.size"]) not in (int, list):
-        raise TypeError("seed, grid.size: expected whole numbers")
-
-
-def _check_origin(summary: Mapping[str, Any]) -> None:
-    """Check that versions and machine are flat mappings: they are counted and shown.
-
-    Raises:
-        Exception: they are not; call it inside `untrusted.decoded`.
-    """
-    for key in ("versions", "machine"):
-        said = summary.get(key, {})
-        if not isinstance(said, Mapping) or any(isinstance(value, (Mapping, list)) for value in said.values()):
-            raise TypeError(f"{key}: expected names and values")
-    if not isinstance(summary["config_sha256"], str):
-        raise TypeError("config_sha256: expected a digest")
-
-
 def _figures(summary: Mapping[str, Any]) -> dict[str, float | None]:
     """`FIGURES` of a summary; on recorded tracks there is no Q_MDP, no bound and no optimum."""
     groups = {"qmdp": summary["qmdp"], "bound": summary["bounds"], "optimal": summary["optimal"]}
-    # What a run took is known of every run; of its other figures some are null, as on recorded tracks.
-    took = {key: _number(key, summary[key]) for key in ("frames", "wall_seconds", "cpu_seconds")}
-    raw = took | summary["policy"]
+    raw = {key: summary[key] for key in ("frames", "wall_seconds", "cpu_seconds")} | summary["policy"]
     raw |= {f"{group}_{key}": value for group, values in groups.items() for key, value in (values or {}).items()}
-    _number("aihtr", raw["aihtr"])
-    if not _number("expected_length", raw["expected_length"]) > 0:  # regrets are per step
-        raise ValueError(f"expected_length: {raw['expected_length']}, expected more than 0")
-    return {key: None if raw.get(key) is None else _number(key, raw[key]) for key in FIGURES}
-
-
-def _number(key: str, value: Any) -> float:
-    # JSON as Python reads it knows NaN and Infinity; neither is less than _LARGE.
-    if type(value) not in (int, float) or not abs(value) < _LARGE:
-        raise TypeError(f"{key}: {str(value)[:40]}, expected a number")
-    return float(value)
+    return checked_figures({key: raw.get(key) for key in FIGURES})
 
 
 def read_curve(file: Path) -> list[CurvePoint]:
@@ -144,9 +105,9 @@ def _points(text: str) -> list[CurvePoint]:
             continue
         last = points[-1] if points else CurvePoint(0, 0, 0.0, 0.0)
         point = CurvePoint(int(row["iteration"]), int(row["frames"]), float(row["seconds"]), float(row["aihtr"]))
-        if not (last.iteration < point.iteration < _LARGE and max(last.frames, 1) <= point.frames < _LARGE):
+        if not (last.iteration < point.iteration < LARGE and max(last.frames, 1) <= point.frames < LARGE):
             raise ValueError("iterations or frames that do not grow")
-        if not (0 <= point.seconds < _LARGE and math.isfinite(point.aihtr) and abs(point.aihtr) < _LARGE):
+        if not (0 <= point.seconds < LARGE and math.isfinite(point.aihtr) and abs(point.aihtr) < LARGE):
             raise ValueError("a number out of range")
         points.append(point)
     return points
@@ -171,7 +132,7 @@ def read_sensed(file: Path, size: tuple[int, int], t_max: Any, visits: Callable[
         raise UserError(f"{file}: not the policy of this run (of another grid or t_max)")
     if value is None:
         raise UserError(f"{file}: not the policy of a run (it has no values)")
-    if not (np.abs(value) < _LARGE).all():
+    if not (np.abs(value) < LARGE).all():
         raise UserError(f"{file}: not the policy of a run (a value out of range)")
     if not table.deterministic:
         raise UserError("policy: draws its sets at random, so that there is no table of them")

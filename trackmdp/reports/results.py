@@ -19,6 +19,7 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.durable import csv_text, write_bytes, write_text
+from trackmdp.reports.checks import check_manifest, checked_figures, checked_settings
 from trackmdp.untrusted import decoded, known_object, printable, read_bytes, read_object, read_text, sealed, unsealed
 from trackmdp.world.files import load_npz, npz_bytes, whole_csr
 from trackmdp.world.model import Array
@@ -225,6 +226,7 @@ def load_results(folder: Path) -> Results:
         common, hashes = manifest.pop("settings"), manifest.pop("config_sha256")
         anomalies = [Anomaly(**entry) for entry in manifest.pop("problems")]
         del manifest["format"]
+        check_manifest(manifest)
         runs = [_run(row, common, hashes) for row in _rows(folder / "runs.csv")]
         curves: dict[str, list[CurvePoint]] = {}
         for row in _rows(folder / "curves.csv"):
@@ -241,12 +243,13 @@ def _digest(file: Path) -> str:
 
 def _run(row: Mapping[str, str], common: Mapping[str, Any], hashes: Mapping[str, str]) -> FinishedRun:
     own = {key: _value(text) for key, text in row.items() if key not in FIGURES and key != "run" and text != ""}
-    figures = {key: float(row[key]) if row[key] else None for key in FIGURES}
+    figures = checked_figures({key: float(row[key]) if row[key] else None for key in FIGURES})
     # A single algorithm needs no column for its name: then it is the one key of `common`.
     algo = own.get("algo.name") or next(iter(common))
     # The other half of what `save_results` does to a name that looks like a formula.
     name = str(_value(row["run"])) if row["run"].startswith('"') else row["run"]
-    return FinishedRun(name, printable_settings({**common[algo], **own, "algo.name": algo}), figures, hashes[name])
+    settings = checked_settings(printable_settings({**common[algo], **own, "algo.name": algo}))
+    return FinishedRun(name, settings, figures, hashes[name])
 
 
 def _common(runs: Iterable[FinishedRun]) -> dict[str, dict[str, Any]]:
