@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import hashlib
+import io
 import json
 import os
 import re
@@ -24,10 +25,11 @@ from trackmdp.errors import UserError
 from trackmdp.reports import watch
 from trackmdp.reports.gather import gather_runs
 from trackmdp.reports.page import build
-from trackmdp.reports.results import is_stored, load_results, save_results
+from trackmdp.reports.results import is_stored, load_results, pack_policies, save_results, unpack_policies
 from trackmdp.reports.tables import Column, Table
 from trackmdp.training.folders import read_summary, write_summary
-from trackmdp.untrusted import read_object, sealed
+from trackmdp.untrusted import decoded, read_object, sealed
+from trackmdp.world.files import load_npz, npz_bytes
 
 Change = Callable[[Path], Any]
 
@@ -232,6 +234,14 @@ def test_stored_figures_of_another_kind_are_refused(column: str, value: str, swe
     (tmp_path / "manifest.json").write_text(json.dumps(sealed(manifest)))
     with pytest.raises(UserError, match="not stored results that can be read"):
         load_results(tmp_path)
+
+
+@pytest.mark.parametrize("change", [lambda values: values[None], lambda values: values[:-1]])
+def test_a_stored_policy_of_other_lengths_is_refused(change: Any, sweep: Path) -> None:
+    stored = load_npz(io.BytesIO(pack_policies(gather_runs(sweep).policies)))
+    assert len(unpack_policies(npz_bytes(stored))) == 3
+    with pytest.raises(UserError, match="not policies"), decoded("x", "policies"):
+        unpack_policies(npz_bytes({**stored, "values": change(stored["values"])}))
 
 
 EVIL = ["=<script>alert(1)<@BODY@", "@$x^{$\\input{x}{}~^&%#_", "\x1b]0;t\x07a\nb\u202e", "[x]"]

@@ -350,6 +350,11 @@ def _joined(parts: Iterable[np.ndarray], kind: Any = np.float64) -> np.ndarray:
 
 def _apart(stored: Mapping[str, np.ndarray], **sizes: np.ndarray) -> Iterator[tuple[Any, ...]]:
     """Of each item its part of every stream of `_joined`, in which item i takes `sizes[i]` places."""
+    for name, size in sizes.items():
+        if size.dtype.kind not in "iu" or not ((size >= 0) & (size < LARGEST)).all():
+            raise ValueError("counts that are none")
+        if stored[name].shape != (size.sum(),) or stored[name].dtype.kind not in "iuf":
+            raise ValueError(f"{name}: expected {size.sum()} numbers")
     # The last sum is the end of the stream, not a place to cut.
     return zip(*(np.split(stored[name], np.cumsum(size)[:-1]) for name, size in sizes.items()), strict=True)
 
