@@ -59,6 +59,14 @@ def test_one_mode_is_the_world_without_modes(seed: int) -> None:
     assert mode_bound(hidden)[:, 0] == pytest.approx(clocked(world), rel=1e-6)
 
 
+def test_the_bound_of_long_episodes_is_found_at_once() -> None:
+    """Rounds in which nothing but the exit brings it nearer would be as many as an episode has steps."""
+    kernel = random_kernel(np.random.default_rng(0), 9, 1e-4)
+    world, hidden = World(kernel, 3, cost=0.2, t_max=1), HiddenWorld(kernel, 3, modes=1, cost=0.2, t_max=1)
+    assert mode_bound(hidden)[:, 0] == pytest.approx(clocked(world), rel=1e-9)
+    assert (mode_bound(hidden)[:, 0] >= clocked(world) * (1 - 1e-12)).all()
+
+
 @pytest.mark.parametrize("known", ["cell", *MORE, "mode"])
 @pytest.mark.parametrize("detection", [1.0, 0.8])
 def test_the_exact_value_is_that_of_the_game(known: str, detection: float) -> None:

@@ -78,6 +78,7 @@ def _worth(pairs: KeyedPairs, value: Array, sets: list[IndexArray]) -> Array:
 
 
 _SETTLED = 1e-10  # of the bound: it is approached from above, so that stopping anywhere is valid
+_ROUNDING = 1e-15  # of an entry, in one round
 
 
 def mode_bound(world: HiddenWorld) -> Array:
@@ -86,6 +87,10 @@ def mode_bound(world: HiddenWorld) -> Array:
     U(z, n) = sum over cells j of max{ sum over z' in j of P_zz' (p_d (r + U(z', 0)) + (1 - p_d) U(z', n+1)) - c_j P_in,
     sum of P_zz' U(z', n+1) }. It is the fixed point of a monotone map, approached from r · (steps of an episode), which
     is above it: every iterate is a bound.
+
+    Such iterates alone fall by a share 1 - p_exit of what is left, for as many rounds as an episode has steps. So each
+    goes on to where it would fall to: with T the map, L the steps of an episode, the same whatever is chosen, so that
+    P L = L - 1, and T U <= U - a, T(U - a L) = T U - a (L - 1) <= U - a L, which is a bound as well.
     """
     kernel, stay = world.kernel, world.stay_probability
     rows, cell = row_index(kernel), kernel.indices // world.modes
@@ -97,13 +102,16 @@ def mode_bound(world: HiddenWorld) -> Array:
     bound = np.tile(world.reward * steps[:, None], (1, world.num_choices + 1))
     while True:
         before = bound.copy()
-        found = world.reward + bound[kernel.indices, 0]
+        found = world.reward + before[kernel.indices, 0]
         bound[:, -1] = per_row(rows, kernel.data * found, world.num_states) - world.safe_cost * stay
         for n in range(world.num_choices - 1, -1, -1):
-            missed = bound[kernel.indices, n + 1]
+            missed = before[kernel.indices, n + 1]
             on = per_row(group, kernel.data * (chance * found + (1.0 - chance) * missed), len(groups)) - price
             off = per_row(group, kernel.data * missed, len(groups))
             bound[:, n] = per_row(owner, np.maximum(on, off), world.num_states)
+        # Less than it falls by, for what rounding adds to that would count L times.
+        fall = (before - bound).min() - _ROUNDING * np.abs(before).max()
+        bound -= max(fall, 0.0) * (steps[:, None] - 1.0)
         if (before - bound).max() <= _SETTLED * max(1.0, float(np.abs(bound).max())):
             return bound
 
