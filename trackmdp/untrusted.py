@@ -134,10 +134,10 @@ def read_object(file: Path, *, most: int = SMALL, source: str = "") -> dict[str,
     return content
 
 
-def known_object(file: Path) -> dict[str, Any]:
-    """The JSON object in a file; empty where there is none."""
+def known_object(file: Path, *, most: int = SMALL) -> dict[str, Any]:
+    """The JSON object in a file of at most `most` bytes; empty where there is none."""
     try:
-        return read_object(file)
+        return read_object(file, most=most)
     except UserError:
         return {}
 

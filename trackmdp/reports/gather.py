@@ -29,7 +29,7 @@ from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.keyed import averaged, visits_of_keys
 from trackmdp.solvers.keyed_search import cell_bound
 from trackmdp.solvers.renewal import DIRECT_CELLS
-from trackmdp.training.folders import FAILED_FILE, PLAN, SUMMARY, check_files, read_summary
+from trackmdp.training.folders import FAILED_FILE, PLAN, PLAN_BYTES, SUMMARY, check_files, read_summary
 from trackmdp.untrusted import known_object, printable
 from trackmdp.world.checks import canonical_kernel
 from trackmdp.world.make import build_world, of_task
@@ -83,7 +83,7 @@ def gather_runs(folder: Path) -> Results:
 
 def planned(folder: Path) -> Mapping[str, Any] | None:
     """The content of `sweep.json`, where there is a readable one."""
-    plan = known_object(folder / PLAN)
+    plan = known_object(folder / PLAN, most=PLAN_BYTES)
     return plan if isinstance(plan.get("jobs"), list) else None
 
 

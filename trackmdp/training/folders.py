@@ -26,6 +26,8 @@ _FILES = ("config.yaml", "kernel.npz", "tracks.json", "policy.npz")
 _LARGEST = 2**36
 PLAN, FAILED_FILE, DONE = "sweep.json", "failed.json", "done.json"
 """Files: of a sweep; of a run that failed, of a run of another command than `train` that ended."""
+PLAN_BYTES = 2**26
+"""Bytes of the longest plan: 100,000 runs, as many as a sweep may have, of 670 bytes each."""
 
 
 def write_summary(folder: Path, content: Mapping[str, Any]) -> None:
@@ -104,7 +106,7 @@ def read_plan(sweep: Path) -> dict[str, Any]:
     Raises:
         UserError: the folder is not that of a sweep.
     """
-    content = known_object(sweep / PLAN)
+    content = known_object(sweep / PLAN, most=PLAN_BYTES)
     jobs = content.get("jobs")
     whole = isinstance(jobs, list) and all(
         isinstance(job, dict) and isinstance(job.get("folder"), str) and isinstance(job.get("overrides"), list)
