@@ -24,7 +24,8 @@ from trackmdp.app.sweep.process import stop_signal
 from trackmdp.app.sweep.sweep import sweep, write_table
 from trackmdp.durable import write_sealed
 from trackmdp.errors import Preempted, RunError, UserError
-from trackmdp.training.folders import RunState, read_plan, run_of, runs_of
+from trackmdp.reports.gather import planned
+from trackmdp.training.folders import RunState, read_plan, run_of, runs_of, write_plan
 from trackmdp.training.lock import locked
 
 __all__ = ["here"]
@@ -184,6 +185,16 @@ def test_the_plan_is_on_disk_before_the_first_run(here: Path, monkeypatch: pytes
     assert content["command"] == "train"
     assert content["line"].startswith("trackmdp train -m grid.size=3 ")
     assert [job["overrides"][-2] for job in content["jobs"]] == ["seed=0", "seed=1"]
+
+
+def test_a_plan_of_the_most_runs_is_read_back(tmp_path: Path) -> None:
+    """As many bytes as 100,000 runs take, in fewer runs."""
+    write_plan(tmp_path, "train", "trackmdp train -m", [(str(place), ["x=" + "y" * 20_000]) for place in range(1_000)])
+    assert (tmp_path / "sweep.json").stat().st_size > 100_000 * 200
+    assert len(read_plan(tmp_path)["jobs"]) == 1_000
+    plan = planned(tmp_path)
+    assert plan is not None
+    assert len(plan["jobs"]) == 1_000
 
 
 def test_a_sweep_that_is_running_is_not_started_twice(here: Path, capfd: pytest.CaptureFixture[str]) -> None:
