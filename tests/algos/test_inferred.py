@@ -7,7 +7,7 @@ import torch
 
 from tests.algos.hindsight import assert_same
 from tests.helpers import collect
-from trackmdp.algos.learned_kernel import InferredMoves
+from trackmdp.algos.inferred import InferredMoves
 from trackmdp.policies.policy import Policy
 from trackmdp.world.model import World
 

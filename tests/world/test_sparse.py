@@ -14,9 +14,9 @@ from scipy import sparse
 
 from tests.helpers import BORDERS
 from trackmdp.errors import UserError
-from trackmdp.world.checks import pairwise_row_sums
 from trackmdp.world.kernels import load_table, random_support, random_walk
 from trackmdp.world.model import World
+from trackmdp.world.rows import pairwise_row_sums
 
 SIDES = st.integers(1, 6)
 

@@ -23,7 +23,7 @@ from trackmdp.algos.actor_loss import ActorLoss, Decision
 from trackmdp.algos.common import Averages, Checkpointed, set_learning_rate
 from trackmdp.algos.exchanged import counted_world, exchanged_sets
 from trackmdp.algos.hindsight_loss import HindsightLoss
-from trackmdp.algos.learned_kernel import InferredMoves
+from trackmdp.algos.inferred import InferredMoves
 from trackmdp.algos.moves import MoveBuffer
 from trackmdp.algos.replay import Replay
 from trackmdp.algos.segments import SegmentBuffer

@@ -14,9 +14,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from trackmdp.world.checks import canonical_kernel, merged, pairwise_row_sums
+from trackmdp.world.checks import canonical_kernel
 from trackmdp.world.files import read_matrix
 from trackmdp.world.model import Array, BoolArray, Size, grid_size
+from trackmdp.world.rows import merged, pairwise_row_sums
 
 Border: TypeAlias = Literal["renormalize", "inside", "clip", "exit"]
 

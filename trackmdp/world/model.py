@@ -14,9 +14,10 @@ from scipy import sparse
 from trackmdp.config.sensing import LARGEST_PRICE
 from trackmdp.config.world import MEMORIES
 from trackmdp.errors import UserError
-from trackmdp.world.checks import PRICES, PROBABILITIES, canonical_kernel, check_kernel, one_each, pairwise_row_sums
+from trackmdp.world.checks import PRICES, PROBABILITIES, canonical_kernel, check_kernel, one_each
 from trackmdp.world.coverage import Coverage
 from trackmdp.world.memory import KeySpace
+from trackmdp.world.rows import pairwise_row_sums
 
 Array: TypeAlias = npt.NDArray[np.float64]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]

@@ -31,8 +31,9 @@ from scipy.special import ndtr
 from trackmdp.config.options import GROUPS
 from trackmdp.config.registry import make
 from trackmdp.errors import UserError
-from trackmdp.world.checks import canonical_kernel, check_kernel, pairwise_row_sums
+from trackmdp.world.checks import canonical_kernel, check_kernel
 from trackmdp.world.model import Array, Size, Task, TaskOptions, World, grid_size
+from trackmdp.world.rows import pairwise_row_sums
 
 _HEADINGS = np.array([(0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1), (1, 0), (1, 1)])
 """Rows and columns of a step; 0 is to the right, and each of the eight turns left by 45 degrees."""
