@@ -16,7 +16,7 @@ Values: TypeAlias = npt.NDArray[np.float64]
 
 LEVEL = 0.95
 """Nominal coverage of every interval."""
-RESAMPLES, LARGE = 999, 2000
+RESAMPLES, _MANY = 999, 2000
 """Of the bootstrap; units above which it is not needed."""
 FEWEST = 3
 """Values a group needs before an interval is shown: from two, its width says more of luck than of the spread."""
@@ -95,7 +95,7 @@ def ratio(part: Values, whole: Values, *, events: bool = False) -> MeanInterval:
     """Σ part / Σ whole over independent units `[n]`, such as tracks, with its bootstrap-t interval (Efron 1979).
 
     Ratios of a few dozen units are skewed, and Student's t on them covers .8 to .9 only; the bootstrap takes the shape
-    of the t statistic from the units themselves. Above `LARGE` units the normal law serves.
+    of the t statistic from the units themselves. Above `_MANY` units the normal law serves.
 
     Args:
         part: `[n]`, the sum of each unit.
@@ -128,7 +128,7 @@ def _bootstrap_t(part: Values, whole: Values, mean: float) -> tuple[float, float
     rest = part - mean * whole
     # Delta method: part/whole - mean ≈ mean(part - mean·whole) / mean(whole), a mean over n units.
     error = float(rest.std(ddof=1) / (whole.mean() * math.sqrt(count)))
-    if count > LARGE or not error:
+    if count > _MANY or not error:
         margin = _student(count - 1) * error
         return mean - margin, mean + margin
     rng = np.random.default_rng(derive(0, "bootstrap"))

@@ -12,8 +12,7 @@ import pytest
 from tests.episodes.browser import CHROMIUM, Browser
 from trackmdp.app.cli import main
 from trackmdp.episodes.episode import Episode
-from trackmdp.episodes.page import WIDE as PAGE_WIDE
-from trackmdp.episodes.page import write_page
+from trackmdp.episodes.page import PAGE_WIDE, write_page
 from trackmdp.episodes.player import WIDE, frame
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.world.make import make_world

@@ -22,10 +22,10 @@ from trackmdp.world.modes import HiddenWorld
 MOST_STEPS = 2000
 """Steps on a page; a longer episode is cut there, and the page says so."""
 
-WIDE = 41
+PAGE_WIDE = 41
 """Rows and columns of a grid that are drawn at most: those around the target."""
 
-MOST_CELLS = 100
+_MOST_CELLS = 100
 """Shaded cells of a step, the likeliest."""
 
 
@@ -57,8 +57,10 @@ def _content(reader: EpisodeReader, episode: Episode) -> dict[str, Any]:
     about = f"{world.rows} x {world.columns} grid, {len(episode)} steps, seed {reader.run.said.get('seed', '')}"
     if len(episode) > MOST_STEPS:
         about += f"; the first {MOST_STEPS:,} steps are shown"
-    if max(world.size) > WIDE:
-        about += f"; of the grid, the {min(world.rows, WIDE)} x {min(world.columns, WIDE)} cells around the target"
+    if max(world.size) > PAGE_WIDE:
+        about += (
+            f"; of the grid, the {min(world.rows, PAGE_WIDE)} x {min(world.columns, PAGE_WIDE)} cells around the target"
+        )
     assert episode.belief is not None  # a logged episode has it
     modes = {}
     if isinstance(world, HiddenWorld) and episode.mode is not None:
@@ -66,7 +68,7 @@ def _content(reader: EpisodeReader, episode: Episode) -> dict[str, Any]:
     return modes | {
         "rows": world.rows,
         "columns": world.columns,
-        "wide": WIDE,
+        "wide": PAGE_WIDE,
         "about": about,
         "bound": float(bound[episode.start]),
         "start": int(episode.start),
@@ -87,7 +89,7 @@ def _sparse(belief: Any) -> list[int]:
     """Cell, probability in ten-thousandths, cell, ...: the likeliest cells, in their order."""
     share = np.rint(belief * 10_000).astype(int)
     # Stable: among equally likely cells always the same ones are kept, so that a page is the same bytes each time.
-    cells = np.sort(np.argsort(-share, kind="stable")[:MOST_CELLS])
+    cells = np.sort(np.argsort(-share, kind="stable")[:_MOST_CELLS])
     cells = cells[share[cells] > 0]
     return np.stack([cells, share[cells]], axis=1).ravel().tolist()
 

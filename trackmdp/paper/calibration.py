@@ -31,7 +31,7 @@ T_MAX = 1
 SEEDS = range(100)
 # The paper says nothing of moves that lead out of the grid. `inside` gives Q_MDP the same accuracy for every Z, so the
 # paper cannot have used it; it is kept to show how far the figures move.
-BORDERS: tuple[Border, ...] = ("renormalize", "clip", "inside", "exit")
+_BORDERS: tuple[Border, ...] = ("renormalize", "clip", "inside", "exit")
 HORIZONS = (0, 1, 2)
 # Fewer than SEEDS, since each is valued with 4 border rules, 3 values of T_max and 12 pairs.
 DRAWS = range(30)
@@ -110,7 +110,7 @@ def chosen(every: Iterable[Candidate]) -> dict[int, int]:
 
 def sensitivity(draws: Sequence[int] = DRAWS) -> Iterator[Setting]:
     """Every border rule with every T_max, for each pair of the paper."""
-    for border, t_max, support_size in itertools.product(BORDERS, HORIZONS, SUPPORTS):
+    for border, t_max, support_size in itertools.product(_BORDERS, HORIZONS, SUPPORTS):
         figures = _figures(border, t_max, support_size, draws)
         # Over all four prices at once, hence one number for Z that every price's `Setting` repeats.
         deviation = float(_deviations(support_size, figures[:, :, 0]).min())

@@ -35,7 +35,7 @@ SEARCHED = 1e-6
 MOST_NODES = 500_000
 CORNER = 2
 """Side of the corner that stands for a world too large for listing all of its states."""
-MOST_CELLS, MOST_BELIEFS = 9, 20_000
+_MOST_CELLS, _MOST_BELIEFS = 9, 20_000
 """Of a world that the POMDP is solved in as a whole."""
 _OF_CELLS = {
     "Theorem 1": "p_j > c/r is sensed, p_j the probability of cell j given the last located cell",
@@ -229,13 +229,13 @@ def _as_pomdp(world: World) -> Iterator[Check]:
     """Theorem 2 on the world itself where it is small enough, else on its corner; at its own prices, and dearer."""
     # Every set is an action: 2^9 = 512 per belief state at most. `changed` without changes drops `max_steps` and the
     # window.
-    own = changed(world) if world.num_cells <= MOST_CELLS and world.t_max <= 1 else corner(world)
+    own = changed(world) if world.num_cells <= _MOST_CELLS and world.t_max <= 1 else corner(world)
     # At low prices little is missed, and a wrong treatment of misses would hardly show; hence also at prices where
     # misses pay.
     for small, prices in ((own, "its own prices"), (dearer(own), "prices at which the safe action is used")):
         try:
-            beliefs = pomdp.solve(small, most_beliefs=MOST_BELIEFS)
-        # More belief states than MOST_BELIEFS; the corner, of at most four cells and t_max 2, has few.
+            beliefs = pomdp.solve(small, most_beliefs=_MOST_BELIEFS)
+        # More belief states than _MOST_BELIEFS; the corner, of at most four cells and t_max 2, has few.
         except UserError:
             small = corner(small)
             beliefs = pomdp.solve(small)

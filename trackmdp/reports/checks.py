@@ -9,14 +9,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-LARGE = 1e15
+LARGEST_FIGURE = 1e15
 """No figure of a run is as large, and sums and squares of smaller ones stay finite."""
 
 
 def number(key: str, value: Any) -> float:
     """`value`, which has to be a number."""
-    # JSON as Python reads it knows NaN and Infinity; neither is less than LARGE.
-    if type(value) not in (int, float) or not abs(value) < LARGE:
+    # JSON as Python reads it knows NaN and Infinity; neither is less than LARGEST_FIGURE.
+    if type(value) not in (int, float) or not abs(value) < LARGEST_FIGURE:
         raise TypeError(f"{key}: {str(value)[:40]}, expected a number")
     return float(value)
 

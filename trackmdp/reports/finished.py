@@ -17,7 +17,7 @@ from trackmdp.config.untrusted import MAX_BYTES
 from trackmdp.errors import UserError
 from trackmdp.policies.saved import load_policy
 from trackmdp.policies.table import PolicyTable
-from trackmdp.reports.checks import LARGE, check_origin, checked_figures, checked_settings
+from trackmdp.reports.checks import LARGEST_FIGURE, check_origin, checked_figures, checked_settings
 from trackmdp.reports.results import FIGURES, Anomaly, CurvePoint, FinishedRun, Sensed, printable_settings
 from trackmdp.solvers.renewal import IndexArray, per_row
 from trackmdp.training.folders import FAILED_FILE, SUMMARY, check_files, read_summary, run_of
@@ -105,9 +105,13 @@ def _points(text: str) -> list[CurvePoint]:
             continue
         last = points[-1] if points else CurvePoint(0, 0, 0.0, 0.0)
         point = CurvePoint(int(row["iteration"]), int(row["frames"]), float(row["seconds"]), float(row["aihtr"]))
-        if not (last.iteration < point.iteration < LARGE and max(last.frames, 1) <= point.frames < LARGE):
+        if not (
+            last.iteration < point.iteration < LARGEST_FIGURE and max(last.frames, 1) <= point.frames < LARGEST_FIGURE
+        ):
             raise ValueError("iterations or frames that do not grow")
-        if not (0 <= point.seconds < LARGE and math.isfinite(point.aihtr) and abs(point.aihtr) < LARGE):
+        if not (
+            0 <= point.seconds < LARGEST_FIGURE and math.isfinite(point.aihtr) and abs(point.aihtr) < LARGEST_FIGURE
+        ):
             raise ValueError("a number out of range")
         points.append(point)
     return points
@@ -132,7 +136,7 @@ def read_sensed(file: Path, size: tuple[int, int], t_max: Any, visits: Callable[
         raise UserError(f"{file}: not the policy of this run (of another grid or t_max)")
     if value is None:
         raise UserError(f"{file}: not the policy of a run (it has no values)")
-    if not (np.abs(value) < LARGE).all():
+    if not (np.abs(value) < LARGEST_FIGURE).all():
         raise UserError(f"{file}: not the policy of a run (a value out of range)")
     if not table.deterministic:
         raise UserError("policy: draws its sets at random, so that there is no table of them")

@@ -27,7 +27,7 @@ _Size: TypeAlias = tuple[int, int]
 """Rows and columns of a grid."""
 _Layers: TypeAlias = dict[str, Array]
 """Numbers `[M]`, one for each cell, by what they are called."""
-ON, OFF, IDLE = "#0072b2", "#dcebf4", "#d55e01"
+_ON, _OFF, _IDLE = "#0072b2", "#dcebf4", "#d55e01"
 _AFTER = ("just located (n = 0)", "after one miss (n = 1)")
 _SIDE = 0.92
 """Of a cell's square: the gap shows the grid without lines."""
@@ -253,7 +253,7 @@ def _tiles(axes: Axes, on: Array, possible: BoolArray, size: _Size, reach: int) 
     rows, columns = size
     # 2 reach + 1 cells and one between tiles; squares are (left, top, side).
     side = 2 * reach + 2
-    groups: dict[str, list[tuple[float, float, float]]] = {OFF: [], ON: [], IDLE: []}
+    groups: dict[str, list[tuple[float, float, float]]] = {_OFF: [], _ON: [], _IDLE: []}
     for x in range(rows * columns):
         row, column = divmod(x, columns)
         # The tile of x begins at (column, row) * side; its centre, x itself, is at + reach, and j is drawn relative to
@@ -261,7 +261,7 @@ def _tiles(axes: Axes, on: Array, possible: BoolArray, size: _Size, reach: int) 
         for j in np.flatnonzero(possible[x] | (on[x] > 0)):
             down, across = j // columns - row, j % columns - column
             left, top, share = column * side + reach + across, row * side + reach + down, on[x, j]
-            for colour, filled in ((OFF, share < 1), (ON, share)) if possible[x, j] else ((IDLE, share),):
+            for colour, filled in ((_OFF, share < 1), (_ON, share)) if possible[x, j] else ((_IDLE, share),):
                 length = _SIDE * float(filled) ** 0.5  # the area is the share
                 if length:
                     margin = 0.5 * (_SIDE - length)

@@ -17,16 +17,15 @@ from rich.table import Table
 from rich.text import Text
 
 from trackmdp.errors import UserError
+from trackmdp.reports.checks import LARGEST_FIGURE
 from trackmdp.reports.gather import planned, run_folders
 from trackmdp.training.folders import SUMMARY, run_of
 from trackmdp.untrusted import decoded, known_object, opened, printable
 
-WAITING, RUNNING, CUT, FAILED, DONE = "waiting", "running", "cut", "failed", "done"
+_WAITING, _RUNNING, _CUT, _FAILED, _DONE = "waiting", "running", "cut", "failed", "done"
 # A table of metrics may be large, and is looked at every few seconds for every run; its end is enough.
 TAIL = 4096
 """Bytes read from the end of `metrics.csv`."""
-LARGE = 1e15
-"""No figure of a run is as large; nan is not smaller either."""
 
 
 @dataclass(frozen=True)
@@ -71,11 +70,11 @@ def watch(sweep: Path, console: Console, every: float) -> int:
         said: dict[str, str] = {}  # name -> the state last told
         for found in chain([first], looks):
             for status in found:
-                if status.state != WAITING and said.get(status.name) != status.state:
+                if status.state != _WAITING and said.get(status.name) != status.state:
                     said[status.name] = status.state
                     console.print(printable(_line(status)), markup=False)
         console.print(_counts(found), markup=False)
-    return sum(status.state == DONE for status in found)
+    return sum(status.state == _DONE for status in found)
 
 
 def statuses(sweep: Path) -> list[Status]:
@@ -97,21 +96,21 @@ def _going(sweep: Path, found: Sequence[Status]) -> bool:
     # "cut" or "waiting" with the sweep still running means: still to come; without it nothing will come, and watching
     # ends.
     states = {status.state for status in found}
-    return RUNNING in states or (bool(states & {WAITING, CUT}) and run_of(sweep).state == RUNNING)
+    return _RUNNING in states or (bool(states & {_WAITING, _CUT}) and run_of(sweep).state == _RUNNING)
 
 
 def _status(place: Path, name: str) -> Status:
     found, plan = run_of(place), known_object(place / "plan.json")
-    if found.state == FAILED:
-        return Status(name, FAILED, reason=found.reason)
+    if found.state == _FAILED:
+        return Status(name, _FAILED, reason=found.reason)
     # The run is being written while it is read: a file may be missing, or of the moment before.
     upper, last = _number(plan, "upper_bound"), _last_rows(place / "metrics.csv")
-    if found.state == DONE:
+    if found.state == _DONE:
         summary = found.result
         earned, best = _number(summary.get("policy"), "aihtr"), _number(summary.get("optimal"), "upper")
         bounds = [bound for bound in (upper, best) if bound is not None]
         # The solver's bound may be tighter than the clocked one of the plan.
-        return Status(name, DONE, 1.0, min(bounds) - earned if bounds and earned is not None else None, 0.0)
+        return Status(name, _DONE, 1.0, min(bounds) - earned if bounds and earned is not None else None, 0.0)
     if not last:  # not begun, or a run by blocks, each of which has metrics of its own
         done, blocks = len([*place.glob(f"blocks/*/{SUMMARY}")]), _number(plan, "blocks") or 0.0
         return Status(name, found.state, min(1.0, done / blocks) if blocks >= 1 else 0.0)
@@ -130,7 +129,7 @@ def _number(said: Any, key: str) -> float | None:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return None
     # Comparing is false for nan, so that it is left out like what is too large.
-    return float(value) if abs(value) < LARGE else None
+    return float(value) if abs(value) < LARGEST_FIGURE else None
 
 
 def _last_rows(file: Path) -> list[dict[str, float]]:
@@ -153,14 +152,16 @@ def _last_rows(file: Path) -> list[dict[str, float]]:
     except UserError:
         return []
     whole = [row for row in found if row.keys() >= {"iteration", "seconds"}]
-    return [row for row in whole if all(abs(value) < LARGE for value in row.values()) and row["iteration"] >= 1]
+    return [
+        row for row in whole if all(abs(value) < LARGEST_FIGURE for value in row.values()) and row["iteration"] >= 1
+    ]
 
 
 def _table(found: Sequence[Status], height: int) -> Group:
     shown = Table(expand=False)
     for label in ("run", "state", "progress", "gap", "left"):
         shown.add_column(label, justify="left" if label in ("run", "state") else "right")
-    order = {RUNNING: 0, FAILED: 1, CUT: 2, WAITING: 3, DONE: 4}
+    order = {_RUNNING: 0, _FAILED: 1, _CUT: 2, _WAITING: 3, _DONE: 4}
     # Frame and heading take four lines, what follows the table two. A table higher than the terminal could not be
     # redrawn in place.
     room = max(3, height - 6)
@@ -174,7 +175,7 @@ def _table(found: Sequence[Status], height: int) -> Group:
 
 def _figures(status: Status) -> tuple[str, str, str]:
     gap = "" if status.gap is None else f"{status.gap:,.2f}"
-    left = "" if status.left is None or status.state != RUNNING else f"{status.left:,.0f} s"
+    left = "" if status.left is None or status.state != _RUNNING else f"{status.left:,.0f} s"
     return f"{100 * status.share:.0f} %", gap, left
 
 
@@ -183,7 +184,7 @@ def _line(status: Status) -> str:
     words = [f"{status.name}: {status.state}"]
     if status.reason:
         words.append(status.reason)
-    if status.state in (RUNNING, CUT):
+    if status.state in (_RUNNING, _CUT):
         words.append(share)
     words += [f"gap {gap}"] * bool(gap) + [f"{left} left"] * bool(left)
     return ", ".join(words)
@@ -191,5 +192,7 @@ def _line(status: Status) -> str:
 
 def _counts(found: Sequence[Status]) -> str:
     states = [status.state for status in found]
-    parts = [f"{states.count(state)} {state}" for state in (DONE, RUNNING, FAILED, CUT, WAITING) if state in states]
+    parts = [
+        f"{states.count(state)} {state}" for state in (_DONE, _RUNNING, _FAILED, _CUT, _WAITING) if state in states
+    ]
     return f"{len(found)} runs: {', '.join(parts)}"

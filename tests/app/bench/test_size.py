@@ -92,7 +92,7 @@ def test_exponents_are_of_growth_with_the_number_of_cells(tmp_path: Path, monkey
 
 
 def test_what_blocks_lose_by_the_width_of_their_halo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(blocks, "COSTS", (0.16,))
+    monkeypatch.setattr(blocks, "_COSTS", (0.16,))
     rows = bench(tmp_path / "handoff", "part=handoff", "grid.size=8", "blocks=[4]", "halos=[0]", "cost.safe=10")
     # The reach of the default kernel is 1: R (T_max + 2) is 3 for T_max 1 and 4 for T_max 2.
     assert [(row["T_max"], row["halo"], row["sweeps"]) for row in rows] == [

@@ -20,7 +20,7 @@ from trackmdp.solvers.solve import by_blocks, run_solver
 from trackmdp.solvers.workers import Crew, Piece, Result, crew
 from trackmdp.world.model import World
 
-COSTS, T_MAX = (0.16, 0.22), (1, 2)
+_COSTS, _T_MAX = (0.16, 0.22), (1, 2)
 
 
 def handoff(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator[dict[str, Any]]:  # noqa: ARG001
@@ -29,7 +29,7 @@ def handoff(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterato
     The kernel and D are those of the config, so that all rows are about one target. A row for each halo shows what the
     blocks' own plans lose; the last one, of the default halo, what is left after the sweeps over the whole grid.
     """
-    for cost, t_max in product(COSTS, T_MAX):
+    for cost, t_max in product(_COSTS, _T_MAX):
         here = replace(world, cost=np.full(world.num_cells, cost), t_max=t_max)
         whole = run_solver(here, compose("solve").solver)
         for block, halo in product(cfg.blocks, [*sorted({*cfg.halos, default_halo(here)}), None]):

@@ -21,7 +21,7 @@ from trackmdp.training.machine import needs
 from trackmdp.world.make import build_world
 from trackmdp.world.model import World
 
-COSTS = (0.16, 0.22)
+_COSTS = (0.16, 0.22)
 """Prices: at the first beliefs hardly spread, at the second all probabilities lie below c/r."""
 WINDOW, ENVS = 2, 1024
 RESULTS = {"solve": "solution.json", "train": "summary.json", "benchmark": "benchmark.json"}
@@ -45,7 +45,7 @@ def _rows(cfg: BenchmarkConfig, device: torch.device) -> Iterator[dict[str, Any]
     own = [f"threads={cfg.threads}", f"device={device}", f"seed={cfg.seed}"]
     for n in cfg.sizes:
         at = [*typed("kernel", "grid.t_max", "cost.safe"), f"grid.size={n}"]
-        for cost in COSTS if "solve" in cfg.work else ():
+        for cost in _COSTS if "solve" in cfg.work else ():
             yield _row(n, f"solve, c = {cost:g}", "solve", *at, f"cost.sensor={cost}")
         if "train" in cfg.work:
             # Actions over all cells would make a budget per cell one of M² numbers.

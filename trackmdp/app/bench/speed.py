@@ -29,11 +29,11 @@ from trackmdp.training.collect import make_collector
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.model import World
 
-Row = dict[str, Any]
+_Row = dict[str, Any]
 _EPISODES = 100
 
 
-def env_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator[Row]:
+def env_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator[_Row]:
     """Steps with random subsets drawn inside the loop, resets included, nothing stored; `grid.window` as it is set."""
     for envs in cfg.batch_sizes:
         env = TrackEnv(world, envs, seed=cfg.seed, device=device)
@@ -51,7 +51,7 @@ def env_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> Itera
         yield {"envs": envs, **rate(step, cfg.seconds, device)}
 
 
-def collector_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator[Row]:
+def collector_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator[_Row]:
     """Frames of the collector that training uses, 32 steps a batch, for policies from free to a network."""
     policies: dict[str, TensorDictModuleBase] = {
         "random": RandomSubset(world.num_sensors, generator(cfg.seed, "benchmark", device=device)),
@@ -82,7 +82,7 @@ def collector_speed(cfg: BenchmarkConfig, world: World, device: torch.device) ->
             yield {"policy": name, "envs": envs, **figures}
 
 
-def train_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator[Row]:
+def train_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator[_Row]:
     """Frames per second of collecting and learning, for each algorithm as its config stands.
 
     Each is run for five times `seconds`, or to its end where that comes first (`whole`): then the updates that follow
@@ -107,7 +107,7 @@ def train_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> Ite
         yield {"algo": name, "whole": done == algorithm.iterations, **figures}
 
 
-def log_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator[Row]:
+def log_speed(cfg: BenchmarkConfig, world: World, device: torch.device) -> Iterator[_Row]:
     """Steps per second of recording, writing, reading and decoding; bytes of a step; belief and policy are in it."""
     policies = {"qmdp": as_policy(world, qmdp.solve(world)), "random_k": Policy.random_k(world, 5)}
     with tempfile.TemporaryDirectory() as folder:
