@@ -236,6 +236,12 @@ def test_files_are_named_after_what_they_show() -> None:
     assert "/" not in figures.slug("kernel=table, path=/a/b")
 
 
+def test_a_long_title_becomes_a_name_that_a_file_can_have() -> None:
+    one, other = (figures.slug("\U00020000" * 5_000 + end) for end in "ab")
+    assert one != other and len(one.encode()) < 200
+    assert figures.slug("a" * 5_000) == figures.slug("a" * 5_000) and len(figures.slug("a" * 5_000)) < 200
+
+
 def test_a_map_of_a_rectangle_has_its_rows_and_columns(results: Results) -> None:
     name, kept = next(iter(results.policies.items()))
     motion = results.motions["a2c-0.16-0"]

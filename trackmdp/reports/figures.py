@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -223,9 +224,12 @@ def _break(upper: Axes, lower: Axes, bottom: float, lower_end: float, upper_star
 
 
 def slug(title: str) -> str:
-    """A title as part of a file's name."""
-    kept = "".join(character if character.isalnum() else "-" for character in title.lower())
-    return "-".join(part for part in kept.split("-") if part) or "all"
+    """A title as part of a file's name, of which systems take 255 bytes."""
+    letters = "".join(character if character.isalnum() else "-" for character in title.lower())
+    kept = "-".join(part for part in letters.split("-") if part) or "all"
+    if len(kept.encode()) <= 200:
+        return kept
+    return f"{kept[:40]}-{hashlib.sha256(title.encode()).hexdigest()[:8]}"  # a letter has four bytes at most
 
 
 def curves(study: Study, points: Mapping[str, Sequence[CurvePoint]], by: str) -> Figure | None:
