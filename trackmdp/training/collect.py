@@ -41,11 +41,11 @@ def single(
         device: the learner's, where the batches end up.
         done: of `cfg.total_frames`, made up to whole batches, so many were collected by an earlier process.
     """
-    env = _env(problem, cfg, seed, "world")
+    env, common = _env_options(cfg, seed), _common(cfg, device, done)
     # Trajectory numbers are read by no learner here, take a tenth of the collecting time, and would be one more state
     # to save. A buffer would be copied out for every batch: without one each batch is stacked once and is the caller's.
     once = {"use_buffers": False, "return_same_td": True}
-    return Collector(env, policy, track_traj_ids=False, **once, **_common(cfg, device, done))
+    return Collector(TrackEnv(problem, **env), policy, track_traj_ids=False, **once, **common)
 
 
 def _in_workers(
@@ -59,8 +59,9 @@ def _in_workers(
     done: int = 0,
 ) -> BaseCollector:
     """A collector of TorchRL's `kind` in worker processes; arguments as for `single`."""
+    env = _env_options(cfg, seed)
     # A resumed run's workers have streams of their own (`done`), not the first ones again.
-    workers = [partial(_worker_env, problem, cfg, seed, f"{worker}-{done}") for worker in range(cfg.workers)]
+    workers = [partial(_worker_env, problem, f"{worker}-{done}", env) for worker in range(cfg.workers)]
     threads = {"num_threads": torch.get_num_threads(), "num_sub_threads": cfg.threads}
     return kind(workers, policy, **threads, **_common(cfg, device, done))
 
@@ -81,13 +82,14 @@ def ray(
     """
     from trackmdp.training import on_ray
 
-    workers = [partial(_remote_env, problem, cfg, seed, f"{worker}-{done}") for worker in range(cfg.workers)]
+    env = _env_options(cfg, seed)
+    workers = [partial(_remote_env, problem, f"{worker}-{done}", env, cfg.threads) for worker in range(cfg.workers)]
     return on_ray.make_ray_collector(workers, policy, cfg, _common(cfg, device, done))
 
 
-def _env(problem: Problem, cfg: CollectorConfig, seed: int, stream: str) -> TrackEnv:
+def _env_options(cfg: CollectorConfig, seed: int) -> dict[str, Any]:
     device = make_device(cfg.device, "collector.device")
-    return TrackEnv(problem, cfg.envs, seed=seed, stream=stream, device=device)
+    return {"batch_size": cfg.envs, "seed": seed, "device": device}
 
 
 def _common(cfg: CollectorConfig, device: torch.device, done: int) -> dict[str, Any]:
@@ -110,18 +112,18 @@ def _common(cfg: CollectorConfig, device: torch.device, done: int) -> dict[str, 
     }
 
 
-def _worker_env(problem: Problem, cfg: CollectorConfig, seed: int, worker: str) -> TrackEnv:
+def _worker_env(world: Problem, worker: str, env: dict[str, Any]) -> TrackEnv:
     """Built in a worker process: its own stream for the targets, and for the actions sampled there."""
     # Ctrl-C, and a scheduler's SIGTERM, go to the workers as well. They must not die of them: the learner would wait
     # for an answer of theirs while it should save. It tells them to end, and kills those that do not.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     end_with_parent()
-    torch.manual_seed(derive(seed, "torch", worker))
-    return _env(problem, cfg, seed, f"world-{worker}")
+    torch.manual_seed(derive(env["seed"], "torch", worker))
+    return TrackEnv(world, stream=f"world-{worker}", **env)
 
 
-def _remote_env(problem: Problem, cfg: WorkersConfig, seed: int, worker: str) -> TrackEnv:
-    torch.set_num_threads(cfg.threads)
-    torch.manual_seed(derive(seed, "torch", worker))
-    return _env(problem, cfg, seed, f"world-{worker}")
+def _remote_env(world: Problem, worker: str, env: dict[str, Any], threads: int) -> TrackEnv:
+    torch.set_num_threads(threads)
+    torch.manual_seed(derive(env["seed"], "torch", worker))
+    return TrackEnv(world, stream=f"world-{worker}", **env)
