@@ -99,6 +99,7 @@ def test_what_is_no_address_leaves_no_folder(
     assert f"{key}={given}: expected" in refused(capsys, *words.split(), f"{key}='{given}'")
 
 
+@pytest.mark.slow  # run where Ray is installed, as the slow tests are
 @pytest.mark.skipif(find_spec("ray") is None, reason="ray is not installed")
 @pytest.mark.parametrize(
     "words",
