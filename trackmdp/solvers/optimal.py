@@ -22,10 +22,11 @@ from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import qmdp
 from trackmdp.solvers.bounds import exact_clocked_table
 from trackmdp.solvers.branch import Tree
+from trackmdp.solvers.budget import Budget, Shares
 from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.exchange import best_of, exchanged, other_starts
-from trackmdp.solvers.known import Budget, Shares, planted
+from trackmdp.solvers.known import planted
 from trackmdp.solvers.layers import Layer, layer_sets, policy_table, reachable_layers
 from trackmdp.solvers.regions import adopted, improved, proved, region_side
 from trackmdp.solvers.renewal import RenewalSystem, expected_steps
