@@ -176,8 +176,12 @@ def _check_files(cfg: CommandConfig, words: Sequence[str]) -> None:
         load_run_config(cfg.run)
     elif isinstance(cfg, config.ExportConfig):
         load_run_config(cfg.run)
-    elif isinstance(cfg, config.ReportConfig) and not Path(cfg.sweep).is_dir():
-        raise UserError(f"sweep={cfg.sweep}: no such folder")
+    elif isinstance(cfg, config.ReportConfig):
+        if not Path(cfg.sweep).is_dir():
+            raise UserError(f"sweep={cfg.sweep}: no such folder")
+        # All that is below would be searched for runs: minutes, for a report of what does not belong together.
+        if not Path(cfg.sweep).resolve().name:
+            raise UserError(f"sweep={cfg.sweep}: expected the folder of a sweep, not the root of the file system")
     elif isinstance(cfg, config.ReplayConfig):
         _check_outputs(cfg)
 

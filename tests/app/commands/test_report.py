@@ -100,6 +100,7 @@ def test_mistakes_end_in_one_line(
     (tmp_path / "empty").mkdir()
     assert refused(capsys, "report") == "sweep: missing, expected the folder of a sweep or an earlier report"
     assert refused(capsys, "report", "sweep=nowhere") == f"sweep={Path.cwd() / 'nowhere'}: no such folder"
+    assert "not the root of the file system" in refused(capsys, "report", "sweep=/", "hydra.run.dir=../out")
     assert "no runs in there" in refused(capsys, "report", "sweep=../empty")
     assert "no runs in there" in refused(capsys, "report", "sweep=../empty", "watch=true")
     assert not list((tmp_path / "empty").iterdir())
