@@ -15,16 +15,18 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from trackmdp.algos.common import make_algorithm
 from trackmdp.config import GROUPS, EvaluateConfig, TrainConfig, options
 from trackmdp.config.compose import compose
-from trackmdp.config.registry import conf_file
+from trackmdp.config.registry import read_values
 from trackmdp.config.world import BORDERS
+from trackmdp.world.dynamics import Dynamics
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.model import Array, World
-from trackmdp.world.modes import HiddenWorld, heading_kernel
+from trackmdp.world.modes import heading_kernel
+from trackmdp.world.paths import RESOLUTION, path_sampler
 
 
 def _without_files(group: str) -> list[str]:
     """Choices of a group that need no file of the user's."""
-    return [name for name in GROUPS[group] if "???" not in conf_file(f"{group}/{name}").read_text()]
+    return [name for name in GROUPS[group] if "???" not in read_values(f"{group}/{name}").values()]
 
 
 KERNELS = [name for name in _without_files("kernel") if not GROUPS["kernel"][name].hides]
@@ -36,6 +38,7 @@ __all__ = [
     "BASELINES",
     "BORDERS",
     "KERNELS",
+    "advanced",
     "algorithm",
     "collect",
     "configured",
@@ -52,7 +55,9 @@ __all__ = [
 
 def configured(command: str, *overrides: str) -> Any:
     """The checked config of `trackmdp command overrides...`."""
-    typed = OmegaConf.from_dotlist([])  # reads values as the command line does: numbers, null, lists
+    typed = OmegaConf.from_dotlist(
+        []
+    )  # reads values as the command line does: numbers, null, lists
     given = {}
     for key, _, value in (word.partition("=") for word in overrides):
         typed.merge_with_dotlist([f"value={value}"])
@@ -76,16 +81,25 @@ def hop_world(t_max: int = 1, *, safe_cost: float = 0.9) -> World:
     """A 2x2 grid: the target hops 0 -> 1 -> 2 -> 3 -> 0, staying in the grid with probability 3/4; r = 2."""
     kernel = np.zeros((4, 4))
     kernel[[0, 1, 2, 3], [1, 2, 3, 0]] = 0.75
-    return World(kernel, 2, cost=np.array([0.1, 0.2, 0.3, 0.4]), safe_cost=safe_cost, t_max=t_max, reward=2.0)
+    return World(
+        kernel, 2, cost=np.array([0.1, 0.2, 0.3, 0.4]), safe_cost=safe_cost, t_max=t_max, reward=2.0
+    )
 
 
-def headings(size: int = 3, keep: float = 0.8, *, cost: float = 0.2, t_max: int = 1, **more: Any) -> HiddenWorld:
+def headings(
+    size: int = 3, keep: float = 0.8, *, cost: float = 0.2, t_max: int = 1, **more: Any
+) -> World:
     kernel, modes = heading_kernel(size, keep=keep, go=0.9, exit_probability=0.05)
-    return HiddenWorld(kernel, size, modes=modes, cost=cost, t_max=t_max, **{"clip": 1, **more})
+    return World(kernel, size, modes=modes, cost=cost, t_max=t_max, **{"clip": 1, **more})
 
 
 def small_world(
-    size: int = 3, t_max: int = 1, *, exit_probability: float = 0.1, seed: int = 0, max_steps: int | None = None
+    size: int = 3,
+    t_max: int = 1,
+    *,
+    exit_probability: float = 0.1,
+    seed: int = 0,
+    max_steps: int | None = None,
 ) -> World:
     """A dense random kernel that leaves soon; the safe action costs what all sensors do."""
     m = size**2
@@ -98,7 +112,9 @@ def limited(problem: Any, max_steps: int | None) -> Any:
     return replace(problem, max_steps=max_steps)
 
 
-def random_kernel(rng: np.random.Generator, m: int, exit_probability: float, density: float = 0.7) -> Array:
+def random_kernel(
+    rng: np.random.Generator, m: int, exit_probability: float, density: float = 0.7
+) -> Array:
     """`[m, m]` with empty cells in most rows, each summing to 1 - exit_probability."""
     table = rng.random((m, m)) ** 3 * (rng.random((m, m)) < density)
     table[np.arange(m), rng.integers(m, size=m)] += 0.2
@@ -114,7 +130,12 @@ def worlds(draw: st.DrawFn) -> World:
     cost = rng.random(m) if draw(st.booleans()) else np.full(m, rng.random())
     kernel = random_kernel(rng, m, draw(st.sampled_from([1e-6, 0.1, 0.5])))
     return World(
-        kernel, size, cost=cost, reward=float(1 + rng.random()), safe_cost=float(3 * rng.random()), t_max=t_max
+        kernel,
+        size,
+        cost=cost,
+        reward=float(1 + rng.random()),
+        safe_cost=float(3 * rng.random()),
+        t_max=t_max,
     )
 
 
@@ -126,7 +147,7 @@ def random_state(world: World, rows: int, seed: int) -> TensorDict:
     history = torch.rand(rows, choices, k, generator=rng) < 0.4
     history &= (torch.arange(choices) < n.unsqueeze(-1)).unsqueeze(-1)
     state = {
-        "target": torch.randint(m, (rows,), generator=rng),
+        "place": torch.randint(m, (rows,), generator=rng),
         "last_cell": torch.randint(m, (rows,), generator=rng),
         "steps_since_detection": n,
         "action_history": history,
@@ -135,10 +156,20 @@ def random_state(world: World, rows: int, seed: int) -> TensorDict:
     return TensorDict(state, [rows])
 
 
+def advanced(problem: Any, state: Any, draws: Any, reports: Any = None) -> dict[str, torch.Tensor]:
+    """A step of the dynamics from a state with its `action`, for uniform draws `[B]` in [0, 1)."""
+    dynamics = Dynamics(problem, path_sampler(problem))
+    numbers = (torch.as_tensor(draws, dtype=torch.float64) * RESOLUTION).long()
+    before = {key: state[key] for key in state.keys() if key != "action"}  # noqa: SIM118 (tensordicts)
+    return dynamics.advance(before, state["action"], numbers, reports)
+
+
 class Watched(TrackEnv):
     """Says after each step of `step_and_maybe_reset` where the targets were and came to: under `target`."""
 
-    def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+    def _step_and_maybe_reset(
+        self, tensordict: TensorDictBase
+    ) -> tuple[TensorDictBase, TensorDictBase]:
         before = self.target
         frame, rows = super()._step_and_maybe_reset(tensordict)
         frame["target"], frame["next", "target"] = before, self.reached
@@ -146,12 +177,14 @@ class Watched(TrackEnv):
 
     def _stepped(self, action: torch.Tensor) -> dict[str, torch.Tensor]:
         following = super()._stepped(action)
-        self.reached = following["target"].reshape(self.batch_size)
+        self.reached = self.target
         return following
 
 
 @torch.no_grad()
-def collect(world: World, policy: Any, envs: int, time: int, *, seed: int = 0, max_steps: int | None = None) -> Any:
+def collect(
+    world: World, policy: Any, envs: int, time: int, *, seed: int = 0, max_steps: int | None = None
+) -> Any:
     """Frames `[envs, time]` of `policy`, as a collector would hand them over."""
     env = TrackEnv(limited(world, max_steps), envs, seed=seed)
     rows, frames = env.reset(), []
@@ -164,8 +197,19 @@ def collect(world: World, policy: Any, envs: int, time: int, *, seed: int = 0, m
 
 def algorithm(name: str, world: World, *overrides: str) -> Any:
     """The learner `name` for `world` on a small budget, its other options as in conf/ but for `overrides`."""
-    small = {"hidden": 32, "batch_size": 64, "buffer_size": 4096, "updates": 2, "rounds": 2, "rounds_at_end": 2}
-    mine = [f"algo.{key}={value}" for key, value in small.items() if key in options(GROUPS["algo"][name])]
+    small = {
+        "hidden": 32,
+        "batch_size": 64,
+        "buffer_size": 4096,
+        "updates": 2,
+        "rounds": 2,
+        "rounds_at_end": 2,
+    }
+    mine = [
+        f"algo.{key}={value}"
+        for key, value in small.items()
+        if key in options(GROUPS["algo"][name])
+    ]
     budget = ("algo.total_frames=4096", "algo.frames_per_batch=256", "algo.envs=32")
     cfg = train_config(f"algo={name}", *budget, *mine, *overrides)
     return make_algorithm(cfg, world, torch.device("cpu"))

@@ -38,7 +38,9 @@ def unread(cfg: Any, reads: set[str]) -> set[str]:
     return everything - reads
 
 
-def _recorder(schema: type[Any], keys: dict[int, str], reads: set[str]) -> Callable[[Any, str], Any]:
+def _recorder(
+    schema: type[Any], keys: dict[int, str], reads: set[str]
+) -> Callable[[Any, str], Any]:
     values = {name for name, described in options(schema).items() if isinstance(described, Option)}
 
     def read(self: Any, name: str) -> Any:

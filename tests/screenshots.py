@@ -21,13 +21,27 @@ from rich.text import Text
 from tests.episodes.browser import Browser
 
 VIEWS = {"desktop": (1280, 900, "light"), "phone": (390, 844, "light"), "dark": (1280, 900, "dark")}
-TERMINAL = {"80": (800, 300, "light")}  # 80 letters are 770 pixels wide; the page is as high as its text
-CITY = ("kernel.step=5", "kernel.cell=50", "grid.size=[18,15]", "cost.sensor=0.1")
+TERMINAL = {
+    "80": (800, 300, "light")
+}  # 80 letters are 770 pixels wide; the page is as high as its text
+CITY = ("kernel.step=5", "grid.cell=50", "grid.size=[18,15]", "cost.sensor=0.1")
 SHORT = ("algo.total_frames=60_000", "algo.frames_per_batch=10_000")
 RUNS = {
     "run": ["cost.sensor=0.22"],
-    "footprint": ["sensor=footprint", "sensor.radius=1", "sensor.spacing=2", "grid.size=8", "cost.sensor=0.22"],
-    "memory": ["algo=path_counts", "kernel=heading", "task.memory=displacement", "grid.size=5", *SHORT],
+    "footprint": [
+        "sensor=footprint",
+        "sensor.radius=1",
+        "sensor.spacing=2",
+        "grid.size=8",
+        "cost.sensor=0.22",
+    ],
+    "memory": [
+        "algo=model_based",
+        "kernel=heading",
+        "task.memory=displacement",
+        "grid.size=5",
+        *SHORT,
+    ],
     "blocks": ["grid.size=16", "cost.sensor=0.22", "partition.block=8"],
 }
 
@@ -71,9 +85,23 @@ def main(folder: Path) -> None:
     sweep, tracks = folder / "sweep", folder / "tracks"
     city = f"kernel.path={Path(__file__).parent / 'data/city.csv'}"
     commands = {
-        "tracks": ["train", "algo=path_counts", "kernel=tracks", city, *CITY, f"hydra.run.dir={tracks}"],
+        "tracks": [
+            "train",
+            "algo=model_based",
+            "kernel=tracks",
+            city,
+            *CITY,
+            f"hydra.run.dir={tracks}",
+        ],
         "held-out": ["evaluate", f"run={tracks}", f"hydra.run.dir={tracks}/e"],
-        "sweep": ["train", "-m", "seed=0,1", "cost.sensor=0.16,0.22", *SHORT, f"hydra.sweep.dir={sweep}"],
+        "sweep": [
+            "train",
+            "-m",
+            "seed=0,1",
+            "cost.sensor=0.16,0.22",
+            *SHORT,
+            f"hydra.sweep.dir={sweep}",
+        ],
         "report": ["report", f"sweep={sweep}"],
         "watch": ["report", f"sweep={sweep}", "watch=true"],
         "verify": ["verify", f"hydra.run.dir={folder / 'verify'}"],
@@ -88,7 +116,13 @@ def main(folder: Path) -> None:
         log = f"file={run}/e/episodes.mcap"
         commands |= {
             name: ["train", *words, f"hydra.run.dir={run}"],
-            f"{name}-evaluate": ["evaluate", f"run={run}", "log=[mcap]", "episodes=20", f"hydra.run.dir={run}/e"],
+            f"{name}-evaluate": [
+                "evaluate",
+                f"run={run}",
+                "log=[mcap]",
+                "episodes=20",
+                f"hydra.run.dir={run}/e",
+            ],
             f"{name}-list": ["replay", log],
             f"{name}-replay": ["replay", log, "episode=3", f"html={pages[f'{name}-episode']}"],
             f"{name}-report": ["report", f"sweep={run}"],
@@ -99,7 +133,9 @@ def main(folder: Path) -> None:
         pages[f"terminal-{name}"] = page
     with Browser(folder / "profile") as browser:
         for name, page in pages.items():
-            for view, (width, height, scheme) in (TERMINAL if "terminal" in name else VIEWS).items():
+            for view, (width, height, scheme) in (
+                TERMINAL if "terminal" in name else VIEWS
+            ).items():
                 browser.view(width, height, scheme)
                 browser.open(page)
                 if name.endswith("episode"):  # at its first miss

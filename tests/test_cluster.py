@@ -5,9 +5,7 @@ from __future__ import annotations
 import signal
 import socket
 import sys
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from importlib.util import find_spec
 from pathlib import Path
 from unittest.mock import Mock
@@ -27,67 +25,28 @@ BLOCKS = "solve grid.size=4 partition.block=2"
 
 
 @pytest.mark.parametrize("given", ["{free}", "auto", "127.0.0.1:99999"])
-def test_where_nothing_listens_is_one_line_at_once(given: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_nothing_listens_is_one_line_at_once(
+    given: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))  # and does not listen
         address = f"127.0.0.1:{free.getsockname()[1]}"
         monkeypatch.setenv("RAY_ADDRESS", address)
         given = given.format(free=address)
         with (
-            pytest.raises(UserError, match=f"x={given}: expected a Ray cluster .nothing listens there: [^\n]+$"),
+            pytest.raises(
+                UserError,
+                match=f"x={given}: expected a Ray cluster .nothing listens there: [^\n]+$",
+            ),
             joining("x", given),
         ):
             pytest.fail("asked Ray, which waits for minutes")
-
-
-@contextmanager
-def listening(greeting: bytes | None) -> Iterator[str]:
-    """The address of what says `greeting` to whoever connects, and ends; None: nothing, and it stays."""
-
-    def greet() -> None:
-        with server.accept()[0] as stream:
-            stream.sendall(greeting or b"")
-            stream.shutdown(socket.SHUT_WR)
-            while stream.recv(99):  # closed with something unread, it would reset the connection
-                pass
-
-    with socket.create_server(("127.0.0.1", 0)) as server, ThreadPoolExecutor(1) as threads:
-        done = threads.submit(greet) if greeting is not None else None
-        yield f"127.0.0.1:{server.getsockname()[1]}"
-        assert done is None or done.result() is None
-
-
-@pytest.mark.parametrize(
-    "greeting", [None, b"", b"\0\0\0\4", b"SSH-2.0-OpenSSH_9.6\r\n", b"HTTP/1.1 400 Bad Request\r\n"]
-)
-def test_what_listens_and_is_not_ray_is_one_line(greeting: bytes | None, monkeypatch: pytest.MonkeyPatch) -> None:
-    if greeting is None:
-        monkeypatch.setattr("trackmdp.cluster._PATIENCE", 0.01)
-    with (
-        listening(greeting) as address,
-        pytest.raises(UserError, match=f"x={address}: expected a Ray cluster .what listens there is not Ray"),
-        joining("x", address),
-    ):
-        pytest.fail("asked Ray, which waits for minutes")
-
-
-def test_what_greets_as_ray_does_is_joined() -> None:
-    settings = b"\0\0\6\4\0\0\0\0\0" + b"\0\5\0\0\x40\0"  # 6 bytes: one setting, the longest frame
-    with listening(settings) as address, joining("x", address):
-        pass
-
-
-def test_behind_tls_the_greeting_is_left_to_ray(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("RAY_USE_TLS", "1")
-    with listening(b"") as address, joining("x", address):
-        pass
 
 
 @pytest.mark.parametrize(
     ("words", "key"),
     [
         (BLOCKS, "partition.cluster"),
-        ("benchmark part=workers", "cluster"),
         ("train collector=ray", "collector.address"),
         ("train -m seed=0,1 hydra/launcher=ray", "hydra.launcher.address"),
     ],
@@ -113,7 +72,9 @@ def test_what_is_no_address_leaves_no_folder(
 def test_without_its_cluster_a_command_leaves_no_folder(
     words: str, empty_folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert "expected a Ray cluster" in refused(capsys, *f"{words}=127.0.0.1:99999 quiet=true".split())
+    assert "expected a Ray cluster" in refused(
+        capsys, *f"{words}=127.0.0.1:99999 quiet=true".split()
+    )
 
 
 def test_a_cluster_of_our_own_is_none_that_runs_already(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -124,7 +85,9 @@ def test_a_cluster_of_our_own_is_none_that_runs_already(monkeypatch: pytest.Monk
     ray = Mock(**{"init.side_effect": ValueError})
     monkeypatch.setitem(sys.modules, "ray", ray)
     with pytest.raises(UserError):
-        launchers.run_on_ray(RayConfig(address=None, num_cpus=1, cpus_per_run=1.0, gpus_per_run=0.0), [])
+        launchers.run_on_ray(
+            RayConfig(address=None, num_cpus=1, cpus_per_run=1.0, gpus_per_run=0.0), []
+        )
     assert ray.init.call_args.kwargs["address"] == "local"
 
 

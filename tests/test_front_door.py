@@ -22,7 +22,9 @@ HEAVY = ("torch", "torchrl", "tensordict", "hydra", "omegaconf", "scipy", "numpy
 def after(code: str) -> Any:
     """What a new process leaves in `found` after `code`."""
     script = f"import json, sys\n{code}\nprint(json.dumps(found))"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
     return json.loads(done.stdout.splitlines()[-1])
 
 
@@ -53,10 +55,14 @@ assert tm.evaluate(world, run.policy).aihtr <= tm.solve(world).upper
 """
 
 
-def test_training_and_solving_touch_no_hydra_and_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_and_solving_touch_no_hydra_and_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("PYTHONPATH", str(Path(tm.__file__).parents[1]))
     monkeypatch.chdir(tmp_path)
-    assert not after(f"{TRAINED}\nfound = [name for name in sys.modules if name.split('.')[0] == 'hydra']")
+    assert not after(
+        f"{TRAINED}\nfound = [name for name in sys.modules if name.split('.')[0] == 'hydra']"
+    )
     assert not list(tmp_path.iterdir())
 
 
@@ -79,8 +85,17 @@ def test_every_name_is_there_and_says_what_it_is(name: str) -> None:
 
 def test_type_checkers_see_the_same_names() -> None:
     tree = ast.parse(Path(tm.__file__).read_text(encoding="utf-8"))
-    block = next(node for node in tree.body if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test))
-    seen = {alias.name: node.module for node in block.body if isinstance(node, ast.ImportFrom) for alias in node.names}
+    block = next(
+        node
+        for node in tree.body
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+    )
+    seen = {
+        alias.name: node.module
+        for node in block.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
     assert seen == tm._HOMES
     assert sorted(seen) == sorted(tm.__all__)
 
@@ -100,10 +115,18 @@ def test_a_world_is_that_of_the_command_line() -> None:
     from tests.helpers import train_config
     from trackmdp.world.make import make_problem
 
-    world = tm.make_world("drift", size=4, cost=np.linspace(0.1, 0.2, 16), direction=90, max_steps=30)
+    world = tm.make_world(
+        "drift", size=4, cost=np.linspace(0.1, 0.2, 16), direction=90, max_steps=30
+    )
     cost = ",".join(str(price) for price in np.linspace(0.1, 0.2, 16))
     same = make_problem(
-        train_config("kernel=drift", "grid.size=4", f"cost.sensor=[{cost}]", "kernel.direction=90", "grid.max_steps=30")
+        train_config(
+            "kernel=drift",
+            "grid.size=4",
+            f"cost.sensor=[{cost}]",
+            "kernel.direction=90",
+            "grid.max_steps=30",
+        )
     )
     assert isinstance(same, tm.World)
     assert (world.kernel != same.kernel).nnz == 0
@@ -114,7 +137,10 @@ def test_a_world_is_that_of_the_command_line() -> None:
 REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"size": 2}, "grid.size=2: expected"),
     ({"kernel": "lvey"}, "kernel=lvey: expected one of random_support"),
-    ({"support_sizee": 3}, "kernel.support_sizee: unknown option, did you mean kernel.support_size?"),
+    (
+        {"support_sizee": 3},
+        "kernel.support_sizee: unknown option, did you mean kernel.support_size?",
+    ),
     ({"cost": [1, 2]}, "cost.sensor: 2 values, expected one number or 100"),
     ({"t_max": 1.5}, "grid.t_max=1.5: expected an integer"),
 ]
@@ -125,3 +151,30 @@ def test_a_mistake_is_told_as_at_the_terminal(arguments: dict[str, Any], message
     with pytest.raises(UserError) as caught:
         tm.make_world(**arguments)
     assert str(caught.value).startswith(message)
+
+
+@pytest.mark.parametrize("name", ["cost", "detection", "safe_detection"])
+def test_a_map_of_numbers_is_taken_as_the_grid_has_it(name: str) -> None:
+    values = np.linspace(0.1, 0.9, 12).reshape(3, 4)
+    made = tm.make_world("drift", size=(3, 4), **{name: values})
+    given = {"cost": 0.1, "t_max": 1, name: values}
+    world = tm.World(np.eye(12) * 0.5, (3, 4), **given)
+    for each in (made, world):
+        assert np.array_equal(getattr(each, name), values.ravel())
+    for refused in (
+        lambda: tm.World(np.eye(12) * 0.5, (3, 4), **(given | {name: values.T})),
+        lambda: tm.make_world("drift", size=(3, 4), **{name: values.T}),
+    ):
+        with pytest.raises(UserError, match="12"):  # one for each of 12 cells
+            refused()
+
+
+def test_an_argument_of_another_kind_is_one_line() -> None:
+    with pytest.raises(UserError, match=r"a ndarray, expected a name; World\(kernel, size"):
+        tm.make_world(np.eye(9))  # type: ignore[arg-type]
+    with pytest.raises(UserError, match="a int, expected the path of a file, or a DataFrame"):
+        tm.load_tracks(3)
+
+
+def test_completion_offers_public_names_alone() -> None:
+    assert [name for name in dir(tm) if not name.startswith("__")] == sorted(tm.__all__)

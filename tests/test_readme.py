@@ -1,8 +1,7 @@
-"""What the README says is so: its picture, its files, its commands."""
+"""README and the handbook of commands: their set-up lines, figures, picture, Python and commands are true."""
 
 from __future__ import annotations
 
-import itertools
 import os
 import re
 import shlex
@@ -12,15 +11,13 @@ from pathlib import Path
 
 import pytest
 
+import trackmdp as tm
+from tests.documents import ROOT, Block, blocks, commands, prose, words_of
 from trackmdp.app.cli import main
 from trackmdp.config import GROUPS
 
-ROOT = Path(__file__).parents[1]
-TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
-BLOCKS = [line[4:] for line in TEXT.splitlines() if line.startswith("    ")]
-SETUP = [line for line in BLOCKS if line.startswith("pip install")]
-COMMANDS = [line for line in BLOCKS if line.startswith(("python ", "trackmdp "))]
-OURS = [line for line in COMMANDS if not line.startswith(("python -c", "python -m venv"))]
+README = ROOT / "README.md"
+COMMANDS_BOOK = ROOT / "scripts" / "README.md"
 SHORT = {
     "train": [
         "collector.total_frames=8192",
@@ -30,92 +27,126 @@ SHORT = {
     ],
     "evaluate": ["episodes=20"],
 }
+"""Words that make a command a matter of seconds."""
+GLOSSARY = "Task World Policy Key Safe_action AIHTR Regret T_max c D r Z Window R Clocked Exchange"
 
 
-def words_of(line: str) -> list[str]:
-    """A line of the README as the words after `trackmdp`."""
-    words = shlex.split(line)
-    if words[0] == "trackmdp":
-        return words[1:]
-    script = re.fullmatch(r"scripts/(\w+)\.py", words[1])
-    assert script, line
-    assert (ROOT / words[1]).is_file()
-    return [script[1], *words[2:]]
+def texts(path: Path, language: str) -> list[Block]:
+    """The blocks of one language."""
+    return [block for block in blocks(path) if block.language == language]
 
 
 def test_two_lines_set_everything_up() -> None:
-    assert SETUP == [
+    lines = [line for line in commands(README) if line.startswith("pip install")]
+    assert lines == [
         "pip install -e '.[dev]' && python scripts/train.py",
         "pip install -e '.[dev]' && pytest",
     ]
-    assert SETUP[1] == next(line for line in BLOCKS if line.endswith("pytest"))
 
 
-@pytest.mark.parametrize("line", OURS)
-def test_every_command_is_one_that_the_options_allow(
-    line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    command, *words = words_of(line)
-    words = [word for word in words if word != "-m" and "," not in word and not word.startswith("hydra")]
-    assert main([command, *words, "-c", "job"]) == 0, capsys.readouterr().err
+def test_the_readme_is_short() -> None:
+    assert len(README.read_text(encoding="utf-8").split()) <= 1420
 
 
-def test_the_picture_is_the_one_its_command_draws(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    (line,) = (line for line in OURS if "baseline=clocked" in line)
-    assert main([*words_of(line), "episodes=0", "quiet=true", "hydra.run.dir=."]) == 0
-    drawn = (tmp_path / "picture.txt").read_text(encoding="utf-8").rstrip()
-    assert "\n".join(line[4:] for line in TEXT.splitlines()).count(drawn) == 1
+def test_every_word_of_the_glossary_has_one_line() -> None:
+    section = prose(README).split("## Words")[1].split("\n## ")[0]
+    words = re.findall(r"^- \*\*([\w ]+)\*\*.*: \w.*\.$", section, re.MULTILINE)
+    assert [word.replace(" ", "_") for word in words] == GLOSSARY.split()
 
 
-def test_named_files_and_choices_exist() -> None:
-    for path in set(re.findall(r"`((?:trackmdp|conf|scripts)/[\w/.]+)`", TEXT)):
-        assert (ROOT / path).exists() or "mine" in path, path
-    named = re.search(r"evaluated in the same way: (.*?)\.\n", TEXT, flags=re.DOTALL)
+def test_the_picture_is_the_one_its_command_draws(empty_folder: Path) -> None:
+    (line,) = (line for line in commands(COMMANDS_BOOK) if "baseline=clocked" in line)
+    assert main([*(words_of(line) or []), "episodes=0", "quiet=true", "hydra.run.dir=."]) == 0
+    drawn = (empty_folder / "picture.txt").read_text(encoding="utf-8").rstrip()
+    assert [block.text for block in texts(COMMANDS_BOOK, "text")].count(drawn) == 1
+
+
+def test_the_first_table_holds_the_exact_figures_of_its_world() -> None:
+    (table,) = (block for block in texts(README, "text") if "AIHTR" in block.lines[0])
+    shown = {line[:20].strip(): line[20:].split() for line in table.lines[1:]}
+    world = tm.make_world("random_support", size=10, support_size=5, cost=0.16, t_max=1)
+    references = {"Q_MDP": "qmdp", "all on": "all_on", "optimum": "optimal"}
+    for row, name in references.items():
+        found = tm.evaluate(world, name)
+        figures = [f"{found.aihtr:,.3f}", f"{found.accuracy:.2%}"[:-1], "%"]
+        assert shown[row] == [*figures, f"{found.sensors_per_step:.2f}"]
+
+
+def test_the_handbook_lists_all_baselines() -> None:
+    named = re.search(r"^Baselines need no learning\.(.*?)\n\n", prose(COMMANDS_BOOK), re.M | re.S)
     assert named
     assert set(re.findall(r"`(\w+)`", named[1])) == set(GROUPS["baseline"])
 
 
+@pytest.mark.slow
+def test_the_lines_of_python_run(tmp_path: Path) -> None:
+    """They print the learned value, close below the optimum, and write nothing."""
+    (block,) = texts(README, "python")
+    shown = blocks(README)[blocks(README).index(block) + 1]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, "-c", block.text],
+        cwd=tmp_path, env=environment, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    number = re.compile(r"\d+\.\d+")
+    assert number.sub("#", done.stdout).splitlines() == [number.sub("#", x) for x in shown.lines]
+    learned, optimum = map(float, number.findall(done.stdout))
+    assert optimum - 0.5 < learned <= optimum
+    assert list(tmp_path.iterdir()) == []
+
+
 def few(line: str) -> list[str]:
-    """What makes the paper's sweep one of a single pair and seed."""
+    """The words that make the paper's sweep one of a single pair and seed."""
     return (
-        ["kernel.support_size=5", "kernel.seed=39", "cost.sensor=0.22", "seed=0"] if "experiment=paper" in line else []
+        ["kernel.support_size=5", "kernel.seed=39", "cost.sensor=0.22", "seed=0"]
+        if "experiment=paper" in line
+        else []
     )
 
 
-@pytest.mark.slow
-def test_the_lines_of_python_run(tmp_path: Path) -> None:
-    """What they print: the learned value, close below the bound."""
-    start = BLOCKS.index("import trackmdp as tm")
-    block = itertools.takewhile(lambda line: "tm" in line, BLOCKS[start:])
-    words = [sys.executable, "-c", "\n".join([*block, "print(len(episodes), env.batch_size)"])]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (0, "")
-    figures, sizes = done.stdout.splitlines()
-    learned, upper = map(float, figures.split())
-    assert upper - 0.5 < learned < upper
-    assert sizes == "100 torch.Size([64])"
-    assert list(tmp_path.iterdir()) == []
+def as_typed(line: str) -> list[str] | None:
+    """The process of a command line, made short; None where it installs packages or takes minutes."""
+    if line.startswith("pip ") or "venv" in line or "benchmark" in line:
+        return None
+    words = words_of(line)
+    if words is None:
+        return [sys.executable, *shlex.split(line)[1:]]
+    command, *more = words
+    more += [*SHORT.get(command, []), *few(line)]
+    return [sys.executable, "-m", "trackmdp.app.cli", command, *more]
 
 
 @pytest.mark.slow
 def test_the_commands_run_in_this_order(tmp_path: Path) -> None:
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    (tmp_path / "tests").symlink_to(ROOT / "tests")  # whoever types the lines is in the checkout, and has its data
-    for line in COMMANDS:
-        if "venv" in line or "benchmark" in line:  # the peers' packages, gigabytes of them, and their minutes
+    # Whoever types the lines is in the checkout, and has its data.
+    (tmp_path / "tests").symlink_to(ROOT / "tests")
+    for line in dict.fromkeys([*commands(README), *commands(COMMANDS_BOOK)]):
+        if (typed := as_typed(line)) is None:
             continue
-        if line in OURS:
-            command, *words = words_of(line)
-            typed = [sys.executable, "-m", "trackmdp.app.cli", command, *words, *SHORT.get(command, []), *few(line)]
-        else:
-            typed = [sys.executable, *shlex.split(line)[1:]]
-        result = subprocess.run(typed, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+        result = subprocess.run(
+            typed, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+        )
         assert (result.returncode, result.stderr) == (0, ""), line
     assert len(list(tmp_path.glob("multirun/a/*/summary.json"))) == 4
     assert len(list(tmp_path.glob("multirun/train-algo_a2c_ppo-*/*/summary.json"))) == 4
     for sweep in ("a", "paper"):
         assert (tmp_path / "multirun" / sweep / "report" / "report.html").is_file()
     assert (tmp_path / "runs/a/evaluation.json").is_file()
+
+
+@pytest.mark.slow
+def test_the_pictures_are_made_by_the_lines_of_the_sweep_and_its_report(tmp_path: Path) -> None:
+    """A picture of other bytes, as another matplotlib draws it, has the same shapes and colours."""
+    for begin in ("trackmdp train -m kernel.support_size", "trackmdp report sweep=multirun/a"):
+        line = next(line for line in commands(COMMANDS_BOOK) if line.startswith(begin))
+        subprocess.run(
+            [sys.executable, "-m", "trackmdp.app.cli", *(words_of(line) or []), "quiet=true"],
+            cwd=tmp_path,
+            env=os.environ | {"PYTHONPATH": str(ROOT)},
+            check=True,
+        )
+    made = (tmp_path / "multirun/a/report/figures/story.svg").read_text(encoding="utf-8")
+    kept = (ROOT / ".pictures" / "story.svg").read_text(encoding="utf-8")
+    assert re.findall(r"fill: #\w+", made) == re.findall(r"fill: #\w+", kept)

@@ -32,7 +32,9 @@ def test_no_two_streams_are_alike() -> None:
 def test_seed_zero_is_a_seed() -> None:
     first, second = generator(0, "a"), generator(0, "a")
     assert torch.equal(torch.rand(5, generator=first), torch.rand(5, generator=second))
-    assert not torch.equal(torch.rand(5, generator=generator(0, "a")), torch.rand(5, generator=generator(1, "a")))
+    assert not torch.equal(
+        torch.rand(5, generator=generator(0, "a")), torch.rand(5, generator=generator(1, "a"))
+    )
     seed_global(0)
     drawn = torch.rand(5)
     torch.rand(3)

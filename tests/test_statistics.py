@@ -32,7 +32,9 @@ def test_groups_of_equal_spread_have_their_degrees_of_freedom_together() -> None
     assert (found.low, found.high) == pytest.approx((7.0 - margin, 7.0 + margin))
 
 
-@pytest.mark.parametrize("groups", [[[1.0]], [[1.0, 5.0]], [[1.0, 2.0, 3.0], [1.0, 2.0]], [[0.1] * 5, [0.3] * 5]])
+@pytest.mark.parametrize(
+    "groups", [[[1.0]], [[1.0, 5.0]], [[1.0, 2.0, 3.0], [1.0, 2.0]], [[0.1] * 5, [0.3] * 5]]
+)
 def test_too_few_values_or_no_spread_give_no_interval(groups: Sequence[Sequence[float]]) -> None:
     found = mean_over_groups(groups)
     assert math.isfinite(found.mean)
@@ -48,7 +50,9 @@ def test_nothing_is_no_estimate() -> None:
 def test_the_interquartile_mean_does_not_trim_a_hard_world_away() -> None:
     easy, hard = [0.0, 0.0, 0.0, 0.0], [8.0, 4.0, 5.0, 90.0]
     assert iqm([easy, easy, easy, hard]) == 6.5 / 4
-    assert stats.trim_mean([*easy, *easy, *easy, *hard], 0.25) == 0.0  # what all runs in one pot would give
+    assert (
+        stats.trim_mean([*easy, *easy, *easy, *hard], 0.25) == 0.0
+    )  # what all runs in one pot would give
 
 
 def test_none_of_many_still_allows_for_some() -> None:
@@ -148,7 +152,12 @@ def test_intervals_over_tracks_cover() -> None:
         steps = 1.0 + rng.geometric(1 / 30, size=count)
         missed = rng.binomial(steps.astype(int), rng.beta(2.0, 8.0, size=count)).astype(float)
         safe = rng.binomial(missed.astype(int), 0.05).astype(float)
-        return {"steps": steps, "missed": missed, "safe": safe, "reward": steps - missed - 3.0 * safe}
+        return {
+            "steps": steps,
+            "missed": missed,
+            "safe": safe,
+            "reward": steps - missed - 3.0 * safe,
+        }
 
     many = drawn(1_000_000)
     truth = {name: many[name].sum() / many["steps"].sum() for name in hits}

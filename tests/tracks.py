@@ -30,7 +30,12 @@ def drawn(kernel: sparse.csr_array, count: int, seed: int = 0) -> Tracks:
         at.append(np.where(at[-1] < m, step, m))
     cells = np.stack(at, axis=1)
     lengths = (cells < m).sum(axis=1)
-    return Tracks(cells[cells < m], np.concatenate([[0], np.cumsum(lengths)]), np.ones(count, bool), np.arange(count))
+    return Tracks(
+        cells[cells < m],
+        np.concatenate([[0], np.cumsum(lengths)]),
+        np.ones(count, bool),
+        np.arange(count),
+    )
 
 
 def recorded(
@@ -58,6 +63,11 @@ def write(file: Path, tracks: Tracks, *, size: int | None = None, step: bool = T
     else:
         columns |= {"row": tracks.cells // size, "column": tracks.cells % size}
     np.savetxt(
-        file, np.stack(list(columns.values()), axis=1), fmt="%d", delimiter=",", header=",".join(columns), comments=""
+        file,
+        np.stack(list(columns.values()), axis=1),
+        fmt="%d",
+        delimiter=",",
+        header=",".join(columns),
+        comments="",
     )
     return file

@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,9 +37,11 @@ def refused(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     return lines[0].removeprefix(prefix)
 
 
-def typed(*words: str, **kwargs: Any) -> subprocess.CompletedProcess[str]:
+def typed(
+    *words: str, start: Sequence[str] = ("-m", "trackmdp.app.cli"), **kwargs: Any
+) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "trackmdp.app.cli", *words],
+        [sys.executable, *start, *words],
         capture_output=True,
         text=True,
         env=ENVIRONMENT,

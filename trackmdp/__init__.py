@@ -6,8 +6,10 @@
     run = tm.train(world, "hindsight", seed=0)               # policy, evaluation, metrics; no folder needed
     best = tm.solve(world)                                   # policy, lower, upper, certified
     tm.evaluate(world, run.policy)                           # exact figures
-    episodes = tm.simulate(world, run.policy, 100, seed=0)   # what the log, the page and the picture are made of
+    tm.frontier(world).at(sensors=2)                         # the most accurate policies with two sensors per step
+    episodes = tm.simulate(world, run.policy, 100, seed=0)   # for the log, the page and the picture
     env = tm.TrackEnv(world, 64)                             # TorchRL; any batch size
+    tracker = run.policy.tracker(cell=42)                    # at work: tracker.sensors(), tracker.report(cell or None)
 
 Every name below is imported from its module when it is first used: ``import trackmdp`` loads neither torch nor scipy.
 """
@@ -15,7 +17,6 @@ Every name below is imported from its module when it is first used: ``import tra
 from __future__ import annotations
 
 import importlib
-import sys
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.2.0"
@@ -23,15 +24,19 @@ __version__ = "0.2.0"
 _HOMES = {
     "Episodes": "trackmdp.episodes.batch",
     "Evaluation": "trackmdp.solvers.evaluation",
-    "HiddenWorld": "trackmdp.world.modes",
     "ObservationVector": "trackmdp.world.observation",
     "Policy": "trackmdp.policies.policy",
     "Recorded": "trackmdp.world.tracks",
     "Run": "trackmdp.training.run",
     "Solution": "trackmdp.solvers.solution",
     "TrackEnv": "trackmdp.world.env",
+    "Tracker": "trackmdp.policies.tracker",
+    "Tradeoff": "trackmdp.solvers.tradeoff",
     "World": "trackmdp.world.model",
-    "evaluate": "trackmdp.solvers.evaluate",
+    "compare": "trackmdp.training.compare",
+    "evaluate": "trackmdp.solvers.value",
+    "export": "trackmdp.policies.export",
+    "frontier": "trackmdp.solvers.frontier",
     "load_run": "trackmdp.training.run",
     "load_tracks": "trackmdp.world.make",
     "make_world": "trackmdp.world.make",
@@ -43,14 +48,19 @@ _HOMES = {
 
 __all__ = sorted(_HOMES)
 
-if TYPE_CHECKING:  # the same once more, for type checkers and editors; `X as X` tells them that it is public
+if TYPE_CHECKING:  # the same once more, for type checkers and editors; `X as X` marks a public name
     from trackmdp.episodes.batch import Episodes as Episodes
     from trackmdp.episodes.simulate import simulate as simulate
+    from trackmdp.policies.export import export as export
     from trackmdp.policies.policy import Policy as Policy
-    from trackmdp.solvers.evaluate import evaluate as evaluate
+    from trackmdp.policies.tracker import Tracker as Tracker
     from trackmdp.solvers.evaluation import Evaluation as Evaluation
+    from trackmdp.solvers.frontier import frontier as frontier
     from trackmdp.solvers.solution import Solution as Solution
     from trackmdp.solvers.solve import solve as solve
+    from trackmdp.solvers.tradeoff import Tradeoff as Tradeoff
+    from trackmdp.solvers.value import evaluate as evaluate
+    from trackmdp.training.compare import compare as compare
     from trackmdp.training.run import Run as Run
     from trackmdp.training.run import load_run as load_run
     from trackmdp.training.train import train as train
@@ -58,17 +68,17 @@ if TYPE_CHECKING:  # the same once more, for type checkers and editors; `X as X`
     from trackmdp.world.make import load_tracks as load_tracks
     from trackmdp.world.make import make_world as make_world
     from trackmdp.world.model import World as World
-    from trackmdp.world.modes import HiddenWorld as HiddenWorld
     from trackmdp.world.observation import ObservationVector as ObservationVector
     from trackmdp.world.tracks import Recorded as Recorded
 
 
-if "gymnasium" in sys.modules:
-    import trackmdp.gym  # noqa: F401
+import trackmdp.gym  # noqa: E402, F401 (registers the environment once Gymnasium is imported)
 
 
 def __getattr__(name: str) -> Any:
     """Import a public name (PEP 562); Python calls this only for names that are not there yet."""
+    if name == "HiddenWorld":
+        raise AttributeError("HiddenWorld: renamed, expected World with modes=...")
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     # Kept among the module's globals: the next access is an ordinary look-up that does not come here.
@@ -77,5 +87,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    # Without this, completion would offer only the names that have been used already.
-    return sorted({*globals(), *__all__})
+    # Completion offers the public names, also those not used yet, and no module or helper of this file.
+    return [*__all__, *(name for name in globals() if name.startswith("__"))]

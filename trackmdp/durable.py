@@ -1,24 +1,22 @@
-"""Atomic writes: a file is whole or absent, whatever happens meanwhile, and a link is never followed out of its folder.
+"""Atomic writes: a file is whole or absent, also after a crash.
 
-Some file systems lack a call; the user is then told once. Without hard links (exFAT, many network and FUSE mounts) a
-copy is made. Without `fsync` a power failure may cost what was saved last, never what was saved before.
+Some file systems lack a call, which is reported once. Without hard links (exFAT, many network and FUSE mounts) a copy
+is made. Without `fsync` a power failure may cost the last save, never an earlier one.
 """
 
 from __future__ import annotations
 
 import csv
 import errno
-import fcntl
 import io
 import json
 import math
 import os
+import secrets
 import shutil
-import stat
 import sys
-import time
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from io import BufferedRandom
 from pathlib import Path
 from typing import IO, Any
@@ -27,144 +25,79 @@ from trackmdp.errors import UserError
 from trackmdp.untrusted import printable, sealed
 
 UNSUPPORTED = (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOLCK)
-"""What a file system answers to a call that it does not know. EIO and ENOSPC are failures, and stay so."""
+"""Answers of a file system to a call that it lacks. EIO and ENOSPC are failures."""
 
 _NO_LINKS = (*UNSUPPORTED, errno.EPERM, errno.EXDEV, errno.EMLINK)
-_said: set[str] = set()
-_TRIES, _BETWEEN = 1200, 0.05
-"""A minute: more than a file takes that two processes happen to write at once."""
+_reported: set[str] = set()
 
 
 @contextmanager
 def whole_file(file: Path) -> Iterator[BufferedRandom]:
     """Write to `file`, which appears under its name only once its bytes are on the disk; a failure leaves no trace.
 
-    Processes that write it at once take turns, and the last one's is kept.
-
-    Where `file` is a symbolic link, the link is replaced, and what it leads to stays as it is.
+    Where `file` is a symbolic link, the link is replaced, and its target stays as it is.
     """
-    # In the same folder, since a rename is atomic within one file system only.
-    part = file.with_name(f"{file.name}.part")
-    with _begin(part) as stream:
+    part = _part(file)
+    with create(part) as stream:
         try:
             yield stream
+            # Before the renaming, which may reach the disk before the bytes do: a power failure would leave an empty
+            # file under the final name.
             sync(stream, part)
-            # After the sync: a rename may reach the disk before the bytes do, and a power failure would leave an empty
-            # file under the final name. Before the closing, which lets go of the lock: the name is ours until then.
             part.replace(file)
-        # Ctrl-C as well, which is no Exception.
-        except BaseException:
+        except BaseException:  # Ctrl-C included
             part.unlink(missing_ok=True)
             raise
 
 
-def _begin(part: Path) -> BufferedRandom:
-    """A new file, open and locked, so that of several processes one at a time writes it; a killed one's is removed.
-
-    Raises:
-        UserError: another process goes on writing it.
-    """
-    for _ in range(_TRIES):
-        _remove_left(part)
-        # FileExistsError: another process was faster.
-        with suppress(FileExistsError):
-            stream = _new(part)
-            if _is_ours(stream.fileno(), part):
-                return stream
-            stream.close()
-        time.sleep(_BETWEEN)
-    raise UserError(f"{part}: another process is writing it")
+def _part(file: Path) -> Path:
+    """A new hidden name beside `file`; a rename is atomic within one file system only."""
+    return file.with_name(f".{file.name}.{secrets.token_hex(4)}.part")
 
 
-def _remove_left(part: Path) -> None:
-    """Remove what has this name, unless a process is writing it."""
-    try:
-        descriptor = os.open(part, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
-    except OSError:  # nothing, or what is not ours, such as a link
+def remove_parts(folder: Path) -> None:
+    """Remove the unfinished files of killed processes; the caller holds the lock of the folder's run."""
+    for part in folder.glob(".*.part"):
         part.unlink(missing_ok=True)
-        return
-    try:
-        if _is_ours(descriptor, part):
-            part.unlink()
-    finally:
-        os.close(descriptor)
-
-
-def _is_ours(descriptor: int, file: Path) -> bool:
-    """Whether the open file is now locked and still has its name; true on a file system without locks."""
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        # Between our opening and locking it, another process may have removed it and begun one of its own.
-        return os.path.samestat(os.fstat(descriptor), file.lstat())
-    except OSError as error:
-        if error.errno in UNSUPPORTED:
-            return True
-        if error.errno in (errno.EAGAIN, errno.EACCES, errno.ENOENT):
-            return False
-        raise
 
 
 def create(file: Path) -> BufferedRandom:
-    """A new file, open for writing and reading; whatever had its name, a link included, is removed, not followed."""
+    """A new file, open for writing and reading, in place of the one of that name, or of a link."""
     file.unlink(missing_ok=True)
-    return _new(file)
+    return os.fdopen(os.open(file, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666), "w+b")
 
 
-def _new(file: Path) -> BufferedRandom:
-    # O_EXCL: if somebody puts a link under this name meanwhile, the call fails instead of writing where it leads.
-    return os.fdopen(os.open(file, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666), "w+b")
-
-
-def reopen(file: Path, mode: str) -> int:
-    """A descriptor of a file that is written in place, made if it is missing: `r+` keeps its content, `w` empties it.
+def reopen(file: Path, *, empty: bool = False) -> int:
+    """A descriptor of a file that is written in place and made if it is missing.
 
     Raises:
-        UserError: it is a symbolic link, which may lead out of the folder, or no ordinary file.
+        OSError: it is a folder, or a link, which may lead out of the folder.
     """
-    try:
-        # No O_TRUNC: a device or a file that is not ours must be recognised before anything of it is lost.
-        descriptor = os.open(file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
-    except OSError as error:
-        if error.errno in (errno.ELOOP, errno.EISDIR, errno.ENXIO):
-            raise UserError(f"{file}: a link, a folder or a device, expected an ordinary file") from None
-        raise
-    # Asked of the descriptor: the name may stand for another file by the time a second call looks at it.
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-        os.close(descriptor)
-        raise UserError(f"{file}: a pipe or a device, expected an ordinary file")
-    if mode == "w":
-        os.ftruncate(descriptor, 0)
-    return descriptor
+    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | (os.O_TRUNC if empty else 0)
+    return os.open(file, flags, 0o666)
 
 
 def own_folder(folder: Path) -> None:
-    """Make a folder inside that of a run, unless it is there.
+    """Make a folder inside a run's, unless it is there.
 
     Raises:
-        UserError: its name is that of a link or of a file: what is written to it, and what is cleared away in it, would
-            be somebody else's.
+        UserError: its name belongs to a file, or to a link, which may lead out of the run's folder.
     """
-    if not folder.is_symlink():
-        try:
-            folder.mkdir(exist_ok=True)
-            return
-        except FileExistsError:
-            pass
-    raise UserError(f"{folder}: a link or a file, expected a folder of the run's own")
+    if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
+        raise UserError(f"{folder}: a link or a file, expected a folder of the run's own")
+    folder.mkdir(exist_ok=True)
 
 
 def second_name(file: Path, name: Path) -> None:
-    """Give `file` another name as well, replacing what had it; where there are no hard links, by a copy."""
-    part = name.with_suffix(".part")
-    part.unlink(missing_ok=True)
+    """Give `file` another name as well, in place of the file of that name; without hard links, by a copy."""
+    part = _part(name)
     try:
-        # os.link cannot replace a name, a rename can: link to a third name, then rename it over the old one. In this
-        # order there is a whole `name` at every moment.
+        # os.link cannot replace a name, a rename can: there is a whole `name` at every moment.
         os.link(file, part)
     except OSError as error:
         if error.errno not in _NO_LINKS:
             raise
-        say_lacking(file.parent, "hard links", "best.pt and last.pt are copies")
+        report_lacking(file.parent, "hard links", "best.pt and last.pt are copies")
         with whole_file(name) as stream, file.open("rb") as source:
             shutil.copyfileobj(source, stream)
         return
@@ -194,14 +127,14 @@ def _fsync(descriptor: int, folder: Path) -> None:
     except OSError as error:
         if error.errno not in UNSUPPORTED:
             raise
-        say_lacking(folder, "fsync", "a power failure may cost what was saved last")
+        report_lacking(folder, "fsync", "a power failure may cost the last save")
 
 
-def say_lacking(folder: Path, what: str, instead: str) -> None:
-    """Tell the user, once, what the file system lacks, and what is done instead."""
-    if what not in _said:
-        _said.add(what)
-        sys.stderr.write(printable(f"{folder}: the file system has no {what}; {instead}\n"))
+def report_lacking(folder: Path, call: str, instead: str) -> None:
+    """Report once, in a line, that the file system lacks a call, and the replacement."""
+    if call not in _reported:
+        _reported.add(call)
+        sys.stderr.write(printable(f"{folder}: the file system has no {call}; {instead}\n"))
 
 
 def write_text(file: Path, text: str) -> None:

@@ -1,4 +1,4 @@
-"""What stops a command without being a bug."""
+"""Errors that stop a command without being a bug."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ FAILED, USER_MISTAKE, INTERRUPTED = 1, 2, 130
 
 
 class UserError(ValueError):
-    """A mistake in what the user typed or handed over; the message says what, where and what was expected.
+    """A mistake in the user's input; the message names the place, the value and the expectation.
 
     The command line prints the message as one line and exits with status 2. It is a `ValueError`, never
     `SystemExit`, so that one bad job does not end a whole Hydra sweep.
@@ -27,12 +27,14 @@ class RunError(RuntimeError):
 class Preempted(BaseException):
     """A signal ended a run between two iterations, after its checkpoint was saved.
 
-    The command line exits with status 128 + the signal's number, so that a scheduler can tell it from a failure. It is
+    The command line exits with status 128 + the signal's number, so that schedulers see no failure. It is
     no `Exception`: it ends a whole sweep, not one job of it.
     """
 
     def __init__(self, signal: int) -> None:
-        super().__init__(signal)  # the arguments alone go through a pickle, from a worker to whom it works for
+        super().__init__(
+            signal
+        )  # the arguments alone go through a pickle, from a worker to whom it works for
         self.signal = signal
 
     def __str__(self) -> str:
@@ -42,7 +44,9 @@ class Preempted(BaseException):
 def adding(extra: str) -> str:
     """The line that installs an extra: in the clone that this package is imported from, or by the package's name."""
     clone = Path(__file__).parents[1]
-    package = f"-e '{clone}[{extra}]'" if (clone / "pyproject.toml").is_file() else f"'trackmdp[{extra}]'"
+    package = (
+        f"-e '{clone}[{extra}]'" if (clone / "pyproject.toml").is_file() else f"'trackmdp[{extra}]'"
+    )
     return f"pip install {package}"
 
 

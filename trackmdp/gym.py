@@ -1,19 +1,70 @@
-"""Registers `trackmdp/Track-v0` with Gymnasium.
+"""Registers `trackmdp/Track-v0` with Gymnasium, whichever of the two packages is imported first.
 
     import gymnasium, trackmdp
     env = gymnasium.make("trackmdp/Track-v0", kernel="random_walk", size=5, cost=0.1)
     env = gymnasium.make_vec("trackmdp/Track-v0", num_envs=64, world=world)
 
-`import trackmdp` does it where Gymnasium is loaded already; else this module does, also as
-``gymnasium.make("trackmdp.gym:trackmdp/Track-v0")``. (Gymnasium 1.0 and later look at no entry points.)
+`import trackmdp` does it; ``gymnasium.make("trackmdp:trackmdp/Track-v0")`` needs no import. Gymnasium is an extra (gym)
+and takes a fifth of a second to import, so that it is not imported here: where it comes later, the registration follows
+its own import. (Gymnasium 1.0 and later look at no entry points.)
 """
 
 from __future__ import annotations
 
-from gymnasium.envs.registration import register, registry
+import sys
+from collections.abc import Sequence
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec, PathFinder
+from types import ModuleType
 
 ID = "trackmdp/Track-v0"
+_REGISTRY = "gymnasium.envs.registration"
 
-if ID not in registry:
-    # By name: torch is loaded when an environment is made.
-    register(ID, "trackmdp.world.gym_env:TrackGym", vector_entry_point="trackmdp.world.gym_env:TrackVector")
+
+def _register(registration: ModuleType) -> None:
+    if ID not in registration.registry:
+        # By name: torch is loaded when an environment is made.
+        registration.register(
+            ID,
+            "trackmdp.world.gym_env:TrackGym",
+            vector_entry_point="trackmdp.world.gym_env:TrackVector",
+        )
+
+
+class _Registering(Loader):
+    """Loads Gymnasium's registry with its own loader, then registers."""
+
+    def __init__(self, own: Loader) -> None:
+        self._own = own
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType | None:
+        return self._own.create_module(spec)
+
+    def exec_module(self, module: ModuleType) -> None:
+        module.__loader__ = self._own
+        self._own.exec_module(module)
+        _register(module)
+
+
+class _Finder(MetaPathFinder):
+    """Finds Gymnasium's registry as Python does, and hands it to `_Registering`."""
+
+    def find_spec(
+        self,
+        fullname: str,
+        path: Sequence[str] | None,
+        target: ModuleType | None = None,
+    ) -> ModuleSpec | None:
+        if fullname != _REGISTRY:
+            return None
+        sys.meta_path.remove(self)
+        found = PathFinder.find_spec(fullname, path, target)
+        if found is not None and found.loader is not None:
+            found.loader = _Registering(found.loader)
+        return found
+
+
+if _REGISTRY in sys.modules:
+    _register(sys.modules[_REGISTRY])
+else:
+    sys.meta_path.insert(0, _Finder())

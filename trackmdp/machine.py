@@ -1,4 +1,4 @@
-"""Memory: what the machine has left, and sizes as they are typed and told."""
+"""Memory: the machine's free bytes, and sizes as they are typed and printed."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ def parse_bytes(text: str) -> int:
 
 
 def gib(size: float) -> str:
-    """A size as it is told."""
+    """A size as it is printed."""
     return f"{size / 2**30:,.2f} GiB"
 
 
 def free_bytes(root: Path = Path("/")) -> int:
-    """Bytes of memory that can still be had: what the system, and the job's own limit, leave.
+    """Bytes of memory still available under the system's and the job's own limit.
 
-    A system that does not say counts as unlimited. `root` is where its files are.
+    A system without such a figure counts as unlimited. `root` is where its files are.
     """
     free = [_entry(root / "proc/meminfo", "MemAvailable:", 1024)]
     for limit, used, cache in _CGROUPS:
         for folder in (root / "sys/fs/cgroup", root / "sys/fs/cgroup/memory"):
-            # A job's own limit (version 2 of cgroups, then version 1) may be far below what the machine has; the
-            # kernel kills whoever exceeds it without a message. Pages of files that are not in use count as used, but
+            # A job's own limit (version 2 of cgroups, then version 1) may be far below the machine's free memory; the
+            # kernel kills a process above it without a message. Pages of files that are not in use count as used, but
             # are given back.
             most, now = _number(folder / limit), _number(folder / used)
             if most is not None and now is not None:

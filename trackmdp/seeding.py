@@ -1,25 +1,36 @@
 """One seed, many named random generators.
 
 Every random draw of a run comes from a generator with a name; two names never share a stream, so drawing more
-from one (evaluating more often, say) leaves the others as they were.
+from one (evaluating more often, for example) leaves the others as they were.
 """
 
 from __future__ import annotations
 
 import hashlib
+import operator
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:  # a world, whose draws are numpy's, is made without loading torch
+from trackmdp.errors import UserError
+
+if TYPE_CHECKING:  # a world draws by numpy and is made without loading torch
     import torch
 
 
 def derive(seed: int, *names: str | int) -> int:
-    """A 63-bit seed for the stream called `names`, for example ``derive(0, "world", 3)``."""
+    """A 63-bit seed for the stream called `names`, for example ``derive(0, "world", 3)``.
+
+    Raises:
+        UserError: `seed` is no whole number.
+    """
+    try:
+        whole = operator.index(seed)  # int() would cut 1.5 to 1
+    except TypeError:
+        raise UserError(f"seed={seed}: expected an integer") from None
     # Hashed, so that neighbouring seeds and names give unrelated streams: with seed + worker, worker 1 of run 0 and
     # worker 0 of run 1 would draw the same numbers. `>> 1` leaves 63 bits, which fit a signed 64-bit integer.
-    text = "/".join([str(int(seed)), *map(str, names)])
+    text = "/".join([str(whole), *map(str, names)])
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 1
 
 
@@ -39,7 +50,7 @@ def seed_global(seed: int) -> None:
 
 @contextmanager
 def preserved_global_rng() -> Iterator[None]:
-    """Leave torch's global generators as they were, whatever is drawn inside."""
+    """Leave torch's global generators as they were, after any draws inside."""
     import torch
 
     # Named, since fork_rng by default warns where there are several GPUs.

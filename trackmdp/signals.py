@@ -1,4 +1,4 @@
-"""Signals: those that ask a run to stop are acted upon between two iterations; the death of a worker at once."""
+"""Signals: requests to stop a run are acted upon between two iterations; the death of a worker at once."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ _ONE = 2.0
 
 @contextmanager
 def handled(handler: Any, *numbers: signal.Signals) -> Iterator[Mapping[signal.Signals, Any]]:
-    """Let `handler` hear signals inside; afterwards those that did before, whatever the body installs meanwhile.
+    """Handle signals by `handler` inside; afterwards by the handlers from before, also if the body installs others.
 
-    Given are those that did before. Outside the main thread nothing is changed.
+    Yields the handlers from before. Outside the main thread nothing is changed.
     """
     # Python allows signal.signal in the main thread alone; `train` called from another one runs without.
     main = threading.current_thread() is threading.main_thread()
@@ -58,7 +58,7 @@ class Signals(ExitStack):
     def heard(self) -> bool:
         """Whether a signal came, or comes within a moment.
 
-        A scheduler signals a whole group of processes; a worker may die of it before this one is told.
+        A scheduler signals a whole group of processes; a worker may die of it before this process receives it.
         """
         # Half a second in all.
         for _ in range(20):
@@ -71,7 +71,7 @@ class Signals(ExitStack):
         kind, now = signal.Signals(number), time.monotonic()
         if kind not in self._first:
             self._first[kind], self.received = now, number
-        # After the first Ctrl-C its former handler is back, so that a second one interrupts at once: whoever sits at a
+        # After the first Ctrl-C its former handler is back, so that a second one interrupts at once: a user at a
         # terminal may not want to wait for the end of the iteration.
         if kind is signal.SIGINT or now - self._first[kind] >= _ONE:
             signal.signal(number, self._before[kind])
@@ -81,7 +81,7 @@ class Signals(ExitStack):
 
 
 def stop(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
-    """What `handled` may let hear a signal: it ends what is under way at once.
+    """A handler for `handled`: it ends the work under way at once.
 
     Raises:
         Preempted: always.
@@ -135,5 +135,9 @@ class Watch(ExitStack):
             code = None if process._closed else process.exitcode
             if code is not None:
                 self._waiting = False  # the others end next, when the collector is shut down
-                how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with status {code}"
+                how = (
+                    f"was killed by {signal.Signals(-code).name}"
+                    if code < 0
+                    else f"ended with status {code}"
+                )
                 raise RuntimeError(f"worker {index} {how}")

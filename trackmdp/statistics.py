@@ -19,7 +19,7 @@ LEVEL = 0.95
 RESAMPLES, _MANY = 999, 2000
 """Of the bootstrap; units above which it is not needed."""
 FEWEST = 3
-"""Values a group needs before an interval is shown: from two, its width says more of luck than of the spread."""
+"""Values a group needs before an interval is shown: from two, its width depends more on luck than on the spread."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ def mean_over_groups(groups: Sequence[Sequence[float]]) -> MeanInterval:
     The groups are fixed, the values within them drawn: a group of n values adds the variance s²/n of its own mean. The
     sum has about f degrees of freedom (Welch 1947, Satterthwaite 1946), which are n - 1 for one group alone.
 
-    A sample that shows no spread at all says nothing of its size either: there is no interval.
+    A sample without any spread is no estimate of the spread: there is no interval.
     """
     filled = [np.asarray(group, dtype=float) for group in groups if len(group)]
     count = sum(map(len, filled))
@@ -66,7 +66,11 @@ def iqm(groups: Sequence[Sequence[float]]) -> float:
     A quarter of the values, rounded down, is left out at each end of a group.
     """
     # Of 10 values 10 // 4 = 2 are left out at each end, of 3 none.
-    trimmed = [np.sort(group)[len(group) // 4 : len(group) - len(group) // 4].mean() for group in groups if len(group)]
+    trimmed = [
+        np.sort(group)[len(group) // 4 : len(group) - len(group) // 4].mean()
+        for group in groups
+        if len(group)
+    ]
     return float(np.mean(trimmed or [math.nan]))
 
 
@@ -74,7 +78,7 @@ def share(part: int, whole: int) -> MeanInterval:
     """`part` of `whole` trials with the interval of Clopper and Pearson (1934), which covers at every n.
 
     None of n seen still allows for about 3.7/n: the interval ends there, not at 0. Trials of unlike chances, as runs
-    in several worlds are, spread less than the binomial law says (Hoeffding 1956), so it holds for them as well.
+    in several worlds are, spread less than by the binomial law (Hoeffding 1956), so it holds for them as well.
     """
     if not whole:
         return MeanInterval(math.nan, None, None, 0)
@@ -99,9 +103,9 @@ def ratio(part: Values, whole: Values, *, events: bool = False) -> MeanInterval:
 
     Args:
         part: `[n]`, the sum of each unit.
-        whole: `[n]`, what it is a share of.
-        events: `part` counts what few units have. What was never seen has no spread to be resampled, so the interval
-            is widened to that of the share of units that have any, each with as many events as such units have.
+        whole: `[n]`, the denominator of each unit.
+        events: `part` counts rare events, which few units have. Without any there is no spread to resample, so the
+            interval is widened to the interval of the share of units with any, at their events per unit.
     """
     count, total = len(part), float(whole.sum())
     if not total:
@@ -140,8 +144,14 @@ def _bootstrap_t(part: Values, whole: Values, mean: float) -> tuple[float, float
     with np.errstate(divide="ignore", invalid="ignore"):
         ratios = (weights @ part) / base
         # Σ w (part - r whole)² from the three sums of squares, so that no [resamples, n] array is made again
-        squares = weights @ part**2 - 2 * ratios * (weights @ (part * whole)) + ratios**2 * (weights @ whole**2)
-        statistic = (ratios - mean) / (np.sqrt(np.maximum(squares, 0.0) * count / (count - 1)) / base)
+        squares = (
+            weights @ part**2
+            - 2 * ratios * (weights @ (part * whole))
+            + ratios**2 * (weights @ whole**2)
+        )
+        statistic = (ratios - mean) / (
+            np.sqrt(np.maximum(squares, 0.0) * count / (count - 1)) / base
+        )
     low, high = np.quantile(statistic[np.isfinite(statistic)], [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     # The quantiles change sides: t = (estimate - truth) / error is at most `high` exactly where truth is at least
     # estimate - high·error.
@@ -149,7 +159,7 @@ def _bootstrap_t(part: Values, whole: Values, mean: float) -> tuple[float, float
 
 
 def _student(freedom: float) -> float:
-    """The quantile of Student's t that leaves out half of what an interval may miss."""
+    """The quantile (1 + `LEVEL`) / 2 of Student's t."""
     from scipy.special import stdtrit  # a quarter of a second to load
 
     return float(stdtrit(freedom, (1 + LEVEL) / 2))

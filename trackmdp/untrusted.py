@@ -1,40 +1,47 @@
-"""Files that others may have written, or that a power failure damaged: read within bounds, or refused in one line.
+"""Files of others: read within limits of size, never unpickled, and refused in one line that names the file.
 
-Every reader of a checkpoint, log, config, kernel, recording, result or summary opens it by `opened`, and decodes its
-bytes inside `decoded`. Neither ever unpickles.
+`opened` opens a file; inside `decoded` every error of a parser becomes one line. All that this package reads from a
+disk goes through these two.
 """
 
 from __future__ import annotations
 
 import errno
 import hashlib
+import io
 import json
-import math
 import os
 import re
 import stat
+import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+import yaml  # type: ignore[import-untyped]  # a dependency of OmegaConf
 
 from trackmdp.errors import UserError
+from trackmdp.machine import free_bytes
+
+if TYPE_CHECKING:  # both take a fifth of a second to import
+    import numpy.typing as npt
+    import torch
 
 SMALL = 2**24
-"""Bytes of the largest summary, plan, index or table of metrics: 16 MiB."""
+"""Bytes of the largest config, summary, index or table of metrics: 16 MiB."""
 
-_DEEPEST = 32
-"""Levels of nested JSON. What this program writes has at most six; a recursive reader could follow a thousand."""
+LARGE = 2**32
+"""Bytes of the largest table of numbers, unpacked: 4 GiB."""
 
-_LARGEST = 2**64
-_KINDS = {
-    stat.S_IFDIR: "a folder",
-    stat.S_IFIFO: "a pipe",
-    stat.S_IFSOCK: "a socket",
-    stat.S_IFCHR: "a device",
-    stat.S_IFBLK: "a device",
-}
+_COPIES = 2
+"""Times that the bytes of an archive's arrays are in memory while it is read."""
+
+_DEEPEST = 50
+_YAML = getattr(
+    yaml, "CSafeLoader", yaml.SafeLoader
+)  # libyaml is ten times faster, and not always there
 
 
 def opened(file: Path, *, most: int, source: str = "", links: bool = False) -> BufferedReader:
@@ -42,61 +49,59 @@ def opened(file: Path, *, most: int, source: str = "", links: bool = False) -> B
 
     Args:
         file: its name.
-        most: bytes; nothing is read of a longer one.
-        source: what messages call it; its name by default.
-        links: whether it may be a symbolic link. True only where a user named this very file: one found in the folder
-            of a run may lead out of that folder.
+        most: bytes.
+        source: its name in messages.
+        links: whether it may be a symbolic link. True only where a user named this very file: a link in the folder of
+            a run may lead out of that folder.
 
     Raises:
         UserError: it is missing, too long, or no ordinary file.
     """
     source = source or str(file)
-    # Without O_NONBLOCK, opening a pipe that nobody writes to would wait for ever.
-    flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | (0 if links else os.O_NOFOLLOW)
+    # O_NONBLOCK: to open a pipe without a writer would take for ever.
+    more = os.O_NONBLOCK | (0 if links else os.O_NOFOLLOW)
     try:
-        descriptor = os.open(file, flags)
+        stream = open(file, "rb", opener=lambda name, flags: os.open(name, flags | more))  # noqa: SIM115
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise UserError(f"{source}: {reason(error)}") from None
-    try:
-        # Of the open descriptor, not of the name, which may be exchanged between a check and the opening.
-        found = os.fstat(descriptor)
-        if not stat.S_ISREG(found.st_mode):
-            kind = _KINDS.get(stat.S_IFMT(found.st_mode), "something else")
-            raise UserError(f"{source}: {kind}, expected an ordinary file")
-        if found.st_size > most:
-            raise UserError(f"{source}: {found.st_size:,} bytes, expected at most {most:,}")
-    except BaseException:
-        os.close(descriptor)
-        raise
-    return os.fdopen(descriptor, "rb")
+    found = os.fstat(stream.fileno())
+    if stat.S_ISREG(found.st_mode) and found.st_size <= most:
+        return stream
+    stream.close()
+    if not stat.S_ISREG(found.st_mode):
+        raise UserError(f"{source}: a pipe or a device, expected an ordinary file")
+    raise UserError(f"{source}: {found.st_size:,} bytes, expected at most {most:,}")
 
 
 @contextmanager
 def decoded(source: str, expected: str) -> Iterator[None]:
-    """Whatever decoding the content of `source` raises ends in one line: `SOURCE: not EXPECTED (reason)`.
+    """Any error inside becomes one line: `SOURCE: not EXPECTED (reason)`.
 
-    Every exception counts: over hostile bytes parsers raise what their documentation does not name (zlib.error,
-    struct.error, RecursionError, MemoryError, KeyError, NotImplementedError for an odd compression).
+    Parsers raise more over damaged bytes than their documentation names: zlib.error, struct.error, RecursionError,
+    MemoryError, KeyError, NotImplementedError.
 
     Raises:
         UserError: decoding failed.
     """
     try:
         yield
-    except UserError:
-        raise
+    except UserError as error:
+        # A constructor names its argument; the file is named here.
+        if str(error).startswith(source):
+            raise
+        raise UserError(f"{source}: {error}") from error
     except Exception as error:
         raise UserError(f"{source}: not {expected} ({reason(error)})") from error
 
 
 def reason(error: BaseException) -> str:
-    """Why something failed, in one short line."""
+    """The reason of an error in one short line."""
     if isinstance(error, OSError) and error.errno is not None:
         if error.errno == errno.ELOOP:
             return "a symbolic link, expected an ordinary file"
         return "no such file" if error.errno == errno.ENOENT else os.strerror(error.errno).lower()
-    said = printable(" ".join(str(error).split()))
-    return said[:200] or type(error).__name__
+    line = printable(" ".join(str(error).split()))
+    return line[:200] or type(error).__name__
 
 
 def read_bytes(file: Path, *, most: int = SMALL, source: str = "", links: bool = False) -> bytes:
@@ -106,8 +111,11 @@ def read_bytes(file: Path, *, most: int = SMALL, source: str = "", links: bool =
         UserError: it cannot be read.
     """
     source = source or str(file)
-    with opened(file, most=most, source=source, links=links) as stream, decoded(source, "a file that can be read"):
-        # As long as it was a moment ago: read(most) would allocate that much at once, and a file may be growing.
+    with (
+        opened(file, most=most, source=source, links=links) as stream,
+        decoded(source, "a file that can be read"),
+    ):
+        # The present length: read(most) would allocate `most` bytes at once, and a file may be growing.
         return stream.read(os.fstat(stream.fileno()).st_size)
 
 
@@ -122,8 +130,22 @@ def read_text(file: Path, *, most: int = SMALL, source: str = "", links: bool = 
         return content.decode("utf-8-sig")
 
 
+def parse_json(text: str | bytes, source: str) -> Any:
+    """The value of JSON text.
+
+    Raises:
+        UserError: it is something else.
+    """
+    with decoded(source, "JSON"):
+        return json.loads(text, parse_constant=_refused)
+
+
+def _refused(word: str) -> Any:
+    raise ValueError(f"{word} is not JSON")
+
+
 def read_object(file: Path, *, most: int = SMALL, source: str = "") -> dict[str, Any]:
-    """The JSON object in a file; see `parse_json`.
+    """The JSON object in a file.
 
     Raises:
         UserError: it cannot be read, or is something else.
@@ -142,50 +164,96 @@ def known_object(file: Path, *, most: int = SMALL) -> dict[str, Any]:
         return {}
 
 
-def parse_json(text: str | bytes, source: str) -> Any:
-    """The value of JSON text: at most 32 levels deep, every number finite and an integer below 2^64 in size.
+def parse_yaml(text: str | bytes, source: str) -> dict[str, Any]:
+    """The mapping in YAML text, of plain data.
 
     Raises:
         UserError: it is something else.
     """
-    with decoded(source, "JSON"):
-        value = json.loads(text, parse_constant=_refused)
-        level: list[Any] = [value]
-        # Level by level instead of by recursion: json.loads follows more levels than Python's own stack holds.
-        for _ in range(_DEEPEST):
-            inner: list[Any] = []
-            for item in level:
-                if isinstance(item, (dict, list)):
-                    inner += item.values() if isinstance(item, dict) else item
-                elif isinstance(item, float) and not math.isfinite(item):  # 1e999
-                    raise ValueError("a number that is not finite")
-                elif isinstance(item, int) and abs(item) >= _LARGEST:
-                    raise ValueError("an integer beyond 64 bits")
-            if not inner:
-                return value
-            level = inner
-        raise ValueError(f"deeper than {_DEEPEST} levels")
+    with decoded(source, "a config"):
+        depth = 0
+        for event in yaml.parse(text, Loader=_YAML):
+            depth += isinstance(event, yaml.CollectionStartEvent)
+            depth -= isinstance(event, yaml.CollectionEndEvent)
+            # Nine lists of nine aliases each, ten times over, are 9^10 values in 700 bytes.
+            if isinstance(event, yaml.AliasEvent) or depth > _DEEPEST:
+                raise ValueError(f"an alias, or deeper than {_DEEPEST} levels")
+        plain = yaml.load(text, Loader=_YAML)
+        if not isinstance(plain, (dict, type(None))):
+            raise ValueError("expected a mapping")
+        return {str(key): value for key, value in (plain or {}).items()}
 
 
-def _refused(word: str) -> Any:
-    raise ValueError(f"{word} is not JSON")
+def load_npy(stream: BinaryIO) -> npt.NDArray[Any]:
+    """The array of an `.npy` file; call it inside `decoded`.
+
+    Raises:
+        Exception: it is something else, or holds Python objects.
+    """
+    import numpy as np
+
+    array: npt.NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
+    if stream.read(1):
+        raise ValueError("more bytes than its header names")
+    return array
+
+
+def load_npz(stream: BinaryIO) -> dict[str, npt.NDArray[Any]]:
+    """The arrays of an `.npz` file by their names; call it inside `decoded`.
+
+    Raises:
+        Exception: it is something else, too large, or holds Python objects.
+    """
+    with zipfile.ZipFile(stream) as archive:
+        # A member never unpacks to more than the length in the archive's directory.
+        unpacked = sum(member.file_size for member in archive.infolist())
+        if unpacked > (most := min(LARGE, free_bytes() // _COPIES)):
+            raise ValueError(f"{unpacked:,} bytes when unpacked, expected at most {most:,}")
+        # Each member is read to its end, where zipfile compares the checksum.
+        return {
+            name.removesuffix(".npy"): load_npy(io.BytesIO(archive.read(name)))
+            for name in archive.namelist()
+        }
+
+
+def load_tensors(file: Path, device: torch.device | str) -> Any:
+    """The tensors and plain values that `torch.save` wrote; call it inside `decoded`.
+
+    On the CPU the tensors are pages of the file, read when they are needed: a large buffer is not held twice.
+
+    Raises:
+        Exception: it is something else, compressed, or holds more than tensors and plain values.
+    """
+    import pickle
+
+    import torch
+
+    with zipfile.ZipFile(file) as archive:
+        # torch.save does not compress; a compressed archive might fill the memory.
+        if any(member.compress_type != zipfile.ZIP_STORED for member in archive.infolist()):
+            raise ValueError("a compressed archive")
+    try:
+        return torch.load(str(file), map_location=device, mmap=True, weights_only=True)
+    except pickle.UnpicklingError as error:  # torch advises to switch weights_only off
+        raise ValueError("it holds more than tensors and plain values") from error
 
 
 _TIMED = re.compile("second|time|per_s$")
-# \x0b-\x1f has the carriage return, by which a name could overwrite the line it stands in, and escape; \x7f-\x9f the
-# C1 controls; \u200e... and \u2066... turn the direction of text; surrogates cannot be encoded, so that printing them
-# raises.
-_UNPRINTABLE = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+# \x0b-\x1f: among others the carriage return, by which a name could overwrite its line, and escape; \x7f-\x9f: the C1
+# controls; \u200e... and \u2066...: the direction of text; surrogates cannot be encoded, so that printing them raises.
+_UNPRINTABLE = re.compile(
+    r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
+)
 
 
 def no_formula(text: str) -> str:
-    """The text of a cell that a spreadsheet shows and does not compute, whatever somebody called a folder."""
-    # With an apostrophe before it, a spreadsheet takes it for text.
+    """The text of a cell that a spreadsheet shows and does not compute, also for hostile names of folders."""
+    # After an apostrophe a spreadsheet takes a cell for text.
     return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text
 
 
 def printable(text: str) -> str:
-    r"""`text` with escapes such as \x1b for what a terminal would obey: control characters, and those that turn text.
+    r"""`text` with escapes such as \x1b for control characters, which a terminal would obey.
 
     Newlines and tabs stay.
     """
@@ -193,10 +261,10 @@ def printable(text: str) -> str:
 
 
 def sealed(content: Mapping[str, Any]) -> dict[str, Any]:
-    """`content` with a digest of itself, so that a changed number in it is noticed.
+    """`content` with a digest of itself, by which a changed number in it is noticed.
 
-    What the clock decides is left out of the digest, so that a run repeated has the same one. It is no signature: who
-    means to deceive can compute it anew.
+    Times are left out of the digest: a run that is repeated has the same one. It is no signature: anybody can compute
+    it anew.
     """
     return {**content, "sha256": _digest(content)}
 
@@ -205,11 +273,15 @@ def unsealed(content: Mapping[str, Any], source: str) -> dict[str, Any]:
     """`content` without its digest.
 
     Raises:
-        UserError: it is not what was sealed.
+        UserError: it differs from the content that was sealed.
     """
     plain = {key: value for key, value in content.items() if key != "sha256"}
-    if content.get("sha256") != _digest(plain):
-        raise UserError(f"{source}: its content does not match its digest; it was changed, or is not by this program")
+    with decoded(source, "a sealed object"):  # RecursionError: a thousand levels
+        same = content.get("sha256") == _digest(plain)
+    if not same:
+        raise UserError(
+            f"{source}: its content does not match its digest; it was changed, or is not by this program"
+        )
     return plain
 
 
@@ -220,5 +292,9 @@ def _digest(content: Mapping[str, Any]) -> str:
 
 def _timeless(content: Any) -> Any:
     if isinstance(content, Mapping):
-        return {str(key): _timeless(value) for key, value in content.items() if not _TIMED.search(str(key))}
+        return {
+            str(key): _timeless(value)
+            for key, value in content.items()
+            if not _TIMED.search(str(key))
+        }
     return [_timeless(item) for item in content] if isinstance(content, (list, tuple)) else content

@@ -12,8 +12,12 @@ def main() -> None:
     run = tm.train(world, "hindsight", seed=0)  # learns from what it senses
     best = tm.solve(world)
     figures = run.evaluation
-    print(f"learned {figures.aihtr:.3f}, the best possible {best.upper:.3f} (proved: {best.certified})")
-    print(f"sensors on per step {figures.sensors_per_step:.2f} of {world.num_cells}, located {figures.accuracy:.1%}")
+    print(
+        f"learned {figures.aihtr:.3f}, the best possible {best.upper:.3f} (proved: {best.certified})"
+    )
+    print(
+        f"sensors on per step {figures.sensors_per_step:.2f} of {world.num_cells}, located {figures.accuracy:.1%}"
+    )
     print(draw_picture(tm.simulate(world, run.policy, 16, seed=0), world, steps=3))
 
 

@@ -20,7 +20,9 @@ def circling(stay: float = 0.1, leave: float = 0.02) -> sparse.csr_array:
     step_column = np.where(up & top, 1, np.where(down & bottom, -1, 0))
     cells = np.arange(ROWS * COLUMNS)
     following = (row + step_row) * COLUMNS + column + step_column
-    weights = np.concatenate([np.full(cells.size, stay), np.full(cells.size, 1 - stay)]) * (1 - leave)
+    weights = np.concatenate([np.full(cells.size, stay), np.full(cells.size, 1 - stay)]) * (
+        1 - leave
+    )
     entries = (np.concatenate([cells, cells]), np.concatenate([cells, following]))
     return sparse.csr_array((weights, entries), shape=(cells.size, cells.size))
 
@@ -30,7 +32,11 @@ def main() -> None:
     world = tm.World(circling(), (ROWS, COLUMNS), cost=0.2, t_max=2)
     best = tm.solve(world)
     run = tm.train(world, "hindsight", seed=0, total_frames=20_000)
-    for name, policy in (("Q_MDP", tm.solve(world, "qmdp").policy), ("learned", run.policy), ("optimal", best.policy)):
+    for name, policy in (
+        ("Q_MDP", tm.solve(world, "qmdp").policy),
+        ("learned", run.policy),
+        ("optimal", best.policy),
+    ):
         figures = tm.evaluate(world, policy)
         print(f"{name:8} {figures.aihtr:8.4f}   located in {figures.accuracy:.1%} of the steps")
     print(f"proved: no policy earns more than {best.upper:.4f} (certified: {best.certified})")

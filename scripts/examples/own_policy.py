@@ -25,7 +25,9 @@ def main() -> None:
     best = tm.solve(world)
     print(f"exact     {exact.aihtr:9.3f}   sensors per step {exact.sensors_per_step:.2f}")
     print(f"simulated {simulated.aihtr.mean:9.3f} +- {simulated.aihtr.standard_error:.3f}")
-    print(f"optimal   {best.lower:9.3f}   short by {(best.upper - exact.aihtr) / exact.expected_length:.3f} per step")
+    print(
+        f"optimal   {best.lower:9.3f}   short by {(best.upper - exact.aihtr) / exact.expected_length:.3f} per step"
+    )
 
 
 if __name__ == "__main__":

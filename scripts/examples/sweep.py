@@ -7,7 +7,12 @@ from pathlib import Path
 
 from trackmdp.app.cli import main as trackmdp
 
-WORLDS = ("grid.size=6", "kernel.support_size=3,5", "cost.sensor=0.16,0.22", "algo.total_frames=50_000")
+WORLDS = (
+    "grid.size=6",
+    "kernel.support_size=3,5",
+    "cost.sensor=0.16,0.22",
+    "algo.total_frames=50_000",
+)
 
 
 def main(folder: Path) -> None:

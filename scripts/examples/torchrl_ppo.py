@@ -5,13 +5,13 @@ from __future__ import annotations
 import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
+from torch.distributions import Bernoulli, Independent
 from torchrl.collectors import Collector
 from torchrl.modules import ProbabilisticActor, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 import trackmdp as tm
-from trackmdp.policies.nets import SubsetDistribution
 
 KEYS = ["last_cell", "steps_since_detection"]
 FRAMES, BATCH = 60_000, 2_000
@@ -31,20 +31,29 @@ class Net(nn.Module):
         return self.table(last_cell * self.clocks + steps_since_detection)
 
 
+def subset(logits: Tensor) -> Independent:
+    """Each sensor on by itself, with the probability sigmoid(logit)."""
+    return Independent(Bernoulli(logits=logits), 1)
+
+
 def main(frames: int = FRAMES) -> None:
     """Train, then print the exact value beside the optimum."""
     torch.manual_seed(0)
     world = tm.make_world("random_walk", size=4, cost=0.1, exit_probability=0.05)
     actor = ProbabilisticActor(
         TensorDictModule(Net(world, world.num_cells, -1.0), in_keys=KEYS, out_keys=["logits"]),
-        in_keys=["logits"], distribution_class=SubsetDistribution, return_log_prob=True,
+        in_keys=["logits"], distribution_class=subset, return_log_prob=True,
     )  # fmt: skip
     critic = ValueOperator(Net(world, 1, 0.0), in_keys=KEYS)
     loss = ClipPPOLoss(actor, critic, clip_epsilon=0.2, entropy_coeff=0.003)
     advantage = GAE(gamma=0.9, lmbda=0.9, value_network=critic)
     optimizer = torch.optim.Adam(loss.parameters(), lr=0.05)
     env = tm.TrackEnv(world, 50, seed=0)
-    budget = {"frames_per_batch": BATCH, "total_frames": frames, "auto_register_policy_transforms": False}
+    budget = {
+        "frames_per_batch": BATCH,
+        "total_frames": frames,
+        "auto_register_policy_transforms": False,
+    }
     for batch in Collector(env, actor, **budget):
         for _ in range(4):
             advantage(batch)
@@ -52,8 +61,9 @@ def main(frames: int = FRAMES) -> None:
             optimizer.zero_grad()
             (parts["loss_objective"] + parts["loss_critic"] + parts["loss_entropy"]).backward()
             optimizer.step()
-    drawing, mode = tm.evaluate(world, actor), tm.evaluate(world, tm.Policy.from_module(world, actor))
-    print(f"PPO as it draws {drawing.aihtr:.3f}, its mode {mode.aihtr:.3f}, optimum {tm.solve(world).upper:.3f}")
+    drawing, best = tm.evaluate(world, actor).aihtr, tm.solve(world).upper
+    mode = tm.evaluate(world, tm.Policy.from_module(world, actor)).aihtr
+    print(f"PPO as it draws {drawing:.3f}, its mode {mode:.3f}, optimum {best:.3f}")
 
 
 if __name__ == "__main__":

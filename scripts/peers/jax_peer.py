@@ -37,18 +37,29 @@ class Env:
 
     def __init__(self, at: track.Instance) -> None:
         self.at = at
-        self.cells, self.cumulated, self.cost = jnp.asarray(at.cells), jnp.asarray(at.cumulated), jnp.asarray(at.cost)
+        self.cells, self.cumulated, self.cost = (
+            jnp.asarray(at.cells),
+            jnp.asarray(at.cumulated),
+            jnp.asarray(at.cost),
+        )
 
     def begin(self, key: jax.Array) -> State:
         cell = jax.random.randint(key, (), 0, self.at.num_cells)
-        return State(cell, cell, jnp.zeros((), jnp.int32), jnp.zeros((self.at.choices, self.at.num_cells)))
+        return State(
+            cell, cell, jnp.zeros((), jnp.int32), jnp.zeros((self.at.choices, self.at.num_cells))
+        )
 
     def observe(self, state: State) -> jax.Array:
         at = self.at
-        parts = jax.nn.one_hot(state.last, at.num_cells), jax.nn.one_hot(state.misses, at.choices + 1)
+        parts = (
+            jax.nn.one_hot(state.last, at.num_cells),
+            jax.nn.one_hot(state.misses, at.choices + 1),
+        )
         return jnp.concatenate([*parts, state.history.ravel()])
 
-    def step(self, key: jax.Array, state: State, action: jax.Array) -> tuple[State, jax.Array, jax.Array]:
+    def step(
+        self, key: jax.Array, state: State, action: jax.Array
+    ) -> tuple[State, jax.Array, jax.Array]:
         """The next state, the scaled reward, and whether the target has exited (a new episode has begun then)."""
         draw, start = jax.random.split(key)
         number = (jax.random.uniform(draw) > self.cumulated[state.target]).sum()
@@ -56,7 +67,9 @@ class Env:
         forced = state.misses == self.at.choices
         found = forced | (action[moved] > 0)
         spent = jnp.where(forced, self.at.safe_cost, action @ self.cost)
-        history = state.history.at[state.misses].set(action)  # one past the end is dropped: there it is forced
+        history = state.history.at[state.misses].set(
+            action
+        )  # one past the end is dropped: there it is forced
         located = State(moved, moved, jnp.zeros((), jnp.int32), jnp.zeros_like(history))
         missed = State(moved, state.last, state.misses + 1, history)
         after = jax.tree.map(lambda a, b: jnp.where(found, a, b), located, missed)
@@ -64,7 +77,9 @@ class Env:
         return after, jnp.where(exited, 0.0, SCALE * (self.at.reward * found - spent)), exited
 
 
-def network(key: jax.Array, inputs: int, outputs: int, scale: float) -> list[tuple[jax.Array, jax.Array]]:
+def network(
+    key: jax.Array, inputs: int, outputs: int, scale: float
+) -> list[tuple[jax.Array, jax.Array]]:
     """Weights of a network with one hidden layer, orthogonal as is usual in PPO."""
     first, second = jax.random.split(key)
     make = jax.nn.initializers.orthogonal
@@ -78,7 +93,9 @@ def apply(layers: list[tuple[jax.Array, jax.Array]], shown: jax.Array) -> jax.Ar
 
 
 def log_probability(logits: jax.Array, action: jax.Array) -> jax.Array:
-    return (action * jax.nn.log_sigmoid(logits) + (1 - action) * jax.nn.log_sigmoid(-logits)).sum(axis=-1)
+    return (action * jax.nn.log_sigmoid(logits) + (1 - action) * jax.nn.log_sigmoid(-logits)).sum(
+        axis=-1
+    )
 
 
 def loss(parameters: Any, batch: dict[str, jax.Array]) -> jax.Array:
@@ -92,7 +109,9 @@ def loss(parameters: Any, batch: dict[str, jax.Array]) -> jax.Array:
     return (VALUE * error**2 - surrogate - ENTROPY * entropy).mean()
 
 
-def collect(env: Env, parameters: Any, states: State, key: jax.Array) -> tuple[State, dict[str, jax.Array]]:
+def collect(
+    env: Env, parameters: Any, states: State, key: jax.Array
+) -> tuple[State, dict[str, jax.Array]]:
     """`STEPS` steps of every row, with their advantages (generalised advantage estimation)."""
 
     def step(states: State, key: jax.Array) -> tuple[State, dict[str, jax.Array]]:
@@ -111,7 +130,9 @@ def collect(env: Env, parameters: Any, states: State, key: jax.Array) -> tuple[S
     states, rows = jax.lax.scan(step, states, jax.random.split(key, STEPS))
     final = apply(parameters["critic"], jax.vmap(env.observe)(states))[..., 0]
 
-    def back(carry: tuple[jax.Array, jax.Array], row: Any) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
+    def back(
+        carry: tuple[jax.Array, jax.Array], row: Any
+    ) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
         advantage, value = carry
         error = row["reward"] + GAMMA * row["goes_on"] * value - row["value"]
         advantage = error + GAMMA * GAE_LAMBDA * row["goes_on"] * advantage
@@ -139,10 +160,14 @@ def learner(env: Env, optimizer: optax.GradientTransformation) -> Any:
             order = jax.random.permutation(key, STEPS * ENVS).reshape(MINIBATCHES, -1)
             return jax.lax.scan(minibatch, carry, jax.tree.map(lambda x: x[order], rows))
 
-        (parameters, moments), _ = jax.lax.scan(epoch, (parameters, moments), jax.random.split(second, EPOCHS))
+        (parameters, moments), _ = jax.lax.scan(
+            epoch, (parameters, moments), jax.random.split(second, EPOCHS)
+        )
         return (parameters, moments, states), None
 
-    return jax.jit(lambda carry, key: jax.lax.scan(update, carry, jax.random.split(key, UPDATES_A_CALL))[0])
+    return jax.jit(
+        lambda carry, key: jax.lax.scan(update, carry, jax.random.split(key, UPDATES_A_CALL))[0]
+    )
 
 
 def main() -> None:
@@ -150,20 +175,27 @@ def main() -> None:
     words = track.arguments(__doc__)
     at = track.Instance(words.instance)
     env = Env(at)
-    record = track.Record(at, words.record, words.seconds)  # compiling counts as learning
+    record = track.Record(words.record, words.seconds)
     actor, critic, begin, key = jax.random.split(jax.random.key(words.seed), 4)
-    parameters = {"actor": network(actor, at.width, at.num_cells, 0.01), "critic": network(critic, at.width, 1, 1.0)}
+    parameters = {
+        "actor": network(actor, at.width, at.num_cells, 0.01),
+        "critic": network(critic, at.width, 1, 1.0),
+    }
     gradients = FALL // (ENVS * STEPS) * EPOCHS * MINIBATCHES
     schedule = optax.linear_schedule(5e-3, 5e-3 / 20, gradients)
     optimizer = optax.chain(optax.clip_by_global_norm(0.5), optax.adam(schedule, eps=1e-5))
-    carry = parameters, optimizer.init(parameters), jax.vmap(env.begin)(jax.random.split(begin, ENVS))
-    learn, steps = learner(env, optimizer), 0
+    carry = (
+        parameters,
+        optimizer.init(parameters),
+        jax.vmap(env.begin)(jax.random.split(begin, ENVS)),
+    )
+    learn, steps = learner(env, optimizer).lower(carry, key).compile(), 0
     logits = jax.jit(lambda parameters, shown: apply(parameters["actor"], shown))
 
     def greedy(shown: np.ndarray) -> np.ndarray:
         return np.asarray(logits(carry[0], shown)) > 0
 
-    while record.keep(greedy, steps):
+    while record.keep(lambda: at.table(greedy), steps):
         key, now = jax.random.split(key)
         carry = jax.block_until_ready(learn(carry, now))
         steps += UPDATES_A_CALL * ENVS * STEPS

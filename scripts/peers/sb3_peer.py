@@ -44,7 +44,9 @@ class Envs(VecEnv):
         exited, moved = number == at.cumulated.shape[1], at.cells[self.target, number]
         forced = self.misses == at.choices  # the safe action: it locates whatever is sensed
         sensed = self.action[self.rows, moved]
-        earned = np.where(forced, at.reward - at.safe_cost, at.reward * sensed - self.action @ at.cost)
+        earned = np.where(
+            forced, at.reward - at.safe_cost, at.reward * sensed - self.action @ at.cost
+        )
         missed = np.flatnonzero(~(exited | forced | sensed))
         self.history[missed, self.misses[missed]] = self.action[missed]
         self.misses[missed] += 1
@@ -53,7 +55,12 @@ class Envs(VecEnv):
             infos[row] = {"terminal_observation": shown, "TimeLimit.truncated": False}
         self.target = np.where(exited, self.rng.integers(at.num_cells, size=ENVS), moved)
         self._locate(np.flatnonzero(exited | forced | sensed))
-        return self._shown(), np.where(exited, 0.0, SCALE * earned).astype(np.float32), exited, infos
+        return (
+            self._shown(),
+            np.where(exited, 0.0, SCALE * earned).astype(np.float32),
+            exited,
+            infos,
+        )
 
     def _locate(self, rows: np.ndarray) -> None:
         self.last[rows], self.misses[rows], self.history[rows] = self.target[rows], 0, 0.0
@@ -70,7 +77,9 @@ class Envs(VecEnv):
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """There is nothing to be set."""
 
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+    def env_method(
+        self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any
+    ) -> list[Any]:
         return [None] * ENVS
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
@@ -80,12 +89,14 @@ class Envs(VecEnv):
 class Keep(BaseCallback):
     """Records the greedy policy between updates, and ends the run in time."""
 
-    def __init__(self, record: track.Record) -> None:
+    def __init__(self, record: track.Record, instance: track.Instance) -> None:
         super().__init__()
-        self.record, self.goes_on = record, True
+        self.record, self.instance, self.goes_on = record, instance, True
 
     def _on_rollout_start(self) -> None:
-        self.goes_on = self.record.keep(self._greedy, self.num_timesteps)
+        self.goes_on = self.record.keep(
+            lambda: self.instance.table(self._greedy), self.num_timesteps
+        )
 
     def _on_step(self) -> bool:
         return self.goes_on
@@ -121,8 +132,8 @@ def main() -> None:
         seed=words.seed,
         device="cpu",
     )
-    record = track.Record(instance, words.record, words.seconds)
-    model.learn(10**12, callback=Keep(record))
+    record = track.Record(words.record, words.seconds)
+    model.learn(10**12, callback=Keep(record, instance))
     record.save()
 
 

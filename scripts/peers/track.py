@@ -1,6 +1,6 @@
 """What the peers share: the instance they learn on, what a policy is shown, and the record a run leaves. Only numpy.
 
-A peer is a script `<name>_peer.py`, called with INSTANCE.npz, RECORD.npz, --seed and --seconds. `trackmdp benchmark
+A peer is a script `<name>_peer.py`, called with INSTANCE.npz, RECORD.npz, --seed and --seconds. `scripts/benchmark.py
 part=peers` writes the instance, and values the policies in the record as it values its own.
 """
 
@@ -24,7 +24,9 @@ class Instance:
     def __init__(self, file: str) -> None:
         with np.load(file, allow_pickle=False) as stored:
             kernel, self.cost = stored["kernel"], stored["cost"]
-            self.safe_cost, self.reward, self.t_max = (stored[key].item() for key in ("safe_cost", "reward", "t_max"))
+            self.safe_cost, self.reward, self.t_max = (
+                stored[key].item() for key in ("safe_cost", "reward", "t_max")
+            )
         self.num_cells = m = len(kernel)
         support = int((kernel > 0).sum(axis=1).max())
         self.cells = np.zeros((m, support + 1), np.int32)
@@ -33,7 +35,9 @@ class Instance:
             after = np.flatnonzero(row)
             self.cells[cell, : len(after)] = after
             # u above the last cumulated probability is the exit, so the unused columns repeat it
-            self.cumulated[cell] = np.cumsum(row[after])[np.minimum(np.arange(support), len(after) - 1)]
+            self.cumulated[cell] = np.cumsum(row[after])[
+                np.minimum(np.arange(support), len(after) - 1)
+            ]
         self.choices = self.t_max + 1
         self.width = m + self.choices + 1 + self.choices * m
 
@@ -56,36 +60,42 @@ class Instance:
 
 
 class Record:
-    """Greedy policies over the seconds spent learning; what recording takes is not counted."""
+    """Greedy policies over the CPU seconds of the process, imports and compilation included, recording left out.
 
-    def __init__(self, instance: Instance, file: str, seconds: float, every: float = 1.0) -> None:
-        self.instance, self.file, self.limit, self.every = instance, file, seconds, every
+    CPU seconds are those of a clock where a core is free, and the same where others use it as well. Learning begins
+    with the first record.
+    """
+
+    def __init__(self, file: str, seconds: float, every: float = 0.25) -> None:
+        self.file, self.limit, self.every = file, seconds, every
         self.seconds: list[float] = []
         self.steps: list[int] = []
         self.sets: list[np.ndarray] = []
-        self._start, self._next = time.perf_counter(), 0.0
+        self._recording = 0.0
 
-    def keep(self, greedy: Callable[[np.ndarray], np.ndarray], steps: int) -> bool:
-        """Record the policy where it is due; returns whether there is time to learn on."""
-        begun = time.perf_counter()
-        spent = begun - self._start
-        if spent >= min(self._next, self.limit):
-            self.sets.append(np.packbits(self.instance.table(greedy)))
+    def keep(self, table: Callable[[], np.ndarray], steps: int, *, last: bool = False) -> bool:
+        """Record the policy `table()` where it is due, and the `last`; returns whether there is time to learn on."""
+        begun = time.process_time()
+        spent = begun - self._recording
+        end = bool(self.seconds) and spent >= self.seconds[0] + self.limit
+        if last or end or not self.seconds or spent >= self.seconds[-1] + self.every:
+            self.sets.append(np.packbits(table()))
             self.seconds.append(spent)
             self.steps.append(steps)
-            self._next = spent + self.every
-            self._start += time.perf_counter() - begun
-        return spent < self.limit
+            self._recording += time.process_time() - begun
+        return not end
 
     def save(self) -> None:
         """Write `seconds` `[E]`, `steps` `[E]` and the policies' `sets` `[E, bytes]`, as bits."""
-        np.savez_compressed(self.file, seconds=self.seconds, steps=self.steps, sets=np.stack(self.sets))
+        np.savez_compressed(
+            self.file, seconds=self.seconds, steps=self.steps, sets=np.stack(self.sets)
+        )
 
 
 def arguments(about: str | None) -> argparse.Namespace:
     """The words that every peer takes."""
     parser = argparse.ArgumentParser(description=about)
-    parser.add_argument("instance", help="INSTANCE.npz, written by trackmdp benchmark part=peers")
+    parser.add_argument("instance", help="INSTANCE.npz, written by scripts/benchmark.py part=peers")
     parser.add_argument("record", help="RECORD.npz, to be written")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=120.0, help="of learning")

@@ -14,12 +14,22 @@ from trackmdp.algos.hindsight_loss import HindsightLoss
 from trackmdp.config import ScheduleConfig
 from trackmdp.policies.policy import as_policy
 from trackmdp.solvers import optimal
-from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import regret_per_step
+from trackmdp.solvers.value import evaluate
 from trackmdp.world.model import World
 
-SHORT = ("algo.updates=30", "algo.updates_per_iteration=10", "algo.batch_size=512", "algo.hidden=16")
-SOLVES = ("algo.updates=300", "algo.updates_per_iteration=100", "algo.batch_size=2048", "algo.hidden=32")
+SHORT = (
+    "algo.updates=30",
+    "algo.updates_per_iteration=10",
+    "algo.batch_size=512",
+    "algo.hidden=16",
+)
+SOLVES = (
+    "algo.updates=300",
+    "algo.updates_per_iteration=100",
+    "algo.batch_size=2048",
+    "algo.hidden=32",
+)
 
 BETA = ScheduleConfig(start=0.3, end=0.3, begin=0.0, until=1.0)
 FORMS: dict[str, Callable[[], ActorLoss]] = {
@@ -33,7 +43,9 @@ FORMS: dict[str, Callable[[], ActorLoss]] = {
 def batches(world: World, count: int = 16, *, envs: int = 32, seed: int = 0) -> list[Any]:
     """What the collector hands over with `tests.helpers.algorithm`'s budget."""
     time = 8 * count
-    return list(collect(world, algorithm("hindsight", world).policy, envs, time, seed=seed).split(8, dim=1))
+    return list(
+        collect(world, algorithm("hindsight", world).policy, envs, time, seed=seed).split(8, dim=1)
+    )
 
 
 def learn(world: World, data: list[Any], *overrides: str, name: str = "hindsight") -> Any:
@@ -74,5 +86,7 @@ def total(loss: HindsightLoss, cells: Tensor, on: Tensor, blend: float) -> dict[
     """The losses, each under the name of the net that it trains: those of all parts added up."""
     losses: dict[str, Tensor] = {}
     for part in loss.parts(cells, on, blend):
-        losses |= {name: losses[name] + each if name in losses else each for name, each in part.items()}
+        losses |= {
+            name: losses[name] + each if name in losses else each for name, each in part.items()
+        }
     return losses

@@ -9,7 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from trackmdp.algos.actor_loss import ActorLoss, Decision, Poisson, PolicyGradient, SensorCredit, Surrogate
+from trackmdp.algos.actor_loss import (
+    ActorLoss,
+    Decision,
+    Poisson,
+    PolicyGradient,
+    SensorCredit,
+    Surrogate,
+)
 from trackmdp.config import ScheduleConfig
 
 LOSSES: dict[str, Callable[[], ActorLoss]] = {
@@ -24,7 +31,9 @@ def flat(value: float) -> ScheduleConfig:
     return ScheduleConfig(start=value, end=value, begin=0.0, until=1.0)
 
 
-def surrogate(entropy: float, *, clip: float = 0.2, sampled: bool = False, minibatches: int = 1) -> Surrogate:
+def surrogate(
+    entropy: float, *, clip: float = 0.2, sampled: bool = False, minibatches: int = 1
+) -> Surrogate:
     rng = torch.Generator().manual_seed(0) if sampled else None
     loss = Surrogate(flat(entropy), clip_epsilon=clip, minibatches=minibatches, generator=rng)
     loss.allocate((1, 1, 1), torch.device("cpu"))
@@ -37,7 +46,9 @@ def one_sensor(plus: float, minus: float, price: float, arrivals: int = 10) -> S
     gain[0, :2] = torch.tensor([plus, -minus], dtype=torch.float64)
     entry = torch.zeros(1, arrivals, dtype=torch.int64)
     shape = (1, 1, 1)
-    return SensorCredit(entry, gain, gain.new_full(shape[:2], arrivals), gain.new_full(shape, price))
+    return SensorCredit(
+        entry, gain, gain.new_full(shape[:2], arrivals), gain.new_full(shape, price)
+    )
 
 
 def logit(value: float) -> Tensor:
@@ -61,7 +72,9 @@ def test_credit_adds_up_by_hand() -> None:
     credit = SensorCredit(entry, gain, torch.tensor([[3.0, 1.0]]), price)
     assert credit.plus.tolist() == [[[4.0, 0.0, 0.0], [0.0, 2.0, 0.0]]]
     assert credit.minus.tolist() == [[[0.0, 0.0, 0.5], [0.0, 0.0, 0.0]]]
-    torch.testing.assert_close(credit.advantage, torch.tensor([[[3.75, -0.5, -1.25], [-0.1, 1.8, -0.3]]]))
+    torch.testing.assert_close(
+        credit.advantage, torch.tensor([[[3.75, -0.5, -1.25], [-0.1, 1.8, -0.3]]])
+    )
 
 
 def test_losses_by_hand() -> None:
@@ -71,7 +84,8 @@ def test_losses_by_hand() -> None:
     expected = {
         "decision": 3 * math.log(4) + 4 * math.log(4 / 3),
         "policy gradient": -0.75 - 0.05 * 10 * entropy,
-        "surrogate": -(0.75 * 0.25 - 0.25 * 0.75) - 0.05 * 10 * entropy,  # both ratios are 1 at the old policy
+        "surrogate": -(0.75 * 0.25 - 0.25 * 0.75)
+        - 0.05 * 10 * entropy,  # both ratios are 1 at the old policy
         "poisson": 2 * 3 - 3 * z,
     }
     for name, make in LOSSES.items():
@@ -79,7 +93,9 @@ def test_losses_by_hand() -> None:
 
 
 @given(st.floats(-3, 3), st.floats(0, 3), st.floats(0, 3), st.floats(0.01, 2))
-def test_slopes_are_those_of_the_formulas(z: float, plus: float, minus: float, price: float) -> None:
+def test_slopes_are_those_of_the_formulas(
+    z: float, plus: float, minus: float, price: float
+) -> None:
     """PG: -σ(1-σ)Δ + βnσ(1-σ)z, which the surrogate shares at the old policy; Poisson: c e^z - (G⁺ - G⁻)."""
     credit, on = one_sensor(plus, minus, price), 1 / (1 + math.exp(-z))
     gradient = -on * (1 - on) * (plus - minus - price - 0.05 * 10 * z)
@@ -90,12 +106,16 @@ def test_slopes_are_those_of_the_formulas(z: float, plus: float, minus: float, p
         "poisson": price * math.exp(z) - (plus - minus),
     }
     for name, make in LOSSES.items():
-        assert value_and_slope(make(), z, credit)[1] == pytest.approx(expected[name], abs=1e-9), name
+        assert value_and_slope(make(), z, credit)[1] == pytest.approx(expected[name], abs=1e-9), (
+            name
+        )
 
 
 @pytest.mark.parametrize("name", LOSSES)
 @pytest.mark.parametrize(("plus", "on"), [(2.5, True), (1.5, False)])
-def test_a_sensor_goes_on_exactly_where_its_gain_exceeds_its_price(name: str, plus: float, on: bool) -> None:
+def test_a_sensor_goes_on_exactly_where_its_gain_exceeds_its_price(
+    name: str, plus: float, on: bool
+) -> None:
     """G⁻ = 1/2 and c = 3/2, descended from either side; no loss learns past where it is sure."""
     for start in (-3.0, 3.0):
         z, loss, credit = logit(start), LOSSES[name](), one_sensor(plus, 0.5, 1.5)
@@ -147,7 +167,9 @@ def test_the_old_policy_is_renewed_once_per_batch() -> None:
     assert seen == [0, 0, 0, 3, 3, 3, 6]
 
 
-def paths(count: int, seed: int, unit: tuple[float, float, float] = (0.1, 0.2, 0.3)) -> tuple[SensorCredit, Tensor]:
+def paths(
+    count: int, seed: int, unit: tuple[float, float, float] = (0.1, 0.2, 0.3)
+) -> tuple[SensorCredit, Tensor]:
     """Rows of three sensors at two clocks, most paths at the first one, with gains of either sign."""
     rng = torch.Generator().manual_seed(seed)
     entry = torch.randint(3, (2, count), generator=rng) + torch.tensor([[0], [3]])
@@ -177,7 +199,9 @@ def test_sampled_credit_is_right_on_average() -> None:
 
 
 @pytest.mark.parametrize("unit", [(0.1, 0.2, 0.3), (1.0, 2.0, 3.0)])
-def test_sampled_credit_varies_as_paths_that_draw_their_own_sets_do(unit: tuple[float, float, float]) -> None:
+def test_sampled_credit_varies_as_paths_that_draw_their_own_sets_do(
+    unit: tuple[float, float, float],
+) -> None:
     """Against drawing every path's whole set: the same variances, within sampling error."""
     credit, on = paths(50, 4, unit)
     rng = torch.Generator().manual_seed(5)
@@ -196,7 +220,9 @@ def test_sampled_credit_varies_as_paths_that_draw_their_own_sets_do(unit: tuple[
 def test_the_sampled_surrogate_has_the_slope_of_the_expected_one_on_average() -> None:
     """At the old policy; the baseline p is what makes an action drawn by chance no evidence for it."""
     credit, on = paths(50, 6)
-    loss = Surrogate(flat(0.0), clip_epsilon=0.2, minibatches=1, generator=torch.Generator().manual_seed(7))
+    loss = Surrogate(
+        flat(0.0), clip_epsilon=0.2, minibatches=1, generator=torch.Generator().manual_seed(7)
+    )
     loss.allocate((1, 2, 3), torch.device("cpu"))
     z = on.logit().requires_grad_()
     slopes = torch.stack([torch.autograd.grad(loss(z, credit).sum(), z)[0] for _ in range(800)])

@@ -39,8 +39,12 @@ def test_the_target_is_chosen_online_and_valued_by_the_target_network() -> None:
         following = rows["next"].select(*KEYS)
         best = online(following.clone())["sensor_value"] > 0
         future = joint_value(target(following.clone()), best)
-        other = joint_value(target(following.clone()), target(following.clone())["sensor_value"] > 0)
-        value = rows["next", "reward"].squeeze(-1) + rows["discount"] * future * ~rows["next", "terminated"].squeeze(-1)
+        other = joint_value(
+            target(following.clone()), target(following.clone())["sensor_value"] > 0
+        )
+        value = rows["next", "reward"].squeeze(-1) + rows["discount"] * future * ~rows[
+            "next", "terminated"
+        ].squeeze(-1)
         error = value - joint_value(online(rows.select(*KEYS)), rows["action"])
     assert (future < other - 1e-3).any()
     assert rows["next", "terminated"].any()
@@ -48,7 +52,9 @@ def test_the_target_is_chosen_online_and_valued_by_the_target_network() -> None:
     torch.testing.assert_close(result["loss"], error.square().mean())
     torch.testing.assert_close(rows["td_error"], error.abs())
     rows["priority_weight"] = torch.rand(len(rows))
-    torch.testing.assert_close(loss(rows)["loss"], (rows["priority_weight"] * error.square()).mean())
+    torch.testing.assert_close(
+        loss(rows)["loss"], (rows["priority_weight"] * error.square()).mean()
+    )
 
 
 def test_only_the_online_network_is_trained() -> None:
@@ -61,7 +67,9 @@ def test_only_the_online_network_is_trained() -> None:
 
 def test_the_evaluated_network_follows_slowly() -> None:
     torch.manual_seed(0)
-    learner = algorithm("dqn", WORLD, "algo.updates=1", "algo.target_tau=0.25", "algo.batch_size=64")
+    learner = algorithm(
+        "dqn", WORLD, "algo.updates=1", "algo.target_tau=0.25", "algo.batch_size=64"
+    )
     start = [p.detach().clone() for p in learner.parameters]
     learner.step(collect(WORLD, learner.policy, 32, 8))
     slowly = list(learner.actor.parameters())
@@ -79,14 +87,23 @@ def test_exploration_and_learning_rate_follow_their_schedules() -> None:
     learner = algorithm("dqn", WORLD, *settings)
     assert learner.explore.epsilon.item() == pytest.approx(0.4)
     seen = [learner.step(collect(WORLD, learner.policy, 4, 4)) for _ in range(16)]
-    assert [d["epsilon"] for d in seen] == pytest.approx([0.4 * (1 - i / 8) for i in range(8)] + [0.0] * 8)
-    assert [d["learning_rate"] for d in seen] == pytest.approx([0.01 - 0.008 * i / 16 for i in range(16)])
+    assert [d["epsilon"] for d in seen] == pytest.approx(
+        [0.4 * (1 - i / 8) for i in range(8)] + [0.0] * 8
+    )
+    assert [d["learning_rate"] for d in seen] == pytest.approx(
+        [0.01 - 0.008 * i / 16 for i in range(16)]
+    )
     assert learner.explore.epsilon.item() == 0.0
 
 
 def test_prioritised_replay_learns_the_errors_it_saw() -> None:
     torch.manual_seed(0)
-    settings = ("algo.prioritized.enabled=true", "algo.prioritized.alpha=1", "algo.updates=1", "algo.batch_size=32")
+    settings = (
+        "algo.prioritized.enabled=true",
+        "algo.prioritized.alpha=1",
+        "algo.updates=1",
+        "algo.batch_size=32",
+    )
     learner = algorithm("dqn", WORLD, *settings, "algo.buffer_size=256")
     learner.step(collect(WORLD, learner.policy, 32, 8))
     mass = learner.buffer.sampler.state_dict()["mass"]

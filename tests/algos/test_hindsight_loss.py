@@ -21,13 +21,17 @@ from trackmdp.world.model import Task, World
 
 
 @given(st.floats(-5, 5), st.floats(0, 3), st.floats(0, 3), st.floats(0.01, 2))
-def test_decision_loss_is_least_where_sensing_pays(logit: float, plus: float, minus: float, price: float) -> None:
+def test_decision_loss_is_least_where_sensing_pays(
+    logit: float, plus: float, minus: float, price: float
+) -> None:
     """Its slope is (c + G⁻ + G⁺)σ(z) - G⁺, zero at z = log(G⁺ / (c + G⁻))."""
     z = torch.tensor(logit, dtype=torch.float64, requires_grad=True)
     parts = [torch.tensor(part, dtype=torch.float64) for part in (plus, minus, price)]
     decision_loss(z, *parts).backward()
     assert z.grad is not None
-    assert z.grad.item() == pytest.approx((price + minus + plus) * torch.sigmoid(z).item() - plus, abs=1e-9)
+    assert z.grad.item() == pytest.approx(
+        (price + minus + plus) * torch.sigmoid(z).item() - plus, abs=1e-9
+    )
 
 
 def test_decision_loss_stops_pulling_at_large_logits() -> None:
@@ -37,7 +41,9 @@ def test_decision_loss_stops_pulling_at_large_logits() -> None:
     assert logits.grad.tolist() == [0.0, 0.0]
 
 
-def of_one_path(form: str, z: Tensor, cost: Tensor, covers: Tensor, gain: Tensor, on: Tensor) -> Tensor:
+def of_one_path(
+    form: str, z: Tensor, cost: Tensor, covers: Tensor, gain: Tensor, on: Tensor
+) -> Tensor:
     """The loss of one path at one clock, which it reaches unlocated and leaves for a cell that the sensors `covers` do.
 
     What seeing it there gains is the gain of each sensor that sees it while none of the others does; `on` says with
@@ -68,7 +74,10 @@ def written_out(
     actor, clocked_actor = loss.actor(), loss.clocked_actor()
     value = [*loss.critic().flatten(), torch.tensor(0.0)]
     clocked = [*loss.clocked_critic().squeeze(-1), torch.zeros(last + 1)]
-    u = [[clocked[x][n] + (safe if n == last and x < m else 0.0) for n in range(last + 1)] for x in range(m + 1)]
+    u = [
+        [clocked[x][n] + (safe if n == last and x < m else 0.0) for n in range(last + 1)]
+        for x in range(m + 1)
+    ]
 
     def follow(path: list[int], n: int) -> Tensor:
         """G_n: the return of the chain from step n on."""
@@ -78,10 +87,16 @@ def written_out(
         if n == last:
             return safe + g * value[y].detach()
         chosen = on[path[0], n]
-        after = 1.0 + g * value[y].detach() if (chosen & covers[:, y]).any() else g * follow(path, n + 1)
+        after = (
+            1.0 + g * value[y].detach()
+            if (chosen & covers[:, y]).any()
+            else g * follow(path, n + 1)
+        )
         return after - float((chosen.numpy() * cost).sum())
 
-    total = {name: torch.tensor(0.0) for name in ("actor", "critic", "clocked_actor", "clocked_critic")}
+    total = {
+        name: torch.tensor(0.0) for name in ("actor", "critic", "clocked_actor", "clocked_critic")
+    }
     for path in cells.T.tolist():
         x, y = path[:2]
         target = follow(path, 0)
@@ -107,8 +122,12 @@ def written_out(
             trust = (1 - blend) * (u[y][0] - u[y][n + 1]) + blend * (value[y] - follow(path, n + 1))
             gain = (1.0 + g * trust).detach()
             # halfway through a run, sets have cooled down to .05^½
-            drawn = (actor[x, n].detach() / (0.05**0.5 if form in ("decision", "poisson") else 1.0)).sigmoid()
-            total["actor"] = total["actor"] + of_one_path(form, actor[x, n], price, covers[:, y], gain, drawn)
+            drawn = (
+                actor[x, n].detach() / (0.05**0.5 if form in ("decision", "poisson") else 1.0)
+            ).sigmoid()
+            total["actor"] = total["actor"] + of_one_path(
+                form, actor[x, n], price, covers[:, y], gain, drawn
+            )
             if (on[x, n] & covers[:, y]).any():
                 break
     return total
@@ -118,15 +137,25 @@ SETTINGS = [("decision", t_max, blend) for t_max in (0, 2) for blend in (0.0, 1.
 
 
 @pytest.mark.parametrize("kind", ["one each", "footprints", "modes told"])
-@pytest.mark.parametrize(("form", "t_max", "blend"), [*SETTINGS, *((form, 2, 0.6) for form in FORMS)])
-def test_summed_up_losses_are_those_of_every_path_apart(form: str, t_max: int, blend: float, kind: str) -> None:
+@pytest.mark.parametrize(
+    ("form", "t_max", "blend"), [*SETTINGS, *((form, 2, 0.6) for form in FORMS)]
+)
+def test_summed_up_losses_are_those_of_every_path_apart(
+    form: str, t_max: int, blend: float, kind: str
+) -> None:
     """Gradients agree with autograd through the formulas; clocks are weighed apart, so each is compared by direction.
 
     Targets do not carry the constant part of a squared error, hence gradients and not values.
     """
-    coverage = discs((3, 3), np.array([(0, 0), (0, 1), (1, 0), (1, 2), (2, 1)]), 1) if kind == "footprints" else None
+    coverage = (
+        discs((3, 3), np.array([(0, 0), (0, 1), (1, 0), (1, 2), (2, 1)]), 1)
+        if kind == "footprints"
+        else None
+    )
     count = 9 if coverage is None else 5
-    world = replace(small_world(t_max=t_max), cost=np.linspace(0.1, 0.5, count), reward=2.0, coverage=coverage).task
+    world = replace(
+        small_world(t_max=t_max), cost=np.linspace(0.1, 0.5, count), reward=2.0, coverage=coverage
+    ).task
     world = replace(world, revealed=2) if kind == "modes told" else world
     outside = world.num_keys
     rng = torch.Generator().manual_seed(1)

@@ -11,13 +11,18 @@ import torch
 from tests.algos.hindsight import SHORT, SOLVES, assert_same, batches, learn, policy
 from tests.helpers import algorithm, collect, random_state, small_world
 from trackmdp.solvers import optimal
-from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import regret_per_step
+from trackmdp.solvers.value import evaluate
 from trackmdp.training.train import train
 from trackmdp.world.kernels import random_walk
 from trackmdp.world.model import World
 
-MIXED = ("algo.collect=mixed", "algo.explore.begin=0.25", "algo.explore.until=0.75", "algo.explore.end=0.1")
+MIXED = (
+    "algo.collect=mixed",
+    "algo.explore.begin=0.25",
+    "algo.explore.until=0.75",
+    "algo.explore.end=0.1",
+)
 
 
 def test_mixed_learns_while_it_collects() -> None:
@@ -44,7 +49,14 @@ def test_mixed_learns_while_it_collects() -> None:
 def test_mixed_reaches_the_optimum_of_a_small_world() -> None:
     """Each batch is collected with the policy learned so far."""
     world = small_world(exit_probability=0.02)
-    learner = algorithm("hindsight", world, *SOLVES, *MIXED, "algo.updates_per_iteration=25", "algo.total_frames=8192")
+    learner = algorithm(
+        "hindsight",
+        world,
+        *SOLVES,
+        *MIXED,
+        "algo.updates_per_iteration=25",
+        "algo.total_frames=8192",
+    )
     torch.manual_seed(0)
     earned = []
     for number in range(learner.iterations):
@@ -102,10 +114,16 @@ def test_the_first_frames_of_a_mixture_decide_how_far_the_nets_see() -> None:
 def test_a_window_that_holds_every_move_costs_nothing(collects: str) -> None:
     """Moves of one cell and t_max = 0: sensors farther away are of no use, so that the window changes no optimum."""
     kernel = random_walk(5, stay=0.2, diagonal=True, exit_probability=0.02, border="renormalize")
-    words = {"total_frames": 20_000, "frames_per_batch": 1000, "envs": 100, "updates": 300, "collect": collects}
+    words = {
+        "total_frames": 20_000,
+        "frames_per_batch": 1000,
+        "envs": 100,
+        "updates": 300,
+        "collect": collects,
+    }
     for window in (None, 1):
         world = World(kernel, 5, cost=0.1, t_max=0, window=window)
         run = train(world, "hindsight", optimal={"enabled": False}, **words)
-        assert run.metrics["moves"][-1] > 2000
+        assert run.columns["moves"][-1] > 2000
         assert run.summary["regret_per_step"] < 0.01
         assert window is None or len(run.policy.sets.indices) < 9 * 25

@@ -51,7 +51,10 @@ def gradients(
         loss.actor_loss.prepare(update, 0.0)
         optimizer.zero_grad()
         cells = torch.arange(300) % m
-        steps = [(cells + (step > 1) * torch.randint(2, (300,), generator=rng)).clamp(max=m) for step in range(t + 3)]
+        steps = [
+            (cells + (step > 1) * torch.randint(2, (300,), generator=rng)).clamp(max=m)
+            for step in range(t + 3)
+        ]
         cells = torch.stack(steps)
         cells = torch.where((cells == m).cummax(0).values, m, cells)
         on = torch.rand(m, t + 1, loss.sensors.width, generator=rng) < 0.3
@@ -59,7 +62,11 @@ def gradients(
         torch.stack(list(losses.values())).sum().backward()
     grads = [weight.grad for weight in loss.parameters() if weight.grad is not None]
     assert len(grads) == len(list(loss.parameters()))
-    return losses, grads, torch.stack([loss.gain_scale.sum(), torch.tensor(float(len(loss.slices())))])
+    return (
+        losses,
+        grads,
+        torch.stack([loss.gain_scale.sum(), torch.tensor(float(len(loss.slices())))]),
+    )
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -81,7 +88,9 @@ def test_parts_of_footprints_are_the_whole() -> None:
     places = np.stack(np.divmod(np.arange(0, 25, 2), 5), axis=1)
     world = replace(far_world(), cost=np.linspace(0.1, 0.5, 13), coverage=discs((5, 5), places, 1))
     one, whole, scale = gradients(world, "decision", 1, 10**6)
-    few, parts, same = gradients(world, "decision", 1, 2 * 3 * 25 * 4)  # at most four sensors see a cell
+    few, parts, same = gradients(
+        world, "decision", 1, 2 * 3 * 25 * 4
+    )  # at most four sensors see a cell
     assert (scale[1], same[1]) == (1, 13)
     for name, loss in one.items():
         torch.testing.assert_close(few[name], loss)

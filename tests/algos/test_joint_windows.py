@@ -13,8 +13,8 @@ from torch.utils._pytree import tree_leaves
 import trackmdp
 from tests.helpers import algorithm, collect, random_state, small_world
 from trackmdp.policies.policy import Policy
-from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import regret_per_step
+from trackmdp.solvers.value import evaluate
 from trackmdp.world.kernels import random_walk
 from trackmdp.world.model import World
 from trackmdp.world.windows import Window
@@ -56,7 +56,9 @@ def test_sensors_outside_the_grid_are_never_on(name: str) -> None:
     """Not even in a policy that has nearly all others on, nor while it explores."""
     torch.manual_seed(0)
     world = replace(small_world(size=4, t_max=1), window=1)
-    learner = algorithm(name, world, "algo.epsilon.start=0.5" if name == "dqn" else "algo.initial_logit=5")
+    learner = algorithm(
+        name, world, "algo.epsilon.start=0.5" if name == "dqn" else "algo.initial_logit=5"
+    )
     batch = collect(world, learner.policy, 32, 16)
     acted = learner.actor(random_state(world, 200, seed=0).exclude("action"))
     window = Window.of(world)
@@ -72,7 +74,9 @@ def test_sensors_outside_the_grid_are_never_on(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "frames"), [*((name, 200_000) for name in JOINT), ("learned_kernel", 20_000)])
+@pytest.mark.parametrize(
+    ("name", "frames"), [*((name, 200_000) for name in JOINT), ("model_based", 20_000)]
+)
 def test_they_learn_what_is_best_in_the_window(name: str, frames: int) -> None:
     """Where the window matters: some moves lead out of it. With all of its sensors on, the regret is 0.48."""
     world = trackmdp.make_world("random_support", size=5, t_max=1, cost=0.16, window=1)

@@ -7,21 +7,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy import sparse
 
 from tests.algos.hindsight import SOLVES, batches, learn, policy, total
 from tests.helpers import algorithm, small_world
 from trackmdp.algos.actor_loss import Decision
+from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
 from trackmdp.algos.gains import chain_returns
 from trackmdp.algos.hindsight_loss import HindsightLoss
-from trackmdp.algos.learned_kernel import observed_paths
 from trackmdp.algos.moves import MoveBuffer, report_weights
-from trackmdp.algos.segments import SegmentBuffer
+from trackmdp.algos.observed import observed_paths
 from trackmdp.episodes.simulate import simulate
 from trackmdp.errors import UserError
 from trackmdp.solvers import optimal
-from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import regret_per_step
-from trackmdp.solvers.kernel_estimate import KernelEstimate
+from trackmdp.solvers.value import evaluate
 from trackmdp.world.model import Task
 
 TASK = Task((1, 3), cost=0.1, t_max=0, detection=[1.0, 0.5, 0.25])
@@ -40,21 +40,11 @@ def test_moves_are_drawn_in_proportion_to_their_weights() -> None:
     start, end = [0] * 11 + [2], [0] * 4 + [1] * 2 + [2] + [3] * 4 + [2]
     buffer.load_state_dict({"moves": torch.tensor([start, end])})
     first, second = buffer.paths(12_000, 1)
-    assert torch.bincount(second[first == 0], minlength=4).tolist() == pytest.approx([1000] * 4, abs=1)
+    assert torch.bincount(second[first == 0], minlength=4).tolist() == pytest.approx(
+        [1000] * 4, abs=1
+    )
     assert second[first == 1].unique().tolist() == [3]  # no move was seen out of 1: its paths leave
     assert second[first == 2].unique().tolist() == [2]
-
-
-def test_segments_count_by_all_their_reports() -> None:
-    """From 0: 0 1 1 (2 · 2), 0 2 1 (4 · 2), 0 1 M (2): 4 to 8 to 2 of 14."""
-    buffer = SegmentBuffer(TASK, 2, 100, torch.Generator().manual_seed(0))
-    cells = torch.tensor([[0, 1, 1], [0, 2, 1], [0, 1, 3]])
-    steps = torch.stack([cells[:, :-1], cells[:, 1:], 1 * (cells[:, 1:] == 3)])
-    buffer.load_state_dict({"judge": None, "paths": {"steps": steps}})
-    paths = buffer.paths(42_000, 2)
-    mine = paths[:, paths[0] == 0]
-    count = [int((torch.tensor(path) == mine[1:].T).all(1).sum()) for path in ([1, 1], [2, 1], [1, 3])]
-    assert count == pytest.approx([4000, 8000, 2000], abs=2)
 
 
 def test_returns_take_the_mean_over_the_reports() -> None:
@@ -74,8 +64,12 @@ def test_returns_take_the_mean_over_the_reports() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("markov", [True, False])
 def test_hindsight_comes_near_the_optimum(markov: bool) -> None:
-    world = replace(small_world(exit_probability=0.02), detection=np.linspace(0.7, 0.95, 9), markov=markov)
-    learner = learn(world, batches(world, 64), *SOLVES, "algo.total_frames=16384", "algo.buffer_size=20000")
+    world = replace(
+        small_world(exit_probability=0.02), detection=np.linspace(0.7, 0.95, 9), markov=markov
+    )
+    learner = learn(
+        world, batches(world, 64), *SOLVES, "algo.total_frames=16384", "algo.buffer_size=20000"
+    )
     best = optimal.solve(world)
     assert best.certified
     assert regret_per_step(best.upper, evaluate(world, policy(learner, world))) < 0.02
@@ -83,15 +77,20 @@ def test_hindsight_comes_near_the_optimum(markov: bool) -> None:
 
 def test_misses_are_censored_moves() -> None:
     """With p_d = .4 for moves to the right half and 1 elsewhere, the moves seen at once are a biased sample."""
-    world = replace(small_world(exit_probability=0.1), detection=np.where(np.arange(9) % 3 == 2, 0.4, 1.0))
+    world = replace(
+        small_world(exit_probability=0.1), detection=np.where(np.arange(9) % 3 == 2, 0.4, 1.0)
+    )
     paths = [observed_paths(batch, world) for batch in batches(world, 48)]
-    told, untold = (KernelEstimate(3, weight=1.0, exit_weight=1.0, detection=p) for p in (world.detection, None))
     errors = []
-    for estimate in (told, untold):
+    for known in (True, False):
+        estimate = KernelEstimate(3, weight=1.0, exit_weight=1.0)
         for part in paths:
-            estimate.add(part)
+            certain = sparse.csr_array(part.sensed > 0, dtype=np.float64)
+            estimate.add(part if known else replace(part, sensed=certain))
         estimate.fit(20)
-        errors.append(float(np.abs(estimate.mean().toarray()[:, :-1] - world.kernel.toarray()).mean()))
+        errors.append(
+            float(np.abs(estimate.mean().toarray()[:, :-1] - world.kernel.toarray()).mean())
+        )
     assert 3 * errors[0] < errors[1]
 
 
@@ -133,10 +132,12 @@ def test_critics_settle_at_the_value_of_what_is_repeated(hidden: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["hindsight", "a2c_per_sensor", "learned_kernel"])
+@pytest.mark.parametrize("name", ["hindsight", "a2c_per_sensor", "model_based"])
 def test_policies_with_a_safe_action_that_misses_come_near_the_optimum(name: str) -> None:
-    world = replace(small_world(exit_probability=0.02), safe_cost=0.5, detection=0.8, safe_detection=0.5)
-    words = () if name == "learned_kernel" else (*SOLVES, "algo.buffer_size=20000")
+    world = replace(
+        small_world(exit_probability=0.02), safe_cost=0.5, detection=0.8, safe_detection=0.5
+    )
+    words = () if name == "model_based" else (*SOLVES, "algo.buffer_size=20000")
     learner = learn(world, batches(world, 64), "algo.total_frames=16384", *words, name=name)
     best, found = optimal.solve(world), policy(learner, world)
     assert best.certified
@@ -148,7 +149,7 @@ def test_policies_with_a_safe_action_that_misses_come_near_the_optimum(name: str
 def test_what_ends_at_a_safe_action_that_may_miss_is_counted_until_then() -> None:
     """With p_s = .3 most of the time goes by at the last clock; the moves made then are not taken for single ones."""
     world = replace(small_world(exit_probability=0.1), detection=0.4, safe_detection=0.3)
-    estimate = KernelEstimate(3, weight=1.0, exit_weight=1.0, detection=world.detection)
+    estimate = KernelEstimate(3, weight=1.0, exit_weight=1.0)
     for batch in batches(world, 96):
         paths = observed_paths(batch, world)
         assert ((paths.end == 10) == (paths.misses == 2)).all()
@@ -162,6 +163,14 @@ def test_what_counts_paths_is_refused() -> None:
     with pytest.raises(UserError, match=r"algo\.surrogate=sampled: expected all_action"):
         algorithm("ppo_per_sensor", replace(small_world(), detection=0.5), "algo.surrogate=sampled")
     with pytest.raises(UserError, match=r"algo\.surrogate=sampled: expected all_action"):
-        algorithm("ppo_per_sensor", replace(small_world(), coverage=np.ones((9, 9))), "algo.surrogate=sampled")
+        algorithm(
+            "ppo_per_sensor",
+            replace(small_world(), coverage=np.ones((9, 9))),
+            "algo.surrogate=sampled",
+        )
     with pytest.raises(UserError, match=r"algo\.share_cells=all: sensors of different p_d"):
-        algorithm("hindsight", replace(small_world(), detection=np.linspace(0.5, 1, 9)), "algo.share_cells=all")
+        algorithm(
+            "hindsight",
+            replace(small_world(), detection=np.linspace(0.5, 1, 9)),
+            "algo.share_cells=all",
+        )

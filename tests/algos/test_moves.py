@@ -109,7 +109,9 @@ def test_the_oldest_moves_go_first() -> None:
 def deviations(start: torch.Tensor, end: torch.Tensor, world: World) -> torch.Tensor:
     """`[M, M + 1]` by how many standard errors the moves seen out of each cell miss the motion; 0 where it has none."""
     m = world.num_cells
-    kernel = torch.as_tensor(np.column_stack([world.kernel.toarray(), 1.0 - world.stay_probability]))
+    kernel = torch.as_tensor(
+        np.column_stack([world.kernel.toarray(), 1.0 - world.stay_probability])
+    )
     counts = torch.bincount(start * (m + 1) + end, minlength=m * (m + 1)).view(m, m + 1)
     seen = counts.sum(1, keepdim=True)
     error = (kernel * (1 - kernel) / seen).sqrt()
@@ -133,7 +135,9 @@ def test_a_mixture_shows_the_motion_as_it_is() -> None:
     whole = deviations(*sensed_moves(frames, 9), world)
     assert whole.max() < 5
     after, exited = frames["next"], frames["next", "terminated"].squeeze(-1)
-    located = (frames["steps_since_detection"] == 0) & ((after["steps_since_detection"] == 0) | exited)
+    located = (frames["steps_since_detection"] == 0) & (
+        (after["steps_since_detection"] == 0) | exited
+    )
     end = torch.where(exited, 9, after["last_cell"])
     naive = deviations(frames["last_cell"][located], end[located], world)
     assert naive.max(1).values.median() > 10
@@ -145,13 +149,20 @@ def test_paths_are_made_of_moves_seen(moves: int, count: int, steps: int, seed: 
     start = torch.randint(M, (moves,), generator=rng).tolist()
     end = torch.randint(M + 1, (moves,), generator=rng).tolist()
     cells = filled(start, end, seed=seed).paths(count, steps)
-    seen = set(zip(start, end, strict=True)) | {(cell, M) for cell in range(M + 1) if cell not in start}
+    seen = set(zip(start, end, strict=True)) | {
+        (cell, M) for cell in range(M + 1) if cell not in start
+    }
     assert cells.shape == (steps + 1, count)
-    assert set(zip(cells[:-1].flatten().tolist(), cells[1:].flatten().tolist(), strict=True)) <= seen
+    assert (
+        set(zip(cells[:-1].flatten().tolist(), cells[1:].flatten().tolist(), strict=True)) <= seen
+    )
 
 
 def test_a_saved_buffer_draws_the_same_paths() -> None:
-    buffer, other = filled([0, 0, 1], [1, 2, 0], seed=3), MoveBuffer(TASK, 100, torch.Generator().manual_seed(3))
+    buffer, other = (
+        filled([0, 0, 1], [1, 2, 0], seed=3),
+        MoveBuffer(TASK, 100, torch.Generator().manual_seed(3)),
+    )
     other.load_state_dict(buffer.state_dict())
     assert torch.equal(buffer.paths(50, 4), other.paths(50, 4))
 

@@ -13,12 +13,16 @@ from trackmdp.algos.dqn import n_step
 STATE = ("last_cell", "steps_since_detection", "action_history")
 
 
-def batch(reward: list[list[float]], terminated: list[list[int]], truncated: list[list[int]]) -> TensorDict:
+def batch(
+    reward: list[list[float]], terminated: list[list[int]], truncated: list[list[int]]
+) -> TensorDict:
     """Frames `[B, time]` whose state is numbered: `last_cell` is 10·row + t, and that of the next state one more."""
     rewards = torch.tensor(reward)
     rows, time = rewards.shape
     cell = 10 * torch.arange(rows)[:, None] + torch.arange(time)
-    ends, cuts = (torch.tensor(flags, dtype=torch.bool).unsqueeze(-1) for flags in (terminated, truncated))
+    ends, cuts = (
+        torch.tensor(flags, dtype=torch.bool).unsqueeze(-1) for flags in (terminated, truncated)
+    )
     history = torch.zeros(rows, time, 2, 4, dtype=torch.bool)
     following = {
         "last_cell": cell + 1,
@@ -59,9 +63,24 @@ def test_three_steps_by_hand() -> None:
         *(1 + 1, 2, 4 + 4, 8),
         *(1 + 1 + 1, 2 + 2, 4, 8),
     ]
-    assert rows["discount"].tolist() == [0.125, 0.125, 0.25, 0.5, 0.25, 0.5, 0.25, 0.5, 0.125, 0.25, 0.5, 0.5]
+    assert rows["discount"].tolist() == [
+        0.125,
+        0.125,
+        0.25,
+        0.5,
+        0.25,
+        0.5,
+        0.25,
+        0.5,
+        0.125,
+        0.25,
+        0.5,
+        0.5,
+    ]
     assert rows["next", "last_cell"].tolist() == [3, 4, 4, 4, 12, 12, 14, 14, 23, 23, 23, 24]
-    assert rows["next", "steps_since_detection"].tolist() == (rows["next", "last_cell"] + 100).tolist()
+    assert (
+        rows["next", "steps_since_detection"].tolist() == (rows["next", "last_cell"] + 100).tolist()
+    )
     ends = rows["next", "terminated"].flatten().tolist()
     assert ends == [False] * 4 + [True, True] + [False] * 6
     assert rows["last_cell"].tolist() == [0, 1, 2, 3, 10, 11, 12, 13, 20, 21, 22, 23]

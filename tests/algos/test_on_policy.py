@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 import torch
 from tensordict import TensorDict
 
+import trackmdp as tm
 from tests.helpers import algorithm, collect, hop_world, small_world
+from trackmdp.algos.on_policy import price
+from trackmdp.policies.nets import SubsetDistribution
 
 ON_POLICY = ["a2c", "ppo"]
 GAMMA, LAMBDA, SCALE, CONSTANT = 0.8, 0.5, 0.1, 3.0
@@ -14,8 +19,10 @@ SETTINGS = (f"algo.gamma={GAMMA}", f"algo.gae_lambda={LAMBDA}", f"algo.reward_sc
 
 
 def frames(terminated: list[int], truncated: list[int], misses: list[int]) -> TensorDict:
-    """One row of four steps with rewards 10, 20, 30, 40."""
-    ends, cuts = (torch.tensor(flags, dtype=torch.bool).reshape(1, 4, 1) for flags in (terminated, truncated))
+    """One row of four steps with rewards 10, 20, 30, 40; all sensors are on, with certainty."""
+    ends, cuts = (
+        torch.tensor(flags, dtype=torch.bool).reshape(1, 4, 1) for flags in (terminated, truncated)
+    )
     state = {
         "last_cell": torch.tensor([[0, 1, 2, 3]]),
         "steps_since_detection": torch.tensor([misses]),
@@ -24,6 +31,7 @@ def frames(terminated: list[int], truncated: list[int], misses: list[int]) -> Te
     following = {**state, "reward": torch.tensor([[[10.0], [20.0], [30.0], [40.0]]])}
     following |= {"terminated": ends, "truncated": cuts, "done": ends | cuts}
     action = {"action": torch.ones(1, 4, 4, dtype=torch.bool), "action_log_prob": torch.zeros(1, 4)}
+    action["logits"] = torch.full((1, 4, 4), 200.0)
     return TensorDict({**state, **action, "next": TensorDict(following, [1, 4])}, [1, 4])
 
 
@@ -94,7 +102,9 @@ def test_a_single_frame_and_a_batch_of_forced_steps_stay_finite(name: str, misse
 @pytest.mark.parametrize("name", ON_POLICY)
 def test_schedules_follow_the_progress_of_the_run(name: str) -> None:
     schedule = ("algo.learning_rate={start: 0.4, end: 0.1, begin: 0, until: 1}",)
-    learner = algorithm(name, small_world(), *schedule, "algo.entropy={start: 0.2, end: 0, begin: 0.5, until: 0.75}")
+    learner = algorithm(
+        name, small_world(), *schedule, "algo.entropy={start: 0.2, end: 0, begin: 0.5, until: 0.75}"
+    )
     assert learner.iterations == 16
     seen = []
     for _ in range(16):
@@ -105,6 +115,42 @@ def test_schedules_follow_the_progress_of_the_run(name: str) -> None:
     rates, entropies = zip(*seen, strict=True)
     assert rates == pytest.approx([0.4 - 0.3 * i / 16 for i in range(16)])
     assert entropies == pytest.approx([0.2] * 9 + [0.15, 0.1, 0.05] + [0.0] * 4)
+
+
+@pytest.mark.parametrize("name", ON_POLICY)
+def test_the_expected_price_takes_the_place_of_the_price_paid(name: str) -> None:
+    """Four sensors for .5 each are on, with probability 1/2: 1 less is expected; not where forced, nor at an exit."""
+    learner = algorithm(name, tm.World(hop_world().kernel, 2, cost=0.5, t_max=1), *SETTINGS)
+    batch = frames([0, 0, 0, 1], [0] * 4, misses=[0, 1, 2, 0])
+    batch["logits"] = torch.zeros(1, 4, 4)
+    data, _ = learner.prepare(batch)
+    earned = torch.tensor([10.0 + 1.0, 20.0 + 1.0, 30.0, 40.0])
+    torch.testing.assert_close(batch["next", "reward"].flatten(), SCALE * earned)
+    # The row at n = 1 is alone and has no variance; at n = 0 the price counts as the advantage does.
+    raw, weight = batch["advantage"].flatten(), data["price_weight"].flatten()
+    assert weight[1:].tolist() == [0.0, 0.0, 0.0]
+    assert weight[0].item() == pytest.approx(SCALE / raw[[0, 3]].std().item())
+
+
+@pytest.mark.parametrize("name", ON_POLICY)
+def test_exact_prices_leave_the_expected_gradient_as_it_is(name: str) -> None:
+    """Of a bandit: over all sets, by their probabilities, the gradient is that of the expected reward."""
+    world = tm.World(hop_world().kernel, 2, cost=[0.5, 0.1, 0.2, 0.3], t_max=0)
+    learner = algorithm(name, world, "algo.reward_scale=1")
+    logits = torch.tensor([0.3, -0.2, 0.1, 0.5], requires_grad=True)
+    sets = torch.tensor(list(itertools.product([False, True], repeat=4)))
+    dist = SubsetDistribution(logits.expand(16, 4))
+    log_prob, rows = dist.log_prob(sets), TensorDict({"last_cell": torch.zeros(16).long()}, [16])
+    gain = sets[:, 0].float() + sets[:, 1] * sets[:, 2]
+    paid = price(learner.costs, rows, sets.float()).squeeze(-1)
+    expected = price(learner.costs, rows, logits.sigmoid().expand(16, 4)).squeeze(-1)
+    weight = log_prob.exp().detach()
+    sampled = (weight * log_prob * (gain - paid)).sum()
+    exact = (weight * (log_prob * gain - expected)).sum()
+    wanted, found = (
+        torch.autograd.grad(each, logits, retain_graph=True)[0] for each in (sampled, exact)
+    )
+    torch.testing.assert_close(found, wanted)
 
 
 @pytest.mark.parametrize("name", ON_POLICY)

@@ -25,7 +25,9 @@ def test_a_draw_that_was_rounded_up_to_one_stays_with_its_cell(entries: int) -> 
 
 
 @given(st.integers(1, 200), st.integers(1, 3), st.integers(1, 30), st.integers(0, 2**31))
-def test_starts_are_even_and_first_draws_stratified(count: int, steps: int, cells: int, seed: int) -> None:
+def test_starts_are_even_and_first_draws_stratified(
+    count: int, steps: int, cells: int, seed: int
+) -> None:
     start, draws = stratified_starts(count, steps, cells, torch.Generator().manual_seed(seed))
     assert draws.shape == (steps, count)
     often = torch.bincount(start, minlength=cells)

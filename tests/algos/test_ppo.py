@@ -20,7 +20,9 @@ def test_the_clipped_objective() -> None:
     learner = algorithm("ppo", world, *ONCE)
     batch = collect(world, learner.policy, 32, 8)
     with torch.no_grad():
-        learner.policy.module[0].module.network.head.weight.normal_(std=0.3)  # off the policy that collected
+        learner.policy.module[0].module.network.head.weight.normal_(
+            std=0.3
+        )  # off the policy that collected
     data, _ = learner.prepare(batch.clone())
     learner.iteration -= 1
     with torch.no_grad():
@@ -60,5 +62,7 @@ def test_every_frame_is_used_once_per_epoch() -> None:
     learner.step(batch)
     assert [len(rows) for rows in seen] == [16] * 12
     epochs = [sorted(itertools.chain(*seen[4 * k : 4 * k + 4])) for k in range(3)]
-    torch.testing.assert_close(torch.tensor(epochs), data["advantage"].flatten().sort().values.expand(3, 64))
+    torch.testing.assert_close(
+        torch.tensor(epochs), data["advantage"].flatten().sort().values.expand(3, 64)
+    )
     assert seen[0] != seen[4] != seen[8]

@@ -14,9 +14,13 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from trackmdp.algos.dqn import PrioritizedSampler
 
 
-def buffer(alpha: float = 0.5, beta: float = 1.0, *, capacity: int = 6, seed: int = 0) -> TensorDictReplayBuffer:
+def buffer(
+    alpha: float = 0.5, beta: float = 1.0, *, capacity: int = 6, seed: int = 0
+) -> TensorDictReplayBuffer:
     sampler = PrioritizedSampler(capacity, alpha, beta)
-    made = TensorDictReplayBuffer(storage=LazyTensorStorage(capacity), sampler=sampler, batch_size=1000)
+    made = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(capacity), sampler=sampler, batch_size=1000
+    )
     made.set_rng(torch.Generator().manual_seed(seed))
     return made
 
@@ -51,7 +55,9 @@ def test_weights_undo_the_draw_and_the_largest_is_one() -> None:
     assert torch.equal(rows["x"], rows["index"].float())
 
 
-def test_the_sign_of_a_priority_does_not_count_and_zero_is_still_drawn_with_finite_weights() -> None:
+def test_the_sign_of_a_priority_does_not_count_and_zero_is_still_drawn_with_finite_weights() -> (
+    None
+):
     made = buffer(alpha=1.0)
     fill(made, 0.0, 1.0)
     made.update_priority(torch.arange(2), torch.tensor([-2.0, 2.0]))

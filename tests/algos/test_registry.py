@@ -46,7 +46,7 @@ BUDGETS = {
         "algo.hidden=64 algo.total_frames=20000 algo.frames_per_batch=20000 algo.envs=100 "
         "algo.batch_size=4096 algo.updates=250",
     ),
-    "learned_kernel": "algo.total_frames=20000 algo.frames_per_batch=4000 algo.envs=100",
+    "model_based": "algo.total_frames=20000 algo.frames_per_batch=4000 algo.envs=100",
 }
 """Seconds each; an algorithm that is not here is tried with the options of conf/."""
 QUIET = ("quiet=true", "optimal.enabled=false", "evaluation.every=100000")
@@ -55,7 +55,9 @@ QUIET = ("quiet=true", "optimal.enabled=false", "evaluation.every=100000")
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=[pytest.mark.slow] * (name in ("a2c", "dqn", "path_counts", "ppo")))
+        pytest.param(
+            name, marks=[pytest.mark.slow] * (name in ("a2c", "dqn", "model_based", "ppo"))
+        )
         for name in ALGORITHMS
     ],
 )
@@ -71,7 +73,9 @@ def test_it_solves_a_tiny_world(name: str, tmp_path: Path) -> None:
 def leaves(state: Any, key: str = "") -> dict[str, Any]:
     """Every value of a state by its place."""
     if isinstance(state, dict):
-        return {k: v for name, part in state.items() for k, v in leaves(part, f"{key}/{name}").items()}
+        return {
+            k: v for name, part in state.items() for k, v in leaves(part, f"{key}/{name}").items()
+        }
     if isinstance(state, (list, tuple)):
         return leaves(dict(enumerate(state)), key)
     return {key: state}
@@ -82,12 +86,14 @@ def different(first: Any, second: Any) -> list[str]:
     a, b = leaves(first), leaves(second)
     assert a.keys() == b.keys()
     equal = torch.equal
-    return [k for k in a if not (equal(a[k], b[k]) if isinstance(a[k], torch.Tensor) else a[k] == b[k])]
+    return [
+        k for k in a if not (equal(a[k], b[k]) if isinstance(a[k], torch.Tensor) else a[k] == b[k])
+    ]
 
 
 VARIANTS = dict.fromkeys(ALGORITHMS, ()) | {
     "dqn-prioritized": ("algo.prioritized.enabled=true", "algo.n_step=3"),
-    "path_counts": ("algo.total_frames=1024",),  # a plan in each of four iterations
+    "model_based": ("algo.total_frames=1024",),  # a plan in each of four iterations
     "hindsight-mixed": ("algo.collect=mixed", "algo.updates=3", "algo.updates_per_iteration=1"),
     "ppo_per_sensor-sampled": ("algo.surrogate=sampled",),
 }
@@ -119,12 +125,19 @@ def test_it_goes_on_from_its_state_as_if_nothing_had_happened(variant: str) -> N
         later_says = later.step(batch.clone())
     assert later_says == straight_says
     assert different(straight.state_dict(), later.state_dict()) == []
-    assert (Policy.from_module(world, straight.actor).dense() == Policy.from_module(world, later.actor).dense()).all()
+    assert (
+        Policy.from_module(world, straight.actor).dense()
+        == Policy.from_module(world, later.actor).dense()
+    ).all()
 
 
 def tiny(name: str) -> list[str]:
     """A run of a second."""
-    small = {"a2c": "algo.hidden=16", "ppo": "algo.hidden=16", "dqn": "algo.batch_size=64 algo.buffer_size=5000"}
+    small = {
+        "a2c": "algo.hidden=16",
+        "ppo": "algo.hidden=16",
+        "dqn": "algo.batch_size=64 algo.buffer_size=5000",
+    }
     if issubclass(GROUPS["algo"][name], PerSensorConfig):
         small[name] = "algo.updates=6 algo.batch_size=256 algo.hidden=16"
     budget = ["algo.total_frames=3072", "algo.frames_per_batch=1024", "algo.envs=64"]
@@ -136,13 +149,17 @@ def assert_same_run(one: Path, other: Path) -> None:
     tables = []
     for folder in (one, other):
         with (folder / "metrics.csv").open(newline="") as stream:
-            tables.append([{k: v for k, v in row.items() if k not in TIMED} for row in csv.DictReader(stream)])
+            tables.append(
+                [{k: v for k, v in row.items() if k not in TIMED} for row in csv.DictReader(stream)]
+            )
     assert tables[0] == tables[1]
     assert len(tables[0]) >= 3
     states = [checkpoint.load(checkpoint.newest(folder)) for folder in (one, other)]
     for state in states:
         state["position"].pop("seconds", None)
-    assert [key for key in different(*states) if key not in ("/callbacks/csv/position", "/seconds")] == []
+    assert [
+        key for key in different(*states) if key not in ("/callbacks/csv/position", "/seconds")
+    ] == []
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
@@ -153,7 +170,9 @@ def test_a_run_is_decided_by_its_seed(name: str, tmp_path: Path) -> None:
         (tmp_path / folder).mkdir()
         run(train_config(*tiny(name), f"algo={name}", f"seed={seed}"), tmp_path / folder)
     assert_same_run(tmp_path / "first", tmp_path / "again")
-    first, other = ((tmp_path / folder / "metrics.csv").read_text() for folder in ("first", "other"))
+    first, other = (
+        (tmp_path / folder / "metrics.csv").read_text() for folder in ("first", "other")
+    )
     assert [line.split(",")[2:-2] for line in first.splitlines()] != [
         line.split(",")[2:-2] for line in other.splitlines()
     ]
@@ -168,7 +187,9 @@ def test_a_run_is_the_same_in_another_process(name: str, tmp_path: Path) -> None
     after = [*words, "-m", f"algo={name}", "seed=5,0", f"hydra.sweep.dir={tmp_path / 'sweep'}"]
     for command in (alone, after):
         environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-        done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path, env=environment)
+        done = subprocess.run(
+            command, capture_output=True, text=True, check=False, cwd=tmp_path, env=environment
+        )
         assert done.returncode == 0, done.stderr
     (again,) = (tmp_path / "sweep").glob("*seed_0-*")
     assert_same_run(tmp_path / "alone", again)

@@ -27,13 +27,18 @@ def walks(world: object, count: int, steps: int, rng: torch.Generator) -> torch.
     return torch.where(gone, keys.num_keys, torch.stack(paths))
 
 
-@pytest.mark.parametrize(("memory", "t_max"), [("displacement", 1), ("displacement_gap", 0), ("two_displacements", 2)])
+@pytest.mark.parametrize(
+    ("memory", "t_max"), [("displacement", 1), ("displacement_gap", 0), ("two_displacements", 2)]
+)
 def test_it_is_followed_as_one_path_at_a_time(memory: str, t_max: int) -> None:
     world, rng = headings(t_max=t_max, memory=memory), torch.Generator().manual_seed(0)
     keys, settled = world.keys, Replay.settling(world.keys)
     paths = walks(world, 40, Replay.steps(keys), rng)
     on = torch.rand(keys.num_keys, t_max + 1, 9, generator=rng) < 0.4
-    spent, value = torch.rand(keys.num_keys, t_max + 1, generator=rng), torch.rand(keys.num_keys, generator=rng)
+    spent, value = (
+        torch.rand(keys.num_keys, t_max + 1, generator=rng),
+        torch.rand(keys.num_keys, generator=rng),
+    )
 
     def moved(key: int, n: int, cell: int) -> tuple[bool, int]:
         found = n > t_max or bool(on[key, n, cell])
@@ -69,21 +74,28 @@ def test_it_is_followed_as_one_path_at_a_time(memory: str, t_max: int) -> None:
             continue
         here = path[at:]
         own = [key] + [
-            keys.num_keys if here[step] == keys.num_keys else moved(key, t_max + 1, here[step] // keys.num_classes)[1]
+            keys.num_keys
+            if here[step] == keys.num_keys
+            else moved(key, t_max + 1, here[step] // keys.num_classes)[1]
             for step in range(1, t_max + 3)
         ]
         if "gap" in memory:  # the misses before are those of the step
             own[1:] = [
                 k
                 if k == keys.num_keys
-                else int(keys.next(torch.tensor(key), s, torch.tensor(here[s + 1] // keys.num_classes)))
+                else int(
+                    keys.next(torch.tensor(key), s, torch.tensor(here[s + 1] // keys.num_classes))
+                )
                 for s, k in enumerate(own[1:])
             ]
-        after = [0.0 if k == keys.num_keys else worth(here, k, step + 1) for step, k in enumerate(own[1:])]
+        after = [
+            0.0 if k == keys.num_keys else worth(here, k, step + 1)
+            for step, k in enumerate(own[1:])
+        ]
         expected.append((own, after))
-    replay = Replay(keys, Window(world, None), on)
+    replay = Replay(world, Window(world, None), on, rng)
     begun, own = replay.begin(paths)
-    found = replay.worth(begun, own, spent, value, safe=SAFE, discount=DISCOUNT)
+    found = replay.worth(begun, own, spent, value, safe_cost=1.0 - SAFE, discount=DISCOUNT)
     assert own.T.tolist() == [each for each, _ in expected]
     assert len(expected) > 15
     torch.testing.assert_close(found.T, torch.tensor([each for _, each in expected]))

@@ -12,15 +12,17 @@ from hydra import compose, initialize_config_dir
 from trackmdp.app.compose import register
 from trackmdp.config import GROUPS, ROOTS, Option, conf_dir, options
 from trackmdp.config.compose import from_hydra
-from trackmdp.config.options import several
 
 REFUSED = {("evaluate", f"log={name}") for name in ("csv", "tensorboard", "wandb", "mlflow")} | {
-    (command, "kernel=tracks") for command in ("evaluate", "solve", "verify", "benchmark")
+    (command, "kernel=tracks") for command in ("evaluate", "solve", "frontier", "verify")
 }
-REFUSED |= {(command, "sensor=false_alarm") for command in ("train", "solve", "verify", "benchmark")}
+REFUSED |= {
+    (command, "sensor=false_alarm")
+    for command in ("train", "compare", "solve", "frontier", "verify")
+}
 REFUSED |= {("verify", "sensor=footprint")}
 MODES = [name for name, schema in GROUPS["kernel"].items() if schema.hides]
-REFUSED |= {(command, f"kernel={name}") for command in ("train", "benchmark") for name in MODES}
+REFUSED |= {("train", f"kernel={name}") for name in MODES}
 """Choices that a command's group offers and its rules refuse."""
 
 COMBINATIONS = [
@@ -29,6 +31,7 @@ COMBINATIONS = [
     for group, item in options(root).items()
     if group in GROUPS and not isinstance(item, Option)
     for name in GROUPS[group]
+    if name != "given"  # set by `trackmdp.train` alone
     if (command, f"{group}={name}") not in REFUSED
 ]
 """(command, choice) of every choice that a command takes."""
@@ -39,7 +42,9 @@ def files_of(command: str, choice: str) -> list[str]:
     group, _, name = choice.partition("=")
     folder = Path(conf_dir())
     places = [(folder / f"{command}.yaml", ""), (folder / group / f"{name}.yaml", f"{group}.")]
-    texts = [(file.read_text(encoding="utf-8"), prefix) for file, prefix in places if file.is_file()]
+    texts = [
+        (file.read_text(encoding="utf-8"), prefix) for file, prefix in places if file.is_file()
+    ]
     pattern = re.compile(r"^(\w+): \?\?\?", flags=re.MULTILINE)
     return [f"{prefix}{key}=no.npy" for text, prefix in texts for key in pattern.findall(text)]
 
@@ -65,9 +70,12 @@ def _walk(schema: type[Any], choice: str, prefix: str) -> Iterator[tuple[str, st
             yield choice, f"{prefix}{key}", item
         elif key in GROUPS and not prefix:
             for name, member in GROUPS[key].items():
-                yield from _walk(member, f"{key}={name}", f"{key}.{name}." if several(schema, key) else f"{key}.")
+                if name == "given":
+                    continue
+                place = f"{key}.{name}." if item.several else f"{key}."
+                yield from _walk(member, f"{key}={name}", place)
         else:
-            yield from _walk(item, choice, f"{prefix}{key}.")
+            yield from _walk(item.schema, choice, f"{prefix}{key}.")
 
 
 def distinct() -> list[tuple[str, list[str], str, Option]]:

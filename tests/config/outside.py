@@ -1,4 +1,4 @@
-"""A package that adds a kernel, an algorithm, a solver and a logger from outside: three files each."""
+"""A package with a kernel, an algorithm, a solver, a logger and a sensor, three files each, and a memory in one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ __all__ = ["FILES", "install"]
 
 FILES = {
     "outside/__init__.py": """
-        from outside import jump_config, lazy_config, lines_config, nearest_config
+        from outside import fading_config, jump_config, lazy_config, lines_config, nearest_config
+        from trackmdp.config import MEMORIES
+
+        MEMORIES["misses"] = "outside.misses:Misses"
     """,
     # A kernel.
     "outside/jump.py": """
@@ -138,6 +141,49 @@ FILES = {
         defaults: [base_lines]
 
         word: line
+    """,
+    # A sensor.
+    "outside/fading.py": """
+        import numpy as np
+
+        def fading(size, *, range):
+            place = np.stack(np.divmod(np.arange(size**2), size), axis=1)
+            apart = np.linalg.norm(place[:, None] - place, axis=2)
+            return {"coverage": np.where(apart <= range, np.exp(-apart), 0.0)}
+    """,
+    "outside/fading_config.py": """
+        from typing import ClassVar
+
+        from trackmdp.config import SensorConfig, choice, option
+
+        @choice("sensor", "fading", makes="outside.fading:fading")
+        class FadingConfig(SensorConfig):
+            '''Sees less far away: p_d = exp(-distance), in cells, up to a range.'''
+
+            covers: ClassVar[bool] = True
+            range: float = option("distance up to which a sensor sees", unit="cells", ge=0)
+    """,
+    "outside/conf/sensor/fading.yaml": """
+        defaults: [base_fading]
+
+        range: 1.0
+    """,
+    # A memory.
+    "outside/misses.py": """
+        from trackmdp.world.memory import Memory
+
+        class Misses(Memory):
+            '''The misses between the last two detections, and 0 at the start.'''
+
+            @property
+            def count(self):
+                return self.t_max + 3
+
+            def after(self, known, rows, columns, misses):
+                return rows * 0 + misses + 1
+
+            def formula(self, last, known):
+                return "1 + misses"
     """,
     # What an installer leaves.
     "outside-1.0.dist-info/METADATA": """

@@ -56,7 +56,9 @@ def by_rules_of_its_own(item: Option) -> bool:
     return item.kind is Any or item.expects.startswith("cpu")
 
 
-KINDS = {(item.kind, item.nullable, bool(item.choices)): index for index, (*_, item) in enumerate(CASES)}
+KINDS = {
+    (item.kind, item.nullable, bool(item.choices)): index for index, (*_, item) in enumerate(CASES)
+}
 TYPED = {
     *KINDS.values(),
     *(index for index, (*_, item) in enumerate(CASES) if by_rules_of_its_own(item)),
@@ -66,7 +68,9 @@ TYPED = {
 
 
 @pytest.mark.parametrize("index", sorted(TYPED), ids=NAMES.__getitem__)
-def test_an_option_of_each_kind_refuses_a_bad_value_in_one_line(index: int, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_option_of_each_kind_refuses_a_bad_value_in_one_line(
+    index: int, capsys: pytest.CaptureFixture[str]
+) -> None:
     command, words, key, item = CASES[index]
     for value in bad_values(item)[index % 3 : 9 : 3]:
         line = refused(capsys, command, *words, f"{key}={value}")
@@ -101,7 +105,9 @@ NODES = list({(command, *words, key.rpartition(".")[0]): None for command, words
 
 
 @pytest.mark.parametrize("index", range(len(NODES)), ids=[" ".join(node) for node in NODES])
-def test_unknown_keys_are_refused_everywhere(index: int, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unknown_keys_are_refused_everywhere(
+    index: int, capsys: pytest.CaptureFixture[str]
+) -> None:
     command, *words, key = NODES[index]
     name = f"{key}.sizzle".lstrip(".")
     words = list(dict.fromkeys([*words, *files_of(command, words[0] if words else "")]))

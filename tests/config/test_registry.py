@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from trackmdp.config import GROUPS, ChoiceConfig
-from trackmdp.config.registry import conf_file, maker
+from trackmdp.config.registry import maker, read_values
 from trackmdp.errors import UserError
 
 CHOICES = [(group, name) for group, names in GROUPS.items() for name in names]
@@ -16,7 +16,7 @@ def test_what_a_choice_makes_is_there(group: str, name: str) -> None:
     schema = GROUPS[group][name]
     assert schema.name == name
     assert callable(maker(schema))
-    assert conf_file(f"{group}/{name}").is_file()
+    assert "defaults" in read_values(f"{group}/{name}")
 
 
 def test_what_is_not_there_is_one_line() -> None:
@@ -24,7 +24,9 @@ def test_what_is_not_there_is_one_line() -> None:
         name = "absent"
         makes = "trackmdp.world.kernels:no_such_kernel"
 
-    with pytest.raises(UserError, match=r"absent: cannot be made, trackmdp\.world\.kernels:no_such_kernel: module"):
+    with pytest.raises(
+        UserError, match=r"absent: cannot be made, trackmdp\.world\.kernels:no_such_kernel: module"
+    ):
         maker(Absent)
     with pytest.raises(UserError, match="kernel/no_such_kernel: no such config"):
-        conf_file("kernel/no_such_kernel")
+        read_values("kernel/no_such_kernel")

@@ -17,7 +17,6 @@ from tests.reads import record_reads, unread
 from trackmdp.config import (
     GROUPS,
     ROOTS,
-    SELECTORS,
     Option,
     TrainConfig,
     conf_dir,
@@ -30,11 +29,6 @@ from trackmdp.errors import UserError
 
 CONF = Path(conf_dir())
 CHOICES = [(group, name) for group, names in GROUPS.items() for name in names]
-
-
-CREDITED = ("a2c", "dqn", "ppo")
-SELECTED = (*CREDITED, *(f"{name}_per_sensor" for name in CREDITED))
-"""Algorithms whose options are where `credit` says."""
 
 
 def read(file: Path) -> dict[str, Any]:
@@ -54,37 +48,37 @@ def test_yaml_of_a_choice_holds_exactly_the_options_of_its_schema(group: str, na
         assert values == {"defaults": [{"/baseline@_here_": name}]}
         return
     schema = GROUPS[group][name]
-    if name in SELECTED:
-        [(target, chosen)] = values["defaults"][0].items()
-        assert (target, len(values)) == ("/credit@_here_", 1)
-        values = read(CONF / "credit" / f"{chosen.replace('${credit}', 'joint')}.yaml")
-        assert values["defaults"] == [f"/algo/base_{name}@_here_"]
-    else:
-        assert values["defaults"] == [f"base_{name}"]
+    assert values["defaults"] == [f"base_{name}"]
     assert keys(values) == set(options(schema))
     for key, item in options(schema).items():
         if not isinstance(item, Option):
-            assert set(values[key]) == set(options(item))
+            assert set(values[key]) == set(options(item.schema))
 
 
 @pytest.mark.parametrize("command", ROOTS)
 def test_yaml_of_a_command_holds_exactly_the_options_of_its_schema(command: str) -> None:
     values = read(CONF / f"{command}.yaml")
     schema = options(ROOTS[command])
-    groups = {name for name, item in schema.items() if name in GROUPS and not isinstance(item, Option)}
+    groups = {
+        name for name, item in schema.items() if name in GROUPS and not isinstance(item, Option)
+    }
     chosen = {key for entry in values["defaults"] if isinstance(entry, dict) for key in entry}
     assert groups <= chosen
     assert keys(values) - groups == set(schema) - groups
     for key in set(schema) - groups:
         if not isinstance(item := schema[key], Option):
-            assert set(values[key]) == set(options(item))
+            assert set(values[key]) == set(options(item.schema))
 
 
 def test_every_yaml_file_belongs_to_a_schema() -> None:
-    found = {str(file.relative_to(CONF)) for file in CONF.rglob("*.yaml") if file.parent.name != "experiment"}
-    expected = {f"{group}/{name}.yaml" for group, name in CHOICES} | {f"{command}.yaml" for command in ROOTS}
-    expected |= {f"credit/{name}.yaml" for name in SELECTORS["credit"].choices}
-    expected |= {f"credit/{name}/{algo}.yaml" for name in SELECTORS["credit"].choices for algo in CREDITED}
+    found = {
+        str(file.relative_to(CONF))
+        for file in CONF.rglob("*.yaml")
+        if file.parent.name != "experiment"
+    }
+    expected = {f"{group}/{name}.yaml" for group, name in CHOICES} | {
+        f"{command}.yaml" for command in ROOTS
+    }
     assert found - {"hydra/folders.yaml"} == expected
 
 
@@ -103,7 +97,7 @@ def every_option() -> list[tuple[str, Option]]:
             if isinstance(item, Option):
                 found.append((f"{where}.{key}", item))
             else:
-                walk(item, f"{where}.{key}")
+                walk(item.schema, f"{where}.{key}")
 
     for schema in [*ROOTS.values(), *(GROUPS[group][name] for group, name in CHOICES)]:
         walk(schema, schema.__name__)
@@ -123,13 +117,17 @@ def test_every_option_says_what_it_is_and_what_it_may_be(where: str, item: Optio
 
 
 @pytest.mark.parametrize(("command", "choice"), COMBINATIONS)
-def test_every_choice_composes_and_survives_config_yaml(command: str, choice: str, tmp_path: Path) -> None:
+def test_every_choice_composes_and_survives_config_yaml(
+    command: str, choice: str, tmp_path: Path
+) -> None:
     words = [choice, *files_of(command, choice)]
     words += ["baseline=qmdp"] * (command == "evaluate" and not choice.startswith("baseline="))
     cfg = configured(command, *words)
     group, name = choice.split("=")
     chosen = getattr(cfg, group)
-    assert [node.name for node in (chosen.values() if isinstance(chosen, dict) else [chosen])] == [name]
+    assert [node.name for node in (chosen.values() if isinstance(chosen, dict) else [chosen])] == [
+        name
+    ]
     file = tmp_path / "config.yaml"
     file.write_text(to_yaml(cfg), encoding="utf-8")
     assert load_config(file, ROOTS[command]) == cfg
@@ -147,25 +145,44 @@ def test_kernel_seed_follows_the_support_size() -> None:
 
 RULES = [
     ("train", "kernel.support_size=10", "kernel.support_size=10: expected an integer from 1 to 9"),
-    ("train", "grid.window=2147483648", "grid.window=2147483648: expected an integer from 0 to 1024 or null (cells)"),
+    (
+        "train",
+        "grid.window=2147483648",
+        "grid.window=2147483648: expected an integer from 0 to 1024 or null (cells)",
+    ),
     ("train", "kernel.low_probability=0.995", "kernel.low_probability=0.995: expected less than"),
     ("train", "cost.sensor=[1,2,3]", "cost.sensor: 3 values, expected one number or 100"),
     ("train", "cost.sensor=-0.1", "cost.sensor=-0.1: expected a number from 0 to 1e15"),
     ("train", "cost.sensor=true", "cost.sensor=True: expected a number from 0 to 1e15"),
-    ("train", "collector.total_frames=1000000000000000000", "collector.total_frames=1000000000000000000: expected an"),
     (
         "train",
-        "kernel=tracks kernel.path=t.csv grid.max_steps=2",
-        "grid.max_steps=2: expected at least grid.t_max + 2 = 3",
+        "collector.total_frames=1000000000000000000",
+        "collector.total_frames=1000000000000000000: expected an",
     ),
     ("train", "cost.sensor=1e16", "cost.sensor=1e+16: expected a number from 0 to 1e15"),
     ("train", "cost.reward=5e-324", "cost.reward=5e-324: expected a number from 1e-15 to 1e15"),
     ("train", "cost.safe=1e308", "cost.safe=1e+308: expected a number from 0 to 1e15"),
-    ("train", "algo=a2c algo.entropy.end=1e308", "algo.entropy.end=1e+308: expected a number from 0 to 1e6"),
+    (
+        "train",
+        "algo=a2c algo.entropy.end=1e308",
+        "algo.entropy.end=1e+308: expected a number from 0 to 1e6",
+    ),
     ("train", "cost.sensor=prices.txt", "cost.sensor=prices.txt: expected a number from 0 to 1e15"),
-    ("train", "algo=ppo collector.envs=100", "collector.frames_per_batch=4096: expected a multiple of 100"),
-    ("train", "algo=ppo collector.total_frames=4095", "collector.total_frames=4095: expected at least"),
-    ("train", "algo.explore.start=1.5", "algo.explore.start=1.5: expected a number from 0 to 1"),
+    (
+        "train",
+        "algo=ppo collector.envs=100",
+        "collector.frames_per_batch=4096: expected a multiple of 100",
+    ),
+    (
+        "train",
+        "algo=ppo collector.total_frames=4095",
+        "collector.total_frames=4095: expected at least",
+    ),
+    (
+        "train",
+        "algo=hindsight algo.explore.start=1.5",
+        "algo.explore.start=1.5: expected a number from 0 to 1",
+    ),
     ("train", "algo=ppo algo.minibatches=3", "algo.minibatches=3: expected a divisor"),
     ("train", "algo=dqn algo.buffer_size=1000", "algo.buffer_size=1000: expected at least"),
     (
@@ -175,7 +192,11 @@ RULES = [
     ),
     ("train", "device=cuda:x", "device=cuda:x: expected cpu, cuda, cuda:N or auto"),
     ("evaluate", "baseline=random_k baseline.k=101", "baseline.k=101: expected at most 100"),
-    ("evaluate", "run=a baseline=qmdp", "expected exactly one of run=FOLDER and baseline=NAME, got both"),
+    (
+        "evaluate",
+        "run=a baseline=qmdp",
+        "expected exactly one of run=FOLDER and baseline=NAME, got both",
+    ),
 ]
 
 
@@ -193,7 +214,9 @@ def test_rules_between_options(command: str, words: str, message: str) -> None:
         ("name: random_support", "kernel=null: expected one of random_support"),
     ],
 )
-def test_a_config_file_with_a_missing_key_is_refused(change: str, message: str, tmp_path: Path) -> None:
+def test_a_config_file_with_a_missing_key_is_refused(
+    change: str, message: str, tmp_path: Path
+) -> None:
     file = tmp_path / "config.yaml"
     file.write_text(to_yaml(composed("train")).replace(f"  {change}\n", "", 1), encoding="utf-8")
     with pytest.raises(UserError, match="config\\.yaml: ") as caught:
@@ -218,7 +241,7 @@ def test_a_file_that_is_no_config_is_refused(text: str, tmp_path: Path) -> None:
 
 
 def test_recorded_reads_are_those_that_happened() -> None:
-    cfg = composed("train")
+    cfg = composed("train", "algo=hindsight")
     with record_reads(cfg) as reads:
         assert cfg.algo.learning_rate.start > cfg.algo.learning_rate.end
         to_yaml(cfg)
@@ -229,18 +252,15 @@ def test_recorded_reads_are_those_that_happened() -> None:
     assert reads == {"algo.learning_rate.start", "algo.learning_rate.end"}
 
 
-@pytest.mark.parametrize("choice", ["algo=hindsight", "algo=a2c credit=per_sensor", "algo=dqn credit=per_sensor"])
-@pytest.mark.parametrize(("size", "frames"), [(3, 27_000), (10, 300_000), (40, 4_800_000)])
+@pytest.mark.parametrize("choice", ["algo=hindsight", "algo=a2c_per_sensor", "algo=dqn_per_sensor"])
+@pytest.mark.parametrize(("size", "frames"), [(3, 300_000), (10, 300_000), (40, 4_800_000)])
 def test_the_budget_grows_with_the_number_of_cells(choice: str, size: int, frames: int) -> None:
-    cfg = configured("train", *choice.split(), f"grid.size={size}")
+    cfg = configured("train", choice, f"grid.size={size}")
     assert cfg.algo.total_frames == cfg.collector.total_frames == cfg.algo.buffer_size == frames
-    typed = configured("train", *choice.split(), f"grid.size={size}", "algo.total_frames=20000")
+    typed = configured("train", choice, f"grid.size={size}", "algo.total_frames=20000")
     assert typed.collector.total_frames == typed.algo.buffer_size == 20_000
 
 
 def test_bytes_that_are_no_text_are_no_config() -> None:
-    for text in ("a: !!binary aGk=", "a: [{!!binary aGk=: 1}]"):
-        with pytest.raises(UserError, match=r"^config.yaml: not a config \("):
-            world_of(text)
-    with pytest.raises(UserError, match=r"^config.yaml: not a config \('utf-8' codec"):
+    with pytest.raises(UserError, match=r"^config.yaml: not a config \("):
         world_of(b"\xff\xfe\xfa")

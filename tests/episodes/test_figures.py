@@ -26,14 +26,24 @@ def assert_close(world: World, policy: Policy, simulation: Simulation) -> None:
     exact = ExactEvaluator(world).evaluate(policy)
     for key in FIGURES:
         estimate, value = getattr(simulation, key), getattr(exact, key)
-        assert abs(estimate.mean - value) <= 4 * estimate.standard_error + 1e-5 * (1 + abs(value)), key
+        assert abs(estimate.mean - value) <= 4 * estimate.standard_error + 1e-5 * (
+            1 + abs(value)
+        ), key
         assert estimate.standard_error < 0.05 * (1 + abs(value)), key
 
 
 @pytest.mark.parametrize("max_steps", [None, 4])
 @pytest.mark.parametrize("name", BASELINES)
-def test_exact_and_simulated_figures_agree_for_every_baseline(name: str, max_steps: int | None) -> None:
-    words = ("grid.size=3", "grid.t_max=2", "kernel.exit_probability=0.2", "cost.sensor=0.25", f"baseline={name}")
+def test_exact_and_simulated_figures_agree_for_every_baseline(
+    name: str, max_steps: int | None
+) -> None:
+    words = (
+        "grid.size=3",
+        "grid.t_max=2",
+        "kernel.exit_probability=0.2",
+        "cost.sensor=0.25",
+        f"baseline={name}",
+    )
     cfg = evaluate_config(*words)
     world = limited(build_world(cfg), max_steps)
     policy = baseline_policy(world, cfg.baseline)
@@ -76,15 +86,22 @@ def test_a_function_that_draws_is_simulated_with_the_history_it_has_made() -> No
     # A set that missed did not hold the target's cell: of nine sensors, eight are on with 1/4.
     assert np.nanmean(seen) == pytest.approx(0.25 * 8 / 9, abs=0.01)
     assert episodes.policy is None
-    assert simulate(world, drawing, 50, seed=1).figures() == simulate(world, drawing, 50, seed=1).figures()
+    assert (
+        simulate(world, drawing, 50, seed=1).figures()
+        == simulate(world, drawing, 50, seed=1).figures()
+    )
 
 
 def test_every_row_counts_up_to_its_first_end() -> None:
     """The target hops with probability 3/4: lengths are geometric, the share of episodes of one step is 1/4."""
     simulation = simulate(hop_world(), Policy.all_on(hop_world()), 40_000, seed=1).figures()
     assert simulation.episodes == 40_000
-    assert simulation.expected_length.mean == pytest.approx(4.0, abs=4 * simulation.expected_length.standard_error)
-    assert simulation.expected_length.standard_error == pytest.approx(math.sqrt(12 / 40_000), rel=0.05)
+    assert simulation.expected_length.mean == pytest.approx(
+        4.0, abs=4 * simulation.expected_length.standard_error
+    )
+    assert simulation.expected_length.standard_error == pytest.approx(
+        math.sqrt(12 / 40_000), rel=0.05
+    )
     assert simulation.accuracy.mean == 1.0
     assert simulation.sensors_per_step.mean == 4.0
     assert simulation.aihtr.mean == pytest.approx(3.0, abs=4 * simulation.aihtr.standard_error)

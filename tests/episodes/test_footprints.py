@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.special import comb
 
 from tests.helpers import small_world
 from trackmdp.app.cli import main
@@ -20,12 +21,23 @@ from trackmdp.policies.policy import Policy
 from trackmdp.world.coverage import discs
 from trackmdp.world.model import World
 
-WORDS = ["sensor=footprint", "grid.size=4", "cost.sensor=.3", "kernel.exit_probability=.1", "quiet=true"]
+WORDS = [
+    "sensor=footprint",
+    "grid.size=4",
+    "cost.sensor=.3",
+    "kernel.exit_probability=.1",
+    "quiet=true",
+]
 
 
 def _world() -> World:
     places = np.array([(0, 0), (0, 2), (2, 0), (2, 2)])
-    return World.of(small_world(), small_world().kernel, coverage=discs((3, 3), places, 1), cost=[0.1, 0.2, 0.3, 0.4])
+    return World.of(
+        small_world(),
+        small_world().kernel,
+        coverage=discs((3, 3), places, 1),
+        cost=[0.1, 0.2, 0.3, 0.4],
+    )
 
 
 def _log(folder: Path, *policies: Policy) -> Path:
@@ -55,7 +67,8 @@ def test_a_log_is_simulated_again_to_the_bit_and_recovered(tmp_path: Path) -> No
         mixed = reader.read(7).probability
         assert mixed is not None
         assert world.coverage is not None
-        assert mixed[0] == pytest.approx(world.coverage.share(0.5, 2))
+        # All d sensors of a cell are off in C(4 - d, 2) of the C(4, 2) = 6 pairs.
+        assert mixed[0] == pytest.approx(1 - comb(4 - world.coverage.degree, 2) / 6)
         assert reader[0]["action"].shape[1] == 4
         whole = [reader.read(row["episode"]) for row in reader.rows]
     cut = tmp_path / "cut.mcap"
@@ -70,7 +83,9 @@ def test_a_page_counts_sensors_and_frames_what_they_see(tmp_path: Path) -> None:
     chains = np.zeros((9, 2, 4), dtype=bool)
     chains[..., 0] = True
     with EpisodeReader(_log(tmp_path, Policy.from_dense(_world(), chains))) as reader:
-        content = re.search(r'type="application/json">(.*?)</script>', page(reader, reader.read(0)))
+        content = re.search(
+            r'type="application/json">(.*?)</script>', page(reader.world(), reader.read(0))
+        )
     assert content is not None
     said = json.loads(content[1])
     assert (said["on"][0], said["sensed"][0], said["frame"]) == (1, [0, 1, 3], "cell sensed")
@@ -93,7 +108,10 @@ def test_the_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     file = run / "episodes.mcap"
     assert main(["replay", f"file={file}", "verify=true"]) == 0
     assert "the same to the bit" in capsys.readouterr().out
-    assert main(["replay", f"file={file}", f"html={tmp_path / 'a.html'}", f"csv={tmp_path / 'csv'}"]) == 0
+    assert (
+        main(["replay", f"file={file}", f"html={tmp_path / 'a.html'}", f"csv={tmp_path / 'csv'}"])
+        == 0
+    )
     assert (tmp_path / "csv" / "steps.csv").read_text().count("\n") > 12
     assert main(["replay", f"file={file}", "episode=0"]) == 0
     again = ["baseline=playback", f"baseline.file={file}", "baseline.episode=0", "episodes=3"]

@@ -12,7 +12,8 @@ import pytest
 from tests.episodes.browser import CHROMIUM, Browser
 from trackmdp.app.cli import main
 from trackmdp.episodes.episode import Episode
-from trackmdp.episodes.page import PAGE_WIDE, write_page
+from trackmdp.episodes.export import write_page
+from trackmdp.episodes.page import PAGE_WIDE
 from trackmdp.episodes.player import WIDE, frame
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.world.make import make_world
@@ -22,7 +23,13 @@ from trackmdp.world.render import around
 
 @pytest.mark.parametrize(
     ("place", "length", "expected"),
-    [(0, 40, range(21)), (4, 40, range(21)), (15, 40, range(5, 26)), (39, 40, range(19, 40)), (3, 9, range(9))],
+    [
+        (0, 40, range(21)),
+        (4, 40, range(21)),
+        (15, 40, range(5, 26)),
+        (39, 40, range(19, 40)),
+        (3, 9, range(9)),
+    ],
 )
 def test_the_part_that_is_drawn(place: int, length: int, expected: range) -> None:
     assert around(place, length, 21) == expected
@@ -31,7 +38,14 @@ def test_the_part_that_is_drawn(place: int, length: int, expected: range) -> Non
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("large") / "e"
-    words = ["baseline=clocked", "grid.size=[60,50]", "episodes=2", "seed=3", "log=[mcap]", "quiet=true"]
+    words = [
+        "baseline=clocked",
+        "grid.size=[60,50]",
+        "episodes=2",
+        "seed=3",
+        "log=[mcap]",
+        "quiet=true",
+    ]
     assert main(["evaluate", *words, f"hydra.run.dir={folder}"]) == 0
     return folder
 
@@ -46,12 +60,16 @@ def test_a_frame_is_the_grid_around_the_target(folder: Path) -> None:
         drawn = [list(line[2:-2:2]) for line in lines[1:-2]]
         top, left = (
             int(each) - 1
-            for each in re.fullmatch(r"rows (\d+) to \d+ of 60, columns (\d+) to \d+ of 50", lines[-1]).groups()
+            for each in re.fullmatch(
+                r"rows (\d+) to \d+ of 60, columns (\d+) to \d+ of 50", lines[-1]
+            ).groups()
         )
         _same_marks(episode, t, task, np.array(drawn), top, left)
 
 
-def _same_marks(episode: Episode, t: int, task: Task, drawn: np.ndarray, top: int, left: int) -> None:
+def _same_marks(
+    episode: Episode, t: int, task: Task, drawn: np.ndarray, top: int, left: int
+) -> None:
     target = int(episode.target[t])
     if target < task.num_cells:
         row, column = divmod(target, task.columns)
@@ -63,13 +81,17 @@ def _same_marks(episode: Episode, t: int, task: Task, drawn: np.ndarray, top: in
         assert not set("●○") & set(drawn.ravel())
     on = episode.action[t].reshape(task.size)[top : top + WIDE, left : left + WIDE]
     if episode.misses[t] <= task.t_max:
-        assert (drawn == "▪").sum() == on.sum() - (target < task.num_cells and episode.action[t][target])
+        assert (drawn == "▪").sum() == on.sum() - (
+            target < task.num_cells and episode.action[t][target]
+        )
 
 
 def test_the_page_says_what_part_it_draws(folder: Path) -> None:
     page = folder / "page.html"
     assert main(["replay", f"file={folder / 'episodes.mcap'}", f"html={page}", "quiet=true"]) == 0
-    data = json.loads(re.search(r'<script id="data" type="application/json">(.*?)</script>', page.read_text())[1])
+    data = json.loads(
+        re.search(r'<script id="data" type="application/json">(.*?)</script>', page.read_text())[1]
+    )
     assert (data["rows"], data["columns"], data["wide"]) == (60, 50, PAGE_WIDE)
     assert "the 41 x 41 cells around the target" in data["about"]
 
@@ -89,12 +111,19 @@ def test_the_part_that_a_browser_draws(folder: Path, tmp_path: Path) -> None:
             if episode.target[t] < 3000:
                 row, column = divmod(int(episode.target[t]), 50)
                 assert x < column < x + width and y < row < y + height
-                assert browser.ask("[target.cx, target.cy].map((at) => at.baseVal.value)") == [column + 0.5, row + 0.5]
+                assert browser.ask("[target.cx, target.cy].map((at) => at.baseVal.value)") == [
+                    column + 0.5,
+                    row + 0.5,
+                ]
             # the corner of what is drawn has its own number, and the shade of its own cell
             corner = browser.ask("[cells[0].x, cells[0].y].map((at) => at.baseVal.value)")
-            labels = browser.ask("[columnLabels, rowLabels].map((each) => Number(each[0].textContent))")
+            labels = browser.ask(
+                "[columnLabels, rowLabels].map((each) => Number(each[0].textContent))"
+            )
             assert labels == [corner[0] + 1, corner[1] + 1]
-            shades = np.array(browser.ask("cells.map((each) => Number(each.getAttribute('fill-opacity')))"))
+            shades = np.array(
+                browser.ask("cells.map((each) => Number(each.getAttribute('fill-opacity')))")
+            )
             belief = episode.belief[t].reshape(60, 50)  # type: ignore[index]
             left, top = map(int, corner)
             seen = belief[top : top + PAGE_WIDE, left : left + PAGE_WIDE].ravel()
@@ -105,7 +134,11 @@ def test_the_part_that_a_browser_draws(folder: Path, tmp_path: Path) -> None:
 def test_a_small_grid_is_drawn_whole() -> None:
     world = make_world("random_walk", size=4)
     episode = Episode.__new__(Episode)
-    for name, value in {"belief": None, "action": np.zeros((1, 16), bool), "target": np.array([5])}.items():
+    for name, value in {
+        "belief": None,
+        "action": np.zeros((1, 16), bool),
+        "target": np.array([5]),
+    }.items():
         object.__setattr__(episode, name, value)
     object.__setattr__(episode, "located", np.array([True]))
     object.__setattr__(episode, "misses", np.array([0]))

@@ -13,11 +13,14 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from tests.episodes.logs import CONFIG, WORLD, policy, recorded, rewritten, write
 from tests.episodes.test_simulate import WINDOWED
-from trackmdp.episodes import schema, writer
+from tests.tracks import by_hand
+from tests.tracks import recorded as recorded_tracks
+from trackmdp.episodes import schema
 from trackmdp.episodes.episode import first_difference
 from trackmdp.episodes.page import page
 from trackmdp.episodes.reader import EpisodeReader, verify
 from trackmdp.episodes.recover import recover
+from trackmdp.episodes.simulate import simulate
 from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
@@ -52,8 +55,10 @@ def test_a_random_policy_and_cut_episodes_come_back_too(tmp_path: Path) -> None:
     episodes = recorded(10, acting=acting, max_steps=6)
     file = write(tmp_path / "a.mcap", episodes, acting=acting, max_steps=6)
     with EpisodeReader(file) as reader:
-        assert all(first_difference(a, b) is None for a, b in zip(episodes, reader.episodes(), strict=True))
-        assert (reader.run.max_steps, reader.policy_table(0), reader.policy(0).k) == (6, None, 3)
+        assert all(
+            first_difference(a, b) is None for a, b in zip(episodes, reader.episodes(), strict=True)
+        )
+        assert (reader.world().max_steps, reader.policy(0).k) == (6, 3)
         assert verify(reader).difference is None
         assert any(row["truncated"] for row in reader.rows)
         assert reader[0]["step_count"].tolist() == list(range(len(reader.read(0))))
@@ -67,14 +72,18 @@ def test_a_rectangle_with_a_window_comes_back_and_verifies(k: int | None, tmp_pa
     file = write(tmp_path / "a.mcap", episodes, acting=acting, world=WINDOWED)
     with EpisodeReader(file) as reader:
         assert (reader.world().size, reader.world().window) == ((3, 4), 1)
-        assert all(first_difference(a, b) is None for a, b in zip(episodes, reader.episodes(), strict=True))
+        assert all(
+            first_difference(a, b) is None for a, b in zip(episodes, reader.episodes(), strict=True)
+        )
         assert verify(reader).difference is None
         assert reader[0]["action"].shape[1:] == (9,)
         assert reader.read(0).action.sum(1).max() <= (9 if k is None else k)
     file.replace(tmp_path / "b.mcap.part")
     saved = recover(tmp_path / "b.mcap.part")
     with EpisodeReader(saved.file) as reader:
-        assert all(first_difference(a, b) is None for a, b in zip(episodes, reader.episodes(), strict=True))
+        assert all(
+            first_difference(a, b) is None for a, b in zip(episodes, reader.episodes(), strict=True)
+        )
 
 
 def test_it_feeds_a_replay_buffer(log: Path) -> None:
@@ -90,7 +99,12 @@ def test_what_the_log_carries_simulates_again(log: Path) -> None:
         world = reader.world()
         assert (world.kernel != WORLD.kernel).nnz == 0
         assert (world.cost == WORLD.cost).all()
-        assert (world.size, world.t_max, world.reward, world.safe_cost) == ((4, 4), 2, WORLD.reward, WORLD.safe_cost)
+        assert (world.size, world.t_max, world.reward, world.safe_cost) == (
+            (4, 4),
+            2,
+            WORLD.reward,
+            WORLD.safe_cost,
+        )
         assert (reader.policy(0).dense() == policy().dense()).all()
         assert reader.attachment("config.yaml").decode() == CONFIG
         assert schema.versions().items() <= reader.run.said.items()
@@ -106,8 +120,13 @@ def test_rows_say_what_became_of_each_episode(log: Path) -> None:
             assert row["length"] == len(episode)
             assert row["return"] == pytest.approx(episode.reward.astype(float).sum(), abs=1e-9)
             assert row["detections"] == episode.located.sum()
-            assert int(row["end_time"]) - int(row["start_time"]) == (len(episode) - 1) * schema.TICK_NS
-        gaps = [int(b["start_time"]) - int(a["end_time"]) for a, b in zip(reader.rows, reader.rows[1:], strict=False)]
+            assert (
+                int(row["end_time"]) - int(row["start_time"]) == (len(episode) - 1) * schema.TICK_NS
+            )
+        gaps = [
+            int(b["start_time"]) - int(a["end_time"])
+            for a, b in zip(reader.rows, reader.rows[1:], strict=False)
+        ]
         assert min(gaps) > schema.TICK_NS
         with pytest.raises(UserError, match=r"episode=30: .* holds 30 episodes \(0 to 29\)"):
             reader[30]
@@ -134,21 +153,16 @@ def test_a_bad_episode_does_not_spoil_the_file(tmp_path: Path) -> None:
         assert first_difference(good, reader.read(0)) is None
 
 
-def test_another_process_may_not_write(tmp_path: Path) -> None:
-    writer = EpisodeWriter.of(tmp_path / "a.mcap", WORLD, facts={}, config=CONFIG)
-    writer._process += 1
-    with pytest.raises(RuntimeError, match="opened by process"):
-        writer.add(recorded(1)[0])
-    writer.abandon()
-
-
 def test_grid_messages_keep_to_the_rules_of_viewers(log: Path) -> None:
     """A field ends within its cell, a row within its stride, data are whole rows; no null, no array of arrays."""
     with EpisodeReader(log) as reader:
-        messages = [each for each in reader._between(0, 2**63) if each.topic == "/grid"]
-    said = json.loads(messages[0].data)
+        said = json.loads(
+            next(data for topic, data in reader._between(0, 2**63) if topic == "/grid")
+        )
     size = {1: 1, 7: 4}
-    assert all(each["offset"] + size[each["type"]] <= said["cell_stride"] for each in said["fields"])
+    assert all(
+        each["offset"] + size[each["type"]] <= said["cell_stride"] for each in said["fields"]
+    )
     assert said["row_stride"] >= said["column_count"] * said["cell_stride"]
     data = b64decode(said["data"])
     assert len(data) == 4 * said["row_stride"]
@@ -162,26 +176,65 @@ def test_a_log_of_a_rectangle_comes_back(tmp_path: Path) -> None:
     world = World(kernel, (3, 5), cost=0.2, t_max=1)
     episodes = recorded(6, world=world)
     with EpisodeReader(write(tmp_path / "a.mcap", episodes, world=world)) as reader:
-        assert (reader.world().size, reader.run.said["size"], reader.run.said["columns"]) == ((3, 5), "3", "5")
-        assert all(first_difference(a, b) is None for a, b in zip(episodes, reader.episodes(), strict=True))
+        assert (reader.world().size, reader.run.said["size"], reader.run.said["columns"]) == (
+            (3, 5),
+            "3",
+            "5",
+        )
+        assert all(
+            first_difference(a, b) is None for a, b in zip(episodes, reader.episodes(), strict=True)
+        )
         assert verify(reader).difference is None
-        assert '"columns":5' in page(reader, reader.read(0))
+        assert '"columns":5' in page(reader.world(), reader.read(0))
 
 
-@pytest.mark.parametrize("acting", [policy(), Policy.all_on(WORLD), Policy.none(WORLD)])
-def test_a_large_grid_is_logged_sparse_and_read_all_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, acting: Policy
-) -> None:
-    episodes = recorded(10, acting=acting)
-    dense = write(tmp_path / "dense.mcap", episodes, acting=acting)
-    monkeypatch.setattr(writer, "DENSE_CELLS", 15)
-    file = write(tmp_path / "a.mcap", episodes, acting=acting)
-    with EpisodeReader(file) as reader, EpisodeReader(dense) as other:
+def test_a_log_of_a_side_above_a_thousand_cells_comes_back(tmp_path: Path) -> None:
+    kernel = random_walk((3, 1100), stay=0.3, diagonal=True, exit_probability=0.3, border="clip")
+    world = World(kernel, (3, 1100), cost=0.001, t_max=1, window=3)
+    acting = Policy.all_on(world)
+    episodes = recorded(3, world=world, acting=acting)
+    file = write(tmp_path / "a.mcap", episodes, world=world, acting=acting)
+    with EpisodeReader(file) as reader:
+        assert (reader.world().size, reader.world().window) == ((3, 1100), 3)
+        assert verify(reader).difference is None
+
+
+DRAWN = Policy.from_dense(WORLD, np.full((WORLD.num_cells, 3, WORLD.num_cells), 0.3))
+
+
+@pytest.mark.parametrize("acting", [policy(), Policy.all_on(WORLD), Policy.none(WORLD), DRAWN])
+def test_a_policy_of_any_kind_is_read_back_and_acts_again(tmp_path: Path, acting: Policy) -> None:
+    file = write(tmp_path / "a.mcap", recorded(10, acting=acting), acting=acting)
+    with EpisodeReader(file) as reader:
         reader.check_all()
-        assert np.array_equal(reader.world().kernel.toarray(), other.world().kernel.toarray())
-        assert set(reader._container.attachments).isdisjoint({"kernel.npy", "policy-0.npy"})
-        if acting.sets is not None:
-            assert np.array_equal(reader.policy(0).dense(), other.policy(0).dense())
+        assert np.array_equal(reader.world().kernel.toarray(), WORLD.kernel.toarray())
+        found = reader.policy(0)
+        assert (found.probability, found.k) == (acting.probability, acting.k)
+        assert found.sets is None or np.array_equal(found.sets.toarray(), acting.sets.toarray())
         assert verify(reader).difference is None
-        assert all(first_difference(a, b) is None for a, b in zip(episodes, reader.episodes(), strict=True))
+    assert recover(file).file.read_bytes() == file.read_bytes()
+
+
+def test_a_policy_without_a_table_cannot_act_again(tmp_path: Path) -> None:
+    writer = EpisodeWriter.of(tmp_path / "a.mcap", WORLD, facts={}, config=CONFIG)
+    writer.add_policy({}, None)
+    for episode in recorded(1):
+        writer.add(episode)
+    with EpisodeReader(writer.finish()) as reader, pytest.raises(UserError, match="policy 0"):
+        verify(reader)
+
+
+def test_a_log_along_recorded_tracks_comes_back(tmp_path: Path) -> None:
+    """It holds the held-out tracks alone, along which its episodes are simulated again."""
+    setting = recorded_tracks(
+        by_hand([0, 1, 2, 5], [4, 3], [8, 7, 4, 1], exits=[True, False, True])
+    )
+    acting = Policy.all_on(setting)
+    episodes = list(simulate(setting, acting, 5).complete())
+    assert not any(each.belief.any() for each in episodes)  # no motion model, no belief
+    file = write(tmp_path / "a.mcap", episodes, acting=acting, world=setting)
+    with EpisodeReader(file) as reader:
+        assert verify(reader).difference is None
+        found = reader.world()
+        assert found.held_out.digest() == found.tracks.digest() == setting.held_out.digest()
     assert recover(file).file.read_bytes() == file.read_bytes()

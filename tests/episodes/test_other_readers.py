@@ -51,7 +51,9 @@ def node_has_mcap() -> bool:
     if NODE is None:
         return False
     asked = subprocess.run(
-        [NODE, "-e", "require('@mcap/core'); require('@mcap/support')"], capture_output=True, check=False
+        [NODE, "-e", "require('@mcap/core'); require('@mcap/support')"],
+        capture_output=True,
+        check=False,
     )
     return asked.returncode == 0
 
@@ -66,13 +68,22 @@ def test_mcap_core_reads_the_whole_file(log: Path) -> None:
     if not node_has_mcap():
         pytest.skip("@mcap/core and @mcap/support are not installed where node looks (NODE_PATH)")
     done = subprocess.run(
-        [str(NODE), "-e", READ, str(log)], capture_output=True, text=True, check=False, env=os.environ
+        [str(NODE), "-e", READ, str(log)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ,
     )
     assert (done.returncode, done.stderr) == (0, "")
     said, episodes = json.loads(done.stdout), recorded(30)
     steps = sum(map(len, episodes))
     assert said["counts"] == {**dict.fromkeys(SCHEMAS, steps), "/episode": 30}
-    assert said["attachments"] == ["config.yaml", "kernel.npy", "cost.npy", "policy-0.npy", "episodes.json"]
+    assert said["attachments"] == [
+        "config.yaml",
+        "problem.npz",
+        "policy-0.npz",
+        "episodes.json",
+    ]
     assert said["metadata"] == ["trackmdp.run", "trackmdp.policy.0", "trackmdp.end"]
     assert said["done"] is True
     assert said["rewards"] == [reward for episode in episodes for reward in episode.reward.tolist()]

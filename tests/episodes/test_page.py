@@ -13,11 +13,15 @@ import pytest
 from tests.episodes.browser import CHROMIUM, Browser
 from tests.episodes.logs import WORLD, recorded, write
 from tests.helpers import train_config
-from trackmdp.episodes.page import MOST_STEPS, page, write_page
+from tests.tracks import by_hand
+from tests.tracks import recorded as recorded_tracks
+from trackmdp.episodes.export import write_page
+from trackmdp.episodes.page import MOST_STEPS, page
 from trackmdp.episodes.reader import EpisodeReader
-from trackmdp.episodes.simulate import resimulate
+from trackmdp.episodes.simulate import resimulate, simulate
+from trackmdp.errors import UserError
 from trackmdp.policies.policy import as_policy
-from trackmdp.solvers import bounds, qmdp
+from trackmdp.solvers import bounds, rules
 from trackmdp.world.make import build_world
 
 
@@ -32,7 +36,9 @@ def longest(reader: EpisodeReader) -> int:
 
 
 def data_of(text: str) -> dict[str, list[float]]:
-    found = re.search(r'<script id="data" type="application/json">(.*?)</script>', text, flags=re.DOTALL)
+    found = re.search(
+        r'<script id="data" type="application/json">(.*?)</script>', text, flags=re.DOTALL
+    )
     assert found
     content: dict[str, list[float]] = json.loads(found[1])
     return content
@@ -41,19 +47,21 @@ def data_of(text: str) -> dict[str, list[float]]:
 def test_a_page_holds_the_episode_to_the_digit(reader: EpisodeReader) -> None:
     episode = reader.read(longest(reader))
     assert episode.belief is not None
-    data = data_of(page(reader, episode))
+    data = data_of(page(WORLD, episode))
     assert data["reward"] == episode.reward.tolist()
     assert data["total"] == episode.returns.tolist()
     assert data["n"] == episode.misses.tolist()
     assert "mode" not in data  # these targets have none
     assert data["bound"] == pytest.approx(bounds.clocked(WORLD)[episode.start])
     shares = dict(zip(data["belief"][0][::2], data["belief"][0][1::2], strict=True))  # type: ignore[index]
-    assert shares[int(episode.belief[0].argmax())] == pytest.approx(1e4 * episode.belief[0].max(), abs=0.5)
+    assert shares[int(episode.belief[0].argmax())] == pytest.approx(
+        1e4 * episode.belief[0].max(), abs=0.5
+    )
 
 
 def test_a_page_is_one_small_file_that_asks_for_nothing(tmp_path: Path) -> None:
     world = build_world(train_config())
-    acting = as_policy(world, qmdp.solve(world))
+    acting = as_policy(world, rules.qmdp(world))
     episodes = resimulate(world, acting, range(100)).complete()
     episode = next(each for each in episodes if 100 <= len(each) < 150)
     with EpisodeReader(write(tmp_path / "a.mcap", [episode], acting=acting, world=world)) as reader:
@@ -65,17 +73,16 @@ def test_a_page_is_one_small_file_that_asks_for_nothing(tmp_path: Path) -> None:
 
 
 def test_what_a_log_says_cannot_break_out_of_the_page(reader: EpisodeReader) -> None:
-    reader.policies[0]["label"], seed = "</script><b>&", reader.run.said["seed"]
-    reader.run.said["seed"] = "</script>"
-    text = page(reader, reader.read(0))
-    reader.policies[0]["label"], reader.run.said["seed"] = "a policy", seed
+    text = page(WORLD, reader.read(0), label="</script><b>&", seed="</script>")
     assert text.count("</script>") == 2
     assert "&lt;/script&gt;&lt;b&gt;&amp;" in text
 
 
-def test_a_long_episode_is_cut_and_the_page_says_so(reader: EpisodeReader, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_episode_is_cut_and_the_page_says_so(
+    reader: EpisodeReader, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("trackmdp.episodes.page.MOST_STEPS", 5)
-    data = data_of(page(reader, reader.read(longest(reader))))
+    data = data_of(page(WORLD, reader.read(longest(reader))))
     assert len(data["target"]) == len(data["belief"]) == 5
     assert "the first 5 steps are shown" in str(data["about"])
     assert MOST_STEPS == 2000
@@ -92,7 +99,9 @@ def test_the_page_in_a_browser(reader: EpisodeReader, tmp_path: Path) -> None:
         browser.view(360, 740, "dark")
         browser.open(tmp_path / "a.html")
         assert browser.ask("Number(document.getElementById('slider').max)") == last
-        assert browser.ask("document.querySelectorAll('.cell').length") == len(reader.world().cost) + 1  # and its key
+        assert (
+            browser.ask("document.querySelectorAll('.cell').length") == len(reader.world().cost) + 1
+        )  # and its key
 
         def value(name: str) -> float:
             return float(browser.ask(f"document.getElementById('v-{name}').dataset.value"))
@@ -105,7 +114,9 @@ def test_the_page_in_a_browser(reader: EpisodeReader, tmp_path: Path) -> None:
             assert value("active") == episode.action[t].sum()
             said = browser.ask("document.getElementById('said').textContent")
             assert said.startswith(f"Step {t + 1} of {last + 1}. ")
-            cursors = "['lanes', 'sum'].map((id) => document.querySelector(`#${id} .now`).getBBox().x)"
+            cursors = (
+                "['lanes', 'sum'].map((id) => document.querySelector(`#${id} .now`).getBBox().x)"
+            )
             assert browser.ask(cursors) == [t + 0.5, t + 0.5]
             # WORLD has 4 columns; x and y of the mark are those of the cell it was last located in before the step
             before = [t for t in range(t) if episode.located[t]]
@@ -119,7 +130,13 @@ def test_the_page_in_a_browser(reader: EpisodeReader, tmp_path: Path) -> None:
                 assert place in said
 
         check(0)
-        for key, t in (("ArrowRight", 1), ("ArrowRight", 2), ("End", last), ("ArrowLeft", last - 1), ("Home", 0)):
+        for key, t in (
+            ("ArrowRight", 1),
+            ("ArrowRight", 2),
+            ("End", last),
+            ("ArrowLeft", last - 1),
+            ("Home", 0),
+        ):
             browser.press(key)
             check(t)
         browser.press("+")
@@ -140,6 +157,24 @@ def test_the_page_in_a_browser(reader: EpisodeReader, tmp_path: Path) -> None:
         assert browser.ask("getComputedStyle(document.body).backgroundColor") == "rgb(22, 24, 27)"
         browser.shoot(tmp_path / "phone.png")
         browser.view(1000, 760, "light")
-        assert browser.ask("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
+        assert (
+            browser.ask("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
+        )
         browser.shoot(tmp_path / "desk.png")
+        assert browser.problems == []
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
+def test_the_page_of_a_recorded_track_has_neither_belief_nor_bound(tmp_path: Path) -> None:
+    setting = recorded_tracks(by_hand([0, 1, 2, 5], [4, 3, 0], [8, 7, 4, 1]))
+    file = simulate(setting, "all_on", 2).page(tmp_path / "a.html", 1)
+    with pytest.raises(UserError, match="episode 2, expected 0 to 1"):
+        simulate(setting, "all_on", 2).page(tmp_path / "b.html", 2)
+    with Browser(tmp_path / "profile") as browser:
+        browser.view(390, 844, "light")
+        browser.open(file)
+        shown = browser.ask("document.body.innerText")
+        assert "held-out track" in shown
+        assert "most likely" not in shown and "bound" not in shown
+        assert browser.ask("document.querySelector('.limit')") is None
         assert browser.problems == []

@@ -24,22 +24,29 @@ from trackmdp.policies import policy as policies
 from trackmdp.policies.acting import Playback
 from trackmdp.policies.policy import Policy
 from trackmdp.seeding import derive
+from trackmdp.world.dynamics import Dynamics
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.model import World
 from trackmdp.world.outcomes import Costs
-from trackmdp.world.targets import Motion
+from trackmdp.world.paths import path_sampler
 
 ACTING = {
     "table": policy(),
     "random_k": Policy.random_k(WORLD, 3),
     "all_on": Policy.all_on(WORLD),
     "none": Policy.none(WORLD),
-    "probabilities": Policy.from_dense(WORLD, np.random.default_rng(1).random((16, 3, 16)) * policy().dense()),
+    "probabilities": Policy.from_dense(
+        WORLD, np.random.default_rng(1).random((16, 3, 16)) * policy().dense()
+    ),
 }
 
 
 WINDOWED = World(
-    random_kernel(np.random.default_rng(0), 12, 0.04), (3, 4), cost=np.linspace(0.1, 0.3, 12), t_max=2, window=1
+    random_kernel(np.random.default_rng(0), 12, 0.04),
+    (3, 4),
+    cost=np.linspace(0.1, 0.3, 12),
+    t_max=2,
+    window=1,
 )
 
 
@@ -52,26 +59,34 @@ def in_window(share: float = 0.5) -> Policy:
 def stepped_alone(world: World, acting: Policy, seed: int) -> TensorDict:
     """The episode as the environment itself makes it, one row, from the same draws."""
     rng = torch.Generator().manual_seed(seed)
-    start, motion = torch.randint(world.num_cells, (1,), generator=rng), Motion(world.kernel)
-    env = TrackEnv(world, 1)
-    hidden, state = {"target": start}, env.reset().set("last_cell", start.clone())
+    start, sampler = torch.randint(world.num_cells, (1,), generator=rng), path_sampler(world)
+    dynamics, env = Dynamics(world, sampler), TrackEnv(world, 1)
+    place, state = start, env.reset().set("last_cell", start.clone())
     steps: list[TensorDict] = []
     while True:
         if len(steps) % 256 == 0:
-            block = motion.draw(256, rng)
+            block = sampler.draw(256, rng)
         state = acting(state)
-        following = TensorDict(env.advance({**state, **hidden}, block[len(steps) % 256].unsqueeze(0)), [1])
-        hidden["target"] = following.pop("target")
+        before, draws = {**state, "place": place}, block[len(steps) % 256].unsqueeze(0)
+        following = TensorDict(dynamics.advance(before, state["action"], draws, None), [1])
+        place = following.pop("place")
         steps.append(state.clone().set("next", following))
         if following["done"].item():
             return torch.cat(steps)
         state = following.select(*env.observation_spec)
-        state.update({key: torch.zeros(1, 1, dtype=torch.bool) for key in ("done", "terminated", "truncated")})
+        state.update(
+            {
+                key: torch.zeros(1, 1, dtype=torch.bool)
+                for key in ("done", "terminated", "truncated")
+            }
+        )
 
 
 @pytest.mark.parametrize("max_steps", [None, 7])
 @pytest.mark.parametrize("window", [None, 1])
-def test_an_episode_is_what_the_environment_makes_of_its_draws(max_steps: int | None, window: int | None) -> None:
+def test_an_episode_is_what_the_environment_makes_of_its_draws(
+    max_steps: int | None, window: int | None
+) -> None:
     """On a square, and on a rectangle of which only a window can be sensed, with actions in its own numbers."""
     world = limited(WORLD if window is None else WINDOWED, max_steps)
     acting = policy() if window is None else in_window()
@@ -101,7 +116,9 @@ def test_its_keys_are_those_of_a_rollout(max_steps: int | None) -> None:
 def test_an_episode_is_the_same_alone_and_among_others(name: str, numbers: list[int]) -> None:
     everyone = together(name)
     seeds = [everyone[number].seed for number in numbers]
-    for number, alone in zip(numbers, resimulate(WORLD, ACTING[name], seeds).complete(), strict=True):
+    for number, alone in zip(
+        numbers, resimulate(WORLD, ACTING[name], seeds).complete(), strict=True
+    ):
         assert first_difference(everyone[number], alone) is None
 
 
@@ -128,7 +145,9 @@ def test_the_belief_is_the_filters(name: str) -> None:
         belief = exact.detect(torch.tensor([episode.start]))
         for t in range(len(episode)):
             predicted = exact.predict(belief)
-            np.testing.assert_allclose(episode.belief[t], predicted[0].numpy(), rtol=1e-6, atol=1e-9)
+            np.testing.assert_allclose(
+                episode.belief[t], predicted[0].numpy(), rtol=1e-6, atol=1e-9
+            )
             action = torch.as_tensor(episode.action[t : t + 1])
             found = torch.tensor([int(episode.target[t])])
             belief = exact.detect(found) if episode.located[t] else exact.miss(predicted, action)
@@ -170,12 +189,16 @@ def test_playback_of_another_grid_is_refused() -> None:
 
 
 @pytest.mark.parametrize("name", ACTING)
-def test_batches_and_ways_of_looking_up_change_nothing(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_batches_and_ways_of_looking_up_change_nothing(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("trackmdp.episodes.actors._MOST_ROWS", 7)
     monkeypatch.setattr("trackmdp.episodes.actors._DRAWS", 100)
     monkeypatch.setattr("trackmdp.episodes.batch._BELIEF", 50)
     monkeypatch.setattr(policies, "_DENSE", 0)
-    acting = Policy(WORLD, ACTING[name].sets, probability=ACTING[name].probability, k=ACTING[name].k)
+    acting = Policy(
+        WORLD, ACTING[name].sets, probability=ACTING[name].probability, k=ACTING[name].k
+    )
     for mine, other in zip(simulate(WORLD, acting, 40).complete(), together(name), strict=False):
         assert first_difference(mine, other) is None
 
@@ -218,9 +241,13 @@ def test_episodes_are_a_sequence() -> None:
 
 
 def test_episodes_of_recorded_tracks_go_along_the_held_out_ones() -> None:
-    setting = recorded_tracks(by_hand([0, 1, 2, 5], [4, 3], [8, 7, 4, 1], exits=[True, False, True]))
+    setting = recorded_tracks(
+        by_hand([0, 1, 2, 5], [4, 3], [8, 7, 4, 1], exits=[True, False, True])
+    )
     closed = setting.held_out.closed(setting.num_cells)
-    paths = [closed.cells[a:b].tolist() for a, b in zip(closed.first[:-1], closed.first[1:], strict=True)]
+    paths = [
+        closed.cells[a:b].tolist() for a, b in zip(closed.first[:-1], closed.first[1:], strict=True)
+    ]
     episodes = simulate(setting, Policy.all_on(setting), 50)
     for episode in episodes:
         path = [episode.start, *episode.target.tolist()]
@@ -228,8 +255,6 @@ def test_episodes_of_recorded_tracks_go_along_the_held_out_ones() -> None:
         assert episode.terminated == (path[-1] == setting.num_cells)
         assert episode.truncated != episode.terminated
     assert len({episode.start for episode in episodes}) > 1
-    with pytest.raises(UserError, match="no motion model"):
-        next(episodes.complete())
 
 
 CHANGES: list[tuple[str, Any, str]] = [
@@ -264,4 +289,31 @@ def test_a_belief_within_the_tolerance_passes() -> None:
     assert first_difference(changed, episode)
     assert first_difference(changed, episode, belief_tolerance=1e-6) is None
     changed.belief[0, 0] = np.nan
-    assert (first_difference(changed, episode, belief_tolerance=1e-6) or "").startswith("step 0, belief of cell 0")
+    assert (first_difference(changed, episode, belief_tolerance=1e-6) or "").startswith(
+        "step 0, belief of cell 0"
+    )
+
+
+@pytest.mark.parametrize("episodes", [-1, 1.5, "3"])
+def test_a_number_of_episodes_that_is_none_is_refused(episodes: Any) -> None:
+    with pytest.raises(UserError, match=f"episodes={episodes}"):
+        simulate(WORLD, policy(), episodes)
+
+
+def test_a_seed_that_is_no_whole_number_is_refused() -> None:
+    for make in (
+        lambda seed: simulate(WORLD, policy(), 1, seed=seed),
+        lambda seed: TrackEnv(WORLD, 2, seed=seed),
+    ):
+        with pytest.raises(UserError, match=r"seed=1\.5"):
+            make(1.5)
+
+
+def test_all_steps_are_one_tensordict() -> None:
+    episodes = simulate(WORLD, "qmdp", 4)
+    steps = episodes.to_tensordict()
+    assert len(steps) == len(episodes.target)
+    assert steps["episode"].bincount().tolist() == [len(each) for each in episodes]
+    mine = steps[steps["episode"] == 2].exclude("episode")
+    assert (mine == episodes[2].to_tensordict(WORLD)).all()
+    assert len(simulate(WORLD, "qmdp", 0).to_tensordict()) == 0

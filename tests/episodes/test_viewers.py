@@ -36,7 +36,10 @@ from foxglove.messages import Grid
 from google.protobuf import descriptor_pb2, descriptor_pool, json_format, message_factory
 
 WALK = World(
-    random_walk((3, 4), stay=0.4, diagonal=False, exit_probability=0.1, border="clip"), (3, 4), cost=0.2, t_max=1
+    random_walk((3, 4), stay=0.4, diagonal=False, exit_probability=0.1, border="clip"),
+    (3, 4),
+    cost=0.2,
+    t_max=1,
 )
 WIDE = World(np.full((10, 10), 0.09), (2, 5), cost=0.2, safe_cost=2.0, t_max=2)
 
@@ -50,7 +53,9 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def messages(log: Path, topic: str) -> list[dict[str, Any]]:
     with log.open("rb") as stream:
-        return [json.loads(message.data) for _, _, message in make_reader(stream).iter_messages(topic)]
+        return [
+            json.loads(message.data) for _, _, message in make_reader(stream).iter_messages(topic)
+        ]
 
 
 LAYERS = ("/grid", "/active", "/target")
@@ -75,7 +80,9 @@ def drawn(said: dict[str, Any], size: tuple[int, int]) -> dict[str, np.ndarray]:
     )
     table = np.frombuffer(made.data, cell).reshape(rows, columns)
     found = {name: np.zeros(size, table.dtype[name]) for name in cell.names or ()}
-    for row, column in np.ndindex(rows, columns):  # the first row is the lowest; a place in x, y is that of a corner
+    for row, column in np.ndindex(
+        rows, columns
+    ):  # the first row is the lowest; a place in x, y is that of a corner
         x = made.pose.position.x + side * (column + 0.5)
         y = made.pose.position.y + side * (row + 0.5)
         assert side == 1 or (x % 1, y % 1) == (0.5, 0.5)
@@ -94,7 +101,9 @@ def published() -> Any:
 
 
 @pytest.mark.parametrize("whole_cells", [WHOLE_CELLS, 9])
-def test_what_is_drawn_is_what_was_logged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole_cells: int) -> None:
+def test_what_is_drawn_is_what_was_logged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole_cells: int
+) -> None:
     """All layers over each other, each above the one before; a large grid's belief without the part where it is 0."""
     monkeypatch.setattr(grids, "WHOLE_CELLS", whole_cells)
     acting = policy(WALK)
@@ -108,12 +117,18 @@ def test_what_is_drawn_is_what_was_logged(tmp_path: Path, monkeypatch: pytest.Mo
         assert np.array_equal(shown["belief"], episode.belief[t])  # type: ignore[index]
         assert np.array_equal(shown["policy"], episode.probability[t])  # type: ignore[index]
         assert np.array_equal(shown["active"], episode.action[t])
-        assert np.flatnonzero(shown["target"]).tolist() == [each for each in [episode.target[t]] if each < 12]
+        assert np.flatnonzero(shown["target"]).tolist() == [
+            each for each in [episode.target[t]] if each < 12
+        ]
     assert {len(each["data"]) for each in every[2]} == {4}  # one byte in base64
     sizes = {len(each["data"]) for each in every[0]}
-    assert max(sizes) == 128 and (min(sizes) < 128) == (whole_cells < 12)  # 12 cells of 8 bytes in base64
+    assert max(sizes) == 128 and (min(sizes) < 128) == (
+        whole_cells < 12
+    )  # 12 cells of 8 bytes in base64
     with EpisodeReader(file) as reader:
-        assert all(first_difference(a, b) is None for a, b in zip(episodes, reader.episodes(), strict=True))
+        assert all(
+            first_difference(a, b) is None for a, b in zip(episodes, reader.episodes(), strict=True)
+        )
 
 
 def test_the_messages_of_a_large_grid_are_as_large_as_what_is_known() -> None:
@@ -139,7 +154,9 @@ def test_the_part_that_viewers_look_at_moves_by_nine_rows_within_the_grid() -> N
     assert {(part["x"], part["z"]) for part in parts} == {(5, 0)}
 
 
-@pytest.mark.parametrize("place", [{"x": -1}, {"x": 4}, {"y": -1}, {"y": 2}, {"x": 0.5}, {"x": None}])
+@pytest.mark.parametrize(
+    "place", [{"x": -1}, {"x": 4}, {"y": -1}, {"y": 2}, {"x": 0.5}, {"x": None}]
+)
 def test_a_grid_that_lies_outside_is_damage(place: dict[str, Any]) -> None:
     [episode] = recorded(1, acting=policy(WALK), world=WALK)
     every = [json.loads(layers["/grid"]) for layers in grids.grid_messages(episode, WALK.size, 0)]
@@ -161,7 +178,14 @@ def test_every_message_is_what_its_schema_says(log: Path, topic: str) -> None:
 
 def check_json(value: Any, schema: dict[str, Any], place: str) -> None:
     """JSON Schema, as far as viewers read it: types, keys, items."""
-    kinds = {"object": dict, "array": list, "string": str, "boolean": bool, "integer": int, "number": (int, float)}
+    kinds = {
+        "object": dict,
+        "array": list,
+        "string": str,
+        "boolean": bool,
+        "integer": int,
+        "number": (int, float),
+    }
     assert isinstance(value, kinds[schema["type"]]), place
     assert isinstance(value, bool) == (schema["type"] == "boolean"), place
     if isinstance(value, dict):
@@ -205,9 +229,15 @@ def test_lines_surround_all_cells_and_none_outside(size: tuple[int, int]) -> Non
         for lines in panel.get("layers", {}).values():
             assert (lines["frameId"], lines["divisions"]) == ("grid", lines["size"])
             left, low = (middle - lines["size"] / 2 for middle in lines["position"][:2])
-            assert min(left, low) >= 0 and left + lines["size"] <= columns and low + lines["size"] <= rows
+            assert (
+                min(left, low) >= 0
+                and left + lines["size"] <= columns
+                and low + lines["size"] <= rows
+            )
             assert left % 1 == low % 1 == 0
-            within[int(low) : int(low) + lines["size"], int(left) : int(left) + lines["size"]] = True
+            within[int(low) : int(low) + lines["size"], int(left) : int(left) + lines["size"]] = (
+                True
+            )
         assert within.all() == ("layers" in panel)
 
 
@@ -229,7 +259,9 @@ def test_what_panels_show_is_in_the_messages(log: Path) -> None:
     for topics in maps:
         assert tuple(topics) == LAYERS
         for topic, layer in topics.items():
-            assert layer["colorField"] in {field["name"] for field in messages(log, topic)[0]["fields"]}
+            assert layer["colorField"] in {
+                field["name"] for field in messages(log, topic)[0]["fields"]
+            }
 
 
 def check(value: Any, kind: Any, place: str) -> None:

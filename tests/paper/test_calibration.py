@@ -10,9 +10,16 @@ import pytest
 
 from trackmdp.config import conf_dir
 from trackmdp.paper.calibration import Candidate, candidates, chosen, sensitivity
-from trackmdp.paper.worlds import COSTS, PRINTED_QMDP, PRINTED_TMDP, SUPPORTS, paper_kernel, paper_world
-from trackmdp.solvers import bounds, qmdp
-from trackmdp.solvers.evaluate import evaluate
+from trackmdp.paper.worlds import (
+    COSTS,
+    PRINTED_QMDP,
+    PRINTED_TMDP,
+    SUPPORTS,
+    paper_kernel,
+    paper_world,
+)
+from trackmdp.solvers import bounds, rules
+from trackmdp.solvers.value import evaluate
 
 PAPER = Path(conf_dir()) / "experiment/paper.yaml"
 
@@ -35,7 +42,9 @@ def test_candidates_are_judged_by_their_worst_price_the_best_first() -> None:
     assert found[0].seed == SEEDS[5]
     for candidate in found:
         printed = [PRINTED_QMDP[5, cost] for cost in COSTS]
-        assert candidate.deviation == max(abs(a - b) for a, b in zip(candidate.accuracy, printed, strict=True))
+        assert candidate.deviation == max(
+            abs(a - b) for a, b in zip(candidate.accuracy, printed, strict=True)
+        )
         assert candidate.deviation >= found[0].deviation
 
 
@@ -64,15 +73,23 @@ def test_the_printed_numbers_are_those_of_table_two() -> None:
 @pytest.mark.slow
 def test_the_sensitivity_is_the_range_over_the_draws() -> None:
     settings = list(sensitivity(draws=[0, 1, 2]))
-    assert len({(s.border, s.t_max, s.support_size, s.cost) for s in settings}) == len(settings) == 4 * 3 * 12
-    (one,) = [s for s in settings if (s.border, s.t_max, s.support_size, s.cost) == ("clip", 2, 4, 0.2)]
+    assert (
+        len({(s.border, s.t_max, s.support_size, s.cost) for s in settings})
+        == len(settings)
+        == 4 * 3 * 12
+    )
+    (one,) = [
+        s for s in settings if (s.border, s.t_max, s.support_size, s.cost) == ("clip", 2, 4, 0.2)
+    ]
     worlds = [paper_world(paper_kernel(4, seed, "clip"), 0.2, 2) for seed in range(3)]
-    exact = [evaluate(world, qmdp.solve(world)) for world in worlds]
+    exact = [evaluate(world, rules.qmdp(world)) for world in worlds]
     accuracy = sorted(100 * e.accuracy for e in exact)
     assert vars(one.accuracy) == {"median": accuracy[1], "low": accuracy[0], "high": accuracy[2]}
     assert one.qmdp.median == np.median([e.aihtr for e in exact])
     assert one.clocked.high == max(bounds.clocked(world).mean() for world in worlds)
     best = candidates(4, border="clip", t_max=2, seeds=range(3))[0]
     assert one.deviation == best.deviation
-    inside = [s.accuracy.median for s in settings if (s.border, s.t_max, s.cost) == ("inside", 1, 0.16)]
+    inside = [
+        s.accuracy.median for s in settings if (s.border, s.t_max, s.cost) == ("inside", 1, 0.16)
+    ]
     assert max(inside) - min(inside) < 1e-9  # the same for every Z, so the paper did not use it

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -9,14 +10,22 @@ import pytest
 from hypothesis import given, settings
 
 from tests.solvers.worlds import paper_world, tiny_worlds
-from trackmdp.paper import theorems, worlds
-from trackmdp.paper.theorems import Check
+from trackmdp.paper import proofs, theorems, worlds
+from trackmdp.paper.check import Check, summarize_checks
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers import bounds, optimal, qmdp
-from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers import bounds, optimal, rules
 from trackmdp.solvers.solution import Solution
+from trackmdp.solvers.value import evaluate
 from trackmdp.world.kernels import random_walk
 from trackmdp.world.model import BoolArray, World
+
+
+@pytest.fixture(autouse=True, scope="module")
+def no_searches() -> Iterator[None]:
+    """They take most of the time, and depend on no world: `test_mutations` has them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(proofs, "of_searches", lambda: iter(()))
+        yield
 
 
 def checks(world: World, solution: Solution | None = None) -> dict[tuple[str, str], Check]:
@@ -76,14 +85,14 @@ def test_the_remark_on_worlds_where_qmdp_is_optimal() -> None:
     rows = {row.name: row for row in theorems.check_remarks(1e-9)}
     assert rows["remark, c = 0.14, Z = 4"].holds
     world = paper_world(4, 0.14, 1)
-    np.testing.assert_array_equal(qmdp.solve(world).dense()[:, 0], world.kernel.toarray() > 0)
+    np.testing.assert_array_equal(rules.qmdp(world).dense()[:, 0], world.kernel.toarray() > 0)
     assert optimal.solve(world).evaluation.accuracy == pytest.approx(1.0)
 
 
 def test_the_printed_bound_is_exceeded() -> None:
     (row,) = [row for row in theorems.check_remarks(1e-9) if row.name == "the printed bound"]
     world = worlds.paper_world(worlds.paper_kernel(5, 5, "inside"), 0.16, 5)
-    attained = evaluate(world, qmdp.clocked_policy(world)).aihtr
+    attained = evaluate(world, rules.clocked_policy(world)).aihtr
     assert attained > bounds.paper(world).mean() + 0.5
     assert attained <= bounds.valid(world).mean()
     assert not row.holds
@@ -95,3 +104,24 @@ def test_ties_do_not_look_like_failures() -> None:
     kernel = random_walk(4, stay=1 / 9, diagonal=True, exit_probability=0.1, border="renormalize")
     world = World(kernel, 4, cost=np.full(16, 1 / 9), safe_cost=16 / 9, t_max=1)
     assert all(row.passed for row in checks(world).values())
+
+
+def test_the_last_line_counts_claims_apart_from_forms_that_are_not_claimed() -> None:
+    rows = [
+        Check("a", "", 0.0, holds=True),
+        Check("b", "", -np.inf, holds=True),
+        Check("c", "", 3.0, closed=False),
+        Check("d", "", 3.0, expected=False),
+    ]
+    assert summarize_checks(rows) == (
+        "of 3 claims 1 hold, 1 have no case in this world, 1 are open, 0 FAIL; "
+        "of 1 looser forms, not claimed, 1 do not hold"
+    )
+    assert [row.passed for row in rows] == [True] * 4
+    assert not Check("e", "", 3.0).passed
+
+
+def test_no_case_where_there_are_cases_fails() -> None:
+    assert Check("a", "", -np.inf).of_cases(0).judged(1e-9).verdict == "no case"
+    assert Check("a", "", -np.inf).of_cases(3).judged(1e-9).verdict == "FAILS"
+    assert Check("a", "", 0.0).of_cases(3).judged(1e-9).verdict == "holds"

@@ -54,7 +54,9 @@ def test_extreme_logits_stay_finite() -> None:
 
 def test_gradients_are_those_of_the_formula() -> None:
     logits = LOGITS.clone().requires_grad_()
-    assert torch.autograd.gradcheck(lambda z: SubsetDistribution(z).log_prob(SUBSETS[[1, 6, 3]]), logits)
+    assert torch.autograd.gradcheck(
+        lambda z: SubsetDistribution(z).log_prob(SUBSETS[[1, 6, 3]]), logits
+    )
     assert torch.autograd.gradcheck(lambda z: SubsetDistribution(z).entropy(), logits)
 
 
@@ -71,7 +73,10 @@ def test_sample_frequencies() -> None:
 def test_the_actor_writes_an_action_and_its_log_probability() -> None:
     world = small_world(t_max=1)
     torch.manual_seed(0)
-    actor, rows = make_actor(world.task, 16, initial_logit=-0.5), random_state(world, 40, seed=0).exclude("action")
+    actor, rows = (
+        make_actor(world.task, 16, initial_logit=-0.5),
+        random_state(world, 40, seed=0).exclude("action"),
+    )
     with torch.no_grad():
         acted = actor(rows.clone())
         assert acted["action"].shape == (40, 9)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from tests.acting import RandomSubset
 from tests.helpers import ALGORITHMS, algorithm, random_state, small_world
-from trackmdp.policies.acting import RandomSubset
 from trackmdp.policies.policy import Policy
 
 WORLD = small_world(t_max=1)
@@ -42,11 +42,11 @@ def policy_called(name: str) -> Any:
 @pytest.mark.parametrize("name", [*FIXED, *LEARNED])
 def test_the_true_cell_changes_no_action(name: str) -> None:
     policy, rows = policy_called(name), random_state(WORLD, 100, seed=0).exclude("action")
-    assert "target" not in policy.in_keys
+    assert {"place", "target"} & set(policy.in_keys) == set()
     actions = []
     for shift in (0, 4):
         moved = rows.clone()
-        moved["target"] = (rows["target"] + shift) % 9
+        moved["place"] = (rows["place"] + shift) % 9
         torch.manual_seed(0)
         if "random" in name:
             policy.generator.manual_seed(0)

@@ -6,7 +6,9 @@ from trackmdp.policies.nets import CellClockNet
 
 
 def test_rows_see_their_own_cell_and_clock_alone() -> None:
-    net = CellClockNet(4, 3, hidden=8, outputs=5, bias=-1.0, generator=torch.Generator().manual_seed(0))
+    net = CellClockNet(
+        4, 3, hidden=8, outputs=5, bias=-1.0, generator=torch.Generator().manual_seed(0)
+    )
     before = net()
     assert before.shape == (4, 3, 5)
     with torch.no_grad():
@@ -38,7 +40,9 @@ def test_without_hidden_units_every_output_has_a_number_of_its_own() -> None:
     table(slice(1, 3)).sum().backward()
     assert table.table.grad is not None
     assert table.table.grad.sum((1, 2)).tolist() == [0, 6, 6, 0]
-    grouped = CellClockNet(4, 2, hidden=0, outputs=3, bias=0.0, generator=generator, groups=torch.tensor([0, 1, 1, 0]))
+    grouped = CellClockNet(
+        4, 2, hidden=0, outputs=3, bias=0.0, generator=generator, groups=torch.tensor([0, 1, 1, 0])
+    )
     with torch.no_grad():
         grouped.table[1] += 1.0
     assert grouped().sum((1, 2)).tolist() == [0, 6, 6, 0]

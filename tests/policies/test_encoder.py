@@ -17,7 +17,12 @@ from trackmdp.world.model import Task, World
 def features(world: World, cell: Tensor, n: Tensor, history: Tensor) -> Tensor:
     """`[B, K]`: cell, n, both, and the history's bits, each as 0 or 1."""
     m, stages = world.num_cells, world.t_max + 2
-    parts = [one_hot(cell, m), one_hot(n, stages), one_hot(cell * stages + n, m * stages), history.flatten(1)]
+    parts = [
+        one_hot(cell, m),
+        one_hot(n, stages),
+        one_hot(cell * stages + n, m * stages),
+        history.flatten(1),
+    ]
     return torch.cat(parts, dim=1).double()
 
 
@@ -31,7 +36,11 @@ def test_it_is_a_linear_layer_on_one_hots(t_max: int) -> None:
     rows = random_state(world, 60, seed=1)
     inputs = [rows[key] for key in ("last_cell", "steps_since_detection", "action_history")]
     tables = [encoder.cell, encoder.stage, encoder.cell_and_stage]
-    weight = torch.cat([*(table.weight.T for table in tables), encoder.history.weight], dim=1).detach().requires_grad_()
+    weight = (
+        torch.cat([*(table.weight.T for table in tables), encoder.history.weight], dim=1)
+        .detach()
+        .requires_grad_()
+    )
     bias = encoder.history.bias.detach().clone().requires_grad_()
     dense = torch.relu(features(world, *inputs) @ weight.T + bias)
     ours = encoder(*inputs)
@@ -51,7 +60,12 @@ def test_a_key_adds_what_it_shares_and_its_own(known: dict[str, Any]) -> None:
     torch.manual_seed(0)
     encoder, bias = StateEncoder(world.task, 8).double(), RelativeBias(world.task).double()
     keys, classes = torch.arange(world.num_keys), world.keys.num_classes
-    state = (world.keys.cell(keys), torch.ones_like(keys), torch.zeros(len(keys), 2, 9, dtype=torch.bool), keys)
+    state = (
+        world.keys.cell(keys),
+        torch.ones_like(keys),
+        torch.zeros(len(keys), 2, 9, dtype=torch.bool),
+        keys,
+    )
     before = encoder(*state)
     shared, own = encoder.known
     for table, moved in ((shared, keys % classes == 5), (own, keys == 4 * classes + 5)):
@@ -74,10 +88,14 @@ def test_batches_of_any_shape_and_rows_alone() -> None:
     inputs = [rows[key] for key in ("last_cell", "steps_since_detection", "action_history")]
     flat = network(*inputs)
     assert flat.shape == (12, 3)
-    torch.testing.assert_close(network(*(x.reshape(3, 4, *x.shape[1:]) for x in inputs)), flat.reshape(3, 4, 3))
+    torch.testing.assert_close(
+        network(*(x.reshape(3, 4, *x.shape[1:]) for x in inputs)), flat.reshape(3, 4, 3)
+    )
     for row in range(12):
         torch.testing.assert_close(network(*(x[row] for x in inputs)), flat[row])
-        torch.testing.assert_close(network(*(x[row : row + 1] for x in inputs)), flat[row : row + 1])
+        torch.testing.assert_close(
+            network(*(x[row : row + 1] for x in inputs)), flat[row : row + 1]
+        )
 
 
 def test_every_state_has_features_of_its_own() -> None:
@@ -108,7 +126,9 @@ def test_the_relative_bias_is_shared_by_all_cells_and_ends_at_the_border() -> No
     assert bias.table.grad[1, right] == 6  # the pairs of cells that are so placed
 
 
-def test_the_relative_bias_of_a_large_grid_is_that_of_a_small_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_relative_bias_of_a_large_grid_is_that_of_a_small_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Places worked out state by state, without a table of all pairs of cells."""
     task = Task((3, 5), cost=0.2, t_max=1)
     kept = RelativeBias(task)

@@ -18,10 +18,10 @@ from tests.helpers import ALGORITHMS, algorithm, random_kernel, random_state, sm
 from trackmdp.episodes.simulate import simulate
 from trackmdp.errors import UserError
 from trackmdp.policies import lookup, policy
+from trackmdp.policies.forms import STATE_KEYS
 from trackmdp.policies.nets import SubsetDistribution
 from trackmdp.policies.policy import Policy, actor_table, as_policy
-from trackmdp.policies.unroll import STATE_KEYS
-from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers.value import evaluate
 from trackmdp.world.model import Task, World
 
 WORLD = small_world(t_max=2)
@@ -38,7 +38,9 @@ def everywhere() -> tuple[np.ndarray, np.ndarray]:
     return rows, cells
 
 
-def three_by_history(last_cell: torch.Tensor, n: torch.Tensor, history: torch.Tensor) -> torch.Tensor:
+def three_by_history(
+    last_cell: torch.Tensor, n: torch.Tensor, history: torch.Tensor
+) -> torch.Tensor:
     """Senses its own cell, and later the cells after those it has sensed."""
     own = torch.nn.functional.one_hot(last_cell, M).bool()
     return own | history.any(1).roll(1, -1)
@@ -48,7 +50,10 @@ def test_a_table_is_looked_up_by_cell_and_misses() -> None:
     on = np.zeros((M, CHOICES, M), dtype=bool)
     on[1, 0, 2] = on[1, 1, 3] = on[2, 1, 0] = on[1, 2, 7] = True
     acting = Policy.from_dense(WORLD, on)
-    rows = {"last_cell": torch.tensor([1, 1, 2, 0, 1]), "steps_since_detection": torch.tensor([0, 1, 1, 1, 3])}
+    rows = {
+        "last_cell": torch.tensor([1, 1, 2, 0, 1]),
+        "steps_since_detection": torch.tensor([0, 1, 1, 1, 3]),
+    }
     action = acting(TensorDict(rows, [5]))["action"]
     assert [cells.nonzero().flatten().tolist() for cells in action] == [[2], [3], [0], [], [7]]
     assert action.dtype == torch.bool
@@ -58,7 +63,9 @@ def test_a_table_is_looked_up_by_cell_and_misses() -> None:
 
 
 @pytest.mark.parametrize("dense_up_to", [0, policy._DENSE])
-def test_both_ways_of_looking_up_agree_with_the_table(dense_up_to: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_both_ways_of_looking_up_agree_with_the_table(
+    dense_up_to: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(policy, "_DENSE", dense_up_to)
     for on in (table(), table().astype(float) * 0.25):
         acting = Policy.from_dense(WORLD, on)
@@ -71,27 +78,34 @@ def test_both_ways_of_looking_up_agree_with_the_table(dense_up_to: int, monkeypa
         assert isinstance(acting._lookup, form)
 
 
-@pytest.mark.parametrize("on", [table(), table() * np.random.default_rng(1).random((M, CHOICES, M))])
+@pytest.mark.parametrize(
+    "on", [table(), table() * np.random.default_rng(1).random((M, CHOICES, M))]
+)
 def test_exact_evaluation_reads_the_table(on: np.ndarray) -> None:
     read, (rows, cells) = Policy.from_dense(WORLD, on), everywhere()
     price = np.random.default_rng(2).random(M)
     for n in range(CHOICES):
-        assert (read.on(n, rows, cells).reshape(M, M) == on[:, n]).all()
+        assert (read.chosen(n, rows, cells).reshape(M, M) == on[:, n]).all()
         assert read.spent(n, price) == pytest.approx(on[:, n] @ price, abs=1e-12)
 
 
 def test_an_empty_table_is_no_sensor_anywhere() -> None:
-    read, (rows, cells) = Policy.from_dense(WORLD, np.zeros((M, CHOICES, M), dtype=bool)), everywhere()
-    assert not read.on(0, rows, cells).any()
+    read, (rows, cells) = (
+        Policy.from_dense(WORLD, np.zeros((M, CHOICES, M), dtype=bool)),
+        everywhere(),
+    )
+    assert not read.chosen(0, rows, cells).any()
     assert not read.spent(1, WORLD.cost).any()
     assert not read(random_state(WORLD, 5, seed=0))["action"].any()
 
 
-@pytest.mark.parametrize(("made", "share"), [(Policy.all_on(WORLD), 1.0), (Policy.none(WORLD), 0.0)])
+@pytest.mark.parametrize(
+    ("made", "share"), [(Policy.all_on(WORLD), 1.0), (Policy.none(WORLD), 0.0)]
+)
 def test_all_on_and_none(made: Policy, share: float) -> None:
     rows, cells = everywhere()
     assert made.deterministic
-    assert (made.on(1, rows, cells) == share).all()
+    assert (made.chosen(1, rows, cells) == share).all()
     assert made.spent(0, WORLD.cost) == pytest.approx(np.full(M, share * WORLD.cost.sum()))
     assert made(random_state(WORLD, 5, seed=0))["action"].tolist() == [[share == 1.0] * M] * 5
     assert (made.dense() == share).all()
@@ -111,8 +125,10 @@ def test_random_k_draws_exactly_k_from_its_own_generator(k: int) -> None:
     assert torch.equal(torch.get_rng_state(), before)
     assert (actions[0].sum(-1) == k).all()
     share = k / 9
-    assert (actions[0].double().mean(0) - share).abs().max() <= 5 * (share * (1 - share) / 20_000) ** 0.5
-    assert drawing.on(0, np.arange(M), np.arange(M)) == pytest.approx(np.full(M, share))
+    assert (actions[0].double().mean(0) - share).abs().max() <= 5 * (
+        share * (1 - share) / 20_000
+    ) ** 0.5
+    assert drawing.chosen(0, np.arange(M), np.arange(M)) == pytest.approx(np.full(M, share))
     assert drawing.deterministic == (k in (0, 9))
 
 
@@ -120,7 +136,10 @@ def test_probabilities_are_those_of_the_sensors_switched_on() -> None:
     chances = np.random.default_rng(3).random((M, CHOICES, M)) * table()
     drawing = Policy.from_dense(WORLD, chances)
     assert not drawing.deterministic
-    state = {"last_cell": torch.full((20_000,), 4), "steps_since_detection": torch.full((20_000,), 1)}
+    state = {
+        "last_cell": torch.full((20_000,), 4),
+        "steps_since_detection": torch.full((20_000,), 1),
+    }
     torch.manual_seed(0)
     seen = drawing(TensorDict(state, [20_000]))["action"].double().mean(0).numpy()
     assert seen == pytest.approx(chances[4, 1], abs=5 * 0.5 / 20_000**0.5)
@@ -131,11 +150,17 @@ def test_probabilities_are_those_of_the_sensors_switched_on() -> None:
 def test_a_function_is_followed_along_its_own_history() -> None:
     read = as_policy(WORLD, three_by_history).dense()
     for x in range(M):
-        assert read[x].nonzero()[1].tolist() == [x, *sorted([x, (x + 1) % M]), *sorted([x, (x + 1) % M, (x + 2) % M])]
+        assert read[x].nonzero()[1].tolist() == [
+            x,
+            *sorted([x, (x + 1) % M]),
+            *sorted([x, (x + 1) % M, (x + 2) % M]),
+        ]
 
 
 @pytest.mark.parametrize("at_once", [1, 2 * CHOICES * M, 2**22])
-def test_blocks_of_located_cells_change_nothing(at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_blocks_of_located_cells_change_nothing(
+    at_once: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("trackmdp.policies.unroll._HISTORY_AT_ONCE", at_once)
     asked = []
 
@@ -170,7 +195,9 @@ def test_a_learner_s_actor_becomes_the_table_of_its_modes(name: str) -> None:
         "action_history": torch.zeros(M, CHOICES, M, dtype=torch.bool),
     }
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        assert torch.equal(read(TensorDict(first, [M]))["action"], actor(TensorDict(first, [M]))["action"])
+        assert torch.equal(
+            read(TensorDict(first, [M]))["action"], actor(TensorDict(first, [M]))["action"]
+        )
 
 
 def stochastic(reads_history: bool, width: int = M) -> ProbabilisticActor:
@@ -204,7 +231,9 @@ def test_a_stochastic_actor_is_valued_as_the_mixture_it_is() -> None:
 
 def test_draws_that_depend_on_draws_before_are_refused_and_can_be_simulated() -> None:
     actor = stochastic(reads_history=True)
-    with pytest.raises(UserError, match="depend on the sets that it drew before, so no exact value; simulate it") as no:
+    with pytest.raises(
+        UserError, match="depend on earlier draws, so it has no exact value; simulate it"
+    ) as no:
         evaluate(WORLD, actor)
     assert "\n" not in str(no.value)
     drawn, free = (simulate(WORLD, stochastic(each), 6_000).figures() for each in (True, False))
@@ -221,9 +250,13 @@ def test_a_recurrent_module_keeps_its_state_in_every_episode() -> None:
         count = torch.zeros_like(cell) if count is None else count
         return (count % 3 == 0).unsqueeze(-1).expand(-1, 9), count + 1
 
-    module = TensorDictModule(turn, in_keys=["last_cell", "count"], out_keys=["action", ("next", "count")])
+    module = TensorDictModule(
+        turn, in_keys=["last_cell", "count"], out_keys=["action", ("next", "count")]
+    )
     world = replace(WORLD, t_max=4)  # never forced: of three steps one detects
-    with pytest.raises(UserError, match="keeps count from step to step, so it has no exact value; simulate it"):
+    with pytest.raises(
+        UserError, match="keeps count from step to step, so it has no exact value; simulate it"
+    ):
         evaluate(world, module)
     for _ in range(2):
         for episode in simulate(world, module, 40).complete():
@@ -255,14 +288,20 @@ DRAWING: dict[str, Any] = {
     "torch, seldom": lambda x, n, h: torch.rand(len(x), M) < 1e-9,
     "its own generator": lambda x, n, h: torch.rand(len(x), M, generator=SHARED) < 0.5,
     "numpy": lambda x, n, h: np.random.random((len(x), M)) < 0.5,  # noqa: NPY002
-    "module": TensorDictModule(lambda x: torch.rand(*x.shape, M) < 0.5, in_keys=["last_cell"], out_keys=["action"]),
+    "module": TensorDictModule(
+        lambda x: torch.rand(*x.shape, M) < 0.5, in_keys=["last_cell"], out_keys=["action"]
+    ),
     "an actor of another form": ProbabilisticActor(
-        TensorDictModule(lambda x: torch.ones(len(x), M), in_keys=["last_cell"], out_keys=["scale"]),
+        TensorDictModule(
+            lambda x: torch.ones(len(x), M), in_keys=["last_cell"], out_keys=["scale"]
+        ),
         in_keys=["scale"],
         distribution_class=Signs,
     ),
     "dropout": TensorDictModule(
-        lambda x: torch.nn.functional.dropout(torch.ones(*x.shape, M)) > 0, in_keys=["last_cell"], out_keys=["action"]
+        lambda x: torch.nn.functional.dropout(torch.ones(*x.shape, M)) > 0,
+        in_keys=["last_cell"],
+        out_keys=["action"],
     ),
 }
 
@@ -275,17 +314,31 @@ def test_what_draws_is_refused_in_one_line(name: str) -> None:
 
 
 def sequence(key: str) -> TensorDictModule:
-    return TensorDictModule(lambda x: torch.ones(len(x), M, dtype=torch.bool), in_keys=[key], out_keys=["action"])
+    return TensorDictModule(
+        lambda x: torch.ones(len(x), M, dtype=torch.bool), in_keys=[key], out_keys=["action"]
+    )
 
 
 WRONG: dict[str, tuple[Any, str]] = {
-    "numbers": (lambda x, n, h: torch.zeros(len(x), M), r"returned float32 \[9, 9\], expected bool \[9, 9\]"),
-    "another width": (lambda x, n, h: torch.zeros(len(x), M + 1, dtype=torch.bool), r"bool \[9, 10\]"),
+    "numbers": (
+        lambda x, n, h: torch.full((len(x), M), 0.5),
+        "its action: expected 0 or 1 for each sensor, got 0.5",
+    ),
+    "another width": (
+        lambda x, n, h: torch.zeros(len(x), M + 1, dtype=torch.bool),
+        r"bool \[9, 10\]",
+    ),
     "reads more": (sequence("hidden"), "reads hidden"),
     "reads the target": (sequence("target"), "reads target"),
-    "no action": (TensorDictModule(torch.nn.Identity(), in_keys=["last_cell"], out_keys=["a"]), "writes no action"),
-    "a number": (3, "got int"),
-    "another world": (Policy.all_on(small_world(2, t_max=2)), "made for 2 x 2 cells, t_max 2; expected 3 x 3"),
+    "no action": (
+        TensorDictModule(torch.nn.Identity(), in_keys=["last_cell"], out_keys=["a"]),
+        "writes no action",
+    ),
+    "a number": (3, "a int, expected a Policy"),
+    "another world": (
+        Policy.all_on(small_world(2, t_max=2)),
+        "made for 2 x 2 cells, t_max 2; expected 3 x 3",
+    ),
     "as many cells": (Policy.all_on(Task((1, 9), cost=0.1, t_max=2)), "made for 1 x 9 cells"),
 }
 
@@ -297,10 +350,18 @@ def test_what_is_no_policy_is_refused_in_one_line(name: str) -> None:
         as_policy(WORLD, given)
 
 
-@pytest.mark.parametrize("wrong", [np.zeros((M, CHOICES, M + 1)), np.full((M, CHOICES, M), 1.5), -table().astype(int)])
+@pytest.mark.parametrize(
+    "wrong", [np.zeros((M, CHOICES, M + 1)), np.full((M, CHOICES, M), 1.5), -table().astype(int)]
+)
 def test_a_table_that_is_none_is_refused(wrong: np.ndarray) -> None:
     with pytest.raises(UserError, match="expected"):
         Policy.from_dense(WORLD, wrong)
+
+
+def test_a_complex_table_is_refused() -> None:
+    for make in (lambda on: Policy.from_dense(WORLD, on), lambda on: evaluate(WORLD, on)):
+        with pytest.raises(UserError, match="complex128"):
+            make(table() * 1j)
 
 
 def test_a_sparse_table_is_brought_into_order_and_left_alone() -> None:
@@ -326,7 +387,9 @@ def test_an_actor_that_is_a_policy_is_not_written_out() -> None:
 
 
 def windowed() -> World:
-    return World(random_kernel(np.random.default_rng(0), 12, 0.1), (3, 4), cost=0.2, t_max=2, window=1)
+    return World(
+        random_kernel(np.random.default_rng(0), 12, 0.1), (3, 4), cost=0.2, t_max=2, window=1
+    )
 
 
 def test_all_on_is_all_of_the_window() -> None:
@@ -371,7 +434,9 @@ def test_in_a_window_policies_act_and_are_asked_in_its_numbers(
 def test_random_k_of_a_window() -> None:
     world = windowed()
     drawing = Policy.random_k(world, 5)
-    assert drawing.on(0, np.array([0, 6, 0]), np.array([5, 1, 2])) == pytest.approx([1.0, 5 / 9, 0.0])
+    assert drawing.chosen(0, np.array([0, 6, 0]), np.array([5, 1, 2])) == pytest.approx(
+        [1.0, 5 / 9, 0.0]
+    )
     torch.manual_seed(0)
     state = {
         "last_cell": torch.tensor([0, 6]).repeat(500),
@@ -383,22 +448,63 @@ def test_random_k_of_a_window() -> None:
     assert action[1::2].double().mean(0) == pytest.approx(np.full(9, 5 / 9), abs=5 * 0.5 / 500**0.5)
 
 
+def test_random_k_of_the_sensors_that_exist() -> None:
+    cost = np.where(np.arange(M) < 4, 0.1, np.nan)
+    drawing = Policy.random_k(Task((3, 3), cost=cost, t_max=1), 3)
+    share = np.where(np.arange(M) < 4, 3 / 4, 0.0)
+    assert drawing.chosen(0, np.zeros(M, dtype=int), np.arange(M)) == pytest.approx(share)
+    state = {"last_cell": torch.zeros(50, dtype=torch.int64)}
+    state["steps_since_detection"] = state["last_cell"]
+    action = drawing(TensorDict(state, [50]))["action"]
+    assert action.sum(1).tolist() == [3] * 50
+    assert not action[:, 4:].any()
+
+
 def test_a_sensor_outside_the_window_is_refused() -> None:
     on = np.zeros((12, 3, 12), dtype=bool)
     on[0, 2, 2] = True
-    with pytest.raises(UserError, match=r"sensor 2 cannot be chosen from cell 0 with grid\.window=1"):
+    with pytest.raises(
+        UserError, match=r"sensor 2 cannot be chosen from cell 0, with grid\.window=1"
+    ):
         Policy.from_dense(windowed(), on)
 
 
 @pytest.mark.parametrize("t_max", [0, 2])
 def test_every_sensor_of_a_window_is_on_however_it_is_looked_up(t_max: int) -> None:
-    world = World(random_kernel(np.random.default_rng(0), 20, 0.1), (4, 5), cost=0.1, t_max=t_max, window=1)
+    world = World(
+        random_kernel(np.random.default_rng(0), 20, 0.1), (4, 5), cost=0.1, t_max=t_max, window=1
+    )
     everything = Policy.all_on(world)
     cell = torch.arange(20).repeat_interleave(t_max + 2).view(2, -1)
     state = TensorDict(
-        {"last_cell": cell, "steps_since_detection": torch.arange(t_max + 2).repeat(20).view(2, -1)}, [2]
+        {
+            "last_cell": cell,
+            "steps_since_detection": torch.arange(t_max + 2).repeat(20).view(2, -1),
+        },
+        [2],
     )
-    assert torch.equal(everything(state.clone())["action"], Policy(world, everything.sets)(state.clone())["action"])
-    assert isinstance(everything._local, lookup.WindowTable)
+    assert torch.equal(
+        everything(state.clone())["action"], Policy(world, everything.sets)(state.clone())["action"]
+    )
     assert everything.sets is not None
     assert (everything.sets.dtype, everything.sets.indices.dtype) == (np.bool_, np.int32)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("last_cell", -1),
+        ("last_cell", M),
+        ("steps_since_detection", -1),
+        ("steps_since_detection", CHOICES + 1),
+    ],
+)
+@pytest.mark.parametrize(
+    "acting",
+    [Policy.all_on(WORLD), Policy.from_dense(WORLD, table()), Policy.random_k(WORLD, 2)],
+)
+def test_a_state_that_is_none_is_refused(acting: Policy, key: str, value: int) -> None:
+    rows = {"last_cell": torch.tensor([1, 2]), "steps_since_detection": torch.tensor([0, 1])}
+    rows[key][1] = value
+    with pytest.raises(UserError, match=f"{key}={value}"):
+        acting(TensorDict(rows, [2]))

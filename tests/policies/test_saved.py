@@ -17,9 +17,11 @@ from trackmdp.errors import UserError
 from trackmdp.policies import saved
 from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.policies.saved import load_policy, save_policy
-from trackmdp.solvers import qmdp
-from trackmdp.solvers.evaluate import evaluate
-from trackmdp.world.model import Task, World
+from trackmdp.solvers import rules
+from trackmdp.solvers.value import evaluate
+from trackmdp.world.model import Task
+from trackmdp.world.place import Place
+from trackmdp.world.problem_file import read_problem
 
 
 def stored(**changed: Any) -> bytes:
@@ -30,8 +32,6 @@ def stored(**changed: Any) -> bytes:
         "task_t_max": np.array(0),
         "task_safe_cost": np.array(0.4),
         "task_reward": np.array(1.0),
-        "task_max_steps": np.array(np.nan),
-        "task_window": np.array(np.nan),
         "task_markov": np.array(True),
         "indices": np.tile(np.arange(4, dtype=np.int32), 4),
         "indptr": np.arange(0, 20, 4),
@@ -44,7 +44,7 @@ def stored(**changed: Any) -> bytes:
 
 def test_a_policy_is_read_back_as_it_was_written(tmp_path: Path) -> None:
     world = small_world(3, t_max=2)
-    policy = as_policy(world, qmdp.solve(world))
+    policy = as_policy(world, rules.qmdp(world))
     value = evaluate(world, policy).value
     policy.save(tmp_path / "policy.npz", value)
     found, values = load_policy(tmp_path / "policy.npz")
@@ -53,7 +53,11 @@ def test_a_policy_is_read_back_as_it_was_written(tmp_path: Path) -> None:
     assert np.array_equal(found.dense(), policy.dense())
     assert 0 < found.dense().mean() < 1
     assert found.task.size == (3, 3)
-    assert (found.task.t_max, found.task.max_steps, found.task.safe_cost) == (2, None, world.safe_cost)
+    assert (found.task.t_max, found.task.max_steps, found.task.safe_cost) == (
+        2,
+        None,
+        world.safe_cost,
+    )
     assert np.array_equal(found.task.cost, world.cost)
 
 
@@ -64,8 +68,24 @@ def test_limits_and_probabilities_are_kept(tmp_path: Path) -> None:
         policy.save(tmp_path / "policy.npz")
         found = Policy.load(tmp_path / "policy.npz")
         assert (found.task.max_steps, found.task.window, found.task.markov) == (7, 2, False)
-        assert (found.deterministic, found.probability) == (policy.deterministic, policy.probability)
-        assert found.on(1, np.arange(6), np.arange(6)) == pytest.approx(policy.on(1, np.arange(6), np.arange(6)))
+        assert (found.deterministic, found.probability) == (
+            policy.deterministic,
+            policy.probability,
+        )
+        assert found.chosen(1, np.arange(6), np.arange(6)) == pytest.approx(
+            policy.chosen(1, np.arange(6), np.arange(6))
+        )
+
+
+def test_the_place_of_the_grid_is_kept(tmp_path: Path) -> None:
+    for place in (Place((1.5, -2.0), 50.0, "EPSG:32632"), Place((0, 0), 1, downwards=True), None):
+        Policy.all_on(Task(2, cost=0.1, t_max=0, place=place)).save(tmp_path / "policy.npz")
+        assert Policy.load(tmp_path / "policy.npz").task.place == place
+    (tmp_path / "other.npz").write_bytes(
+        stored(**{"task_place.cell": np.array(-1.0), "task_place.corner": np.ones(2)})
+    )
+    with pytest.raises(UserError, match=r"^.*other\.npz: .*place: corner .*, cell -1"):
+        Policy.load(tmp_path / "other.npz")
 
 
 @pytest.mark.parametrize("window", [None, 1])
@@ -82,13 +102,18 @@ def test_exactly_k_sensors_come_back_as_exactly_k(window: int | None, tmp_path: 
 
 def test_a_run_leaves_the_policy_of_its_summary(tmp_path: Path) -> None:
     cfg = train_config(
-        "grid.size=3", "algo.total_frames=2048", "algo.frames_per_batch=1024", "algo.envs=64", "algo.updates=5"
+        "grid.size=3",
+        "algo.total_frames=2048",
+        "algo.frames_per_batch=1024",
+        "algo.envs=64",
+        "algo=hindsight",
+        "algo.updates=5",
     )
     cfg.quiet, cfg.optimal.enabled = True, False
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
         aihtr = train.run(cfg, tmp_path / name)
-    world = World(sparse.load_npz(tmp_path / "a/kernel.npz"), 3, cost=0.16, t_max=1)
+    world = read_problem(tmp_path / "a/problem.npz")
     found, value = load_policy(tmp_path / "a/policy.npz")
     assert value is not None
     assert evaluate(world, found).aihtr == aihtr
@@ -112,6 +137,7 @@ def test_the_file_made_here_is_a_policy(tmp_path: Path) -> None:
         stored(task_size=np.array([4, 4])),
         stored(indices=np.tile(np.arange(1, 5, dtype=np.int32), 4)),
         stored(indices=np.tile(np.arange(4.0), 4)),
+        stored(indices=np.tile(np.array([0, 1, 1, 2], dtype=np.int32), 4)),
         stored(indptr=np.array([0, 99, 8, 12, 16])),
         stored(indptr=np.array([-4, 4, 8, 12, 16])),
         stored(value=np.zeros(3)),
@@ -148,7 +174,7 @@ def test_sets_are_read_back_from_a_list_and_from_an_array_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, listed: int
 ) -> None:
     world = small_world(3, t_max=1)
-    policy, value = qmdp.solve(world), np.arange(9.0)
+    policy, value = rules.qmdp(world), np.arange(9.0)
     monkeypatch.setattr(saved, "LISTED_CELLS", listed)
     named = saved.write_sets(tmp_path, policy, value=value)
     assert [file.name for file in tmp_path.iterdir()] == [saved.sets_name(world)]
@@ -162,10 +188,19 @@ def test_sets_are_read_back_from_a_list_and_from_an_array_file(
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        ('{"size": [2, 2], "t_max": 0, "sets": {"0": [[4]], "1": [[]], "2": [[]], "3": [[]]}}', "not sets"),
+        (
+            '{"size": [2, 2], "t_max": 0, "sets": {"0": [[4]], "1": [[]], "2": [[]], "3": [[]]}}',
+            "not sets",
+        ),
         ('{"size": [2, 2], "t_max": 0, "sets": {"0": [[1]]}}', "not sets .1 plans"),
-        ('{"size": [2, 2], "t_max": 0, "sets": {"0": [["x"]], "1": [[]], "2": [[]], "3": [[]]}}', "not sets"),
-        ('{"size": [1, 4], "t_max": 0, "sets": {"0": [[]], "1": [[]], "2": [[]], "3": [[]]}}', "size .1, 4.,.* .2, 2."),
+        (
+            '{"size": [2, 2], "t_max": 0, "sets": {"0": [["x"]], "1": [[]], "2": [[]], "3": [[]]}}',
+            "not sets",
+        ),
+        (
+            '{"size": [1, 4], "t_max": 0, "sets": {"0": [[]], "1": [[]], "2": [[]], "3": [[]]}}',
+            "size .1, 4.,.* .2, 2.",
+        ),
         ('{"t_max": 0, "sets": {"0": [[]], "1": [[]], "2": [[]], "3": [[]]}}', "not sets .*size"),
         ("[]", "expected a JSON object"),
     ],

@@ -25,7 +25,9 @@ def scrambled(m: int) -> TensorDictModule:
     def act(cell: torch.Tensor, n: torch.Tensor, history: torch.Tensor) -> torch.Tensor:
         weights = torch.arange(1, history[0].numel() + 1)
         seen = (history.flatten(1) * weights).sum(-1) + 31 * cell + 17 * n
-        return ((seen[:, None] + 1) * torch.tensor([71, 113, 137, 193, 239, 293, 379, 419, 431][:m])) % 101 < 33
+        return (
+            (seen[:, None] + 1) * torch.tensor([71, 113, 137, 193, 239, 293, 379, 419, 431][:m])
+        ) % 101 < 33
 
     return TensorDictModule(act, in_keys=STATE, out_keys=["action"])
 
@@ -39,7 +41,9 @@ def test_a_table_holds_the_sets_along_a_row_of_misses() -> None:
         history = torch.zeros(1, 4, 9, dtype=torch.bool)
         for n in range(4):
             rows = {"last_cell": torch.tensor([cell]), "steps_since_detection": torch.tensor([n])}
-            action = actor(TensorDict({**rows, "action_history": history.clone()}, [1]))["action"][0]
+            action = actor(TensorDict({**rows, "action_history": history.clone()}, [1]))["action"][
+                0
+            ]
             assert chains[cell, n].tolist() == action.tolist()
             history[0, n] = action
     assert len({chains[x, n].tobytes() for x in range(9) for n in range(4)}) > 20
@@ -67,7 +71,9 @@ def test_a_table_holds_what_the_actor_does_in_the_environment(name: str) -> None
 
 @pytest.mark.parametrize("known", [{"revealed": 8}, {"memory": "displacement_gap"}])
 @pytest.mark.parametrize("name", ["a2c", "dqn"])
-def test_an_actor_that_knows_more_than_the_cell_has_a_plan_for_each_key(name: str, known: dict[str, Any]) -> None:
+def test_an_actor_that_knows_more_than_the_cell_has_a_plan_for_each_key(
+    name: str, known: dict[str, Any]
+) -> None:
     world = headings(t_max=2, **known)
     torch.manual_seed(0)
     actor = algorithm(name, world).actor
@@ -94,7 +100,9 @@ def test_a_module_that_does_not_read_the_key_knows_the_cell() -> None:
 def _evaluated(actor: Any) -> Callable[[TensorDict], TensorDict]:
     def act(rows: TensorDict) -> TensorDict:
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            return rows.set("action", actor(rows.select(*STATE, *(["key"] if "key" in rows else [])))["action"])
+            return rows.set(
+                "action", actor(rows.select(*STATE, *(["key"] if "key" in rows else [])))["action"]
+            )
 
     return act
 
@@ -119,7 +127,13 @@ def test_evaluating_does_not_disturb_training(name: str) -> None:
 def _tensors(state: Any, key: str = "") -> dict[str, torch.Tensor]:
     if isinstance(state, torch.Tensor):
         return {key: state}
-    pairs = state.items() if isinstance(state, dict) else enumerate(state) if isinstance(state, (list, tuple)) else ()
+    pairs = (
+        state.items()
+        if isinstance(state, dict)
+        else enumerate(state)
+        if isinstance(state, (list, tuple))
+        else ()
+    )
     found: dict[str, torch.Tensor] = {}
     for name, value in pairs:
         found |= _tensors(value, f"{key}/{name}")

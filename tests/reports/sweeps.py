@@ -9,16 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import sparse
 
 from tests.helpers import train_config
 from trackmdp.config import PaperCostConfig, TrainConfig
 from trackmdp.config.tree import config_digest, config_text
 from trackmdp.policies.policy import Policy
-from trackmdp.solvers import qmdp
+from trackmdp.solvers import rules
 from trackmdp.training.evaluator import ExactEvaluator, figures
 from trackmdp.training.folders import write_summary
 from trackmdp.world.make import build_world
+from trackmdp.world.problem_file import PROBLEM, problem_bytes
 
 VERSIONS = {"trackmdp": "0.1.0", "torch": "2.13.0"}
 MACHINE = {"processor": "a processor", "cores": 2}
@@ -44,7 +44,7 @@ def write_run(
     cfg.cost.sensor, cfg.seed = cost, seed
     world = build_world(cfg)
     evaluator = ExactEvaluator(world)
-    chains = qmdp.clocked_policy(world).dense()
+    chains = rules.clocked_policy(world).dense()
     rng = np.random.default_rng(cfg.seed)
     chains.flat[rng.choice(chains.size, wrong, replace=False)] ^= True
     score = evaluator.score(Policy.from_dense(world, chains))
@@ -57,6 +57,7 @@ def write_run(
         "policy": figures(score.evaluation),
         "qmdp": figures(evaluator.qmdp),
         "bounds": evaluator.bounds,
+        "references": {"all on": figures(evaluator.evaluate(Policy.all_on(world)))},
         "optimal": {"lower": evaluator.upper - 0.01, "upper": evaluator.upper, "certified": True},
         "regret_per_step": score.regret_per_step,
         "versions": versions or VERSIONS,
@@ -64,10 +65,10 @@ def write_run(
         "config_sha256": config_digest(cfg, folder),
     }
     (folder / "config.yaml").write_text(config_text(cfg, folder), encoding="utf-8")
-    sparse.save_npz(folder / "kernel.npz", world.kernel)
+    (folder / PROBLEM).write_bytes(problem_bytes(world))
     Policy.from_dense(world, chains).save(folder / "policy.npz", score.evaluation.value)
-    write_summary(folder, summary)
     write_curve(folder, np.linspace(-100.0, score.evaluation.aihtr, 40))
+    write_summary(folder, summary)
     return summary
 
 
@@ -87,5 +88,12 @@ def write_sweep(folder: Path) -> Path:
         for algo, wrong in (("a2c", 9), ("hindsight", 1)):
             for seed in range(3):
                 name = f"{algo}-{cost}-{seed}"
-                write_run(folder / name, "grid.size=3", f"algo={algo}", cost=cost, seed=seed, wrong=wrong + seed)
+                write_run(
+                    folder / name,
+                    "grid.size=3",
+                    f"algo={algo}",
+                    cost=cost,
+                    seed=seed,
+                    wrong=wrong + seed,
+                )
     return folder

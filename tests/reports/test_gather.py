@@ -1,30 +1,38 @@
-"""From a sweep's folder to its results and back; what is wrong in there is named, and the rest is used."""
+"""From the folder of a sweep to its results and back; faults are listed, and the other runs are used."""
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 from scipy import sparse
 
 from tests.reports.sweeps import VERSIONS, write_curve, write_run, write_sweep
-from trackmdp.durable import write_json
+from trackmdp.config import load_run_config
+from trackmdp.durable import write_json, write_sealed
 from trackmdp.errors import UserError
-from trackmdp.policies.saved import save_policy
 from trackmdp.policies.table import PolicyTable
-from trackmdp.reports import finished, results
-from trackmdp.reports.finished import MOST_POINTS
+from trackmdp.reports import watch
+from trackmdp.reports.finished import MOST_POINTS, averaged_sets, sensed_cells
 from trackmdp.reports.gather import gather_runs
-from trackmdp.reports.results import Results
-from trackmdp.solvers import bounds, qmdp
-from trackmdp.solvers.evaluate import evaluate
+from trackmdp.reports.page import build
+from trackmdp.reports.results import RESULTS, Results, load_results, save_results
+from trackmdp.solvers import bounds, rules
+from trackmdp.solvers.value import evaluate
 from trackmdp.training.folders import read_summary, write_summary
 from trackmdp.training.lock import locked
 from trackmdp.world.make import build_world
-from trackmdp.world.model import Array, Task
+from trackmdp.world.model import Task
+
+Change = Callable[[Path], Any]
 
 
 @pytest.fixture(scope="module")
@@ -37,15 +45,20 @@ def sweep(whole: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(whole, tmp_path / "sweep"))
 
 
-def problems(found: Results) -> dict[str, str]:
+def reasons(found: Results) -> dict[str, str]:
     return {anomaly.run: anomaly.text for anomaly in found.anomalies}
 
 
-def plan(folder: Path, *names: str) -> None:
+def plan(folder: Path, *names: object) -> None:
     jobs = [{"folder": name, "overrides": []} for name in names]
-    write_json(
-        folder / "sweep.json", {"command": "train", "line": "trackmdp train -m hydra.sweep.dir=/x", "jobs": jobs}
-    )
+    line = "trackmdp train -m hydra.sweep.dir=/x"
+    write_json(folder / "sweep.json", {"command": "train", "line": line, "jobs": jobs})
+
+
+def sealed_again(run: Path) -> None:
+    """A summary that fits the files of the run as they are now."""
+    plain = {key: value for key, value in read_summary(run).items() if key != "files"}
+    write_summary(run, plain)
 
 
 def test_every_figure_of_a_run_is_read(whole: Path) -> None:
@@ -56,116 +69,82 @@ def test_every_figure_of_a_run_is_read(whole: Path) -> None:
     summary = json.loads((whole / run.name / "summary.json").read_text())
     assert (run.algo, run.seed, run.settings["cost.sensor"]) == ("a2c", 1, 0.22)
     assert run.figure("aihtr") == summary["policy"]["aihtr"]
-    assert run.figure("qmdp_accuracy") == summary["qmdp"]["accuracy"]
-    assert run.figure("bound_paper") == summary["bounds"]["paper"]
+    assert run.references["Q_MDP"]["accuracy"] == summary["qmdp"]["accuracy"]
+    assert run.references["all on"]["sensors_per_step"] == pytest.approx(9.0)
+    assert run.references["printed bound"]["aihtr"] == summary["bounds"]["paper"]
     assert run.figure("optimal_upper") == summary["optimal"]["upper"]
-    assert run.config_sha256 == summary["config_sha256"]
     assert found.manifest["wall_seconds"] == 24.0
     assert found.manifest["versions"] == [{"runs": 12, **VERSIONS}]
 
 
-def test_one_policy_per_group_is_kept_that_of_the_run_in_the_middle(whole: Path) -> None:
+def test_the_policy_that_is_drawn_is_the_middle_one_of_its_seeds(whole: Path) -> None:
     found = gather_runs(whole)
-    assert len(found.policies) == 4
-    for name, kept in found.policies.items():
-        group = [run for run in found.runs if run.name.rsplit("-", 1)[0] == name.rsplit("-", 1)[0]]
-        assert kept.value.mean() == pytest.approx(np.median([run.figure("aihtr") for run in group]))
-        assert not (kept.sets != finished.read_sensed(whole / name / "policy.npz", (3, 3), 1, _alike).sets).nnz
+    assert [(each.world, each.method) for each in found.maps] == [
+        (world, method)
+        for world in ("Z=5, c=0.16", "Z=5, c=0.22")
+        for method in ("a2c", "hindsight")
+    ]
+    for each in found.maps:
+        price = each.world[-4:]
+        group = [run for run in found.runs if run.name.startswith(f"{each.method}-{price}")]
+        assert each.value.mean() == pytest.approx(np.median([run.figure("aihtr") for run in group]))
+    world = build_world(load_run_config(whole / "a2c-0.22-0"))
+    last = found.maps[-1]
+    assert np.array_equal(last.kernel.toarray(), world.kernel.toarray())
+    assert np.array_equal(last.bound, bounds.clocked(world))
+    assert np.array_equal(last.qmdp, evaluate(world, rules.qmdp(world)).value)
 
 
-def _alike(table: PolicyTable) -> Array:
-    return np.ones(table.task.num_keys)
-
-
-def test_plans_of_one_cell_are_averaged_by_how_often_each_occurs(tmp_path: Path) -> None:
+def test_plans_of_one_cell_are_averaged_by_their_visits() -> None:
     """Two cells and ten classes: after one miss, cell 1 is sensed from cell 0 where the class is 3 or 7."""
     task = Task((1, 2), cost=0.1, t_max=1, safe_cost=1.0, memory="displacement", clip=1)
     sets, visits = np.zeros((2, 10, 2, 2), dtype=bool), np.ones((2, 10))
     sets[0, [3, 7], 1, 1] = True
     visits[0, 7], visits[1] = 3.0, 5.0
     table = PolicyTable(task, sparse.csr_array(sets.reshape(40, 2)))
-    save_policy(tmp_path / "policy.npz", table, np.zeros(2))
-    found = finished.read_sensed(tmp_path / "policy.npz", (1, 2), 1, lambda _: visits.ravel())
-    for read in (found, results.unpack_policies(results.pack_policies({"a": found}))["a"]):
-        assert read.choices == 2
-        assert read.averaged
-        assert read.on(0).nnz == 0
-        assert read.on(1).toarray() == pytest.approx(np.array([[0.0, 4 / 12], [0.0, 0.0]]))
+    found = averaged_sets(table, sensed_cells(table), visits.ravel())
+    assert found[0::2].nnz == 0
+    assert found[1::2].toarray() == pytest.approx(np.array([[0.0, 4 / 12], [0.0, 0.0]]))
 
 
-def test_a_policy_of_another_grid_is_refused_before_its_visits_are_counted(tmp_path: Path) -> None:
-    task = Task((1, 4), cost=0.1, t_max=1, safe_cost=1.0, memory="displacement", clip=1)
-    save_policy(tmp_path / "policy.npz", PolicyTable.all_on(task), np.zeros(4))
-
-    def visits(table: PolicyTable) -> Array:
-        raise AssertionError(f"visits of {table.task.num_keys} keys")
-
-    for size, t_max in (((2, 2), 1), ((1, 4), 2), ((1, 4), None)):
-        with pytest.raises(UserError, match="of another grid or t_max"):
-            finished.read_sensed(tmp_path / "policy.npz", size, t_max, visits)
-
-
-def test_of_sensors_with_footprints_the_cells_that_they_cover_are_kept(tmp_path: Path) -> None:
+def test_of_sensors_with_footprints_the_cells_in_view_are_drawn() -> None:
     task = Task((1, 3), cost=0.1, t_max=0, safe_cost=1.0, coverage=[[1, 1, 0], [0, 1, 1]])
-    save_policy(tmp_path / "policy.npz", PolicyTable.from_dense(task, np.eye(3, 2, dtype=bool)[:, None]), np.zeros(3))
-    found = finished.read_sensed(tmp_path / "policy.npz", (1, 3), 0, _alike)
-    assert found.on(0).toarray().tolist() == [[True, True, False], [False, True, True], [False, False, False]]
-
-
-def test_motion_and_references_are_kept_per_world(whole: Path) -> None:
-    found = gather_runs(whole)
-    assert sorted(found.motions) == ["a2c-0.16-0", "a2c-0.22-0"]
-    from trackmdp.config import load_run_config
-
-    world = build_world(load_run_config(whole / "a2c-0.22-0"))
-    motion = found.motions["a2c-0.22-0"]
-    assert np.array_equal(motion.kernel.toarray(), world.kernel.toarray())
-    assert np.array_equal(motion.clocked, bounds.clocked(world))
-    assert np.array_equal(motion.qmdp, evaluate(world, qmdp.solve(world)).value)
+    table = PolicyTable.from_dense(task, np.eye(3, 2, dtype=bool)[:, None])
+    assert sensed_cells(table).toarray().tolist() == [[1, 1, 0], [0, 1, 1], [0, 0, 0]]
+    everything = sensed_cells(PolicyTable.all_on(task))
+    assert everything.toarray().all() and everything.shape == (3, 3)
 
 
 def test_stored_results_read_back_the_same_and_are_small(whole: Path, tmp_path: Path) -> None:
     found = gather_runs(whole)
-    for name in ("a", "b"):
-        (tmp_path / name).mkdir()
-    results.save_results(found, tmp_path / "a")
-    assert results.is_stored(tmp_path / "a")
-    assert not results.is_stored(whole)
-    read = results.load_results(tmp_path / "a")
-    assert [(r.name, dict(r.settings), dict(r.figures)) for r in read.runs] == [
-        (r.name, dict(r.settings), dict(r.figures)) for r in found.runs
-    ]
-    assert read.curves.keys() == found.curves.keys()
-    for name, kept in found.policies.items():
-        assert not (read.policies[name].sets != kept.sets).nnz
-        assert np.array_equal(read.policies[name].value, kept.value)
-    for name, motion in found.motions.items():
-        assert np.array_equal(read.motions[name].kernel.toarray(), motion.kernel.toarray())
-        assert np.array_equal(read.motions[name].qmdp, motion.qmdp)
-        assert np.array_equal(read.motions[name].clocked, motion.clocked)
-    results.save_results(read, tmp_path / "b")
-    for file in sorted((tmp_path / "a").iterdir()):
-        assert file.read_bytes() == (tmp_path / "b" / file.name).read_bytes(), file.name
-    assert sum(file.stat().st_size for file in (tmp_path / "a").iterdir()) < 20_000
+    save_results(found, tmp_path)
+    read = load_results(tmp_path)
+    assert read.runs == found.runs
+    assert (read.anomalies, read.manifest) == (found.anomalies, found.manifest)
+    for one, other in zip(found.maps, read.maps, strict=True):
+        assert (one.label, one.size, one.averaged) == (other.label, other.size, other.averaged)
+        assert not (one.sets != other.sets).nnz and not (one.kernel != other.kernel).nnz
+        assert np.array_equal(one.value, other.value) and np.array_equal(one.bound, other.bound)
+    content = (tmp_path / RESULTS).read_bytes()
+    assert len(content) < 20_000
+    save_results(read, tmp_path)
+    assert (tmp_path / RESULTS).read_bytes() == content
 
 
 def test_no_path_of_the_machine_is_kept(sweep: Path, tmp_path: Path) -> None:
     plan(sweep, "a2c-0.16-0")
-    (tmp_path / "out").mkdir()
-    results.save_results(gather_runs(sweep), tmp_path / "out")
-    for file in ("manifest.json", "runs.csv"):
-        assert str(tmp_path) not in (tmp_path / "out" / file).read_text()
-    assert results.load_results(tmp_path / "out").manifest["line"] == "trackmdp train -m"
+    save_results(gather_runs(sweep), tmp_path)
+    assert load_results(tmp_path).manifest["line"] == "trackmdp train -m"
 
 
 def test_a_curve_keeps_its_ends_and_few_points(sweep: Path) -> None:
     values = np.linspace(-5.0, 5.0, 300)
     write_curve(sweep / "a2c-0.16-0", values)
-    curve = gather_runs(sweep).curves["a2c-0.16-0"]
+    sealed_again(sweep / "a2c-0.16-0")
+    curve = next(run for run in gather_runs(sweep).runs if run.name == "a2c-0.16-0").curve
     assert len(curve) <= MOST_POINTS
-    assert (curve[0].aihtr, curve[-1].aihtr, curve[-1].iteration) == (values[0], values[-1], 600)
-    gaps = np.diff([point.iteration for point in curve])
-    assert gaps[0] < gaps[-1]
+    assert (curve[0][2], curve[-1][2], curve[-1][0]) == (values[0], values[-1], 60_000)
+    assert curve[1][0] - curve[0][0] < curve[-1][0] - curve[-2][0]
 
 
 def test_a_run_by_blocks_is_one_run_that_needs_no_curve(tmp_path: Path) -> None:
@@ -173,83 +152,114 @@ def test_a_run_by_blocks_is_one_run_that_needs_no_curve(tmp_path: Path) -> None:
     (tmp_path / "whole" / "metrics.csv").unlink()
     for number in range(2):
         write_run(tmp_path / "whole" / "blocks" / f"{number:05d}", seed=number)
-    for place, name in ((tmp_path, "whole"), (tmp_path / "whole", ".")):  # the folder of the run itself, too
+    for place, name in ((tmp_path, "whole"), (tmp_path / "whole", ".")):
         found = gather_runs(place)
         assert [run.name for run in found.runs] == [name]
         assert found.anomalies == []
 
 
-@pytest.mark.parametrize("text", ["{", "[]", "{}"])
-def test_a_failure_or_a_plan_that_says_nothing_is_no_obstacle(sweep: Path, text: str) -> None:
-    for name in ("a2c-0.16-0/failed.json", "sweep.json"):
-        (sweep / name).write_text(text)
-    found = gather_runs(sweep)
-    assert problems(found)["a2c-0.16-0"] == "failed: no reason given"
-    assert found.manifest["planned"] is None
-
-
-def test_what_is_wrong_with_a_run_is_named(sweep: Path) -> None:
+def test_faults_of_a_run_are_listed(sweep: Path) -> None:
     (sweep / "a2c-0.16-0/summary.json").unlink()
     (sweep / "a2c-0.16-1/summary.json").write_text('{"frames": 3')
     (sweep / "a2c-0.16-2/summary.json").write_text('{"frames": 3}')
     (sweep / "a2c-0.22-0/config.yaml").write_text("a: [")
     write_json(sweep / "a2c-0.22-1/failed.json", {"reason": "out of luck"})
-    (sweep / "hindsight-0.16-1/metrics.csv").write_text("iteration,frames\n1,x\n")
+    (sweep / "a2c-0.22-2/failed.json").write_text("{")
     for seed in range(3):
         (sweep / f"hindsight-0.22-{seed}/policy.npz").write_bytes(b"nothing")
-    (sweep / "hindsight-0.16-0/kernel.npz").unlink()
+    (sweep / "hindsight-0.16-0/problem.npz").unlink()
+    (sweep / "hindsight-0.16-1/problem.npz").unlink()
+    (sweep / "hindsight-0.16-2/problem.npz").unlink()
     found = gather_runs(sweep)
-    said = problems(found)
-    assert len(found.runs) == 7
+    said = reasons(found)
+    assert len(found.runs) == 6
     assert said["a2c-0.16-0"] == "cut: it has no summary.json"
     assert said["a2c-0.16-1"].startswith("summary.json: not JSON")
-    assert said["a2c-0.16-2"].startswith("summary.json: its content does not match its digest")
-    assert said["a2c-0.22-0"].startswith("config.yaml: not the file that this run left")
+    assert "digest" in said["a2c-0.16-2"]
+    assert said["a2c-0.22-0"].startswith("config.yaml: ")
     assert said["a2c-0.22-1"] == "failed: out of luck"
-    assert said["hindsight-0.16-1"] == "no learning curve"
-    assert said["hindsight-0.22-1"].startswith("policy.npz: not the file that this run left")
-    assert said["hindsight-0.16-0"].startswith("its world cannot be built")
-    assert said["a2c"] == "no run in 1 of 2 worlds: Z=5, c=0.16"
-    assert sorted(found.policies)[0] == "a2c-0.22-2"
-    assert len(found.policies) == 2
+    assert said["a2c-0.22-2"].startswith("failed: ")
+    assert said["hindsight-0.22-1"].startswith("policy.npz: ")
+    assert said["hindsight-0.16-1"].startswith("problem.npz: ")
+    assert found.maps == []
+
+
+def test_another_run_of_the_group_is_drawn_where_a_policy_is_missing(sweep: Path) -> None:
+    seed = gather_runs(sweep).maps[0].seed
+    (sweep / f"a2c-0.16-{seed}/policy.npz").unlink()
+    found = gather_runs(sweep)
+    assert (found.maps[0].method, found.maps[0].world) == ("a2c", "Z=5, c=0.16")
+    assert found.maps[0].seed != seed
+    assert list(reasons(found)) == [f"a2c-0.16-{seed}"]
+
+
+def facts(**changed: Any) -> Change:
+    """A summary with other figures and the right digest."""
+    return lambda run: write_sealed(run / "summary.json", {**read_summary(run), **changed})
+
+
+SPOILT: dict[str, tuple[Change, str]] = {
+    "changed": (
+        lambda run: (run / "summary.json").write_text(
+            (run / "summary.json").read_text().replace("2.0", "3.0", 1).replace("4000", "5000")
+        ),
+        "summary.json: ",
+    ),
+    "deep": (lambda run: (run / "summary.json").write_text("[" * 10**5), "summary.json: "),
+    "of another run": (
+        lambda run: shutil.copy(run.parent / "a2c-0.22-1/summary.json", run / "summary.json"),
+        "config.yaml: ",
+    ),
+    "policy": (facts(policy=True), "summary.json: "),
+    "frames": (facts(frames="x"), "summary.json: "),
+    "no time": (facts(cpu_seconds=None), "summary.json: "),
+    "no length": (facts(policy={"aihtr": 9.0}), "summary.json: "),
+    "curve": (
+        lambda run: [(run / "metrics.csv").write_text("aihtr\nx\n"), sealed_again(run)],
+        "metrics.csv: ",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", SPOILT)
+def test_a_run_that_was_changed_is_listed_and_the_others_are_read(case: str, sweep: Path) -> None:
+    change, start = SPOILT[case]
+    change(sweep / "a2c-0.16-0")
+    found = gather_runs(sweep)
+    assert len(found.runs) == 11
+    assert reasons(found)["a2c-0.16-0"].startswith(start)
+    assert "\n" not in reasons(found)["a2c-0.16-0"]
 
 
 def test_a_run_of_a_version_with_other_options_counts(sweep: Path) -> None:
     file = sweep / "a2c-0.16-0/config.yaml"
-    file.write_text(
-        file.read_text().replace("  radius: 1\n", "  radius: 1\n  later: 3\n").replace("algo:", "algo:\n  x: 1")
-    )
-    write_summary(file.parent, read_summary(file.parent))
-    found = gather_runs(sweep)
-    assert len(found.runs) == 12
-    assert "a2c-0.16-0" in found.motions
+    file.write_text(file.read_text().replace("  radius: 1\n", "  radius: 1\n  later: 3\n"))
+    sealed_again(file.parent)
+    assert len(gather_runs(sweep).runs) == 12
 
 
 def test_a_run_under_way_is_not_called_cut(sweep: Path) -> None:
     (sweep / "a2c-0.16-0/summary.json").unlink()
     with locked(sweep / "a2c-0.16-0"):
-        assert problems(gather_runs(sweep))["a2c-0.16-0"] == "still running"
+        assert reasons(gather_runs(sweep))["a2c-0.16-0"] == "still running"
 
 
-def test_a_missing_seed_is_named(sweep: Path) -> None:
+def test_planned_runs_that_are_missing_are_listed(sweep: Path) -> None:
     shutil.rmtree(sweep / "a2c-0.16-1")
-    assert problems(gather_runs(sweep)) == {"a2c, Z=5, c=0.16": "seed 1 missing"}
-
-
-def test_what_was_planned_and_is_not_there_is_named(sweep: Path) -> None:
-    names = sorted(path.name for path in sweep.iterdir())
-    plan(sweep, *names, "ppo-0.16-0")
+    assert gather_runs(sweep).anomalies == []
+    plan(sweep, *sorted(path.name for path in sweep.iterdir()), "ppo-0.16-0")
     found = gather_runs(sweep)
-    assert problems(found) == {"ppo-0.16-0": "not started"}
-    assert found.manifest["planned"] == 13
+    assert reasons(found) == {"ppo-0.16-0": "not started"}
+    assert found.manifest["planned"] == 12
 
 
-def test_runs_of_other_versions_and_repeated_runs_are_named(sweep: Path) -> None:
+def test_runs_of_other_versions_and_repeated_runs_are_listed(sweep: Path) -> None:
     shutil.rmtree(sweep / "a2c-0.16-1")
-    write_run(sweep / "a2c-0.16-1", "grid.size=3", "algo=a2c", seed=1, versions=VERSIONS | {"torch": "1.0"})
+    other = VERSIONS | {"torch": "1.0"}
+    write_run(sweep / "a2c-0.16-1", "grid.size=3", "algo=a2c", seed=1, versions=other)
     shutil.copytree(sweep / "a2c-0.22-0", sweep / "z")
     found = gather_runs(sweep)
-    assert problems(found) == {
+    assert reasons(found) == {
         "a2c-0.16-1": "other versions: torch 1.0, most have 2.13.0",
         "z": "the same config as a2c-0.22-0, which counts",
     }
@@ -261,17 +271,78 @@ def test_a_folder_without_runs_is_refused(content: str | None, tmp_path: Path) -
     if content:
         (tmp_path / content).parent.mkdir()
         (tmp_path / content).touch()
-    with pytest.raises(UserError, match="no runs in there"):
+    with pytest.raises(UserError, match=f"sweep={tmp_path}"):
         gather_runs(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("file", "content"),
-    [("runs.csv", "run\nx\n"), ("policies.npz", "PK"), ("worlds.npz", ""), ("curves.csv", "run,iteration\n99,1\n")],
-)
-def test_damaged_stored_results_are_refused_in_one_line(file: str, content: str, whole: Path, tmp_path: Path) -> None:
-    results.save_results(gather_runs(whole), tmp_path)
-    (tmp_path / file).write_text(content)
-    with pytest.raises(UserError, match="not stored results that can be read") as caught:
-        results.load_results(tmp_path)
+@pytest.mark.parametrize("folder", ["../outside", "{outside}", "a2c-0.16-0/../../outside", "link"])
+def test_a_plan_does_not_lead_out_of_the_sweep(folder: str, sweep: Path) -> None:
+    outside = sweep.parent / "outside"
+    shutil.copytree(sweep / "a2c-0.16-0", outside)
+    (outside / "failed.json").write_text('{"reason": "SECRET"}')
+    (sweep / "link").symlink_to(outside)
+    plan(sweep, folder.format(outside=outside))
+    assert not any("SECRET" in text for text in reasons(gather_runs(sweep)).values())
+    assert not any("SECRET" in each.reason for each in watch.statuses(sweep))
+
+
+@pytest.mark.parametrize("name", [3, "a\0b", "\ud800"])
+def test_a_plan_of_rubbish_is_refused_in_one_line(name: object, sweep: Path) -> None:
+    if isinstance(name, int):
+        (sweep / "sweep.json").write_text('{"jobs": [{}], "line": "", "command": "train"}')
+    else:
+        plan(sweep, name)
+    with pytest.raises(UserError, match=r"sweep\.json") as caught:
+        gather_runs(sweep)
     assert "\n" not in str(caught.value)
+
+
+def test_damaged_stored_results_are_refused_in_one_line(whole: Path, tmp_path: Path) -> None:
+    save_results(gather_runs(whole), tmp_path)
+    content, kept = (tmp_path / RESULTS).read_bytes(), load_results(tmp_path)
+    flipped = [
+        content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :]
+        for place in range(0, len(content), 211)
+    ]
+    refused = 0
+    for damaged in (b"PK", content[:-40], *flipped):
+        (tmp_path / RESULTS).write_bytes(damaged)
+        try:
+            found = load_results(tmp_path)
+        except UserError as error:
+            assert RESULTS in str(error) and "\n" not in str(error)
+            refused += 1
+        else:  # a bit that has no meaning, as in a date of the archive
+            assert (found.runs, found.manifest) == (kept.runs, kept.manifest)
+    assert refused > len(flipped) / 2
+
+
+EVIL = ["=<script>alert(1)<@BODY@", "@$x^{$\\input{x}{}~^&%#_", "\x1b]0;t\x07a\nb\u202e", "[x]"]
+
+
+def test_a_folders_name_is_a_name_everywhere(
+    sweep: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for run, name in zip(sorted(sweep.iterdir()), EVIL, strict=False):
+        run.rename(sweep / name)
+        (sweep / f"failed {name}").mkdir()
+        (sweep / f"failed {name}/failed.json").write_text(json.dumps({"reason": name}))
+    (sweep / os.fsdecode(b"r\xff")).mkdir()
+    (sweep / os.fsdecode(b"r\xff") / "config.yaml").touch()
+    save_results(gather_runs(sweep), tmp_path)
+    found = load_results(tmp_path)
+    assert len(found.runs) == 12
+    report = build(dataclasses.replace(found, manifest={**found.manifest, "line": "".join(EVIL)}))
+    page = report.html()
+    assert "<script>alert" not in page
+    assert page.count("</body>") == 1
+    assert "\x1b" not in page
+    assert "r\\udcff" in page
+    for table in report.tables:
+        assert "\\input" not in table.latex()
+        cells = (cell for line in table.csv().splitlines() for cell in line.split(","))
+        assert not any(cell.startswith(("=", "@")) for cell in cells)
+    watch.watch(sweep, Console(force_terminal=False), 0.01)
+    said = capsys.readouterr().out
+    assert "\x1b" not in said
+    assert "[x]: done" in said

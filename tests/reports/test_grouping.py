@@ -1,8 +1,9 @@
-"""Runs in groups: what tells them apart names them."""
+"""Runs in groups, labels by the options that differ, and the tables of both."""
 
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -10,9 +11,10 @@ import pytest
 from tests.helpers import train_config
 from trackmdp.config import to_dict
 from trackmdp.config.tree import flatten
-from trackmdp.reports.grouping import study, world_key
+from trackmdp.reports.grouping import study
 from trackmdp.reports.results import FIGURES, FinishedRun
-from trackmdp.reports.summaries import methods_table, runs_table
+from trackmdp.reports.summaries import groups_table, outcome_table, runs_table
+from trackmdp.reports.tables import Cell, Table
 
 
 @functools.cache
@@ -20,10 +22,12 @@ def composed(*overrides: str) -> dict[str, Any]:
     return flatten(to_dict(train_config(*overrides)))
 
 
-def run(name: str, *overrides: str, options: dict[str, Any] | None = None, **figures: float) -> FinishedRun:
+def run(
+    name: str, *overrides: str, options: dict[str, Any] | None = None, **figures: float
+) -> FinishedRun:
     """A run with its figures; `options` are put into its config as they are."""
     settings = composed(*overrides) | (options or {})
-    return FinishedRun(name, settings, dict.fromkeys(FIGURES, None) | figures, name)
+    return FinishedRun(name, settings, dict.fromkeys(FIGURES, None) | figures)
 
 
 def paper_world(support_size: int, cost: float) -> dict[str, Any]:
@@ -39,24 +43,33 @@ def test_labels_name_the_world_and_the_algorithm() -> None:
         for s in (1, 0)
     ]
     found = study(runs)
-    assert found.worlds == ["Z=3, c=0.16", "Z=3, c=0.22", "Z=5, c=0.16", "Z=5, c=0.22"]  # kernel.seed follows Z
+    assert found.worlds == [
+        "Z=3, c=0.16",
+        "Z=3, c=0.22",
+        "Z=5, c=0.16",
+        "Z=5, c=0.22",
+    ]  # kernel.seed follows Z
     assert found.methods == ["a2c", "hindsight", "ppo"]
     assert [r.name for r in found.of("Z=5, c=0.22", "ppo")] == ["50.22ppo0", "50.22ppo1"]
-    assert len({world_key(r) for r in runs}) == 4
 
 
 def test_an_option_that_differs_is_named_once() -> None:
     runs = [
-        run(f"{t}{g}", options={"grid.t_max": t, "algo.gamma": g, "threads": t + 1}) for t in (0, 1) for g in (0.7, 0.9)
+        run(f"{t}{g}", options={"grid.t_max": t, "algo.gamma": g, "threads": t + 1})
+        for t in (0, 1)
+        for g in (0.7, 0.9)
     ]
     found = study(runs)
     assert found.worlds == ["Z=5, c=0.16, T_max=0", "Z=5, c=0.16, T_max=1"]
-    assert found.methods == ["hindsight, gamma=0.7", "hindsight, gamma=0.9"]
+    assert found.methods == ["model_based, gamma=0.7", "model_based, gamma=0.9"]
 
 
 def test_options_that_go_together_are_named_by_one_of_them() -> None:
     runs = [run(str(frames), f"algo.total_frames={frames}") for frames in (20_000, 40_000)]
-    assert study(runs).methods == ["hindsight, buffer_size=20000", "hindsight, buffer_size=40000"]
+    assert study(runs).methods == [
+        "model_based, total_frames=20000",
+        "model_based, total_frames=40000",
+    ]
 
 
 def test_another_draw_of_the_kernel_is_another_world() -> None:
@@ -69,34 +82,70 @@ def test_kernels_without_support_size_are_named_by_their_name() -> None:
     assert [world.split(",")[0] for world in found.worlds] == ["drift", "random_walk"]
 
 
+EARNED = {"expected_length": 200.0, "frames": 1.0, "wall_seconds": 1.0, "cpu_seconds": 1.0}
+
+
+def column(table: Table, label: str) -> list[Cell]:
+    place = [column.label for column in table.columns].index(label)
+    return [row[place] for row in table.rows]
+
+
 def test_regret_is_to_the_best_upper_bound_that_any_run_of_the_world_has_proved() -> None:
+    proved = (
+        {"optimal_upper": 100.0, "optimal_lower": 99.0},
+        {"optimal_upper": 99.5, "optimal_lower": 99.2},
+    )
     runs = [
-        run("a", options={"seed": 0}, aihtr=90.0, expected_length=200.0, bound_clocked=101.0, optimal_upper=100.0),
-        run("b", options={"seed": 1}, aihtr=99.0, expected_length=200.0, bound_clocked=101.0, optimal_upper=99.5),
+        run(str(seed), options={"seed": seed}, aihtr=aihtr, **EARNED, **bounds)
+        for seed, (aihtr, bounds) in enumerate(zip((90.0, 99.0), proved, strict=True))
     ]
-    runs[0].figures["optimal_lower"], runs[1].figures["optimal_lower"] = 99.0, 99.2  # type: ignore[index]
-    for each in runs:
-        each.figures.update(dict.fromkeys(("frames", "wall_seconds", "cpu_seconds", "accuracy"), 1.0))  # type: ignore[attr-defined]
     found = study(runs)
     (world,) = found.worlds
     assert (found.upper(world), found.lower(world)) == (99.5, 99.2)
-    assert found.regrets(world, "hindsight") == pytest.approx([9.5 / 200, 0.5 / 200])
+    assert found.regrets("model_based") == [pytest.approx([9.5 / 200, 0.5 / 200])]
     assert found.bracket(world) == pytest.approx(0.3 / 200)  # 99.2 is attained, 99.5 may be
     table = runs_table(found)
-    at = [column.label for column in table.columns].index("regret per step to the best known")
-    assert [row[at : at + 2] for row in table.rows] == [
-        pytest.approx([9.2 / 200, 9.5 / 200]),
-        pytest.approx([0.2 / 200, 0.5 / 200]),
-    ]
-    assert f"not certified: {world} by 0.0015" in methods_table(found, None).caption
+    assert column(table, "regret per step") == pytest.approx([9.5 / 200, 0.5 / 200])
+    assert column(table, "regret per step to the best known") == pytest.approx(
+        [9.2 / 200, 0.2 / 200]
+    )
+    assert f"not certified: {world} by 0.0015" in outcome_table(found, None).caption
 
 
-def test_a_learned_policy_above_the_solvers_is_the_best_known() -> None:
-    found = study([run("a", aihtr=99.4, expected_length=200.0, optimal_lower=99.0, optimal_upper=100.0)])
-    (world,) = found.worlds
-    assert found.best(world) == 99.4
+def test_a_learned_policy_above_that_of_the_solver_is_the_best_known() -> None:
+    found = study([run("a", aihtr=99.4, optimal_lower=99.0, optimal_upper=100.0, **EARNED)])
+    assert found.best(found.worlds[0]) == 99.4
 
 
-def test_without_a_bound_there_is_no_regret() -> None:
-    found = study([run("a", aihtr=90.0, expected_length=200.0)])
-    assert found.regrets(found.worlds[0], "hindsight") == []
+def test_the_outcome_has_the_other_policies_and_names_a_proved_optimum() -> None:
+    known = {"aihtr": 99.0, "accuracy": 0.9, "sensors_per_step": 2.0}
+    others = {
+        "Q_MDP": known | {"aihtr": 79.0},
+        "best known": known,
+        "valid bound": {"aihtr": 120.0},
+    }
+    for upper, name in ((99.0, "optimum"), (99.5, "best known")):
+        one = run("a", aihtr=98.0, accuracy=0.8, optimal_lower=99.0, optimal_upper=upper, **EARNED)
+        table = outcome_table(study([replace(one, references=others)]), 0.02)
+        assert column(table, "policy") == ["model_based", "Q_MDP", name]
+        assert column(table, "AIHTR") == [98.0, 79.0, 99.0]
+        assert column(table, "accuracy") == [80.0, 90.0, 90.0]
+        missing = [(upper - aihtr) / 200 for aihtr in (98.0, 79.0, 99.0)]
+        assert column(table, "regret per step") == pytest.approx(missing)
+        assert column(table, "runs ≤ 0.02") == [1, None, None]
+
+
+def test_on_recordings_figures_are_of_the_validation_tracks_and_others_are_called_held_out() -> (
+    None
+):
+    one = run("a", "kernel=tracks", "kernel.path=x.csv", aihtr=9.0, held_out_aihtr=8.0, **EARNED)
+    one = replace(one, references={"all on": {"held_out_aihtr": -70.0}})
+    found = study([one])
+    assert found.regrets("model_based") == []
+    table = outcome_table(found, None)
+    assert column(table, "AIHTR")[0] == 9.0
+    assert column(table, "held-out AIHTR") == [8.0, -70.0]
+    assert "validation tracks" in table.caption
+    for made in (runs_table(found), groups_table(found, None)):
+        assert (column(made, "AIHTR"), column(made, "held-out AIHTR")) == ([9.0], [8.0])
+        assert "nan" not in made.html()

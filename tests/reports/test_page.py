@@ -12,6 +12,8 @@ import pytest
 
 from tests.episodes.browser import CHROMIUM, Browser
 from tests.reports.sweeps import write_run
+from tests.tracks import by_hand, recorded
+from trackmdp.config.compose import compose
 from trackmdp.paper.calibration import Openings, candidates, checks, sensitivity
 from trackmdp.paper.sections import accuracy_table, sections
 from trackmdp.paper.worlds import pairs
@@ -19,8 +21,9 @@ from trackmdp.reports.gather import gather_runs
 from trackmdp.reports.grouping import study
 from trackmdp.reports.page import Report, build
 from trackmdp.reports.results import Anomaly, Results
-from trackmdp.reports.summaries import groups_table, methods_table
+from trackmdp.reports.summaries import groups_table, outcome_table
 from trackmdp.training.folders import write_summary
+from trackmdp.world.problem_file import problem_bytes
 
 PAIRS = ((3, 0.22), (5, 0.16), (5, 0.22))
 WRONG = {"a2c": 40, "hindsight": 1}
@@ -34,7 +37,9 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
         for algo, wrong in WRONG.items():
             for seed in range(2):
                 words = (f"kernel.support_size={z}", f"algo={algo}")
-                write_run(folder / f"{algo}-{z}-{cost}-{seed}", *words, cost=cost, seed=seed, wrong=wrong)
+                write_run(
+                    folder / f"{algo}-{z}-{cost}-{seed}", *words, cost=cost, seed=seed, wrong=wrong
+                )
     found = gather_runs(folder)
     found.anomalies.append(Anomaly("</script><b>", "cut & gone"))  # type: ignore[attr-defined]
     return found
@@ -56,28 +61,33 @@ def test_the_paper_s_worlds_are_found_by_z_and_price(results: Results) -> None:
 
 
 def test_a_price_for_each_cell_is_none_of_the_paper_s(results: Results) -> None:
-    runs = [replace(run, settings={**run.settings, "cost.sensor": [0.22] * 100}) for run in results.runs]
+    runs = [
+        replace(run, settings={**run.settings, "cost.sensor": [0.22] * 100}) for run in results.runs
+    ]
     assert not pairs(study(runs))
 
 
 def test_runs_are_counted_up_to_the_threshold_where_one_is_given(results: Results) -> None:
     grouped = study(results.runs)
-    regrets = {m: [r for world in grouped.worlds for r in grouped.regrets(world, m)] for m in WRONG}
+    regrets = {m: [r for group in grouped.regrets(m) for r in group] for m in WRONG}
     threshold = sorted(regrets["hindsight"])[2]
     for table, expected in (
-        (methods_table(grouped, threshold), {"a2c": 0, "hindsight": 3}),
+        (outcome_table(grouped, threshold), {"a2c": 0, "hindsight": 3}),
         (groups_table(grouped, threshold), None),
     ):
         place = [column.label for column in table.columns].index(f"runs ≤ {threshold:g}")
-        counted = [row[place] for row in table.rows]
+        counted = [row[place] for row in table.rows if row[place] is not None]
         if expected:
             assert dict(zip(grouped.methods, counted, strict=True)) == expected
         assert sum(map(int, counted)) == 3  # type: ignore[arg-type]
-    assert not [column for column in methods_table(grouped, None).columns if "≤" in column.label]
+    assert not [column for column in outcome_table(grouped, None).columns if "≤" in column.label]
 
 
-def test_a_budget_below_the_shipped_one_is_said(report: Report) -> None:
-    assert "a2c: 4,000 of 4,096,000; hindsight: 4,000 of 300,000" in report.html()  # the stand-ins have 4,000 steps
+def test_a_budget_below_the_default_is_named(report: Report) -> None:
+    """The stand-ins have 4,000 steps."""
+    defaults = {algo: compose("train", {"algo": algo}).algo.total_frames for algo in WRONG}
+    named = "; ".join(f"{algo}: 4,000 of {full:,}" for algo, full in defaults.items())
+    assert named in report.html()
 
 
 def test_accuracies_stand_beside_the_printed_ones(results: Results) -> None:
@@ -86,12 +96,14 @@ def test_accuracies_stand_beside_the_printed_ones(results: Results) -> None:
     row = rows[5, 0.22]
     assert (row[2], row[4]) == (54.3, 90.21)
     runs = grouped.of("Z=5, c=0.22", "hindsight")
-    assert row[3] == 100 * runs[0].figure("qmdp_accuracy")
+    assert row[3] == 100 * (runs[0].references["Q_MDP"]["accuracy"] or 0.0)
     assert row[7] == pytest.approx(50 * sum(run.figure("accuracy") for run in runs))
 
 
 @pytest.mark.slow
-def test_the_same_results_give_the_same_page(results: Results, openings: Openings, report: Report) -> None:
+def test_the_same_results_give_the_same_page(
+    results: Results, openings: Openings, report: Report
+) -> None:
     again = build(results, 0.02, sections(study(results.runs), openings))
     assert again.html() == report.html()
     assert [figure.png for figure in again.figures] == [figure.png for figure in report.figures]
@@ -107,20 +119,25 @@ def test_the_page_is_one_file_that_asks_for_nothing(report: Report) -> None:
     assert len(ids) == len(set(ids))
 
 
-def test_every_figure_has_a_text_alternative_its_numbers_and_its_n(report: Report) -> None:
+def test_every_figure_has_a_name_its_numbers_and_its_n(report: Report) -> None:
     text = report.html()
-    drawings = re.findall(r'<svg class="chart" role="img"[^>]*aria-labelledby="(\S+) (\S+)"', text)
-    assert len(drawings) == len(report.figures) == text.count("<figure ")
-    for label, description in drawings:
-        for mark, name in ((label, "title"), (description, "desc")):
-            found = re.search(rf'<{name} id="{re.escape(mark)}">(.+?)</{name}>', text)
-            assert found, mark
+    names = re.findall(r'<svg class="chart" role="img"[^>]* aria-label="([^"]+)"', text)
+    assert len(names) == len(report.figures) == text.count("<figure ")
     for figure in report.figures:
         assert re.search(r"\bn = \d", figure.title), figure.table.name
         assert figure.table.rows
 
 
-def test_what_results_say_cannot_break_out_of_the_page(report: Report) -> None:
+def test_the_words_of_the_page_are_explained_on_it(report: Report) -> None:
+    words = re.search(r'<section id="words">.*?</section>', report.html(), re.DOTALL)
+    assert words
+    for word in ("AIHTR", "accuracy", "regret per step", "Q_MDP", "all on", "optimum", "T_max"):
+        assert re.search(rf"<dt>[^<]*{word}", words[0]), word
+    for bound in ("clocked", "valid", "printed"):
+        assert f"{bound} bound" in words[0]
+
+
+def test_texts_of_results_cannot_break_out_of_the_page(report: Report) -> None:
     text = report.html()
     assert text.count("</script>") == 1
     assert "&lt;/script&gt;&lt;b&gt;" in text
@@ -132,7 +149,8 @@ def test_the_printed_bound_is_shown_to_be_none(report: Report, results: Results)
     table = next(table for table in report.tables if table.name == "bounds")
     for row, (_, world) in zip(table.rows, pairs(grouped).items(), strict=True):
         run = grouped.in_world(world)[0]
-        assert row[-1] == ((grouped.lower(world) or 0.0) > run.figure("bound_paper"))
+        printed = run.references["printed bound"]["aihtr"]
+        assert printed is not None and row[-1] == ((grouped.lower(world) or 0.0) > printed)
     assert "bound 41.93, a policy attains 42.56" in report.html()
 
 
@@ -141,21 +159,36 @@ def test_a_sweep_without_finished_runs_still_says_what_is_missing() -> None:
     assert "cut: it has no summary.json" in page
 
 
-def test_runs_on_recorded_tracks_have_neither_bound_nor_regret(tmp_path: Path) -> None:
+def test_runs_on_recordings_have_no_regret_and_held_out_figures_under_their_name(
+    tmp_path: Path,
+) -> None:
     for cost in (0.16, 0.22):
         place = tmp_path / str(cost)
         write_run(place, "grid.size=3", cost=cost)
         summary = json.loads((place / "summary.json").read_text())
-        summary |= {"qmdp": None, "bounds": dict.fromkeys(("paper", "valid", "clocked")), "optimal": None}
-        config = (place / "config.yaml").read_text()
-        (place / "config.yaml").write_text(config.replace("name: random_support", "name: tracks"))
-        write_summary(place, {key: value for key, value in summary.items() if key != "sha256"})
+        parts = ("aihtr", "accuracy", "sensors_per_step")
+        summary |= {
+            "validation": summary["policy"] | {"aihtr": 7.0},
+            "qmdp": None,
+            "bounds": dict.fromkeys(("paper", "valid", "clocked")),
+            "references": {},
+            "optimal": None,
+            "held_out": {"figures": {"no sensors": {key: {"mean": -3.0} for key in parts}}},
+        }
+        (place / "problem.npz").write_bytes(problem_bytes(recorded(by_hand([0, 1, 2]))))
+        plain = {key: value for key, value in summary.items() if key not in ("sha256", "files")}
+        write_summary(place, plain)
     found = gather_runs(tmp_path)
     assert not found.anomalies
-    assert not found.motions
+    assert not found.maps
     made = build(found)
-    assert [figure.table.name for figure in made.figures] == ["aihtr-tracks-z-5"]
-    table = next(table for table in made.tables if table.name == "methods")
+    drawn = [figure.table.name for figure in made.figures]
+    assert drawn == ["aihtr-z-5", "accuracy-z-5", "sensors-per-step-z-5"]
+    table = next(table for table in made.tables if table.name == "outcome")
+    heads = [column.label for column in table.columns]
+    learned, reference = table.rows
+    assert learned[heads.index("AIHTR")] == 7.0
+    assert (reference[0], reference[heads.index("held-out AIHTR")]) == ("no sensors", -3.0)
     assert "nan" not in table.html()
 
 
@@ -163,6 +196,11 @@ def test_runs_on_recorded_tracks_have_neither_bound_nor_regret(tmp_path: Path) -
 def browser(tmp_path: Path) -> Iterator[Browser]:
     with Browser(tmp_path / "profile") as opened:
         yield opened
+
+
+def place(label: str) -> str:
+    """The heading of a column of the first table."""
+    return f"[...{HEADS}].findIndex((head) => head.textContent.startsWith('{label}'))"
 
 
 ROWS = "[...document.querySelectorAll('#outcome table')[0].tBodies[0].rows].map((row) => row.cells[0].textContent)"
@@ -173,7 +211,10 @@ HEADS = "document.querySelectorAll('#outcome table')[0].tHead.rows[0].cells"
 def test_the_page_in_a_browser(report: Report, browser: Browser, tmp_path: Path) -> None:
     file = tmp_path / "report.html"
     file.write_text(report.html(), encoding="utf-8")
-    for width, scheme, colour in ((390, "dark", "rgb(22, 24, 27)"), (1280, "light", "rgb(255, 255, 255)")):
+    for width, scheme, colour in (
+        (390, "dark", "rgb(22, 24, 27)"),
+        (1280, "light", "rgb(255, 255, 255)"),
+    ):
         browser.view(width, 844, scheme)
         browser.open(file)
         assert browser.ask("document.documentElement.scrollWidth") <= width
@@ -182,16 +223,19 @@ def test_the_page_in_a_browser(report: Report, browser: Browser, tmp_path: Path)
         narrow = "[...document.querySelectorAll('svg.chart')].every((svg) => svg.getBoundingClientRect().width > 250)"
         assert browser.ask(narrow)
         assert browser.smallest_letters() >= 11
-    assert browser.ask(ROWS) == ["a2c", "hindsight"]
-    browser.ask(f"{HEADS}[3].querySelector('button').focus()")
+        assert browser.touching_letters() == []
+    assert browser.ask(ROWS)[:2] == ["a2c", "hindsight"]
+    regret = browser.ask(place("regret"))
+    browser.ask(f"{HEADS}[{regret}].querySelector('button').focus()")
     browser.press(" ")
-    assert browser.ask(f"{HEADS}[3].getAttribute('aria-sort')") == "ascending"
-    assert browser.ask(ROWS) == ["hindsight", "a2c"]  # by regret, smallest first
+    assert browser.ask(f"{HEADS}[{regret}].getAttribute('aria-sort')") == "ascending"
+    ascending = browser.ask(ROWS)
+    assert (ascending[0], ascending[-1]) == ("hindsight", "all on")
     browser.press(" ")
-    assert browser.ask(f"{HEADS}[3].getAttribute('aria-sort')") == "descending"
-    assert browser.ask(ROWS) == ["a2c", "hindsight"]
+    assert browser.ask(f"{HEADS}[{regret}].getAttribute('aria-sort')") == "descending"
+    assert browser.ask(ROWS) == ascending[::-1]
     browser.ask(f"{HEADS}[0].querySelector('button').focus()")
     browser.press(" ")
-    assert browser.ask(f"{HEADS}[3].hasAttribute('aria-sort')") is False
+    assert browser.ask(f"{HEADS}[{regret}].hasAttribute('aria-sort')") is False
     assert browser.ask(f"{HEADS}[0].getAttribute('aria-sort')") == "ascending"
     assert browser.problems == []

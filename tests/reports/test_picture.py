@@ -21,7 +21,11 @@ def right_mover() -> World:
 
 
 def from_the_middle(world: World, on: np.ndarray) -> Episode:
-    return next(episode for episode in simulate(world, Policy.from_dense(world, on), 50) if episode.start == 4)
+    return next(
+        episode
+        for episode in simulate(world, Policy.from_dense(world, on), 50)
+        if episode.start == 4
+    )
 
 
 def test_a_detection_by_hand() -> None:
@@ -35,12 +39,17 @@ def test_a_miss_by_hand() -> None:
     on = np.zeros((9, 1, 9), dtype=bool)
     on[4, 0, 3] = True
     expected = ["step 1", "· · ·", "▪ · ○", "· · ·", "", PICTURE_LEGEND, ""]
-    assert draw_picture([from_the_middle(right_mover(), on)], right_mover(), steps=1).split("\n") == expected
+    assert (
+        draw_picture([from_the_middle(right_mover(), on)], right_mover(), steps=1).split("\n")
+        == expected
+    )
 
 
 def test_the_safe_action_follows_the_last_free_miss() -> None:
     stay = World(np.eye(9), 3, cost=np.full(9, 0.1), safe_cost=0.9, t_max=0, max_steps=4)
-    lines = draw_picture([from_the_middle(stay, np.zeros((9, 1, 9), dtype=bool))], stay, steps=3).split("\n")
+    lines = draw_picture(
+        [from_the_middle(stay, np.zeros((9, 1, 9), dtype=bool))], stay, steps=3
+    ).split("\n")
     assert lines[:4] == [
         "step 1   step 2   step 3",
         "· · ·    ▪ ▪ ▪    · · ·",
@@ -66,7 +75,7 @@ def test_of_a_large_grid_the_part_around_the_target_is_drawn() -> None:
     *frames, empty, where, legend, _ = draw_picture([episode], world, steps=1).split("\n")
     assert (empty, legend) == ("", PICTURE_LEGEND)
     top, left = min(max(row - 10, 0), 19), min(max(column - 10, 0), 29)
-    assert where == f"rows {top} to {top + 20} of 40, columns {left} to {left + 20} of 50"
+    assert where == (f"rows {top + 1} to {top + 21} of 40, columns {left + 1} to {left + 21} of 50")
     assert frames[0] == "step 1"
     assert [len(line.split()) for line in frames[1:]] == [21] * 21
     assert frames[1 + row - top].split()[column - left] == "●"

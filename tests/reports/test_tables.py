@@ -24,7 +24,10 @@ def test_csv_keeps_every_digit() -> None:
 
 
 def test_cells_are_shown_to_the_digits_asked_for() -> None:
-    shown = [[column.text(value) for column, value in zip(TABLE.columns, row, strict=True)] for row in TABLE.rows]
+    shown = [
+        [column.text(value) for column, value in zip(TABLE.columns, row, strict=True)]
+        for row in TABLE.rows
+    ]
     assert shown == [["Q_MDP <b>", "1,234.57", "0.3", "5", "yes"], ["none", "0.00", "–", "–", "no"]]
     assert Column("x", 2).text(-1.5) == "−1.50"
 
@@ -68,3 +71,25 @@ def test_latex_escapes_and_has_as_many_cells_as_columns() -> None:
     assert all(row.count(" & ") == 4 for row in rows)
     assert r"Q\_MDP" in rows[1]
     assert r"share (\%)" in rows[0]
+
+
+def test_a_column_without_values_is_in_the_file_alone() -> None:
+    table = Table("t", "", [Column("x"), Column("y")], [[1.0, None], [2.0, float("nan")]])
+    assert ">y<" not in table.html() and "textbf{y}" not in table.latex()
+    assert table.csv() == "x,y\n1.0,\n2.0,\n"
+
+
+def test_latex_letters_are_letters() -> None:
+    table = Table("t", "a\ncaption", [Column("x")], [["\\ { } $ ~ ^ & % # _"]])
+    lines = table.latex().splitlines()
+    assert lines[0] == "% a caption"
+    assert lines[5] == (
+        r"\textbackslash{} \{ \} \$ \textasciitilde{} \textasciicircum{} \& \% \# \_ \\"
+    )
+
+
+def test_a_cell_of_a_spreadsheet_is_no_formula() -> None:
+    rows = [[evil] for evil in ("=1+1", "+1", "-1", "@SUM(1)", "\t=1")]
+    lines = Table("t", "", [Column("x")], rows).csv().splitlines()
+    assert lines[1:] == [f"'{row[0]}" for row in rows]
+    assert Table("t", "", [Column("x")], [[-1.5]]).csv() == "x\n-1.5\n"

@@ -42,7 +42,9 @@ def finish(place: Path) -> None:
 def test_every_state_is_read_from_the_folder(tmp_path: Path) -> None:
     sweep = sweep_of(tmp_path / "s", "a", "b", "c", "d", "e")
     finish(begin(sweep / "a"))
-    begin(sweep / "b", "20,2000,30.0,4.0\n25,2500,,5.0\n26,2600,,5")  # the last row is being written
+    begin(
+        sweep / "b", "20,2000,30.0,4.0\n25,2500,,5.0\n26,2600,,5"
+    )  # the last row is being written
     begin(sweep / "c", "50,5000,45.0,10.0\n")
     (sweep / "d").mkdir()
     write_json(sweep / "d/failed.json", {"reason": "out of luck"})
@@ -68,7 +70,9 @@ def test_of_a_run_by_blocks_those_that_are_done_are_counted(tmp_path: Path) -> N
         assert statuses(tmp_path) == [Status("a", "running", 0.25)]
 
 
-def test_only_the_end_of_a_long_table_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_the_end_of_a_long_table_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(watch, "TAIL", 40)
     sweep = sweep_of(tmp_path / "s", "a")
     begin(sweep / "a", "".join(f"{i},{100 * i},{i / 2},{i / 10}\n" for i in range(1, 81)))
@@ -84,7 +88,12 @@ def test_a_table_without_a_whole_row_is_no_progress_yet(text: str, tmp_path: Pat
     assert statuses(sweep) == [Status("a", "cut")]
 
 
-def said(sweep: Path, monkeypatch: pytest.MonkeyPatch, *steps: Callable[[], object], terminal: bool = False) -> str:
+def said(
+    sweep: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    *steps: Callable[[], object],
+    terminal: bool = False,
+) -> str:
     """What is shown while `steps` happen, one between each look and the next."""
     left = list(steps)
     monkeypatch.setattr(watch.time, "sleep", lambda seconds: left.pop(0)())
@@ -95,7 +104,9 @@ def said(sweep: Path, monkeypatch: pytest.MonkeyPatch, *steps: Callable[[], obje
     return out.getvalue()
 
 
-def test_piped_a_line_comes_for_each_change_until_all_are_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_piped_a_line_comes_for_each_change_until_all_are_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     sweep = sweep_of(tmp_path / "s", "a", "b")
     with ExitStack() as running:
         running.enter_context(locked(sweep))
@@ -116,7 +127,7 @@ def test_piped_a_line_comes_for_each_change_until_all_are_over(tmp_path: Path, m
     assert lines == [
         "a: running, 20 %, gap 20.00, 16 s left",
         "a: done, gap 0.50",
-        "b: failed, out of luck",
+        "b: failed: out of luck",
         "2 runs: 1 done, 1 failed",
     ]
 

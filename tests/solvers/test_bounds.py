@@ -14,8 +14,8 @@ from tests.solvers.worlds import (
     reference_world,
     tiny_worlds,
 )
-from trackmdp.solvers import bounds, qmdp
-from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers import bounds, rules
+from trackmdp.solvers.value import evaluate
 from trackmdp.world.model import World
 
 
@@ -23,20 +23,30 @@ from trackmdp.world.model import World
 def test_reference_values(reference: dict) -> None:
     world = reference_world(reference)
     np.testing.assert_allclose(bounds.clocked(world), reference["clocked_bound"], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(bounds.valid(world), reference["paper_bound_valid"], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(bounds.paper(world), reference["paper_bound_as_printed"], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(evaluate(world, qmdp.solve(world)).value, reference["qmdp_value"], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        bounds.valid(world), reference["paper_bound_valid"], rtol=0, atol=1e-9
+    )
+    np.testing.assert_allclose(
+        bounds.paper(world), reference["paper_bound_as_printed"], rtol=0, atol=1e-9
+    )
+    np.testing.assert_allclose(
+        evaluate(world, rules.qmdp(world)).value, reference["qmdp_value"], rtol=0, atol=1e-9
+    )
 
 
 @pytest.mark.parametrize(
-    "row", PAPER_REFERENCES, ids=lambda row: f"Z{row['support_size']}-c{row['cost']}-T{row['t_max']}"
+    "row",
+    PAPER_REFERENCES,
+    ids=lambda row: f"Z{row['support_size']}-c{row['cost']}-T{row['t_max']}",
 )
 def test_the_papers_worlds(row: dict) -> None:
     world = paper_world(row["support_size"], row["cost"], row["t_max"])
     assert bounds.clocked(world).mean() == pytest.approx(row["clocked_bound"], abs=1e-9)
-    assert evaluate(world, qmdp.solve(world)).aihtr == pytest.approx(row["qmdp"], abs=1e-9)
+    assert evaluate(world, rules.qmdp(world)).aihtr == pytest.approx(row["qmdp"], abs=1e-9)
     if row["cost"] != 0.22 or row["support_size"] != 5:
-        assert evaluate(world, qmdp.clocked_policy(world)).aihtr == pytest.approx(row["best_known"], abs=1e-9)
+        assert evaluate(world, rules.clocked_policy(world)).aihtr == pytest.approx(
+            row["best_known"], abs=1e-9
+        )
 
 
 @given(tiny_worlds())
@@ -64,9 +74,15 @@ def test_a_probability_equal_to_the_threshold_is_sensed_whatever_its_rounding() 
     kernel[:, 1], kernel[:, 2] = 0.15, 0.6
     kernel[1, 1] = np.nextafter(0.15, 0)
     world = World(kernel, 2, cost=np.full(4, 0.15), safe_cost=0.6, t_max=0)
-    assert qmdp.solve(world).dense()[:, 0].tolist() == [[False, True, True, False]] * 4
-    assert qmdp.myopic(world, threshold=0.15).dense()[:, 0].tolist() == [[False, True, True, False]] * 4
-    assert qmdp.myopic(world, threshold=0.2).dense()[:, 0].tolist() == [[False, False, True, False]] * 4
+    assert rules.qmdp(world).dense()[:, 0].tolist() == [[False, True, True, False]] * 4
+    assert (
+        rules.myopic(world, threshold=0.15).dense()[:, 0].tolist()
+        == [[False, True, True, False]] * 4
+    )
+    assert (
+        rules.myopic(world, threshold=0.2).dense()[:, 0].tolist()
+        == [[False, False, True, False]] * 4
+    )
 
 
 def test_the_in_grid_threshold_senses_what_the_printed_one_leaves() -> None:
@@ -74,11 +90,13 @@ def test_the_in_grid_threshold_senses_what_the_printed_one_leaves() -> None:
     kernel = np.zeros((4, 4))
     kernel[:, 0], kernel[:, 1] = 0.4, 0.1
     world = World(kernel, 2, cost=np.full(4, 0.5), safe_cost=2.0, t_max=0)
-    assert qmdp.solve(world).dense().sum() == 0
-    assert qmdp.solve(world, in_grid=True).dense()[:, 0].tolist() == [[True, False, False, False]] * 4
+    assert rules.qmdp(world).dense().sum() == 0
+    assert (
+        rules.qmdp(world, in_grid=True).dense()[:, 0].tolist() == [[True, False, False, False]] * 4
+    )
 
 
 def test_costs_per_cell_set_the_threshold_per_cell() -> None:
     kernel = np.full((4, 4), 0.2)
     world = World(kernel, 2, cost=np.array([0.1, 0.3, 0.19, 0.21]), safe_cost=1.0, t_max=0)
-    assert qmdp.solve(world).dense()[:, 0].tolist() == [[True, False, True, False]] * 4
+    assert rules.qmdp(world).dense()[:, 0].tolist() == [[True, False, True, False]] * 4

@@ -11,13 +11,13 @@ from tests.solvers.worlds import all_plans, best_of_all, paper_world, random_tin
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import bounds, delayed, optimal, search
 from trackmdp.solvers.branch import Tree
-from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers.inner import InnerProblem
 from trackmdp.solvers.joint import Joint
 from trackmdp.solvers.known import tables
-from trackmdp.solvers.layers import reachable_layers
 from trackmdp.solvers.optimal import payment
-from trackmdp.solvers.search import InnerProblem
+from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.solution import SearchProgress
+from trackmdp.solvers.value import evaluate
 from trackmdp.world.model import World
 
 
@@ -29,7 +29,7 @@ def _tree() -> tuple[Tree, np.ndarray, np.ndarray]:
     """The renewals of the policy that the homotopy finds at Z = 5, c = 0.22, t_max = 2: some can be improved."""
     world = paper_world(5, 0.22, 2)
     value = evaluate(world, search.solve(world)).value
-    problem = InnerProblem.of(world, reachable_layers(world, 3), value)
+    problem = InnerProblem.of(Renewal(world, world.motion), value)
     known = tables(problem, slack=1e-9, run=_to_the_end)
     tree = Tree(problem, known, value, 1e-9)
     closed = Tree(problem, known, value, 1e-9)
@@ -87,8 +87,12 @@ def test_a_search_cut_short_keeps_a_bracket_around_the_optimum() -> None:
         assert solution.upper >= best - 1e-9
 
 
-@pytest.mark.parametrize("seed", [7, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (8, 9, 10))])
-def test_every_bound_is_above_the_best_of_all_plans(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "seed", [7, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (8, 9, 10))]
+)
+def test_every_bound_is_above_the_best_of_all_plans(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """80 worlds, the search stopped after 1, 30, 300 nodes or at its end: no policy exceeds what it claims.
 
     With the tables of positions revealed late, which close many of them at once, and by the tree alone. The slow ones
@@ -119,7 +123,7 @@ def test_what_is_paid_on_the_way_covers_what_any_plan_gains() -> None:
     for nodes in np.tile([0, 4, 16, 64], 10):
         world = random_tiny_world(rng)
         value = evaluate(world, PolicyTable.none(world)).value
-        problem = InnerProblem.of(world, reachable_layers(world, world.num_choices), value)
+        problem = InnerProblem.of(Renewal(world, world.motion), value)
         known = tables(problem, slack=1e-9, run=_to_the_end)
         tree = Tree(problem, known, value, 1e-9)
         tree.run(lambda tree, most=nodes: tree.nodes < most)
@@ -141,7 +145,9 @@ def test_what_is_paid_is_enough_by_its_own_rate_and_less_than_after_three_steps(
         steps.append(np.maximum(tree.rate(value, steps[-1]), 0.0))
     paid = payment(tree, value)
     assert (paid >= tree.rate(value, paid) - 1e-12).all()
-    assert (steps[4] < tree.rate(value, steps[4]) - 1e-4).any()  # an even number of steps is not enough
+    assert (
+        steps[4] < tree.rate(value, steps[4]) - 1e-4
+    ).any()  # an even number of steps is not enough
     assert (paid <= steps[3] + 1e-12).all()
     assert paid.mean() < 0.96 * steps[3].mean()
 
@@ -153,7 +159,11 @@ def test_joint_losses_hold_for_all_sets_of_undecided_cells() -> None:
         kernel = rng.random((6, 6)) ** 3 * (rng.random((6, 6)) < 0.6)
         kernel *= 0.95 / np.maximum(kernel.sum(axis=1, keepdims=True), 1e-9)
         world = World(kernel, (2, 3), cost=rng.uniform(0.0, 0.5, 6), t_max=1)
-        detected, ends, known = rng.normal(2.0, 1.0, 6), rng.normal(0.0, 1.0, 6), rng.normal(2.0, 1.0, 6)
+        detected, ends, known = (
+            rng.normal(2.0, 1.0, 6),
+            rng.normal(0.0, 1.0, 6),
+            rng.normal(2.0, 1.0, 6),
+        )
         cells, mass = np.arange(6)[None], rng.random((1, 6))
         joint = Joint(world, detected, [ends, known])
         after = joint.next(cells, np.ones((1, 6), dtype=bool))
@@ -166,7 +176,9 @@ def test_joint_losses_hold_for_all_sets_of_undecided_cells() -> None:
 
         for decided in (2, 3, 6):
             left = np.arange(6) < decided - (decided == 3)
-            own, added = joint.losses(after, cells, mass, 1, np.zeros(1, dtype=int), left[None], decided)
+            own, added = joint.losses(
+                after, cells, mass, 1, np.zeros(1, dtype=int), left[None], decided
+            )
             np.testing.assert_allclose(own[0], lost(left))
             for others in itertools.product([False, True], repeat=6 - decided):
                 chosen = left | np.array([False] * decided + list(others))

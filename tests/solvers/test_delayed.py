@@ -12,7 +12,7 @@ from tests.solvers.worlds import paper_world, random_tiny_world
 from trackmdp.solvers import delayed, optimal
 from trackmdp.solvers.choices import LeftOut
 from trackmdp.solvers.delayed import Delayed
-from trackmdp.solvers.renewal import forced_worth
+from trackmdp.solvers.linear import forced_worth
 from trackmdp.world.model import Array, World
 
 
@@ -36,7 +36,9 @@ def _worlds(count: int, seed: int) -> list[tuple[World, Array, Array]]:
     for number in range(count):
         world = replace(random_tiny_world(rng), t_max=2)
         if number % 2:
-            world = replace(world, detection=rng.uniform(0.5, 1.0, world.num_cells), safe_detection=0.8)
+            world = replace(
+                world, detection=rng.uniform(0.5, 1.0, world.num_cells), safe_detection=0.8
+            )
         detected = world.reward + rng.normal(0.0, 1.0, world.num_cells)
         made.append((world, detected, forced_worth(world, detected)))
     return made
@@ -58,7 +60,9 @@ def test_no_plan_beats_the_tables_and_what_is_exact_is() -> None:
             is_left = np.zeros((m, m), dtype=bool)
             moves = np.diff(world.kernel.indptr)
             for i in range(m):
-                is_left[i, tables.successors[i, : moves[i]]] = (number >> np.arange(moves[i])) % 2 > 0
+                is_left[i, tables.successors[i, : moves[i]]] = (
+                    number >> np.arange(moves[i])
+                ) % 2 > 0
             mass = world.kernel.toarray() * np.where(is_left, 1.0, 1.0 - world.detection)
             for sets in (0, 1, 2):
                 best = _best(world, mass, sets, detected, missed)

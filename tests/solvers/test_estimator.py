@@ -10,8 +10,8 @@ from hypothesis import given, settings
 
 from tests.solvers.worlds import paper_world, tiny_worlds
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers import estimator, optimal, qmdp
-from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers import estimator, optimal, rules
+from trackmdp.solvers.value import evaluate
 from trackmdp.world.model import BoolArray, World
 
 
@@ -25,7 +25,7 @@ def test_the_exact_form_is_the_belief(world: World) -> None:
 @settings(max_examples=25)
 @given(tiny_worlds(most_t_max=1))
 def test_the_belief_is_that_of_all_paths(world: World) -> None:
-    table = qmdp.solve(world)
+    table = rules.qmdp(world)
     chains = table.dense()
     for estimate in estimator.positions(world, table, evaluate(world, table).value):
         for x, cell, belief in zip(estimate.rows, estimate.cells, estimate.belief, strict=True):
@@ -70,7 +70,7 @@ def test_both_forms_by_hand() -> None:
 def test_accuracy_on_missed_steps() -> None:
     """Missed steps are those of the exact evaluation; the exact form is as good as the belief, the paper's is not."""
     world = paper_world(5, 0.22, 2)
-    chains = qmdp.solve(world)
+    chains = rules.qmdp(world)
     scored, exact = estimator.accuracy(world, chains), evaluate(world, chains)
     assert scored.missed_per_episode == pytest.approx((exact.steps - exact.detections).mean())
     assert scored.exact == pytest.approx(scored.bayes, abs=1e-9)
@@ -81,4 +81,9 @@ def test_accuracy_on_missed_steps() -> None:
 def test_nothing_missed_is_all_right() -> None:
     world = paper_world(5, 0.16, 0)
     scored = estimator.accuracy(world, PolicyTable.all_on(world))
-    assert (scored.paper, scored.exact, scored.bayes, scored.missed_per_episode) == (1.0, 1.0, 1.0, 0.0)
+    assert (scored.paper, scored.exact, scored.bayes, scored.missed_per_episode) == (
+        1.0,
+        1.0,
+        1.0,
+        0.0,
+    )

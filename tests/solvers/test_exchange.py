@@ -9,32 +9,36 @@ from hypothesis import strategies as st
 
 from tests.solvers.worlds import best_of_all, tiny_worlds
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers import exchange, optimal, plans, search
-from trackmdp.solvers.evaluate import evaluate
-from trackmdp.solvers.layers import layer_sets, policy_table, reachable_layers
-from trackmdp.solvers.search import InnerProblem
+from trackmdp.solvers import exchange, optimal, search
+from trackmdp.solvers.inner import InnerProblem
+from trackmdp.solvers.plans import Plans
+from trackmdp.solvers.renewal import Renewal
+from trackmdp.solvers.search import Found, candidates_of, columns_of
+from trackmdp.solvers.value import evaluate
 from trackmdp.world.make import make_world
 from trackmdp.world.model import BoolArray, World
 
 
-def improved(world: World, chains: BoolArray) -> PolicyTable:
-    """`[M, t_max + 1, M]` after exchange."""
-    layers = reachable_layers(world, world.num_choices)
-    start = layer_sets(layers, PolicyTable.from_dense(world, chains))
-    return policy_table(world, layers, exchange.exchanged(world, layers, start))
+def ascended(problem: InnerProblem, sets: list[BoolArray]) -> list[BoolArray]:
+    """Sets of which no single one can be changed for the better."""
+    return columns_of(problem.plans().ascend(candidates_of(sets), sweeps=9))
 
 
 @given(tiny_worlds(size=3, most_t_max=3, misses=True), st.integers(0, 2**32 - 1))
 def test_no_cells_value_falls_from_whatever_sets_it_starts(world: World, seed: int) -> None:
-    chains = np.random.default_rng(seed).random((9, world.num_choices, 9)) < 0.5
-    before, after = evaluate(world, chains).value, evaluate(world, improved(world, chains)).value
+    rng = np.random.default_rng(seed)
+    start = PolicyTable.from_dense(world, rng.random((9, world.num_choices, 9)) < 0.5)
+    before, after = (
+        evaluate(world, each).value for each in (start, exchange.improve(world, start))
+    )
     assert (after >= before - 1e-9 * (1.0 + np.abs(before))).all()
-    # Nor does what one round makes of the plans fall short of them, from whatever mass is left.
-    layers, mass = reachable_layers(world, world.num_choices), np.random.default_rng(seed).random(9)
-    problem = InnerProblem.of(world, layers, before)
-    sets = problem.ascend(layer_sets(layers, PolicyTable.from_dense(world, chains)), mass, sweeps=9)
+    # Nor are the plans worth less after one round, whatever the mass that is left.
+    renewal, mass = Renewal(world, world.motion), rng.random(9)
+    problem = InnerProblem.of(renewal, before)
+    plans, sets = problem.plans(mass), renewal.sets(start)
     worth = problem.worth(sets, mass)
-    assert (problem.worth(exchange.exchange(problem, sets, mass), mass) >= worth - 1e-9 * (1.0 + np.abs(worth))).all()
+    found = problem.worth(exchange.exchange(plans, sets, np.ones(9, dtype=bool)), mass)
+    assert (found >= worth - 1e-9 * (1.0 + np.abs(worth))).all()
 
 
 def test_one_round_gains_most_of_what_all_of_them_gain() -> None:
@@ -42,13 +46,19 @@ def test_one_round_gains_most_of_what_all_of_them_gain() -> None:
     start = search.solve(world)
     before, once, after = (
         evaluate(world, each).value
-        for each in (start, exchange.improve(world, start, once=True), exchange.improve(world, start))
+        for each in (
+            start,
+            exchange.improve(world, start, once=True),
+            exchange.improve(world, start),
+        )
     )
     assert (once >= before - 1e-9).all()
     assert 0.5 < (once.mean() - before.mean()) / (after.mean() - before.mean()) < 1.0 - 1e-6
 
 
-@settings(max_examples=30, derandomize=True)  # a search, not a proof: these 30 have to come out, others may not
+@settings(
+    max_examples=30, derandomize=True
+)  # a search, not a proof: these 30 have to come out, others may not
 @given(tiny_worlds(size=2, most_t_max=1))
 def test_tiny_worlds_are_solved_as_brute_force_solves_them(world: World) -> None:
     best = best_of_all(world)
@@ -56,46 +66,57 @@ def test_tiny_worlds_are_solved_as_brute_force_solves_them(world: World) -> None
     np.testing.assert_allclose(found, best, rtol=0, atol=1e-8 * (1.0 + np.abs(best).max()))
 
 
-def four_ways() -> tuple[World, InnerProblem]:
+def four_ways() -> InnerProblem:
     """From cell 0 to one of 1, 2, 3, 4, where the target stays but for an exit at .001; r = 1, c = .3, D = 5, V = 0."""
     kernel = 0.5 * np.eye(9)
     kernel[0, :5] = 0.0, 0.25, 0.25, 0.25, 0.25
     kernel[1:5, 1:5] = 0.999 * np.eye(4)
     world = World(kernel, 3, cost=0.3, safe_cost=5.0, t_max=1)
     detected = np.ones(9)
-    return world, InnerProblem(world, reachable_layers(world, 2), detected, world.kernel @ (detected - 5.0))
+    renewal = Renewal(world, world.motion)
+    return InnerProblem(renewal, detected, world.kernel @ (detected - 5.0), 2)
 
 
 @pytest.mark.parametrize(("first", "then"), [((1, 2, 3, 4), ()), ((1, 2, 3), (4,))])
-def test_one_or_two_cells_are_left_for_the_next_set(first: tuple[int, ...], then: tuple[int, ...]) -> None:
+def test_one_or_two_cells_are_left_for_the_next_set(
+    first: tuple[int, ...], then: tuple[int, ...]
+) -> None:
     """Sensing k of the four cells and then the rest earns k/4 - .3 k + .999 (1 - k/4) (1 - .3 (4 - k)).
 
     That is -.2, .0248, .0998, .0249, -.2 for k = 0 ... 4: best is to halve the search, .5 - .6 + .999 · .5 · .4. With k
     = 4 or 3 no other set is better at either step, while the other step's stays as it is.
     """
-    _, problem = four_ways()
-    mass = np.ones(9)
+    problem = four_ways()
+    choices = problem.renewal.choices
     sets = [
-        np.isin(layer.cells, cells) & (layer.rows == 0)
-        for layer, cells in zip(problem.layers[1:], (first, then), strict=True)
+        np.isin(choice.sensors, cells) & (choice.rows == 0)
+        for choice, cells in zip(choices, (first, then), strict=True)
     ]
     stuck = [
-        on[layer.rows == 0] for layer, on in zip(problem.layers[1:], problem.ascend(sets, mass, sweeps=9), strict=True)
+        on[choice.rows == 0] for choice, on in zip(choices, ascended(problem, sets), strict=True)
     ]
     assert [on.sum() for on in stuck] == [len(first), len(then)]
-    found = exchange.exchange(problem, sets, mass)
-    assert problem.worth(found, mass)[0] == pytest.approx(0.5 - 0.6 + 0.999 * 0.5 * 0.4, abs=1e-12)
+    found = exchange.exchange(problem.plans(), sets, np.ones(9, dtype=bool))
+    assert problem.worth(found)[0] == pytest.approx(0.5 - 0.6 + 0.999 * 0.5 * 0.4, abs=1e-12)
 
 
 @pytest.mark.parametrize(
     ("kernel", "cost", "options"),
-    [("drift", 0.22, {"persistence": 0.5}), ("drift", 0.3, {"persistence": 0.7}), ("random_walk", 0.4, {})],
+    [
+        ("drift", 0.22, {"persistence": 0.5}),
+        ("drift", 0.3, {"persistence": 0.7}),
+        ("random_walk", 0.4, {}),
+    ],
 )
-def test_drifts_and_walks_reach_the_certified_optimum(kernel: str, cost: float, options: dict[str, float]) -> None:
+def test_drifts_and_walks_reach_the_certified_optimum(
+    kernel: str, cost: float, options: dict[str, float]
+) -> None:
     world = make_world(kernel, size=10, cost=cost, t_max=1, **options)
     best = optimal.solve(world)
     assert best.certified
-    assert evaluate(world, exchange.solve(world)).aihtr == pytest.approx(best.lower, abs=1e-6 * abs(best.lower))
+    assert evaluate(world, exchange.solve(world)).aihtr == pytest.approx(
+        best.lower, abs=1e-6 * abs(best.lower)
+    )
     assert evaluate(world, search.solve(world)).aihtr < best.lower - 1.0
 
 
@@ -103,8 +124,11 @@ def test_parts_and_windows(monkeypatch: pytest.MonkeyPatch) -> None:
     """However many located cells fit into a part, the sets are the same, and none leaves the window."""
     world = make_world("random_walk", size=6, cost=0.3, t_max=2, window=1)
     whole = exchange.solve(world).sets
-    assert evaluate(world, PolicyTable(world, whole)).aihtr > evaluate(world, search.solve(world)).aihtr + 1.0
-    monkeypatch.setattr(plans, "MOST_NUMBERS", 1)
+    assert (
+        evaluate(world, PolicyTable(world, whole)).aihtr
+        > evaluate(world, search.solve(world)).aihtr + 1.0
+    )
+    monkeypatch.setattr(exchange, "MOST_NUMBERS", 1)
     alone = exchange.solve(world).sets
     assert whole is not None
     assert alone is not None
@@ -114,24 +138,28 @@ def test_parts_and_windows(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_each_cell_takes_the_best_plan_of_all_starts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Half of the cells have good plans in one start, half in another; each is poor elsewhere."""
     world = make_world("drift", size=4, persistence=0.5, cost=0.3, t_max=2, exit_probability=0.02)
-    best, layers = exchange.solve(world, 0), reachable_layers(world, 3)
-    monkeypatch.setattr(exchange, "exchange", lambda problem, sets, *_, **__: sets)  # the plans as they are
-    monkeypatch.setattr(InnerProblem, "ascend", lambda _, sets, *__, **___: sets)
-    good, none = layer_sets(layers, best), layer_sets(layers, PolicyTable.none(world))
+    best, renewal = exchange.solve(world, 0), Renewal(world, world.motion)
+    # The plans as they are.
+    monkeypatch.setattr(exchange, "exchange", lambda _, sets, *__: sets)
+    monkeypatch.setattr(Plans, "ascend", lambda _, sets, **__: sets)
+    good, none = renewal.sets(best), renewal.sets(PolicyTable.none(world))
     halves = [
-        [np.where((layer.rows < 8) == first, *on) for layer, *on in zip(layers[1:], good, none, strict=True)]
+        [
+            np.where((choice.rows < 8) == first, *on)
+            for choice, *on in zip(renewal.choices, good, none, strict=True)
+        ]
         for first in (True, False)
     ]
-    found = policy_table(world, layers, exchange.best_of(world, layers, none, halves))
-    assert (found.sets != best.sets).nnz == 0
-    kept = exchange.best_of(world, layers, good, [none, *halves])
-    assert all((new == old).all() for new, old in zip(kept, good, strict=True))
+    found = exchange.best_of(renewal, Found(renewal, none), halves)
+    assert (renewal.table(found.sets).sets != best.sets).nnz == 0
+    kept = exchange.best_of(renewal, Found(renewal, good), [none, *halves])
+    assert all((new == old).all() for new, old in zip(kept.sets, good, strict=True))
 
 
 def test_other_starts_are_led_by_other_prices_and_end_higher() -> None:
     world = make_world("random_walk", size=6, cost=0.15, t_max=2, diagonal=True)
-    layers = reachable_layers(world, world.num_choices)
-    first, again = (list(exchange.other_starts(world, layers, 2)) for _ in range(2))
+    renewal = Renewal(world, world.motion)
+    first, again = (list(exchange.other_starts(renewal, world, 2)) for _ in range(2))
     assert all(
         (one == other).all()
         for each, same in zip(first, again, strict=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,10 +20,11 @@ from tests.solvers.worlds import (
 )
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import bounds, delayed, optimal, search
-from trackmdp.solvers.evaluate import evaluate
-from trackmdp.solvers.layers import Layer, layer_sets, policy_table, reachable_layers
-from trackmdp.solvers.search import InnerProblem
+from trackmdp.solvers.inner import InnerProblem
+from trackmdp.solvers.renewal import Renewal
+from trackmdp.solvers.search import Found, candidates_of, columns_of
 from trackmdp.solvers.solution import SearchProgress
+from trackmdp.solvers.value import evaluate
 from trackmdp.world.kernels import drift, random_walk
 from trackmdp.world.model import BoolArray, World
 
@@ -32,7 +34,9 @@ def assert_optimal(world: World, best: np.ndarray, tolerance: float = 1e-9) -> N
     scale = 1.0 + np.abs(best).max()
     assert solution.certified
     np.testing.assert_allclose(solution.value, best, rtol=0, atol=2 * tolerance * scale)
-    np.testing.assert_allclose(solution.value, evaluate(world, solution.table).value, rtol=0, atol=1e-12 * scale)
+    np.testing.assert_allclose(
+        solution.value, evaluate(world, solution.table).value, rtol=0, atol=1e-12 * scale
+    )
     assert (best <= solution.bound + 1e-9 * scale).all()
     assert solution.lower <= solution.upper
 
@@ -47,7 +51,9 @@ def test_reference_values(reference: dict) -> None:
 
 
 @pytest.mark.parametrize(
-    "row", PAPER_REFERENCES, ids=lambda row: f"Z{row['support_size']}-c{row['cost']}-T{row['t_max']}"
+    "row",
+    PAPER_REFERENCES,
+    ids=lambda row: f"Z{row['support_size']}-c{row['cost']}-T{row['t_max']}",
 )
 def test_the_papers_worlds_are_certified(row: dict) -> None:
     world = paper_world(row["support_size"], row["cost"], row["t_max"])
@@ -72,15 +78,14 @@ def test_every_chain_of_a_3x3_world_tried(world: World) -> None:
 def test_the_search_ends_where_no_single_set_can_be_improved(world: World) -> None:
     table = search.solve(world)
     value = evaluate(world, table).value
-    layers = reachable_layers(world, world.num_choices)
-    sets = layer_sets(layers, table)
-    np.testing.assert_array_equal(policy_table(world, layers, sets).dense(), table.dense())
-    problem = InnerProblem.of(world, layers, value)
-    located = np.ones(world.num_cells)
-    worth = problem.worth(sets, located)
+    renewal = Renewal(world, world.motion)
+    sets = renewal.sets(table)
+    np.testing.assert_array_equal(renewal.table(sets).dense(), table.dense())
+    problem = InnerProblem.of(renewal, value)
+    worth = problem.worth(sets)
     np.testing.assert_allclose(worth, value, rtol=1e-9, atol=1e-9)
-    ascended = problem.worth(problem.ascend(sets, located, sweeps=1), located)
-    np.testing.assert_allclose(ascended, worth, rtol=1e-9, atol=1e-9)
+    ascended = columns_of(problem.plans().ascend(candidates_of(sets), sweeps=1))
+    np.testing.assert_allclose(problem.worth(ascended), worth, rtol=1e-9, atol=1e-9)
 
 
 def test_the_homotopy_finds_sets_that_have_to_change_together() -> None:
@@ -147,7 +152,9 @@ def test_the_same_world_gives_the_same_policy() -> None:
 
 def _kernel_with_edges() -> np.ndarray:
     """3x3: a row of one cell, a cell that cannot be reached, a strong asymmetry, exit 1e-6 but from one cell."""
-    kernel = drift(3, direction=0.0, persistence=0.9, exit_probability=1e-6, border="renormalize").toarray()
+    kernel = drift(
+        3, direction=0.0, persistence=0.9, exit_probability=1e-6, border="renormalize"
+    ).toarray()
     kernel[:, 4] = 0.0
     kernel[0] = 0.0
     kernel[0, 1] = 1.0 - 1e-6
@@ -171,7 +178,9 @@ def test_numeric_edges(name: str, shape: str) -> None:
     cost = np.broadcast_to(price, (9,)).astype(float)
     walk = random_walk(3, stay=0.2, diagonal=False, exit_probability=0.01, border="clip")
     kernel = _kernel_with_edges() if shape == "edges" else walk
-    world = World(kernel, 3, cost=cost, safe_cost=float(cost.sum()) if safe is None else safe, t_max=t_max)
+    world = World(
+        kernel, 3, cost=cost, safe_cost=float(cost.sum()) if safe is None else safe, t_max=t_max
+    )
     solution = optimal.solve(world)
     scale = 1.0 + np.abs(solution.bound).max()
     assert np.isfinite(solution.value).all()
@@ -228,16 +237,21 @@ def test_a_time_limit_is_said_where_it_ends_the_search(monkeypatch: pytest.Monke
     monkeypatch.setattr("time.monotonic", FastClock())
     solution = optimal.solve(open_world(), time_limit=1.0)
     assert solution.timed_out
-    assert solution.ended == "not closed, stopped by the time limit (another machine may end elsewhere)"
+    assert (
+        solution.ended
+        == "not closed, stopped by the time limit (another machine may end elsewhere)"
+    )
     # nothing was left to stop
     assert not optimal.solve(paper_world(3, 0.16, 3), time_limit=1.0).timed_out
 
 
-def test_the_solution_is_no_worse_than_the_policy_it_was_handed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_solution_is_no_worse_than_the_policy_it_was_handed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     world = paper_world(5, 0.22, 2)
     best = optimal.solve(world)
     # Without the exchange, which finds the optimum of all worlds small enough to be certified in a test.
-    monkeypatch.setattr(optimal, "exchanged", lambda world, layers, sets, **_: sets)
+    monkeypatch.setattr(optimal, "exchanged", lambda _, policy, **__: policy)
     alone = optimal.solve(world, nodes=1)
     assert alone.lower < best.lower
     handed = optimal.solve(world, nodes=1, start=best.table)
@@ -248,28 +262,37 @@ def test_the_solution_is_no_worse_than_the_policy_it_was_handed(monkeypatch: pyt
     assert np.array_equal(poor.bound, alone.bound)
 
 
-def test_an_open_bracket_is_searched_again_from_other_starts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_open_bracket_is_searched_again_from_other_starts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """A better policy that they lead to is used."""
     world = open_world()
     better = optimal.solve(world, nodes=1).table
     # without exchange the first policy is worse, and stays so unless a restart is used
-    monkeypatch.setattr(optimal, "exchanged", lambda world, layers, sets, **_: sets)
+    monkeypatch.setattr(optimal, "exchanged", lambda _, policy, **__: policy)
     monkeypatch.setattr(optimal, "FIRST_NODES", 1_000)
     found: list[BoolArray] = []
 
     def restarted(
-        world: World,
-        layers: list[Layer],
-        sets: list[BoolArray],
-        others: Iterable[list[BoolArray]],
-        *_: object,
-        **__: object,
-    ) -> list[BoolArray]:
+        renewal: Renewal, policy: Found, others: Iterable[list[BoolArray]], **_: Any
+    ) -> Found:
         assert len(list(others)) == optimal.RESTARTS
-        return found or sets
+        return Found(renewal, found) if found else policy
 
     monkeypatch.setattr(optimal, "best_of", restarted)
     alone = optimal.solve(world, nodes=4_000)
-    found = layer_sets(reachable_layers(world, 3), better)
+    found = Renewal(world, world.motion).sets(better)
     solution = optimal.solve(world, nodes=4_000)
     assert solution.lower >= evaluate(world, better).aihtr > alone.lower
+
+
+def test_where_the_state_is_known_at_a_detection_memory_changes_nothing() -> None:
+    """Nor does a policy of other keys to start from, whose rows are not those of cells."""
+    world = paper_world(5, 0.22, 1)
+    remembering = world.but(memory="displacement", clip=1)
+    plain = optimal.solve(world)
+    found = optimal.solve(remembering, start=PolicyTable.all_on(remembering))
+    assert found.certified
+    assert found.table.task.memory == "cell"
+    assert np.array_equal(found.value, plain.value)
+    assert np.array_equal(found.bound, plain.bound)

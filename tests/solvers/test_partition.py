@@ -63,8 +63,12 @@ def test_the_reach_is_that_of_the_longest_move() -> None:
 
 
 @pytest.mark.parametrize(("cost", "t_max"), [(0.16, 1), (0.22, 2)])
-def test_with_the_default_halo_blocks_lose_nothing_and_without_one_they_do(cost: float, t_max: int) -> None:
-    world = tm.make_world("random_support", size=14, support_size=5, radius=1, cost=cost, t_max=t_max, safe_cost=8)
+def test_with_the_default_halo_blocks_lose_nothing_and_without_one_they_do(
+    cost: float, t_max: int
+) -> None:
+    world = tm.make_world(
+        "random_support", size=14, support_size=5, radius=1, cost=cost, t_max=t_max, safe_cost=8
+    )
     whole = tm.solve(world)
     wide = tm.solve(world, block=5)
     assert whole.lower - wide.lower <= 1e-4 * whole.evaluation.expected_length
@@ -79,7 +83,9 @@ def test_with_the_default_halo_blocks_lose_nothing_and_without_one_they_do(cost:
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:partition.halo=0")
 def test_sweeps_over_the_whole_grid_mend_what_blocks_cannot() -> None:
-    world = tm.make_world("random_support", size=12, support_size=5, radius=1, cost=0.22, t_max=1, safe_cost=8)
+    world = tm.make_world(
+        "random_support", size=12, support_size=5, radius=1, cost=0.22, t_max=1, safe_cost=8
+    )
     whole, alone = tm.solve(world), tm.solve(world, block=4, halo=0, sweeps=0)
     once, mended = (tm.solve(world, block=4, halo=0, sweeps=sweeps) for sweeps in (1, 10))
     assert alone.lower < once.lower <= mended.lower <= whole.upper + 1e-9
@@ -89,7 +95,11 @@ def test_sweeps_over_the_whole_grid_mend_what_blocks_cannot() -> None:
     # a round that gains nothing is the last one
     rounds: list[int] = []
     again = regions.settled(
-        world, mended.table, 4, 10, lambda work, jobs: [rounds.append(len(jobs)), in_turn(work, jobs)][1]
+        world,
+        mended.table,
+        4,
+        10,
+        lambda work, jobs: [rounds.append(len(jobs)), in_turn(work, jobs)][1],
     )
     assert rounds == [9]
     assert again is mended.table
@@ -131,7 +141,9 @@ def test_no_more_workers_are_started_than_there_are_blocks(monkeypatch: pytest.M
     monkeypatch.setattr("trackmdp.solvers.solve.crew", noted)
     tm.solve(tm.make_world("random_walk", size=5), block=3, workers=1000)
     assert asked == [4]
-    with pytest.raises(UserError, match=r"partition.workers=1000000: expected an integer from 1 to 1024"):
+    with pytest.raises(
+        UserError, match=r"partition.workers=1000000: expected an integer from 1 to 1024"
+    ):
         tm.solve(tm.make_world("random_walk", size=5), block=3, workers=1_000_000)
 
 
@@ -252,7 +264,9 @@ def test_what_comes_while_workers_start_is_heard_afterwards(kind: signal.Signals
         blocked = signal.pthread_sigmask(signal.SIG_BLOCK, [])
         reached.append(blocked)
     assert told.value.signal == kind
-    assert reached == [{signal.SIGINT, signal.SIGUSR1}]  # which a worker inherits; by SIGTERM it is ended
+    assert reached == [
+        {signal.SIGINT, signal.SIGUSR1}
+    ]  # which a worker inherits; by SIGTERM it is ended
     assert not signal.pthread_sigmask(signal.SIG_BLOCK, [])
 
 
@@ -266,7 +280,9 @@ def test_a_policy_of_another_grid_cannot_be_put_together() -> None:
     def whole(number: int, world: World) -> tm.Policy:
         return tm.Policy.all_on(tm.make_world(size=8))
 
-    with pytest.raises(UserError, match="policy: made for 8 x 8 cells, t_max 1; expected 7 x 7 cells, t_max 1"):
+    with pytest.raises(
+        UserError, match="policy: made for 8 x 8 cells, t_max 1; expected 7 x 7 cells, t_max 1"
+    ):
         plan_by_blocks(tm.make_world(size=8), whole, 4)
 
 
@@ -281,7 +297,9 @@ def test_a_policy_that_draws_cannot_be_put_together() -> None:
 def test_blocks_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["solve", "grid.size=8", f"hydra.run.dir={tmp_path / 'a'}"]
     assert main([*words, "partition.block=4", "partition.halo=1"]) == 0
-    assert "warning: partition.halo=1: below 3 = R (T_max + 2)" in " ".join(capsys.readouterr().out.split())
+    assert "warning: partition.halo=1: below 3 = R (T_max + 2)" in " ".join(
+        capsys.readouterr().out.split()
+    )
     assert main([*words, "partition.halo=1"]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1

@@ -35,6 +35,8 @@ def test_belief_states_are_counted_once() -> None:
 
 
 def test_too_many_beliefs_are_refused() -> None:
-    world = World(np.random.default_rng(0).random((4, 4)) / 5, 2, cost=np.full(4, 0.1), safe_cost=0.4, t_max=2)
+    world = World(
+        np.random.default_rng(0).random((4, 4)) / 5, 2, cost=np.full(4, 0.1), safe_cost=0.4, t_max=2
+    )
     with pytest.raises(UserError, match="more than 100 belief states"):
         pomdp.solve(world, most_beliefs=100)

@@ -12,17 +12,20 @@ from hypothesis import given, settings
 import trackmdp as tm
 from tests.solvers.worlds import best_of_all, tiny_worlds
 from trackmdp.errors import UserError
-from trackmdp.solvers import optimal, qmdp, regions
-from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers import optimal, regions, rules
 from trackmdp.solvers.exchange import exchange
-from trackmdp.solvers.layers import layer_sets, policy_table, reachable_layers
-from trackmdp.solvers.search import InnerProblem
+from trackmdp.solvers.inner import InnerProblem
+from trackmdp.solvers.renewal import Renewal
+from trackmdp.solvers.search import candidates_of, columns_of
 from trackmdp.solvers.solution import SearchProgress, Solution
+from trackmdp.solvers.value import evaluate
 from trackmdp.world.make import make_world
 from trackmdp.world.model import World
 
 
-def by_regions(world: World, side: int, monkeypatch: pytest.MonkeyPatch, **options: object) -> Solution:
+def by_regions(
+    world: World, side: int, monkeypatch: pytest.MonkeyPatch, **options: object
+) -> Solution:
     with monkeypatch.context() as patch:
         patch.setattr(optimal, "region_side", lambda *_: side)
         return optimal.solve(world, **options)  # type: ignore[arg-type]
@@ -42,13 +45,22 @@ def test_every_chain_of_tiny_worlds_tried(world: World) -> None:
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"t_max": 2}, {"window": 1, "cost": 0.2, "safe_cost": 4.0}, {"p_d": 0.95, "cost": 0.2, "safe_cost": 4.0}],
+    [
+        {},
+        {"t_max": 2},
+        {"window": 1, "cost": 0.2, "safe_cost": 4.0},
+        {"p_d": 0.95, "cost": 0.2, "safe_cost": 4.0},
+    ],
     ids=["t_max 1", "t_max 2", "window", "misses"],
 )
-def test_regions_end_where_the_whole_grid_does(options: dict, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_regions_end_where_the_whole_grid_does(
+    options: dict, monkeypatch: pytest.MonkeyPatch
+) -> None:
     world = _world(10, **options)
     whole = optimal.solve(world)
-    assert float(evaluate(world, qmdp.clocked_policy(world)).aihtr) < whole.lower - 1e-3  # there is something to search
+    assert (
+        float(evaluate(world, rules.clocked_policy(world)).aihtr) < whole.lower - 1e-3
+    )  # there is something to search
     found = by_regions(world, 5, monkeypatch)
     assert whole.certified and found.certified
     assert found.lower == pytest.approx(whole.lower, rel=2e-6)
@@ -57,12 +69,12 @@ def test_regions_end_where_the_whole_grid_does(options: dict, monkeypatch: pytes
 
 def test_a_round_is_the_round_of_the_whole_grid_whatever_the_side() -> None:
     world = _world(11)
-    policy = qmdp.clocked_policy(world)
+    policy = rules.clocked_policy(world)
     value = evaluate(world, policy).value
-    layers, located = reachable_layers(world, world.num_choices), np.ones(world.num_cells)
-    problem = InnerProblem.of(world, layers, value)
-    sets = problem.ascend(layer_sets(layers, policy), located, sweeps=10)
-    whole = policy_table(world, layers, exchange(problem, sets, located)).dense()
+    renewal = Renewal(world, world.motion)
+    plans = InnerProblem.of(renewal, value).plans()
+    sets = columns_of(plans.ascend(candidates_of(renewal.sets(policy)), sweeps=10))
+    whole = renewal.table(exchange(plans, sets, np.ones(world.num_cells, dtype=bool))).dense()
     for side in (3, 4, 11):
         found = regions.improved(world, policy, value, side, lambda _: True)
         np.testing.assert_array_equal(found.dense(), whole)
@@ -70,13 +82,14 @@ def test_a_round_is_the_round_of_the_whole_grid_whatever_the_side() -> None:
 
 def test_what_is_proved_of_a_plan_holds_for_each_cell() -> None:
     world = _world(8)
-    policy = qmdp.clocked_policy(world)
+    policy = rules.clocked_policy(world)
     value = evaluate(world, policy).value
-    short, better = regions.proved(world, policy, value, 3, 1e-9, lambda _, __, tree: tree.run(lambda _: True))
+    short, better = regions.proved(
+        world, policy, value, 3, 1e-9, lambda _, __, tree: tree.run(lambda _: True)
+    )
     # One step of policy iteration gains no more than is proved, at no cell, and closes it where trees are closed.
-    layers = reachable_layers(world, world.num_choices)
-    problem = InnerProblem.of(world, layers, value)
-    gained = problem.worth(layer_sets(layers, better), np.ones(world.num_cells)) - value
+    renewal = Renewal(world, world.motion)
+    gained = InnerProblem.of(renewal, value).worth(renewal.sets(better)) - value
     assert short.max() > 1e-3
     np.testing.assert_allclose(gained, short, rtol=0, atol=1e-7)
 
@@ -110,7 +123,9 @@ def test_memory_decides_on_the_side_of_a_region() -> None:
     assert narrow is not None and 1 <= narrow < side
     # the sizes add up: what all of it takes is below the limit
     assert regions._whole_bytes(large) + regions._region_bytes(large, narrow) <= 125 * 2**20
-    with pytest.raises(UserError, match=r"solver.memory=80MiB: 150 x 150 cells need about 0\.\d\d GiB, expected at"):
+    with pytest.raises(
+        UserError, match=r"solver.memory=80MiB: 150 x 150 cells need about 0\.\d\d GiB, expected at"
+    ):
         regions.region_side(large, "80MiB")
 
 
@@ -119,19 +134,29 @@ def test_memory_grows_with_what_is_left_unsensed() -> None:
     costs = {0.16: (95, 190), 0.22: (450, 650)}
     for cost, (least, most) in costs.items():
         world = make_world(
-            "random_support", size=160, support_size=5, radius=2, cost=cost, t_max=3, safe_cost=100 * cost
+            "random_support",
+            size=160,
+            support_size=5,
+            radius=2,
+            cost=cost,
+            t_max=3,
+            safe_cost=100 * cost,
         )
         assert least <= regions._whole_bytes(world) / 2**20 <= most
 
 
 def test_what_the_machine_lacks_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(regions, "free_bytes", lambda: 2**25)
-    with pytest.raises(UserError, match=r"solver.memory=null: .* need about .* 0\.03 GiB are available"):
+    with pytest.raises(
+        UserError, match=r"solver.memory=null: .* need about .* 0\.03 GiB are available"
+    ):
         regions.region_side(_world(12))
 
 
 def test_a_size_that_is_none_is_refused() -> None:
-    with pytest.raises(UserError, match=r"solver.memory=2GB: expected bytes, or a size such as 500MiB or 2GiB"):
+    with pytest.raises(
+        UserError, match=r"solver.memory=2GB: expected bytes, or a size such as 500MiB or 2GiB"
+    ):
         tm.solve(_world(4), memory="2GB")
 
 
@@ -139,6 +164,10 @@ def _world(size: int, **options: Any) -> World:
     """Five successors of which the last is not worth a sensor: clocked plans are not the best ones."""
     p_d = options.pop("p_d", 1.0)
     world = make_world(
-        "random_support", size=size, support_size=5, radius=2, **{"cost": 0.22, "safe_cost": 22.0, **options}
+        "random_support",
+        size=size,
+        support_size=5,
+        radius=2,
+        **{"cost": 0.22, "safe_cost": 22.0, **options},
     )
     return replace(world, detection=np.full(world.num_cells, p_d))

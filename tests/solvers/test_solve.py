@@ -11,19 +11,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.solvers.worlds import best_of_all, paper_world, tiny_worlds, value_of
+from tests.solvers.chain import by_cell, totals_of
+from tests.solvers.worlds import best_of_all, paper_world, tiny_worlds
 from trackmdp.config import GROUPS
 from trackmdp.errors import UserError
 from trackmdp.solvers import bounds, optimal
-from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.solution import SearchProgress, Solution
 from trackmdp.solvers.solve import solve
+from trackmdp.solvers.value import evaluate
 from trackmdp.world.model import World
 
 SOLVERS = sorted(GROUPS["solver"])
 
 
-def rectangle(rng: np.random.Generator, rows: int, columns: int, window: int | None, t_max: int = 1) -> World:
+def rectangle(
+    rng: np.random.Generator, rows: int, columns: int, window: int | None, t_max: int = 1
+) -> World:
     """A world whose target moves up to one cell, most moves at random, so that two moves may leave a window of one.
 
     Sensors are cheap enough to be wanted there, and too dear to be switched on at once.
@@ -49,7 +52,8 @@ def test_a_solution_is_what_it_says(solver: str, world: World) -> None:
     """Value by stepping through the plans one set at a time; the optimum of all plans within the bracket."""
     solution = solve(world, solver)
     scale = 1.0 + np.abs(solution.bound).max()
-    np.testing.assert_allclose(solution.value, value_of(world, solution.table.dense()), rtol=0, atol=1e-9 * scale)
+    value = by_cell(world, totals_of(world, solution.table)[:, 0])
+    np.testing.assert_allclose(solution.value, value, rtol=0, atol=1e-9 * scale)
     assert (solution.value <= solution.bound + 1e-9 * scale).all()
     best = best_of_all(world)
     assert (solution.value <= best + 1e-8 * scale).all()
@@ -83,12 +87,14 @@ def test_the_optimum_with_a_window_is_that_of_all_plans_within_it(seed: int) -> 
     """On 2 x 3 cells every pair of sets within the window is tried; wide windows change nothing."""
     rng = np.random.default_rng(seed)
     world = rectangle(rng, 2, 3, window=1)
-    best = best_of_all(world, allowed=distance(world) <= 1)
+    best = best_of_all(world)
     solution = solve(world, tolerance=1e-9)
     assert solution.certified
     np.testing.assert_allclose(solution.value, best, rtol=0, atol=1e-7)
     words = {"cost": world.cost, "t_max": world.t_max}
-    wide, free = (solve(World(world.kernel, (2, 3), window=window, **words)) for window in (2, None))
+    wide, free = (
+        solve(World(world.kernel, (2, 3), window=window, **words)) for window in (2, None)
+    )
     assert np.array_equal(wide.value, free.value)
 
 
@@ -102,7 +108,9 @@ def test_the_bracket_and_the_figures_are_those_of_the_parts() -> None:
     assert (solution.policy.sets != solution.table.sets).nnz == 0
 
 
-def test_nothing_is_searched_where_the_clocked_policy_attains_its_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_searched_where_the_clocked_policy_attains_its_bound(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Z = 3 at any price: at most one possible cell is left unsensed."""
     monkeypatch.delattr(optimal, "follow_credit")
     seen: list[SearchProgress] = []

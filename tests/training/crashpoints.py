@@ -22,7 +22,13 @@ from tests.training.runs import assert_same_run, train
 from trackmdp.errors import RunError
 
 OPERATIONS = ("link", "replace", "rename", "unlink", "fsync", "mkdir", "ftruncate")
-LOGGED = ("log=[mcap]", "log.mcap.episodes=2", "log.mcap.evaluations=1", "evaluation.every=2", "checkpoint.every=512")
+LOGGED = (
+    "log=[mcap]",
+    "log.mcap.episodes=2",
+    "log.mcap.evaluations=1",
+    "evaluation.every=2",
+    "checkpoint.every=512",
+)
 FAILURES = (errno.ENOSPC, errno.EIO, errno.EPERM)
 
 
@@ -66,7 +72,9 @@ class Disk:
     def lose_power(self) -> None:
         """Cut each file to its length at its last fsync."""
         for file in self.folder.rglob("*"):
-            if file.is_file() and file.stat().st_size > (kept := self.synced.get(file.stat().st_ino, 0)):
+            if file.is_file() and file.stat().st_size > (
+                kept := self.synced.get(file.stat().st_ino, 0)
+            ):
                 os.truncate(file, kept)
 
 

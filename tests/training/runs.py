@@ -16,12 +16,29 @@ from trackmdp.training import checkpoint
 from trackmdp.training.loggers import CsvLogger
 
 TIMED = ("seconds", "frames_per_second")
-QUICK = ("grid.size=3", "quiet=true", "optimal.enabled=false", "evaluation.every=4", "checkpoint.seconds=null")
-BUDGET = ("collector.total_frames=2048", "collector.frames_per_batch=256", "collector.envs=32", "checkpoint.every=256")
+QUICK = (
+    "grid.size=3",
+    "quiet=true",
+    "optimal.enabled=false",
+    "evaluation.every=4",
+    "checkpoint.seconds=null",
+)
+BUDGET = (
+    "collector.total_frames=2048",
+    "collector.frames_per_batch=256",
+    "collector.envs=32",
+    "checkpoint.every=256",
+)
 SMALL = {
     "ppo": ("algo=ppo", "algo.hidden=16"),
     "a2c": ("algo=a2c", "algo.hidden=16"),
-    "dqn": ("algo=dqn", "algo.hidden=16", "algo.buffer_size=1000", "algo.batch_size=64", "algo.updates=2"),
+    "dqn": (
+        "algo=dqn",
+        "algo.hidden=16",
+        "algo.buffer_size=1000",
+        "algo.batch_size=64",
+        "algo.updates=2",
+    ),
     "hindsight": (
         "algo=hindsight",
         "algo.hidden=16",
@@ -70,7 +87,11 @@ def tensors(state: Any, prefix: str = "") -> dict[str, Any]:
                 found |= tensors(value, f"{prefix}.{key}")
         return found
     if isinstance(state, (list, tuple)):
-        return {k: v for i, value in enumerate(state) for k, v in tensors(value, f"{prefix}[{i}]").items()}
+        return {
+            k: v
+            for i, value in enumerate(state)
+            for k, v in tensors(value, f"{prefix}[{i}]").items()
+        }
     return {prefix: state}
 
 

@@ -14,7 +14,7 @@ import pytest
 import trackmdp as tm
 from trackmdp.app.cli import main
 from trackmdp.errors import Preempted, UserError
-from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers.value import evaluate
 from trackmdp.training.callbacks import Callback
 from trackmdp.training.lock import locked
 from trackmdp.training.state import Checkpoints
@@ -22,7 +22,6 @@ from trackmdp.world.model import World
 
 SMALL: dict[str, Any] = {
     "optimal.enabled": False,
-    "algo.samples": 2,
     "algo.plan_every": 100,
     "evaluation.every": 100,
     "collector.envs": 50,
@@ -35,11 +34,19 @@ SMALL: dict[str, Any] = {
 
 
 def world(**options: Any) -> World:
-    given = {"size": 8, "support_size": 3, "radius": 1, "cost": 0.16, "t_max": 1, "safe_cost": 8.0, "window": 2}
+    given = {
+        "size": 8,
+        "support_size": 3,
+        "radius": 1,
+        "cost": 0.16,
+        "t_max": 1,
+        "safe_cost": 8.0,
+        "window": 2,
+    }
     return tm.make_world("random_support", **given | options)
 
 
-def learned(folder: Path | None = None, algo: str = "learned_kernel", **options: Any) -> tm.Run:
+def learned(folder: Path | None = None, algo: str = "model_based", **options: Any) -> tm.Run:
     return tm.train(world(), algo, folder=folder, **SMALL | options)
 
 
@@ -49,7 +56,10 @@ def uncut(tmp_path_factory: pytest.TempPathFactory) -> tm.Run:
 
 
 def policies(folder: Path) -> dict[str, bytes]:
-    return {str(file.relative_to(folder)): file.read_bytes() for file in sorted(folder.rglob("policy.npz"))}
+    return {
+        str(file.relative_to(folder)): file.read_bytes()
+        for file in sorted(folder.rglob("policy.npz"))
+    }
 
 
 @pytest.mark.slow
@@ -68,9 +78,16 @@ def test_frames_are_shared_out_by_what_blocks_see(uncut: tm.Run) -> None:
     assert uncut.folder is not None
     places = [uncut.folder / "blocks" / f"{number:05d}" for number in range(4)]
     # of 8 x 8 cells with side 5 and halo 1: 6 x 6, 6 x 4, 4 x 6 and 4 x 4 cells, 100 in all
-    assert [tuple(np.load(place / "kernel.npz")["shape"]) for place in places] == [(n, n) for n in (36, 24, 24, 16)]
+    assert [tuple(np.load(place / "problem.npz")["kernel.shape"]) for place in places] == [
+        (n, n) for n in (36, 24, 24, 16)
+    ]
     ends = [json.loads((place / "summary.json").read_text()) for place in places]
-    assert [end["frames"] for end in ends] == [2400, 1500, 1500, 1200]  # 2160, 1440, 1440 and 960, in whole batches
+    assert [end["frames"] for end in ends] == [
+        2400,
+        1500,
+        1500,
+        1200,
+    ]  # 2160, 1440, 1440 and 960, in whole batches
     assert uncut.summary["frames"] == 6600
     earned = uncut.summary["while_collecting"]["reward_per_frame"]
     assert earned == pytest.approx(
@@ -79,7 +96,9 @@ def test_frames_are_shared_out_by_what_blocks_see(uncut: tm.Run) -> None:
     assert len({end["seed"] for end in ends}) == 4
 
 
-def test_a_cut_run_ends_as_if_it_had_not_been(uncut: tm.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cut_run_ends_as_if_it_had_not_been(
+    uncut: tm.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     save, saved = Checkpoints.save, []
 
     def noted(self: Checkpoints, trainer: Any) -> None:
@@ -107,7 +126,12 @@ def test_a_cut_run_ends_as_if_it_had_not_been(uncut: tm.Run, tmp_path: Path, mon
     copied = Path(shutil.copytree(folder, tmp_path / "copied"))
     shutil.rmtree(folder)
     block = tm.load_run(copied / "blocks" / "00001")
-    words = ["evaluate", f"run={block.folder}", "episodes=0", f"hydra.run.dir={tmp_path / 'figures'}"]
+    words = [
+        "evaluate",
+        f"run={block.folder}",
+        "episodes=0",
+        f"hydra.run.dir={tmp_path / 'figures'}",
+    ]
     assert main(words) == 0
     figures = json.loads((tmp_path / "figures" / "evaluation.json").read_text())
     assert figures["exact"]["aihtr"] == block.evaluation.aihtr
@@ -118,12 +142,17 @@ def test_blocks_have_their_part_of_a_map(tmp_path: Path) -> None:
     np.save(tmp_path / "map.npy", classes)
     given = {"algo.share_cells": tmp_path / "map.npy", "collector.total_frames": 600}
     learned(tmp_path / "run", **given)
-    kept = [np.load(tmp_path / "run" / "blocks" / f"{number:05d}" / "classes.npy") for number in range(4)]
+    kept = [
+        np.load(tmp_path / "run" / "blocks" / f"{number:05d}" / "problem.npz")["classes"]
+        for number in range(4)
+    ]
     assert (kept[1] == classes[:6, 4:].ravel()).all()
     assert (kept[2] == classes[4:, :6].ravel()).all()
-    np.save(tmp_path / "map.npy", classes + 1)
-    with pytest.raises(UserError, match=r"classes.npy: not what the run's config describes now"):
-        learned(tmp_path / "run", resume="auto", **given)
+    (tmp_path / "map.npy").unlink()
+    shutil.rmtree(tmp_path / "run" / "blocks" / "00002")
+    learned(tmp_path / "run", resume="auto", **given)
+    again = np.load(tmp_path / "run" / "blocks" / "00002" / "problem.npz")["classes"]
+    assert (again == classes[4:, :6].ravel()).all()
 
 
 @pytest.mark.parametrize("name", ["blocks", "blocks/00000"])
@@ -132,7 +161,9 @@ def test_blocks_are_not_written_through_a_link(tmp_path: Path, name: str) -> Non
     outside.mkdir()
     link.parent.mkdir(parents=True)
     link.symlink_to(outside)
-    with pytest.raises(UserError, match=f"{name}: a link or a file, expected a folder of the run's own"):
+    with pytest.raises(
+        UserError, match=f"{name}: a link or a file, expected a folder of the run's own"
+    ):
         learned(tmp_path / "run")
     assert not list(outside.iterdir())
 
@@ -147,12 +178,19 @@ def test_another_config_leaves_a_run_as_it_was(uncut: tm.Run) -> None:
 
 def test_a_block_that_runs_elsewhere_is_refused(tmp_path: Path) -> None:
     (tmp_path / "blocks" / "00000").mkdir(parents=True)
-    with locked(tmp_path / "blocks" / "00000"), pytest.raises(UserError, match="00000: another process is running"):
+    with (
+        locked(tmp_path / "blocks" / "00000"),
+        pytest.raises(UserError, match="00000: another process is running"),
+    ):
         learned(tmp_path)
 
 
-@pytest.mark.parametrize("end", [{}, {"frames": 600, "while_collecting": {"reward_per_frame": None}}])
-def test_a_block_that_tells_no_frames_is_refused(uncut: tm.Run, end: dict[str, Any], monkeypatch: Any) -> None:
+@pytest.mark.parametrize(
+    "end", [{}, {"frames": 600, "while_collecting": {"reward_per_frame": None}}]
+)
+def test_a_block_that_tells_no_frames_is_refused(
+    uncut: tm.Run, end: dict[str, Any], monkeypatch: Any
+) -> None:
     monkeypatch.setattr("trackmdp.training.blocks.read_summary", lambda folder: end)
     with pytest.raises(UserError, match="blocks: not the runs of blocks"):
         learned(uncut.folder, resume="auto")
@@ -163,7 +201,9 @@ def test_a_signal_between_two_blocks_ends_the_run(
     number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = signal.getsignal(number)
-    monkeypatch.setattr("trackmdp.training.blocks.finished", lambda cfg, folder: signal.raise_signal(number))
+    monkeypatch.setattr(
+        "trackmdp.training.blocks.finished", lambda cfg, folder: signal.raise_signal(number)
+    )
     with pytest.raises(Preempted, match=f"stopped by signal {int(number)}"):
         learned(tmp_path)
     assert signal.getsignal(number) == before
@@ -171,7 +211,9 @@ def test_a_signal_between_two_blocks_ends_the_run(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cluster", [None, "local"])
-def test_the_result_does_not_depend_on_the_workers(uncut: tm.Run, tmp_path: Path, cluster: str | None) -> None:
+def test_the_result_does_not_depend_on_the_workers(
+    uncut: tm.Run, tmp_path: Path, cluster: str | None
+) -> None:
     if cluster:
         pytest.importorskip("ray")
     learned(tmp_path, **{"partition.workers": 2, "partition.cluster": cluster})
@@ -186,11 +228,11 @@ def test_the_result_does_not_depend_on_the_workers(uncut: tm.Run, tmp_path: Path
         ("hindsight", {"updates": 20, "hidden": 8}),
         ("a2c", {"envs": 50}),
         ("ppo", {"minibatches": 5}),
-        ("dqn", {"credit": "per_sensor", "updates": 20, "hidden": 8}),
+        ("dqn_per_sensor", {"updates": 20, "hidden": 8}),
     ],
 )
 def test_every_learner_learns_by_blocks(algo: str, words: dict[str, Any]) -> None:
-    options = {name: value for name, value in SMALL.items() if "samples" not in name and "plan" not in name} | words
+    options = {name: value for name, value in SMALL.items() if "plan" not in name} | words
     kept = [tm.train(world(), algo, **options).evaluation.value for _ in range(2)]
     assert np.array_equal(*kept)
     assert kept[0].mean() > evaluate(world(), tm.Policy.none(world())).aihtr
@@ -201,7 +243,10 @@ def test_a_run_by_blocks_is_evaluated_and_exported(
     uncut: tm.Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["evaluate", f"run={uncut.folder}", "episodes=0", f"hydra.run.dir={tmp_path}"]) == 0
-    assert json.loads((tmp_path / "evaluation.json").read_text())["exact"]["aihtr"] == uncut.evaluation.aihtr
+    assert (
+        json.loads((tmp_path / "evaluation.json").read_text())["exact"]["aihtr"]
+        == uncut.evaluation.aihtr
+    )
     words = ["export", f"run={uncut.folder}", "format=sets", f"hydra.run.dir={tmp_path}"]
     assert main(words) == 0
     assert json.loads((tmp_path / "sets.json").read_text()) == uncut.policy.as_lists()
@@ -213,12 +258,14 @@ def test_a_run_by_blocks_is_evaluated_and_exported(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ({"log": ["mcap"]}, r"log=\[mcap\]: expected \[csv\] with partition.block"),
+        ({"log": ["mcap"]}, r"log=.*mcap"),
         ({"init_from": "elsewhere"}, "init_from=.*: expected null with partition.block"),
         ({"callbacks": [Callback()]}, "callbacks: expected none"),
-        ({"partition.block": None, "partition.halo": 1}, "partition.halo=1: without effect without partition.block"),
+        (
+            {"partition.block": None, "partition.halo": 1},
+            "partition.halo=1: without effect without partition.block",
+        ),
         ({"partition.sweeps": 1}, "partition.sweeps: unknown option"),
-        ({"algo.block": 5}, "algo.block: renamed, expected partition.block"),
     ],
 )
 def test_what_does_not_go_together_with_blocks_is_refused(words: dict[str, Any], said: str) -> None:
@@ -229,9 +276,15 @@ def test_what_does_not_go_together_with_blocks_is_refused(words: dict[str, Any],
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["kernel=tracks", "kernel.path=tests/data/city.csv"], "partition.block=4: expected null with kernel=tracks"),
+        (
+            ["kernel=tracks", "kernel.path=tests/data/city.csv"],
+            "partition.block=4: expected null with kernel=tracks",
+        ),
         (["kernel=heading", "algo=ppo"], "partition.block=4: expected null with kernel=heading"),
-        (["sensor=footprint", "algo=ppo"], "partition.block=4: expected null with sensor=footprint"),
+        (
+            ["sensor=footprint", "algo=ppo"],
+            "partition.block=4: expected null with sensor=footprint",
+        ),
     ],
 )
 def test_worlds_that_are_not_cut_to_blocks_are_refused(

@@ -27,7 +27,11 @@ from trackmdp.training import checkpoint
 def state(seed: int = 0, size: int = 2000) -> dict[str, Any]:
     rng = torch.Generator().manual_seed(seed)
     weights = torch.rand(size, generator=rng)
-    return {"weights": weights, "counter": seed, "nested": {"flags": weights > 0.5, "rates": [0.1, None, "a"]}}
+    return {
+        "weights": weights,
+        "counter": seed,
+        "nested": {"flags": weights > 0.5, "rates": [0.1, None, "a"]},
+    }
 
 
 @contextmanager
@@ -74,7 +78,9 @@ def test_what_is_read_is_what_was_saved(tmp_path: Path) -> None:
     assert torch.equal(read["nested"]["flags"], state(3)["nested"]["flags"])
 
 
-def test_a_large_tensor_is_a_page_of_the_file_and_writing_to_it_leaves_the_file_alone(tmp_path: Path) -> None:
+def test_a_large_tensor_is_a_page_of_the_file_and_writing_to_it_leaves_the_file_alone(
+    tmp_path: Path,
+) -> None:
     file = checkpoint.save(tmp_path / "checkpoints", 1, state(size=2**19), keep=2)
     read = checkpoint.load(file)
     read["weights"].zero_()
@@ -84,8 +90,15 @@ def test_a_large_tensor_is_a_page_of_the_file_and_writing_to_it_leaves_the_file_
 def test_the_newest_are_kept_and_the_best_for_ever(tmp_path: Path) -> None:
     for iteration in range(1, 6):
         checkpoint.save(tmp_path, iteration, state(iteration), keep=2, best=iteration == 2)
-    assert names(tmp_path) == ["best.pt", "iteration-00000004.pt", "iteration-00000005.pt", "last.pt"]
-    assert [checkpoint.load(tmp_path / name)["iteration"] for name in (checkpoint.BEST, checkpoint.LAST)] == [2, 5]
+    assert names(tmp_path) == [
+        "best.pt",
+        "iteration-00000004.pt",
+        "iteration-00000005.pt",
+        "last.pt",
+    ]
+    assert [
+        checkpoint.load(tmp_path / name)["iteration"] for name in (checkpoint.BEST, checkpoint.LAST)
+    ] == [2, 5]
     assert [file.name for file in checkpoint.available_checkpoints(tmp_path)] == [
         "iteration-00000005.pt",
         "iteration-00000004.pt",
@@ -144,7 +157,9 @@ def test_another_format_is_refused(tmp_path: Path, content: Any) -> None:
 def test_an_older_format_is_named(tmp_path: Path) -> None:
     file = checkpoint.save(tmp_path, 1, state(), keep=1)
     file.write_bytes(
-        file.read_bytes().replace(f"checkpoint {checkpoint.CHECKPOINT_FORMAT} ".encode(), b"checkpoint 1 ")
+        file.read_bytes().replace(
+            f"checkpoint {checkpoint.CHECKPOINT_FORMAT} ".encode(), b"checkpoint 1 "
+        )
     )
     with pytest.raises(UserError, match=f"format 1, expected {checkpoint.CHECKPOINT_FORMAT}"):
         checkpoint.load(file)
@@ -162,14 +177,16 @@ def test_a_full_disk_leaves_the_older_checkpoints_whole(tmp_path: Path, room: in
     assert checkpoint.load(tmp_path / checkpoint.LAST)["counter"] == 2
 
 
-def test_the_reason_of_a_failed_write_is_not_lost_in_torch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_reason_of_a_failed_write_is_not_lost_in_torch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     class Full(io.BufferedRandom):
         def write(self, piece: Any) -> int:
             if self.tell() > 500:
                 raise OSError(28, "No space left on device")
             return super().write(piece)
 
-    monkeypatch.setattr(durable, "_new", lambda file: Full(io.FileIO(file, "x+")))
+    monkeypatch.setattr(durable, "create", lambda file: Full(io.FileIO(file, "x+")))
     with pytest.raises(OSError, match="No space left"):
         checkpoint.save(tmp_path, 1, state(), keep=1)
 
@@ -204,7 +221,7 @@ def test_saving_does_not_hold_the_state_twice(tmp_path: Path) -> None:
 
 
 def test_what_a_killed_save_left_is_cleared_away(tmp_path: Path) -> None:
-    (tmp_path / "iteration-00000009.part").write_bytes(b"half")
+    (tmp_path / ".iteration-00000009.pt.01ab.part").write_bytes(b"half")
     checkpoint.save(tmp_path, 10, state(), keep=2)
     assert names(tmp_path) == ["iteration-00000010.pt", "last.pt"]
 
@@ -241,7 +258,7 @@ def test_what_is_no_ordinary_file_is_neither_read_nor_removed(tmp_path: Path) ->
     assert checkpoint.available_checkpoints(tmp_path) == [mine]
     newer = checkpoint.save(tmp_path, 2, state(2), keep=1)
     assert checkpoint.available_checkpoints(tmp_path) == [newer]
-    for number, kind in ((7, "a folder"), (8, "a pipe"), (9, "a symbolic link")):
+    for number, kind in ((7, "is a directory"), (8, "a pipe"), (9, "a symbolic link")):
         with pytest.raises(UserError, match=f"iteration-0000000{number}.pt: {kind}"):
             checkpoint.load(tmp_path / f"iteration-0000000{number}.pt")
 
@@ -255,7 +272,9 @@ def test_a_folder_of_checkpoints_that_is_a_link_is_refused(tmp_path: Path) -> No
     assert names(tmp_path / "theirs") == ["notes.part"]
 
 
-def test_without_hard_links_the_names_are_copies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_hard_links_the_names_are_copies(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refused(*args: Any) -> None:
         raise PermissionError(errno.EPERM, "Operation not permitted")
 
@@ -263,46 +282,21 @@ def test_without_hard_links_the_names_are_copies(tmp_path: Path, monkeypatch: py
     for iteration in (1, 2, 3):
         checkpoint.save(tmp_path, iteration, state(iteration), keep=1, best=iteration == 2)
     assert names(tmp_path) == ["best.pt", "iteration-00000003.pt", "last.pt"]
-    assert [checkpoint.load(tmp_path / name)["counter"] for name in (checkpoint.BEST, checkpoint.LAST)] == [2, 3]
+    assert [
+        checkpoint.load(tmp_path / name)["counter"] for name in (checkpoint.BEST, checkpoint.LAST)
+    ] == [2, 3]
 
 
 def test_a_run_killed_between_two_names_gets_them_when_it_resumes(tmp_path: Path) -> None:
     checkpoint.save(tmp_path, 1, state(1), keep=2, best=True)
     file = checkpoint.save(tmp_path, 2, state(2), keep=2)
     checkpoint.point(file, best=True)
-    assert [checkpoint.load(tmp_path / name)["counter"] for name in (checkpoint.BEST, checkpoint.LAST)] == [2, 2]
+    assert [
+        checkpoint.load(tmp_path / name)["counter"] for name in (checkpoint.BEST, checkpoint.LAST)
+    ] == [2, 2]
 
 
 def test_a_name_given_twice_leaves_nothing_behind(tmp_path: Path) -> None:
     file = checkpoint.save(tmp_path, 1, state(1), keep=2, best=True)
     checkpoint.point(file, best=True)
     assert names(tmp_path) == ["best.pt", "iteration-00000001.pt", "last.pt"]
-
-
-def test_numbers_in_another_order_of_bytes_are_refused(tmp_path: Path) -> None:
-    """torch would turn every number round without a word."""
-    file, packed = checkpoint.save(tmp_path, 1, state(), keep=1), io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(file.read_bytes()[:-128])) as old, zipfile.ZipFile(packed, "w") as new:
-        for member in old.infolist():
-            new.writestr(member.filename, b"big" if member.filename.endswith("byteorder") else old.read(member))
-    file.write_bytes(sealed(packed.getvalue()))
-    with pytest.raises(UserError, match="another order of bytes"):
-        checkpoint.load(file)
-
-
-def test_complex_numbers_are_refused(tmp_path: Path) -> None:
-    """Copied into weights they would lose half of themselves."""
-    file = checkpoint.save(tmp_path, 1, {"weights": torch.ones(3, dtype=torch.complex64)}, keep=1)
-    with pytest.raises(UserError, match="complex numbers"):
-        checkpoint.load(file)
-
-
-def test_a_tensor_that_reaches_beyond_what_is_stored_is_refused(tmp_path: Path) -> None:
-    file, packed = checkpoint.save(tmp_path, 1, state(), keep=1), io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(file.read_bytes()[:-128])) as old, zipfile.ZipFile(packed, "w") as new:
-        for member in old.infolist():
-            content = old.read(member)
-            new.writestr(member.filename, content[:-4] if member.filename.endswith("/data/0") else content)
-    file.write_bytes(sealed(packed.getvalue()))
-    with pytest.raises(UserError, match="not a checkpoint that can be read"):
-        checkpoint.load(file)

@@ -17,14 +17,19 @@ from trackmdp.training.display import Display
 def shown(width: int, *, terminal: bool) -> list[str]:
     """The lines that are printed for a run of 1,000,000 frames, collected in 4 s."""
     out = io.StringIO()
-    console = Console(width=width, file=out, force_terminal=terminal, color_system=None, soft_wrap=not terminal)
+    console = Console(
+        width=width, file=out, force_terminal=terminal, color_system=None, soft_wrap=not terminal
+    )
     trainer: Any = SimpleNamespace(
         position=Position(), iterations=10, evaluator=SimpleNamespace(upper=117.25), collecting=0.0
     )
     display = Display(console, "hindsight seed 12")
     display.on_start(trainer)
     trainer.score = SimpleNamespace(evaluation=SimpleNamespace(aihtr=-2985.0))
-    trainer.position, trainer.collecting = Position(iteration=10, frames=1_000_000, seconds=50.0), 4.0
+    trainer.position, trainer.collecting = (
+        Position(iteration=10, frames=1_000_000, seconds=50.0),
+        4.0,
+    )
     display.on_update(trainer, {})
     display.on_end(trainer)
     return re.split(r"\r?\n|\r|\x1b\[2K|\x1b\[1A", out.getvalue())
@@ -41,4 +46,7 @@ def test_at_80_columns_the_progress_takes_one_line() -> None:
 @pytest.mark.parametrize("terminal", [True, False])
 def test_frames_per_second_are_those_of_collecting(terminal: bool) -> None:
     # 1,000,000 frames in 4 s of collecting, whatever the 50 s of the run were spent on
-    assert any("1,000,000 frames 250,000/s AIHTR -2,985.00" in line for line in shown(160, terminal=terminal))
+    assert any(
+        "1,000,000 frames 250,000/s AIHTR -2,985.00" in line
+        for line in shown(160, terminal=terminal)
+    )

@@ -42,7 +42,10 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def saved(folder: Path) -> list[int]:
     """Iterations of the checkpoints, all of which can be read; nothing half-written lies about."""
     assert not list(folder.rglob("*.part"))
-    return [checkpoint.load(file)["iteration"] for file in checkpoint.available_checkpoints(folder / "checkpoints")]
+    return [
+        checkpoint.load(file)["iteration"]
+        for file in checkpoint.available_checkpoints(folder / "checkpoints")
+    ]
 
 
 def test_a_disk_that_fills_up_costs_nothing_but_a_call(
@@ -52,7 +55,9 @@ def test_a_disk_that_fills_up_costs_nothing_but_a_call(
     with monkeypatch.context() as patch:
         at_iteration(patch, 5, lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard)))
         try:
-            with pytest.raises(RunError, match="File too large; resume=auto resumes from the last checkpoint"):
+            with pytest.raises(
+                RunError, match="File too large; resume=auto resumes from the last checkpoint"
+            ):
                 train(tmp_path)
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
@@ -141,7 +146,10 @@ def test_rows_written_after_the_checkpoint_are_cut_off(
 
 
 def test_one_process_per_folder(tmp_path: Path) -> None:
-    with locked(tmp_path), pytest.raises(UserError, match="another process is running in this folder"):
+    with (
+        locked(tmp_path),
+        pytest.raises(UserError, match="another process is running in this folder"),
+    ):
         train(tmp_path)
     assert not list(tmp_path.iterdir())
     train(tmp_path)
@@ -149,7 +157,10 @@ def test_one_process_per_folder(tmp_path: Path) -> None:
 
 def while_collecting(patch: pytest.MonkeyPatch, action: Callable[[], Any]) -> None:
     """Do something just before the fourth batch is waited for."""
-    check, calls = Watch._check, iter([*range(6), None])  # two calls in each iteration: for the batch, for the weights
+    check, calls = (
+        Watch._check,
+        iter([*range(6), None]),
+    )  # two calls in each iteration: for the batch, for the weights
 
     def checked(self: Watch) -> None:
         check(self)
@@ -160,7 +171,9 @@ def while_collecting(patch: pytest.MonkeyPatch, action: Callable[[], Any]) -> No
 
 
 @pytest.mark.slow
-def test_a_signal_to_the_workers_as_well_is_no_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_signal_to_the_workers_as_well_is_no_failure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def signal_all() -> None:
         signal.raise_signal(signal.SIGTERM)
         for worker in multiprocessing.active_children():
@@ -175,7 +188,9 @@ def test_a_signal_to_the_workers_as_well_is_no_failure(tmp_path: Path, monkeypat
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("collector", "when"), [("multi_sync", "between"), ("multi_async", "while collecting")])
+@pytest.mark.parametrize(
+    ("collector", "when"), [("multi_sync", "between"), ("multi_async", "while collecting")]
+)
 def test_a_worker_that_is_killed_is_named(
     collector: str, when: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -186,10 +201,14 @@ def test_a_worker_that_is_killed_is_named(
         at_iteration(monkeypatch, 3, kill)
     else:
         while_collecting(monkeypatch, kill)
-    with pytest.raises(RunError, match=r"iteration \d: collecting broke down \(worker [01] .*(SIGKILL|-9)"):
+    with pytest.raises(
+        RunError, match=r"iteration \d: collecting broke down \(worker [01] .*(SIGKILL|-9)"
+    ):
         train(tmp_path, f"collector={collector}")
     for worker in multiprocessing.active_children():
-        worker.join(60)  # TorchRL tells all of them to end, and waits ten seconds for it, too few on a busy machine
+        worker.join(
+            60
+        )  # TorchRL tells all of them to end, and waits ten seconds for it, too few on a busy machine
     assert not multiprocessing.active_children()
     assert saved(tmp_path)[0] >= 2
     monkeypatch.undo()
@@ -210,7 +229,9 @@ worker = multiprocessing.get_context("fork").Process(target=work)
 worker.start()
 worker.join()
 """
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as learner:
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True
+    ) as learner:
         assert learner.stdout is not None
         assert learner.stdout.readline() == "ready\n"
         learner.kill()
@@ -220,7 +241,9 @@ worker.join()
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("mode", "step"), [("kill", 23), ("power", 19), ("error", 21)])
-def test_a_run_that_ends_at_any_file_operation_resumes_to_the_same_run(mode: str, step: int, tmp_path: Path) -> None:
+def test_a_run_that_ends_at_any_file_operation_resumes_to_the_same_run(
+    mode: str, step: int, tmp_path: Path
+) -> None:
     """Some of the points only; step 1 goes through all of them, in minutes."""
     words = [sys.executable, "-m", "tests.training.crashpoints", str(tmp_path), mode, str(step)]
     done = subprocess.run(words, capture_output=True, text=True, check=True)
@@ -240,14 +263,18 @@ class Held(Callback):
         gc.collect()
         # `type`, not `isinstance`: that asks an object of torch's own for its class, which warns.
         self.files.append(len(list(Path("/proc/self/fd").iterdir())))
-        self.bytes.append(sum(found.nbytes for found in gc.get_objects() if issubclass(type(found), torch.Tensor)))
+        self.bytes.append(
+            sum(found.nbytes for found in gc.get_objects() if issubclass(type(found), torch.Tensor))
+        )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("algo", ["ppo", "dqn"])
 def test_a_longer_run_holds_no_more_files_and_tensors(algo: str, tmp_path: Path) -> None:
     held = Held()
-    options: dict[str, Any] = {"buffer_size": 500, "batch_size": 64, "updates": 1} if algo == "dqn" else {}
+    options: dict[str, Any] = (
+        {"buffer_size": 500, "batch_size": 64, "updates": 1} if algo == "dqn" else {}
+    )
     options |= {"hidden": 16, "total_frames": 16 * 256, "frames_per_batch": 256, "envs": 32}
     options["checkpoint"] = {"every": 256, "seconds": None}
     world = tm.make_world("random_walk", size=3, cost=0.1)

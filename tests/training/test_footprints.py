@@ -9,17 +9,26 @@ import pytest
 
 import trackmdp as tm
 from tests.helpers import small_world
-from trackmdp.app.cli import main
 from trackmdp.errors import UserError
 from trackmdp.world.coverage import discs
 from trackmdp.world.model import World
 
-SHORT = {"total_frames": 2048, "collector.envs": 64, "frames_per_batch": 512, "optimal.enabled": False}
+SHORT = {
+    "total_frames": 2048,
+    "collector.envs": 64,
+    "frames_per_batch": 512,
+    "optimal.enabled": False,
+}
 
 
 def _world() -> World:
     places = np.array([(0, 0), (0, 2), (2, 0), (2, 2)])
-    return World.of(small_world(), small_world().kernel, coverage=discs((3, 3), places, 1.5), cost=[0.1, 0.2, 0.3, 0.4])
+    return World.of(
+        small_world(),
+        small_world().kernel,
+        coverage=discs((3, 3), places, 1.5),
+        cost=[0.1, 0.2, 0.3, 0.4],
+    )
 
 
 @pytest.mark.parametrize("algo", ["a2c", "ppo", "dqn", "hindsight"])
@@ -31,15 +40,29 @@ def test_sets_of_sensors_are_learned_and_kept(algo: str, tmp_path: Path) -> None
     assert (again.policy.dense() == run.policy.dense()).all()
 
 
-LEARNS = {"total_frames": 32_768, "updates": 300, "updates_per_iteration": 100, "batch_size": 2048, "hidden": 32}
+LEARNS = {
+    "total_frames": 32_768,
+    "updates": 300,
+    "updates_per_iteration": 100,
+    "batch_size": 2048,
+    "hidden": 32,
+}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("algo", "t_max"), [("hindsight", 0), ("hindsight", 2), ("a2c", 2), ("ppo", 0), ("dqn", 2)])
+@pytest.mark.parametrize(
+    ("algo", "t_max"),
+    [
+        ("hindsight", 0),
+        ("hindsight", 2),
+        ("a2c_per_sensor", 2),
+        ("ppo_per_sensor", 0),
+        ("dqn_per_sensor", 2),
+    ],
+)
 def test_what_sensors_gain_beside_the_others_leads_to_the_optimum(algo: str, t_max: int) -> None:
     world = World.of(_world(), small_world(exit_probability=0.02).kernel, t_max=t_max)
-    credit = {} if algo == "hindsight" else {"credit": "per_sensor"}
-    run = tm.train(world, algo, **SHORT | LEARNS | credit)
+    run = tm.train(world, algo, **SHORT | LEARNS)
     best = tm.solve(world)
     assert (best.upper - run.evaluation.aihtr) / run.evaluation.expected_length < 0.01
 
@@ -49,24 +72,19 @@ def test_sets_that_cool_down_do_not_end_where_no_single_sensor_gains() -> None:
     """Hard sets from the first update on end at a regret of .0097 per step here."""
     plain = tm.make_world("random_support", size=8, cost=0.16)
     world = World.of(plain, plain.kernel, coverage=discs((8, 8), np.argwhere(np.ones((8, 8))), 2.0))
-    run = tm.train(world, "dqn", credit="per_sensor")
+    run = tm.train(world, "dqn_per_sensor")
     best = tm.solve(world)
     assert (best.upper - run.evaluation.aihtr) / run.evaluation.expected_length < 0.002
-
-
-def test_cells_do_not_share_what_sensors_with_footprints_see() -> None:
-    with pytest.raises(UserError, match=r"algo\.share_cells=all: sensors with footprints"):
-        tm.train(World.of(_world(), _world().kernel, cost=0.1), share_cells="all", **SHORT)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("algo", "options"),
     [
-        ("learned_kernel", {"sensing": "all"}),
-        ("learned_kernel", {"sensing": "chosen"}),
+        ("model_based", {"sensing": "all"}),
+        ("model_based", {"sensing": "chosen"}),
         ("hindsight", {}),
-        ("a2c", {"credit": "per_sensor"}),
+        ("a2c_per_sensor", {}),
     ],
 )
 def test_moves_to_cells_that_none_covers_are_inferred(algo: str, options: dict[str, str]) -> None:
@@ -86,17 +104,5 @@ def test_moves_to_cells_that_none_covers_are_inferred(algo: str, options: dict[s
 def test_a_run_of_other_footprints_is_not_resumed(tmp_path: Path) -> None:
     tm.train(_world(), "a2c", folder=tmp_path, **SHORT)
     other = World.of(_world(), _world().kernel, coverage=np.ones((4, 9)))
-    with pytest.raises(UserError, match=r"footprints.npz: not what the run's config describes now"):
+    with pytest.raises(UserError, match="belongs to a run with another config or problem"):
         tm.train(other, "a2c", folder=tmp_path, resume="auto", **SHORT)
-
-
-def test_algorithms_that_know_no_footprints_say_so_before_anything_is_written(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["train", "sensor=footprint", "algo=path_counts", f"hydra.run.dir={tmp_path / 'run'}"]) != 0
-    shown = capsys.readouterr().err
-    assert "algo=path_counts: expected one of" in shown
-    assert shown.count("\n") == 1
-    with pytest.raises(UserError, match="expected one of"):
-        tm.train(_world(), "path_counts")
-    assert not (tmp_path / "run").exists()

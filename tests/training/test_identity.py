@@ -8,17 +8,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
-from scipy import sparse
 from torchrl.collectors import Collector
 
+from tests.helpers import small_world
 from tests.training.runs import assert_same_run, at_iteration, tensors, train
 from trackmdp.algos.moves import MoveBuffer
 from trackmdp.errors import Preempted, RunError, UserError
 from trackmdp.training import checkpoint, state
 from trackmdp.training.run import trained
+from trackmdp.world.problem_file import PROBLEM, problem_bytes
 
 CPU = torch.device("cpu")
 
@@ -34,7 +34,9 @@ def assert_same_best(one: Path, other: Path) -> None:
         assert mine["iteration"] == theirs["iteration"]
         assert mine["callbacks"]["checkpoints"] == theirs["callbacks"]["checkpoints"]
         kept, found = tensors(mine), tensors(theirs)
-        assert all(torch.equal(kept[k], found[k]) for k in kept if isinstance(kept[k], torch.Tensor))
+        assert all(
+            torch.equal(kept[k], found[k]) for k in kept if isinstance(kept[k], torch.Tensor)
+        )
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +61,9 @@ def test_the_best_does_not_depend_on_where_a_run_was_cut(
     assert_same_best(tmp_path, whole)
 
 
-def test_a_checkpoint_that_a_signal_asked_for_is_not_the_best(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_checkpoint_that_a_signal_asked_for_is_not_the_best(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Saved at iterations 3, 6 and 8 of 8; the run that is stopped after 2, 3 and 7 of them, at these as well."""
     words = ("checkpoint.every=768", "evaluation.every=1")
     train(tmp_path / "whole", *words)
@@ -74,7 +78,10 @@ def test_a_checkpoint_that_a_signal_asked_for_is_not_the_best(tmp_path: Path, mo
 def test_the_best_is_the_policy_that_it_was_called_the_best_for(whole: Path) -> None:
     figures = [
         checkpoint.load(file)["callbacks"]["checkpoints"]
-        for file in (whole / "checkpoints" / checkpoint.BEST, whole / "checkpoints" / checkpoint.LAST)
+        for file in (
+            whole / "checkpoints" / checkpoint.BEST,
+            whole / "checkpoints" / checkpoint.LAST,
+        )
     ]
     assert figures[0]["is_best"]
     assert figures[0]["best"] == figures[1]["best"]
@@ -136,9 +143,12 @@ SWAPS: dict[str, tuple[Callable[[Path, Path], Any], bool]] = {
     "newest": (newer, False),
     "best": (one_file("checkpoints/best.pt"), True),
     "config": (one_file("config.yaml"), False),
-    "kernel": (lambda mine, theirs: sparse.save_npz(mine / "kernel.npz", sparse.csr_array(np.eye(9))), False),
-    "kernel, cut": (lambda mine, theirs: (mine / "kernel.npz").write_bytes(b"PK"), False),
-    "no kernel": (lambda mine, theirs: (mine / "kernel.npz").unlink(), True),
+    "kernel": (
+        lambda mine, theirs: (mine / PROBLEM).write_bytes(problem_bytes(small_world(seed=1))),
+        False,
+    ),
+    "kernel, cut": (lambda mine, theirs: (mine / PROBLEM).write_bytes(b"PK"), False),
+    "no kernel": (lambda mine, theirs: (mine / PROBLEM).unlink(), True),
 }
 
 
@@ -191,7 +201,7 @@ def test_a_sealed_state_that_makes_no_sense_is_refused_in_one_line(
     assert (mine / "metrics.csv").read_bytes() == before
 
 
-@pytest.mark.parametrize("content", [b"", b"x" * 9999, b"\0" * 9999, b"a\n" * 5000])
+@pytest.mark.parametrize("content", [b"", b"x" * 9999, b"\0" * 9999, b"a\n" * 5000, b"aa\n" * 5000])
 def test_metrics_of_rubbish_stop_a_resume_before_anything_is_written(
     content: bytes, tmp_path: Path, whole: Path
 ) -> None:
@@ -199,7 +209,7 @@ def test_metrics_of_rubbish_stop_a_resume_before_anything_is_written(
     shutil.copytree(whole, mine)
     (mine / "summary.json").unlink()
     (mine / "metrics.csv").write_bytes(content)
-    with pytest.raises(UserError, match=r"metrics\.csv: not the metrics of this run"):
+    with pytest.raises(UserError, match=r"metrics\.csv: "):
         train(mine, "resume=auto")
     assert (mine / "metrics.csv").read_bytes() == content
 
@@ -213,11 +223,15 @@ def test_another_version_of_a_package_that_composes_or_computes_is_refused(
     (mine / "summary.json").unlink()
     found = state.version
     monkeypatch.setattr(state, "version", lambda name: "0.1" if name == package else found(name))
-    with pytest.raises(UserError, match=rf"written with {package} \d[^ ]*, this is 0.1; expected the same"):
+    with pytest.raises(
+        UserError, match=rf"written with {package} \d[^ ]*, this is 0.1; expected the same"
+    ):
         train(mine, "resume=auto")
 
 
-def test_a_batch_is_whoever_s_it_was_given_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_batch_is_whoever_s_it_was_given_to(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Learners may keep parts of a batch: the collector must not write the next one over it."""
     kept: list[tuple[torch.Tensor, torch.Tensor]] = []
     step = MoveBuffer.extend

@@ -1,12 +1,10 @@
-"""One process per folder, also where the file system has no locks."""
+"""One process per folder."""
 
 from __future__ import annotations
 
 import errno
 import fcntl
-import json
-import os
-import socket
+import re
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -14,36 +12,19 @@ from typing import Any
 
 import pytest
 
+from trackmdp import durable
 from trackmdp.errors import UserError
-from trackmdp.training import lock
 from trackmdp.training.lock import is_locked, locked
-
-OWNER = ".lock.owner"
-
-
-@pytest.fixture
-def lockless(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A file system such as Lustre mounted without flock."""
-
-    def refused(*args: Any) -> None:
-        raise OSError(errno.ENOSYS, "Function not implemented")
-
-    monkeypatch.setattr(fcntl, "flock", refused)
-    monkeypatch.setattr(lock, "_SETTLE", 0.01)
-
-
-def owned(folder: Path, **said: Any) -> Path:
-    """What an owner leaves that was killed."""
-    file = folder / OWNER
-    file.write_text(json.dumps({"token": "x", "host": socket.gethostname(), "pid": os.getpid()} | said))
-    return file
 
 
 def test_a_folder_is_held_once(tmp_path: Path) -> None:
     assert not is_locked(tmp_path)
     with locked(tmp_path):
         assert is_locked(tmp_path)
-        with pytest.raises(UserError, match="another process is running in this folder"), locked(tmp_path):
+        with (
+            pytest.raises(UserError, match="another process is running in this folder"),
+            locked(tmp_path),
+        ):
             pass
     assert not list(tmp_path.iterdir())
 
@@ -57,52 +38,33 @@ def test_who_may_wait_has_the_folder_next(tmp_path: Path, monkeypatch: pytest.Mo
             assert is_locked(tmp_path)
 
 
-@pytest.mark.usefixtures("lockless")
-def test_without_locks_a_file_names_the_owner(tmp_path: Path) -> None:
-    with locked(tmp_path):
-        assert is_locked(tmp_path)
-        with pytest.raises(UserError, match=rf"another process .*\(process {os.getpid()} on "), locked(tmp_path):
-            pass
-    assert not is_locked(tmp_path)
+def test_a_file_system_without_locks_is_reported_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As Lustre mounted without flock."""
+
+    def refused(*args: Any) -> None:
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    monkeypatch.setattr(fcntl, "flock", refused)
+    monkeypatch.setattr(durable, "_reported", set())
+    for _ in range(2):
+        with locked(tmp_path):
+            assert not is_locked(tmp_path)
+    assert re.fullmatch(f"{tmp_path}: .* no locks; .*\n", capsys.readouterr().err)
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.usefixtures("lockless")
-def test_an_owner_that_was_killed_is_noticed_at_once(tmp_path: Path) -> None:
-    gone = os.posix_spawn("/bin/true", ["true"], {})
-    os.waitpid(gone, 0)
-    owned(tmp_path, pid=gone)
-    assert not is_locked(tmp_path)
+def test_the_parts_of_a_killed_process_are_removed(tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").touch()
+    (tmp_path / ".summary.json.0123abcd.part").write_text("half")
     with locked(tmp_path):
-        assert is_locked(tmp_path)
+        assert [each.name for each in sorted(tmp_path.iterdir())] == [".lock", "config.yaml"]
 
 
-@pytest.mark.usefixtures("lockless")
-def test_an_owner_on_another_host_counts_as_gone_after_a_silence(tmp_path: Path) -> None:
-    file = owned(tmp_path, host="elsewhere")
-    with pytest.raises(UserError, match="on elsewhere"), locked(tmp_path):
-        pass
-    old = time.time() - 2 * lock._SILENT
-    os.utime(file, (old, old))
-    with locked(tmp_path):
-        assert json.loads(file.read_text())["pid"] == os.getpid()
-
-
-@pytest.mark.usefixtures("lockless")
-def test_an_owner_gives_signs_of_life(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lock, "_BEAT", 0.02)
-    with locked(tmp_path):
-        os.utime(tmp_path / OWNER, (1, 1))
-        for _ in range(200):
-            time.sleep(0.02)
-            if (tmp_path / OWNER).stat().st_mtime > 1:
-                return
-    pytest.fail("the file was never touched")
-
-
-@pytest.mark.parametrize("make", [lambda file: file.mkdir(), os.mkfifo, lambda file: file.symlink_to("/etc/hostname")])
+@pytest.mark.parametrize("make", [lambda file: file.mkdir(), lambda file: file.symlink_to("/x")])
 def test_a_lock_that_is_no_file_is_refused(tmp_path: Path, make: Any) -> None:
     make(tmp_path / ".lock")
     assert not is_locked(tmp_path)
-    with pytest.raises(UserError, match="expected an ordinary file"), locked(tmp_path):
+    with pytest.raises(OSError, match=r"\.lock"), locked(tmp_path):
         pass

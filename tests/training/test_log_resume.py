@@ -13,8 +13,9 @@ from tests.training.runs import at_iteration, train
 from trackmdp.episodes.log import EpisodeLog
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.episodes.writer import EpisodeWriter
-from trackmdp.errors import RunError
+from trackmdp.errors import RunError, UserError
 from trackmdp.training import checkpoint
+from trackmdp.training.run import load_run
 
 LOGGED = (
     "log=[mcap]",
@@ -45,7 +46,9 @@ def cut(folder: Path, monkeypatch: pytest.MonkeyPatch, *, closes: bool, iteratio
     """A run that ends once an iteration is recorded, before its checkpoint."""
     with monkeypatch.context() as patch, pytest.raises(Killed):
         if not closes:
-            patch.setattr(EpisodeLog, "close", lambda self: self._writer.abandon())  # the file stays as it is
+            patch.setattr(
+                EpisodeLog, "close", lambda self: self._writer.abandon()
+            )  # the file stays as it is
         at_iteration(patch, iteration, killed)
         train(folder, *LOGGED)
 
@@ -56,7 +59,9 @@ def count(log: Path) -> int:
 
 
 @pytest.mark.parametrize("closes", [False, True])
-def test_it_is_cut_back_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: Path, closes: bool) -> None:
+def test_it_is_cut_back_and_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: Path, closes: bool
+) -> None:
     cut(tmp_path / "cut", monkeypatch, closes=closes)
     left = tmp_path / "cut" / ("episodes.mcap" if closes else "episodes.mcap.part")
     assert left.is_file()
@@ -64,6 +69,9 @@ def test_it_is_cut_back_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     logs = sorted(file.name for file in (tmp_path / "cut").glob("episodes*"))
     assert logs == ["episodes.mcap"]
     assert count(whole / "episodes.mcap") == 15
+    assert load_run(tmp_path / "cut").columns[
+        "iteration"
+    ]  # its digests are those of the files at the end
     assert (tmp_path / "cut/episodes.mcap").read_bytes() == (whole / "episodes.mcap").read_bytes()
 
 
@@ -104,11 +112,36 @@ def test_on_a_full_disk_one_line_says_why_and_the_run_goes_on_as_if_it_never_had
         train(tmp_path / "cut", *LOGGED)
     assert capsys.readouterr().err == ""
     train(tmp_path / "cut", *LOGGED, "resume=auto")
-    mine, theirs = (checkpoint.load(checkpoint.newest(run))["callbacks"] for run in (tmp_path / "cut", whole))
+    mine, theirs = (
+        checkpoint.load(checkpoint.newest(run))["callbacks"] for run in (tmp_path / "cut", whole)
+    )
     assert mine["episodes"] == theirs["episodes"] == {"policies": 5}
 
 
-def test_what_a_checkpoint_counts_on_is_on_the_disk_before_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("place", "error"),
+    [("of", UserError("too large")), ("add", ValueError("NaN")), ("flush", MemoryError("none"))],
+)
+def test_a_log_that_cannot_be_written_never_ends_a_run(
+    place: str,
+    error: Exception,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def broken(*_: Any, **__: Any) -> None:
+        raise error
+
+    monkeypatch.setattr(EpisodeWriter, place, broken)
+    train(tmp_path / "run", *LOGGED)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"episodes.mcap.part: {error}" in line
+    assert (tmp_path / "run" / "summary.json").is_file()
+
+
+def test_what_a_checkpoint_counts_on_is_on_the_disk_before_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """After a power failure the bytes are gone that no fsync has put on the disk."""
     synced: dict[int, int] = {}
     fsync, point = os.fsync, checkpoint.point

@@ -12,11 +12,16 @@ from tests.training.test_log_resume import Killed, killed
 from trackmdp.app.cli import main
 from trackmdp.config import load_run_config, to_dict, to_yaml
 from trackmdp.config.compose import compose
-from trackmdp.config.tree import continued
+from trackmdp.config.resume import continued
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.errors import UserError
 
-ALL = ("log=[csv,tensorboard,mcap]", "log.mcap.episodes=2", "log.csv.every=2", "kernel.exit_probability=0.2")
+ALL = (
+    "log=[csv,tensorboard,mcap]",
+    "log.mcap.episodes=2",
+    "log.csv.every=2",
+    "kernel.exit_probability=0.2",
+)
 EVENTS = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
 
 
@@ -30,7 +35,9 @@ def written(folder: Path) -> tuple[list[int], list[int], int]:
     return table, sorted({event.step for event in events.Scalars("iteration")}), episodes
 
 
-def test_all_three_are_written_and_each_goes_on_with_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_three_are_written_and_each_goes_on_with_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     train(tmp_path / "whole", *ALL)
     table, frames, episodes = written(tmp_path / "whole")
     assert (table, frames) == ([2, 4, 6, 8], [256 * k for k in range(1, 9)])
@@ -50,6 +57,17 @@ def test_all_three_are_written_and_each_goes_on_with_the_run(tmp_path: Path, mon
     assert logs[0] == logs[1]
 
 
+def test_tensorboard_has_pictures_and_hyperparameters(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    train(tmp_path, "log=[tensorboard]")
+    events = EVENTS.EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    assert set(events.Tags()["images"]) == {"policy", "value", "world"}
+    assert events.Images("value")[0].encoded_image_string.startswith(b"\x89PNG")
+    assert "_hparams_/experiment" in events.summary_metadata
+    assert {each.name for each in tmp_path.glob("tensorboard/*") if each.is_dir()} == set()
+
+
 def test_without_csv_the_table_has_every_iteration(tmp_path: Path) -> None:
     train(tmp_path, "log=[]")
     assert [int(row["iteration"]) for row in rows(tmp_path)] == list(range(1, 9))
@@ -62,8 +80,13 @@ def resumed(folder: Path, *words: str) -> dict[str, object]:
         to_yaml(compose("train", {"log": ["mcap"], "log.mcap.episodes": 3})), encoding="utf-8"
     )
     typed = dict(word.split("=") for word in words)
-    overrides = {key: value.strip("[]").split(",") if key == "log" else int(value) for key, value in typed.items()}
-    found = to_dict(continued(compose("train", overrides | {"resume": "auto"}), folder, words))["log"]
+    overrides = {
+        key: value.strip("[]").split(",") if key == "log" else int(value)
+        for key, value in typed.items()
+    }
+    found = to_dict(continued(compose("train", overrides | {"resume": "auto"}), folder, words))[
+        "log"
+    ]
     assert isinstance(found, dict)
     return found
 
@@ -91,7 +114,10 @@ def test_a_resumed_run_keeps_the_options_of_its_loggers(
 def test_an_option_of_a_logger_that_the_run_does_not_have(tmp_path: Path) -> None:
     with pytest.raises(UserError) as caught:
         resumed(tmp_path, "log.csv.every=4")
-    assert str(caught.value) == "log.csv.every: the run has log=[mcap], expected log=[mcap,csv] beside it"
+    assert (
+        str(caught.value)
+        == "log.csv.every: the run has log=[mcap], expected log=[mcap,csv] beside it"
+    )
 
 
 @pytest.mark.parametrize(
@@ -102,12 +128,17 @@ def test_an_option_of_a_logger_that_the_run_does_not_have(tmp_path: Path) -> Non
         ("log=null", "log=null: expected one of csv, tensorboard, wandb, mlflow, mcap"),
         ("log=csv,mcap", "log=csv,mcap: expected log=[csv,mcap]"),
         ("log.every=2", "log.every: renamed, expected log.csv.every"),
-        ("log=[csv,mcap] log.mcap.episodes=0", "log.mcap.episodes=0: expected an integer from 1 to 1e6 (episodes)"),
+        (
+            "log=[csv,mcap] log.mcap.episodes=0",
+            "log.mcap.episodes=0: expected an integer from 1 to 1e6 (episodes)",
+        ),
         ("log=[mcap] +log.csv={every:2}", "log.csv"),
         ("-m log=[csv],[nope]", "log=nope: expected one of csv, tensorboard, wandb, mlflow, mcap"),
     ],
 )
-def test_what_is_wrong_is_one_line(words: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_wrong_is_one_line(
+    words: str, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["train", *words.split()]) == 2
     error = capsys.readouterr().err
     assert error.startswith(f"trackmdp train: {message}")
@@ -118,15 +149,18 @@ def test_a_config_file_with_an_unknown_logger_is_one_line(tmp_path: Path) -> Non
     text = to_yaml(compose("train"))
     assert "csv:" in text
     (tmp_path / "config.yaml").write_text(text.replace("csv:", "nope:"), encoding="utf-8")
-    with pytest.raises(UserError, match="log=nope: expected one of csv, tensorboard, wandb, mlflow, mcap"):
+    with pytest.raises(
+        UserError, match="log=nope: expected one of csv, tensorboard, wandb, mlflow, mcap"
+    ):
         load_run_config(tmp_path)
 
 
 def test_help_lists_them(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["train", "--help"]) == 0
+    assert main(["train", "--help", "all"]) == 0
     text = capsys.readouterr().out
-    assert "log=[csv,tensorboard,wandb,mlflow,mcap]: any of them, none by log=[] (default: [csv])" in " ".join(
-        text.split()
+    assert (
+        "log=[csv,tensorboard,wandb,mlflow,mcap]: any of them, none by log=[] (default: [csv])"
+        in " ".join(text.split())
     )
     assert main(["train", "log=[csv,mcap]", "--help"]) == 0
     text = capsys.readouterr().out
@@ -137,7 +171,11 @@ def test_help_lists_them(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_from_python(tmp_path: Path) -> None:
     world = tm.make_world("random_walk", size=3, exit_probability=0.2)
-    options = {"collector.total_frames": 512, "collector.frames_per_batch": 256, "collector.envs": 32}
+    options = {
+        "collector.total_frames": 512,
+        "collector.frames_per_batch": 256,
+        "collector.envs": 32,
+    }
     tm.train(
         world,
         "a2c",

@@ -37,9 +37,16 @@ def system(root: Path, free: int, **cgroup: str) -> Path:
 
 @pytest.mark.parametrize("prioritized", [True, False])
 @pytest.mark.parametrize(("t_max", "window"), [(0, None), (2, None), (2, 1)])
-def test_the_replay_buffer_takes_what_was_estimated(prioritized: bool, t_max: int, window: int | None) -> None:
+def test_the_replay_buffer_takes_what_was_estimated(
+    prioritized: bool, t_max: int, window: int | None
+) -> None:
     world = replace(small_world(size=4, t_max=t_max), window=window)
-    words = ("algo=dqn", "algo.buffer_size=3000", "algo.updates=1", f"algo.prioritized.enabled={prioritized}")
+    words = (
+        "algo=dqn",
+        "algo.buffer_size=3000",
+        "algo.updates=1",
+        f"algo.prioritized.enabled={prioritized}",
+    )
     words += (f"grid.window={'null' if window is None else window}",)
     cfg = train_config(*words, "algo.batch_size=64", "collector.frames_per_batch=256")
     assert isinstance(cfg.algo, DqnConfig)
@@ -54,7 +61,10 @@ def test_a_buffer_that_cannot_fit_is_refused_before_anything_is_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "run"
-    assert main(["train", "algo=dqn", "algo.buffer_size=1000000000000", f"hydra.run.dir={folder}"]) == 2
+    assert (
+        main(["train", "algo=dqn", "algo.buffer_size=1000000000000", f"hydra.run.dir={folder}"])
+        == 2
+    )
     told = capsys.readouterr().err
     assert told.startswith("trackmdp train: algo.buffer_size=1000000000000: needs about 511,")
     assert told.endswith(" GiB are available\n")
@@ -62,22 +72,43 @@ def test_a_buffer_that_cannot_fit_is_refused_before_anything_is_written(
     assert not folder.exists()
 
 
-def test_a_batch_of_paths_that_cannot_fit_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["train", "algo.batch_size=999999999999", f"hydra.run.dir={tmp_path / 'run'}"]) == 2
+def test_a_batch_of_paths_that_cannot_fit_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert (
+        main(
+            [
+                "train",
+                "algo=hindsight",
+                "algo.batch_size=999999999999",
+                f"hydra.run.dir={tmp_path / 'run'}",
+            ]
+        )
+        == 2
+    )
     # 4 cells of a path with t_max 1, six numbers of 8 bytes for each: 192 bytes a path.
     assert "algo.batch_size=999999999999: needs about 178,813" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
 
 
 def test_batches_that_cannot_fit_are_named() -> None:
-    cfg = train_config("algo=ppo", "collector.frames_per_batch=2560000000", "collector.total_frames=2560000000")
-    with pytest.raises(UserError, match=r"^collector.frames_per_batch=2560000000: needs about [\d,.]+ GiB, "):
+    cfg = train_config(
+        "algo=ppo", "collector.frames_per_batch=2560000000", "collector.total_frames=2560000000"
+    )
+    with pytest.raises(
+        UserError, match=r"^collector.frames_per_batch=2560000000: needs about [\d,.]+ GiB, "
+    ):
         check_memory(cfg, small_world().task, CPU)
 
 
 def test_a_run_says_what_it_takes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["grid.size=3", "collector.total_frames=512", "collector.frames_per_batch=512", "collector.envs=32"]
-    budget = ["algo.updates=1", "optimal.enabled=false"]
+    words = [
+        "grid.size=3",
+        "collector.total_frames=512",
+        "collector.frames_per_batch=512",
+        "collector.envs=32",
+    ]
+    budget = ["algo=hindsight", "algo.updates=1", "optimal.enabled=false"]
     assert main(["train", *words, *budget, f"hydra.run.dir={tmp_path}"]) == 0
     (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("memory: "))
     assert re.fullmatch(r"memory: about 0\.00 GiB of [\d,.]+ GiB, most by [a-z_.]+", line)
@@ -99,7 +130,9 @@ def test_a_run_says_what_it_takes(tmp_path: Path, capsys: pytest.CaptureFixture[
         ),
     ],
 )
-def test_the_job_may_have_less_than_the_machine(tmp_path: Path, cgroup: dict[str, str], kib: int) -> None:
+def test_the_job_may_have_less_than_the_machine(
+    tmp_path: Path, cgroup: dict[str, str], kib: int
+) -> None:
     assert available_bytes(CPU, system(tmp_path, 8000, **cgroup)) == kib * 1024
 
 

@@ -23,7 +23,10 @@ ROW = {"iteration": 1, "frames": 256, "aihtr": 0.1 + 0.2, "loss": 1e-300, "gap":
 
 def trainer(frames: int) -> Any:
     """What a log asks of a trainer."""
-    known = {"config": compose("train"), "error": KeyboardInterrupt()}  # cut: there are no final figures
+    known = {
+        "config": compose("train"),
+        "error": KeyboardInterrupt(),
+    }  # cut: there are no final figures
     return SimpleNamespace(position=Position(frames=frames), due=lambda every: every == 1, **known)
 
 
@@ -55,7 +58,13 @@ def test_what_is_missing_or_not_finite_is_an_empty_field(tmp_path: Path) -> None
     log.write(ROW)
     log.write({"iteration": 2, "frames": 512, "aihtr": None, "loss": math.nan, "gap": math.inf})
     log.on_end(TRAINER)
-    assert rows(tmp_path)[1] == {"iteration": "2", "frames": "512", "aihtr": "", "loss": "", "gap": ""}
+    assert rows(tmp_path)[1] == {
+        "iteration": "2",
+        "frames": "512",
+        "aihtr": "",
+        "loss": "",
+        "gap": "",
+    }
 
 
 def test_the_columns_are_those_of_the_first_row(tmp_path: Path) -> None:
@@ -96,7 +105,9 @@ def test_json_is_strict_and_whole(tmp_path: Path) -> None:
     assert json.loads(file.read_text()) == content
 
 
-def test_a_crash_while_writing_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_crash_while_writing_leaves_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     file = tmp_path / "config.yaml"
     write_text(file, "old")
 

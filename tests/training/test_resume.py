@@ -34,7 +34,12 @@ RECIPES = {
         "algo.batch_size=1024",
         "algo.updates_per_iteration=4",
     ],
-    "hindsight": ["algo=hindsight", "algo.updates=120", "algo.batch_size=1024", "algo.updates_per_iteration=4"],
+    "hindsight": [
+        "algo=hindsight",
+        "algo.updates=120",
+        "algo.batch_size=1024",
+        "algo.updates_per_iteration=4",
+    ],
 }
 # Environment and replay buffer with sensors that miss; the joint learners know of them through the environment alone.
 # As large grids are learned: tables in place of nets, and actions of the window's sensors alone.
@@ -44,10 +49,18 @@ RECIPES["hindsight-map"] = [*RECIPES["hindsight-tables"], "algo.share_cells={fol
 RECIPES["ppo-told"] = [*RECIPES["ppo"], "kernel=heading", "kernel.reveals=true"]
 RECIPES["hindsight-told"] = [*RECIPES["hindsight"], "kernel=heading", "kernel.reveals=true"]
 RECIPES["hindsight-memory"] = [*RECIPES["hindsight"], "kernel=heading", "task.memory=displacement"]
-RECIPES["learned-told"] = ["algo=learned_kernel", "kernel=heading", "kernel.reveals=true"]
+RECIPES["learned-told"] = ["algo=model_based", "kernel=heading", "kernel.reveals=true"]
 RECIPES["dqn-memory"] = [*RECIPES["dqn"], "kernel=heading", "task.memory=displacement"]
-RECIPES |= {f"{name}-miss": [*RECIPES[name], "sensor=miss", "sensor.p_d=.8"] for name in ("hindsight", "ppo")}
-SMALL = ["grid.size=3", "optimal.enabled=false", "evaluation.every=4", "collector.total_frames=61440"]
+RECIPES |= {
+    f"{name}-miss": [*RECIPES[name], "sensor=miss", "sensor.p_d=.8"]
+    for name in ("hindsight", "ppo")
+}
+SMALL = [
+    "grid.size=3",
+    "optimal.enabled=false",
+    "evaluation.every=4",
+    "collector.total_frames=61440",
+]
 BATCHES = ["collector.frames_per_batch=2048", "collector.envs=64"]
 
 
@@ -56,7 +69,9 @@ def command(folder: Path, *words: str) -> list[str]:
 
 
 def train(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(command(folder, *words), capture_output=True, text=True, check=False, env=environment())
+    return subprocess.run(
+        command(folder, *words), capture_output=True, text=True, check=False, env=environment()
+    )
 
 
 def environment() -> dict[str, str]:
@@ -65,7 +80,9 @@ def environment() -> dict[str, str]:
 
 def cut(folder: Path, number: int, after: int, *words: str) -> int:
     """Start a run, send it a signal once `metrics.csv` has `after` rows, and return its exit status."""
-    with subprocess.Popen(command(folder, *words), env=environment(), stdout=subprocess.DEVNULL) as process:
+    with subprocess.Popen(
+        command(folder, *words), env=environment(), stdout=subprocess.DEVNULL
+    ) as process:
         while process.poll() is None and len(rows(folder)) < after:
             with suppress(subprocess.TimeoutExpired):
                 process.wait(timeout=0.01)
@@ -82,7 +99,12 @@ def resumes_exactly(folder: Path, recipe: str, kills: int) -> None:
     words += ["resume=auto", "checkpoint.every=2048", "checkpoint.seconds=0.05"]
     for _ in range(kills):
         done = len(rows(folder / "cut"))
-        cut(folder / "cut", signal.SIGKILL, min(whole, done + moments.randint(1, max(2, whole // (kills + 1)))), *words)
+        cut(
+            folder / "cut",
+            signal.SIGKILL,
+            min(whole, done + moments.randint(1, max(2, whole // (kills + 1)))),
+            *words,
+        )
     last = train(folder / "cut", *words)
     assert last.returncode == 0, last.stderr
     assert_same_run(folder / "whole", folder / "cut")

@@ -8,7 +8,9 @@ import pytest
 from trackmdp.signals import Signals
 
 
-def test_the_first_signal_is_noted_and_a_later_one_acts_as_before(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_first_signal_is_noted_and_a_later_one_acts_as_before(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     heard: list[int] = []
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
     for number in before:
@@ -17,7 +19,9 @@ def test_the_first_signal_is_noted_and_a_later_one_acts_as_before(monkeypatch: p
         with Signals() as signals:
             assert signals.received == 0
             signal.raise_signal(signal.SIGTERM)
-            signal.raise_signal(signal.SIGTERM)  # `timeout` signals the process, and then its group once more
+            signal.raise_signal(
+                signal.SIGTERM
+            )  # `timeout` signals the process, and then its group once more
             assert (signals.received, heard) == (signal.SIGTERM, [])
             monkeypatch.setattr("trackmdp.signals._ONE", 0.0)
             signal.raise_signal(signal.SIGTERM)

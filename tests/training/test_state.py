@@ -7,6 +7,7 @@ import re
 import shutil
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +21,8 @@ from trackmdp.config import load_run_config, to_dict
 from trackmdp.errors import RunError, UserError
 from trackmdp.training import checkpoint
 from trackmdp.training.state import find
+from trackmdp.world.model import World
+from trackmdp.world.problem_file import PROBLEM, problem_bytes, read_problem
 
 CPU = torch.device("cpu")
 
@@ -54,7 +57,17 @@ def half(broken: Path, tmp_path: Path) -> Path:
 
 
 def typed(folder: Path, *words: str) -> int:
-    return main(["train", *SMALL["ppo"], *QUICK, *BUDGET, "checkpoint.keep=3", f"hydra.run.dir={folder}", *words])
+    return main(
+        [
+            "train",
+            *SMALL["ppo"],
+            *QUICK,
+            *BUDGET,
+            "checkpoint.keep=3",
+            f"hydra.run.dir={folder}",
+            *words,
+        ]
+    )
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -65,18 +78,19 @@ def test_sixty_corruptions_are_passed_over_for_the_one_before(whole: Path, tmp_p
     train(tmp_path / "other", "seed=5", "collector.total_frames=256")
     foreign = checkpoint.newest(tmp_path / "other").read_bytes()
     cfg = train_config(*SMALL["ppo"], *QUICK, *BUDGET, "checkpoint.keep=3", "resume=auto")
+    problem = read_problem(whole / PROBLEM)
     newest, rng = checkpoint.newest(whole), random.Random(3)
     content = newest.read_bytes()
     try:
         for trial in range(60):
             newest.write_bytes(foreign if trial % 20 == 0 else corrupted(content, foreign, rng))
-            state, passed_over = find(cfg, whole, CPU)
+            state, passed_over = find(cfg, problem, whole, CPU)
             assert state is not None
             assert state["iteration"] == 7, trial
             assert [line.split(":")[0] for line in passed_over] == [str(newest)]
     finally:
         newest.write_bytes(content)
-    assert find(cfg, whole, CPU)[1] == []
+    assert find(cfg, problem, whole, CPU)[1] == []
 
 
 def test_auto_goes_on_from_the_one_before_and_says_so(
@@ -98,13 +112,17 @@ def test_a_checkpoint_that_is_named_is_taken_or_refused(
     content = chosen.read_bytes()
     chosen.write_bytes(content[:-1])
     assert typed(half, f"resume={chosen}") == 2
-    assert re.fullmatch(f"trackmdp train: resume={chosen}: no checkpoint .*damaged.*\n", capsys.readouterr().err)
+    assert re.fullmatch(
+        f"trackmdp train: resume={chosen}: no checkpoint .*damaged.*\n", capsys.readouterr().err
+    )
     chosen.write_bytes(content)
     assert typed(half, f"resume={chosen}") == 0
     assert_same_run(half, whole)
 
 
-def test_no_run_starts_anew_where_every_checkpoint_is_damaged(half: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_run_starts_anew_where_every_checkpoint_is_damaged(
+    half: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for file in checkpoint.available_checkpoints(half / "checkpoints"):
         file.write_bytes(b"")
     before = files(half)
@@ -119,30 +137,27 @@ def test_no_run_starts_anew_where_every_checkpoint_is_damaged(half: Path, capsys
         ("algo.clip_epsilon=0.25", "algo.clip_epsilon: the run has 0.2, typed was 0.25"),
         ("seed=1", "seed: the run has 0, typed was 1"),
         ("algo=a2c", "algo: the run has ppo, typed was a2c"),
-        ("credit=per_sensor", "algo: the run has ppo, typed was ppo_per_sensor"),
+        ("algo=ppo_per_sensor", "algo: the run has ppo, typed was ppo_per_sensor"),
         ("collector.envs=64", "collector.envs: the run has 32, typed was 64"),
         ("grid.max_steps=9", "grid.max_steps: the run has null, typed was 9"),
     ],
 )
-def test_another_option_is_refused(word: str, told: str, half: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_another_option_is_refused(
+    word: str, told: str, half: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     before = files(half)
     assert typed(half, "resume=auto", word) == 2
     assert capsys.readouterr().err == f"trackmdp train: {told}; it cannot change on resume\n"
     assert files(half) == before
 
 
-def test_another_credit_is_refused_where_the_algorithm_is_not_typed(
-    half: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = ["train", *QUICK, f"hydra.run.dir={half}", "resume=auto"]
-    assert main([*words, "credit=per_sensor"]) == 2
-    told = "credit: the run has joint, typed was per_sensor; it cannot change on resume"
-    assert capsys.readouterr().err == f"trackmdp train: {told}\n"
-    assert main([*words, "credit=joint"]) == 0
-
-
 def test_budget_logging_and_saving_may_change(half: Path) -> None:
-    words = ["collector.total_frames=2560", "checkpoint.every=512", "evaluation.every=2", "log.csv.every=2"]
+    words = [
+        "collector.total_frames=2560",
+        "checkpoint.every=512",
+        "evaluation.every=2",
+        "log.csv.every=2",
+    ]
     assert typed(half, "resume=auto", *words) == 0
     assert [int(row["iteration"]) for row in rows(half)] == [1, 2, 3, 4, 6, 8, 10]
     saved = load_run_config(half)
@@ -150,77 +165,103 @@ def test_budget_logging_and_saving_may_change(half: Path) -> None:
     assert to_dict(saved)["log"] == {"csv": {"every": 2}}
 
 
-def test_a_config_edited_by_hand_is_not_the_run(half: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_config_edited_by_hand_is_not_the_run(
+    half: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     config = half / "config.yaml"
     config.write_text(config.read_text().replace("gae_lambda: 0.5", "gae_lambda: 0.6"))
     assert main(["train", "resume=auto", f"hydra.run.dir={half}"]) == 2
     assert "belongs to a run with another config" in capsys.readouterr().err
 
 
-def test_a_part_that_nothing_reads_is_refused(half: Path) -> None:
-    cfg = train_config(*SMALL["ppo"], *QUICK, *BUDGET, "checkpoint.keep=3", f"resume={checkpoint.newest(half)}")
+@pytest.mark.parametrize("callbacks", [{}, [1]])
+def test_a_state_without_those_of_the_callbacks_is_refused(half: Path, callbacks: Any) -> None:
+    """`metrics.csv` would begin anew."""
+    cfg = train_config(
+        *SMALL["ppo"], *QUICK, *BUDGET, "checkpoint.keep=3", f"resume={checkpoint.newest(half)}"
+    )
     state = checkpoint.load(checkpoint.newest(half))
     iteration = state.pop("iteration")
     state.pop("format")
-    checkpoint.save(half / "checkpoints", iteration, {**state, "metrics": -5}, keep=3)
-    with pytest.raises(UserError, match=r"parts \['metrics'\] missing or too many"):
-        find(cfg, half, CPU)
+    checkpoint.save(half / "checkpoints", iteration, {**state, "callbacks": callbacks}, keep=3)
+    with pytest.raises(UserError, match="no states of callbacks"):
+        find(cfg, read_problem(half / PROBLEM), half, CPU)
 
 
-@pytest.mark.parametrize("package", ["torch", "torchrl", "tensordict", "numpy", "scipy", "trackmdp"])
-def test_another_version_is_refused(package: str, half: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "package", ["torch", "torchrl", "tensordict", "numpy", "scipy", "trackmdp"]
+)
+def test_another_version_is_refused(
+    package: str, half: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """All of them draw or add up what a run learns from."""
     cfg = train_config(*SMALL["ppo"], *QUICK, *BUDGET, "checkpoint.keep=3", "resume=auto")
     monkeypatch.setattr(
-        "trackmdp.training.state.version", lambda name: "0.0" if name == package else metadata.version(name)
+        "trackmdp.training.state.version",
+        lambda name: "0.0" if name == package else metadata.version(name),
     )
-    with pytest.raises(UserError, match=rf"written with {package} [\d.]+\S*, this is 0.0; expected the same"):
-        find(cfg, half, CPU)
+    with pytest.raises(
+        UserError, match=rf"written with {package} [\d.]+\S*, this is 0.0; expected the same"
+    ):
+        find(cfg, read_problem(half / PROBLEM), half, CPU)
 
 
-def test_a_kernel_that_changed_is_refused(
+def test_a_run_goes_on_with_its_own_kernel_whatever_became_of_the_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    kernel, world = tmp_path / "kernel.npy", ("kernel=table", f"kernel.path={tmp_path / 'kernel.npy'}")
+    kernel, world = (
+        tmp_path / "kernel.npy",
+        ("kernel=table", f"kernel.path={tmp_path / 'kernel.npy'}"),
+    )
     np.save(kernel, np.full((9, 9), 0.1))
+    train(tmp_path / "whole", *world)
     with monkeypatch.context() as patch:
         at_iteration(patch, 5, lambda: (_ for _ in ()).throw(OSError(5, "Input/output error")))
         with pytest.raises(RunError):
             train(tmp_path / "run", *world)
-    np.save(kernel, np.full((9, 9), 0.05))
-    assert main(["train", "resume=auto", f"hydra.run.dir={tmp_path / 'run'}"]) == 2
-    assert "kernel.npz: not what the run's config describes now" in capsys.readouterr().err
+    kernel.unlink()
+    shutil.copytree(tmp_path / "run", tmp_path / "swapped")
+    assert main(["train", "resume=auto", f"hydra.run.dir={tmp_path / 'run'}"]) == 0
+    assert_same_run(tmp_path / "run", tmp_path / "whole")
+    other = World(np.full((9, 9), 0.05), 3, cost=0.2, t_max=1)
+    (tmp_path / "swapped" / PROBLEM).write_bytes(problem_bytes(other))
+    capsys.readouterr()
+    assert main(["train", "resume=auto", f"hydra.run.dir={tmp_path / 'swapped'}"]) == 2
+    assert "belongs to a run with another config or problem" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("algo", ["hindsight", "learned_kernel"])
+@pytest.mark.parametrize("algo", ["hindsight", "model_based"])
+@pytest.mark.parametrize("later", ["another map", "no map"])
 def test_a_map_of_classes_is_kept_and_no_other_one_taken(
-    algo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    algo: str, later: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     classes, file = np.array([0, 0, 0, 0, 0, 0, 1, 1, 1]), tmp_path / "map.npy"
     np.save(file, classes)
-    words = [f"algo.share_cells={file}", *(SMALL["hindsight"] if algo == "hindsight" else [f"algo={algo}"])]
+    words = [
+        f"algo.share_cells={file}",
+        *(SMALL["hindsight"] if algo == "hindsight" else [f"algo={algo}"]),
+    ]
     command = [*words, *QUICK, *BUDGET, "resume=auto", f"hydra.run.dir={tmp_path / 'run'}"]
     for folder in ("whole", "run"):
         with monkeypatch.context() as patch:
             if folder == "run":
                 at_iteration(patch, 5, breaks)
-            assert main(["train", *command[:-1], f"hydra.run.dir={tmp_path / folder}"]) == (folder == "run")
-    before = files(tmp_path / "run")
-    capsys.readouterr()
-    np.save(file, np.zeros(9))
-    assert main(["train", *command]) == 2
-    assert "classes.npy: not what the run's config describes now" in capsys.readouterr().err
+            assert main(["train", *command[:-1], f"hydra.run.dir={tmp_path / folder}"]) == (
+                folder == "run"
+            )
     file.unlink()
-    assert main(["train", *command]) == 2
-    assert capsys.readouterr().err == f"trackmdp train: algo.share_cells={file}: no such file\n"
-    assert before == files(tmp_path / "run")
-    np.save(file, classes)
+    if later == "another map":
+        np.save(file, np.zeros(9))
     assert main(["train", *command]) == 0
     assert_same_run(tmp_path / "run", tmp_path / "whole")
-    assert (tmp_path / "run" / "policy.npz").read_bytes() == (tmp_path / "whole" / "policy.npz").read_bytes()
+    assert (tmp_path / "run" / "policy.npz").read_bytes() == (
+        tmp_path / "whole" / "policy.npz"
+    ).read_bytes()
 
 
-def test_events_after_the_checkpoint_are_hidden(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_events_after_the_checkpoint_are_hidden(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     with monkeypatch.context() as patch:
@@ -232,24 +273,33 @@ def test_events_after_the_checkpoint_are_hidden(tmp_path: Path, monkeypatch: pyt
     assert [event.step for event in events.Scalars("iteration")] == list(range(256, 2049, 256))
 
 
-def test_a_finished_run_ends_at_once_and_stays_as_it_is(whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_finished_run_ends_at_once_and_stays_as_it_is(
+    whole: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     before = files(whole)
     assert typed(whole, "resume=auto", "quiet=false") == 0
     assert "finished before" in capsys.readouterr().out
     assert files(whole) == before
 
 
-def test_a_folder_with_a_run_is_refused_without_resume(whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_with_a_run_is_refused_without_resume(
+    whole: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     before = files(whole)
     assert typed(whole) == 2
-    assert "holds a run already; go on with it by resume=auto" in capsys.readouterr().err
+    assert "holds a run already; resume it by resume=auto" in capsys.readouterr().err
     assert files(whole) == before
 
 
-def test_weights_are_taken_where_they_fit(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_weights_are_taken_where_they_fit(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     given = checkpoint.load(checkpoint.newest(whole))["algorithm"]
     words = [f"init_from={whole}", "quiet=false", "seed=3", "collector.total_frames=256"]
-    assert typed(tmp_path / "same", *words, "algo.learning_rate.start=0", "algo.learning_rate.end=0") == 0
+    assert (
+        typed(tmp_path / "same", *words, "algo.learning_rate.start=0", "algo.learning_rate.end=0")
+        == 0
+    )
     mine = checkpoint.load(checkpoint.newest(tmp_path / "same"))["algorithm"]
     for name in ("policy", "critic"):
         for key, tensor in mine[name].items():
@@ -257,9 +307,23 @@ def test_weights_are_taken_where_they_fit(whole: Path, tmp_path: Path, capsys: p
     assert f"weights from {whole}: " in (out := capsys.readouterr().out)
     assert out.count("encoder.cell.weight") == 2
     assert typed(tmp_path / "longer", *words, "grid.t_max=2") == 0
-    taken = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("weights from"))
+    taken = next(
+        line for line in capsys.readouterr().out.splitlines() if line.startswith("weights from")
+    )
     assert "encoder.cell.weight" in taken
     assert "encoder.history.weight" not in taken
-    assert main(["train", *SMALL["dqn"], *BUDGET, *QUICK, f"hydra.run.dir={tmp_path / 'none'}", words[0]]) == 2
+    assert (
+        main(
+            [
+                "train",
+                *SMALL["dqn"],
+                *BUDGET,
+                *QUICK,
+                f"hydra.run.dir={tmp_path / 'none'}",
+                words[0],
+            ]
+        )
+        == 2
+    )
     assert "none of its weights has the name and shape of one of ours" in capsys.readouterr().err
     assert not (tmp_path / "none").exists()

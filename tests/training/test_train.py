@@ -66,17 +66,32 @@ class Heard(Callback):
 def test_it_is_the_run_of_the_command(tmp_path: Path) -> None:
     world = small_world()
     run = train(world, "ppo", seed=3, folder=tmp_path / "python", **QUICK)
-    words = [f"algo.{key}={QUICK[key]}" for key in ("total_frames", "frames_per_batch", "envs", "hidden")]
-    words += ["optimal.enabled=false", "evaluation.every=4", "quiet=true", "grid.size=3", "cost.sensor=0.2"]
-    table = f"kernel.path={tmp_path / 'python' / 'kernel.npz'}"
+    words = [
+        f"algo.{key}={QUICK[key]}" for key in ("total_frames", "frames_per_batch", "envs", "hidden")
+    ]
+    words += [
+        "optimal.enabled=false",
+        "evaluation.every=4",
+        "quiet=true",
+        "grid.size=3",
+        "cost.sensor=0.2",
+    ]
+    np.save(tmp_path / "kernel.npy", world.kernel.toarray())
+    table = f"kernel.path={tmp_path / 'kernel.npy'}"
     (tmp_path / "typed").mkdir()
-    reached = command.run(train_config("algo=ppo", "seed=3", "kernel=table", table, *words), tmp_path / "typed")
+    reached = command.run(
+        train_config("algo=ppo", "seed=3", "kernel=table", table, *words), tmp_path / "typed"
+    )
     assert reached == run.evaluation.aihtr
     assert rows(tmp_path / "typed") == rows(tmp_path / "python")
-    assert (tmp_path / "typed/policy.npz").read_bytes() == (tmp_path / "python/policy.npz").read_bytes()
+    assert (tmp_path / "typed/policy.npz").read_bytes() == (
+        tmp_path / "python/policy.npz"
+    ).read_bytes()
 
 
-def test_nothing_is_written_and_nothing_is_disturbed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_written_and_nothing_is_disturbed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     torch.manual_seed(5)
     expected = torch.rand(3)
@@ -85,8 +100,8 @@ def test_nothing_is_written_and_nothing_is_disturbed(tmp_path: Path, monkeypatch
     assert torch.equal(torch.rand(3), expected)
     assert not list(tmp_path.iterdir())
     assert run.folder is None
-    assert run.metrics["iteration"] == list(range(1, 9))
-    assert run.metrics["aihtr"][-1] == run.summary["policy"]["aihtr"] == run.evaluation.aihtr
+    assert run.columns["iteration"] == list(range(1, 9))
+    assert run.columns["aihtr"][-1] == run.summary["policy"]["aihtr"] == run.evaluation.aihtr
     assert run.policy.dense().shape == (9, 2, 9)
 
 
@@ -94,10 +109,13 @@ def test_a_run_is_loaded_as_it_ended(tmp_path: Path) -> None:
     run = train(small_world(), "ppo", folder=tmp_path / "run", **QUICK)
     found = load_run(tmp_path / "run")
     assert np.array_equal(found.policy.dense(), run.policy.dense())
-    assert found.metrics == run.metrics
+    assert found.columns == run.columns
     assert found.summary["policy"] == run.summary["policy"]
     assert np.array_equal(found.evaluation.value, run.evaluation.value)
-    assert (found.evaluation.aihtr, found.evaluation.accuracy) == (run.evaluation.aihtr, run.evaluation.accuracy)
+    assert (found.evaluation.aihtr, found.evaluation.accuracy) == (
+        run.evaluation.aihtr,
+        run.evaluation.accuracy,
+    )
     with pytest.raises(UserError, match="not the folder of a finished run"):
         load_run(tmp_path)
 
@@ -108,13 +126,15 @@ def test_a_run_in_a_folder_is_resumed_exactly(tmp_path: Path) -> None:
             if row["iteration"] == 5:
                 raise RuntimeError("stopped")
 
-    whole = train(small_world(), "ppo", folder=tmp_path / "whole", **QUICK, **{"checkpoint.every": 256})
+    whole = train(
+        small_world(), "ppo", folder=tmp_path / "whole", **QUICK, **{"checkpoint.every": 256}
+    )
     words: dict[str, Any] = {**QUICK, "checkpoint.every": 256, "folder": tmp_path / "cut"}
     with pytest.raises(RuntimeError, match="stopped"):
         train(small_world(), "ppo", callbacks=[Stop()], **words)
     with pytest.raises(UserError, match="holds a run already"):
         train(small_world(), "ppo", **words)
-    with pytest.raises(UserError, match=r"kernel\.npz: not what the run's config describes now"):
+    with pytest.raises(UserError, match="belongs to a run with another config or problem"):
         train(small_world(seed=1), "ppo", resume="auto", **words)
     run = train(small_world(), "ppo", resume="auto", **words)
     assert rows(tmp_path / "cut") == rows(tmp_path / "whole")
@@ -156,7 +176,9 @@ def test_recorded_tracks_are_learned_from() -> None:
 
 def test_recorded_tracks_in_a_folder_are_resumed_and_evaluated(tmp_path: Path) -> None:
     world = small_world(exit_probability=0.05)
-    setting = recorded(drawn(world.kernel, 120), drawn(world.kernel, 40, seed=1), markov=False, anywhere=True)
+    setting = recorded(
+        drawn(world.kernel, 120), drawn(world.kernel, 40, seed=1), markov=False, anywhere=True
+    )
     whole = train(setting, "ppo", folder=tmp_path / "whole", **QUICK)
 
     class Stop(Callback):
@@ -170,10 +192,21 @@ def test_recorded_tracks_in_a_folder_are_resumed_and_evaluated(tmp_path: Path) -
     words = [f"hydra.run.dir={tmp_path / 'cut'}", "quiet=true"]
     assert main(["train", "resume=auto", *words]) == 0
     assert load_run(tmp_path / "cut").summary["policy"] == whole.summary["policy"]
-    assert main(["evaluate", f"run={tmp_path / 'cut'}", "quiet=true", f"hydra.run.dir={tmp_path / 'e'}"]) == 0
+    assert (
+        main(
+            ["evaluate", f"run={tmp_path / 'cut'}", "quiet=true", f"hydra.run.dir={tmp_path / 'e'}"]
+        )
+        == 0
+    )
     other = recorded(drawn(world.kernel, 120, seed=5), markov=False, anywhere=True)
-    with pytest.raises(UserError, match=r"tracks\.json: not what the run's config describes now"):
-        train(other, "ppo", folder=tmp_path / "cut", resume="auto", **{**options, "collector.total_frames": 4096})
+    with pytest.raises(UserError, match="belongs to a run with another config or problem"):
+        train(
+            other,
+            "ppo",
+            folder=tmp_path / "cut",
+            resume="auto",
+            **{**options, "collector.total_frames": 4096},
+        )
 
 
 def test_the_regret_is_the_same_on_a_busy_machine(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -196,18 +229,31 @@ def test_the_regret_is_the_same_on_a_busy_machine(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize("solved", [True, False])
-def test_an_evaluation_of_a_run_measures_against_what_the_run_proved(tmp_path: Path, solved: bool) -> None:
+def test_an_evaluation_of_a_run_measures_against_what_the_run_proved(
+    tmp_path: Path, solved: bool
+) -> None:
     """The regret of `evaluate run=` is that of the run's summary; without a bracket there, to the clocked bound."""
     kernel = drift(5, direction=0.0, persistence=0.5, exit_probability=0.01, border="renormalize")
     np.save(tmp_path / "kernel.npy", kernel.toarray())
     words = "kernel=table grid.size=5 grid.t_max=2 cost.sensor=0.3 algo=ppo collector.total_frames=512 quiet=true"
     frames = ["collector.frames_per_batch=256", "collector.envs=32", "optimal.nodes=2000"]
-    own = [f"kernel.path={tmp_path / 'kernel.npy'}", f"optimal.enabled={solved}", f"hydra.run.dir={tmp_path / 'run'}"]
+    own = [
+        f"kernel.path={tmp_path / 'kernel.npy'}",
+        f"optimal.enabled={solved}",
+        f"hydra.run.dir={tmp_path / 'run'}",
+    ]
     assert main(["train", *words.split(), *frames, *own]) == 0
-    judge = ["evaluate", f"run={tmp_path / 'run'}", "episodes=0", "quiet=true", f"hydra.run.dir={tmp_path / 'judged'}"]
+    judge = [
+        "evaluate",
+        f"run={tmp_path / 'run'}",
+        "episodes=0",
+        "quiet=true",
+        f"hydra.run.dir={tmp_path / 'judged'}",
+    ]
     assert main(judge) == 0
     summary, found = (
-        json.loads((tmp_path / name).read_text()) for name in ("run/summary.json", "judged/evaluation.json")
+        json.loads((tmp_path / name).read_text())
+        for name in ("run/summary.json", "judged/evaluation.json")
     )
     for name in ("regret_per_step", "regret_per_step_lower"):
         assert found[name] == pytest.approx(summary[name], abs=1e-12)
@@ -216,5 +262,18 @@ def test_an_evaluation_of_a_run_measures_against_what_the_run_proved(tmp_path: P
     assert (found["regret_per_step"] < clocked - 1e-4) is solved
     if solved:
         # A bracket of another world would make the regret what it is not.
-        (tmp_path / "run/config.yaml").write_text((tmp_path / "run/config.yaml").read_text() + "# touched\n")
+        (tmp_path / "run/config.yaml").write_text(
+            (tmp_path / "run/config.yaml").read_text() + "# touched\n"
+        )
         assert main(judge) != 0
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    folder = tmp_path / "file" / "run"
+    with pytest.raises(UserError, match=f"folder={folder}: cannot be made"):
+        train(small_world(), "a2c", folder=folder, **QUICK)
+
+
+def test_the_threads_of_a_summary_are_those_of_the_run() -> None:
+    assert train(small_world(), "a2c", threads=2, **QUICK).summary["machine"]["torch_threads"] == 2

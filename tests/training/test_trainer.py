@@ -12,7 +12,7 @@ from tests.helpers import train_config
 from tests.training.runs import BUDGET, QUICK, rows, train
 from trackmdp.app.commands.train import run
 from trackmdp.config import CheckpointConfig
-from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers.value import evaluate
 from trackmdp.training.callbacks import Position
 from trackmdp.training.evaluator import ExactEvaluator
 from trackmdp.training.state import Checkpoints
@@ -78,13 +78,17 @@ def test_a_budget_is_made_up_to_whole_batches(tmp_path: Path) -> None:
     assert int(rows(tmp_path)[-1]["frames"]) == 768
 
 
-def test_a_plan_is_valued_once_and_a_net_whenever_it_is_due(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_plan_is_valued_once_and_a_net_whenever_it_is_due(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     asked: list[object] = []
     score = ExactEvaluator.score
-    monkeypatch.setattr(ExactEvaluator, "score", lambda self, policy: [asked.append(policy), score(self, policy)][1])
+    monkeypatch.setattr(
+        ExactEvaluator, "score", lambda self, policy: [asked.append(policy), score(self, policy)][1]
+    )
     folder = tmp_path / "plans"
     folder.mkdir()
-    words = ("algo=learned_kernel", "algo.plan_every=4", "algo.samples=2", "evaluation.every=1")
+    words = ("algo=model_based", "algo.plan_every=4", "evaluation.every=1")
     run(train_config(*words, *QUICK[:3], *BUDGET), folder)
     # all on, two plans in eight iterations, and the last of them once more for the summary
     plans = len(asked)

@@ -14,7 +14,9 @@ from tests.helpers import random_kernel, small_world
 from trackmdp.episodes.belief import BeliefFilter
 from trackmdp.world.env import TrackEnv
 
-KERNEL = sparse.csr_array([[0.2, 0.3, 0.4, 0.0], [0.5, 0.0, 0.0, 0.25], [0.0, 0.0, 0.5, 0.5], [0.1, 0.1, 0.1, 0.1]])
+KERNEL = sparse.csr_array(
+    [[0.2, 0.3, 0.4, 0.0], [0.5, 0.0, 0.0, 0.25], [0.0, 0.0, 0.5, 0.5], [0.1, 0.1, 0.1, 0.1]]
+)
 
 
 def test_two_steps_by_hand() -> None:
@@ -37,7 +39,9 @@ def test_a_miss_that_cannot_happen_leaves_the_prediction() -> None:
     predicted = belief.predict(belief.detect(torch.tensor([0])))
     after = belief.miss(predicted, torch.ones(1, 4, dtype=torch.bool))
     np.testing.assert_allclose(after, predicted / 0.9)
-    nothing = belief.miss(torch.zeros(1, 4, dtype=torch.float64), torch.ones(1, 4, dtype=torch.bool))
+    nothing = belief.miss(
+        torch.zeros(1, 4, dtype=torch.float64), torch.ones(1, 4, dtype=torch.bool)
+    )
     assert torch.isfinite(nothing).all()
 
 
@@ -74,7 +78,7 @@ def test_it_says_where_the_environments_targets_are() -> None:
     env = TrackEnv(world, count, seed=1)
     env.reset()
     there = env.snapshot()
-    there["rows"] |= dict.fromkeys(("target", "last_cell"), torch.full((count,), 4))
+    there["rows"] |= dict.fromkeys(("place", "last_cell"), torch.full((count,), 4))
     state = env.restore(there)
     belief = BeliefFilter(world.kernel)
     rows = belief.detect(torch.tensor([4]))

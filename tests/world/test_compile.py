@@ -16,21 +16,24 @@ from tensordict.nn import TensorDictModule
 from tests.helpers import limited, small_world
 from tests.tracks import by_hand, recorded
 from trackmdp.world.env import TrackEnv
-from trackmdp.world.modes import HiddenWorld, heading_kernel
+from trackmdp.world.model import World
+from trackmdp.world.modes import heading_kernel
 
 TRACKS = ([0, 1, 2], [3, 4, 5, 8], [7, 4, 1, 0])
 
 
-def heading() -> HiddenWorld:
+def heading() -> World:
     kernel, modes = heading_kernel(3, keep=0.8, go=0.9, exit_probability=0.1)
-    return HiddenWorld(kernel, 3, modes=modes, cost=0.2, t_max=1, clip=1)
+    return World(kernel, 3, modes=modes, cost=0.2, t_max=1, clip=1)
 
 
 PROBLEMS: dict[str, Callable[[], Any]] = {
     "world": lambda: small_world(t_max=2),
     "limited": lambda: limited(small_world(t_max=2), 4),
     "window": lambda: replace(small_world(), window=1),
-    "misses": lambda: replace(small_world(), detection=np.full(9, 0.7), safe_detection=np.full(9, 0.6)),
+    "misses": lambda: replace(
+        small_world(), detection=np.full(9, 0.7), safe_detection=np.full(9, 0.6)
+    ),
     "hidden": heading,
     "tracks": lambda: recorded(by_hand(*TRACKS, exits=True)),
     "memory": lambda: recorded(by_hand(*TRACKS), memory="displacement_gap", clip=1),
@@ -86,7 +89,8 @@ FAST = ("misses", "memory")
 
 
 @pytest.mark.parametrize(
-    "name", [each if each in FAST else pytest.param(each, marks=pytest.mark.slow) for each in PROBLEMS]
+    "name",
+    [each if each in FAST else pytest.param(each, marks=pytest.mark.slow) for each in PROBLEMS],
 )
 def test_a_step_is_one_graph_and_the_same_step(name: str) -> None:
     """30 steps of 5 targets, episodes ending and beginning; `fullgraph` refuses a graph break."""
@@ -149,7 +153,10 @@ def test_where_torchrl_itself_branches_on_data() -> None:
     before the first step with `auto_reset=False`.
     """
     env, _ = pair("world")
-    with pytest.raises(torch._dynamo.exc.Unsupported, match=r"(?s)Data-dependent branching.*envs/common.py.*any_done"):
+    with pytest.raises(
+        torch._dynamo.exc.Unsupported,
+        match=r"(?s)Data-dependent branching.*envs/common.py.*any_done",
+    ):
         torch.compile(env.rollout, fullgraph=True, backend="eager")(3, POLICY)
 
 
@@ -165,6 +172,8 @@ def test_a_copy_draws_from_its_own_generators() -> None:
     compiled = torch.compile(copied.step_and_maybe_reset, fullgraph=True, backend="eager")
     plain = stepped(theirs.step_and_maybe_reset, theirs, 5)
     before = TensorDict(mine.snapshot()).clone()
-    assert all((one == other).all() for one, other in zip(stepped(compiled, copied, 5), plain, strict=True))
+    assert all(
+        (one == other).all() for one, other in zip(stepped(compiled, copied, 5), plain, strict=True)
+    )
     assert (TensorDict(mine.snapshot()) == before).all()
     assert same(copied, theirs)

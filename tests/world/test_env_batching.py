@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import TensorDict, TensorDictBase
 
-from tests.helpers import limited, random_state, small_world, worlds
-from trackmdp.policies.acting import RandomSubset
+from tests.acting import RandomSubset
+from tests.helpers import advanced, limited, random_state, small_world, worlds
 from trackmdp.seeding import generator
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.model import World
@@ -17,7 +17,9 @@ SEEDS = st.integers(0, 2**32 - 1)
 LIMITS = st.sampled_from([None, 3])
 
 
-def states(world: World, rows: int, seed: int, max_steps: int | None) -> tuple[TensorDict, torch.Tensor]:
+def states(
+    world: World, rows: int, seed: int, max_steps: int | None
+) -> tuple[TensorDict, torch.Tensor]:
     before, rng = random_state(world, rows, seed), torch.Generator().manual_seed(seed)
     if max_steps:
         before["step_count"] = torch.randint(max_steps, (rows,), generator=rng)
@@ -32,20 +34,26 @@ def equal(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor]) -> bo
 
 
 @given(worlds(), st.integers(1, 20), SEEDS, LIMITS)
-def test_rows_together_equal_rows_alone(world: World, rows: int, seed: int, max_steps: int | None) -> None:
+def test_rows_together_equal_rows_alone(
+    world: World, rows: int, seed: int, max_steps: int | None
+) -> None:
     before, draws = states(world, rows, seed, max_steps)
-    together = TrackEnv(limited(world, max_steps), rows).advance(before, draws)
-    one = TrackEnv(limited(world, max_steps), 1)
-    alone = [one.advance(before[i : i + 1], draws[i : i + 1]) for i in range(rows)]
+    cut = limited(world, max_steps)
+    together = advanced(cut, before, draws)
+    alone = [advanced(cut, before[i : i + 1], draws[i : i + 1]) for i in range(rows)]
     assert equal(together, {key: torch.cat([row[key] for row in alone]) for key in together})
 
 
 @given(worlds(), st.integers(2, 20), SEEDS, LIMITS)
-def test_permuted_rows_give_permuted_results(world: World, rows: int, seed: int, max_steps: int | None) -> None:
+def test_permuted_rows_give_permuted_results(
+    world: World, rows: int, seed: int, max_steps: int | None
+) -> None:
     before, draws = states(world, rows, seed, max_steps)
-    env = TrackEnv(limited(world, max_steps), rows)
+    cut = limited(world, max_steps)
     order = torch.randperm(rows, generator=torch.Generator().manual_seed(seed))
-    straight, permuted = env.advance(before, draws), env.advance(before[order], draws[order])
+    straight, permuted = (
+        advanced(cut, *each) for each in ((before, draws), (before[order], draws[order]))
+    )
     assert equal({key: value[order] for key, value in straight.items()}, permuted)
 
 
@@ -53,12 +61,14 @@ def test_permuted_rows_give_permuted_results(world: World, rows: int, seed: int,
 def test_a_step_leaves_its_input_as_it_was(world: World, rows: int, seed: int) -> None:
     before, draws = states(world, rows, seed, 3)
     kept = before.clone()
-    TrackEnv(limited(world, 3), rows).advance(before, draws)
+    advanced(limited(world, 3), before, draws)
     assert (before == kept).all()
 
 
 @given(SEEDS, st.lists(st.booleans(), min_size=6, max_size=6), LIMITS)
-def test_a_partial_reset_leaves_the_other_rows(seed: int, mask: list[bool], max_steps: int | None) -> None:
+def test_a_partial_reset_leaves_the_other_rows(
+    seed: int, mask: list[bool], max_steps: int | None
+) -> None:
     world = small_world(t_max=2)
     env, rows = TrackEnv(limited(world, max_steps), 6, seed=seed), torch.tensor(mask)
     before = _midway(env)

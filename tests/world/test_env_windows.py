@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torchrl.envs.utils import check_env_specs
 
-from tests.helpers import random_state, small_world, worlds
+from tests.helpers import advanced, random_state, small_world, worlds
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.kernels import random_walk
 from trackmdp.world.model import World
@@ -30,19 +30,23 @@ def everywhere(world: World, state: Any) -> dict[str, torch.Tensor]:
     """The same state in global numbers."""
     window, start = Window.of(world), state["last_cell"]
     slots = start[:, None].expand(-1, world.num_choices)
-    found = {key: state[key] for key in ("target", "last_cell", "steps_since_detection")}
+    found = {key: state[key] for key in ("place", "last_cell", "steps_since_detection")}
     found["action_history"] = window.to_global(slots, state["action_history"])
-    return found | ({"action": window.to_global(start, state["action"])} if "action" in state else {})
+    return found | (
+        {"action": window.to_global(start, state["action"])} if "action" in state else {}
+    )
 
 
 @given(worlds(), st.integers(0, 3), st.integers(1, 12), st.integers(0, 2**32 - 1))
-def test_a_step_with_a_window_is_the_one_without(world: World, radius: int, rows: int, seed: int) -> None:
+def test_a_step_with_a_window_is_the_one_without(
+    world: World, radius: int, rows: int, seed: int
+) -> None:
     """The same target, sets within the window: the same reward to the bit, and the same state after it."""
     local = replace(world, window=radius)
     state = random_state(local, rows, seed)
     draws = torch.rand(rows, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-    mine = TrackEnv(local, rows).advance(state, draws)
-    theirs = TrackEnv(world, rows).advance(everywhere(local, state), draws)
+    mine = advanced(local, state, draws)
+    theirs = advanced(world, everywhere(local, state), draws)
     assert set(mine) == set(theirs)
     for key, value in (mine | everywhere(local, mine)).items():
         assert torch.equal(value, theirs[key]), key
@@ -56,7 +60,10 @@ def test_whole_episodes_with_and_without_a_window_are_the_same() -> None:
     for _ in range(300):
         action = torch.rand(40, 9, generator=rng) < 0.6
         mine["action"], theirs["action"] = action, window.to_global(mine["last_cell"], action)
-        (ours, mine), (others, theirs) = local.step_and_maybe_reset(mine), whole.step_and_maybe_reset(theirs)
+        (ours, mine), (others, theirs) = (
+            local.step_and_maybe_reset(mine),
+            whole.step_and_maybe_reset(theirs),
+        )
         assert torch.equal(local.target, whole.target)
         assert torch.equal(mine["last_cell"], theirs["last_cell"])
         assert torch.equal(ours["next", "reward"], others["next", "reward"])
@@ -68,26 +75,29 @@ def test_the_safe_action_locates_outside_the_window() -> None:
     """One row of 5 cells, radius 1: the target is four cells away, and only when forced it is located."""
     kernel = random_walk((1, 5), stay=1.0, diagonal=False, exit_probability=0.0, border="clip")
     world = World(kernel, (1, 5), cost=0.1, t_max=0, max_steps=99, window=1)
-    env = TrackEnv(world, 1)
     state = {
-        "target": torch.tensor([4]),
+        "place": torch.tensor([4]),
         "last_cell": torch.tensor([0]),
         "steps_since_detection": torch.tensor([0]),
         "action_history": torch.zeros(1, 1, 9, dtype=torch.bool),
         "action": torch.ones(1, 9, dtype=torch.bool),
         "step_count": torch.tensor([0]),
     }
-    missed = env.advance(state, torch.zeros(1, dtype=torch.float64))
-    assert missed["reward"].item() == pytest.approx(-0.2)  # cells 0 and 1; all others of the window lie outside
+    missed = advanced(world, state, [0.0])
+    assert missed["reward"].item() == pytest.approx(
+        -0.2
+    )  # cells 0 and 1; all others of the window lie outside
     assert missed["steps_since_detection"].tolist() == [1]
-    located = env.advance(missed | {"action": state["action"]}, torch.zeros(1, dtype=torch.float64))
+    located = advanced(world, missed | {"action": state["action"]}, [0.0])
     assert located["last_cell"].tolist() == [4]
     assert located["reward"].item() == pytest.approx(1.0 - 0.5)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize(("window", "max_steps"), [(None, None), (1, 3)])
-def test_specs_hold_for_every_shape(shape: tuple[int, ...], window: int | None, max_steps: int | None) -> None:
+def test_specs_hold_for_every_shape(
+    shape: tuple[int, ...], window: int | None, max_steps: int | None
+) -> None:
     env = TrackEnv(replace(walk(window), max_steps=max_steps), shape)
     check_env_specs(env)
     assert env.action_spec.shape == (*shape, 20 if window is None else 9)
@@ -107,7 +117,14 @@ def test_a_batch_of_any_shape_is_the_row_of_its_targets(shape: tuple[int, ...]) 
     for _ in range(30):
         action = torch.rand(count, 9, generator=rng) < 0.4
         mine["action"], theirs["action"] = action.reshape(*shape, 9), action
-        (ours, mine), (others, theirs) = shaped.step_and_maybe_reset(mine), row.step_and_maybe_reset(theirs)
+        (ours, mine), (others, theirs) = (
+            shaped.step_and_maybe_reset(mine),
+            row.step_and_maybe_reset(theirs),
+        )
         for done, expected in ((ours, others), (mine, theirs)):
             assert done.batch_size == shape
-            assert (done == expected.reshape(shape)).all() if shape else (done.unsqueeze(0) == expected).all()
+            assert (
+                (done == expected.reshape(shape)).all()
+                if shape
+                else (done.unsqueeze(0) == expected).all()
+            )

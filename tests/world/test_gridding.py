@@ -27,16 +27,24 @@ def grid(**more: Any) -> Gridding:
 
     3 4 5 are the lower cells (y < 10), 0 1 2 the upper ones.
     """
-    usual: dict[str, Any] = {"size": (2, 3), "cell": 10.0, "step": 5.0, "max_gap": 15.0, "origin": (0.0, 0.0)}
+    usual: dict[str, Any] = {
+        "size": (2, 3),
+        "cell": 10.0,
+        "step": 5.0,
+        "max_gap": 15.0,
+        "origin": (0.0, 0.0),
+    }
     return Gridding(**(usual | {"crs": None, "shortest": 1, "exits": True} | more))
 
 
 def cells(tracks: Tracks) -> list[list[int]]:
-    return [tracks.cells[a:b].tolist() for a, b in zip(tracks.first[:-1], tracks.first[1:], strict=True)]
+    return [
+        tracks.cells[a:b].tolist() for a, b in zip(tracks.first[:-1], tracks.first[1:], strict=True)
+    ]
 
 
 def made(positions: Positions, **more: Any) -> tuple[Tracks, dict[str, int]]:
-    return to_tracks(positions, grid(**more), "here")
+    return to_tracks(positions, grid(**more), "here")[:2]
 
 
 def test_between_reports_a_straight_line() -> None:
@@ -83,7 +91,9 @@ def test_positions_beyond_the_projection_do_not_move_the_grid() -> None:
     """A third of all reports, far more than the percentiles leave out: the others stay in the middle of the grid."""
     near = [(0, 5 * k, 9.0 + 1e-6 * k, 47.0) for k in range(20)]
     away = [(1, 5 * k, -81.0, 0.0) for k in range(10)]
-    tracks, _ = made(seen(*near, *away, geographic=True), size=(3, 3), cell=100.0, origin=None, crs="EPSG:32632")
+    tracks, _ = made(
+        seen(*near, *away, geographic=True), size=(3, 3), cell=100.0, origin=None, crs="EPSG:32632"
+    )
     assert cells(tracks) == [[4] * 20]
 
 
@@ -105,7 +115,14 @@ def test_pieces_of_the_file_stay_apart() -> None:
 def test_a_track_is_cut_where_it_leaves_the_grid() -> None:
     """Right and upper edges are outside; who comes back is a track of the same name."""
     tracks, report = made(
-        seen((0, 0, 25, 5), (0, 5, 30, 5), (0, 10, 29.9, 5), (0, 15, 29.9, 20), (1, 0, -0.1, 5), (1, 5, 0, 0)),
+        seen(
+            (0, 0, 25, 5),
+            (0, 5, 30, 5),
+            (0, 10, 29.9, 5),
+            (0, 15, 29.9, 20),
+            (1, 0, -0.1, 5),
+            (1, 5, 0, 0),
+        ),
         exits=False,
     )
     assert cells(tracks) == [[5], [5], [3]]
@@ -131,8 +148,14 @@ def test_short_tracks_are_dropped_and_all_is_counted() -> None:
         "steps kept": 3,
         "tracks kept": 1,
     }
-    assert said({"reports read": 1234, "steps": 0, "tracks kept": 2}) == "1,234 reports read, 2 tracks kept"
-    with pytest.raises(UserError, match=r"^here: no track of at least 4 cells; 7 reports read, .*6 steps in 4 tracks"):
+    assert (
+        said({"reports read": 1234, "steps": 0, "tracks kept": 2})
+        == "1,234 reports read, 2 tracks kept"
+    )
+    with pytest.raises(
+        UserError,
+        match=r"^here: no track of at least 4 cells; 7 reports read, .*6 steps in 4 tracks",
+    ):
         made(positions, shortest=4, size=(9, 9))
 
 
@@ -147,7 +170,9 @@ def test_without_an_origin_the_middles_agree() -> None:
 def test_degrees_become_metres_of_the_utm_zone() -> None:
     """On the central meridian of zone 32 (9 E) x is 500,000; a minute of latitude is about 1,853 m."""
     north = 47.0 + 1 / 60
-    positions = seen((0, 0, 9.0, 47.0), (0, 5, 9.0, north), (0, 10, 9.0 + 2 / 60, north), geographic=True)
+    positions = seen(
+        (0, 0, 9.0, 47.0), (0, 5, 9.0, north), (0, 10, 9.0 + 2 / 60, north), geographic=True
+    )
     # From 500 m west and south of the first: (500, 500), (500, 2353), and 2 · 1,853 · cos(47°) = 2,534 m further east.
     west, south = 9.0 - 500 / 76_055, 47.0 - 500 / 111_170
     tracks, _ = made(positions, cell=1000.0, size=(4, 5), origin=(west, south))
@@ -170,14 +195,34 @@ AT_SEA = seen((0, 0, 1, 1), geographic=True)
         (
             AT_SEA,
             {"crs": "EPSG:4326"},
-            "kernel.crs=EPSG:4326: WGS 84, expected a projected coordinate system in",
+            "grid.crs=EPSG:4326: WGS 84, expected a projected coordinate system in",
         ),
-        (AT_SEA, {"crs": "EPSG:2225"}, "kernel.crs=EPSG:2225: NAD83 / California zone 1 (ftUS), expected a projected"),
-        (AT_SEA, {"crs": "EPSG:1"}, "kernel.crs=EPSG:1: no known coordinate system ("),
-        (AT_SEA, {"origin": (9.0, 470.0)}, "kernel.origin=[9.0, 470.0]: outside of EPSG:32631, expected lon, lat"),
-        (seen((0, 0, 1, 1), (0, 5, 40, 1), geographic=True), {}, "here: from 1.4 to 39.6 degrees of longitude, at "),
-        (seen((0, 0, 1, 88), geographic=True), {}, "here: from 1.0 to 1.0 degrees of longitude, at latitude 88.0"),
-        (seen((0, 0, 5, 5), (0, 9e9, 5, 5)), {"max_gap": 1e10}, "kernel.step=5: makes 1.8e+09 steps of it, expected "),
+        (
+            AT_SEA,
+            {"crs": "EPSG:2225"},
+            "grid.crs=EPSG:2225: NAD83 / California zone 1 (ftUS), expected a projected",
+        ),
+        (AT_SEA, {"crs": "EPSG:1"}, "grid.crs=EPSG:1: no known coordinate system ("),
+        (
+            AT_SEA,
+            {"origin": (9.0, 470.0)},
+            "grid.origin=[9.0, 470.0]: outside of EPSG:32631, expected lon, lat",
+        ),
+        (
+            seen((0, 0, 1, 1), (0, 5, 40, 1), geographic=True),
+            {},
+            "here: from 1.4 to 39.6 degrees of longitude, at ",
+        ),
+        (
+            seen((0, 0, 1, 88), geographic=True),
+            {},
+            "here: from 1.0 to 1.0 degrees of longitude, at latitude 88.0",
+        ),
+        (
+            seen((0, 0, 5, 5), (0, 9e9, 5, 5)),
+            {"max_gap": 1e10},
+            "kernel.step=5: makes 1.8e+09 steps of it, expected ",
+        ),
         (
             seen((0, 0, 5, 5), (0, 1, 5, 5)),
             {"step": 5e-324},
@@ -186,14 +231,18 @@ AT_SEA = seen((0, 0, 1, 1), geographic=True)
         (seen((0, 0, 5, 5), (0, 5, 7, 5)), {"cell": 5e-324}, "here: no track of at least 1 cells"),
     ],
 )
-def test_what_does_not_fit_is_refused(positions: Positions, more: dict[str, Any], message: str) -> None:
+def test_what_does_not_fit_is_refused(
+    positions: Positions, more: dict[str, Any], message: str
+) -> None:
     with pytest.raises(UserError) as caught:
         made(positions, **({"origin": None} | more))
     assert str(caught.value).startswith(message)
     assert "\n" not in str(caught.value)
 
 
-REPORTS = st.tuples(st.integers(0, 3), st.integers(0, 60), st.integers(-20, 50), st.integers(-20, 40))
+REPORTS = st.tuples(
+    st.integers(0, 3), st.integers(0, 60), st.integers(-20, 50), st.integers(-20, 40)
+)
 
 
 @given(st.lists(REPORTS, min_size=1))
@@ -203,7 +252,11 @@ def test_every_step_is_kept_or_counted(reports: list[tuple[int, int, int, int]])
     except UserError as error:
         assert "no track of at least 2 cells" in str(error)
         return
-    dropped = [count for name, count in report.items() if name.startswith("steps ") and name != "steps kept"]
+    dropped = [
+        count
+        for name, count in report.items()
+        if name.startswith("steps ") and name != "steps kept"
+    ]
     assert report["steps"] == report["steps kept"] + sum(dropped)
     assert report["steps kept"] == len(tracks.cells) == tracks.lengths.sum()
     assert (tracks.lengths >= 2).all()
@@ -211,7 +264,9 @@ def test_every_step_is_kept_or_counted(reports: list[tuple[int, int, int, int]])
     # one target alone gives the same tracks as among the others
     alone = _cells_or_none([report for report in reports if report[0] == reports[0][0]])
     name = sorted({str(report[0]) for report in reports}).index(str(reports[0][0]))
-    assert alone == [row for row, own in zip(cells(tracks), tracks.names, strict=True) if own == name]
+    assert alone == [
+        row for row, own in zip(cells(tracks), tracks.names, strict=True) if own == name
+    ]
 
 
 def _cells_or_none(reports: list[tuple[int, int, int, int]]) -> list[list[int]]:
@@ -225,7 +280,9 @@ CITY = Path(__file__).parents[1] / "data" / "city.csv"
 
 
 def load(**more: Any) -> Recorded:
-    return tm.load_tracks(CITY, (18, 15), **({"step": 5, "cell": 50, "t_max": 1, "cost": 0.1} | more))
+    return tm.load_tracks(
+        CITY, (18, 15), **({"step": 5, "cell": 50, "t_max": 1, "cost": 0.1} | more)
+    )
 
 
 def test_the_city_is_read_from_python() -> None:
@@ -236,7 +293,13 @@ def test_the_city_is_read_from_python() -> None:
     assert len(set(names.tolist())) == len(names) == tracks.loaded["tracks kept"] == 718
     assert sum(len(part.cells) for part in parts) == tracks.loaded["steps kept"] == 17_967
     # vehicle 719 - 1 is the last one: at 5 s it is where the file says
-    first = tracks.tracks if 0 in tracks.tracks.names else tracks.held_out if 0 in tracks.held_out.names else parts[1]
+    first = (
+        tracks.tracks
+        if 0 in tracks.tracks.names
+        else tracks.held_out
+        if 0 in tracks.held_out.names
+        else parts[1]
+    )
     place = first.first[first.names.tolist().index(0)]
     x, y = np.loadtxt(CITY, delimiter=",", skiprows=1, max_rows=1)[2:]
     everything = np.loadtxt(CITY, delimiter=",", skiprows=1)
@@ -248,13 +311,22 @@ def test_the_city_is_read_from_python() -> None:
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        ({"step": None}, "kernel.step: missing, expected seconds from one cell to the next; kernel.path="),
-        ({"cell": None}, "kernel.cell: missing, expected the side of a cell in metres; kernel.path="),
-        ({"origin": [1]}, "kernel.origin=[1]: expected [x, y], or [lon, lat], or null"),
-        ({"crs": "/etc/passwd"}, "kernel.crs=/etc/passwd: expected a code such as EPSG:2056"),
+        (
+            {"step": None},
+            "kernel.step: missing, expected seconds from one cell to the next; kernel.path=",
+        ),
+        (
+            {"cell": None},
+            "grid.cell: missing, expected the side of a cell in metres; kernel.path=",
+        ),
+        ({"origin": [1]}, "grid.origin=[1]: expected [x, y], or [lon, lat], or null"),
+        ({"crs": "/etc/passwd"}, "grid.crs=/etc/passwd: expected a code such as EPSG:2056"),
         ({"crs": "EPSG:2056"}, "kernel.path="),
         ({"format": "gpx"}, "kernel.path="),
-        ({"format": "ais"}, "kernel.format=ais: expected one of cells, points, geojson, gpx, mot, sumo"),
+        (
+            {"format": "ais"},
+            "kernel.format=ais: expected one of cells, points, geojson, gpx, mot, sumo",
+        ),
         ({"step": 0}, "kernel.step=0: expected a number > 0"),
     ],
 )
@@ -267,7 +339,12 @@ def test_options_that_do_not_fit_are_refused(more: dict[str, Any], message: str)
 def test_cells_need_no_gridding(tmp_path: Path) -> None:
     file = tmp_path / "t.csv"
     file.write_text("track,cell\n0,1\n")
-    with pytest.raises(UserError, match=r"^kernel\.cell=50\.0: only for positions; kernel\.path=.* holds cells$"):
-        tm.load_tracks(file, 3, cell=50)
-    with pytest.raises(UserError, match=r"expected a file that ends with one of \.csv, \.npz, .*, or kernel\.format$"):
+    with pytest.raises(
+        UserError, match=r"^kernel\.step=50\.0: only for positions; kernel\.path=.* holds cells$"
+    ):
+        tm.load_tracks(file, 3, step=50)
+    with pytest.raises(
+        UserError,
+        match=r"expected a file that ends with one of \.csv, \.npz, .*, or kernel\.format$",
+    ):
         tm.load_tracks(tmp_path / "t.doc", 3)

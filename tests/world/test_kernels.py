@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 
 from tests.helpers import BORDERS, KERNELS, configured
 from tests.world.kernels import paper
+from trackmdp.errors import UserError
 from trackmdp.world import kernels
 from trackmdp.world.kernels import drift, random_walk
-from trackmdp.world.make import build_world
+from trackmdp.world.make import build_world, make_world
 
 
 def window_of(size: int, cell: int, radius: int = 1) -> np.ndarray:
@@ -26,7 +27,12 @@ def window_of(size: int, cell: int, radius: int = 1) -> np.ndarray:
 @pytest.mark.parametrize("border", BORDERS)
 @pytest.mark.parametrize("name", KERNELS)
 def test_every_kernel_is_a_table_of_probabilities_within_reach(name: str, border: str) -> None:
-    words = ("grid.size=6", f"kernel={name}", f"kernel.border={border}", "kernel.exit_probability=0.02")
+    words = (
+        "grid.size=6",
+        f"kernel={name}",
+        f"kernel.border={border}",
+        "kernel.exit_probability=0.02",
+    )
     table = build_world(configured("train", *words)).kernel.toarray()
     assert table.shape == (36, 36)
     assert table.dtype == np.float64
@@ -52,7 +58,13 @@ def test_every_kernel_is_a_table_of_probabilities_within_reach(name: str, border
     seed=st.integers(0, 2**32 - 1),
 )
 def test_random_support_keeps_its_promises(
-    size: int, radius: int, share: float, low: float, exit_probability: float, border: Any, seed: int
+    size: int,
+    radius: int,
+    share: float,
+    low: float,
+    exit_probability: float,
+    border: Any,
+    seed: int,
 ) -> None:
     count = 1 + round(share * ((2 * radius + 1) ** 2 - 1))
     table = paper(
@@ -112,13 +124,23 @@ def test_a_corner_row_of_the_papers_kernel(border: Any) -> None:
         assert set(np.flatnonzero(row)) == set(folded)
         inner_rest = (1 - 0.15 - 0.005) / 3
         within = {
-            "renormalize": [{c: 0.995 * (0.15 if c == j else rest) / (0.15 + 3 * rest) for c in folded} for j in folded]
+            "renormalize": [
+                {c: 0.995 * (0.15 if c == j else rest) / (0.15 + 3 * rest) for c in folded}
+                for j in folded
+            ]
             + [dict.fromkeys(folded, 0.995 / 4)],
-            "exit": [{c: 0.15 if c == j else rest for c in folded} for j in folded] + [dict.fromkeys(folded, rest)],
+            "exit": [{c: 0.15 if c == j else rest for c in folded} for j in folded]
+            + [dict.fromkeys(folded, rest)],
             "inside": [{c: 0.15 if c == j else inner_rest for c in folded} for j in folded],
-            "clip": [{c: folded[c] * rest + (0.15 - rest) * (c == j) for c in folded} for j in folded],
+            "clip": [
+                {c: folded[c] * rest + (0.15 - rest) * (c == j) for c in folded} for j in folded
+            ],
         }[border]
-        matching = [k for k, cells in enumerate(within) if np.allclose(row[list(cells)], list(cells.values()))]
+        matching = [
+            k
+            for k, cells in enumerate(within)
+            if np.allclose(row[list(cells)], list(cells.values()))
+        ]
         assert len(matching) == 1, row[list(folded)]
         seen.add(matching[0])
     assert len(seen) > 2
@@ -178,7 +200,9 @@ def test_a_corner_row_of_the_drift(border: Any, row: dict[int, float]) -> None:
 @given(st.floats(0, 359.99))
 def test_the_drift_heads_where_it_is_told(direction: float) -> None:
     """The heading is shared between the two nearest of the eight neighbours, in proportion to the angle."""
-    row = drift(5, direction=direction, persistence=1.0, exit_probability=0.0, border="clip").toarray()[12]
+    row = drift(
+        5, direction=direction, persistence=1.0, exit_probability=0.0, border="clip"
+    ).toarray()[12]
     cells = np.flatnonzero(row)
     assert len(cells) <= 2
     angles = np.degrees(np.arctan2(2 - cells // 5, cells % 5 - 2)) % 360
@@ -189,5 +213,14 @@ def test_the_drift_heads_where_it_is_told(direction: float) -> None:
 
 def test_all_kernels_are_listed() -> None:
     functions = inspect.getmembers(kernels, inspect.isfunction)
-    made = {name for name, found in functions if found.__module__ == kernels.__name__ and not name.startswith("_")}
+    made = {
+        name
+        for name, found in functions
+        if found.__module__ == kernels.__name__ and not name.startswith("_")
+    }
     assert made - {"load_table"} == set(KERNELS)
+
+
+def test_an_argument_of_another_name_is_refused_with_the_right_one() -> None:
+    with pytest.raises(UserError, match="grid_size: unknown argument, did you mean size"):
+        make_world(grid_size=5)

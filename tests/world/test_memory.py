@@ -18,8 +18,8 @@ from trackmdp.world.model import Task
 SIZE = (4, 5)  # cell = 5 row + column
 
 
-def space(memory: str, clip: int = 1) -> KeySpace:
-    return KeySpace(SIZE, 1, memory, clip)
+def space(memory: str, clip: int = 1, modes: int = 1) -> KeySpace:
+    return KeySpace(SIZE, 1, memory, clip, modes)
 
 
 def test_keys_by_hand() -> None:
@@ -47,13 +47,34 @@ def test_a_larger_clip_tells_displacements_apart_and_their_direction_stays() -> 
     assert two.num_classes == 26 * 10
     first = two.next(two.start(np.int64(6)), 0, np.int64(13))  # (1, 2): (1 + 2) 5 + (2 + 2) = 19
     assert first % two.num_classes == 20 * 10
-    assert two.next(first, 0, np.int64(13)) % two.num_classes == (12 + 1) * 10 + 1 + 8  # stays: (0, 0); before (1, 1)
+    assert (
+        two.next(first, 0, np.int64(13)) % two.num_classes == (12 + 1) * 10 + 1 + 8
+    )  # stays: (0, 0); before (1, 1)
+
+
+@pytest.mark.parametrize("keys", [*(space(each, 2) for each in MEMORIES), space("cell", modes=3)])
+def test_its_recipe_makes_the_same_keys(keys: KeySpace) -> None:
+    recipe, rng = keys.recipe(), np.random.default_rng(0)
+    for key in rng.integers(keys.num_keys, size=500):
+        cell, misses, mode = (int(rng.integers(count)) for count in (20, 3, keys.modes))
+        known = {"key": int(key), "cell": cell, "misses": misses, "mode": mode}
+        for name, made in (
+            ("key_start", keys.start(np.int64(cell), mode)),
+            ("key_next", keys.next(key, misses, np.int64(cell), mode)),
+        ):
+            found = dict(known)
+            exec(recipe[name], {"max": max, "min": min}, found)
+            assert found["key"] == made, name
 
 
 @pytest.mark.parametrize("memory", MEMORIES)
 def test_arrays_and_tensors_agree_and_keys_hold_their_cell(memory: str) -> None:
     keys, rng = space(memory, 2), np.random.default_rng(0)
-    known, cells, misses = rng.integers(keys.num_keys, size=500), rng.integers(20, size=500), rng.integers(3, size=500)
+    known, cells, misses = (
+        rng.integers(keys.num_keys, size=500),
+        rng.integers(20, size=500),
+        rng.integers(3, size=500),
+    )
     following = keys.next(known, misses, cells)
     assert (keys.cell(following) == cells).all()
     assert (following < keys.num_keys).all()

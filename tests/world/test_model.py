@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 
 from tests.helpers import hop_world
 from trackmdp.errors import UserError
+from trackmdp.world.make import load_tracks, make_world
 from trackmdp.world.model import Task, World
 
 
@@ -17,7 +20,7 @@ def test_a_task_knows_nothing_of_the_motion() -> None:
     task = world.task
     assert type(task) is Task
     known = {"size", "cost", "t_max", "safe_cost", "reward", "max_steps", "window", "markov"}
-    known |= {"detection", "safe_detection", "coverage", "memory", "clip", "revealed"}
+    known |= {"detection", "safe_detection", "coverage", "memory", "clip", "revealed", "place"}
     assert {field.name for field in dataclasses.fields(task)} == known
     assert not any(np.shape(value) == (4, 4) for value in vars(task).values())
     assert (task.num_cells, task.num_choices) == (4, 4)
@@ -29,7 +32,26 @@ def test_derived_tables() -> None:
 
 
 def test_shapes_that_do_not_fit_are_refused() -> None:
-    with pytest.raises(UserError, match=r"cost: 3 values, expected one number or 4 \(one per cell\)"):
+    with pytest.raises(
+        UserError, match=r"cost: 3 values, expected one number or 4 \(one per cell\)"
+    ):
         Task(2, cost=np.zeros(3), safe_cost=1.0, t_max=0)
     with pytest.raises(UserError, match=r"kernel: 9 rows, but a 2x2 grid has 4 cells"):
         World(np.eye(9), 2, cost=np.zeros(4), safe_cost=1.0, t_max=0)
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        lambda: make_world("random_walk", size=10**9),
+        lambda: make_world("heading", size=[3, 10**18]),
+        lambda: World(np.eye(9) / 2, 10**9, cost=0.1, t_max=1),
+        lambda: load_tracks("no such file.csv", 10**9),
+    ],
+)
+def test_a_grid_that_cannot_fit_into_memory_is_refused_before_any_is_asked_for(
+    made: Callable[[], Any],
+) -> None:
+    with pytest.raises(UserError, match=r"size=\[?\d.*: needs about .* GiB") as said:
+        made()
+    assert "\n" not in str(said.value)

@@ -7,11 +7,13 @@ import os
 import re
 from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 
+import trackmdp as tm
 from trackmdp.errors import UserError, adding
 from trackmdp.world.positions import IGNORED, NO_IDENTITY, NO_POSITION, REPEATED, Positions
 from trackmdp.world.track_files import read_positions
@@ -87,7 +89,9 @@ def test_of_reports_at_one_time_the_first_counts(tmp_path: Path) -> None:
 
 def test_infinite_numbers_are_no_position(tmp_path: Path) -> None:
     """Nor a time: left in, they would sort last and stretch the path over everything."""
-    found = read(tmp_path, "id,t,x,y\na,0,1,2\na,inf,1,2\na,1,-inf,2\na,2,1,inf\na,3,nan,2\na,4,5,6\n")
+    found = read(
+        tmp_path, "id,t,x,y\na,0,1,2\na,inf,1,2\na,1,-inf,2\na,2,1,inf\na,3,nan,2\na,4,5,6\n"
+    )
     assert rows(found) == [(0, 0, 0, 1, 2), (0, 0, 4, 5, 6)]
     assert found.dropped == {NO_POSITION: 4, REPEATED: 0}
 
@@ -112,7 +116,10 @@ def test_parquet_is_as_csv(tmp_path: Path) -> None:
     times = pd.to_datetime(["2024-05-01T12:00:05", "2024-05-01T12:00:00"])
     table = pd.DataFrame({"id": [3, 3], "time": times, "x": [1, 2.5]})
     table.assign(y=[0, 1], other=["a", None]).to_parquet(tmp_path / "t.parquet")
-    assert rows(read_positions(tmp_path / "t.parquet", "points")) == [(0, 0, NOON, 2.5, 1), (0, 0, NOON + 5, 1, 0)]
+    assert rows(read_positions(tmp_path / "t.parquet", "points")) == [
+        (0, 0, NOON, 2.5, 1),
+        (0, 0, NOON + 5, 1, 0),
+    ]
 
 
 def test_gpx_keeps_segments_apart(tmp_path: Path) -> None:
@@ -156,13 +163,21 @@ DAMAGED = {
     "no columns": ("points", "a,b\n1,2\n", "columns a, b: expected id (mmsi, icao24,"),
     "both": ("points", "id,t,x,y,lat,lon\n", "expected either x, y or lat, lon"),
     "half": ("points", "id,t,x,lon\n", "expected either x, y or lat, lon"),
-    "word": ("points", "id,t,x,y\n1,1,east,2\n", "not a table of positions (Unable to parse string"),
+    "word": (
+        "points",
+        "id,t,x,y\n1,1,east,2\n",
+        "not a table of positions (Unable to parse string",
+    ),
     "time": ("points", "id,t,x,y\n1,yesterday,1,2\n", "not a table of positions ("),
     "ragged": ("points", "id,t,x,y\n1,2,3,4\n1,2,3,4,5,6\n", "not a table of positions ("),
     "binary": ("points", b"\x00\xff\xfe" * 50, "not a table of positions ("),
     "parquet cut": ("points", b"PAR1" + bytes(50), "not a table of positions ("),
     "nothing": ("points", "", "not a table of positions ("),
-    "no rows": ("points", "id,t,x,y\n", "no positions, expected a table of positions (0 reports read)"),
+    "no rows": (
+        "points",
+        "id,t,x,y\n",
+        "no positions, expected a table of positions (0 reports read)",
+    ),
     "nowhere": (
         "points",
         "id,t,x,y\n1,,1,1\n,1,1,1\n1,1,inf,1\n",
@@ -184,11 +199,23 @@ DAMAGED = {
     "gpx other": ("gpx", "<html></html>", "a GPX track log"),
     "gpx bomb": ("gpx", BOMB + "<gpx>&b;</gpx>", "not a GPX track log (DTDForbidden"),
     "mot words": ("mot", "1,2,a,b,c,d\n", "not MOT-Challenge text ("),
-    "mot short": ("mot", "1,2,3\n", "not MOT-Challenge text (3 columns, expected frame, id, left, top, width, height)"),
+    "mot short": (
+        "mot",
+        "1,2,3\n",
+        "not MOT-Challenge text (3 columns, expected frame, id, left, top, width, height)",
+    ),
     "sumo cut": ("sumo", SUMO[:120], "not SUMO's fcd-output ("),
-    "sumo other": ("sumo", "<routes></routes>", "not SUMO's fcd-output (<routes>, expected <fcd-export>)"),
+    "sumo other": (
+        "sumo",
+        "<routes></routes>",
+        "not SUMO's fcd-output (<routes>, expected <fcd-export>)",
+    ),
     "sumo unnamed": ("sumo", SUMO.replace('id="b"', ""), "not SUMO's fcd-output ("),
-    "sumo bomb": ("sumo", BOMB + "<fcd-export>&b;</fcd-export>", "not SUMO's fcd-output (DTDForbidden"),
+    "sumo bomb": (
+        "sumo",
+        BOMB + "<fcd-export>&b;</fcd-export>",
+        "not SUMO's fcd-output (DTDForbidden",
+    ),
 }
 
 
@@ -209,7 +236,10 @@ def test_only_ordinary_files_of_bounded_size_are_read(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     os.mkfifo(tmp_path / "pipe")
-    for name, message in (("pipe", "a pipe, expected an ordinary file"), ("none", "no such file")):
+    for name, message in (
+        ("pipe", "a pipe or a device, expected an ordinary file"),
+        ("none", "no such file"),
+    ):
         with pytest.raises(UserError, match=rf"^kernel\.path=.*/{name}: {message}$"):
             read_positions(tmp_path / name, kind)
     monkeypatch.setattr("trackmdp.world.track_files.LONGEST", 10)
@@ -217,13 +247,19 @@ def test_only_ordinary_files_of_bounded_size_are_read(
         read(tmp_path, "x" * 50, kind)
 
 
-def test_a_parquet_file_that_unfolds_to_too_much_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_parquet_file_that_unfolds_to_too_much_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A column of one value takes a few bytes, however long it is."""
     zeros = np.zeros(200_000)
-    pd.DataFrame({"id": zeros, "t": zeros, "x": zeros, "y": zeros}).to_parquet(tmp_path / "t.parquet")
+    pd.DataFrame({"id": zeros, "t": zeros, "x": zeros, "y": zeros}).to_parquet(
+        tmp_path / "t.parquet"
+    )
     monkeypatch.setattr("trackmdp.world.positions.LONGEST", 100_000)
     assert (tmp_path / "t.parquet").stat().st_size < 100_000
-    with pytest.raises(UserError, match=r"not a table of positions \([\d,]+ bytes once unfolded, expected"):
+    with pytest.raises(
+        UserError, match=r"not a table of positions \([\d,]+ bytes once unfolded, expected"
+    ):
         read_positions(tmp_path / "t.parquet", "points")
 
 
@@ -234,21 +270,101 @@ def test_one_long_text_in_all_rows_of_a_parquet_file_is_refused(
     numbers = {name: np.arange(1000.0) for name in ("t", "x", "y")}
     for size, fine in ((50, True), (150, False)):
         pd.DataFrame({"id": "v" * size, **numbers}).to_parquet(tmp_path / "t.parquet")
-        with nullcontext() if fine else pytest.raises(UserError, match="150,000 bytes once unfolded, expected at most"):
+        with (
+            nullcontext()
+            if fine
+            else pytest.raises(UserError, match="150,000 bytes once unfolded, expected at most")
+        ):
             assert len(read_positions(tmp_path / "t.parquet", "points").time) == 1000
 
 
 def test_columns_of_lists_are_no_columns_of_a_parquet_file(tmp_path: Path) -> None:
-    pd.DataFrame({"id": [1, 1], "t": [0, 5], "x": [[1.0], [2.0]], "y": [0, 1]}).to_parquet(tmp_path / "t.parquet")
+    pd.DataFrame({"id": [1, 1], "t": [0, 5], "x": [[1.0], [2.0]], "y": [0, 1]}).to_parquet(
+        tmp_path / "t.parquet"
+    )
     with pytest.raises(UserError, match="columns id, t, y: expected either x, y or lat, lon"):
         read_positions(tmp_path / "t.parquet", "points")
 
 
-@pytest.mark.parametrize(("kind", "module"), [("points", "pandas"), ("gpx", "gpxpy"), ("sumo", "defusedxml")])
+@pytest.mark.parametrize(
+    ("kind", "module"), [("points", "pandas"), ("gpx", "gpxpy"), ("sumo", "defusedxml")]
+)
 def test_a_missing_library_is_named_with_its_extra(
     kind: str, module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == module else found(name))
-    with pytest.raises(UserError, match=re.escape(f"needs {module}, which {adding('tracks')} adds") + "$"):
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: None if name == module else found(name)
+    )
+    with pytest.raises(
+        UserError, match=re.escape(f"needs {module}, which {adding('tracks')} adds") + "$"
+    ):
         read(tmp_path, "", kind)
+
+
+OPTIONS: dict[str, Any] = {"size": (4, 4), "cell": 10.0, "step": 1.0, "min_length": 1}
+
+
+def frame() -> Any:
+    pandas = pytest.importorskip("pandas")
+    count = 12
+    steps = np.tile(np.arange(5), count)
+    x = np.tile(np.linspace(1, 39, 5), count)
+    return pandas.DataFrame(
+        {"device": np.repeat(np.arange(count), 5), "seen": steps, "x": x, "y": 5.0 + 0 * x}
+    )
+
+
+COLUMNS = ["id:device", "time:seen"]
+
+
+def test_a_frame_and_columns_of_ones_own_are_read_as_a_file_is(tmp_path: Path) -> None:
+    table = frame()
+    table.to_csv(tmp_path / "a.csv", index=False)
+    usual = table.rename(columns={"device": "id", "seen": "time"})
+    usual.to_csv(tmp_path / "b.csv", index=False)
+    digests = {
+        tm.load_tracks(source, **OPTIONS, **more).tracks.digest()
+        for source, more in (
+            (table, {"columns": COLUMNS}),
+            (tmp_path / "a.csv", {"columns": COLUMNS}),
+            (usual, {}),
+            (tmp_path / "b.csv", {}),
+        )
+    }
+    assert len(digests) == 1
+    run = tm.train(
+        tm.load_tracks(usual, **OPTIONS),
+        "model_based",
+        total_frames=2000,
+        frames_per_batch=1000,
+        envs=50,
+    )
+    assert run.summary["place"]["cell"] == 10.0
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({}, "load_tracks: not a table of positions (columns device, seen, x, y: expected id"),
+        ({"columns": ["id:nobody", "time:seen"]}, "load_tracks: not a table of positions"),
+        ({"columns": ["who:device"]}, "kernel.columns=['who:device']: expected a list"),
+    ],
+)
+def test_a_column_that_is_not_there_is_named(more: dict[str, Any], message: str) -> None:
+    with pytest.raises(UserError) as caught:
+        tm.load_tracks(frame(), **OPTIONS, **more)
+    assert str(caught.value).startswith(message)
+
+
+def test_a_file_with_neither_positions_nor_cells_is_refused_by_its_columns(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("device_id,when,breite,laenge\n1,0,54.3,10.1\n")
+    with pytest.raises(UserError) as caught:
+        tm.load_tracks(tmp_path / "a.csv", **OPTIONS)
+    assert "(columns device_id, when, breite, laenge: expected id (" in str(caught.value)
+    assert "kernel.columns" in str(caught.value)
+
+
+def test_columns_are_those_of_a_table(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="only for a table of positions"):
+        tm.load_tracks(tmp_path / "a.gpx", format="gpx", columns=COLUMNS, **OPTIONS)

@@ -10,15 +10,18 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.helpers import random_kernel, small_world
+from tests.helpers import advanced, random_kernel, small_world
 from trackmdp.app.cli import main
 from trackmdp.episodes.simulate import simulate
+from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.policies.saved import load_policy, save_policy
-from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers.value import evaluate
+from trackmdp.world.dynamics import Dynamics
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.make import make_world
 from trackmdp.world.model import World
+from trackmdp.world.paths import path_sampler
 
 LINE = np.diag(np.full(3, 0.9), 1)
 
@@ -28,22 +31,22 @@ def _line(**sensors: float) -> World:
     return World(LINE, (1, 4), cost=0.25, t_max=0, safe_cost=2.0, **sensors)
 
 
-def _from_zero(env: TrackEnv, action: torch.Tensor, reports: list[float]) -> list[TensorDict]:
+def _from_zero(world: World, action: torch.Tensor, reports: list[float]) -> list[TensorDict]:
     """The steps of one target from cell 0 that moves on and is reported where the draw is below p."""
-    state = dict(env._fresh(env._every)) | {"target": torch.tensor([0]), "last_cell": torch.tensor([0])}
+    state = Dynamics(world, path_sampler(world)).start(torch.tensor([0]))
     steps = []
     for report in reports:
-        draws = torch.tensor([0.5], dtype=torch.float64), torch.tensor([report], dtype=torch.float64)
-        state |= env.advance(state | {"action": action}, *draws)
+        uniform = torch.tensor([report], dtype=torch.float64)
+        state |= advanced(world, state | {"action": action}, [0.5], uniform)
         steps.append(TensorDict({key: value.clone() for key, value in state.items()}, [1]))
     return steps
 
 
 def test_a_miss_costs_and_a_safe_action_that_misses_is_repeated() -> None:
-    env = TrackEnv(_line(detection=0.5, safe_detection=0.25), 1)
+    world = _line(detection=0.5, safe_detection=0.25)
     action = torch.tensor([[False, True, True, False]])
     # Missed by the sensor at 1 (.6 > p_d), by the safe action at 2 (.3 > p_s), and found by it at 3 (.2 < p_s).
-    first, second, third = _from_zero(env, action, [0.6, 0.3, 0.2])
+    first, second, third = _from_zero(world, action, [0.6, 0.3, 0.2])
     assert [step["reward"].item() for step in (first, second, third)] == [-0.5, -2.0, -1.0]
     assert [step["steps_since_detection"].item() for step in (first, second, third)] == [1, 1, 0]
     assert [step["last_cell"].item() for step in (first, second, third)] == [0, 0, 3]
@@ -54,8 +57,7 @@ def test_a_miss_costs_and_a_safe_action_that_misses_is_repeated() -> None:
 
 
 def test_a_detection_is_what_it_is_without_misses() -> None:
-    env = TrackEnv(_line(detection=0.5), 1)
-    (first,) = _from_zero(env, torch.tensor([[False, True, True, False]]), [0.4])
+    (first,) = _from_zero(_line(detection=0.5), torch.tensor([[False, True, True, False]]), [0.4])
     assert (first["reward"].item(), first["last_cell"].item()) == (0.5, 1)
 
 
@@ -77,7 +79,10 @@ def test_exact_values_are_those_of_simulation_on_thirty_worlds() -> None:
     for seed in range(30):
         rng = np.random.default_rng(seed)
         kernel = random_kernel(rng, 9, 0.2)
-        probabilities = {"detection": 1 - 0.7 * rng.random(9), "safe_detection": 1 - 0.5 * rng.random(9) * (seed % 2)}
+        probabilities = {
+            "detection": 1 - 0.7 * rng.random(9),
+            "safe_detection": 1 - 0.5 * rng.random(9) * (seed % 2),
+        }
         world = World(kernel, 3, cost=0.3 * rng.random(9), t_max=seed % 3, **probabilities)
         policy = Policy.from_dense(world, rng.random((9, world.num_choices, 9)) < 0.5)
         simulated, exact = simulate(world, policy, 1_000, seed=1).figures(), evaluate(world, policy)
@@ -99,10 +104,25 @@ def test_the_environment_earns_the_exact_value() -> None:
     assert abs(returns.mean() - evaluate(world, policy).aihtr) <= 3 * error
 
 
-def test_episodes_that_are_logged_replay_to_the_bit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_episodes_that_are_logged_replay_to_the_bit(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     words = ["grid.size=4", "kernel=random_walk", "kernel.exit_probability=.05", "quiet=true"]
     sensors = ["sensor=miss", "sensor.p_d=.7", "sensor.p_s=.6", "cost.sensor=.3"]
-    assert main(["evaluate", *words, *sensors, "baseline=clocked", "episodes=20", "log=[mcap]", _in(tmp_path)]) == 0
+    assert (
+        main(
+            [
+                "evaluate",
+                *words,
+                *sensors,
+                "baseline=clocked",
+                "episodes=20",
+                "log=[mcap]",
+                _in(tmp_path),
+            ]
+        )
+        == 0
+    )
     file = next(tmp_path.glob("*.mcap"))
     assert main(["replay", f"file={file}", "verify=true"]) == 0
     assert "the same to the bit" in capsys.readouterr().out
@@ -121,21 +141,39 @@ def test_beliefs_of_a_log_are_those_of_bayes() -> None:
     seen = [
         episode.belief[1]
         for episode in simulate(other, policy, 40).complete()
-        if episode.start == 0 and len(episode) > 1 and episode.misses[1] == 1 and episode.belief is not None
+        if episode.start == 0
+        and len(episode) > 1
+        and episode.misses[1] == 1
+        and episode.belief is not None
     ]
     # Predicted .8 and .1, missed: .16 to .1; after the next move .8 · .16 + .1 · .1 over .26.
     assert len(seen) > 2
     assert all(belief == pytest.approx([0.138 / 0.26, 0.096 / 0.26], abs=1e-6) for belief in seen)
 
 
-def test_a_saved_policy_keeps_its_sensors_and_a_perfect_one_its_bytes(tmp_path: Path) -> None:
+def test_a_saved_policy_keeps_its_sensors(tmp_path: Path) -> None:
     world = replace(small_world(), detection=np.linspace(0.5, 1, 9), safe_detection=0.9)
     save_policy(tmp_path / "a.npz", as_policy(world, Policy.all_on(world)))
     task = load_policy(tmp_path / "a.npz")[0].task
     assert np.array_equal(task.detection, world.detection)
     assert np.array_equal(task.safe_detection, world.safe_detection)
     save_policy(tmp_path / "b.npz", Policy.all_on(small_world()))
-    assert not [name for name in np.load(tmp_path / "b.npz").files if "detection" in name]
+    assert load_policy(tmp_path / "b.npz")[0].task.perfect
+
+
+def test_a_policy_is_valued_with_the_sensors_of_the_world() -> None:
+    perfect, on = small_world(), np.random.default_rng(0).random((9, 2, 9)) < 0.6
+    made = Policy.from_dense(perfect, on)
+    world = replace(perfect, detection=0.5)
+    assert evaluate(world, made).aihtr == evaluate(world, Policy.from_dense(world, on)).aihtr
+    assert evaluate(world, made).aihtr < evaluate(perfect, made).aihtr
+    cost = perfect.cost.copy()
+    cost[4] = np.nan
+    gone = replace(perfect, cost=cost)
+    for policy in (made, Policy.all_on(perfect), Policy.random_k(perfect, 2)):
+        with pytest.raises(UserError, match="sensor 4 "):
+            evaluate(gone, policy)
+    assert evaluate(gone, Policy.none(perfect)).accuracy > 0
 
 
 def test_the_command_line_and_python_make_the_same_world(tmp_path: Path) -> None:
@@ -150,11 +188,17 @@ def test_the_command_line_and_python_make_the_same_world(tmp_path: Path) -> None
     ("words", "told"),
     [
         (["sensor=miss", "sensor.p_d=0"], "sensor.p_d=0: expected a number above 0, at most 1"),
-        (["sensor=miss", "sensor.p_s=1.01"], "sensor.p_s=1.01: expected a number above 0, at most 1"),
-        (["sensor=miss", "sensor.p_d=[.5,.5]"], "sensor.p_d: 2 values, expected one number or 9 (one per cell)"),
+        (
+            ["sensor=miss", "sensor.p_s=1.01"],
+            "sensor.p_s=1.01: expected a number above 0, at most 1",
+        ),
+        (
+            ["sensor=miss", "sensor.p_d=[.5,.5]"],
+            "sensor.p_d: 2 values, expected one number or 9 (one per cell)",
+        ),
         (["sensor=miss", "sensor.p_d=here.txt"], "sensor.p_d=here.txt: expected a number above 0"),
         (["sensor=miss", "sensor.p_d=none.npy"], "none.npy"),
-        (["sensor.p_d=.5"], "sensor.p_d: unknown"),
+        (["sensor.p_d=.5"], "sensor=miss"),
         (["sensor=deaf"], "sensor=deaf"),
     ],
 )
@@ -168,9 +212,22 @@ def test_bad_sensors_are_refused_in_one_line(
     assert not (tmp_path / "run").exists()
 
 
-def test_a_file_with_no_probability_names_its_cell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_file_with_no_probability_names_its_cell(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     np.save(tmp_path / "p.npy", np.array([0.5] * 8 + [1.5]))
-    assert main(["solve", "grid.size=3", "sensor=miss", f"sensor.p_d={tmp_path / 'p.npy'}", _in(tmp_path / "run")]) != 0
+    assert (
+        main(
+            [
+                "solve",
+                "grid.size=3",
+                "sensor=miss",
+                f"sensor.p_d={tmp_path / 'p.npy'}",
+                _in(tmp_path / "run"),
+            ]
+        )
+        != 0
+    )
     assert "cell 8 has 1.5, expected a probability above 0, at most 1" in capsys.readouterr().err
 
 

@@ -9,9 +9,9 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
+from tests.acting import RandomSubset
 from tests.helpers import Watched, limited, small_world
 from tests.tracks import by_hand, drawn, recorded
-from trackmdp.policies.acting import RandomSubset
 from trackmdp.seeding import generator
 from trackmdp.world.env import TrackEnv
 
@@ -77,7 +77,9 @@ def test_specs_are_those_of_torchrl(num_envs: int, anywhere: bool, max_steps: in
 @pytest.mark.parametrize("max_steps", [None, 4])
 def test_one_pass_equals_torchrls_step_and_reset_bit_for_bit(max_steps: int | None) -> None:
     tracks = drawn(small_world().kernel, 40)
-    cut = recorded(type(tracks)(tracks.cells, tracks.first, tracks.names % 2 == 0, tracks.names), t_max=2)
+    cut = recorded(
+        type(tracks)(tracks.cells, tracks.first, tracks.names % 2 == 0, tracks.names), t_max=2
+    )
     cut = recorded(cut.tracks.select(cut.tracks.lengths > 1), t_max=2)
     ours, stock = (TrackEnv(limited(cut, max_steps), 50, seed=5) for _ in range(2))
     a, b = ours.reset(), stock.reset()
@@ -109,7 +111,11 @@ def test_the_seed_and_the_stream_decide_the_order() -> None:
     tracks = recorded(drawn(small_world().kernel, 200))
 
     def order(**names: Any) -> list[int]:
-        return [int(cell) for frame in rollout(Watched(tracks, 16, **names), 30) for cell in frame["target"]]
+        return [
+            int(cell)
+            for frame in rollout(Watched(tracks, 16, **names), 30)
+            for cell in frame["target"]
+        ]
 
     assert order(seed=0) == order(seed=0)
     assert order(seed=0) != order(seed=1)

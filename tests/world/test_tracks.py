@@ -73,10 +73,16 @@ def test_a_file_that_has_changed_is_read_again(tmp_path: Path) -> None:
         ("", "columns , expected track, cell (or row, column) and, if wanted, step"),
         ("0,1\n0,2\n", "columns 0, 1, expected track, cell"),
         ("track,cell,row\n0,1,1\n", "columns track, cell, row, expected track, cell"),
-        ("track,cell,cell\n0,1,1\n", "not a table of numbers (two columns of one name in track,cell,cell)"),
+        (
+            "track,cell,cell\n0,1,1\n",
+            "not a table of numbers (two columns of one name in track,cell,cell)",
+        ),
         ("track,cell\n0,one\n", "not a table of numbers"),
         ("track,cell\n0,1\n0\n", "not a table of numbers"),
-        ("track,cell\n0,1,2\n", "not a table of numbers (2 names in the first line, but 3 columns)"),
+        (
+            "track,cell\n0,1,2\n",
+            "not a table of numbers (2 names in the first line, but 3 columns)",
+        ),
     ],
 )
 def test_what_is_wrong_is_said_in_one_line(text: str, message: str, tmp_path: Path) -> None:
@@ -90,7 +96,12 @@ def test_what_is_wrong_is_said_in_one_line(text: str, message: str, tmp_path: Pa
 
 def test_files_that_are_no_columns_are_refused(tmp_path: Path) -> None:
     track = np.zeros(3, dtype=int)
-    np.savez(tmp_path / "objects.npz", track=track, cell=np.array([{}] * 3, dtype=object), allow_pickle=True)
+    np.savez(
+        tmp_path / "objects.npz",
+        track=track,
+        cell=np.array([{}] * 3, dtype=object),
+        allow_pickle=True,
+    )
     np.savez(tmp_path / "long.npz", track=track, cell=np.zeros(4, dtype=int))
     np.savez(tmp_path / "deep.npz", track=track, cell=np.zeros((3, 1), dtype=int))
     np.savez(tmp_path / "words.npz", track=track, cell=np.array(["a"] * 3))
@@ -117,12 +128,16 @@ def test_short_tracks_are_refused() -> None:
     assert check_tracks(tracks, 1, "x") is tracks
     with pytest.raises(UserError, match=r"^x: track 2 has 1 cells, expected at least 2$"):
         check_tracks(tracks, 2, "x")
-    with pytest.raises(UserError, match=r"^x: track 0 has 3 cells, expected at least 4 \(3 of 4 are too short\)$"):
+    with pytest.raises(
+        UserError, match=r"^x: track 0 has 3 cells, expected at least 4 \(3 of 4 are too short\)$"
+    ):
         check_tracks(tracks, 4, "x")
 
 
 @given(st.integers(2, 50), st.floats(0.05, 0.95), st.floats(0.05, 0.95), st.integers(0, 2**31))
-def test_a_split_deals_out_every_track_once(count: int, share: float, middle: float, seed: int) -> None:
+def test_a_split_deals_out_every_track_once(
+    count: int, share: float, middle: float, seed: int
+) -> None:
     tracks = by_hand(*[[i % 9, (i + 1) % 9, 3][: 1 + i % 3] for i in range(count)])
     last, chosen_by = round(share * count), round(middle * count)
     if not (last and chosen_by and last + chosen_by < count):
@@ -136,7 +151,9 @@ def test_a_split_deals_out_every_track_once(count: int, share: float, middle: fl
     for part in (mine, validation, held_out):
         for place, name in enumerate(part.names):
             cells = part.cells[part.first[place] : part.first[place + 1]]
-            assert cells.tolist() == tracks.cells[tracks.first[name] : tracks.first[name + 1]].tolist()
+            assert (
+                cells.tolist() == tracks.cells[tracks.first[name] : tracks.first[name + 1]].tolist()
+            )
     assert all(map(same, split(tracks, share, middle, seed), (mine, validation, held_out)))
     # how many are validated on does not change which ones are held out
     assert same(split(tracks, share, 1 / count, seed)[2], held_out)
@@ -171,6 +188,10 @@ def test_closed_and_limited_by_hand() -> None:
 
 def test_the_digest_is_that_of_the_recording() -> None:
     tracks = by_hand([4, 5], [6, 7, 8])
-    others = [by_hand([4, 5], [6, 7, 7]), by_hand([4, 5, 6], [7, 8]), by_hand([4, 5], [6, 7, 8], exits=False)]
+    others = [
+        by_hand([4, 5], [6, 7, 7]),
+        by_hand([4, 5, 6], [7, 8]),
+        by_hand([4, 5], [6, 7, 8], exits=False),
+    ]
     assert same(by_hand([4, 5], [6, 7, 8]), tracks)
     assert len({each.digest() for each in [tracks, *others]}) == 4

@@ -14,12 +14,16 @@ RADII = st.one_of(st.none(), st.integers(0, 7))
 
 
 @given(SIZES, RADII, st.integers(0, 2**32 - 1))
-def test_local_and_global_are_inverse_within_the_window(size: tuple[int, int], radius: int | None, seed: int) -> None:
+def test_local_and_global_are_inverse_within_the_window(
+    size: tuple[int, int], radius: int | None, seed: int
+) -> None:
     window, rng = Window(size, radius), torch.Generator().manual_seed(seed)
     m = window.num_cells
     start = torch.randint(m, (3, 5), generator=rng)
     everywhere = torch.rand(3, 5, m, generator=rng) < 0.5
-    reached = torch.stack([window.contains(start, torch.full_like(start, cell)) for cell in range(m)], dim=-1)
+    reached = torch.stack(
+        [window.contains(start, torch.full_like(start, cell)) for cell in range(m)], dim=-1
+    )
     local = window.to_local(start, everywhere)
     assert local.shape == (3, 5, window.width)
     assert torch.equal(window.to_global(start, local), everywhere & reached)
@@ -27,7 +31,9 @@ def test_local_and_global_are_inverse_within_the_window(size: tuple[int, int], r
 
 
 @given(SIZES, RADII)
-def test_a_window_holds_the_cells_within_its_radius(size: tuple[int, int], radius: int | None) -> None:
+def test_a_window_holds_the_cells_within_its_radius(
+    size: tuple[int, int], radius: int | None
+) -> None:
     window, (rows, columns) = Window(size, radius), size
     m = rows * columns
     for start in range(m):
@@ -35,7 +41,8 @@ def test_a_window_holds_the_cells_within_its_radius(size: tuple[int, int], radiu
             cell
             for cell in range(m)
             if radius is None
-            or max(abs(cell // columns - start // columns), abs(cell % columns - start % columns)) <= radius
+            or max(abs(cell // columns - start // columns), abs(cell % columns - start % columns))
+            <= radius
         ]
         assert [cell for cell in window.cells[start].tolist() if cell < m] == near
         cells, starts = torch.arange(m + 1), torch.full((m + 1,), start)
@@ -53,7 +60,9 @@ def test_the_window_of_a_task_is_that_of_its_option() -> None:
     assert Window.of(Task((4, 7), cost=0.1, t_max=0, window=1)).width == 9
     whole = Window.of(Task((4, 7), cost=0.1, t_max=0))
     assert (whole.width, whole.is_local) == (28, False)
-    assert Window.of(Task(3, cost=0.1, t_max=0, window=2)).width == 25  # corners lie outside, seen from anywhere
+    assert (
+        Window.of(Task(3, cost=0.1, t_max=0, window=2)).width == 25
+    )  # corners lie outside, seen from anywhere
 
 
 def test_on_a_rectangle_by_hand() -> None:
@@ -68,7 +77,10 @@ def test_the_local_number_of_a_cell_stands_for_it(size: int, radius: int) -> Non
     view, m = Window.reaching(size, radius), size**2
     assert view.width == min((2 * radius + 1) ** 2, m)
     for start in range(m):
-        distance = [max(abs(cell // size - start // size), abs(cell % size - start % size)) for cell in range(m)]
+        distance = [
+            max(abs(cell // size - start // size), abs(cell % size - start % size))
+            for cell in range(m)
+        ]
         near = [cell for cell in range(m) if distance[cell] <= radius]
         place = view.index(torch.full((len(near),), start), torch.tensor(near))
         assert view.cells[start, place].tolist() == near

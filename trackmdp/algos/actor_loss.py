@@ -19,8 +19,8 @@ from torch.nn.functional import logsigmoid, softplus
 from trackmdp.algos.gains import gather, scatter_add
 from trackmdp.config.learning import ScheduleConfig
 
-# σ(20) differs from 1 by 2e-9: no probability is told from certainty beyond. e^6 = 403: gains up to 403 times the cost
-# are told apart. |z| = 4 is a probability of 1.8 or 98.2 %.
+# σ(20) differs from 1 by 2e-9: larger logits are certainty. e^6 = 403: gains up to 403 times the cost differ in their
+# logits. |z| = 4 is a probability of 1.8 or 98.2 %.
 _LARGEST_LOGIT = 20.0
 _LARGEST_LOG_RATIO = 6.0
 _SOFT_LIMIT = 4.0
@@ -35,12 +35,12 @@ class SensorCredit:
 
     Attributes:
         entry: int64 `[T+1, B]`, for each path and clock the place in `[M, T+1, C]` of the cell the target moved to.
-        gain: `[T+1, B]`, what seeing it there gains; 0 where the path did not get to the clock unlocated.
+        gain: `[T+1, B]`, gain of seeing it there; 0 where the path did not get to the clock unlocated.
         arrivals: `[M, T+1]`, paths at each row.
-        price: `[M, T+1, K]`, what having a sensor on costs on all of them.
+        price: `[M, T+1, K]`, cost of having a sensor on on all of them.
         rows: the located cells that these tables are of, where they are a part of all M.
-        of_sensors: what sensors gain `[M, T+1, K]` where it gains `[M, T+1, C]` to see the cells; the same where each
-            sensor has a cell of its own.
+        of_sensors: gains of sensors `[M, T+1, K]`, from the gains `[M, T+1, C]` of seeing the cells; the same where
+            each sensor has a cell of its own.
         cells: C, where it is not K.
     """
 
@@ -74,14 +74,14 @@ class SensorCredit:
 
     @cached_property
     def advantage(self) -> Tensor:
-        """Δ = G⁺ - G⁻ - c `[M, T+1, K]`, what having a sensor on is worth more than having it off."""
+        """Δ = G⁺ - G⁻ - c `[M, T+1, K]`, worth of a sensor on over off."""
         return self.plus - self.minus - self.price
 
     def sampled(self, on: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Δ `[M, T+1, K]` of the paths on which a sensor was drawn on, and of those on which it was off.
 
-        Every path draws its own set. The sensors a path does not move to differ only in their cost there, so that of
-        them it is enough to know how many paths drew them.
+        Every path draws its own set. Sensors that a path does not move to differ only in their cost there, so their
+        number of draws is enough.
 
         Args:
             on: `[M, T+1, K]`, probabilities.
@@ -90,8 +90,13 @@ class SensorCredit:
         size, shape = on.numel(), on.shape
         # A gain of 0 is a path that did not get to this clock, or moved out of view: no sensor earns anything there.
         moved = self.gain != 0
-        drawn = torch.rand(self.gain.shape, generator=generator, device=on.device) < gather(on, self.entry)
-        moves, gains = scatter_add(moved.float(), self.entry, size), scatter_add(self.gain, self.entry, size)
+        drawn = torch.rand(self.gain.shape, generator=generator, device=on.device) < gather(
+            on, self.entry
+        )
+        moves, gains = (
+            scatter_add(moved.float(), self.entry, size),
+            scatter_add(self.gain, self.entry, size),
+        )
         moves_on = scatter_add((moved & drawn).float(), self.entry, size).view(shape)
         gains_on = scatter_add(self.gain * drawn, self.entry, size).view(shape)
         arrivals = self.arrivals.unsqueeze(-1)
@@ -100,7 +105,9 @@ class SensorCredit:
         paths_on = moves_on + torch.binomial(arrivals - moves.view(shape), on, generator=generator)
         # `price` is over all arrivals; per path it is c.
         unit = self.price / arrivals.clamp(min=1)
-        return gains_on - unit * paths_on, gains.view(shape) - gains_on - unit * (arrivals - paths_on)
+        return gains_on - unit * paths_on, gains.view(shape) - gains_on - unit * (
+            arrivals - paths_on
+        )
 
 
 class ActorLoss(nn.Module):
@@ -111,18 +118,18 @@ class ActorLoss(nn.Module):
         self._heat = 1.0
 
     def allocate(self, shape: tuple[int, int, int], device: torch.device) -> None:
-        """Make what depends on the shape (M, T+1, K) of the logits; called once."""
+        """Make all parts that depend on the shape (M, T+1, K) of the logits; called once."""
 
     def prepare(self, update: int, progress: float) -> None:  # noqa: ARG002
-        """Set what changes in the course of a run, before update number `update`."""
+        """Set the parameters that change in the course of a run, before update number `update`."""
         self._heat = _COOLEST**progress
 
     def acting(self, logits: Tensor) -> Tensor:
-        """`[M, T+1, K]`, with what probability the sensors are on: what the gain of one with footprint stands beside.
+        """`[M, T+1, K]`, probabilities of sensors on, on which the gains of sensors with shared cells depend.
 
-        Of a loss that is least at log(gain / price) z is no probability: at σ(z) two sensors of the same cells would
-        stay on at half the gain each. The sets cool down to z > 0 in the course of a run; hard ones from the start on
-        would be the local optimum that the first few updates fall into.
+        A loss with its minimum at z = log(gain / price) makes σ(z) no acting probability: at σ(z) two sensors of the
+        same cells would stay on at half the gain each. The sets cool down to z > 0 in the course of a run; hard sets
+        from the start would stay in the local optimum of the first few updates.
         """
         return (logits / self._heat).sigmoid()
 
@@ -170,7 +177,7 @@ class PolicyGradient(ActorLoss):
         return logits.sigmoid()
 
     def objective(self, logits: Tensor, credit: SensorCredit) -> Tensor:
-        """What the policy gains, to be maximised."""
+        """The gain of the policy, to be maximised."""
         # The expected value of a set is Σ_j σ(z_j) Δ_j: gains add over sensors, and no set need be drawn. With
         # footprints Δ_j depends on the others, held fixed here, and the slope is the same.
         return logits.sigmoid() * credit.advantage
@@ -190,10 +197,20 @@ class Surrogate(PolicyGradient):
     """
 
     def __init__(
-        self, entropy: ScheduleConfig, *, clip_epsilon: float, minibatches: int, generator: torch.Generator | None
+        self,
+        entropy: ScheduleConfig,
+        *,
+        clip_epsilon: float,
+        minibatches: int,
+        generator: torch.Generator | None,
     ) -> None:
         super().__init__(entropy)
-        self._epsilon, self._minibatches, self._generator, self._renew = clip_epsilon, minibatches, generator, True
+        self._epsilon, self._minibatches, self._generator, self._renew = (
+            clip_epsilon,
+            minibatches,
+            generator,
+            True,
+        )
 
     def allocate(self, shape: tuple[int, int, int], device: torch.device) -> None:
         """Room for the old policy's logits."""
@@ -231,12 +248,12 @@ class Surrogate(PolicyGradient):
 class Poisson(ActorLoss):
     """DQN: the Q that adds up over the sensors, Q = b + Σ a_j q_j with q = c(e^z - 1), by the loss c e^z - (G⁺ - G⁻)z.
 
-    At its minimum c e^z is the gain of the sensor and q what it is worth more on than off. A squared error would have
-    to tell gains from costs where both are tiny; on the log scale cells where the target seldom is are no harder.
+    At its minimum c e^z is the gain of the sensor and q its worth on over off. A squared error would have to separate
+    gains from costs where both are tiny; on the log scale cells where the target seldom is are no harder.
     """
 
     def forward(self, logits: Tensor, credit: SensorCredit) -> Tensor:
-        """C e^z - (G⁺ - G⁻) z, z no larger than what any gain comes to."""
+        """C e^z - (G⁺ - G⁻) z, z no larger than for any gain."""
         z = logits.clamp(-_LARGEST_LOGIT, _LARGEST_LOG_RATIO)
         # Derivative in z: c e^z - (G⁺ - G⁻), zero at e^z = (G⁺ - G⁻) / c, which is above 1 exactly where sensing pays.
         return credit.price * z.exp() - (credit.plus - credit.minus) * z
@@ -252,7 +269,7 @@ def decision_loss(logits: Tensor, plus: Tensor, minus: Tensor, price: Tensor) ->
         logits: z.
         plus: G⁺, sum of the positive gains.
         minus: G⁻, minus the sum of the negative ones.
-        price: c, what having the sensor on costs in sum.
+        price: c, sum of the costs of the sensor on.
     """
     # Beyond the clamp nothing is left to learn, and without it logits run off to where floats lose precision.
     logits = logits.clamp(-_LARGEST_LOGIT, _LARGEST_LOGIT)

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from inspect import signature
 from typing import Any, ClassVar, Protocol
 
+import numpy as np
 import numpy.typing as npt
 import torch
+from scipy import sparse
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from trackmdp.config import TrainConfig
 from trackmdp.config.registry import maker
+from trackmdp.errors import UserError
+from trackmdp.policies.table import PolicyTable
 from trackmdp.world.model import Task
 
 
@@ -45,15 +50,31 @@ class Algorithm(Protocol):
         ...
 
 
-def make_algorithm(cfg: TrainConfig, task: Task, device: torch.device) -> Algorithm:
-    """The learner that a config names; it is given the task, never the motion."""
+def make_algorithm(
+    cfg: TrainConfig, task: Task, device: torch.device, nets: Mapping[str, Any] | None = None
+) -> Algorithm:
+    """The learner that a config names; it is given the task, never the motion.
+
+    Args:
+        cfg: the config.
+        task: the task.
+        device: where the networks live.
+        nets: `actor` and `critic` of the user's own.
+
+    Raises:
+        UserError: the learner takes no such networks.
+    """
+    made = maker(cfg.algo)
+    if unknown := (nets or {}).keys() - signature(made).parameters.keys():
+        raise UserError(f"{min(unknown)}: algo={cfg.algo.name} makes its own, expected a2c or ppo")
     # Rounded up: 100,001 frames in batches of 10,000 are 11 iterations, the last one whole as well.
     batches = -(-cfg.collector.total_frames // cfg.collector.frames_per_batch)
-    return maker(cfg.algo)(task.task, cfg.algo, iterations=batches, seed=cfg.seed, device=device)
+    given = {"iterations": batches, "seed": cfg.seed, "device": device} | dict(nets or {})
+    return made(task.task, cfg.algo, **given)
 
 
 class Checkpointed:
-    """What goes into a checkpoint by the names of its parts.
+    """An object saved in a checkpoint by the names of its parts.
 
     Modules, optimizers and the like by their `state_dict`, generators by their state, plain values as they are.
     """
@@ -80,6 +101,31 @@ def _state(part: Any) -> Any:
     if isinstance(part, torch.Generator):
         return part.get_state()
     return part.state_dict() if hasattr(part, "state_dict") else part
+
+
+def located(task: Task) -> Task:
+    """The task of policies that remember the last detection alone, with the mode where it is revealed."""
+    return task.remembering(revealed=task.revealed) if task.order else task
+
+
+def known_alone(batch: TensorDictBase, task: Task) -> TensorDictBase:
+    """A collected batch with the keys of `located(task)`: the mode alone, where the memory holds more."""
+    if task.order:
+        for part in (batch, batch["next"]):
+            mode = part["key"] % task.revealed
+            part["key"] = task.keys.cell(part["key"]) * task.revealed + mode
+    return batch
+
+
+def lifted(task: Task, table: PolicyTable) -> PolicyTable:
+    """The policy of `task` that acts as `table`, made for it or for `located(task)`."""
+    if table.task.order == task.order:
+        return table
+    keys = np.arange(task.num_keys)
+    known = task.keys.cell(keys) * task.revealed + keys % task.revealed
+    rows = known[:, None] * task.num_choices + np.arange(task.num_choices)
+    assert table.sets is not None
+    return PolicyTable(task, sparse.csr_array(table.sets[rows.ravel()]))
 
 
 def tensors(arrays: Mapping[str, Any]) -> dict[str, Tensor]:
@@ -124,7 +170,10 @@ def set_learning_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:
 
 
 def clipped_step(
-    loss: Tensor, optimizer: torch.optim.Optimizer, parameters: Iterable[nn.Parameter], max_norm: float
+    loss: Tensor,
+    optimizer: torch.optim.Optimizer,
+    parameters: Iterable[nn.Parameter],
+    max_norm: float,
 ) -> Tensor:
     """One gradient step with the gradient's norm clipped; returns the norm before clipping.
 
@@ -146,4 +195,6 @@ def explained_variance(predicted: Tensor, target: Tensor) -> Tensor:
     if target.numel() < 2:
         return torch.zeros(())
     variance = target.var()
-    return torch.where(variance > 0, 1 - (target - predicted).var() / variance, torch.zeros_like(variance))
+    return torch.where(
+        variance > 0, 1 - (target - predicted).var() / variance, torch.zeros_like(variance)
+    )

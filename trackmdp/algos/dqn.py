@@ -15,7 +15,12 @@ from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictParams, TensorDictSequential
+from tensordict.nn import (
+    TensorDictModule,
+    TensorDictModuleBase,
+    TensorDictParams,
+    TensorDictSequential,
+)
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import RandomSampler, Sampler
@@ -24,8 +29,8 @@ from torchrl.objectives import LossModule, SoftUpdate
 
 from trackmdp.algos.common import Averages, Checkpointed, clipped_step, set_learning_rate
 from trackmdp.config.learning import DqnConfig
+from trackmdp.policies.forms import STATE_KEYS
 from trackmdp.policies.nets import EpsilonFlip, joint_value, make_qvalue
-from trackmdp.policies.unroll import STATE_KEYS
 from trackmdp.seeding import generator
 from trackmdp.world.model import Task
 
@@ -39,7 +44,9 @@ class PrioritizedSampler(Sampler):
     `sample` also returns `priority_weight` `[batch]`, (N · P(i))^-beta over its largest possible value.
     """
 
-    def __init__(self, capacity: int, alpha: float, beta: float, device: torch.device | str = "cpu") -> None:
+    def __init__(
+        self, capacity: int, alpha: float, beta: float, device: torch.device | str = "cpu"
+    ) -> None:
         self.alpha, self.beta = alpha, beta
         self._mass = torch.zeros(capacity, dtype=torch.float64, device=device)
         self._largest = torch.ones((), dtype=torch.float64, device=device)
@@ -62,7 +69,10 @@ class PrioritizedSampler(Sampler):
 
     def update_priority(self, index: Tensor | int, priority: Tensor | float, **_: Any) -> None:
         """Set the priorities of `index` to |priority|."""
-        value = torch.as_tensor(priority, dtype=torch.float64, device=self._mass.device).abs() + _SMALLEST
+        value = (
+            torch.as_tensor(priority, dtype=torch.float64, device=self._mass.device).abs()
+            + _SMALLEST
+        )
         self._largest = torch.maximum(self._largest, value.max())
         self._mass[index] = value**self.alpha
 
@@ -107,7 +117,9 @@ class AdditiveDQNLoss(LossModule):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """`loss` of a batch of transitions as `n_step` makes them."""
-        chosen = joint_value(self._values(tensordict, self.qvalue_network_params), tensordict["action"])
+        chosen = joint_value(
+            self._values(tensordict, self.qvalue_network_params), tensordict["action"]
+        )
         with torch.no_grad():
             following = tensordict["next"]
             best = self._values(following, self.qvalue_network_params)["sensor_value"] > 0
@@ -117,7 +129,9 @@ class AdditiveDQNLoss(LossModule):
         error = target - chosen
         tensordict["td_error"] = error.detach().abs()
         weight = tensordict.get("priority_weight", torch.ones_like(error))
-        return TensorDict({"loss": (weight * error.square()).mean(), "q_value": chosen.detach().mean()})
+        return TensorDict(
+            {"loss": (weight * error.square()).mean(), "q_value": chosen.detach().mean()}
+        )
 
     def _values(self, tensordict: TensorDictBase, params: TensorDictBase) -> TensorDictBase:
         with params.to_module(self.qvalue_network):
@@ -133,14 +147,16 @@ class _ZeroedStorage(LazyTensorStorage):
 
 
 class DQN(Checkpointed):
-    """Learns off policy from a replay buffer; explores by flipping sensors; the target network is what is evaluated."""
+    """Learns off policy from a replay buffer; explores by flipping sensors; the target network is evaluated."""
 
     parts: ClassVar[tuple[str, ...]] = ("loss", "optimizer", "buffer", "explore", "iteration")
 
-    def __init__(self, task: Task, cfg: DqnConfig, *, iterations: int, seed: int, device: torch.device) -> None:
+    def __init__(
+        self, task: Task, cfg: DqnConfig, *, iterations: int, seed: int, device: torch.device
+    ) -> None:
         self.cfg, self.iterations, self.iteration, self.device = cfg, iterations, 0, device
         qvalue = make_qvalue(task, cfg.hidden, cfg.reward_scale).to(device)
-        self.explore = EpsilonFlip(cfg.epsilon.start).to(device)
+        self.explore = EpsilonFlip(cfg.epsilon.start, qvalue.module.units).to(device)
         self.policy = TensorDictSequential(qvalue, self.explore)
         self.loss = AdditiveDQNLoss(qvalue)
         self.target = SoftUpdate(self.loss, tau=cfg.target_tau)
@@ -148,9 +164,15 @@ class DQN(Checkpointed):
         self.parameters = list(qvalue.parameters())
         self.optimizer = torch.optim.Adam(self.parameters, lr=cfg.learning_rate.start, fused=True)
         per = cfg.prioritized
-        sampler = PrioritizedSampler(cfg.buffer_size, per.alpha, per.beta, device) if per.enabled else RandomSampler()
+        sampler = (
+            PrioritizedSampler(cfg.buffer_size, per.alpha, per.beta, device)
+            if per.enabled
+            else RandomSampler()
+        )
         self.buffer = TensorDictReplayBuffer(
-            storage=_ZeroedStorage(cfg.buffer_size, device=device), sampler=sampler, batch_size=cfg.batch_size
+            storage=_ZeroedStorage(cfg.buffer_size, device=device),
+            sampler=sampler,
+            batch_size=cfg.batch_size,
         )
         self.buffer.set_rng(generator(seed, "buffer", device=device))
 
@@ -173,18 +195,24 @@ class DQN(Checkpointed):
         for _ in range(self.cfg.updates):
             rows = self.buffer.sample()
             losses = self.loss(rows)
-            norm = clipped_step(losses["loss"], self.optimizer, self.parameters, self.cfg.max_grad_norm)
+            norm = clipped_step(
+                losses["loss"], self.optimizer, self.parameters, self.cfg.max_grad_norm
+            )
             self.target.step()
             if self.cfg.prioritized.enabled:
                 self.buffer.update_priority(rows["index"], rows["td_error"])
             error = rows["td_error"].mean()
-            averages.add(loss=losses["loss"], q_value=losses["q_value"], td_error=error, grad_norm=norm)
+            averages.add(
+                loss=losses["loss"], q_value=losses["q_value"], td_error=error, grad_norm=norm
+            )
         epsilon = self.cfg.epsilon.at(progress)
         self.explore.epsilon.fill_(epsilon)
         return {"learning_rate": rate, "epsilon": epsilon} | averages.means()
 
 
-def n_step(batch: TensorDictBase, steps: int, gamma: float, state: Sequence[str] = STATE_KEYS) -> TensorDictBase:
+def n_step(
+    batch: TensorDictBase, steps: int, gamma: float, state: Sequence[str] = STATE_KEYS
+) -> TensorDictBase:
     """Transitions `[B · time]` that bootstrap after up to `steps` steps.
 
     A sum stops at the end of an episode and at the end of the batch. `discount` is γ^k for the k steps taken, and
@@ -194,7 +222,7 @@ def n_step(batch: TensorDictBase, steps: int, gamma: float, state: Sequence[str]
         batch: collected frames `[B, time]`.
         steps: n.
         gamma: discount.
-        state: keys of what a policy reads of a state.
+        state: keys of a state that a policy reads.
     """
     reward, done = batch["next", "reward"].squeeze(-1), batch["next", "done"].squeeze(-1)
     total, taken, alive = reward.clone(), torch.ones_like(reward, dtype=torch.int64), ~done
@@ -205,7 +233,9 @@ def n_step(batch: TensorDictBase, steps: int, gamma: float, state: Sequence[str]
         alive[:, :-k] &= ~done[:, k:]
     following = batch["next"].select(*state, "terminated")
     if steps > 1:
-        following = following.gather(1, torch.arange(batch.shape[1], device=taken.device) + taken - 1)
+        following = following.gather(
+            1, torch.arange(batch.shape[1], device=taken.device) + taken - 1
+        )
     following["reward"] = total.unsqueeze(-1)
     rows = batch.select(*state, "action")
     rows["discount"] = gamma ** taken.to(reward.dtype)

@@ -1,7 +1,7 @@
-"""What switching one sensor on is worth (theory: credit that reaches the optimum).
+"""The gain of switching one sensor on (theory.md#gains).
 
 The motion is exogenous, so on a fully sensed path every policy can be replayed, its misses included. At an info state
-with n misses, the target moving to cell y next, the sensor of y gains what a detection is worth more than a miss, no
+with n misses, the target moving to cell y next, the sensor of y gains the worth of a detection over a miss, no
 other sensor gains anything, and each sensor that is on costs its c. Gains are gathered from and added up in tables over
 (cell, clock, sensor).
 """
@@ -12,11 +12,13 @@ import torch
 from torch import Tensor
 
 
-def sensing_gain(clocked: Tensor, own: Tensor | None = None, *, discount: float, blend: float = 0.0) -> Tensor:
+def sensing_gain(
+    clocked: Tensor, own: Tensor | None = None, *, discount: float, blend: float = 0.0
+) -> Tensor:
     """The gain, in units of r, of having the target's sensor on: 1 + γ[(1-λ)(U(y,0) - U(y,n+1)) + λ(V(y) - G_{n+1})].
 
-    At λ = 0 the clocked values say it, which are optimistic about what follows a miss; at λ = 1 the policy's own
-    continuation does. Taking λ slowly from 0 to 1 leads past optima that no change of a single sensor improves.
+    At λ = 0 it is the clocked gain, with optimistic values after a miss; at λ = 1 the gain by the policy's own
+    continuation. Taking λ slowly from 0 to 1 leads past optima that no change of a single sensor improves.
 
     Args:
         clocked: U(y,0) - U(y,n+1), any shape.
@@ -31,7 +33,7 @@ def sensing_gain(clocked: Tensor, own: Tensor | None = None, *, discount: float,
 
 
 def clocked_advantage(clocked: Tensor) -> Tensor:
-    """U(y,0) - U(y,n+1), `[T+1, M]`: what a detection in cell y after n misses is worth more than a miss.
+    """U(y,0) - U(y,n+1), `[T+1, M]`: worth of a detection in cell y after n misses over a miss.
 
     Args:
         clocked: `[M, T+2]`, U(y,n), the value when the position is revealed after every action but the clock runs on.
@@ -58,7 +60,7 @@ def chain_returns(
     that may miss gives the mean of the two: no report is drawn, and none adds noise.
 
     Args:
-        hits: `[T+1, B]`, whether A_n contains y, or with what probability the sensor there reports.
+        hits: `[T+1, B]`, whether A_n contains y, or the probability that the sensor there reports.
         inside: bool `[T+2, B]`, whether the target is in the grid after the move.
         set_cost: `[T+1, B]`, c(A_n), the cost of the sensors on.
         value: `[T+2, B]`, V(y).
@@ -66,18 +68,24 @@ def chain_returns(
         safe_cost: D.
         discount: γ.
         repeated: `[B]` each, p_s(y) and L(y), the value of the target being in y where the safe action comes next;
-            what it misses at the last step is worth γL(y). None: it always locates.
+            a target that it misses at the last step is worth γL(y). None: it always locates.
 
     Returns:
         `[T+2, B]`.
     """
     found = reward + discount * value
-    last = found[-1] if repeated is None else torch.lerp(discount * repeated[1], found[-1], repeated[0])
+    last = (
+        found[-1]
+        if repeated is None
+        else torch.lerp(discount * repeated[1], found[-1], repeated[0])
+    )
     # The forced step has no set to pay for. Each G is 0 where the target has left by then, so that a
     # plan that misses until the exit has paid for its sets in the grid alone.
     returns = [(last - safe_cost) * inside[-1]]
     for n in reversed(range(len(hits))):
-        outcome = torch.lerp(discount * returns[-1], found[n], hits[n].to(found.dtype)) - set_cost[n]
+        outcome = (
+            torch.lerp(discount * returns[-1], found[n], hits[n].to(found.dtype)) - set_cost[n]
+        )
         returns.append(outcome * inside[n])
     return torch.stack(returns[::-1])
 

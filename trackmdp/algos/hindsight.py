@@ -1,10 +1,10 @@
 """Hindsight: learn the sensing policy from fully sensed paths, on which every policy can be replayed.
 
-Sensing never moves the target. With all sensors on, every path shows what any policy would have found and missed
-on it. Nothing else is read: neither the kernel nor a position that was not sensed. The clocked actor
-and critic only lend credit: they say what a detection is worth while the actor's own chains are still poor. At the end
-the learned sets are exchanged, which gets past what no change of one set improves: on the counted moves
-(`algos/exchanged.py`), or where those do not combine on whole paths (`solvers/path_exchange.py`).
+Sensing never moves the target. With all sensors on, every path shows the detections and misses of any policy
+on it. Nothing else is read: neither the kernel nor a position that was not sensed, and no motion is estimated. The
+clocked actor and critic only lend credit: the worth of a detection while the actor's own chains are still poor. Where
+the next move does not depend on the cell alone, the learned sets are exchanged at the end on whole paths, which gets
+past the optima that no change of one set improves (`estimates/path_plans.py`).
 """
 
 from __future__ import annotations
@@ -20,22 +20,27 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from trackmdp.algos.actor_loss import ActorLoss, Decision
-from trackmdp.algos.common import Averages, Checkpointed, set_learning_rate
-from trackmdp.algos.exchanged import counted_world, exchanged_sets
+from trackmdp.algos.common import (
+    Averages,
+    Checkpointed,
+    known_alone,
+    lifted,
+    located,
+    set_learning_rate,
+)
+from trackmdp.algos.estimates.alike import cell_classes
+from trackmdp.algos.estimates.path_plans import choose_plan
 from trackmdp.algos.hindsight_loss import HindsightLoss
-from trackmdp.algos.inferred import InferredMoves
 from trackmdp.algos.moves import MoveBuffer
 from trackmdp.algos.replay import Replay
-from trackmdp.algos.segments import SegmentBuffer
+from trackmdp.algos.segments import InferredMoves, SegmentBuffer
 from trackmdp.config.per_sensor import PerSensorConfig
 from trackmdp.errors import UserError
 from trackmdp.policies.acting import Exploring
-from trackmdp.policies.policy import Policy
+from trackmdp.policies.policy import Policy, as_policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import generator
-from trackmdp.solvers.alike import cell_classes
-from trackmdp.solvers.path_exchange import choose_plan
-from trackmdp.solvers.renewal import IndexArray
+from trackmdp.solvers.linear import IndexArray
 from trackmdp.world.model import Task
 from trackmdp.world.windows import Window
 
@@ -43,24 +48,13 @@ _MOST_CELLS_OF_NETS = 4_096
 """Above, embeddings of each (cell, clock) take time and memory that tables do not. At N = 32 tables end .007 per step
 below the optimum where nets end .002 below, and both .002 after the exchange."""
 _LOSSES = ("clocked_actor", "clocked_critic", "actor", "critic")
-_BEFORE_EXCHANGE, _MOST_ROWS = 100, 400
-"""Updates of a problem of so many rows whose sets are exchanged in the end. On 10 x 10 cells (seed 100, not one of any
-table) the exchanged policies after 1, 20, 60, 100 and 500 of them were the same, or of the same regret to .0001; after
-one update alone exchange took longer than the updates that it replaced. At t_max 3 so were those after 100 and 800, in
-4 CPU seconds in place of 15 to 20. Larger problems were not tried."""
 
 
 def budget(task: Task, cfg: PerSensorConfig) -> tuple[int, int]:
     """Updates and hidden units: as configured, else by the number of rows (x, n) that the actor has to get right."""
-    rows = task.num_keys * task.num_choices
-    few = rows <= 300
-    alone = round(cfg.effort * (500 if few else 800))
-    # A mixture acts on the nets from early on; misses and windows were not tried either. What has so few rows is never
-    # too large to be exchanged.
-    certain = task.perfect and task.safe
-    exchanged = cfg.exchange and task.markov and certain and task.window is None and cfg.collect == "all_on"
+    few = task.num_keys * task.num_choices <= 300
     hidden = 128 if few else 256 if task.num_keys <= _MOST_CELLS_OF_NETS else 0
-    updates = cfg.updates or (_BEFORE_EXCHANGE if exchanged and rows <= _MOST_ROWS else alone)
+    updates = cfg.updates or round(cfg.effort * (500 if few else 800))
     return updates, hidden if cfg.hidden is None else cfg.hidden
 
 
@@ -72,8 +66,12 @@ class Hindsight:
     output for where it is.
     """
 
-    def __init__(self, task: Task, cfg: PerSensorConfig, *, iterations: int, seed: int, device: torch.device) -> None:
-        self.task, self.cfg, self.device = task, cfg, device
+    def __init__(
+        self, task: Task, cfg: PerSensorConfig, *, iterations: int, seed: int, device: torch.device
+    ) -> None:
+        self.cfg, self.device, self._whole_task = cfg, device, task
+        # Where the next move depends on the last detection alone, more of the past is of no use.
+        self.task = task = located(task) if task.markov else task
         self.updates, self.hidden = budget(task, cfg)
         self._collecting, self._iteration, self._update = iterations, 0, 0
         self._mixed = cfg.collect == "mixed"
@@ -83,10 +81,12 @@ class Hindsight:
         self._collect_first = max(1, round(share * iterations))
         alongside = (iterations - self._collect_first) * cfg.updates_per_iteration
         # Updates not done beside the collecting are done after it, updates_per_iteration at a time, rounded up.
-        self.iterations = iterations + max(0, -(-(self.updates - alongside) // cfg.updates_per_iteration))
+        self.iterations = iterations + max(
+            0, -(-(self.updates - alongside) // cfg.updates_per_iteration)
+        )
         self._generator = generator(seed, "hindsight", device=device)
         # Whether another policy is better is judged on recordings that nothing was learned from.
-        judges = cfg.exchange and task.perfect and task.safe and task.coverage is None and not self._mixed
+        judges = cfg.exchange and not self._mixed
         self._buffer = _buffer(task, cfg.buffer_size, self._generator, seed if judges else None)
         window = Window.of(task, device)
         # [M, K], the sensors of each window that the border cuts off.
@@ -94,20 +94,20 @@ class Hindsight:
         self._learner: _Learner | None = None
         self._seen: int | None = None
         self._classes = _classes(task, cfg)
-        if task.order and not (task.perfect and task.safe):  # its keys are those of paths on which nothing was missed
-            raise UserError(f"task.memory={task.memory}: expected sensors that never miss with this algo")
-        self.actor = Policy.none(task)
-        self.policy = Exploring(task, device) if self._mixed else Policy.all_on(task)
+        whole = self._whole_task
+        self.actor = Policy.none(whole)
+        self.policy = Exploring(whole, device) if self._mixed else Policy.all_on(whole)
 
     def step(self, batch: TensorDictBase | None) -> dict[str, float]:
         """Store one batch `[B, time]`, then `updates_per_iteration` updates if enough batches are in."""
         self._iteration += 1
         if batch is not None:
             if self._outside is not None:
-                # Sensors of the window outside the grid are off, whoever acts; nothing is missed there, so that a step
+                # Sensors of the window outside the grid are always off; nothing is missed there, so that a step
                 # with all others on is fully sensed.
                 batch["action"] = batch["action"] | self._outside[batch["last_cell"]]
-            self._buffer.extend(batch)
+            known = known_alone(batch, self._whole_task) if self.task.markov else batch
+            self._buffer.extend(known)
             self._seen = None
         averages, cfg = Averages(), self.cfg
         if self._iteration > self._collect_first:
@@ -119,15 +119,19 @@ class Hindsight:
                 learner.loss.actor_loss.prepare(self._update, progress)
                 cells = self._paths()
                 cells = _within(cells, learner.loss.reach, self.task) if farther else cells
-                averages.add(**learner.update(cells, cfg.learning_rate.at(progress), cfg.blend.at(progress)))
+                averages.add(
+                    **learner.update(cells, cfg.learning_rate.at(progress), cfg.blend.at(progress))
+                )
                 self._update += 1
             self._renew_policy(learner)
         losses = averages.means() or dict.fromkeys(_LOSSES, math.nan)
-        return {"moves": len(self._buffer), "updates": self._update} | {f"loss_{k}": v for k, v in losses.items()}
+        return {"moves": len(self._buffer), "updates": self._update} | {
+            f"loss_{k}": v for k, v in losses.items()
+        }
 
     def _paths(self) -> Tensor:
-        """`[T+3, B]` cells: located, T + 1 free choices, the forced step; whole paths where more is remembered."""
-        if isinstance(self._buffer, SegmentBuffer) and self.task.order:
+        """`[T+3, B]` cells: located, T + 1 free choices, the forced step; longer paths where moves do not combine."""
+        if isinstance(self._buffer, SegmentBuffer):
             return self._buffer.sample(self.cfg.batch_size)
         return self._buffer.paths(self.cfg.batch_size, self.task.t_max + 2)
 
@@ -157,29 +161,24 @@ class Hindsight:
 
     def _renew_policy(self, learner: _Learner) -> None:
         """Rebuild the evaluated policy, and with `collect=mixed` the collecting one, from the averaged actor."""
-        self.actor = Policy(self.task, self._exchanged(learner.sets(self.task)))
+        table = PolicyTable(self.task, self._exchanged(learner.sets(self.task)))
+        self.actor = as_policy(self._whole_task, lifted(self._whole_task, table))
         if isinstance(self.policy, Exploring):
             self.policy.renew(self.actor)
             self.policy.explore.fill_(self.cfg.explore.at(self._iteration / self._collecting))
 
     def _exchanged(self, sets: sparse.csr_array) -> sparse.csr_array:
-        """The learned sets after exchange, at the end and, of moves, for a mixture that collects.
-
-        Moves out of a cell are counted whatever came before, which only says how the target moves if that is Markov;
-        else whole paths are followed.
-        """
-        task, cfg, last = self.task, self.cfg, self._update == self.updates
-        acts = self._mixed and self._iteration < self._collecting
-        if not cfg.exchange or not (last or acts):
-            return sets
-        if isinstance(self._buffer, MoveBuffer):
-            counts = self._buffer.counts()
-            world = counted_world(task, *self._buffer.moves(), classes=self._classes, count=counts)
-            return exchanged_sets(world, sets, anew=last)
-        if self._buffer.judge is None:
+        """The learned sets after exchange on whole paths, at the end."""
+        exchanges = self.cfg.exchange and self._update == self.updates
+        if not exchanges or isinstance(self._buffer, MoveBuffer) or self._buffer.judge is None:
             return sets
         paths, judge = self._buffer.tracks(), self._buffer.judge
-        return choose_plan(task, paths, learned=PolicyTable(task, sets), discount=cfg.gamma, seed=judge).policy.sets
+        learned = PolicyTable(self.task, sets)
+        others = [lambda _: learned]  # no validation path was learned from
+        found = choose_plan(
+            self.task, paths, priors=(), others=others, discount=self.cfg.gamma, seed=judge
+        )
+        return found.policy.sets
 
     def _make_learner(self, reach: int) -> _Learner:
         loss = HindsightLoss(
@@ -204,26 +203,24 @@ class Hindsight:
             UserError: it was never seen to move.
         """
         if not len(self._buffer):
-            raise UserError("algo.total_frames: in none of them was a target located and sensed again; expected more")
+            raise UserError(
+                "algo.total_frames: in none of them was a target located and sensed again; expected more"
+            )
         if self._seen is None:
             self._seen = int(_distance(*self._buffer.moves(), self.task).max())
         return self._seen
 
 
-def _buffer(task: Task, capacity: int, rng: torch.Generator, judge: int | None) -> MoveBuffer | SegmentBuffer:
-    """Paths put together from moves where the next one depends on the cell alone, else only those that were sensed.
-
-    Raises:
-        UserError: only whole paths will do, and no sensor covers some cell.
-    """
-    if task.coverage is not None and not task.coverage.degree.all():
-        if task.markov:
-            return InferredMoves(task, rng)
-        cell = int(task.coverage.degree.argmin())
-        raise UserError(f"sensor: none covers cell {cell}, expected one for each cell with kernel.markov=false")
-    if task.markov and not task.order:
-        return MoveBuffer(task, capacity, rng)
-    return SegmentBuffer(task, Replay.steps(task.keys), capacity, rng, judge)
+def _buffer(
+    task: Task, capacity: int, rng: torch.Generator, judge: int | None
+) -> MoveBuffer | SegmentBuffer:
+    """Paths put together from moves where the next one depends on the cell alone, else only sensed ones."""
+    if not task.markov:
+        return SegmentBuffer(task, Replay.steps(task.keys), capacity, rng, judge)
+    covered = np.diff(task.sees_by_cell[:, task.available].indptr) > 0
+    # Of footprints a window may leave out sensors of cells that the target moves to.
+    sees = covered.all() and (task.window is None or task.coverage is None)
+    return MoveBuffer(task, capacity, rng) if sees else InferredMoves(task, rng)
 
 
 def _classes(task: Task, cfg: PerSensorConfig) -> IndexArray | None:
@@ -232,20 +229,28 @@ def _classes(task: Task, cfg: PerSensorConfig) -> IndexArray | None:
     if classes is None:
         return None
     alike = (
-        ((task.cost == task.cost[0]).all(), "sensors of different prices, expected one price for all"),
-        ((task.detection == task.detection[0]).all(), "sensors of different p_d, expected one for all"),
+        (
+            (task.cost == task.cost[0]).all(),
+            "sensors of different prices, expected one price for all",
+        ),
+        (
+            (task.detection == task.detection[0]).all(),
+            "sensors of different p_d, expected one for all",
+        ),
         (task.coverage is None, "sensors with footprints, expected one in each cell"),
     )
-    for fine, said in alike:
+    for fine, mistake in alike:
         if not fine:
-            raise UserError(f"algo.share_cells={cfg.share_cells}: {said}")
+            raise UserError(f"algo.share_cells={cfg.share_cells}: {mistake}")
     return classes
 
 
 def _distance(start: Tensor, end: Tensor, task: Task) -> Tensor:
     """How far moves go, in rows or in columns; 0 where they end outside, in M."""
     columns, (start, end) = task.columns, (task.keys.cell(each) for each in (start, end))
-    moved = torch.maximum((start // columns - end // columns).abs(), (start % columns - end % columns).abs())
+    moved = torch.maximum(
+        (start // columns - end // columns).abs(), (start % columns - end % columns).abs()
+    )
     return moved.masked_fill_(end == task.num_cells, 0)
 
 
@@ -263,7 +268,7 @@ class _Learner(Checkpointed):
 
     def __init__(self, loss: HindsightLoss, ema_decay: float) -> None:
         self.loss, self.reach, self._decay, self.count = loss, loss.reach, ema_decay, 0
-        # Paths are replayed with the average, whose decisions change less from update to update than those of the
+        # Paths are replayed with the average: its decisions change less from update to update than those of the
         # weights.
         self.ema = copy.deepcopy(loss.actor).requires_grad_(False)
         self.optimizer = torch.optim.Adam(loss.parameters(), lr=0.0, betas=(0.9, 0.99), fused=True)
@@ -282,7 +287,9 @@ class _Learner(Checkpointed):
         decay = min(self._decay, (1 + self.count) / (10 + self.count))
         self.count += 1
         with torch.no_grad():
-            for mean, weight in zip(self.ema.parameters(), self.loss.actor.parameters(), strict=True):
+            for mean, weight in zip(
+                self.ema.parameters(), self.loss.actor.parameters(), strict=True
+            ):
                 mean.lerp_(weight, 1.0 - decay)
         return losses
 
@@ -298,7 +305,7 @@ class _Learner(Checkpointed):
         # lists them row by row.
         key, n, local = self._on().nonzero(as_tuple=True)
         column = sensors[task.keys.cell(key), local]
-        there = column < task.total_sensors
+        there = torch.as_tensor(np.append(task.available, False), device=column.device)[column]
         place = ((key * task.num_choices + n)[there].cpu().numpy(), column[there].cpu().numpy())
         shape = (task.num_keys * task.num_choices, task.total_sensors)
         return sparse.csr_array((np.ones(len(place[0]), dtype=bool), place), shape=shape)

@@ -1,4 +1,4 @@
-"""The losses of hindsight learning, from paths whose every cell was sensed."""
+"""The losses of hindsight learning, from fully sensed paths."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
@@ -15,7 +16,7 @@ from trackmdp.algos.gains import chain_returns, clocked_advantage, gather, scatt
 from trackmdp.algos.in_view import SensorsInView
 from trackmdp.algos.replay import Replay
 from trackmdp.policies.nets import CellClockNet
-from trackmdp.solvers.renewal import IndexArray
+from trackmdp.solvers.linear import IndexArray
 from trackmdp.world.model import Task
 from trackmdp.world.windows import Window
 
@@ -34,9 +35,9 @@ class _Replayed:
         row: `[T+1, B]`, the place in `[M, T+1]` of the path's first cell.
         entry: `[T+1, B]`, the place in `[M, T+1, K]` of the sensor the target moved to.
         alive: `[T+1, B]`, probability that the target was not yet located where it is in the grid, else 0.
-        gain: `[T+1, B]`, what having that sensor on gains, times p_d and `alive`.
+        gain: `[T+1, B]`, of a report there, times `alive`.
         target: `[M, 1]`, mean return of the paths from each cell, the critic's target; where the safe action may miss
-            `[M, 2]`, the second that of paths at whose first step it comes.
+            `[M, 2]`, the second of paths with it at the first step.
     """
 
     row: Tensor
@@ -69,9 +70,9 @@ class HindsightLoss(nn.Module):
         hidden: hidden units of each net.
         discount: γ of the credit.
         generator: draws the initial weights.
-        classes: `[M]`, cells of one class, away from the border, are those from which the target moves alike; None: no
-            two cells share what is learned.
-        max_entries: entries (x, n, sensor) of a table at most, where that leaves one cell; what has more is gone
+        classes: `[M]`, the target moves alike from all cells of one class away from the border; None: no two cells
+            share estimates or sets.
+        max_entries: entries (x, n, sensor) of a table at most, where that leaves one cell; larger tables are worked
             through in parts, a few cells at a time. The losses are the same, up to rounding.
     """
 
@@ -91,55 +92,75 @@ class HindsightLoss(nn.Module):
         # Shapes below: M cells, T + 1 = t_max + 1 clocks, B paths, C cells of a window around the located cell, and K
         # sensors that may see them, one in each where none has a footprint.
         m, choices, device = task.num_keys, task.num_choices, generator.device
-        self.reach, self._window, self._keys, self._classes = reach, task.window, task.keys, task.keys.num_classes
+        self.reach, self._window, self._keys, self._classes = (
+            reach,
+            task.numbered,
+            task.keys,
+            task.keys.num_classes,
+        )
         # One move takes the target to a cell that is near; t_max + 1 of them, to one in view.
-        self.near, self.view = Window.reaching(task, reach, device), _in_view(task, choices * reach, device)
+        self.near, self.view = (
+            Window.reaching(task, reach, device),
+            _in_view(task, choices * reach, device),
+        )
         self.nearby, self.sensors = SensorsInView(task, self.near), SensorsInView(task, self.view)
         # The border looks alike from two cells where it is equally far, or out of reach until the safe action; and so
         # must all classes of cells do that the target may come to before it.
-        # What to sense is then learned once for both; values stay each cell's own.
+        # The sets are then learned once for both; values stay each cell's own.
         groups = None
         if classes is not None:
-            groups = self._groups(Window(task, choices * reach, device), torch.as_tensor(classes, device=device))
+            groups = self._groups(
+                Window(task, choices * reach, device), torch.as_tensor(classes, device=device)
+            )
 
         net = partial(CellClockNet, m, hidden=hidden, generator=generator, classes=self._classes)
 
         def decisions(seen: Window, sensors: SensorsInView) -> CellClockNet:
             # Where the window is the whole grid an output stands for a cell, and cannot be shared. Bias -1 starts all
             # sensors off (z > 0 is on).
-            return net(choices, outputs=sensors.width, bias=-1.0, groups=groups if seen.is_local else None)
+            return net(
+                choices, outputs=sensors.width, bias=-1.0, groups=groups if seen.is_local else None
+            )
 
         # U has T + 2 clocks: also n = T + 1, where the safe action is forced. V has a second one, L, only where that
         # may have to be repeated.
-        self.actor, self.critic = decisions(self.view, self.sensors), net(1 if task.safe else 2, outputs=1)
-        self.clocked_actor, self.clocked_critic = decisions(self.near, self.nearby), net(choices + 1, outputs=1)
+        self.actor, self.critic = (
+            decisions(self.view, self.sensors),
+            net(1 if task.safe else 2, outputs=1),
+        )
+        self.clocked_actor, self.clocked_critic = (
+            decisions(self.near, self.nearby),
+            net(choices + 1, outputs=1),
+        )
         actor_loss.allocate((m, choices, self.sensors.width), device)
         self.actor_loss = actor_loss
         self.discount, self.safe_cost = discount, task.safe_cost / task.reward
-        # What the forced step earns, in units of r: (r - D) / r; or about what all of them do until one locates.
+        # Reward of the forced step, in units of r: (r - D) / r; or about the sum of all until one locates.
         safe = float(task.safe_detection.mean())
         self._forced = (safe - self.safe_cost) / (1.0 - discount * (1.0 - safe))
         entries = max(self.sensors.entries, self.near.width * self._classes)
         self._keys_at_once = max(1, max_entries // (choices * entries))
-        cost = torch.as_tensor(task.cost / task.reward, dtype=torch.float32, device=device)
+        # A sensor that does not exist reports nothing, and is learned to be off by a price like the others'.
+        price = np.where(task.available, task.cost, np.nanmean(task.cost))
+        cost = torch.as_tensor(price / task.reward, dtype=torch.float32, device=device)
         # [S + 1]: the last one, which there is none of, costs nothing, so that windows cut off by the border need no
         # mask here.
         self.cost = nn.Buffer(pad(cost, (0, 1)))
-        # p_d and p_s [M + 1], known to the learner like the prices; 0 outside, and no state: they are the task's, not
-        # the training's.
-        detects, locates = (
-            pad(torch.as_tensor(p, dtype=torch.float32, device=device).repeat_interleave(self._classes), (0, 1))
-            for p in (task.detection, task.safe_detection)
-        )
-        self._perfect, self._detection = task.perfect, detects
-        self._safe_detection = None if task.safe else locates
+        # p_s [M + 1], known to the learner like the prices; 0 outside, and no state: it is the task's.
+        locates = torch.as_tensor(task.safe_detection, dtype=torch.float32, device=device)
+        every = pad(locates.repeat_interleave(self._classes), (0, 1))
+        self._safe_detection = None if task.safe else every
+        self._task, self._generator = task, generator
         self.clocks = nn.Buffer(torch.arange(choices, device=device).unsqueeze(-1))
         # Row 0 for the clocked actor, row 1 for the actor.
         self.gain_scale = nn.Buffer(torch.ones(2, choices, device=device))
 
     def _groups(self, window: Window, alike: Tensor) -> Tensor:
         """`[M]` the groups of located cells, or of keys: those of their cells and of one class."""
-        groups, classes = window.groups(alike).unsqueeze(1), torch.arange(self._classes, device=self.view.cells.device)
+        groups, classes = (
+            window.groups(alike).unsqueeze(1),
+            torch.arange(self._classes, device=self.view.cells.device),
+        )
         return (groups * self._classes + classes).flatten()
 
     def parts(self, cells: Tensor, on: Tensor, blend: float) -> Iterator[dict[str, Tensor]]:
@@ -153,15 +174,18 @@ class HindsightLoss(nn.Module):
             on: bool `[M, T+1, K]`, the sensors that the replayed policy switches on, as the actor's outputs.
             blend: λ of the gain.
         """
-        replay = Replay(self._keys, self.view, on) if self._keys.order else None
+        found = torch.cat([self.sensors.reports(on[rows], rows) for rows in self.slices()])
+        replay = None
+        if not self._task.markov:
+            replay = Replay(self._task, self.view, found, self._generator)
         cells, own = replay.begin(cells) if replay else (cells, cells)
         clocked, value = self.clocked_critic().squeeze(-1), self.critic().squeeze(-1)
         # U(x, T+1) holds r - D for certain; the net learns the rest.
         clocked = torch.cat([clocked[:, :-1], clocked[:, -1:] + self._forced], dim=1)
         value = torch.cat([value[:, :1], value[:, 1:] + self._forced], dim=1)
-        # [T + 1, M + 1], nothing gained by sensing what has exited. Detached: decisions do not train the values.
+        # [T + 1, M + 1], nothing gained by sensing an exited target. Detached: decisions do not train the values.
         advantage = pad(clocked_advantage(clocked.detach()), (0, 1))
-        plans = self._replay(replay, cells, own, on, advantage, value.detach(), blend)
+        plans = self._replay(replay, cells, own, (on, found), advantage, value.detach(), blend)
         weights = (
             self._weights(0, *self._first_gains(cells[1], advantage)),
             self._weights(1, plans.alive.sum(1), plans.gain.abs().sum(1)),
@@ -172,23 +196,36 @@ class HindsightLoss(nn.Module):
         for rows in slices:
             chosen = self._paths_from(cells[0], rows)
             loss, target = self._clocked(cells[:2, chosen], rows, advantage, known)
-            actor_loss = self._own(plans, rows, chosen if own is cells else self._paths_from(own[0], rows))
+            actor_loss = self._own(
+                plans, rows, chosen if own is cells else self._paths_from(own[0], rows)
+            )
             targets.append(target)
             # The actor's rows are those of the policy's own plans, the clocked actor's every (x, n) that a move was
             # seen from.
-            losses = {"actor": (actor_loss * weights[1]).sum(), "clocked_actor": (loss * weights[0]).sum()}
+            losses = {
+                "actor": (actor_loss * weights[1]).sum(),
+                "clocked_actor": (loss * weights[0]).sum(),
+            }
             if rows is slices[-1]:
-                visits, begun = (torch.bincount(paths[0], minlength=len(value)) for paths in (own, cells))
+                visits, begun = (
+                    torch.bincount(paths[0], minlength=len(value)) for paths in (own, cells)
+                )
                 # The squared error per cell times its number of paths is, up to a constant, the sum over paths of (V -
                 # return)^2.
                 losses["critic"] = _squared_error(value, plans.target, visits) / cells.shape[1]
-                losses["clocked_critic"] = _squared_error(clocked, torch.cat(targets), begun) / cells.shape[1]
+                losses["clocked_critic"] = (
+                    _squared_error(clocked, torch.cat(targets), begun) / cells.shape[1]
+                )
             yield losses
 
     def slices(self) -> list[slice]:
         """The located cells, as many at once as `max_entries` allows."""
         m, step = self._keys.num_keys, self._keys_at_once
-        return [slice(begin, begin + step) for begin in range(0, m, step)] if step < m else [slice(None)]
+        return (
+            [slice(begin, begin + step) for begin in range(0, m, step)]
+            if step < m
+            else [slice(None)]
+        )
 
     def _paths_from(self, start: Tensor, rows: slice) -> slice | Tensor:
         """Which paths start in the cells `rows`."""
@@ -197,14 +234,15 @@ class HindsightLoss(nn.Module):
         return ((start >= rows.start) & (start < rows.stop)).nonzero().squeeze(1)
 
     def _first_gains(self, end: Tensor, advantage: Tensor) -> tuple[Tensor, Tensor]:
-        """How many paths stay in the grid for a move, and the sum of what sensing gains there, `[T+1]`."""
+        """How many paths stay in the grid for a move, and the sum of the gains of sensing there, `[T+1]`."""
         # The gain depends on the end y and the clock alone, so moves are counted by y: [T + 1, M] @ [M].
         arrived = torch.bincount(end, minlength=advantage.shape[1])[:-1].float()
-        seen = arrived * self._detection[:-1]
         gain = sensing_gain(advantage[:, :-1], discount=self.discount)
-        return arrived.sum(), gain.abs() @ seen
+        return arrived.sum(), gain.abs() @ arrived
 
-    def _clocked(self, moves: Tensor, rows: slice, advantage: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
+    def _clocked(
+        self, moves: Tensor, rows: slice, advantage: Tensor, known: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """From the moves `[2, B]` out of the cells `rows`, at every clock: the position is revealed after every action.
 
         Returns:
@@ -214,37 +252,50 @@ class HindsightLoss(nn.Module):
         nearby, logits = self._of_keys(near.cells, rows), self.clocked_actor(rows)
         count, k = nearby.shape
         # [x, C H], the keys in those cells; M outside the grid.
-        ends = (nearby.unsqueeze(-1) * h + torch.arange(h, device=nearby.device)).flatten(1).clamp_max(m)
+        ends = (
+            (nearby.unsqueeze(-1) * h + torch.arange(h, device=nearby.device))
+            .flatten(1)
+            .clamp_max(m)
+        )
         start, end = moves
         first = rows.start or 0
         # Flat place in [rows, C H] of a move: with C = 9, H = 1, from cell 7 to its local cell 5 is 7 * 9 + 5 = 68;
         # where the slice begins at cell 4, 68 - 36 = 32. Exits have weight 0, wherever `index` puts them.
         place = (start * k + near.index(start // h, end // h) - first * k) * h + end % h
         moved = scatter_add((end < m).float(), place, count * k * h).view(count, 1, k * h)
-        # moved [x, 1, C H] counts moves by their end; stays [x, 1] those that stay in the grid, visits [x, 1] all.
+        # moved [x, 1, C H] counts moves by their end; stays [x, 1] the moves that stay in the grid, visits [x, 1] all.
         # Their quotients are the empirical kernel: moved / visits for P_xj, stays / visits for P_in(x).
         stays, visits = moved.sum(-1), torch.bincount(start - first, minlength=count).unsqueeze(-1)
-        # advantage[:, ends] is [T + 1, x, C H]: transposed to the layout [x, T + 1, C H]. A sensor that is on reports
-        # p_d of the moves to its cell; what it misses goes on like what is not sensed.
-        seen = moved if self._perfect else moved * self._detection[ends].unsqueeze(1)
-        gain = seen * sensing_gain(advantage[:, ends].transpose(0, 1), discount=self.discount)
-        # All moves to a key have the same gain, so its sign says whether it is part of its cell's G⁺ or G⁻.
-        plus, minus = (part.unflatten(-1, (k, h)).sum(-1) for part in (gain.clamp(min=0), gain.clamp(max=0).neg()))
-        chosen, cost = logits.detach() > 0, self.cost[self._of_keys(self.nearby.numbers, rows)].unsqueeze(1)
+        # advantage[:, ends] is [T + 1, x, C H]: transposed to the layout [x, T + 1, C H].
+        gain = moved * sensing_gain(advantage[:, ends].transpose(0, 1), discount=self.discount)
+        # All moves to a key have the same gain, so its sign makes it a part of its cell's G⁺ or G⁻.
+        plus, minus = (
+            part.unflatten(-1, (k, h)).sum(-1)
+            for part in (gain.clamp(min=0), gain.clamp(max=0).neg())
+        )
+        chosen, cost = (
+            logits.detach() > 0,
+            self.cost[self._of_keys(self.nearby.numbers, rows)].unsqueeze(1),
+        )
         if self._window is not None and self._window < self.reach:
             # Sensors outside the window cannot be chosen: they neither gain nor cost, nor are they learned about.
             allowed = self._choosable(nearby, rows).unsqueeze(1)
-            chosen, plus, minus, cost = chosen & allowed, plus * allowed, minus * allowed, cost * allowed
+            chosen, plus, minus, cost = (
+                chosen & allowed,
+                plus * allowed,
+                minus * allowed,
+                cost * allowed,
+            )
         # [x, 1, C H] @ [x, C H, T + 2]: gamma sum_j moved_j U(j, n), for all n by one product.
         following = self.discount * torch.bmm(moved, known[ends]).squeeze(1)
         # U(x, n) = sum_j P_xj gamma U(j, n + 1), if nothing is sensed; each sensor on adds its gain, which turns gamma
         # U(j, n + 1) into r + gamma U(j, 0), and takes its cost away. At n = T + 1 all are located: r - D + gamma U(j,
         # 0).
-        found = ((plus - minus) * self.nearby.seen(chosen, rows)).sum(-1)
+        found = ((plus - minus) * self.nearby.reports(chosen, rows)).sum(-1)
         free = following[:, 1:] + found - stays * (chosen * cost).sum(-1)
         if self._safe_detection is None:
             forced = following[:, :1] + (1.0 - self.safe_cost) * stays
-        else:  # what it misses goes on at n = T + 1
+        else:  # a missed target goes on at n = T + 1
             located = moved.squeeze(1) * self._safe_detection[ends]
             after = located * (1.0 + self.discount * known[ends, 0])
             missed = (moved.squeeze(1) - located) * self.discount * known[ends, -1]
@@ -266,7 +317,7 @@ class HindsightLoss(nn.Module):
         replay: Replay | None,
         cells: Tensor,
         own: Tensor,
-        on: Tensor,
+        policy: tuple[Tensor, Tensor],
         advantage: Tensor,
         value: Tensor,
         blend: float,
@@ -277,11 +328,12 @@ class HindsightLoss(nn.Module):
             replay: of a policy that remembers detections.
             cells: the paths.
             own: `[T+3, B]`, the key that the policy has at first, and those of a first detection at each later step.
-            on: the policy.
+            policy: the sensors that it switches on, and the probability of a report in each cell in view.
             advantage: of detecting, the position being revealed after every action.
             value: V.
             blend: λ.
         """
+        on, found = policy
         m, choices, k = len(on), on.shape[1], self.view.width
         # [B], [T + 2, B] and [T + 1, B]: the free choices are for the first T + 1 moves, the last one is the forced
         # step.
@@ -292,25 +344,29 @@ class HindsightLoss(nn.Module):
         # target moving to 2 makes entry 7 * 4 + 2 = 30.
         row = start * choices + self.clocks
         entry = row * k + self.view.index(located_in, there)
-        # Where the target has left the grid or the view, `entry` is that of some other sensor.
-        seen = end < m if self._window is None else self.view.contains(located_in.expand_as(end), there)
+        # Where the target has left the grid or the view, `entry` is some other sensor's.
+        seen = (
+            end < m
+            if self._window is None
+            else self.view.contains(located_in.expand_as(end), there)
+        )
         # [T + 1, B], the probability of a report; 0 or 1 with sensors that never miss.
-        found = torch.cat([self.sensors.seen(on[rows], rows) for rows in self.slices()])
-        reports, inside = (gather(found, entry) & seen).float(), moves < m
-        detects = None if self._perfect else gather(self._detection, end)
-        reports = reports if detects is None else reports * detects
+        reports, inside = gather(found, entry) * seen.float(), moves < m
         # Set costs are computed once per (x, n) and looked up by the paths, however many there are.
         prices = torch.cat([self._set_cost(on[rows], rows) for rows in self.slices()])
         spent, discount = gather(prices, row), self.discount
         located = gather(pad(value[:, 0], (0, 1)), own[1:])
         if replay:
-            located = replay.worth(cells, own, prices, value[:, 0], safe=1.0 - self.safe_cost, discount=discount)
+            terms = {"safe_cost": self.safe_cost, "discount": discount}
+            located = replay.worth(cells, own, prices, value[:, 0], **terms)
         terms = {"reward": 1.0, "safe_cost": self.safe_cost, "discount": discount}
-        returns = chain_returns(reports, inside, spent, located, repeated=self._repeated(moves[-1], value), **terms)
+        returns = chain_returns(
+            reports, inside, spent, located, repeated=self._repeated(moves[-1], value), **terms
+        )
         # advantage is [T + 1, M + 1]: entry (n, y) is n (M + 1) + y.
         clocked = gather(advantage, self.clocks * (m + 1) + end)
         # V(y) - G_{n+1}: located at y now, against the plan's return on the rest of this very path. The target's true
-        # cell is known because it was sensed, not because the simulator tells it.
+        # cell is known because it was sensed, not from the simulator.
         gain = sensing_gain(clocked, located[:-1] - returns[1:], discount=discount, blend=blend)
         # Clock n is reached if no earlier set of the plan reported; other rows are not states of this policy. The move
         # has to stay in the grid, too: an exit step earns and costs nothing.
@@ -319,19 +375,20 @@ class HindsightLoss(nn.Module):
             alive[n] *= alive[n - 1] * (1.0 - reports[n - 1])
         visits = torch.bincount(start, minlength=m)
         gain = gain * (alive if self._window is None else alive * seen)
-        gain = gain if detects is None else gain * detects
         totals = [scatter_add(returns[0], start, m)]
         if self._safe_detection is not None:
             # No set is before it, so that it is the first step of a path.
             repeated = self._repeated(moves[0], value)
-            forced = chain_returns(reports[:0], inside[:1], spent[:0], located[:1], repeated=repeated, **terms)
+            forced = chain_returns(
+                reports[:0], inside[:1], spent[:0], located[:1], repeated=repeated, **terms
+            )
             totals.append(scatter_add(forced[0], start, m))
         # Cells without a path get the target 0, and with `visits` 0 no weight in the critic's loss.
         target = torch.stack(totals, dim=1) / visits.clamp(min=1).unsqueeze(-1)
         return _Replayed(row, entry, alive, gain, target)
 
     def _repeated(self, end: Tensor, value: Tensor) -> tuple[Tensor, Tensor] | None:
-        """`[B]` each, p_s of the cells `end`, and L, what follows there if the safe action misses; or None."""
+        """`[B]` each, p_s of the cells `end`, and L, the value there if the safe action misses; or None."""
         if self._safe_detection is None:
             return None
         return self._safe_detection[end], pad(value[:, 1], (0, 1))[end]
@@ -355,7 +412,9 @@ class HindsightLoss(nn.Module):
         row, entry, alive, gain = replayed.of(chosen, first, first * self.view.width)
         # Paths that reach each (x, n); every sensor on costs c on each of them, the one the target moves to included.
         arrivals = scatter_add(alive, row, count * choices).view(count, choices)
-        price = arrivals.unsqueeze(-1) * self.cost[self._of_keys(self.sensors.numbers, rows)].unsqueeze(1)
+        price = arrivals.unsqueeze(-1) * self.cost[
+            self._of_keys(self.sensors.numbers, rows)
+        ].unsqueeze(1)
 
         def of_sensors(gain: Tensor) -> Tensor:
             on = self.actor_loss.acting(logits.detach()) if self.sensors.shared else logits
@@ -373,9 +432,9 @@ class HindsightLoss(nn.Module):
 
 def _in_view(task: Task, radius: int, device: torch.device) -> Window:
     """The sensors that are of use from a located cell until the safe action: in reach, and in the task's window."""
-    if task.window is None:
+    if task.numbered is None:
         return Window.reaching(task, radius, device)
-    return Window(task, min(radius, task.window), device)
+    return Window(task, min(radius, task.numbered), device)
 
 
 def _squared_error(values: Tensor, targets: Tensor, visits: Tensor) -> Tensor:

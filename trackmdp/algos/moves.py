@@ -1,8 +1,8 @@
 """Replay buffer of sensed moves, and paths drawn from it, for targets whose motion is Markov in the cell.
 
-And what the buffers of sensed paths share: which steps count, and how paths are drawn from each cell alike. Where a
-policy knows more at a detection than the cell, paths are of keys: with all sensors on, a key says where the target is
-and what is known of how it came there. All that is said of cells and M holds for keys and their number.
+And the common part of the buffers of sensed paths: which steps count, and how paths are drawn from each cell alike.
+Where a policy knows more at a detection than the cell, paths are of keys: with all sensors on, a key contains the
+target's cell and some of its past. All statements on cells and M hold for keys and their number.
 """
 
 from __future__ import annotations
@@ -44,18 +44,24 @@ class CellIndex(NamedTuple):
         first = torch.where(seen > 0, seen.cumsum(0) - seen, len(start))
         # Half a float's spacing below the count, so that a draw close to 1 does not round up to the next cell's.
         share = seen.clamp(min=1).float() * (1.0 - 2.0**-24)
-        return cls(first, share, None if weights is None else pad(weights.double().cumsum(0), (1, 0)))
+        return cls(
+            first, share, None if weights is None else pad(weights.double().cumsum(0), (1, 0))
+        )
 
     def pick(self, cells: Tensor, draws: Tensor) -> Tensor:
         """Places of entries of `cells`, one for each draw from [0, 1), in proportion to their weights."""
         if self.sums is not None:
             first = self.first.index_select(0, cells)
             # `ceil` undoes the reduction. A cell without entries has one place behind all of them, and keeps it.
-            last = (first + self.share.index_select(0, cells).ceil().long()).clamp_max(len(self.sums) - 1)
+            last = (first + self.share.index_select(0, cells).ceil().long()).clamp_max(
+                len(self.sums) - 1
+            )
             begin, end = self.sums[first], self.sums[last]
             place = torch.searchsorted(self.sums, begin + draws * (end - begin), right=True) - 1
             return torch.where(first < last, place.clamp(first, last - 1), first)
-        return (draws * self.share.index_select(0, cells)).long() + self.first.index_select(0, cells)
+        return (draws * self.share.index_select(0, cells)).long() + self.first.index_select(
+            0, cells
+        )
 
 
 def report_weights(task: Task, device: torch.device) -> Tensor | None:
@@ -66,11 +72,15 @@ def report_weights(task: Task, device: torch.device) -> Tensor | None:
     """
     if task.perfect:
         return None
-    weights = (1.0 / torch.as_tensor(task.detection, device=device)).repeat_interleave(task.keys.num_classes)
+    weights = (1.0 / torch.as_tensor(task.detection, device=device)).repeat_interleave(
+        task.keys.num_classes
+    )
     return pad(weights, (0, 1), value=1.0)
 
 
-def stratified_starts(count: int, steps: int, num_cells: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def stratified_starts(
+    count: int, steps: int, num_cells: int, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
     """Cells `[count]` that paths start in, all equally often, and the draws `[steps, count]` that pick their moves.
 
     The draws of the first step are stratified: those of one cell are spread evenly over [0, 1).
@@ -87,23 +97,28 @@ def stratified_starts(count: int, steps: int, num_cells: int, generator: torch.G
 
 
 def known_as(batch: TensorDictBase) -> str:
-    """The name of what a detection leaves in a collected batch: `key` where there is one, else `last_cell`."""
+    """The name of a detection's record in a collected batch: `key` where there is one, else `last_cell`."""
     return "key" if "key" in batch.keys() else "last_cell"  # noqa: SIM118 (no dict)
 
 
-def sensed_steps(batch: TensorDictBase, num_cells: int, name: str = "last_cell") -> tuple[Tensor, Tensor]:
+def sensed_steps(
+    batch: TensorDictBase, num_cells: int, name: str = "last_cell"
+) -> tuple[Tensor, Tensor]:
     """Which steps of a collected batch `[B, time]` count, and the cell (or `key`) after each of those, M for outside.
 
-    Fully sensed steps of a located target count. Read is only what the tracker saw: where it located the target, and
+    Fully sensed steps of a located target count. Only observations are read: where the tracker located the target, and
     that it left the grid. Steps that did not sense every cell are passed over, also where they detected: to keep the
     detections alone would favour the sensed cells.
     """
     after = batch["next"]
     exited = after["terminated"].squeeze(-1)
     located = (after["steps_since_detection"] == 0) | exited
-    # `all(-1)` is decided before the move, so that steps are not selected by where the target goes; with all M sensors
+    # `every` is decided before the move, so that steps are not selected by where the target goes; with all M sensors
     # on, a step ends located or exited.
-    whole = batch["action"].all(-1) & (batch["steps_since_detection"] == 0) & located
+    action = batch["action"]
+    # Counted: `all` of bools takes ten times as long.
+    every = action.count_nonzero(-1) == action.shape[-1]
+    whole = every & (batch["steps_since_detection"] == 0) & located
     return whole, torch.where(exited, num_cells, after[name])
 
 
@@ -145,7 +160,9 @@ class MoveBuffer:
     def _appended(self) -> Tensor:
         """`[2, K]`, all moves kept."""
         if self._fresh:
-            self._moves = torch.cat([self._moves, *self._fresh], dim=1)[:, -self._capacity :].contiguous()
+            self._moves = torch.cat([self._moves, *self._fresh], dim=1)[
+                :, -self._capacity :
+            ].contiguous()
             self._fresh = []
         return self._moves
 
@@ -153,10 +170,6 @@ class MoveBuffer:
         """Cells before and after every move, int64 `[K]` each."""
         start, end = self._appended().long()
         return start, end
-
-    def counts(self) -> Tensor | None:
-        """`[K]`, how many each of `moves` stands for; None: each was seen."""
-        return None
 
     def paths(self, count: int, steps: int) -> Tensor:
         """`[steps + 1, count]` int64 cells of `count` paths, M from the exit on; every cell starts equally many.

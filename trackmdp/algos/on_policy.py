@@ -2,6 +2,11 @@
 
 Advantage actor-critic is the learner of the paper (Section VII; Mnih et al. 2016); proximal policy optimisation is
 after Schulman et al. 2017. They have actor, critic and advantage in common.
+
+The price of a set is known, so its gradient is exact: the expected price Σ_j c_j π_j takes the place of the price paid,
+in the rewards and in the loss. The expectation of the policy gradient is the same, but an advantage has no noise from
+the prices of a hundred sensors: E[-c_j a_j ∇ log π] = -c_j ∇π_j, for any actions of the others. An
+actor of one's own may have other distributions; for it, prices are as paid.
 """
 
 from __future__ import annotations
@@ -16,13 +21,20 @@ from torch import Tensor
 from torchrl.objectives import A2CLoss, ClipPPOLoss, LossModule
 from torchrl.objectives.value import GAE
 
-from trackmdp.algos.common import Averages, Checkpointed, clipped_step, explained_variance, set_learning_rate
+from trackmdp.algos.common import (
+    Averages,
+    Checkpointed,
+    clipped_step,
+    explained_variance,
+    set_learning_rate,
+)
 from trackmdp.config.learning import ActorCriticConfig, PpoConfig
 from trackmdp.policies.nets import make_actor, make_critic
 from trackmdp.seeding import generator
 from trackmdp.world.model import Task
+from trackmdp.world.outcomes import Costs
 
-_KEPT = ("action", "action_log_prob", "advantage", "value_target")
+_KEPT = ("action", "action_log_prob", "action_mask", "advantage", "value_target")
 
 
 class OnPolicy(Checkpointed):
@@ -30,24 +42,51 @@ class OnPolicy(Checkpointed):
 
     parts: ClassVar[tuple[str, ...]] = ("policy", "critic", "optimizer", "iteration")
     make_loss: Callable[..., LossModule]
-    """Makes it of actor, critic and what all losses are told."""
-    diagnostics: ClassVar = {"loss_actor": "loss_objective", "loss_critic": "loss_critic", "entropy": "entropy"}
-    """What is reported, by its name in `loss`."""
+    """Makes the loss from actor, critic and the arguments common to all losses."""
+    diagnostics: ClassVar = {
+        "loss_actor": "loss_objective",
+        "loss_critic": "loss_critic",
+        "entropy": "entropy",
+    }
+    """The reported diagnostics, by their names in `loss`."""
 
-    def __init__(self, task: Task, cfg: ActorCriticConfig, *, iterations: int, seed: int, device: torch.device) -> None:
+    def __init__(
+        self,
+        task: Task,
+        cfg: ActorCriticConfig,
+        *,
+        iterations: int,
+        seed: int,
+        device: torch.device,
+        actor: TensorDictModuleBase | None = None,
+        critic: TensorDictModuleBase | None = None,
+    ) -> None:
         self.cfg, self._t_max = cfg, task.t_max
         self.iterations, self.iteration, self.device = iterations, 0, device
-        self.policy = make_actor(task, cfg.hidden, cfg.initial_logit).to(device)
-        self.critic = make_critic(task, cfg.hidden).to(device)
+        own = actor or make_actor(task, cfg.hidden, cfg.initial_logit)
+        self.policy = own.to(device)
+        self.critic = (critic or make_critic(task, cfg.hidden)).to(device)
         self.parameters = [*self.policy.parameters(), *self.critic.parameters()]
-        self.optimizer = torch.optim.Adam(self.parameters, lr=cfg.learning_rate.start, eps=1e-5, fused=True)
-        self.advantage = GAE(gamma=cfg.gamma, lmbda=cfg.gae_lambda, value_network=self.critic, deactivate_vmap=True)
-        told = {"entropy_coeff": cfg.entropy.start, "critic_coeff": cfg.critic_coef, "loss_critic_type": "l2"}
-        self.loss, self.generator = self.make_loss(self.policy, self.critic, **told), generator(seed, "minibatches")
+        self.optimizer = torch.optim.Adam(
+            self.parameters, lr=cfg.learning_rate.start, eps=1e-5, fused=True
+        )
+        self.advantage = GAE(
+            gamma=cfg.gamma, lmbda=cfg.gae_lambda, value_network=self.critic, deactivate_vmap=True
+        )
+        common = {
+            "entropy_coeff": cfg.entropy.start,
+            "critic_coeff": cfg.critic_coef,
+            "loss_critic_type": "l2",
+        }
+        self.loss, self.generator = (
+            self.make_loss(self.policy, self.critic, **common),
+            generator(seed, "minibatches"),
+        )
+        self.costs = Costs(task, device) if actor is None else None
 
     @property
     def actor(self) -> TensorDictModuleBase:
-        """The policy itself; its mode is what is evaluated."""
+        """The policy itself; its mode is evaluated."""
         return self.policy
 
     def step(self, batch: TensorDictBase | None) -> dict[str, float]:
@@ -57,8 +96,13 @@ class OnPolicy(Checkpointed):
         for rows in self.minibatches(data):
             losses = self.loss(rows)
             total = losses["loss_objective"] + losses["loss_entropy"] + losses["loss_critic"]
+            if self.costs is not None:
+                chosen = self.policy.get_dist(rows).base_dist.logits.sigmoid()
+                total = total + (rows["price_weight"] * price(self.costs, rows, chosen)).mean()
             norm = clipped_step(total, self.optimizer, self.parameters, self.cfg.max_grad_norm)
-            averages.add(**{name: losses[key] for name, key in self.diagnostics.items()}, grad_norm=norm)
+            averages.add(
+                **{name: losses[key] for name, key in self.diagnostics.items()}, grad_norm=norm
+            )
         return diagnostics | averages.means()
 
     def minibatches(self, data: TensorDictBase) -> Iterator[TensorDictBase]:
@@ -69,7 +113,8 @@ class OnPolicy(Checkpointed):
         """Set this iteration's schedules and return the batch as `[frames]` rows with a normalised advantage.
 
         The advantage is normalised at each n by itself: near the safe action returns spread wider than elsewhere. On
-        forced steps that action replaces the policy's, which therefore gets no credit for them.
+        forced steps that action replaces the policy's, which therefore gets no credit for them. Prices are paid on all
+        other steps but the last of an episode; `price_weight` is their weight beside the advantage.
         """
         if batch is None:
             raise ValueError("an on-policy algorithm learns from fresh frames only")
@@ -78,29 +123,47 @@ class OnPolicy(Checkpointed):
         rate, entropy = self.cfg.learning_rate.at(progress), self.cfg.entropy.at(progress)
         set_learning_rate(self.optimizer, rate)
         self.loss.entropy_coeff.fill_(entropy)
+        paid = (batch["steps_since_detection"] <= self._t_max).unsqueeze(-1)
+        paid = paid & ~batch["next", "terminated"]
+        reward = batch["next", "reward"]
+        if self.costs is not None:
+            more = batch["action"].float() - batch["logits"].sigmoid()
+            reward = reward + price(self.costs, batch, more) * paid
         # Before the advantage, so that the critic's targets are scaled as well; evaluation never sees scaled rewards.
-        batch["next", "reward"] = batch["next", "reward"] * self.cfg.reward_scale
+        batch["next", "reward"] = reward * self.cfg.reward_scale
         with torch.no_grad():
             self.advantage(batch)
         fit = explained_variance(batch["state_value"], batch["value_target"]).item()
-        data = batch.select(*self.critic.in_keys, *_KEPT).reshape(-1)
-        data["advantage"] = _normalised(data["advantage"], data["steps_since_detection"].unsqueeze(-1), self._t_max)
+        seen = {*self.critic.in_keys, *self.policy.in_keys, "steps_since_detection"}
+        data = batch.select(*sorted(seen), *_KEPT, strict=False).reshape(-1)
+        data["advantage"], unit = _normalised(
+            data["advantage"], data["steps_since_detection"].unsqueeze(-1), self._t_max
+        )
+        data["price_weight"] = unit * paid.reshape(-1, 1) * self.cfg.reward_scale
         return data, {"learning_rate": rate, "entropy_coef": entropy, "explained_variance": fit}
 
 
-def _normalised(advantage: Tensor, misses: Tensor, t_max: int) -> Tensor:
-    """`advantage` with mean 0 and variance 1 over the rows of each n up to `t_max`, 0 elsewhere.
+def price(costs: Costs, rows: TensorDictBase, share: Tensor) -> Tensor:
+    """`[*B, 1]` price of sensors that are on to the `share` `[*B, K]`; sensors that cannot be chosen are free."""
+    if "action_mask" in rows.keys():  # noqa: SIM118 (no dict)
+        share = share * rows["action_mask"]
+    return (share * costs.of_each(rows["last_cell"])).sum(-1, keepdim=True)
 
-    One row alone tells nothing.
+
+def _normalised(advantage: Tensor, misses: Tensor, t_max: int) -> tuple[Tensor, Tensor]:
+    """`advantage` with mean 0 and variance 1 over the rows of each n up to `t_max`, and its factor; 0 elsewhere.
+
+    One row alone gives no variance.
     """
-    normalised = torch.zeros_like(advantage)
+    normalised, unit = torch.zeros_like(advantage), torch.zeros_like(advantage)
     for n in range(t_max + 1):
         counted = misses == n
         chosen = advantage[counted]
         # The standard deviation of one number is nan.
         if len(chosen) > 1:
-            normalised[counted] = (chosen - chosen.mean()) / (chosen.std() + 1e-8)
-    return normalised
+            unit[counted] = 1.0 / (chosen.std() + 1e-8)
+            normalised[counted] = (chosen - chosen.mean()) * unit[counted]
+    return normalised, unit
 
 
 class A2C(OnPolicy):
@@ -117,11 +180,16 @@ class PPO(OnPolicy):
 
     cfg: PpoConfig
     parts: ClassVar[tuple[str, ...]] = (*OnPolicy.parts, "generator")
-    diagnostics: ClassVar = OnPolicy.diagnostics | {"approx_kl": "kl_approx", "clip_fraction": "clip_fraction"}
+    diagnostics: ClassVar = OnPolicy.diagnostics | {
+        "approx_kl": "kl_approx",
+        "clip_fraction": "clip_fraction",
+    }
 
-    def make_loss(self, *nets: TensorDictModuleBase, **told: Any) -> LossModule:
+    def make_loss(self, *nets: TensorDictModuleBase, **common: Any) -> LossModule:
         """The clipped surrogate."""
-        return ClipPPOLoss(*nets, clip_epsilon=self.cfg.clip_epsilon, normalize_advantage=False, **told)
+        return ClipPPOLoss(
+            *nets, clip_epsilon=self.cfg.clip_epsilon, normalize_advantage=False, **common
+        )
 
     def minibatches(self, data: TensorDictBase) -> Iterator[TensorDictBase]:
         """The rows of each gradient step."""

@@ -28,14 +28,18 @@ class PerSensorPPO(Hindsight):
     def __init__(self, task: Task, cfg: PpoPerSensorConfig, **run: Any) -> None:
         # It counts paths, which have weights where sensors miss, and each of which one sensor sees.
         if cfg.surrogate == "sampled" and not (task.perfect and task.coverage is None):
-            raise UserError("algo.surrogate=sampled: expected all_action where sensors miss or have footprints")
+            raise UserError(
+                "algo.surrogate=sampled: expected all_action where sensors miss or have footprints"
+            )
         super().__init__(task, cfg, **run)
 
     def _actor_loss(self) -> ActorLoss:
         cfg = self.cfg
         # Without a generator the surrogate takes its expectation over the old policy's sets.
         rng = self._generator if cfg.surrogate == "sampled" else None
-        return Surrogate(cfg.entropy, clip_epsilon=cfg.clip_epsilon, minibatches=cfg.minibatches, generator=rng)
+        return Surrogate(
+            cfg.entropy, clip_epsilon=cfg.clip_epsilon, minibatches=cfg.minibatches, generator=rng
+        )
 
 
 class PerSensorDQN(Hindsight):

@@ -10,17 +10,19 @@ import os
 import platform
 import sys
 import traceback
+from pathlib import Path
 
 from trackmdp import __version__
 from trackmdp.errors import FAILED, INTERRUPTED, USER_MISTAKE, Preempted, RunError, UserError
-from trackmdp.imports import importing
+from trackmdp.imports import importing, leave_current_folder
 
 COMMANDS = {
     "train": "learn a policy without the motion model, and evaluate it exactly",
     "evaluate": "value a trained policy or a baseline, exactly and by simulation",
+    "compare": "set policies side by side, with the differences and their intervals",
     "solve": "solve a world with its motion model",
+    "frontier": "find the best accuracy for every number of sensors per step",
     "verify": "check the paper's theorems on a world",
-    "benchmark": "measure speed and quality on this machine",
     "export": "write a learned policy as a file that runs without this package",
     "replay": "list, play, verify, recover logged episodes, or show one as a page",
     "report": "make figures, tables and a web page of a sweep, or watch it run",
@@ -29,7 +31,17 @@ COMMANDS = {
 
 _OF_FILES = {
     getattr(errno, name)
-    for name in ("EACCES", "EDQUOT", "EISDIR", "ELOOP", "ENAMETOOLONG", "ENOSPC", "ENOTDIR", "EPERM", "EROFS")
+    for name in (
+        "EACCES",
+        "EDQUOT",
+        "EISDIR",
+        "ELOOP",
+        "ENAMETOOLONG",
+        "ENOSPC",
+        "ENOTDIR",
+        "EPERM",
+        "EROFS",
+    )
 }
 """Errors of the file system that are reported by the file's name and the system's message, without a traceback."""
 
@@ -42,6 +54,10 @@ def main(argv: list[str] | None = None) -> int:
     # Shared out to more threads, by default to all cores, sums round differently: the last digits of exact figures
     # would depend on the machine. `threads` is about torch alone.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # Every process that the command starts inherits it; see `trackmdp.imports.safe_children`.
+    os.environ.setdefault("PYTHONSAFEPATH", "1")
+    if argv is None:
+        leave_current_folder()
     try:
         status = _dispatch(words)
         # Now, not at the interpreter's end: there a closed pipe could no longer be answered by an exit status.
@@ -62,11 +78,17 @@ def _dispatch(words: list[str]) -> int:
         return 0
     command = words[0]
     try:
+        if command == "example":
+            sys.stdout.write(_example(words[1:]))
+            return 0
         if command not in COMMANDS:
             raise UserError(f"unknown command {command!r}: expected one of {', '.join(COMMANDS)}")
         # Runs lock their folders and hear signals as POSIX has them; better here than in the middle of an import.
         if platform.system() == "Windows":
-            raise UserError("Windows is not supported: expected Linux or macOS, or Linux in WSL on Windows")
+            raise UserError(
+                "Windows is not supported: expected Linux or macOS, or Linux in WSL on Windows"
+            )
+        _check_current_folder()
         return _run(command, words[1:])
     except BrokenPipeError:
         raise
@@ -75,8 +97,15 @@ def _dispatch(words: list[str]) -> int:
         return _report(command, error)
 
 
+def _check_current_folder() -> None:
+    try:
+        Path.cwd()
+    except FileNotFoundError:
+        raise UserError("the current folder was removed, expected one that exists") from None
+
+
 def _report(command: str, error: BaseException) -> int:
-    """Say why a command ended, in one line unless it is a bug; returns the exit status."""
+    """Print why a command ended, in one line unless it is a bug; returns the exit status."""
     line, status = str(error), FAILED
     if isinstance(error, KeyboardInterrupt):
         line, status = "interrupted", INTERRUPTED
@@ -86,12 +115,14 @@ def _report(command: str, error: BaseException) -> int:
         status = USER_MISTAKE if isinstance(error, UserError) else FAILED
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             traceback.print_exception(error)
-    # Without a file's name it is not about what the user named, and is reported as a bug.
+    # Without a file's name it is about no file of the user, and is reported as a bug.
     elif isinstance(error, OSError) and error.filename is not None and error.errno in _OF_FILES:
         line = f"{error.filename}: {error.strerror}"
-    elif isinstance(error, MemoryError) or "can't allocate memory" in line:  # torch's words, in a RuntimeError
-        line = "not enough memory for what is asked for"
-    else:  # a bug: whoever reads it needs all of it
+    elif (
+        isinstance(error, MemoryError) or "can't allocate memory" in line
+    ):  # torch's words, in a RuntimeError
+        line = "not enough memory"
+    else:  # a bug: its reader needs all of it
         traceback.print_exception(error)
         return status
     name = f"trackmdp {command}" if command in COMMANDS else "trackmdp"
@@ -112,14 +143,26 @@ def _run(command: str, words: list[str]) -> int:
 
 
 def _printable(text: str) -> str:
-    """`text` in one line; what a terminal would obey, such as an escape sequence in a file's name, is spelled out."""
-    return "".join(each if each.isprintable() else ascii(each)[1:-1] for each in " ".join(text.split()))
+    """`text` in one line; control characters, such as an escape sequence in a file's name, are spelled out."""
+    return "".join(
+        each if each.isprintable() else ascii(each)[1:-1] for each in " ".join(text.split())
+    )
+
+
+def _example(names: list[str]) -> str:
+    """The text of an example; without a name all names."""
+    from trackmdp.examples import example_file, examples
+
+    return example_file(names[0]).read_text("utf-8") if names else "\n".join([*examples(), ""])
 
 
 def _overview() -> str:
     width = max(map(len, COMMANDS))
     lines = "".join(f"  {name:<{width}}  {text}\n" for name, text in COMMANDS.items())
-    last = "trackmdp COMMAND --help lists every option of a command."
+    last = (
+        "trackmdp COMMAND --help: the options used most; --help all: all of them.\n"
+        "trackmdp example: the names of the examples; trackmdp example NAME: its text."
+    )
     return f"usage: trackmdp COMMAND [option=value ...]\n\n{lines}\n{last}\n"
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import shlex
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -19,11 +20,21 @@ from hydra.types import HydraContext
 from omegaconf import DictConfig, OmegaConf, read_write
 
 from trackmdp import __version__
+from trackmdp.app.completion import bash
 from trackmdp.app.compose import Composer
-from trackmdp.app.prepare import Prepared, announce, folder_of, make_folder, prepare, remove_if_empty
-from trackmdp.app.words import parsed, run_words
-from trackmdp.config import GROUPS
+from trackmdp.app.prepare import (
+    Prepared,
+    announce,
+    folder_of,
+    make_folder,
+    prepare,
+    remove_if_empty,
+    say,
+)
+from trackmdp.app.words import gathered, parsed, run_words
+from trackmdp.config import GROUPS, ROOTS
 from trackmdp.config.checks import validate
+from trackmdp.config.options import options
 from trackmdp.config.registry import maker
 from trackmdp.errors import UserError
 
@@ -34,9 +45,11 @@ def launch(command: str, words: Sequence[str]) -> int:
     """Compose, check and run `trackmdp command words...`; returns the exit status.
 
     Raises:
-        UserError: what was typed, or a file it names, is not as expected; nothing has been written then.
+        UserError: the command line, or a file it names, is not as expected; nothing has been written then.
     """
     args = parse(words)
+    if command == "compare":
+        args.overrides = gathered(args.overrides, ("run", "baseline"))
     with Composer(command, args.overrides, args.config_name, args.config_dir) as compose:
         # Before anything is checked or made: `--cfg job` also shows a config that a run would refuse.
         if answer(compose, args):
@@ -48,6 +61,9 @@ def launch(command: str, words: Sequence[str]) -> int:
 
 def _run_once(compose: Composer) -> int:
     cfg = compose(compose.words)
+    # The default folder has the time in its name: no run would ever be resumed.
+    if "resume=auto" in compose.words and "${now:" in str(OmegaConf.to_container(cfg.hydra.run)):
+        raise UserError("resume=auto: expected hydra.run.dir=FOLDER beside it, the run's own")
     # All checks come first, so that a mistyped line leaves no folder behind.
     ready = prepare(compose.command, cfg, run_words(compose.words))
     made = make_folder("hydra.run.dir", ready.folder)
@@ -56,6 +72,10 @@ def _run_once(compose: Composer) -> int:
         cfg.hydra.run.dir = str(ready.folder)  # a run that is resumed writes to its own
     try:
         announce(compose.command, ready.cfg, ready.folder)
+        if (grids := _grids(cfg)) and not ready.cfg.quiet:
+            say(
+                f"one run with the defaults: -m is missing, which runs all {grids} grids of this config"
+            )
         _run_in_hydra(cfg, ready)
     finally:
         # A run that failed before its first file leaves nothing; one that wrote something keeps it.
@@ -63,10 +83,17 @@ def _run_once(compose: Composer) -> int:
     return 0
 
 
+def _grids(cfg: DictConfig) -> int:
+    """How many grids of runs the config gives its sweeper, which a single run does not read."""
+    return len(OmegaConf.select(cfg, "hydra.sweeper.blocks") or [])
+
+
 def _run_in_hydra(cfg: DictConfig, ready: Prepared) -> None:
     """Run under Hydra's own settings: logging, environment variables, current folder, the folder `.hydra`."""
     configure_log(cfg.hydra.hydra_logging, cfg.hydra.verbose)
-    ready = replace(ready, folder=ready.folder.absolute())  # hydra.job.chdir moves the current folder
+    ready = replace(
+        ready, folder=ready.folder.absolute()
+    )  # hydra.job.chdir moves the current folder
     raised: list[Exception] = []
 
     def task(_: DictConfig) -> Any:
@@ -93,29 +120,40 @@ def _sweep(compose: Composer) -> int:
 
     command, words = compose.command, run_words(compose.words)
     for word in words:
-        parsed(word)  # refused here, where the message names the word; later `hydra.sweep.dir` would be named
-    # Hydra refuses words with several values outside its own multirun; what concerns the sweep as a whole has one
+        parsed(word)  # here the message names the word, later `hydra.sweep.dir`
+    if given := next(
+        (word for word in compose.words if word.startswith("hydra.sweep.subdir=")), None
+    ):
+        raise UserError(f"{given}: without effect, a run's folder has the name of its options")
+    # Hydra refuses words with several values outside its own multirun; options of the sweep as a whole have one
     # value.
     cfg = compose([word for word in compose.words if not _has_values(word)])
-    # Now, so that a missing package is told before anything is planned or written.
-    sweeper, launcher = _plugin("sweeper", cfg.hydra.sweeper), _plugin("launcher", cfg.hydra.launcher)
+    # Now, so that a missing package is reported before anything is planned or written.
+    sweeper, launcher = (
+        _plugin("sweeper", cfg.hydra.sweeper),
+        _plugin("launcher", cfg.hydra.launcher),
+    )
     grids = getattr(sweeper, "blocks", [sweeper.name]) or []
-    # `hydra.sweep.dir` says `${sweep_name:}`, which is resolved in the next line: the same words find the same folder
+    # `hydra.sweep.dir` is `${sweep_name:}`, which is resolved in the next line: the same words find the same folder
     # again, and with it the runs that are done. Hydra's own time stamp would begin anew each time.
-    OmegaConf.register_new_resolver("sweep_name", lambda: sweep_name(command, words, grids), replace=True)
+    OmegaConf.register_new_resolver(
+        "sweep_name", lambda: sweep_name(command, words, grids), replace=True
+    )
     folder = folder_of(cfg, "hydra.sweep.dir")
-    # Absolute: runs start in processes, perhaps on other machines, whose current folder is another.
+    # Absolute: runs start in processes, perhaps on other machines, with another current folder.
     place = folder.absolute()
 
     def launch_jobs(jobs: Sequence[Job]) -> None:
         maker(launcher)(launcher, [replace(job, concurrent=launcher.concurrent) for job in jobs])
 
-    batches = maker(sweeper)(sweeper, words, place, partial(plan, command, place, compose))
+    console = make_console(cfg.quiet)
+    planned = partial(plan, command, place, compose, console=console)
+    batches = maker(sweeper)(sweeper, words, place, planned)
     line = shlex.join(["trackmdp", command, "-m", *compose.words])
     made = make_folder("hydra.sweep.dir", folder)
     try:
         # A grid has been composed and checked to the last run by now; a search plans its runs as it goes.
-        return sweep(place, command, line, batches, launch_jobs, make_console(cfg.quiet))
+        return sweep(place, command, line, batches, launch_jobs, console)
     finally:
         remove_if_empty(made)
 
@@ -124,11 +162,15 @@ def _plugin(part: str, node: DictConfig) -> Any:
     """The typed, checked options of `hydra.<part>`.
 
     Raises:
-        UserError: a value is out of its range, the option chosen is none of ours, or what it needs is not installed.
+        UserError: a value is out of its range, the option chosen is none of ours, or a package for it is missing.
     """
     known = GROUPS[f"hydra/{part}"]
-    if OmegaConf.get_type(node) not in known.values():
+    schema = OmegaConf.get_type(node)
+    if schema not in known.values():
         raise UserError(f"hydra/{part}: expected one of {', '.join(known)}")
+    assert schema is not None
+    if more := sorted(map(str, node.keys() - options(schema).keys())):
+        raise UserError(f"hydra.{part}.{more[0]}: unknown option")
     typed: Any = OmegaConf.to_object(node)
     validate(typed, f"hydra.{part}")
     return typed
@@ -142,7 +184,7 @@ def _has_values(word: str) -> bool:
     """
     try:
         several = parsed(word).is_sweep_override()
-    except UserError:  # composing says what is wrong with it
+    except UserError:  # composing reports the mistake
         return False
     if several and not run_words([word]):
         raise UserError(f"{word}: expected one {word.partition('=')[0].split('/')[-1]}")
@@ -150,33 +192,43 @@ def _has_values(word: str) -> bool:
 
 
 def parse(words: Sequence[str]) -> argparse.Namespace:
-    """Flags and overrides of a command line; the flags are those that Hydra's own commands have.
+    """Flags and overrides of a command line; the flags of Hydra's own commands.
 
     Raises:
         UserError: a flag is unknown, lacks its value, or does not go with another.
     """
     # Intermixed: Hydra users write flags between overrides, `train algo=ppo -m seed=0,1`.
     args = _parser().parse_intermixed_args(list(words))
-    # It is offered by the parser all the same, so that the refusal can say why.
+    # It is offered by the parser all the same, so that the refusal can give the reason.
     if args.experimental_rerun is not None:
-        raise UserError("--experimental-rerun: not offered, it would unpickle a file; start from the run's config.yaml")
-    asked = [args.cfg, args.info, args.hydra_help or None, args.shell_completion or None, args.multirun or None]
+        raise UserError(
+            "--experimental-rerun: not offered, it would unpickle a file; start from the run's config.yaml"
+        )
+    asked = [
+        args.cfg,
+        args.info,
+        args.hydra_help or None,
+        args.shell_completion or None,
+        args.multirun or None,
+    ]
     if sum(each is not None for each in [*asked, args.run or None]) > 1:
-        raise UserError("expected only one of --run, --multirun, --cfg, --info, --hydra-help and --shell-completion")
+        raise UserError(
+            "expected only one of --run, --multirun, --cfg, --info, --hydra-help and --shell-completion"
+        )
     if args.cfg is None and (args.resolve or args.package is not None):
         raise UserError("--resolve and --package: only together with --cfg")
     return args
 
 
 def answer(compose: Composer, args: argparse.Namespace) -> bool:
-    """Show what was asked for; returns whether anything was, instead of a run.
+    """Show the information asked for; returns whether any was, instead of a run.
 
     Raises:
         UserError: the words do not make a config, or the question makes no sense.
     """
     if not (args.cfg or args.info or args.hydra_help or args.shell_completion):
         return False
-    hydra = GlobalHydra.instance().hydra  # its methods print; what they print is Hydra's business, not ours
+    hydra = GlobalHydra.instance().hydra  # its methods print
     assert hydra is not None
     if args.cfg or args.info:
         cfg = compose(compose.words)
@@ -190,18 +242,22 @@ def answer(compose: Composer, args: argparse.Namespace) -> bool:
         elif args.hydra_help:
             args.overrides = []  # Hydra's help is about no command
             hydra.hydra_help(None, _parser(), args)
+        elif compose.words == ["install=bash"]:
+            sys.stdout.write(bash([*ROOTS, "example"]))
         else:
             hydra.shell_completion(compose.name, compose.words)
-    except Exception as error:  # of many kinds; all are about what was typed
-        said = str(error).strip().splitlines() or [type(error).__name__]
-        raise UserError(said[0]) from error
+    except Exception as error:  # of many kinds; all are about the command line
+        lines = str(error).strip().splitlines() or [type(error).__name__]
+        raise UserError(lines[0]) from error
     return True
 
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> None:  # type: ignore[override]
         """Refuse as every mistake is refused: in one line, without the usage."""
-        raise UserError(f"{message} (see --help)")
+        _, _, flag = message.partition("unrecognized arguments: --")
+        hint = f"write {flag.split()[0].partition('=')[0]}=VALUE" if flag else "see --help"
+        raise UserError(f"{message} ({hint})")
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -216,10 +272,27 @@ def _parser() -> argparse.ArgumentParser:
     flag("--resolve", action="store_true", help="with --cfg: resolve interpolations")
     flag("--package", "-p", help="with --cfg: the part to show, such as algo")
     flag("--run", "-r", action="store_true", help="run once")
-    flag("--multirun", "-m", action="store_true", help="run once for every combination of option=a,b,c")
-    flag("--shell-completion", "-sc", action="store_true", help="install=bash, uninstall=bash, query=bash")
+    flag(
+        "--multirun",
+        "-m",
+        action="store_true",
+        help="run once for every combination of option=a,b,c",
+    )
+    flag(
+        "--shell-completion",
+        "-sc",
+        action="store_true",
+        help="install=bash, uninstall=bash, query=bash",
+    )
     flag("--config-name", "-cn", help="the primary config in place of the command's")
-    flag("--config-dir", "-cd", help="a folder with further choices")
+    flag("--config-dir", "-cd", action="append", default=[], help="a folder with further choices")
     flag("--experimental-rerun", help="not offered")
-    flag("--info", "-i", const="all", nargs="?", choices=_INFO, help="show how the config is composed")
+    flag(
+        "--info",
+        "-i",
+        const="all",
+        nargs="?",
+        choices=_INFO,
+        help="show how the config is composed",
+    )
     return parser

@@ -19,7 +19,7 @@ from trackmdp.config.checks import refuse_ignored
 from trackmdp.config.compose import from_hydra
 from trackmdp.config.learning import file_of_classes
 from trackmdp.config.loggers import require_packages
-from trackmdp.config.tree import continued, key_of, run_folder
+from trackmdp.config.resume import continued, key_of, run_folder
 from trackmdp.errors import UserError
 from trackmdp.imports import importing
 
@@ -36,7 +36,7 @@ def typed_config(command: str, cfg: DictConfig, folder: Path) -> CommandConfig:
         UserError: an option is unknown or not allowed.
     """
     typed = from_hydra(cfg, config.ROOTS[command], folder)
-    # A run that is resumed has a config of its own, which says what is read; `prepare` looks once it is known.
+    # A run that is resumed has a config of its own, which names its inputs; `prepare` checks them later.
     if not getattr(typed, "resume", None):
         _refuse_ignored(typed, cfg)
     return typed
@@ -48,7 +48,7 @@ def _refuse_ignored(typed: CommandConfig, composed: DictConfig) -> None:
         # As typed: an interpolation in a word that a later one replaces may be of no resolver there is.
         as_typed: Any = OmegaConf.to_container(composed.hydra.overrides.task, resolve=False)
         words = (word.lstrip("+~").partition("=") for word in as_typed)
-        refuse_ignored(typed, {key: value for key, _, value in words}, composed.hydra.runtime.choices)
+        refuse_ignored(typed, {key: value for key, _, value in words})
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Prepared:
     """A command that can be run: all that can be checked has been.
 
     Attributes:
-        command: what is run.
+        command: the command to run.
         cfg: its config.
         folder: where it writes.
         problem: the world or the tracks of `cfg`, where checking has built them; else `run` builds them, when the
@@ -69,23 +69,23 @@ class Prepared:
     problem: Problem | None = None
 
     def run(self) -> Any:
-        """Run the command; returns what it returns."""
+        """Run the command; returns its result."""
         # Not at the top of the file: a command imports torch and TorchRL, which takes seconds, and a mistyped option
         # is refused before.
         with importing():
-            run: Callable[..., Any] = importlib.import_module(f"trackmdp.app.commands.{self.command}").run
+            run: Callable[..., Any] = importlib.import_module(
+                f"trackmdp.app.commands.{self.command}"
+            ).run
         if isinstance(self.cfg, WorldConfig):
-            from trackmdp.world.make import make_problem
-
-            return run(self.cfg, self.folder, self.problem or make_problem(self.cfg))
+            return run(self.cfg, self.folder, self.problem or _problem(self.cfg, self.folder))
         return run(self.cfg, self.folder)
 
 
 def prepare(command: str, composed: DictConfig, words: Sequence[str]) -> Prepared:
-    """From what Hydra composed to a command that can be run in the current folder, by every check there is.
+    """From Hydra's config to a command that can be run in the current folder, by every check there is.
 
     Raises:
-        UserError: an option is not allowed, or what it names is not there or not what is expected.
+        UserError: an option is not allowed, or the file it names is missing or not as expected.
     """
     cfg = typed_config(command, composed, Path.cwd())
     prepared = check(command, cfg, folder_of(composed, "hydra.run.dir"), words)
@@ -95,16 +95,16 @@ def prepare(command: str, composed: DictConfig, words: Sequence[str]) -> Prepare
 
 
 def check(command: str, cfg: CommandConfig, folder: Path, words: Sequence[str]) -> Prepared:
-    """Check what the config names: runs, sweeps, files to write, tables of motion and prices.
+    """Check the files that the config names: runs, sweeps, files to write, tables of motion and prices.
 
     Args:
-        command: what is to be run.
+        command: the command to run.
         cfg: its typed config.
         folder: where it is to write, unless `cfg.resume` names a run, which then goes on in its own folder.
         words: the overrides that were typed.
 
     Raises:
-        UserError: what is named is not there, or not what is expected.
+        UserError: a named file is missing, or not as expected.
     """
     try:
         if isinstance(cfg, TrainConfig):
@@ -112,14 +112,12 @@ def check(command: str, cfg: CommandConfig, folder: Path, words: Sequence[str]) 
             folder = run_folder(cfg, folder)
             cfg = continued(cfg, folder, words)
             require_packages(cfg.log)
-        _check_files(cfg, words)
+        _check_files(cfg, folder, words)
         # A world from options alone cannot fail once they are in range; one from files can, and is refused before a
         # folder is made.
         problem = None
         if isinstance(cfg, WorldConfig) and _reads_files(cfg):
-            from trackmdp.world.make import make_problem  # imports scipy, which takes longer than all other checks
-
-            problem = make_problem(cfg)
+            problem = _problem(cfg, folder)
     except OSError as error:
         raise UserError(f"{error.filename}: cannot be read ({error.strerror})") from error
     return Prepared(command, cfg, folder, problem)
@@ -130,21 +128,32 @@ def announce(command: str, cfg: CommandConfig, folder: Path, label: str = "") ->
     if cfg.quiet or not isinstance(cfg, WorldConfig):
         return
     label = f"({label}) " if label else ""
-    what = next((getattr(cfg, name).name for name in ("algo", "baseline", "solver") if getattr(cfg, name, None)), "")
-    if isinstance(cfg, config.EvaluateConfig) and cfg.run is not None:
-        say(f"{label}evaluate {cfg.run} -> {shown(folder)}")
+    subject = next(
+        (
+            getattr(cfg, name).name
+            for name in ("algo", "baseline", "solver")
+            if getattr(cfg, name, None)
+        ),
+        "",
+    )
+    if runs := _runs(cfg):
+        say(f"{label}{command} {', '.join(runs)} -> {shown(folder)}")
         return
     rows, columns = cfg.grid.sides
     seed = f", seed {cfg.seed}" if hasattr(cfg, "seed") else ""
     where = f"on a {rows}x{columns} grid, T_max {cfg.grid.t_max}, kernel {cfg.kernel.name}{seed}"
-    line, to = label + " ".join(f"{command} {what} {where}".split()), f"-> {shown(folder)}"
+    line, to = label + " ".join(f"{command} {subject} {where}".split()), f"-> {shown(folder)}"
     # On two lines rather than broken within a name, at the width that every terminal has.
     say(f"{line}{' ' if len(line) + len(to) < 80 else chr(10) + '  '}{to}")
 
 
 def shown(folder: Path) -> Path:
     """The folder as seen from the current one, where it lies in it."""
-    return folder.relative_to(Path.cwd()) if folder.is_absolute() and folder.is_relative_to(Path.cwd()) else folder
+    return (
+        folder.relative_to(Path.cwd())
+        if folder.is_absolute() and folder.is_relative_to(Path.cwd())
+        else folder
+    )
 
 
 def say(line: str) -> None:
@@ -161,27 +170,60 @@ def _reads_files(cfg: WorldConfig) -> bool:
     return not exits or any(isinstance(table, str) for table in tables)
 
 
-def _check_files(cfg: CommandConfig, words: Sequence[str]) -> None:
-    if isinstance(cfg, TrainConfig) and (classes := file_of_classes(cfg.algo)):
-        from trackmdp.solvers.alike import cell_classes  # imports scipy, as a world does
+def _problem(cfg: WorldConfig, folder: Path) -> Problem:
+    """The world or the tracks of `cfg`; those of a run that `folder` holds already are read from there."""
+    # Imported here: scipy takes longer than all other checks.
+    if isinstance(cfg, TrainConfig):
+        from trackmdp.training.inputs import problem_of
+
+        return problem_of(cfg, folder)
+    from trackmdp.world.make import make_problem
+
+    return make_problem(cfg)
+
+
+def _runs(cfg: CommandConfig) -> list[str]:
+    """The runs that `evaluate` or `compare` read their world from; none where it is the options' own."""
+    if isinstance(cfg, config.CompareConfig):
+        return cfg.runs or []
+    return [cfg.run] if isinstance(cfg, config.EvaluateConfig) and cfg.run else []
+
+
+def _check_files(cfg: CommandConfig, folder: Path, words: Sequence[str]) -> None:
+    if isinstance(cfg, config.CompareConfig):
+        count = len(cfg.runs or []) + len(cfg.baselines or [])
+        if count < 2:
+            raise UserError(
+                f"expected at least two policies, run=FOLDER or baseline=NAME, got {count}"
+            )
+    begun = (folder / "config.yaml").is_file()  # then the run has its own copy of the classes
+    if isinstance(cfg, TrainConfig) and not begun and (classes := file_of_classes(cfg.algo)):
+        from trackmdp.algos.estimates.alike import cell_classes  # imports scipy, as a world does
 
         cell_classes(classes, cfg.grid.sides)
-    if isinstance(cfg, config.EvaluateConfig) and cfg.run is not None:
+    if runs := _runs(cfg):
         for word in words:
             group = key_of(word).split(".")[0]
-            if group == "sensor" and isinstance(cfg.sensor, config.FalseAlarmConfig):
-                continue  # how a trained policy stands up to them is what they are for
+            if group == "sensor" and isinstance(
+                getattr(cfg, "sensor", None), config.FalseAlarmConfig
+            ):
+                continue  # they are for testing trained policies
             if group in WORLD_KEYS:
-                raise UserError(f"{word}: not together with run={cfg.run}, whose own world is used")
-        load_run_config(cfg.run)
+                raise UserError(
+                    f"{word}: not together with run={','.join(runs)}: its own world is used"
+                )
+        for run in runs:
+            load_run_config(run)
     elif isinstance(cfg, config.ExportConfig):
         load_run_config(cfg.run)
     elif isinstance(cfg, config.ReportConfig):
         if not Path(cfg.sweep).is_dir():
             raise UserError(f"sweep={cfg.sweep}: no such folder")
-        # All that is below would be searched for runs: minutes, for a report of what does not belong together.
+        # All folders below would be searched for runs: minutes, for a report of unrelated runs.
         if not Path(cfg.sweep).resolve().name:
-            raise UserError(f"sweep={cfg.sweep}: expected the folder of a sweep, not the root of the file system")
+            raise UserError(
+                f"sweep={cfg.sweep}: expected the folder of a sweep, not the root of the file system"
+            )
     elif isinstance(cfg, config.ReplayConfig):
         _check_outputs(cfg)
 
@@ -204,9 +246,9 @@ def folder_of(cfg: DictConfig, key: str) -> Path:
     """
     try:
         value = OmegaConf.select(cfg, key)  # None for a missing key, and for "???"
-    except Exception as error:  # a resolver of `${name:...}` raises what it likes
-        said = str(error).strip().splitlines() or [type(error).__name__]
-        raise UserError(f"{key}: {said[0]}") from error
+    except Exception as error:  # a resolver of `${name:...}` may raise anything
+        lines = str(error).strip().splitlines() or [type(error).__name__]
+        raise UserError(f"{key}: {lines[0]}") from error
     if not isinstance(value, str):
         raise UserError(f"{key}: missing, expected a folder")
     folder = Path(value)
@@ -215,7 +257,9 @@ def folder_of(cfg: DictConfig, key: str) -> Path:
         # in one line.
         folder.exists()
     except OSError as error:
-        raise UserError(f"{key}={value}: expected a folder that can be written to ({error.strerror})") from error
+        raise UserError(
+            f"{key}={value}: expected a folder that can be written to ({error.strerror})"
+        ) from error
     return folder
 
 
@@ -235,7 +279,9 @@ def make_folder(key: str, folder: Path) -> list[Path]:
             raise PermissionError(errno.EACCES, "it cannot be written to")
     except OSError as error:
         remove_if_empty(made)
-        raise UserError(f"{key}={folder}: expected a folder that can be written to ({error.strerror})") from error
+        raise UserError(
+            f"{key}={folder}: expected a folder that can be written to ({error.strerror})"
+        ) from error
     return made
 
 

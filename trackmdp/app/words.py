@@ -11,8 +11,8 @@ from hydra.core.override_parser.types import Glob, Override
 from hydra.errors import HydraException
 from omegaconf import DictConfig
 
-from trackmdp.config import GROUPS, ROOTS, SELECTORS, Option, options
-from trackmdp.config.checks import check_choice, check_option, refuse_renamed
+from trackmdp.config import GROUPS, ROOTS, Option, options
+from trackmdp.config.checks import check_choice, check_option
 from trackmdp.config.compose import composed_values, known_options
 from trackmdp.config.options import listed, refuse, several
 from trackmdp.errors import UserError
@@ -29,10 +29,23 @@ def parsed(word: str) -> Override:
     try:
         override = OverridesParser.create().parse_override(word)
     except (HydraException, ValueError) as error:  # ValueError: an integer of thousands of digits
-        raise UserError(f"{word}: expected option=value (a value with blanks or commas needs quotes)") from error
+        raise UserError(
+            f"{word}: expected option=value (a value with blanks or commas needs quotes)"
+        ) from error
     if isinstance(override.value(), Glob):
         raise UserError(f"{word}: expected the values themselves, separated by commas")
     return override
+
+
+def gathered(words: Sequence[str], names: Iterable[str]) -> list[str]:
+    """The words, with those of one of some names put together: run=a run=b becomes runs=[a,b]."""
+    kept = list(words)
+    for name in names:
+        values = [word.partition("=")[2] for word in words if word.startswith(f"{name}=")]
+        if values:
+            kept = [word for word in kept if not word.startswith(f"{name}=")]
+            kept.append(f"{name}s=[{','.join(values)}]")
+    return kept
 
 
 def values_of(override: Override) -> list[Any]:
@@ -55,17 +68,17 @@ def run_words(words: Iterable[str]) -> list[str]:
 
 
 def diagnose(error: Exception, command: str, words: Sequence[str], compose: Compose) -> UserError:
-    """The `UserError` that says which of the typed `words` Hydra's `error` is about.
+    """The `UserError` that names the one of the typed `words` that Hydra's `error` is about.
 
     Args:
-        error: what composing raised.
+        error: of composing.
         command: the command.
         words: its overrides, as typed.
         compose: composes a config from overrides.
     """
     try:
         # Composing stops at the first mistake in its own order, and its message names Hydra's internals. The words are
-        # gone through again here, to name the one that is wrong with what was expected instead.
+        # gone through again here, to name the wrong one and the expectation.
         if not isinstance(error, UserError):  # else a file of the user's was refused
             _refuse_wrong(error, command, words, compose)
     except UserError as refusal:
@@ -82,15 +95,18 @@ def _refuse_wrong(error: Exception, command: str, words: Sequence[str], compose:
     """
     overrides = [parsed(word) for word in words]
     for override in overrides:
-        refuse_renamed(override.key_or_group)
         values_of(override)  # refused here where they cannot be listed
-    # Hydra says that a sweep "requires --multirun"; nothing is wrong with the value itself.
+    # Hydra's message is that a sweep "requires --multirun"; nothing is wrong with the value itself.
     sweeps = [override.input_line for override in overrides if override.is_sweep_override()]
     if sweeps and ("multirun" in str(error).lower()):
         group, _, names = str(sweeps[0]).partition("=")
         if several(ROOTS[command], group) and "[" not in names:
             raise UserError(f"{sweeps[0]}: expected {group}=[{names}]")
         raise UserError(f"{sweeps[0]}: expected one value; add -m to run once for each")
+    for override in overrides:
+        key, value = override.key_or_group, override.value()
+        if override.is_add() and isinstance(value, str) and "Multiple values" in str(error):
+            raise UserError(f"{override.input_line}: in the config already, expected {key}={value}")
     files = [override for override in overrides if _is_file(override, command)]
     groups = [override for override in overrides if _is_choice(override, command)]
     # Choices before values: with algo=pppo every algo.* would be unknown, though only the choice is wrong.
@@ -98,12 +114,14 @@ def _refuse_wrong(error: Exception, command: str, words: Sequence[str], compose:
         _check_file(override, str(error))
     for override in groups:
         _check_choice(override, str(error))
-    # What options there are depends on the choices: in algo=a2c,ppo algo.epochs is an option of one of them. The first
+    # The options depend on the choices: in algo=a2c,ppo algo.epochs is an option of one of them. The first
     # combination that composes and shows a mistake decides.
     for choices in itertools.product(*map(_single_words, [*files, *groups])):
         try:
             values = composed_values(compose(choices), ROOTS[command])
-        except Exception:  # the choices themselves are at fault; at the end Hydra's own message is reported
+        except (
+            Exception
+        ):  # the choices themselves are at fault; at the end Hydra's own message is reported
             continue
         known = dict(known_options(ROOTS[command], values))
         for override in overrides:
@@ -113,11 +131,8 @@ def _refuse_wrong(error: Exception, command: str, words: Sequence[str], compose:
 
 def _is_choice(override: Override, command: str) -> bool:
     """Whether a word chooses from one of the command's groups."""
-    # A selector such as credit=joint picks a file within its group (`algo`), and belongs to the command if the group
-    # does.
     key = override.key_or_group
-    chosen = SELECTORS[key].group if key in SELECTORS else key
-    return chosen in GROUPS and chosen in options(ROOTS[command])
+    return key in GROUPS and key in options(ROOTS[command])
 
 
 def _is_file(override: Override, command: str) -> bool:
@@ -126,26 +141,28 @@ def _is_file(override: Override, command: str) -> bool:
     return key.startswith("hydra/") or (key == "experiment" and command == "train")
 
 
-def _check_choice(override: Override, said: str) -> None:
-    """Refuse a choice that Hydra did not find, as it `said`."""
+def _check_choice(override: Override, message: str) -> None:
+    """Refuse a choice that Hydra did not find, by its message `message`."""
     group = override.key_or_group
     for value in _names(override):
-        # Hydra says `find` of a single choice and `load` of one in a list.
-        missing = any(f"Could not {verb} '{group}/{value}" in said for verb in ("find", "load"))
+        # Hydra has `find` for a single choice and `load` of one in a list.
+        missing = any(f"Could not {verb} '{group}/{value}" in message for verb in ("find", "load"))
         if missing or not isinstance(value, str):
             check_choice(group, value)
 
 
-def _check_file(override: Override, said: str) -> None:
-    """Refuse a choice that does not exist, as Hydra `said`, or several where one is expected."""
+def _check_file(override: Override, message: str) -> None:
+    """Refuse a choice that does not exist, by its message `message`, or several where one is expected."""
     key, values = override.key_or_group, values_of(override)
     if len(values) > 1:
         raise UserError(f"{override.input_line}: expected one {key.split('/')[-1]}")
-    if f"Could not find '{key}/{values[0]}'" in said:
+    if f"Could not find '{key}/{values[0]}'" in message:
         # Hydra ends its message with one option a line, each after a tab. Schemas are stored as `base_...`, and are no
         # choices.
-        tail = said.partition(f"Available options in '{key}':")[2].splitlines()[1:]
-        names = [line.strip() for line in itertools.takewhile(lambda line: line.startswith("\t"), tail)]
+        tail = message.partition(f"Available options in '{key}':")[2].splitlines()[1:]
+        names = [
+            line.strip() for line in itertools.takewhile(lambda line: line.startswith("\t"), tail)
+        ]
         known = [name for name in names if not name.startswith("base_")]
         raise refuse(key, values[0], f"one of {', '.join(known) or 'none, since there is none'}")
 
@@ -157,7 +174,9 @@ def _check_value(override: Override, known: dict[str, Option]) -> None:
     if key.split(".")[0] == "hydra" or "@" in key:
         return
     if inner := [name for name in known if name.startswith(f"{key}.")]:
-        raise UserError(f"{override.input_line}: expected {inner[0]}=value (known: {', '.join(inner)})")
+        raise UserError(
+            f"{override.input_line}: expected {inner[0]}=value (known: {', '.join(inner)})"
+        )
     # Every option exists already: `+` would add a second meaning, `~` would leave a hole in the typed config.
     if key in known and (override.is_delete() or override.is_add()):
         raise UserError(f"{override.input_line}: expected {key}=value, without + or ~")
@@ -173,13 +192,17 @@ def _single_words(override: Override) -> list[str]:
 
 def _names(override: Override) -> list[Any]:
     """The choices that a word makes; a list of a group of several is taken apart."""
-    return [name for value in values_of(override) for name in (value if isinstance(value, list) else [value])]
+    return [
+        name
+        for value in values_of(override)
+        for name in (value if isinstance(value, list) else [value])
+    ]
 
 
 def _plain(error: Exception) -> str:
     """The messages of an error and its cause in one line, without repetitions and hints on Hydra's syntax."""
-    # Hydra wraps OmegaConf's error, and each says a part: where, and what.
-    said = [str(each).strip() for each in (error, error.__cause__) if each is not None]
-    lines = [line.strip(" .:") for text in said for line in text.splitlines()[:2]]
-    told = [line for line in lines if line and not line.startswith(("To append", "full_key"))]
-    return ": ".join(dict.fromkeys(told)) or type(error).__name__
+    # Hydra wraps OmegaConf's error, and each names a part: the place, and the mistake.
+    messages = [str(each).strip() for each in (error, error.__cause__) if each is not None]
+    lines = [line.strip(" .:") for text in messages for line in text.splitlines()[:2]]
+    kept = [line for line in lines if line and not line.startswith(("To append", "full_key"))]
+    return ": ".join(dict.fromkeys(kept)) or type(error).__name__

@@ -5,11 +5,18 @@ Here stand the names that commands and plugins use most; each schema is in a mod
 
 from trackmdp.config.baselines import BaselineConfig, PlaybackConfig
 from trackmdp.config.learning import AlgoConfig, CollectorConfig, DqnConfig, ScheduleConfig
-from trackmdp.config.loggers import CsvConfig, LogConfig, McapConfig, MlflowConfig, TensorboardConfig, WandbConfig
+from trackmdp.config.loggers import (
+    CsvConfig,
+    LogConfig,
+    McapConfig,
+    MlflowConfig,
+    TensorboardConfig,
+    WandbConfig,
+)
 from trackmdp.config.options import (
     GROUPS,
-    SELECTORS,
     ChoiceConfig,
+    Node,
     NodeConfig,
     Option,
     Sizes,
@@ -22,11 +29,12 @@ from trackmdp.config.per_sensor import PerSensorConfig
 from trackmdp.config.registry import conf_dir, load_plugins
 from trackmdp.config.roots import (
     ROOTS,
-    BenchmarkConfig,
     CheckpointConfig,
     CommandConfig,
+    CompareConfig,
     EvaluateConfig,
     ExportConfig,
+    FrontierConfig,
     ReplayConfig,
     ReportConfig,
     SolveConfig,
@@ -36,6 +44,6 @@ from trackmdp.config.roots import (
 )
 from trackmdp.config.sensing import CostConfig, FalseAlarmConfig, PaperCostConfig, SensorConfig
 from trackmdp.config.tree import load_config, load_run_config, to_dict, to_yaml, world_of
-from trackmdp.config.world import KernelConfig, TableConfig
+from trackmdp.config.world import MEMORIES, KernelConfig, TableConfig
 
 load_plugins()  # at the end: they import the names above

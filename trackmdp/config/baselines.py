@@ -1,6 +1,6 @@
 """Schema of the policies that are not learned: fixed rules and solvers.
 
-The group `baseline` (evaluate) offers all of them, the group `solver` (solve) those that read the kernel.
+The group `baseline` (evaluate) has all of them, the group `solver` (solve) the ones that read the kernel.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from trackmdp.machine import SIZE_PATTERN
 class BaselineConfig(ChoiceConfig):
     """Base of the groups `baseline` and `solver`.
 
-    What a choice makes is called with the world and the choice's options, and returns a `Policy` or a `Solution`.
+    The code of a choice gets the world and the options of the choice, and returns a `Policy` or a `Solution`.
 
     Attributes:
-        reads_motion: needs the kernel, which recorded tracks have not.
+        reads_motion: needs the kernel; recorded tracks have none.
         knows_footprints: sensors may cover several cells.
         whole_episodes: plans for episodes that only the exit ends; `grid.max_steps` then counts in the valuing alone.
     """
@@ -27,10 +27,10 @@ class BaselineConfig(ChoiceConfig):
     knows_footprints: ClassVar[bool] = True
 
 
-@choice("baseline", "qmdp", makes="trackmdp.solvers.qmdp:solve")
-@choice("solver", "qmdp", makes="trackmdp.solvers.qmdp:solve")
+@choice("baseline", "qmdp", makes="trackmdp.solvers.rules:qmdp")
+@choice("solver", "qmdp", makes="trackmdp.solvers.rules:qmdp")
 class QmdpConfig(BaselineConfig):
-    """Q_MDP: sense every cell whose predicted probability is worth the sensor's price."""
+    """Q_MDP: sense every cell with a predicted probability worth the sensor's price."""
 
     in_grid: bool = option("threshold c·p_in/r instead of the printed c/r")
 
@@ -57,28 +57,30 @@ class RandomKConfig(BaselineConfig):
     k: int = option("sensors switched on, at most as many as there are", unit="sensors", ge=0)
 
     def check(self, key: str, root: Any) -> None:
-        """There are only so many sensors."""
+        """No more sensors than there are."""
         count = root.sensor.count(root.grid)
         if count is not None and self.k > count:
             expected = f"at most {count}, the sensors of a grid.size={root.grid.size} grid"
             raise refuse(f"{key}.k", self.k, expected)
 
 
-@choice("baseline", "myopic", makes="trackmdp.solvers.qmdp:myopic")
+@choice("baseline", "myopic", makes="trackmdp.solvers.rules:myopic")
 class MyopicConfig(BaselineConfig):
-    """Sense the cells whose belief, conditioned on the misses so far, exceeds a threshold."""
+    """Sense the cells with a belief, given the misses so far, above a threshold."""
 
-    threshold: float | None = option("predicted probability from which a cell is sensed; null = c·p_in/r", ge=0, le=1)
+    threshold: float | None = option(
+        "predicted probability from which a cell is sensed; null = c·p_in/r", ge=0, le=1
+    )
 
 
-@choice("baseline", "clocked", makes="trackmdp.solvers.qmdp:clocked_policy")
-@choice("solver", "clocked", makes="trackmdp.solvers.qmdp:clocked_policy")
+@choice("baseline", "clocked", makes="trackmdp.solvers.rules:clocked_policy")
+@choice("solver", "clocked", makes="trackmdp.solvers.rules:clocked_policy")
 class ClockedConfig(BaselineConfig):
     """Sets read off the clocked bound."""
 
 
-@choice("baseline", "fcr", makes="trackmdp.solvers.qmdp:fcr")
-@choice("solver", "fcr", makes="trackmdp.solvers.qmdp:fcr")
+@choice("baseline", "fcr", makes="trackmdp.solvers.rules:fcr")
+@choice("solver", "fcr", makes="trackmdp.solvers.rules:fcr")
 class FcrConfig(BaselineConfig):
     """First cost reduction: decide as if nothing were observed any more."""
 
@@ -103,13 +105,17 @@ class OptimalConfig(BaselineConfig):
 
     whole_episodes: ClassVar[bool] = True
 
-    nodes: int = option("choices of branch and bound after which the bracket is left as it is", unit="nodes", ge=1)
+    nodes: int = option(
+        "choices of branch and bound after which the bracket is left as it is", unit="nodes", ge=1
+    )
     time_limit: float | None = option(
-        "stop after this long even so, where the machine is slow; said where it happens; null = never", unit="s", gt=0
+        "stop after this time even so; the output then names it; null = never",
+        unit="s",
+        gt=0,
     )
     tolerance: float = option("bracket that counts as closed, relative to the value", ge=0, lt=1)
     memory: str | None = option(
-        "memory that may be used: large grids are then gone through in smaller regions; null = what the machine has",
+        "memory that may be used: large grids are then solved in smaller regions; null = all memory of the machine",
         pattern=SIZE_PATTERN,
         expects="bytes, or a size such as 500MiB or 2GiB",
     )
@@ -117,7 +123,7 @@ class OptimalConfig(BaselineConfig):
 
 @choice("baseline", "sets", makes="trackmdp.policies.saved:read_sets")
 class SetsConfig(BaselineConfig):
-    """The sets in a file that evaluate, solve, export or a run has written."""
+    """The sets in a file of evaluate, solve, export or a run."""
 
     reads_motion: ClassVar[bool] = False
     file: str = option("the sets", expects="a sets.json, or a sets.npz or policy.npz", path=True)
@@ -125,14 +131,20 @@ class SetsConfig(BaselineConfig):
 
 @choice("baseline", "playback", makes="trackmdp.policies.acting:Playback")
 class PlaybackConfig(BaselineConfig):
-    """The actions of a logged episode again, step by step, whatever is observed; none on after the last."""
+    """The actions of a logged episode again, step by step, independent of observations; none on after the last."""
 
     file: str = option("the log", expects="a file written with log=[mcap]", path=True)
-    episode: int = option("which of its episodes", ge=0)
+    episode: int = option("number of the episode", ge=0)
 
     def check(self, key: str, root: Any) -> None:
-        """What is played back is simulated, and not logged a second time."""
+        """Played back episodes are simulated, and not logged a second time."""
         if root.log:
-            raise refuse("log", listed(root.log), "[] with baseline=playback, whose episodes are logged already")
+            raise refuse(
+                "log",
+                listed(root.log),
+                "[] with baseline=playback: its episodes are logged already",
+            )
         if root.episodes == 0:
-            raise refuse("episodes", 0, "at least 1 with baseline=playback, which is only simulated")
+            raise refuse(
+                "episodes", 0, "at least 1 with baseline=playback, which is only simulated"
+            )

@@ -1,6 +1,6 @@
-"""Checks before anything is built: names, each option's range, rules between options, and options without effect.
+"""Checks before anything is built: names, ranges, rules between options, and options without effect.
 
-What is refused is told in one line, the same from Python and at the terminal.
+A refusal is one line, the same from Python and at the terminal.
 """
 
 from __future__ import annotations
@@ -12,36 +12,25 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from trackmdp.config.options import GROUPS, SELECTORS, Option, choices_of, leaves, nodes, options, refuse
-from trackmdp.config.registry import conf_file
+from trackmdp.config.options import GROUPS, Option, is_number, leaves, nodes, options, refuse
 from trackmdp.errors import UserError
 
 _T = TypeVar("_T")
 
 RENAMED: dict[str, str] = {
-    "algo.average": "algo.ema_decay",
-    "algo.block": "partition.block",
-    "algo.clip": "algo.clip_epsilon",
-    "algo.lam": "algo.gae_lambda",
     "algo.lr": "algo.learning_rate",
-    "kernel.homogeneous": "algo.share_cells",
-    "log.episodes": "log.mcap.episodes",
-    "log.evaluations": "log.mcap.evaluations",
+    "algo=learned_kernel": "algo=model_based",
+    "algo=path_counts": "algo=model_based",
+    "credit": "algo=a2c_per_sensor",
+    "kernel.cell": "grid.cell",
+    "kernel.crs": "grid.crs",
+    "kernel.origin": "grid.origin",
     "log.every": "log.csv.every",
-    "log.layout": "log.mcap.layout",
-    "lr": "algo.learning_rate",
 }
-"""Former name of an option (``group.option``) -> its name."""
+"""Former or usual name of an option, or of a choice -> its name."""
 
-
-def refuse_renamed(key: str) -> None:
-    """Refuse the former name of an option.
-
-    Raises:
-        UserError: it is one; the message has the new name.
-    """
-    if key in RENAMED:
-        raise UserError(f"{key}: renamed, expected {RENAMED[key]}")
+_VALUES = {"cost": "cost.sensor", "sensor": "sensor=miss sensor.p_d"}
+"""Group -> words that end in the option that is meant where the group is given a number."""
 
 
 def suggestion(name: str, known: Iterable[str], listed: Iterable[str] | None = None) -> str:
@@ -53,13 +42,20 @@ def suggestion(name: str, known: Iterable[str], listed: Iterable[str] | None = N
 
 
 def unknown_option(key: str, known: Mapping[str, Option]) -> UserError:
-    """The refusal of a dotted key that does not exist, naming those that stand beside it."""
-    parent = key.rpartition(".")[0]
-    beside = [name for name in known if name.startswith(f"{parent}.")] if parent else []
-    # For `algo.epoch` the options of the algorithm; for a misspelt group (`alg.epochs`) the first parts of all keys,
-    # each once and in their order, which a set would not keep.
-    names = beside or list(dict.fromkeys(name.split(".")[0] for name in known))
-    return UserError(f"{key}: unknown option{suggestion(key, known, names)}")
+    """The refusal of a dotted key that does not exist, with the names beside it."""
+    if key in RENAMED:
+        return UserError(f"{key}: renamed, expected {RENAMED[key]}")
+    # `algo.epochs` without algo=ppo is no misspelling.
+    group, _, name = key.partition(".")
+    others = [each for each, schema in GROUPS.get(group, {}).items() if name in options(schema)]
+    if others:
+        choices = " or ".join(f"{group}={each}" for each in others)
+        return UserError(f"{key}: an option of another choice, expected {choices} beside it")
+    # For `algo.epoch` the options of the algorithm; for `alg.epochs` the first parts of all keys, each once.
+    parent = f"{key.rpartition('.')[0]}."
+    beside = [each for each in known if each.startswith(parent)]
+    first = dict.fromkeys(each.split(".")[0] for each in known)
+    return UserError(f"{key}: unknown option{suggestion(key, known, beside or first)}")
 
 
 def check_option(key: str, value: Any, known: Mapping[str, Option]) -> None:
@@ -69,7 +65,6 @@ def check_option(key: str, value: Any, known: Mapping[str, Option]) -> None:
         UserError: it is one; the message names the option that may be meant.
     """
     if key not in known:
-        refuse_renamed(key)
         *parents, _ = itertools.accumulate(key.split("."), "{}.{}".format)
         if above := next((each for each in parents if each in known), None):
             raise UserError(f"{above}: a mapping, expected {known[above].expected}")
@@ -79,69 +74,65 @@ def check_option(key: str, value: Any, known: Mapping[str, Option]) -> None:
 
 
 def check_choice(group: str, name: Any) -> None:
-    """Refuse what is none of the choices of a group or of a selector.
+    """Refuse a name that is none of the choices of a group.
 
     Raises:
         UserError: it is none.
     """
-    if not isinstance(name, str) or name not in choices_of(group):
-        raise refuse(group, name, f"one of {', '.join(choices_of(group))}")
+    if isinstance(name, str) and name in GROUPS[group]:
+        return
+    if (former := f"{group}={name}") in RENAMED:
+        raise UserError(f"{former}: renamed, expected {RENAMED[former]}")
+    if group in _VALUES and name is not None and is_number(str(name)):
+        raise UserError(f"{group}={name}: expected {_VALUES[group]}={name}")
+    raise refuse(group, name, f"one of {', '.join(GROUPS[group])}")
 
 
 def validate(cfg: Any, place: str = "", root: Any = None) -> None:
-    """Raise a `UserError` naming key, value and allowed range for the first option that breaks a rule.
+    """Refuse the first option that is out of range or breaks a rule.
 
     Args:
         cfg: the config of a command, or a part of one.
         place: dotted key of a part.
         root: the config that a part belongs to.
+
+    Raises:
+        UserError: the message has the key, the value and the range.
     """
-    for key, described, value in leaves(cfg, place):
-        if not described.allows(value):
-            raise refuse(key, value, described.expected)
-    # Rules between options may count on every single value; a node's rule comes after those of the nodes around it.
+    for key, item, value in leaves(cfg, place):
+        if not item.allows(value):
+            raise refuse(key, value, item.expected)
+    # Rules between options may count on every single value; the rule of a node comes after those around it.
     for key, node in nodes(cfg, place):
         node.check(key, root or cfg)
 
 
-def refuse_ignored(cfg: Any, typed: Mapping[str, Any], choices: Mapping[str, Any]) -> None:
-    """Refuse what was typed and has no effect on this config: whoever typed it expects one.
+def refuse_ignored(cfg: Any, typed: Mapping[str, Any]) -> None:
+    """Refuse a typed option without effect on this config.
 
     Args:
-        cfg: the typed, valid config.
-        typed: what was set, by dotted names; the defaults of `conf/` may well hold values that nothing reads.
-        choices: group -> the file chosen from it (``{"algo": "ppo"}``, which credit=per_sensor turns into another).
+        cfg: the checked config.
+        typed: values by dotted names; the defaults of `conf/` may well hold values that nothing reads.
 
     Raises:
-        UserError: an option or a selector is not read.
+        UserError: an option is not read.
     """
-    for name, selector in SELECTORS.items():
-        chosen = choices.get(selector.group)
-        if name in typed and chosen and not _selects(name, selector.group, chosen):
-            readers = ", ".join(each for each in GROUPS[selector.group] if _selects(name, selector.group, each))
-            raise UserError(f"{name}={typed[name]}: not read by {selector.group}={chosen}, expected one of {readers}")
     for place, node in nodes(cfg):
         for name, why in node.ignored(cfg).items():
             key = f"{place}.{name}".lstrip(".")
-            for given in typed:
+            for given, value in typed.items():
                 # `explore` without effect covers `algo.explore.start`, but not `algo.explored`.
-                if given == key or given.startswith(f"{key}."):
-                    raise UserError(f"{given}={typed[given]}: without effect {why}")
-
-
-def _selects(selector: str, group: str, choice: str) -> bool:
-    """Whether the file of a choice depends on the selector."""
-    return f"${{{selector}}}" in conf_file(f"{group}/{choice}").read_text(encoding="utf-8")
+                if f"{given}.".startswith(f"{key}."):
+                    raise UserError(f"{given}={value}: without effect {why}")
 
 
 def absolute_paths(cfg: Any, folder: Path) -> None:
-    """Resolve every path of the config against `folder`, where the user typed the command."""
-    # Saved as absolute paths, they still mean the same files when the run is resumed from another folder.
+    """Resolve every path of the config against `folder`, so that a run can be resumed from another one."""
     _each_path(cfg, lambda path: str(folder / path))  # `path` itself where that is absolute
 
 
 def own_paths(cfg: _T, folder: Path) -> _T:
-    """A copy in which what lies in `folder`, that of the run, is named relative to it: a run may be moved."""
+    """A copy in which paths inside `folder`, of the run, are relative to it: a run may be moved."""
     copied, place = copy.deepcopy(cfg), folder.absolute()
 
     def relative(path: str) -> str:
@@ -153,10 +144,10 @@ def own_paths(cfg: _T, folder: Path) -> _T:
 
 def _each_path(cfg: Any, change: Callable[[str], str]) -> None:
     for _, node in nodes(cfg):
-        for name, described in options(type(node)).items():
+        for name, item in options(type(node)).items():
             value = vars(node)[name]
             # resume=auto is a word, not a file called `auto`.
-            if isinstance(described, Option) and described.path and value not in described.words:
+            if isinstance(item, Option) and item.path and value not in item.words:
                 setattr(node, name, _changed(value, change))
 
 
@@ -165,5 +156,7 @@ def _changed(value: Any, change: Callable[[str], str]) -> Any:
     if isinstance(value, str):
         return change(value)
     if isinstance(value, list):
-        return [_changed(each, change) if isinstance(each, dict) else each for each in value]
-    return value | {"path": _changed(value["path"], change)} if isinstance(value, dict) and "path" in value else value
+        return [_changed(each, change) for each in value]
+    if isinstance(value, dict) and "path" in value:
+        return value | {"path": change(value["path"])}
+    return value

@@ -6,10 +6,19 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from trackmdp.cluster import ADDRESS
-from trackmdp.config.options import BYTES, ChoiceConfig, NodeConfig, Sizes, choice, nested, option, refuse
+from trackmdp.config.options import (
+    BYTES,
+    ChoiceConfig,
+    NodeConfig,
+    Sizes,
+    choice,
+    nested,
+    option,
+    refuse,
+)
 
 MOST_FRAMES = 10**12
-"""Of a run: eleven days at a million frames per second. What asks for more would not end, and is a slip."""
+"""Most frames of a run: eleven days at a million frames per second. A larger number is a slip."""
 
 DEVICE = r"auto|cpu|cuda(:\d+)?"
 """Names of devices."""
@@ -23,7 +32,9 @@ class ScheduleConfig(NodeConfig):
     start: float = option("value at the start", ge=0, le=1e6)
     end: float = option("value at the end", ge=0, le=1e6)
     begin: float = option("where the change begins", unit="fraction of the run", ge=0, le=1)
-    until: float = option("where the change ends, not before begin", unit="fraction of the run", ge=0, le=1)
+    until: float = option(
+        "where the change ends, not before begin", unit="fraction of the run", ge=0, le=1
+    )
 
     def check(self, key: str, root: Any) -> None:
         """The change does not end before it begins."""
@@ -39,20 +50,21 @@ class ScheduleConfig(NodeConfig):
         if progress <= self.begin:
             return self.start
         # Example: start 1, end 0.02, begin 0.1, until 0.2: at 0.15 half the way is done, 0.51.
-        return self.start + (self.end - self.start) * (progress - self.begin) / (self.until - self.begin)
+        return self.start + (self.end - self.start) * (progress - self.begin) / (
+            self.until - self.begin
+        )
 
 
 class AlgoConfig(ChoiceConfig):
-    """Base of the group `algo`: how a policy is learned. The three budgets are what `collector` takes by default.
+    """Base of the group `algo`: how a policy is learned. The three budgets are the defaults of `collector`.
 
-    What a choice makes is called as ``Learner(task, cfg, iterations=..., seed=..., device=...)``.
+    The code of a choice is called as ``Learner(task, cfg, iterations=..., seed=..., device=...)``.
     """
 
-    credit: ClassVar[str | None] = "joint"
     remembers: ClassVar[bool] = False
     """Whether it learns policies that remember more than the cell (`task.memory`)."""
     told: ClassVar[bool] = False
-    """Whether it learns what to do where a detection tells the target's mode (`kernel.reveals`)."""
+    """Whether it learns where a detection reveals the mode of the target (`kernel.reveals`)."""
     knows_footprints: ClassVar[bool] = False
     """Whether sensors may cover several cells."""
     total_frames: int = option("env steps the algorithm needs", unit="frames", ge=1, le=MOST_FRAMES)
@@ -61,7 +73,7 @@ class AlgoConfig(ChoiceConfig):
 
 
 class EveryTaskConfig(AlgoConfig):
-    """Base of the algorithms that learn whatever is remembered, told and covered."""
+    """Base of the algorithms that learn with every memory, revealed mode and footprint."""
 
     remembers: ClassVar[bool] = True
     told: ClassVar[bool] = True
@@ -69,9 +81,11 @@ class EveryTaskConfig(AlgoConfig):
 
 
 class NetworkConfig(EveryTaskConfig):
-    """What the algorithms have in common that learn networks from what they sense themselves."""
+    """Common options of the algorithms with networks that learn from their own sensing."""
 
-    gamma: float = option("discount while learning; policies are evaluated undiscounted", ge=0, le=1)
+    gamma: float = option(
+        "discount while learning; policies are evaluated undiscounted", ge=0, le=1
+    )
     learning_rate: ScheduleConfig = nested(LEARNING_RATE)
     max_grad_norm: float = option("gradients are clipped to this norm", gt=0)
     hidden: int = option("units of the hidden layer of each network", unit="units", ge=1, le=4096)
@@ -83,7 +97,7 @@ class NetworkConfig(EveryTaskConfig):
 
 
 class ActorCriticConfig(NetworkConfig):
-    """What A2C and PPO have in common."""
+    """Common options of A2C and PPO."""
 
     gae_lambda: float = option("λ of the generalised advantage estimate", ge=0, le=1)
     entropy: ScheduleConfig = nested(ENTROPY)
@@ -122,14 +136,21 @@ class PrioritizedConfig(NodeConfig):
 
     def ignored(self, root: Any) -> dict[str, str]:
         """Uniform replay has no priorities."""
-        return {} if self.enabled else dict.fromkeys(("alpha", "beta"), "with algo.prioritized.enabled=false")
+        return (
+            {}
+            if self.enabled
+            else dict.fromkeys(("alpha", "beta"), "with algo.prioritized.enabled=false")
+        )
 
 
 @choice("algo", "dqn", makes="trackmdp.algos.dqn:DQN")
 class DqnConfig(NetworkConfig):
     """Double DQN with a Q that adds up over the sensors."""
 
-    epsilon: ScheduleConfig = nested("probability that a sensor is switched over at random while collecting")
+    epsilon: ScheduleConfig = nested(
+        "probability that a sensor of no use is on at random while collecting; one of use is off the more seldom, the "
+        "more prices it is worth"
+    )
     n_step: int = option("rewards summed before bootstrapping", unit="steps", ge=1, le=64)
     buffer_size: int = option("transitions kept for replay", unit="frames", ge=1)
     batch_size: int = option("transitions per update", unit="frames", ge=1)
@@ -138,19 +159,23 @@ class DqnConfig(NetworkConfig):
     prioritized: PrioritizedConfig
 
     def check(self, key: str, root: Any) -> None:
-        """The replay buffer holds what is collected and what is drawn at once."""
+        """The replay buffer has room for a collected batch and for one of updates."""
         frames = root.collector.frames_per_batch
         if self.buffer_size < max(frames, self.batch_size):
             expected = f"at least collector.frames_per_batch={frames} and {key}.batch_size={self.batch_size}"
             raise refuse(f"{key}.buffer_size", self.buffer_size, expected)
 
     def needs(self, task: Sizes, root: Any) -> dict[str, int]:
-        """The replay buffer, whose transitions hold two states; the networks."""
+        """The replay buffer with two states a transition; the networks."""
         # State and next state, the action's K bits as bools, two float32 and one flag (reward, discount,
         # terminated), an index.
-        transition = 2 * state_bytes(task) + task.num_sensors + 2 * BYTES["float32"] + 1 + BYTES["int64"]
+        transition = (
+            2 * state_bytes(task) + task.num_sensors + 2 * BYTES["float32"] + 1 + BYTES["int64"]
+        )
         priority = BYTES["float64"] if self.prioritized.enabled else 0
-        return super().needs(task, root) | {"algo.buffer_size": self.buffer_size * (transition + priority)}
+        return super().needs(task, root) | {
+            "algo.buffer_size": self.buffer_size * (transition + priority)
+        }
 
 
 class CollectorConfig(ChoiceConfig):
@@ -158,10 +183,14 @@ class CollectorConfig(ChoiceConfig):
 
     total_frames: int = option("env steps of the whole run", unit="frames", ge=1, le=MOST_FRAMES)
     frames_per_batch: int = option(
-        "env steps per collected batch, a multiple of the number of environments", unit="frames", ge=1
+        "env steps per collected batch, a multiple of the number of environments",
+        unit="frames",
+        ge=1,
     )
     envs: int = option("environments stepped together, in each worker", ge=1)
-    device: str = option("device the environments live on", expects="cpu, cuda, cuda:N or auto", pattern=DEVICE)
+    device: str = option(
+        "device the environments live on", expects="cpu, cuda, cuda:N or auto", pattern=DEVICE
+    )
 
     @property
     def stepped(self) -> int:
@@ -193,7 +222,7 @@ class SingleConfig(CollectorConfig):
 
 
 class WorkersConfig(CollectorConfig):
-    """What the two collectors with worker processes have more."""
+    """Common options of the collectors with worker processes."""
 
     workers: int = option("worker processes", ge=1, le=256)
     threads: int = option("torch threads of each worker process", unit="threads", ge=1, le=256)
@@ -211,19 +240,21 @@ class MultiSyncConfig(WorkersConfig):
 
 @choice("collector", "multi_async", makes="trackmdp.training.collect:multi_async")
 class MultiAsyncConfig(WorkersConfig):
-    """In worker processes; a batch is what one of them has ready. A resumed run starts new episodes."""
+    """In worker processes; a batch comes from the first one that is ready. A resumed run starts new episodes."""
 
 
 @choice("collector", "ray", makes="trackmdp.training.collect:ray")
 class RayWorkersConfig(WorkersConfig):
-    """In workers of a Ray cluster: for one run whose environments need more cores than a machine has.
+    """In workers of a Ray cluster: for one run with environments that need more cores than a machine has.
 
     On one machine multi_sync does the same for less. For many runs at once take hydra/launcher=ray, for planning one
     large grid partition.cluster.
     """
 
     address: str | None = option(
-        "cluster to join; null = start one on this machine", expects="auto, or host:port", pattern=ADDRESS
+        "cluster to join; null = start one on this machine",
+        expects="auto, or host:port",
+        pattern=ADDRESS,
     )
     cpus_per_worker: float = option("cores of each worker", unit="cores", gt=0)
     gpus_per_worker: float = option("GPUs of each worker", unit="GPUs", ge=0)
@@ -236,15 +267,15 @@ def file_of_classes(algo: AlgoConfig) -> str | None:
 
 
 def check_classes(key: str, algo: AlgoConfig) -> None:
-    """Refuse what is neither a word of `share_cells` nor the name of a table, such as the former true and false."""
+    """Refuse a text that is neither a word of `share_cells` nor the name of a table."""
     given = file_of_classes(algo)
     if given is not None and Path(given).suffix not in (".npy", ".npz", ".csv"):
-        expected = "all (formerly true), none (formerly false), or a path to a .npy, .npz or .csv file"
+        expected = "all, none, or a path to a .npy, .npz or .csv file"
         raise refuse(key, given, expected)
 
 
 def state_bytes(task: Sizes) -> int:
-    """Of one observation: located cell, misses, the key where there is one, and the actions since the detection."""
+    """Bytes of one observation: located cell, misses, the key where there is one, the actions since the detection."""
     return (2 + task.keyed) * BYTES["int64"] + task.num_choices * task.num_sensors
 
 
@@ -252,7 +283,7 @@ def networks(task: Sizes, hidden: int | None) -> int:
     """Bytes of two networks of one hidden layer (256 units where `hidden` is left open), with Adam's two moments."""
     # located cell, n and both at once by number; the history by sensor, as are the outputs
     inputs = task.num_cells * (task.num_choices + 3) + task.num_choices * (task.num_sensors + 1) + 1
-    if task.keyed:  # the key, and what it shares, with n: the classes are a few more
+    if task.keyed:  # the key, and its shared parts, with n
         inputs += (task.num_keys + 2 * task.num_keys // task.num_cells) * (task.num_choices + 1)
     weights = (256 if hidden is None else hidden) * (inputs + task.num_sensors)
     return 2 * weights * 4 * BYTES["float32"]  # weight, gradient, two moments

@@ -1,4 +1,4 @@
-"""Schema of what a training writes of itself."""
+"""Schema of the logs of a training."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from trackmdp.errors import require
 
 
 class LogConfig(ChoiceConfig):
-    """Base of the group `log`: what is written of each iteration, next to `summary.json`; any of them together.
+    """Base of the group `log`: files of figures by iteration, next to `summary.json`; any of them together.
 
-    What a choice makes is called with its config and the run's folder, and returns a callback of the training.
+    The code of a choice gets its config and the folder of the run, and returns a callback of the training.
     """
 
     episodes_only: ClassVar[bool] = False
     package: ClassVar[str | None] = None
-    """What it imports beyond trackmdp's own dependencies; it comes with the extra called as the choice is."""
+    """A package beyond the dependencies of trackmdp; the extra with the name of the choice adds it."""
 
 
 class RowsConfig(LogConfig):
@@ -40,10 +40,12 @@ class TensorboardConfig(RowsConfig):
 
 @choice("log", "wandb", makes="trackmdp.training.loggers:WandbLogger")
 class WandbConfig(RowsConfig):
-    """Weights & Biases. `wandb sync` uploads what was logged offline, in the run's folder."""
+    """Weights & Biases. `wandb sync` uploads an offline log, in the folder of the run."""
 
     package: ClassVar[str | None] = "wandb"
-    mode: str = option("offline = to files alone, online = to the server", choices=("offline", "online"))
+    mode: str = option(
+        "offline = to files alone, online = to the server", choices=("offline", "online")
+    )
     project: str = option("project of the run", expects="a name", pattern=r"[\w .-]{1,128}")
 
 
@@ -52,7 +54,9 @@ class MlflowConfig(RowsConfig):
     """MLflow, in a database or on a server."""
 
     package: ClassVar[str | None] = "mlflow"
-    uri: str | None = option("tracking database or server; null = mlflow.db in the run's folder", expects="a URI")
+    uri: str | None = option(
+        "tracking database or server; null = mlflow.db in the run's folder", expects="a URI"
+    )
     experiment: str = option("experiment of the run", expects="a name", pattern=r"[\w .-]{1,128}")
 
 
@@ -62,9 +66,13 @@ class McapConfig(LogConfig):
 
     episodes_only: ClassVar[bool] = True
     evaluations: int = option(
-        "training: from one recorded evaluation to the next; the last is recorded too", unit="evaluations", ge=1
+        "training: from one recorded evaluation to the next; the last is recorded too",
+        unit="evaluations",
+        ge=1,
     )
-    episodes: int = option("training: episodes recorded of each such evaluation", unit="episodes", ge=1, le=10**6)
+    episodes: int = option(
+        "training: episodes recorded of each such evaluation", unit="episodes", ge=1, le=10**6
+    )
     layout: bool = option("write a viewer's layout next to the log")
 
     def ignored(self, root: Any) -> dict[str, str]:
@@ -73,7 +81,7 @@ class McapConfig(LogConfig):
 
 
 def require_packages(log: Mapping[str, LogConfig]) -> None:
-    """See that what the loggers import is there, before the run's folder is made.
+    """Check that the packages of the loggers are installed, before the folder of the run is made.
 
     Raises:
         UserError: a package is not installed.

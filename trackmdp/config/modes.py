@@ -18,40 +18,45 @@ _FARTHEST = 1_000_000
 
 
 class HiddenKernelConfig(KernelConfig):
-    """Base of the kernels with a mode; what a choice makes returns a kernel on (cell, mode), and the number of modes.
+    """Base of the kernels with a mode; the code of a choice returns a kernel on (cell, mode), and the number of modes.
 
-    `reveals` is not handed to it.
+    `reveals` is no argument of it.
     """
 
     hides: ClassVar[bool] = True
-    reveals: bool = option("whether a detection tells the mode as well (Doppler, AIS); false: the cell alone")
+    reveals: bool = option(
+        "whether a detection reveals the mode as well (Doppler, AIS); false: the cell alone"
+    )
 
     def check(self, key: str, root: Any) -> None:
-        """What knows of modes: learners that remember, solving over keys, and exact evaluation."""
-        if not root.knows_modes:
-            raise refuse(key, self.name, "a kernel without a hidden mode")
-        able = [name for name, schema in GROUPS["algo"].items() if (schema.told if self.reveals else schema.remembers)]
+        """Learners with a memory, solving over keys, and exact evaluation take modes; nothing else does."""
+        able = [
+            name
+            for name, schema in GROUPS["algo"].items()
+            if (schema.told if self.reveals else schema.remembers)
+        ]
         if root.learns and root.algo.name not in able:
             known = f"kernel={self.name}" + f" and {key}.reveals=true" * self.reveals
             raise refuse("algo", root.algo.name, f"one of {', '.join(able)} with {known}")
-        solver = getattr(root, "solver", None)
-        if solver is not None and (solver.name != "optimal" or root.partition.block is not None):
-            raise refuse(key, self.name, "with it solver=optimal, and no blocks")
-        for name in ("max_steps", "window"):
-            if (value := getattr(root.grid, name)) is not None:
-                raise refuse(f"grid.{name}", value, f"null with kernel={self.name}")
-        if root.sensor.name not in ("perfect", "miss"):
-            raise refuse("sensor", root.sensor.name, f"perfect or miss with kernel={self.name}")
-        if getattr(root.sensor, "p_s", 1) != 1:
-            raise refuse("sensor.p_s", root.sensor.p_s, f"1 with kernel={self.name}")
+        solver, partition = getattr(root, "solver", None), getattr(root, "partition", None)
+        blocks = partition is not None and partition.block is not None
+        if solver is not None and blocks:
+            raise refuse(key, self.name, "with it no blocks")
 
 
 @choice("kernel", "heading", makes="trackmdp.world.modes:heading_kernel")
 class HeadingConfig(HiddenKernelConfig):
-    """A target with one of eight headings, which the tracker is not shown; at the border it turns back."""
+    """A target with one of eight headings, hidden from the tracker; at the border it turns back."""
 
-    keep: float = option("probability of keeping the heading; else it turns by 45 degrees", unit="per step", ge=0, le=1)
-    go: float = option("probability of moving one cell that way; else it stays", unit="per step", ge=0, le=1)
+    keep: float = option(
+        "probability of keeping the heading; else it turns by 45 degrees",
+        unit="per step",
+        ge=0,
+        le=1,
+    )
+    go: float = option(
+        "probability of moving one cell that way; else it stays", unit="per step", ge=0, le=1
+    )
     exit_probability: float = option("probability of leaving the grid", unit="per step", gt=0, lt=1)
 
 
@@ -59,7 +64,7 @@ class HeadingConfig(HiddenKernelConfig):
 class RegimesConfig(HiddenKernelConfig):
     """A target that switches between other kernels, such as to linger and to travel; the one in force is its mode.
 
-    It switches first, then moves as the new regime says, whose own border and exit hold.
+    It switches first, then moves by the new regime, with the border and the exit of that.
     """
 
     stay: Any = option(
@@ -74,29 +79,45 @@ class RegimesConfig(HiddenKernelConfig):
     )
 
     def check(self, key: str, root: Any) -> None:
-        """Each regime is a kernel of cells that exists, with options that it has; what was left out is filled in."""
+        """Each regime is a kernel of cells that exists, with its own options; those left out are filled in."""
         super().check(key, root)
         if not isinstance(self.regimes, list) or not 2 <= len(self.regimes) <= MOST_MODES:
             raise refuse(f"{key}.regimes", self.regimes, f"a list of 2 to {MOST_MODES:,} kernels")
-        self.regimes = [_regime(f"{key}.regimes[{place}]", entry, root) for place, entry in enumerate(self.regimes)]
-        shares, probability = self.stay if isinstance(self.stay, list) else [self.stay], Option("", ge=0, le=1)
+        self.regimes = [
+            _regime(f"{key}.regimes[{place}]", entry, root)
+            for place, entry in enumerate(self.regimes)
+        ]
+        shares, probability = (
+            self.stay if isinstance(self.stay, list) else [self.stay],
+            Option("", ge=0, le=1),
+        )
         if isinstance(self.stay, list) and len(shares) != len(self.regimes):
-            raise refuse(f"{key}.stay", self.stay, f"one number, or {len(self.regimes)} (one per regime)")
+            raise refuse(
+                f"{key}.stay", self.stay, f"one number, or {len(self.regimes)} (one per regime)"
+            )
         for share in shares:
-            if isinstance(share, bool) or not isinstance(share, (int, float)) or not probability.allows(share):
+            if (
+                isinstance(share, bool)
+                or not isinstance(share, (int, float))
+                or not probability.allows(share)
+            ):
                 raise refuse(f"{key}.stay", self.stay, "numbers from 0 to 1")
 
 
 class VelocityConfig(HiddenKernelConfig):
-    """What the kernels in metres and seconds have in common.
+    """Common options of the kernels in metres and seconds.
 
     At the border the target turns back: it stays in its cell, with the opposite velocity.
     """
 
-    cell: float = option("side of a cell", unit="m", gt=0)
+    cell: float = option("side of a cell; by default grid.cell", unit="m", gt=0)
     step: float = option("time from one step to the next", unit="s", gt=0, le=1e9)
-    speed: float = option("greatest speed along rows, and along columns; a faster target has that", unit="m/s", gt=0)
-    spacing: float = option("velocities are told apart by so much: the modes are multiples of it", unit="m/s", gt=0)
+    speed: float = option(
+        "greatest speed along rows, and along columns; a faster target has that", unit="m/s", gt=0
+    )
+    spacing: float = option(
+        "distance of two velocities: the modes are multiples of it", unit="m/s", gt=0
+    )
     noise: float = option(
         "standard deviation of the acceleration along rows, and along columns, the same for one step (discrete white "
         "noise)",
@@ -106,14 +127,15 @@ class VelocityConfig(HiddenKernelConfig):
     exit_probability: float = option("probability of leaving the grid", unit="per step", gt=0, lt=1)
 
     def check(self, key: str, root: Any) -> None:
-        """Some velocities, and not too many; a step that is not out of all proportion to them and to the cells."""
+        """At least one velocity, and at most `MOST_MODES`; a step in proportion to them and to the cells."""
         super().check(key, root)
         if self.spacing > self.speed:
             raise refuse(f"{key}.spacing", self.spacing, f"at most {key}.speed={self.speed:g}")
         levels = 2 * self.speed / self.spacing + 1
         if (modes := levels * levels) > MOST_MODES:  # not **, which raises where it overflows
             expected = (
-                f"more: with {key}.speed={self.speed:g} these are {modes:,.0f} velocities, {MOST_MODES:,} at most"
+                f"more: with {key}.speed={self.speed:g} these are {modes:,.0f} velocities, "
+                f"{MOST_MODES:,} at most"
             )
             raise refuse(f"{key}.spacing", self.spacing, expected)
         for name, ratio, of in (
@@ -135,26 +157,34 @@ class CoordinatedTurnConfig(VelocityConfig):
     """As constant_velocity, but the target turns left, right or not at all; turn and velocity are the mode."""
 
     turn_rate: float = option("how fast it turns", unit="degrees/s", gt=0, le=180)
-    stay: float = option("probability of going on as it turns; else the other two are as likely", ge=0, le=1)
+    stay: float = option(
+        "probability of going on as it turns; else the other two are as likely", ge=0, le=1
+    )
 
 
 def _regime(key: str, entry: Any, root: Any) -> dict[str, Any]:
-    """One regime with all its options, checked; what is not given is as in `conf/`.
+    """One regime with all its options, checked; defaults are those of `conf/`.
 
     Raises:
         UserError: there is no such kernel of cells, or an option is not allowed.
     """
     if isinstance(entry, str) and Path(entry).suffix in (".npy", ".npz", ".csv"):
         entry = {"kernel": "table", "path": entry}
-    known = [name for name, schema in GROUPS["kernel"].items() if schema.is_motion and not schema.hides]
+    known = [
+        name for name, schema in GROUPS["kernel"].items() if schema.is_motion and not schema.hides
+    ]
     if not isinstance(entry, dict) or "kernel" not in entry:
-        raise refuse(key, entry, "{kernel: NAME, OPTION: VALUE, ...}, or a path to a .npy, .npz or .csv file")
+        raise refuse(
+            key, entry, "{kernel: NAME, OPTION: VALUE, ...}, or a path to a .npy, .npz or .csv file"
+        )
     given = dict(entry)
     if (name := given.pop("kernel")) not in known:
         raise refuse(f"{key}.kernel", name, f"one of {', '.join(known)}")
-    values, schema = choice_values("kernel", name, {}), options(GROUPS["kernel"][name])
+    values, schema = choice_values("kernel", name), options(GROUPS["kernel"][name])
     if unknown := [each for each in given if each not in schema]:
-        beside = {f"{key}.{each}": item for each, item in schema.items() if isinstance(item, Option)}
+        beside = {
+            f"{key}.{each}": item for each, item in schema.items() if isinstance(item, Option)
+        }
         raise unknown_option(f"{key}.{unknown[0]}", beside)
     plain = resolved(values | given, schema, f"{key}.")
     node = GROUPS["kernel"][name](**{option: plain[option] for option in schema})

@@ -1,6 +1,6 @@
-"""What an option is, a dataclass field with its help, unit and range and no value, and what every schema has.
+"""Options: dataclass fields with help, unit and range and without a value; the base of every schema; groups of choices.
 
-Values live in `conf/*.yaml` only; types, units and ranges live in the dataclasses of this package only.
+Values are in `conf/*.yaml` alone, types, units and ranges in the dataclasses of this package alone.
 """
 
 from __future__ import annotations
@@ -8,10 +8,12 @@ from __future__ import annotations
 import dataclasses
 import re
 import sys
+import textwrap
 import types
 import typing
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import Field, dataclass
+from functools import cache
 from typing import Any, ClassVar, TypeVar, dataclass_transform
 
 from trackmdp.errors import UserError
@@ -19,24 +21,14 @@ from trackmdp.errors import UserError
 _T = TypeVar("_T")
 
 GROUPS: dict[str, dict[str, type[Any]]] = {}
-"""Group -> option of the group -> its dataclass, for example ``GROUPS["kernel"]["drift"]``."""
+"""Group -> choice -> its schema, for example ``GROUPS["kernel"]["drift"]``."""
 
-SELECTORS: dict[str, Selector] = {}
-"""Name -> a group without options of its own, which only picks among those of another one."""
-
-_KINDS: dict[Any, str] = {int: "an integer", float: "a number", bool: "true or false", str: "a text"}
-
-
-@dataclass(frozen=True)
-class Selector:
-    """Picks, for some choices of `group`, which of its options they stand for; `choices` come with their help.
-
-    Each option of the group has the choice that it stands for under the selector's name.
-    """
-
-    group: str
-    about: str
-    choices: dict[str, str]
+_KINDS: dict[Any, str] = {
+    int: "an integer",
+    float: "a number",
+    bool: "true or false",
+    str: "a text",
+}
 
 
 @dataclass(frozen=True)
@@ -44,16 +36,16 @@ class Option:
     """Help, unit and allowed values of one field.
 
     Attributes:
-        help: what it is, in a few words.
+        help: meaning, in a few words.
         unit: unit of the value, shown in brackets.
-        ge, gt, le, lt: limits of the value.
+        ge, gt, le, lt: limits of the value; of a list, of its elements.
         choices: the words allowed, for a text.
-        expects: says in words what is allowed where type and range cannot.
+        expects: the allowed values in words, where type and range are not enough.
         pattern: regular expression that a text must match as a whole.
-        path: a text is a path, relative to where the command is typed.
-        words: texts that are no path although others are.
+        path: a text is a path, relative to the current folder of the command.
+        words: texts of such an option that are no path.
         pair: a whole number, or a list of two; the field's type is ``Any``, as OmegaConf has no such union.
-        kind: its type, and `nullable` whether null is allowed: `options` reads both off the field's annotation.
+        kind: type, and `nullable` whether null is allowed: `options` reads both off the annotation of the field.
     """
 
     help: str
@@ -62,7 +54,7 @@ class Option:
     gt: float | None = None
     le: float | None = None
     lt: float | None = None
-    choices: tuple[str, ...] = ()
+    choices: Collection[str] = dataclasses.field(default=(), hash=False)
     expects: str = ""
     pattern: str = ""
     path: bool = False
@@ -73,8 +65,10 @@ class Option:
 
     @property
     def expected(self) -> str:
-        """What a value must be, in words: ``an integer from 3 to 64 (cells)``."""
-        words = self.expects or (f"one of {', '.join(self.choices)}" if self.choices else self._kind_in_range())
+        """The allowed values in words: ``an integer from 3 to 64 (cells)``."""
+        words = self.expects
+        if not words:
+            words = f"one of {', '.join(self.choices)}" if self.choices else self._range()
         words = f"a list, each {words}" if self._element else words
         words += ", or a pair of them" if self.pair else ""
         words += " or null" if self.nullable else ""
@@ -84,15 +78,15 @@ class Option:
         """Whether `value` has the right type and lies in the range."""
         if value is None:
             return self.nullable
-        if isinstance(value, dict):  # groups are mappings, options never; what an option holds may be of any kind
+        if isinstance(value, dict):  # a group, never an option
             return False
         if self._element:
-            return isinstance(value, list) and len(value) > 0 and all(map(self._element.allows, value))
+            return isinstance(value, list) and bool(value) and all(map(self._element.allows, value))
         if self.pair and isinstance(value, (list, tuple)):
-            return len(value) == 2 and all(map(dataclasses.replace(self, pair=False).allows, value))
-        # `cost.reward=10` is a number to whoever types it, but an int to YAML. `True` is an int to Python,
-        # and no number.
-        if self.kind is float and isinstance(value, int) and not isinstance(value, bool):
+            one = dataclasses.replace(self, pair=False)
+            return len(value) == 2 and all(map(one.allows, value))
+        # `cost.reward=10` is an integer to YAML.
+        if self.kind is float and type(value) is int:
             value = as_float(value)
         # `type`, not isinstance: True would pass as the integer 1.
         if self.kind in _KINDS and type(value) is not self.kind:
@@ -105,17 +99,13 @@ class Option:
 
     @property
     def _element(self) -> Option | None:
-        """What the elements must be, if this is a list."""
+        """The option of each element, if this is a list."""
         if typing.get_origin(self.kind) is not list:
             return None
-        # Range and choices of a list are those of its elements: list[int] with ge=1 holds positive
-        # integers.
         return dataclasses.replace(self, kind=typing.get_args(self.kind)[0], nullable=False)
 
     def _in_range(self, value: float) -> bool:
-        # Without this an option that has no upper bound would let .inf pass, and one that has no bound at
-        # all .nan: YAML has words for both.
-        # An integer may have more digits than a float can hold: isfinite would raise, comparisons are exact.
+        # YAML has words for infinite numbers and for nan. isfinite raises at integers of more digits than a float has.
         return abs(value) <= sys.float_info.max and (
             (self.ge is None or value >= self.ge)
             and (self.gt is None or value > self.gt)
@@ -123,18 +113,34 @@ class Option:
             and (self.lt is None or value < self.lt)
         )
 
-    def _kind_in_range(self) -> str:
-        kind = _KINDS.get(self._element.kind if self._element else self.kind, str(self.kind))
+    def _range(self) -> str:
+        kind = self._element.kind if self._element else self.kind
+        words = _KINDS.get(kind, str(kind))
         if self.ge is not None and self.le is not None:
-            return f"{kind} from {_told(self.ge)} to {_told(self.le)}"
-        signs = ((">=", self.ge), (">", self.gt), ("<=", self.le), ("<", self.lt))
-        limits = [f"{sign} {_told(limit)}" for sign, limit in signs if limit is not None]
-        return " ".join([kind, " and ".join(limits)]).strip()
+            return f"{words} from {_typed(self.ge)} to {_typed(self.le)}"
+        signs = {">=": self.ge, ">": self.gt, "<=": self.le, "<": self.lt}
+        limits = (f"{sign} {_typed(limit)}" for sign, limit in signs.items() if limit is not None)
+        return f"{words} {' and '.join(limits)}".strip()
 
 
-def _told(limit: float) -> str:
-    """A limit as one would type it: 1e6, not 1e+06."""
+def _typed(limit: float) -> str:
+    """A limit in the form of the command line: 1e6, not 1e+06."""
     return re.sub(r"e\+0*", "e", f"{limit:g}")
+
+
+@dataclass(frozen=True)
+class Node:
+    """A nested config.
+
+    Attributes:
+        schema: its dataclass; of a group the base of the choices.
+        optional: whether it may be null.
+        several: whether any number of choices may be made, as in ``log=[csv,mcap]``.
+    """
+
+    schema: type[Any]
+    optional: bool
+    several: bool
 
 
 def option(help: str, **described: Any) -> Any:
@@ -143,7 +149,7 @@ def option(help: str, **described: Any) -> Any:
 
 
 def nested(help: str) -> Any:
-    """A dataclass field that is a config of its own, with what `--help` says above its options."""
+    """A dataclass field that is a config of its own, with a line for `--help` above its options."""
     return dataclasses.field(metadata={"nested": help})
 
 
@@ -153,7 +159,7 @@ BYTES = {"float32": 4, "int64": 8, "float64": 8, "int16": 2, "bool": 1}
 
 @dataclass(frozen=True)
 class Sizes:
-    """What `needs` may know of a task, as `trackmdp.world.model.Task` has it.
+    """The sizes of a task that `needs` may use, as `trackmdp.world.model.Task` has them.
 
     Attributes:
         num_cells: M.
@@ -164,7 +170,6 @@ class Sizes:
         keyed: whether a key is more than the cell.
         order: detections before the last one that are remembered.
         markov: whether moves of different paths combine.
-        pair_bytes: that exact evaluation over pairs of a key and a mode takes; 0 where there is none.
     """
 
     num_cells: int
@@ -175,14 +180,13 @@ class Sizes:
     keyed: bool
     order: int
     markov: bool
-    pair_bytes: int
 
 
 @dataclass_transform(kw_only_default=True, field_specifiers=(option, nested))
 class NodeConfig:
-    """Base of every schema, each a dataclass with keywords only, whose decorator it need not have.
+    """Base of every schema. Each subclass becomes a dataclass with keywords only, without a decorator.
 
-    A rule on one option is its `option(...)`; what concerns several is said here.
+    A rule on one option is in its `option(...)`, a rule on several in `check`.
     """
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
@@ -191,96 +195,99 @@ class NodeConfig:
         dataclass(kw_only=True)(cls)
 
     def check(self, key: str, root: Any) -> None:
-        """Look after the rules between options of this node, and between them and those of the whole config.
+        """Check the rules between options of this node, and between them and the rest of the config.
 
         Args:
-            key: where the node stands, such as ``algo``; what is refused is named ``{key}.{option}``.
-            root: the config of the command; its values have passed their own checks.
+            key: of the node, such as ``algo``; messages name ``{key}.{option}``.
+            root: the config of the command; its values are in range.
 
         Raises:
             UserError: a rule is broken.
         """
 
     def ignored(self, root: Any) -> dict[str, str]:
-        """Options of this node without effect on this config, and why: ``{"alpha": "with algo.prioritized..."}``.
+        """Options of this node without effect on this config, and the reason: ``{"alpha": "with ...enabled=false"}``.
 
-        They are refused where they were typed (`trackmdp.config.checks`).
+        They are refused if typed (`trackmdp.config.checks`).
         """
         return {}
 
     def needs(self, task: Sizes, root: Any) -> dict[str, int]:
-        """Bytes that a run needs for what this node asks for, by the dotted option that they grow with."""
+        """Bytes that a run needs for this node, by the dotted option that they grow with."""
         return {}
 
 
 class ChoiceConfig(NodeConfig):
-    """Base of the config groups; `choice` gives each member its name and what it makes."""
+    """Base of the config groups; `choice` gives each member its name and its maker."""
 
     name: ClassVar[str]
     makes: ClassVar[str]
 
 
-def options(schema: type[Any]) -> dict[str, Option | type[Any]]:
-    """Fields of a schema in order: an `Option` for a value, the dataclass (or group base) for a nested config.
+def options(schema: type[Any]) -> dict[str, Option | Node]:
+    """Fields of a schema in order: an `Option` for a value, a `Node` for a nested config."""
+    return _fields(typing.cast(Any, schema))  # a class has a hash, which mypy does not know
 
-    A group of which any number of choices may be made is a ``dict[str, Base]`` and found as its ``Base``; `several`
-    tells it from the others.
-    """
-    # `from __future__ import annotations` leaves the annotations as text; this evaluates them.
+
+@cache  # half of composing
+def _fields(schema: Any) -> dict[str, Option | Node]:
+    # The annotations are texts (`from __future__ import annotations`).
     hints = typing.get_type_hints(schema)
-    found: dict[str, Option | type[Any]] = {}
+    found: dict[str, Option | Node] = {}
     for field in dataclasses.fields(schema):
-        kind, nullable = _strip_none(hints[field.name])
-        kind = _element_of(kind) or kind
+        kind, nullable = _without_none(hints[field.name])
+        several = typing.get_origin(kind) is dict and typing.get_args(kind)[1]
         described = field.metadata.get("option")
-        if dataclasses.is_dataclass(kind) and isinstance(kind, type):
-            found[field.name] = kind
+        if dataclasses.is_dataclass(several or kind):
+            found[field.name] = Node(several or kind, nullable, bool(several))
         elif isinstance(described, Option):
             kind = int if described.pair else kind
             found[field.name] = dataclasses.replace(described, kind=kind, nullable=nullable)
         else:
-            raise TypeError(f"{schema.__name__}.{field.name} is neither option(...) nor a nested config")
+            raise TypeError(
+                f"{schema.__name__}.{field.name} is neither option(...) nor a nested config"
+            )
     return found
 
 
-def optional(schema: type[Any], name: str) -> bool:
-    """Whether the field `name`, a choice or a nested config, may be null."""
-    return _strip_none(typing.get_type_hints(schema).get(name))[1]
+def _without_none(hint: Any) -> tuple[Any, bool]:
+    """``int | None`` -> (int, True)."""
+    if typing.get_origin(hint) is not types.UnionType:
+        return hint, False
+    rest = [part for part in typing.get_args(hint) if part is not types.NoneType]
+    return (rest[0], True) if len(rest) == 1 else (hint, False)
 
 
 def several(schema: type[Any], name: str) -> bool:
     """Whether any number of choices may be made of the group `name`: ``log=[csv,mcap]``, none by ``log=[]``."""
-    return _element_of(_strip_none(typing.get_type_hints(schema).get(name))[0]) is not None
+    item = options(schema).get(name)
+    return isinstance(item, Node) and item.several
 
 
-def choice(group: str, name: str, *, makes: str) -> typing.Callable[[type[_T]], type[_T]]:
-    """Class decorator: make a dataclass the choice `name` of a config group.
+def choice(group: str, name: str, *, makes: str) -> Callable[[type[_T]], type[_T]]:
+    """Class decorator: make a schema the choice `name` of a config group.
 
     Args:
         group: ``kernel``, ``algo``, ``solver``, ...
-        name: what is typed: ``kernel=name``.
-        makes: ``module:attribute`` of what the choice stands for; imported when it is first made
-            (`trackmdp.config.registry.maker`), so that a schema loads neither torch nor scipy.
+        name: as typed: ``kernel=name``.
+        makes: ``module:attribute`` of the code; imported when it is first used (`trackmdp.config.registry.maker`), so
+            that a schema loads neither torch nor scipy.
 
     Raises:
         UserError: another schema has this name.
     """
 
     def register(schema: type[_T]) -> type[_T]:
-        # setdefault keeps the first comer, so that a plugin cannot replace a choice by registering its name
-        # once more; registering the very same class twice (a module imported again) does no harm.
+        # The first comer stays: a plugin replaces no choice. The same class twice is a module imported again.
         known = GROUPS.setdefault(group, {}).setdefault(name, schema)
         if known is not schema:
-            raise UserError(f"{group}={name}: offered by {known.__module__} and by {schema.__module__}")
+            raise UserError(
+                f"{group}={name}: offered by {known.__module__} and by {schema.__module__}"
+            )
         schema.name, schema.makes = name, makes  # type: ignore[attr-defined]
         return schema
 
     return register
-
-
-def choices_of(group: str) -> typing.Iterable[str]:
-    """The names that may be chosen from a group or by a selector."""
-    return SELECTORS[group].choices if group in SELECTORS else GROUPS[group]
 
 
 def nodes(cfg: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -288,47 +295,49 @@ def nodes(cfg: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
     yield prefix, cfg
     for name, value in vars(cfg).items():
         # A group of several holds a dict of its choices: log.csv, log.mcap.
-        inner = {f"{name}.{each}": node for each, node in value.items()} if isinstance(value, dict) else {name: value}
-        for key, node in inner.items():
+        inner = value if isinstance(value, dict) else {"": value}
+        for each, node in inner.items():
             if dataclasses.is_dataclass(node):
-                yield from nodes(node, f"{prefix}.{key}".lstrip("."))
+                yield from nodes(node, f"{prefix}.{name}.{each}".strip("."))
 
 
 def leaves(cfg: Any, prefix: str = "") -> Iterator[tuple[str, Option, Any]]:
     """Every option of a config with its dotted key and its value."""
     for key, node in nodes(cfg, prefix):
-        for name, described in options(type(node)).items():
-            if isinstance(described, Option):
-                yield f"{key}.{name}".lstrip("."), described, vars(node)[name]
+        for name, item in options(type(node)).items():
+            if isinstance(item, Option):
+                yield f"{key}.{name}".lstrip("."), item, vars(node)[name]
 
 
 def as_float(value: int) -> float:
-    """An integer given for a number; one beyond the largest float stays as it is, and is refused for its type."""
+    """An integer given for a number; one beyond the largest float stays, and is refused for its type."""
     return float(value) if abs(value) <= sys.float_info.max else value
 
 
 def refuse(key: str, value: object, expected: str) -> UserError:
     """The error for a value that is not allowed."""
-    return UserError(f"{key}={'null' if value is None else value}: expected {expected}")
+    number = "number" in expected or "integer" in expected
+    if number and isinstance(value, str) and is_number(value):
+        # `seed=4: expected an integer` would contradict itself; from the environment comes text.
+        how = "${oc.decode:${oc.env:NAME}}"
+        return UserError(
+            f"{key}: the text '{value}', expected {expected} (from the environment: {how})"
+        )
+    text = "null" if value is None else " ".join(str(value).split())
+    return UserError(
+        f"{key}={textwrap.shorten(text, 200, placeholder=' ...')}: expected {expected}"
+    )
 
 
-def listed(names: typing.Iterable[str]) -> str:
-    """Choices as they are typed: ``[csv,mcap]``."""
+def is_number(text: str) -> bool:
+    """Whether a text reads as a number."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def listed(names: Iterable[str]) -> str:
+    """Choices in the form of the command line: ``[csv,mcap]``."""
     return f"[{','.join(names)}]"
-
-
-def _element_of(kind: Any) -> type[Any] | None:
-    """What each of ``dict[str, Base]`` is: ``Base``; None for any other type."""
-    if typing.get_origin(kind) is not dict:
-        return None
-    element = typing.get_args(kind)[1]
-    return element if isinstance(element, type) and dataclasses.is_dataclass(element) else None
-
-
-def _strip_none(hint: Any) -> tuple[Any, bool]:
-    # `Optional[int]` has the origin typing.Union, `int | None` has types.UnionType.
-    if typing.get_origin(hint) in (typing.Union, types.UnionType):
-        rest = [part for part in typing.get_args(hint) if part is not type(None)]
-        if len(rest) == 1:
-            return rest[0], True
-    return hint, False

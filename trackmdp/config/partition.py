@@ -13,7 +13,7 @@ class PartitionConfig(NodeConfig):
 
     block: int | None = option("side of a block; null = the whole grid is one", unit="cells", ge=1)
     halo: int | None = option(
-        "cells around its own that a block knows of; null = R (T_max + 2), R the reach of a move, which loses nothing",
+        "cells around its own that a block includes; null = R (T_max + 2), R the reach of a move, which loses nothing",
         unit="cells",
         ge=0,
     )
@@ -37,7 +37,9 @@ class PartitionConfig(NodeConfig):
         if not root.kernel.is_motion or root.kernel.hides:
             raise refuse(f"{key}.block", self.block, f"null with kernel={root.kernel.name}")
         if [*root.log] not in ([], ["csv"]):
-            raise refuse("log", listed(root.log), f"[csv] with {key}.block: each block has a log of its own")
+            raise refuse(
+                "log", listed(root.log), f"[csv] with {key}.block: each block has a log of its own"
+            )
         if root.init_from is not None:
             raise refuse("init_from", root.init_from, f"null with {key}.block")
 

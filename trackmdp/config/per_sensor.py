@@ -4,45 +4,59 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-from trackmdp.config.learning import ENTROPY, LEARNING_RATE, EveryTaskConfig, ScheduleConfig, check_classes, networks
-from trackmdp.config.options import BYTES, SELECTORS, Selector, Sizes, choice, nested, option, refuse
-
-SELECTORS["credit"] = Selector(
-    group="algo",
-    about="what a2c, ppo and dqn learn from; hindsight and learned_kernel have a credit of their own",
-    choices={
-        "joint": "the reward of the whole set of sensors, as in the paper",
-        "per_sensor": "what each sensor gains on fully sensed paths, as in hindsight",
-    },
+from trackmdp.config.learning import (
+    ENTROPY,
+    LEARNING_RATE,
+    EveryTaskConfig,
+    ScheduleConfig,
+    check_classes,
+    networks,
+)
+from trackmdp.config.options import (
+    BYTES,
+    Sizes,
+    choice,
+    nested,
+    option,
+    refuse,
 )
 
 
 class PerSensorConfig(EveryTaskConfig):
-    """What the algorithms with a credit per sensor have in common.
+    """Common options of the algorithms with a credit per sensor.
 
     `explore`, read with `collect=mixed`: the probability of sensing everything where the target is located, in the
     course of the frames. Learning starts where it begins to change.
     """
 
-    credit: ClassVar[str | None] = "per_sensor"
     effort: ClassVar[float] = 1.0
     collect: str = option(
         "all sensors on; or mixed with the policy learned so far, which costs less and shows less",
         choices=("all_on", "mixed"),
     )
-    explore: ScheduleConfig = nested("with collect=mixed, share of the steps in which all sensors are on")
-    gamma: float = option("discount inside the credit; policies are evaluated undiscounted", ge=0, lt=1)
+    explore: ScheduleConfig = nested(
+        "with collect=mixed, share of the steps in which all sensors are on"
+    )
+    gamma: float = option(
+        "discount inside the credit; policies are evaluated undiscounted", ge=0, lt=1
+    )
     learning_rate: ScheduleConfig = nested(LEARNING_RATE)
     blend: ScheduleConfig = nested(
-        "λ, how much the gain of a detection counts by what the policy itself earns after a miss; the rest by the "
+        "λ, weight of the reward of the policy itself after a miss in the gain of a detection; the rest is the "
         "clocked bound, which is optimistic"
     )
-    ema_decay: float = option("decay of the exponential moving average of the actor, which is evaluated", ge=0, lt=1)
+    ema_decay: float = option(
+        "decay of the exponential moving average of the actor, which is evaluated", ge=0, lt=1
+    )
     batch_size: int = option("path segments per update", unit="segments", ge=1)
     updates: int | None = option(
-        "updates of the whole run; null: by the size of the problem, and few where exchange follows", ge=1, le=10**9
+        "updates of the whole run; null: by the size of the problem",
+        ge=1,
+        le=10**9,
     )
-    updates_per_iteration: int = option("updates from one evaluation, log row or checkpoint to the next at most", ge=1)
+    updates_per_iteration: int = option(
+        "updates from one evaluation, log row or checkpoint to the next at most", ge=1
+    )
     hidden: int | None = option(
         "units of each net's hidden layer, 0 = plain tables without one; null: by the size of the problem, from 4,097 "
         "cells on tables",
@@ -52,16 +66,15 @@ class PerSensorConfig(EveryTaskConfig):
     )
     buffer_size: int = option("path segments kept for replay", unit="segments", ge=1)
     share_cells: str = option(
-        "assume that the target moves alike from all cells, or from those of one class, and learn one policy for those "
-        "whose surroundings are alike; with one price for all sensors",
+        "assume that the target moves alike from all cells, or from those of one class, and learn one policy for all "
+        "with the same surroundings; with one price for all sensors",
         expects="all, none, or a path to a .npy, .npz or .csv file of the class of each cell",
         path=True,
         words=("all", "none"),
     )
     exchange: bool = option(
-        "at the end, change learned sets jointly where the sensed moves, counted, say that it pays (with collect=mixed "
-        "in the policy that collects, too); with kernel.markov=false and collect=all_on, where a quarter of the "
-        "recordings, kept from learning, says so"
+        "where the next move does not depend on the cell alone, with collect=all_on: at the end, change learned sets "
+        "jointly where it pays on a quarter of the sensed paths, kept from learning"
     )
     max_entries: int = option(
         "entries (located cell, misses, sensor) of the losses' tables at once; larger ones are gone through in parts",
@@ -70,42 +83,33 @@ class PerSensorConfig(EveryTaskConfig):
     )
 
     def check(self, key: str, root: Any) -> None:
-        """`explore` is a probability; where whole paths are learned from, episodes have room for one."""
+        """`explore` is a probability."""
         check_classes(f"{key}.share_cells", self)
         for end in ("start", "end"):
             if (probability := getattr(self.explore, end)) > 1:
-                raise refuse(f"{key}.explore.{end}", probability, "a number from 0 to 1, a probability")
-        # Tracks of t_max + 3 cells or more, which is what null asks for, are all cut off by a smaller limit.
-        kernel, limit, path = root.kernel, root.grid.max_steps, root.grid.t_max + 2
-        if not (getattr(kernel, "markov", True) or kernel.min_length) and limit is not None and limit < path:
-            expected = f"at least grid.t_max + 2 = {path} with kernel.markov=false, a whole path of a policy"
-            raise refuse("grid.max_steps", limit, expected)
-        if root.task.memory != "cell":
-            self._check_memory(key, root)
-
-    def _check_memory(self, key: str, root: Any) -> None:
-        """A policy that remembers detections is replayed on paths that were sensed from end to end."""
-        remembered = f"task.memory={root.task.memory}"
-        if self.collect != "all_on":
-            raise refuse(f"{key}.collect", self.collect, f"all_on with {remembered}")
-        if root.sensor.name != "perfect":
-            raise refuse("sensor", root.sensor.name, f"perfect with algo={self.name} and {remembered}")
+                raise refuse(
+                    f"{key}.explore.{end}", probability, "a number from 0 to 1, a probability"
+                )
 
     def ignored(self, root: Any) -> dict[str, str]:
         """All sensors on leave nothing to explore."""
         return {} if self.collect == "mixed" else {"explore": "with algo.collect=all_on"}
 
     def needs(self, task: Sizes, root: Any) -> dict[str, int]:
-        """The moves kept, with what sorting them takes; the paths of one update; the networks.
+        """The moves kept, and their sorting; the paths of one update; the networks.
 
-        A move is two cells of 16 bits. Where moves of different paths do not combine (`markov`), a third number says
-        which go on, paths of t_max + 3 cells, longer ones where a policy remembers detections, are kept as well, and
-        what is worked out of whole paths by exchange, for each detection that may be on them.
+        A move is two cells of 16 bits. Where moves of different paths do not combine (`markov`), a third number
+        marks the ones that go on; paths of t_max + 3 cells, longer ones where a policy remembers detections, are kept
+        as well, and the results of exchange on whole paths, for each detection that may be on them.
         """
-        length = task.t_max + 3 + (2 * (task.order + 2) * (task.t_max + 2) - 2 if task.order else 0)
+        length = (
+            task.t_max + 3 + (0 if task.markov else 2 * (task.order + 2) * (task.t_max + 2) - 2)
+        )
         moves = min(self.buffer_size, root.collector.total_frames)
         whole, events = self.exchange * (task.t_max + 2) * 12, (task.t_max + 3) ** task.order
-        cells, numbers = (2, 5) if task.markov and not task.order else (length + 3, 8 + whole * events)
+        cells, numbers = (
+            (2, 5) if task.markov and not task.order else (length + 3, 8 + whole * events)
+        )
         return {
             "algo.buffer_size": moves * (cells * BYTES["int16"] + numbers * BYTES["int64"]),
             # Each cell of a path, and about five numbers that are gathered for it.
@@ -116,11 +120,11 @@ class PerSensorConfig(EveryTaskConfig):
 
 @choice("algo", "hindsight", makes="trackmdp.algos.hindsight:Hindsight")
 class HindsightConfig(PerSensorConfig):
-    """Collect with all sensors on, then learn from those paths what any policy would have found and missed on them."""
+    """Collect with all sensors on, then learn on those paths from the detections and misses of every policy."""
 
 
 class PolicyGradientConfig(PerSensorConfig):
-    """What A2C and PPO with a credit per sensor have in common."""
+    """Common options of A2C and PPO with a credit per sensor."""
 
     effort: ClassVar[float] = 1.6
     entropy: ScheduleConfig = nested(ENTROPY)
@@ -128,20 +132,23 @@ class PolicyGradientConfig(PerSensorConfig):
 
 @choice("algo", "a2c_per_sensor", makes="trackmdp.algos.per_sensor:PerSensorA2C")
 class A2cPerSensorConfig(PolicyGradientConfig):
-    """Hindsight with the policy gradient of A2C, over both actions of every sensor (algo=a2c credit=per_sensor)."""
+    """Hindsight with the policy gradient of A2C, over both actions of every sensor."""
 
 
 @choice("algo", "ppo_per_sensor", makes="trackmdp.algos.per_sensor:PerSensorPPO")
 class PpoPerSensorConfig(PolicyGradientConfig):
-    """Hindsight with the clipped surrogate of PPO, per sensor (algo=ppo credit=per_sensor)."""
+    """Hindsight with the clipped surrogate of PPO, per sensor."""
 
     clip_epsilon: float = option("how far a sensor's probability ratio may leave 1", gt=0, lt=1)
-    minibatches: int = option("parts of a batch: updates until the old policy of the ratio is renewed", ge=1)
+    minibatches: int = option(
+        "parts of a batch: updates until the old policy of the ratio is renewed", ge=1
+    )
     surrogate: str = option(
-        "over both actions of every sensor, or over sets drawn from the old policy", choices=("all_action", "sampled")
+        "over both actions of every sensor, or over sets drawn from the old policy",
+        choices=("all_action", "sampled"),
     )
 
 
 @choice("algo", "dqn_per_sensor", makes="trackmdp.algos.per_sensor:PerSensorDQN")
 class DqnPerSensorConfig(PerSensorConfig):
-    """Hindsight with a Q that adds up over the sensors, for DQN (algo=dqn credit=per_sensor)."""
+    """Hindsight with a Q that adds up over the sensors, for DQN."""

@@ -1,11 +1,10 @@
-"""Schema of each command: what can be set for it."""
+"""Schema of each command."""
 
 from __future__ import annotations
 
 from typing import Any, ClassVar
 
-from trackmdp.cluster import ADDRESS
-from trackmdp.config import counting, modes, per_sensor, sweeping  # noqa: F401  (more to choose from)
+from trackmdp.config import counting, given, modes, per_sensor, sweeping  # noqa: F401  (more to choose from)
 from trackmdp.config.baselines import BaselineConfig
 from trackmdp.config.learning import DEVICE, AlgoConfig, CollectorConfig
 from trackmdp.config.loggers import LogConfig
@@ -17,18 +16,18 @@ from trackmdp.errors import UserError
 
 
 class CommandConfig(NodeConfig):
-    """What every command has."""
+    """Common options of all commands."""
 
     learns: ClassVar[bool] = False
-    quiet: bool = option("say nothing at the terminal but errors")
+    quiet: bool = option("print nothing but errors")
 
 
 class WorldConfig(CommandConfig):
-    """What every command has that takes place in a world."""
+    """Common options of the commands in a world."""
 
     needs_motion: ClassVar[bool] = True
-    knows_modes: ClassVar[bool] = True
-    """Whether the target may have a hidden mode."""
+    all_prices: ClassVar[bool] = False
+    """Whether the command sets the prices of sensors itself; those given are then ratios."""
     grid: GridConfig
     kernel: KernelConfig
     cost: CostConfig
@@ -36,7 +35,7 @@ class WorldConfig(CommandConfig):
 
     @property
     def remembered(self) -> dict[str, Any]:
-        """What policies remember, as arguments of `Task`: the cell, where the command has no options of it."""
+        """Memory of policies, as arguments of `Task`; the cell, where the command has no options of it."""
         task: TaskConfig | None = getattr(self, "task", None)
         return {} if task is None else {"memory": task.memory, "clip": task.clip}
 
@@ -53,7 +52,9 @@ class OptimalBoundConfig(NodeConfig):
     enabled: bool = option("solve for the optimum at the end")
     nodes: int = option("choices of branch and bound after which solving stops", unit="nodes", ge=1)
     time_limit: float | None = option(
-        "stop after this long even so; regrets then depend on the machine, and say so; null = never", unit="s", gt=0
+        "stop after this time even so; regrets then depend on the machine, and the output names it; null = never",
+        unit="s",
+        gt=0,
     )
 
 
@@ -79,7 +80,9 @@ class TrainConfig(WorldConfig):
     needs_motion: ClassVar[bool] = False
     learns: ClassVar[bool] = True
     seed: int = option("every random draw of the run derives from it", ge=0)
-    device: str = option("device the networks live on", expects="cpu, cuda, cuda:N or auto", pattern=DEVICE)
+    device: str = option(
+        "device the networks live on", expects="cpu, cuda, cuda:N or auto", pattern=DEVICE
+    )
     threads: int = option("torch threads of the learning process", unit="threads", ge=1, le=256)
     task: TaskConfig
     algo: AlgoConfig
@@ -96,7 +99,9 @@ class TrainConfig(WorldConfig):
         words=("auto",),
     )
     init_from: str | None = option(
-        "start from the weights of another run, where shapes fit", expects="the folder of a run", path=True
+        "start from the weights of another run, where shapes fit",
+        expects="the folder of a run",
+        path=True,
     )
 
 
@@ -106,12 +111,16 @@ class EvaluateConfig(WorldConfig):
     needs_motion: ClassVar[bool] = False
     task: TaskConfig
     run: str | None = option(
-        "folder of a training run; its world is taken from there", expects="the folder of a run", path=True
+        "folder of a training run; its world is taken from there",
+        expects="the folder of a run",
+        path=True,
     )
     baseline: BaselineConfig | None
     log: dict[str, LogConfig]
     seed: int = option("seed of the simulated episodes", ge=0)
-    device: str = option("device of the simulation", expects="cpu, cuda, cuda:N or auto", pattern=DEVICE)
+    device: str = option(
+        "device of the simulation", expects="cpu, cuda, cuda:N or auto", pattern=DEVICE
+    )
     threads: int = option("torch threads", unit="threads", ge=1, le=256)
     episodes: int = option("episodes simulated; 0 = exact figures only", unit="episodes", ge=0)
 
@@ -125,6 +134,28 @@ class EvaluateConfig(WorldConfig):
             raise refuse("log", listed(self.log), "[mcap] or []; an evaluation has no iterations")
 
 
+class CompareConfig(WorldConfig):
+    """Policies side by side on one problem: the one of the first run, else the world of the options."""
+
+    needs_motion: ClassVar[bool] = False
+    task: TaskConfig
+    runs: list[str] | None = option(
+        "folders of training runs; run=A run=B is the same as runs=[A,B]",
+        expects="the folder of a run",
+        path=True,
+    )
+    baselines: list[str] | None = option(
+        "policies that are not learned; baseline=A baseline=B is the same as baselines=[A,B]",
+        expects="a baseline of evaluate",
+    )
+
+    def check(self, key: str, root: Any) -> None:
+        """The baselines exist."""
+        for name in self.baselines or []:
+            if name not in GROUPS["baseline"]:
+                raise refuse("baseline", name, f"one of {', '.join(GROUPS['baseline'])}")
+
+
 class SolveConfig(WorldConfig):
     """Solve the world with its motion model."""
 
@@ -132,6 +163,31 @@ class SolveConfig(WorldConfig):
     solver: BaselineConfig
     partition: SweptPartitionConfig
     verify: bool = option("check the paper's theorems on this world as well")
+
+
+class FrontierConfig(WorldConfig):
+    """Accuracy against sensors per step, over all prices of a sensor: the best policies, with a proof.
+
+    D stays as it is, and its payments count; cost.safe=0 leaves them out.
+    """
+
+    all_prices: ClassVar[bool] = True
+    task: TaskConfig
+    solver: BaselineConfig
+    accuracy: float | None = option(
+        "show the policies that have this accuracy with the fewest sensors", ge=0, le=1
+    )
+    sensors: float | None = option(
+        "show the best policies with so many sensors", unit="sensors per step", ge=0
+    )
+    resolution: float = option(
+        "height above an edge below which no further corner is looked for, in accuracy", gt=0, lt=1
+    )
+
+    def check(self, key: str, root: Any) -> None:
+        """Whole episodes alone are solved."""
+        if self.grid.max_steps is not None:
+            raise refuse("grid.max_steps", self.grid.max_steps, "null: whole episodes are solved")
 
 
 class VerifyConfig(WorldConfig):
@@ -142,66 +198,33 @@ class VerifyConfig(WorldConfig):
     def check(self, key: str, root: Any) -> None:
         """The theorems are on sensors of one cell."""
         if self.sensor.covers:
-            raise refuse("sensor", self.sensor.name, "perfect or miss; the theorems are on sensors of one cell")
-
-
-_PARTS = ("env", "collector", "train", "size", "handoff", "memory", "peers", "log", "regret", "bracket", "workers")
-
-
-class BenchmarkConfig(WorldConfig):
-    """Measure time and memory on this machine; how good the policies are, sweeps and reports say."""
-
-    knows_modes: ClassVar[bool] = False
-    part: str = option("what is measured", choices=_PARTS)
-    seed: int = option("every random draw derives from it", ge=0)
-    device: str = option("device of environments and networks", expects="cpu, cuda, cuda:N or auto", pattern=DEVICE)
-    threads: int = option("torch threads", unit="threads", ge=1, le=256)
-    seconds: float = option("least time spent on each figure of speed", unit="s", gt=0)
-    batch_sizes: list[int] = option("`env`: environments stepped together", unit="environments", ge=1)
-    sizes: list[int] = option("`size`: sides of the grid", unit="cells", ge=3)
-    work: list[str] = option("`size`: kinds of work", choices=("solve", "train", "env"))
-    # Its own default budget: that of `hindsight` takes hours from N = 40 on, `learned_kernel`'s seconds.
-    learner: str = option("`size`: algorithm that trains, with its own budget", choices=tuple(GROUPS["algo"]))
-    blocks: list[int] = option("`handoff`, `workers`: sides of the blocks", unit="cells", ge=1)
-    halos: list[int] = option("`handoff`: cells around a block, besides the default", unit="cells", ge=0)
-    workers: list[int] = option(
-        "`workers`: of each row, to plan by blocks of the first of `blocks`", unit="processes", ge=1
-    )
-    cluster: str | None = option(
-        "`workers`: Ray cluster that they are of; null = no Ray",
-        expects="local, auto, or host:port",
-        pattern=f"local|{ADDRESS}",
-    )
-    # Evaluated while this module is imported, before plugins are: only this package's own algorithms.
-    algos: list[str] = option("`memory`: algorithms that train", choices=tuple(GROUPS["algo"]))
-    seeds: list[int] = option("`peers`, `regret`: seeds that all train with", ge=0)
-    worlds: list[str] | None = option("`regret`, `bracket`: words that a world's name holds; null for all worlds")
-    nodes: int = option("`regret`, `bracket`: choices that branch and bound looks at", unit="nodes", ge=1)
-    peers: str = option(
-        "`peers`: folder with the scripts <name>_peer.py to run beside ours",
-        expects="the folder of the scripts",
-        path=True,
-    )
-    peers_seconds: float = option("`peers`: how long a peer learns", unit="s", gt=0)
-
-    def check(self, key: str, root: Any) -> None:
-        """What the peers are made for."""
-        if self.part == "peers" and self.sensor.name != "perfect":
-            raise refuse("sensor", self.sensor.name, "perfect with part=peers, whose scripts know no other")
+            raise refuse(
+                "sensor",
+                self.sensor.name,
+                "perfect or miss; the theorems are on sensors of one cell",
+            )
 
 
 class ReplayConfig(CommandConfig):
-    """Look at logged episodes, prove them, rebuild a damaged log; without more than file=, list what it holds."""
+    """Look at logged episodes, prove them, rebuild a damaged log; with file= alone, list the episodes."""
 
     file: str = option("the log", expects="a file written with log=[mcap]", path=True)
-    episode: int | None = option("play this episode; for html= and csv= the one that is written", ge=0)
+    episode: int | None = option(
+        "play this episode; for html= and csv= the one that is written", ge=0
+    )
     verify: bool = option("re-simulate every episode and name the first difference")
-    recover: bool = option("write every whole episode of a cut or damaged log to a new one beside it")
+    recover: bool = option(
+        "write every whole episode of a cut or damaged log to a new one beside it"
+    )
     html: str | None = option(
-        "write one episode (by default the first) as a web page", expects="a file to write", path=True
+        "write one episode (by default the first) as a web page",
+        expects="a file to write",
+        path=True,
     )
     csv: str | None = option("write steps.csv and episodes.csv", expects="a folder", path=True)
-    layout: str | None = option("write the layout for viewers", expects="a file to write", path=True)
+    layout: str | None = option(
+        "write the layout for viewers", expects="a file to write", path=True
+    )
     speed: float = option("speed of playing", unit="steps/s", gt=0, le=1000)
 
 
@@ -209,14 +232,20 @@ class ReportConfig(CommandConfig):
     """Make figures, tables and one web page of a sweep, or watch it run."""
 
     sweep: str = option(
-        "folder of the sweep, or of stored results", expects="the folder of a sweep or an earlier report", path=True
+        "folder of the sweep, or of stored results",
+        expects="the folder of a sweep or an earlier report",
+        path=True,
     )
     watch: bool = option("show all runs live until they are done, instead of a report")
-    paper: bool | None = option("add what concerns the paper's settings; null = where the runs cover its twelve worlds")
-    threshold: float | None = option(
-        "count the runs that end at most this far from the bound", unit="reward/step", gt=0
+    paper: bool | None = option(
+        "add the sections on the paper; null = where the runs cover its twelve worlds"
     )
-    every: float = option("seconds from one look at the runs to the next, with watch=true", unit="s", gt=0, le=3600)
+    threshold: float | None = option(
+        "count the runs with a regret of at most this", unit="reward/step", gt=0
+    )
+    every: float = option(
+        "seconds from one look at the runs to the next, with watch=true", unit="s", gt=0, le=3600
+    )
 
 
 class ExportConfig(CommandConfig):
@@ -224,11 +253,13 @@ class ExportConfig(CommandConfig):
 
     run: str = option("folder of a training run", expects="the folder of a run", path=True)
     format: str = option(
-        "torch_export: policy.pt2, onnx: policy.onnx, sets: sets.json", choices=("torch_export", "onnx", "sets")
+        "onnx: policy.onnx, pt2: policy.pt2 for torch.export, sets: sets.json, geojson: cells on a map with value and "
+        "sensors",
+        choices=("onnx", "pt2", "sets", "geojson"),
     )
     checkpoint: str = option(
-        "which of the run's checkpoints; best = of the largest AIHTR: the oracle's choice, made with the motion no "
-        "learner knows, and with kernel=tracks the validation tracks'",
+        "newest checkpoint of the run, or best: of the largest AIHTR by the motion, which no learner knows, with "
+        "kernel=tracks on the validation tracks",
         choices=("newest", "best"),
     )
 
@@ -236,9 +267,10 @@ class ExportConfig(CommandConfig):
 ROOTS: dict[str, type[CommandConfig]] = {
     "train": TrainConfig,
     "evaluate": EvaluateConfig,
+    "compare": CompareConfig,
     "solve": SolveConfig,
+    "frontier": FrontierConfig,
     "verify": VerifyConfig,
-    "benchmark": BenchmarkConfig,
     "replay": ReplayConfig,
     "export": ExportConfig,
     "report": ReportConfig,

@@ -1,4 +1,4 @@
-"""Schema of what sensing costs, and what it shows of the target."""
+"""Schema of prices and sensors."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from trackmdp.config.world import GridConfig
 from trackmdp.errors import UserError
 
 LARGEST_PRICE = 1e15
-"""Of a price or a reward: sums of them over cells and steps, and squares of those in a loss, stay far from overflow."""
+"""Largest price or reward: sums over cells and steps, and their squares in a loss, stay far from overflow."""
 
 
 class CostConfig(ChoiceConfig):
-    """Base of the group `cost`: what sensing earns and costs.
+    """Base of the group `cost`: rewards and prices.
 
-    What a choice makes is called with the grid's size and the choice's options, and returns r, c `[M]` and D.
+    The code of a choice gets the size of the grid and the options of the choice, and returns r, c `[M]` and D.
     """
 
 
@@ -24,36 +24,71 @@ class CostConfig(ChoiceConfig):
 class PaperCostConfig(CostConfig):
     """The paper's rewards: r for a detection, c per sensor switched on, D for the safe action."""
 
-    reward: float = option("r, earned by a detection", unit="reward", ge=1 / LARGEST_PRICE, le=LARGEST_PRICE)
+    reward: float = option(
+        "r, earned by a detection", unit="reward", ge=1 / LARGEST_PRICE, le=LARGEST_PRICE
+    )
     sensor: Any = option(
         "c, price of one sensor switched on for one step, for all sensors or for each",
         unit="reward per sensor-step",
-        expects="a number from 0 to 1e15, a list of one per sensor, or a path to a .npy or .csv file of one per sensor",
+        expects="a number from 0 to 1e15, or one per sensor: a list (null = no sensor), or a path to a .npy, .npz or "
+        ".csv file (nan = no sensor)",
         path=True,
     )
     safe: float | None = option(
-        "D, price of the safe action; null = the sum of all sensors' prices", unit="reward", ge=0, le=LARGEST_PRICE
+        "D, price of the safe action; null = the sum of all sensors' prices",
+        unit="reward",
+        ge=0,
+        le=LARGEST_PRICE,
     )
 
     def check(self, key: str, root: Any) -> None:
         """One price for all sensors, or one for each; a file is read later."""
         price = Option("", ge=0, le=LARGEST_PRICE, kind=float)
         count, each = root.sensor.count(root.grid), "sensor" if root.sensor.covers else "cell"
-        _check_per_cell(f"{key}.sensor", self.sensor, count, price, "number from 0 to 1e15", each)
+        _check_per_cell(
+            f"{key}.sensor", self.sensor, count, price, "number from 0 to 1e15", each, some=True
+        )
+
+    def ignored(self, root: Any) -> dict[str, str]:
+        """One price for all sensors, where the command goes through all prices and D is given."""
+        one = isinstance(self.sensor, (int, float))
+        if root.all_prices and one and self.safe is not None:
+            return {"sensor": "where all prices are gone through, and cost.safe is given"}
+        return {}
 
 
 class SensorConfig(ChoiceConfig):
-    """Base of the group `sensor`: what a sensor that is on sees of the target in its cell.
+    """Base of the group `sensor`: detections of a sensor that is on.
 
-    What a choice makes is called with the grid's size and the choice's options, and returns arguments of `Task`.
+    The code of a choice gets the size of the grid and the options of the choice, and returns arguments of `Task`.
     """
 
     covers: ClassVar[bool] = False
     """Whether a sensor covers a set of cells, so that there need not be one in each cell."""
 
     def count(self, grid: GridConfig) -> int | None:
-        """S, how many sensors there are; None where only a file tells."""
+        """S, the number of sensors; None where it is in a file."""
         return grid.num_cells
+
+    def _check_solver(self, key: str, root: Any) -> None:
+        """Refuse solvers, learners and proofs for sensors of one cell, where each covers several."""
+        for group in ("solver", "baseline", "algo"):
+            planner = getattr(root, group, None)
+            if planner is not None and not planner.knows_footprints:
+                known = [name for name, schema in GROUPS[group].items() if schema.knows_footprints]
+                raise refuse(
+                    group, planner.name, f"one of {', '.join(known)} with {key}={self.name}"
+                )
+        if getattr(root, "verify", False):
+            raise refuse(
+                "verify",
+                True,
+                f"false with {key}={self.name}: the theorems are on sensors of one cell",
+            )
+        if (
+            partition := getattr(root, "partition", None)
+        ) is not None and partition.block is not None:
+            raise refuse("partition.block", partition.block, f"null with {key}={self.name}")
 
 
 @choice("sensor", "perfect", makes="trackmdp.world.make:perfect")
@@ -63,7 +98,7 @@ class PerfectSensorConfig(SensorConfig):
 
 def _chance(help: str) -> Any:
     """An option of a probability above 0, for all cells or for each."""
-    expects = "a number above 0, at most 1, a list of one per cell, or a path to a .npy or .csv file of one per cell"
+    expects = "a number above 0, at most 1, or one per cell: a list, or a path to a .npy, .npz or .csv file"
     return option(help, expects=expects, path=True)
 
 
@@ -92,31 +127,42 @@ class FalseAlarmConfig(SensorConfig):
         "p_d, probability that a sensor that is on reports the target in its cell, for all cells or for each"
     )
     p_f: float = option(
-        "p_f, probability that a sensor that is on reports in a step in which the target is not there", ge=0, lt=1
+        "p_f, probability that a sensor that is on reports in a step in which the target is not there",
+        ge=0,
+        lt=1,
     )
 
     def check(self, key: str, root: Any) -> None:
         """Robustness of a policy made without them, and nothing else."""
         if not hasattr(root, "baseline"):
             raise refuse(
-                key, self.name, "perfect or miss; policies are evaluated with false alarms, never made for them"
+                key,
+                self.name,
+                "perfect or miss; policies are evaluated with false alarms, never made for them",
             )
         if root.log:
-            raise refuse("log", listed(root.log), f"[] with {key}={self.name}, where nothing is simulated")
+            raise refuse(
+                "log", listed(root.log), f"[] with {key}={self.name}, where nothing is simulated"
+            )
         _check_chance(f"{key}.p_d", self.p_d, root.grid)
 
 
 @choice("sensor", "footprint", makes="trackmdp.world.make:footprint")
-class FootprintConfig(SensorConfig):
-    """Wide sensors: each covers several cells, and if on it always locates the target in any of them, never misses."""
+class FootprintConfig(MissConfig):
+    """Wide sensors: each covers several cells, and reports a target in any of them with probability p_d of its cell."""
 
     covers: ClassVar[bool] = True
     radius: float = option(
-        "how far from its own cell the centres of the cells are that a sensor covers", unit="cells", ge=0
+        "distance from its own cell to the centres of the cells that a sensor covers",
+        unit="cells",
+        ge=0,
     )
-    spacing: int = option("rows and columns from one sensor to the next, on a lattice", unit="cells", ge=1)
+    spacing: int = option(
+        "rows and columns from one sensor to the next, on a lattice", unit="cells", ge=1
+    )
     path: str | None = option(
-        "file in place of the lattice: a row per sensor, 1 in the column of each cell that it covers",
+        "file in place of the lattice: a row per sensor, 1 in the column of each cell that it covers, or the "
+        "probability of a report there, a factor on p_d",
         expects="a path to a .npz (scipy.sparse.save_npz or an array), .npy or .csv file",
         path=True,
     )
@@ -127,28 +173,11 @@ class FootprintConfig(SensorConfig):
         return None if self.path is not None else rows * columns
 
     def check(self, key: str, root: Any) -> None:
-        """What footprints do not go together with."""
+        """A file of a known kind; options that exclude footprints are refused."""
         if self.path is not None and Path(self.path).suffix not in (".npz", ".npy", ".csv"):
             raise refuse(f"{key}.path", self.path, "a path to a .npz, .npy or .csv file")
-        if root.grid.window is not None:
-            raise refuse("grid.window", root.grid.window, f"null with {key}={self.name}, whose sensors lie at no cell")
+        super().check(key, root)
         self._check_solver(key, root)
-        if root.kernel.hides:
-            raise refuse("kernel", root.kernel.name, f"a kernel without a hidden mode with {key}={self.name}")
-        if getattr(root, "task", None) is not None and root.task.memory != "cell":
-            raise refuse("task.memory", root.task.memory, f"cell with {key}={self.name}")
-
-    def _check_solver(self, key: str, root: Any) -> None:
-        """What plans and proves for sensors of one cell alone."""
-        for group in ("solver", "baseline", "algo"):
-            planner = getattr(root, group, None)
-            if planner is not None and not planner.knows_footprints:
-                known = [name for name, schema in GROUPS[group].items() if schema.knows_footprints]
-                raise refuse(group, planner.name, f"one of {', '.join(known)} with {key}={self.name}")
-        if getattr(root, "verify", False):
-            raise refuse("verify", True, f"false with {key}={self.name}: the theorems are on sensors of one cell")
-        if (partition := getattr(root, "partition", None)) is not None and partition.block is not None:
-            raise refuse("partition.block", partition.block, f"null with {key}={self.name}")
 
     def ignored(self, root: Any) -> dict[str, str]:
         """A file holds the footprints themselves."""
@@ -167,9 +196,18 @@ def _check_chance(key: str, value: Any, grid: GridConfig) -> None:
 
 
 def _check_per_cell(
-    key: str, value: Any, count: int | None, number: Option, allowed: str, each_of: str = "cell"
+    key: str,
+    value: Any,
+    count: int | None,
+    number: Option,
+    allowed: str,
+    each_of: str = "cell",
+    *,
+    some: bool = False,
 ) -> None:
-    """Refuse what is neither one number for all cells or sensors, nor a list of one for each, nor the name of a table.
+    """Refuse a value that is neither one number, nor a list of one for each cell or sensor, nor the name of a table.
+
+    With `some`, an entry of a list may be null.
 
     Such options are declared Any, since OmegaConf has no union of number, list and text; so values are checked here.
 
@@ -178,13 +216,19 @@ def _check_per_cell(
     """
     if isinstance(value, list):
         if count is not None and len(value) != count:
-            raise UserError(f"{key}: {len(value)} values, expected one number or {count} (one per {each_of})")
+            raise UserError(
+                f"{key}: {len(value)} values, expected one number or {count} (one per {each_of})"
+            )
         for index, each in enumerate(value):
-            if each is None or not number.allows(each):
-                raise refuse(f"{key}[{index}]", each, f"a {allowed}")
+            if not (some if each is None else number.allows(each)):
+                raise refuse(f"{key}[{index}]", each, f"a {allowed}" + ", or null" * some)
         return
-    fine = Path(value).suffix in (".npy", ".csv") if isinstance(value, str) else number.allows(value)
+    fine = (
+        Path(value).suffix in (".npy", ".npz", ".csv")
+        if isinstance(value, str)
+        else number.allows(value)
+    )
     if value is None or not fine:
         several = "" if count is None else f" of {count} of them"
-        expected = f"a {allowed}, a list{several} (one per {each_of}), or a path to a .npy or .csv file"
+        expected = f"a {allowed}, a list{several} (one per {each_of}), or a path to a .npy, .npz or .csv file"
         raise refuse(key, value, expected)

@@ -1,4 +1,4 @@
-"""Schema of sweeps: `hydra/sweeper` says which runs there are, `hydra/launcher` where they are run."""
+"""Schema of sweeps: `hydra/sweeper` chooses the runs, `hydra/launcher` their place."""
 
 from __future__ import annotations
 
@@ -9,48 +9,51 @@ from trackmdp.config.options import ChoiceConfig, choice, option
 from trackmdp.errors import UserError, require
 
 PLUGINS = ("launcher", "sweeper")
-"""What Hydra has plugins for, and this package choices of its own: `hydra/launcher`, `hydra/sweeper`."""
+"""Parts of Hydra with choices of this package: `hydra/launcher`, `hydra/sweeper`."""
 
 
 class PluginConfig(ChoiceConfig):
     """Base of both groups."""
 
     package: ClassVar[str] = ""
-    """What it imports; `extra` is the extra of this package that adds it."""
+    """Imported package; `extra` is the extra of this package that adds it."""
     extra: ClassVar[str] = ""
 
     def check(self, key: str, root: Any) -> None:
-        """What it imports is installed."""
+        """The package is installed."""
         if self.package:
             require(self.package, self.extra, f"{key.replace('.', '/')}={self.name}")
 
 
 class SweeperConfig(PluginConfig):
-    """Base of the group `hydra/sweeper`: which runs a sweep has.
+    """Base of the group `hydra/sweeper`: the runs of a sweep.
 
-    What a choice makes is called with its config, the typed words, the sweep's folder, and a function that makes jobs
+    The code of a choice gets its config, the typed words, the folder of the sweep, and a function that makes jobs
     of words (`plan` without its first arguments); it returns batches of jobs, and a search plans each when asked.
     """
 
 
 @choice("hydra/sweeper", "blocks", makes="trackmdp.app.sweep.plan:grid")
 class BlocksConfig(SweeperConfig):
-    """Every combination of the values in each block; what is typed is added to each, or replaces its words."""
+    """Every combination of the values in each block; typed words are added to each, or replace its words."""
 
     blocks: list[str] | None = option(
-        "grids whose union is the sweep; null = one of the typed words", expects="a line of words"
+        "grids that together are the sweep; null = one of the typed words",
+        expects="a line of words",
     )
 
 
 @choice("hydra/sweeper", "optuna", makes="trackmdp.app.sweep.trials:trials")
 class OptunaConfig(SweeperConfig):
-    """A search: the words with several values, `range(a,b)` or `interval(a,b)` say what is searched."""
+    """A search over the words with several values, `range(a,b)` or `interval(a,b)`."""
 
     package = extra = "optuna"
-    n_trials: int = option("runs of the whole study, those of earlier calls among them", unit="runs", ge=1)
+    n_trials: int = option(
+        "runs of the whole study, those of earlier calls among them", unit="runs", ge=1
+    )
     objective: str = option(
-        "what is searched for: the largest AIHTR, or the least regret to the bound that each run proves in "
-        "optimal.nodes; both are made out with the motion, or with kernel=tracks on the validation tracks",
+        "the largest AIHTR, or the least regret to the bound that each run proves in optimal.nodes; both are computed "
+        "with the motion, or with kernel=tracks on the validation tracks",
         choices=("aihtr", "regret_per_step"),
     )
     sampler: str = option("how the next run is chosen", choices=("tpe", "random"))
@@ -58,14 +61,15 @@ class OptunaConfig(SweeperConfig):
     batch: int = option("runs chosen at once, for launchers that run several", unit="runs", ge=1)
     study: str = option("name of the study in its storage", expects="a name")
     storage: str | None = option(
-        "database of the study; null = study.db in the sweep's folder", expects="a URL such as sqlite:///studies.db"
+        "database of the study; null = study.db in the sweep's folder",
+        expects="a URL such as sqlite:///studies.db",
     )
 
 
 class LauncherConfig(PluginConfig):
-    """Base of the group `hydra/launcher`: where the runs of a sweep take place.
+    """Base of the group `hydra/launcher`: the place of the runs of a sweep.
 
-    What a choice makes is called with its config and jobs, and returns once none of them is running.
+    The code of a choice gets its config and jobs, and returns once none of them is running.
     """
 
     concurrent: ClassVar[bool] = True
@@ -84,7 +88,9 @@ class JoblibConfig(LauncherConfig):
 
     package, extra = "joblib", "sweep"
 
-    n_jobs: int | None = option("runs at once; null = one for each core", unit="runs", ge=1, le=1024)
+    n_jobs: int | None = option(
+        "runs at once; null = one for each core", unit="runs", ge=1, le=1024
+    )
 
 
 class SubmititConfig(LauncherConfig):
@@ -92,15 +98,19 @@ class SubmititConfig(LauncherConfig):
 
     package, extra = "submitit", "slurm"
 
-    timeout_min: int = option("a run is stopped after this long, and resumes where requeued", unit="min", ge=1)
+    timeout_min: int = option(
+        "a run is stopped after this long, and resumes where requeued", unit="min", ge=1
+    )
     cpus_per_task: int = option("cores of a run", unit="cores", ge=1)
 
 
 @choice("hydra/launcher", "submitit_local", makes="trackmdp.app.sweep.launchers:run_here")
 class SubmititLocalConfig(SubmititConfig):
-    """As submitit_slurm, but on this machine: to try out what a cluster will do."""
+    """As submitit_slurm, but on this machine: to try out a cluster."""
 
-    n_jobs: int | None = option("runs at once; null = as many as there are cores for", unit="runs", ge=1, le=1024)
+    n_jobs: int | None = option(
+        "runs at once; null = as many as there are cores for", unit="runs", ge=1, le=1024
+    )
 
 
 @choice("hydra/launcher", "submitit_slurm", makes="trackmdp.app.sweep.launchers:run_on_slurm")
@@ -110,12 +120,16 @@ class SubmititSlurmConfig(SubmititConfig):
     mem_gb: float | None = option("memory of a run; null = the cluster's default", unit="GB", gt=0)
     gpus_per_node: int | None = option("GPUs of a run; null = none asked for", unit="GPUs", ge=0)
     array_parallelism: int = option("runs at once", unit="runs", ge=1)
-    max_num_timeout: int = option("how often a run that is out of time is requeued", ge=0)
-    signal_delay_s: int = option("a run is told to save this long before its time is out", unit="s", ge=1)
+    max_num_timeout: int = option("times that a run that is out of time is requeued", ge=0)
+    signal_delay_s: int = option("a run saves this long before its time is out", unit="s", ge=1)
     partition: str | None = option("partition; null = the cluster's default", expects="its name")
     account: str | None = option("account; null = the user's default", expects="its name")
-    setup: list[str] | None = option("lines of shell before each run, such as `module load ...`", expects="a line")
-    additional_parameters: dict[str, str] | None = option("further `#SBATCH` parameters", expects="{name: value}")
+    setup: list[str] | None = option(
+        "lines of shell before each run, such as `module load ...`", expects="a line"
+    )
+    additional_parameters: dict[str, str] | None = option(
+        "further `#SBATCH` parameters", expects="{name: value}"
+    )
 
     def check(self, key: str, root: Any) -> None:
         """There is a cluster: submitting would fail only after the sweep's folder has been made."""

@@ -1,13 +1,29 @@
-"""Schema of the world: grid, what a policy may know, motion kernel."""
+"""Schema of the world: grid, memory of policies, motion kernel."""
 
 from __future__ import annotations
 
 from typing import Any, ClassVar
 
-from trackmdp.config.options import GROUPS, ChoiceConfig, NodeConfig, Sizes, choice, listed, option, refuse
+from trackmdp.config.options import (
+    GROUPS,
+    ChoiceConfig,
+    NodeConfig,
+    Sizes,
+    choice,
+    option,
+    refuse,
+)
+from trackmdp.errors import UserError
 
 BORDERS = ("renormalize", "inside", "clip", "exit")
-MEMORIES = ("cell", "displacement", "displacement_gap", "two_displacements")
+CRS_CODE = "[A-Za-z]+:[0-9]{1,9}"
+MEMORIES = {
+    "cell": "trackmdp.world.memory:Cell",
+    "displacement": "trackmdp.world.memory:Displacement",
+    "displacement_gap": "trackmdp.world.memory:DisplacementGap",
+    "two_displacements": "trackmdp.world.memory:TwoDisplacements",
+}
+"""Memories of policies: the class of each name. A plugin adds its own, before its configs are composed."""
 
 
 class GridConfig(NodeConfig):
@@ -19,9 +35,14 @@ class GridConfig(NodeConfig):
         ge=3,
         pair=True,
     )
-    t_max: int = option("T_max: free choices at n = 0 ... t_max, then the safe action", unit="steps", ge=0, le=16)
+    t_max: int = option(
+        "T_max: free choices at n = 0 ... t_max, then the safe action", unit="steps", ge=0, le=16
+    )
     max_steps: int | None = option(
-        "truncate an episode after so many steps; null = only the exit ends it", unit="steps", ge=1, le=1_000_000
+        "truncate an episode after so many steps; null = only the exit ends it",
+        unit="steps",
+        ge=1,
+        le=1_000_000,
     )
     window: int | None = option(
         "W: only the sensors up to W rows and columns from the last located cell can be chosen, and moves out of that "
@@ -30,6 +51,33 @@ class GridConfig(NodeConfig):
         ge=0,
         le=1024,
     )
+
+    cell: float | None = option(
+        "side of a cell; with it and grid.origin cells have positions", unit="m; mot: pixels", gt=0
+    )
+    origin: list[float] | None = option(
+        "corner of the grid with the least coordinates, [x, y] or [lon, lat]; null = not known, with kernel=tracks the "
+        "middles of grid and positions agree"
+    )
+    crs: str | None = option(
+        "projection of lat, lon to metres; null = positions are x, y, with kernel=tracks the UTM zone of lat, lon",
+        expects="a code such as EPSG:2056",
+        pattern=CRS_CODE,
+    )
+
+    def check(self, key: str, root: Any) -> None:
+        """An origin is two numbers, and places a grid together with the side of a cell."""
+        if self.origin is not None and len(self.origin) != 2:
+            raise refuse(f"{key}.origin", self.origin, "[x, y], or [lon, lat], or null")
+        if root.kernel.is_motion:
+            for name, needed in (("origin", "cell"), ("crs", "origin")):
+                if getattr(self, name) is not None and getattr(self, needed) is None:
+                    raise UserError(f"{key}.{needed}: missing, expected beside {key}.{name}")
+
+    @property
+    def place(self) -> dict[str, Any]:
+        """Side of a cell, corner and projection."""
+        return {"cell": self.cell, "origin": self.origin, "crs": self.crs}
 
     @property
     def num_cells(self) -> int:
@@ -45,48 +93,45 @@ class GridConfig(NodeConfig):
 
 
 class TaskConfig(NodeConfig):
-    """What the policy may know."""
+    """Memory of policies."""
 
     memory: str = option(
-        "what a policy remembers at a detection: the cell; with it the displacement since the detection before, with "
-        "or without the misses between; or the last displacement and the direction of the one before; "
-        "algo=path_counts learns more than the cell best and fastest",
+        "memory of a policy at a detection: the cell; with it the displacement since the detection before, with "
+        "or without the misses between; or the last displacement and the direction of the one before",
         choices=MEMORIES,
     )
     clip: int = option(
-        "rows and columns up to which displacements are told apart; larger ones count as that", unit="cells", ge=1, le=8
+        "rows and columns up to which displacements differ; larger ones count as that",
+        unit="cells",
+        ge=1,
+        le=8,
     )
 
     def check(self, key: str, root: Any) -> None:
-        """More than the cell is remembered where there is a learner of it, and paths to learn from."""
+        """A memory of more than the cell takes a learner of it."""
         if self.memory == "cell":
             return
         readers = [name for name, schema in GROUPS["algo"].items() if schema.remembers]
         if root.learns and not root.algo.remembers:
             expected = f"cell with algo={root.algo.name}; more is learned by {', '.join(readers)}"
             raise refuse(f"{key}.memory", self.memory, expected)
-        if root.kernel.is_motion and not root.kernel.hides:
-            expected = f"cell with kernel={root.kernel.name}, whose next move depends on the cell alone"
-            raise refuse(f"{key}.memory", self.memory, expected)
-        if root.kernel.hides and root.kernel.reveals:
-            raise refuse(f"{key}.memory", self.memory, "cell with kernel.reveals=true: a detection tells all there is")
 
     def needs(self, task: Sizes, root: Any) -> dict[str, int]:
-        """A set for every key and n, with what finding it takes; and exact evaluation where targets have a mode."""
-        if self.memory == "cell" and not task.pair_bytes:
+        """A set for every key and n, and its search."""
+        if self.memory == "cell":
             return {}
         # Some six sensors a set, each 60 bytes while plans are put together, and a row pointer or two.
-        return {"task.memory": task.num_keys * (task.t_max + 1) * 400 + task.pair_bytes}
+        return {"task.memory": task.num_keys * (task.t_max + 1) * 400}
 
     def ignored(self, root: Any) -> dict[str, str]:
-        """Where the cell alone is remembered there is no displacement."""
+        """A memory of the cell alone has no displacement."""
         return {"clip": "with task.memory=cell"} if self.memory == "cell" else {}
 
 
 class KernelConfig(ChoiceConfig):
     """Base of the group `kernel`: how the target moves.
 
-    What a choice makes is called with the grid's size and the choice's options, and returns the `[M, M]` kernel.
+    The code of a choice gets the size of the grid and the options of the choice, and returns the `[M, M]` kernel.
     """
 
     is_motion: ClassVar[bool] = True
@@ -95,7 +140,7 @@ class KernelConfig(ChoiceConfig):
 
     @property
     def source(self) -> str:
-        """What a message about the kernel begins with."""
+        """First words of a message about the kernel."""
         return f"kernel={self.name}"
 
 
@@ -103,18 +148,24 @@ class KernelConfig(ChoiceConfig):
 class RandomSupportConfig(KernelConfig):
     """The paper's motion: Z random positions around each cell, one of low probability, the others equal."""
 
-    support_size: int = option("Z, positions the target may move to, at most (2·radius+1)²", unit="cells", ge=1)
-    radius: int = option("how far the target moves in one step", unit="cells", ge=1, le=8)
-    low_probability: float = option("probability of the one unlikely position", unit="per step", gt=0, lt=1)
+    support_size: int = option(
+        "Z, positions the target may move to, at most (2·radius+1)²", unit="cells", ge=1
+    )
+    radius: int = option("reach of a move", unit="cells", ge=1, le=8)
+    low_probability: float = option(
+        "probability of the one unlikely position", unit="per step", gt=0, lt=1
+    )
     exit_probability: float = option("probability of leaving the grid", unit="per step", ge=0, lt=1)
-    border: str = option("what becomes of positions outside the grid", choices=BORDERS)
+    border: str = option("rule for positions outside the grid", choices=BORDERS)
     seed: int = option("seed of the random positions", ge=0)
 
     def check(self, key: str, root: Any) -> None:
         """The positions fit into the window, and their probabilities under one."""
         window = (2 * self.radius + 1) ** 2
         if self.support_size > window:
-            expected = f"an integer from 1 to {window} ({key}.radius={self.radius} gives {window} cells)"
+            expected = (
+                f"an integer from 1 to {window} ({key}.radius={self.radius} gives {window} cells)"
+            )
             raise refuse(f"{key}.support_size", self.support_size, expected)
         if self.low_probability + self.exit_probability >= 1:
             expected = f"less than 1 - {key}.exit_probability = {1 - self.exit_probability:g}"
@@ -128,7 +179,7 @@ class RandomWalkConfig(KernelConfig):
     stay: float = option("probability of staying in the cell", unit="per step", ge=0, le=1)
     diagonal: bool = option("whether the 4 diagonal neighbours are reached as well")
     exit_probability: float = option("probability of leaving the grid", unit="per step", ge=0, lt=1)
-    border: str = option("what becomes of positions outside the grid", choices=BORDERS)
+    border: str = option("rule for positions outside the grid", choices=BORDERS)
 
 
 @choice("kernel", "drift", makes="trackmdp.world.kernels:drift")
@@ -136,20 +187,24 @@ class DriftConfig(KernelConfig):
     """A target that heads one way most of the time."""
 
     direction: float = option("heading, 0 = right, 90 = up", unit="degrees", ge=0, lt=360)
-    persistence: float = option("probability of keeping to the heading", unit="per step", ge=0, le=1)
+    persistence: float = option(
+        "probability of keeping to the heading", unit="per step", ge=0, le=1
+    )
     exit_probability: float = option("probability of leaving the grid", unit="per step", ge=0, lt=1)
-    border: str = option("what becomes of positions outside the grid", choices=BORDERS)
+    border: str = option("rule for positions outside the grid", choices=BORDERS)
 
 
 @choice("kernel", "table", makes="trackmdp.world.kernels:load_table")
 class TableConfig(KernelConfig):
     """A table of your own: row i holds the probabilities of moving from cell i to each cell."""
 
-    path: str = option("file with the M x M table", expects="a path to a .npy, .npz or .csv file", path=True)
+    path: str = option(
+        "file with the M x M table", expects="a path to a .npy, .npz or .csv file", path=True
+    )
 
     @property
     def source(self) -> str:
-        """What a message about the kernel begins with."""
+        """First words of a message about the kernel."""
         return f"kernel.path={self.path}"
 
 
@@ -164,59 +219,58 @@ class TracksConfig(KernelConfig):
         path=True,
     )
     format: str | None = option(
-        "what the file holds; null = as its ending and columns say. points = a table of id, time and x, y or lat, lon, "
+        "content of the file; null = by its ending and columns. points = a table of id, time and x, y or lat, lon, "
         "as of AIS and ADS-B; sumo = fcd-output",
         choices=("cells", "points", "geojson", "gpx", "mot", "sumo"),
     )
-    step: float | None = option("positions: time from one cell of a track to the next", unit="s; mot: frames", gt=0)
-    cell: float | None = option("positions: side of a cell", unit="m; mot: pixels", gt=0)
+    columns: list[str] | None = option(
+        "a table of positions: names of its columns, such as [id:device_id,time:seen]; of id, time, x, y, lat, lon",
+        expects="id:NAME",
+        pattern="(id|time|x|y|lat|lon):.+",
+    )
+    step: float | None = option(
+        "positions: time from one cell of a track to the next", unit="s; mot: frames", gt=0
+    )
     max_gap: float | None = option(
         "positions: longest time between two reports that a straight line bridges; longer ones cut the track; null = 3 "
         "steps",
         unit="s; mot: frames",
         gt=0,
     )
-    origin: list[float] | None = option(
-        "positions: corner of the grid with the least coordinates, [x, y] or [lon, lat]; null = the middles of grid "
-        "and positions agree"
-    )
-    crs: str | None = option(
-        "positions as lat, lon: projection to metres; null = the UTM zone where they lie",
-        expects="a code such as EPSG:2056",
-        pattern="[A-Za-z]+:[0-9]{1,9}",
-    )
     ends: str = option(
-        "what the end of a track is: exit = the target left the grid, cut = the recording stopped",
+        "meaning of the end of a track: exit = the target left the grid, cut = the recording stopped",
         choices=("exit", "cut"),
     )
     starts: str = option(
-        "where episodes begin while learning: first = where a track does, anywhere = at any recorded point",
+        "start of episodes while learning: first = start of a track, anywhere = any recorded point",
         choices=("first", "anywhere"),
     )
     held_out: float = option(
-        "share of the tracks for the last figures, which no learner and no choice sees", gt=0, lt=1
+        "share of the tracks for the last figures, kept from learners and choices", gt=0, lt=1
     )
     validation: float = option(
-        "share of the tracks for figures while learning, best.pt and Optuna; nothing learns from them", gt=0, lt=1
+        "share of the tracks for figures while learning, best.pt and Optuna; nothing learns from them",
+        gt=0,
+        lt=1,
     )
     seed: int = option("seed of the draw of these two", ge=0)
     min_length: int | None = option(
-        "fewest cells of a track; null = grid.t_max + 3, a whole path of a policy", unit="cells", ge=1
+        "fewest cells of a track; null = grid.t_max + 3, a whole path of a policy",
+        unit="cells",
+        ge=1,
     )
-    markov: bool = option("take the next move to depend on the cell alone, so that moves of different tracks combine")
+    markov: bool = option(
+        "take the next move to depend on the cell alone, so that moves of different tracks combine"
+    )
 
     def check(self, key: str, root: Any) -> None:
-        """Recorded tracks hold no motion model: nothing that reads one goes with them."""
-        if self.origin is not None and len(self.origin) != 2:
-            raise refuse(f"{key}.origin", self.origin, "[x, y], or [lon, lat], or null")
+        """Recorded tracks have no motion model: solvers and baselines that read one are refused."""
         if root.needs_motion:
             raise refuse(key, self.name, "a motion model, which train and evaluate do without")
-        if any(node.episodes_only for node in root.log.values()):
-            *some, last = (name for name, schema in GROUPS["log"].items() if not schema.episodes_only)
-            expected = f"none but {', '.join(some)} and {last} with kernel=tracks, without a motion model"
-            raise refuse("log", listed(root.log), expected)
         baseline = getattr(root, "baseline", None)
         if baseline is not None and baseline.reads_motion:
             known = [name for name, schema in GROUPS["baseline"].items() if not schema.reads_motion]
-            expected = f"{', '.join(known[:-1])} or {known[-1]} with kernel=tracks, without a motion model"
+            expected = (
+                f"{', '.join(known[:-1])} or {known[-1]} with kernel=tracks, without a motion model"
+            )
             raise refuse("baseline", baseline.name, expected)

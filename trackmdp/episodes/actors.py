@@ -1,15 +1,14 @@
 """Actors: the decisions of a policy, playback or function in a batch of states, given the uniform draws.
 
-A step asks three things of a decision: whether the target is sensed where it turns up, how many sensors are on, and
-what they cost. A table answers them from one row per state, so that a step costs the same on any grid; whatever else
-acts writes its action out over all S sensors.
+A step asks three things of a decision: the probability that the target is reported where it turns up, the number of
+sensors on, and their price. A table answers them from one row per state, so that a step costs the same on any grid; all
+other actors write their action out over all S sensors.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TypeAlias
 
 import numpy as np
@@ -20,11 +19,22 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from trackmdp.policies.acting import Playback
-from trackmdp.policies.policy import Policy, PolicyLike, as_policy, looked_up, rule_of
-from trackmdp.policies.unroll import STATE_KEYS, DrawsError, Rule, acting, kept_keys, module_action
+from trackmdp.policies.forms import (
+    STATE_KEYS,
+    DrawsError,
+    Rule,
+    acting,
+    kept_keys,
+    module_action,
+    rule_of,
+)
+from trackmdp.policies.policy import Policy, PolicyLike, as_policy, looked_up
+from trackmdp.policies.table import SetTable
+from trackmdp.world.actions import ActionMask
+from trackmdp.world.detection import Detection
 from trackmdp.world.model import Task
 from trackmdp.world.outcomes import Costs
-from trackmdp.world.windows import Sight, Window
+from trackmdp.world.windows import Window
 
 _MOST_ROWS = 4096  # episodes stepped together: their generators take 5 kB each
 _DRAWS = 25_600  # of one step: 256 steps of them are held at a time, 26 MB
@@ -39,7 +49,7 @@ class States:
         row: `[B]` which episodes of the batch these are.
         place: `[B]` of the targets (`world/targets.py`), for the simulator's eyes.
         last_cell: `[B]` cell of the last detection.
-        key: `[B]` what the policy remembered there; the cell, where that is all.
+        key: `[B]` the policy's key at it; the cell alone for most policies.
         misses: `[B]` n since then.
         step: steps done so far.
     """
@@ -53,23 +63,25 @@ class States:
 
     def kept(self, rows: Tensor) -> States:
         """Those of the positions `rows`."""
-        return replace(self, **{name: part[rows] for name, part in vars(self).items() if name != "step"})
+        return replace(
+            self, **{name: part[rows] for name, part in vars(self).items() if name != "step"}
+        )
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What was decided in B states.
+    """The decisions in B states.
 
     Attributes:
         count: `[B]` int64, sensors on.
         spent: `[B]` float32, their price.
-        sensed: whether a sensor that is on sees a cell, `[B]` bool of cells `[B]`.
+        report: probability that some sensor reports a target, `[B]` of its cells `[B]`; see `Detection`.
         action: `[B, S]` bool; None where it follows from the state, and need not be kept.
     """
 
     count: Tensor
     spent: Tensor
-    sensed: Callable[[Tensor], Tensor]
+    report: Callable[[Tensor], Tensor]
     action: Tensor | None = None
 
 
@@ -99,7 +111,7 @@ class Actor:
 
 
 def actor_of(task: Task, policy: PolicyLike | Playback, costs: Costs) -> Actor:
-    """What steps a policy; a function or module that does not draw is turned into its table first.
+    """The actor of a policy; a function or module that does not draw is turned into its table first.
 
     Raises:
         UserError: the policy is made for another grid, or is none.
@@ -116,18 +128,23 @@ def actor_of(task: Task, policy: PolicyLike | Playback, costs: Costs) -> Actor:
         return Actor(_writing(told, costs, _with_history(told, ask, most_rows)), most_rows)
     if made.deterministic:
         return Actor(_following(made, costs), _MOST_ROWS, made)
-    drawing = _writing(made.task, costs, lambda states, draws: made.act(states.key, states.misses, draws))
+    drawing = _writing(
+        made.task, costs, lambda states, draws: made.act(states.key, states.misses, draws)
+    )
     return Actor(drawing, max(1, min(256, _DRAWS // made.num_draws)), made, made.num_draws)
 
 
 def _writing(task: Task, costs: Costs, action_of: Acts) -> Decides:
-    """The decisions of what writes its actions `[B, S]` out over all sensors."""
-    sight = Sight(task, everywhere=True)
+    """The decisions of a policy with its actions `[B, S]` written out over all sensors."""
+    detection = Detection(task, everywhere=True)
+    mask = ActionMask(task, everywhere=True)
 
     def decide(states: States, draws: Tensor | None) -> Choice:
         action = action_of(states, draws)
+        if mask.observed:
+            action = action & mask(states.last_cell)
         spent = costs.price_of(action)
-        return Choice(action.sum(-1), spent, lambda cell: sight.sees(action, cell, cell), action)
+        return Choice(action.sum(-1), spent, lambda cell: detection(action, cell, cell), action)
 
     return decide
 
@@ -137,14 +154,21 @@ def _following(policy: Policy, costs: Costs) -> Decides:
     sets, coverage, alike = policy.sets, policy.task.coverage, policy.sets is None
     if sets is None:
         sets = sparse.csr_array(np.full((1, policy.task.total_sensors), policy.probability == 1.0))
-    seen, cpu = sets if coverage is None else coverage.seen(sets), torch.device("cpu")
-    table = policy.lookup(cpu) if seen is policy.sets else looked_up(seen, cpu)
-    # A CSR matrix's indptr says where each row's entries begin: 0 2 2 5 are rows of 2, 0 and 3 sensors.
+    cpu = torch.device("cpu")
+    if coverage is None:
+        table = looked_up(sets, cpu) if alike else policy.lookup(cpu)
+    else:
+        table = looked_up(SetTable(policy.task, sets, 1).reporting, cpu)
+    # A CSR matrix's indptr is the place where each row's entries begin: 0 2 2 5 are rows of 2, 0 and 3 sensors.
     count, spent = torch.as_tensor(np.diff(sets.indptr).astype(np.int64)), costs.of_sets(sets)
+
+    detection = Detection(policy.task)
 
     def decide(states: States, draws: Tensor | None) -> Choice:  # noqa: ARG001
         row = torch.zeros_like(states.key) if alike else policy.row(states.key, states.misses)
-        return Choice(count[row], spent[row], partial(table.entry, row))
+        return Choice(
+            count[row], spent[row], lambda cell: detection.of_cell(table.entry(row, cell), cell)
+        )
 
     return decide
 
@@ -155,7 +179,7 @@ def _issuing(playback: Playback) -> Acts:
 
     def action_of(states: States, draws: Tensor | None) -> Tensor:  # noqa: ARG001
         action = playback.at(states.step).expand(len(states.row), -1).contiguous()
-        if window.is_local:  # what lies outside the window cannot be chosen
+        if window.is_local:  # sensors outside the window cannot be chosen
             action = window.to_global(states.last_cell, window.to_local(states.last_cell, action))
         return action
 
@@ -168,7 +192,7 @@ def _with_history(task: Task, ask: Asks, most_rows: int) -> Acts:
     kept = torch.zeros(most_rows, task.num_choices, task.num_sensors, dtype=torch.bool)
 
     def action_of(states: States, draws: Tensor | None) -> Tensor:  # noqa: ARG001
-        # Slot s holds the action at s misses; what stands in slot n and later is left from an earlier row of misses.
+        # Slot s holds the action at s misses; slots from n on are left from an earlier row of misses.
         filled = slots < states.misses.unsqueeze(1)
         with acting():
             action = ask(states, kept[states.row] & filled.unsqueeze(-1))
@@ -183,12 +207,14 @@ def _asking(rule: Rule) -> Asks:
 
 
 def _remembering(task: Task, module: TensorDictModuleBase, most_rows: int) -> Asks:
-    """A recurrent module; what it keeps from step to step is kept for each episode. At the first step it is None."""
+    """A recurrent module; its state is kept for each episode from step to step. At the first step it is None."""
     kept = dict[str, Tensor]()
 
     def ask(states: States, history: Tensor) -> Tensor:
         said = dict(zip(STATE_KEYS, (states.last_cell, states.misses, history), strict=True))
-        batch = TensorDict(said, len(states.row)).set("is_init", torch.full((len(states.row), 1), states.step == 0))
+        batch = TensorDict(said, len(states.row)).set(
+            "is_init", torch.full((len(states.row), 1), states.step == 0)
+        )
         if states.step:
             batch.update({key: value[states.row] for key, value in kept.items()})
         action = module_action(task, module, batch)

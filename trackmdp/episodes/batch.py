@@ -8,18 +8,22 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias, overload
+from pathlib import Path
+from typing import Any, TypeAlias, cast, overload
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from tensordict import TensorDict
 
+from trackmdp.durable import write_text
 from trackmdp.episodes.belief import beliefs
 from trackmdp.episodes.episode import Episode, Floats, Integers, last_cells
 from trackmdp.errors import UserError
+from trackmdp.notebook.card import Card, Carded, decimal, grid_words, percent
 from trackmdp.policies.policy import Policy
 from trackmdp.world.model import Array, BoolArray
-from trackmdp.world.tracks import Problem, Recorded
+from trackmdp.world.tracks import Problem
 
 _BELIEF = 25_600  # cells, or hidden states, of the beliefs updated together: memory stays bounded on large grids
 
@@ -51,8 +55,8 @@ class Simulation:
     expected_length: MeanEstimate
 
 
-@dataclass(frozen=True, eq=False)
-class Episodes(Sequence[Episode]):
+@dataclass(frozen=True, eq=False, repr=False)
+class Episodes(Carded, Sequence[Episode]):
     """The episodes of one policy, all their steps end to end; a sequence of `Episode`.
 
     Attributes:
@@ -68,7 +72,7 @@ class Episodes(Sequence[Episode]):
         truncated: `[S]`, whether the step was the last one allowed.
         sensors: `[S]`, how many were on.
         bits: `[S, ceil(sensors/8)]`, the actions, eight sensors to a byte; None where they follow from the policy.
-        key: `[S]`, what the policy remembered before each step; None where that is the last cell alone.
+        key: `[S]`, the policy's key before each step; None where it is the last cell alone.
         mode: `[S]`, the target's mode after the step, -1 once exited; None where targets have none.
         start_mode: `[E]`, their modes at the start; 0 where they have none.
     """
@@ -90,17 +94,28 @@ class Episodes(Sequence[Episode]):
     start_mode: Integers | None = None
 
     @classmethod
-    def of(cls, problem: Problem, policy: Policy | None, seeds: Sequence[int], batches: Sequence[Columns]) -> Episodes:
+    def of(
+        cls,
+        problem: Problem,
+        policy: Policy | None,
+        seeds: Sequence[int],
+        batches: Sequence[Columns],
+    ) -> Episodes:
         """The episodes of some batches, in their order; each has the columns, and the `length` of its episodes."""
         none = np.zeros(0, dtype=np.int32)
         # No episode: columns of length 0, of the types that they have otherwise.
         empty: Columns = dict.fromkeys(("misses", "target", "sensors", "length"), none)
         empty |= dict.fromkeys(("start", "start_mode"), none.astype(np.int64))
         empty |= {"located": none > 0, "truncated": none > 0, "reward": none.astype(np.float32)}
-        columns = {name: np.concatenate([each[name] for each in batches or [empty]]) for name in (*batches, empty)[0]}
+        columns = {
+            name: np.concatenate([each[name] for each in batches or [empty]])
+            for name in (*batches, empty)[0]
+        }
         # Lengths 2 1 3 begin at 0 2 3, and end at 6: episode i has the steps first[i] ... first[i + 1] - 1.
         first = np.concatenate([[0], np.cumsum(columns.pop("length"))])
-        return cls(problem, policy, list(seeds), first=first, bits=columns.pop("bits", None), **columns)
+        return cls(
+            problem, policy, list(seeds), first=first, bits=columns.pop("bits", None), **columns
+        )
 
     def __len__(self) -> int:
         return len(self.seeds)
@@ -114,6 +129,25 @@ class Episodes(Sequence[Episode]):
             return [self._episode(number) for number in range(len(self))[which]]
         return self._episode(range(len(self))[which])
 
+    def card(self) -> Card:
+        """Number of episodes and steps, and their figures with standard errors."""
+        problem = self.problem
+        task = f"{grid_words(problem.size)}, T_max {problem.t_max}"
+        facts = {"problem": f"{type(problem).__name__}, {task}", "steps": f"{len(self.target):,}"}
+        title = f"Episodes: {len(self):,}"
+        if not len(self):
+            return Card(title, facts)
+        found = self.figures()
+        for name, each, form in (
+            ("AIHTR", found.aihtr, decimal),
+            ("accuracy", found.accuracy, percent),
+            ("sensors per step", found.sensors_per_step, decimal),
+            ("safe actions per episode", found.safe_per_episode, decimal),
+            ("steps per episode", found.expected_length, decimal),
+        ):
+            facts[name] = f"{form(each.mean)} ± {form(each.standard_error)}"
+        return Card(f"{title} (figures: mean ± standard error)", facts)
+
     def _episode(self, number: int) -> Episode:
         steps = slice(int(self.first[number]), int(self.first[number + 1]))
         target, located = self.target[steps].astype(np.int64), self.located[steps]
@@ -124,7 +158,9 @@ class Episodes(Sequence[Episode]):
             policy=0,
             start=start,
             misses=misses,
-            action=self._action(steps, self._keys(steps, last_cells(start, target, located)[:-1]), misses),
+            action=self._action(
+                steps, self._keys(steps, last_cells(start, target, located)[:-1]), misses
+            ),
             target=target,
             located=located,
             reward=self.reward[steps],
@@ -136,7 +172,7 @@ class Episodes(Sequence[Episode]):
         )
 
     def _keys(self, steps: slice, last_cell: Integers) -> Integers:
-        """`[T]`, what the policy remembered before each step."""
+        """`[T]`, the policy's key before each step."""
         return last_cell if self.key is None else self.key[steps].astype(np.int64)
 
     def _action(self, steps: slice, key: Integers, misses: Integers) -> BoolArray:
@@ -144,12 +180,14 @@ class Episodes(Sequence[Episode]):
         # A policy with a table needs no bits: its action follows from (key, misses), and S rows of M bits are not
         # kept.
         if self.bits is not None:
-            return np.unpackbits(self.bits[steps], axis=-1, count=self.problem.total_sensors).astype(np.bool_)
+            return np.unpackbits(
+                self.bits[steps], axis=-1, count=self.problem.total_sensors
+            ).astype(np.bool_)
         assert self.policy is not None
         return self.policy.act(torch.from_numpy(key), torch.from_numpy(misses)).numpy()
 
     def figures(self) -> Simulation:
-        """What the episodes say of the policy, with standard errors."""
+        """The policy's figures from the episodes, with standard errors."""
         if not len(self):
             return _summary(np.zeros((6, 0)))
         in_grid = self.target < self.problem.num_cells
@@ -157,24 +195,77 @@ class Episodes(Sequence[Episode]):
         # Sensors are counted where they cost: not at the exit, nor where the safe action replaced them.
         chosen = self.sensors * (in_grid & ~forced)
         every = np.ones(len(self.target))
-        columns: list[npt.NDArray[Any]] = [self.reward, in_grid, self.located, chosen, forced, every]
-        # Every episode has a step, so that no two of `first` are the same and each sum is that of one episode.
-        totals: Array = np.stack([np.add.reduceat(column.astype(np.float64), self.first[:-1]) for column in columns])
+        columns: list[npt.NDArray[Any]] = [
+            self.reward,
+            in_grid,
+            self.located,
+            chosen,
+            forced,
+            every,
+        ]
+        # Every episode has a step, so that no two of `first` are the same and each sum belongs to one episode.
+        totals: Array = np.stack(
+            [np.add.reduceat(column.astype(np.float64), self.first[:-1]) for column in columns]
+        )
         return _summary(totals)
 
     def complete(self) -> Iterator[Episode]:
         """The episodes with `belief` and `probability`, computed for a bounded number of them at a time.
 
-        Raises:
-            UserError: recorded tracks have no motion model, and so no belief.
+        Recorded tracks have no motion model; their belief is 0 in all cells.
         """
-        if isinstance(self.problem, Recorded):
-            raise UserError("episodes: recorded tracks have no motion model, and so no belief")
-        at_once = max(1, min(256, _BELIEF // self.problem.kernel.shape[0]))
+        world = self.problem.model
+        states = self.problem.num_cells if world is None else world.num_states
+        at_once = max(1, min(256, _BELIEF // states))
         for begin in range(0, len(self), at_once):
-            some = self[begin : begin + at_once]
-            for episode, belief in zip(some, beliefs(self.problem, some), strict=True):
-                yield replace(episode, belief=belief, probability=self._probability(episode))
+            yield from self._completed(self[begin : begin + at_once])
+
+    def _completed(self, some: Sequence[Episode]) -> Iterator[Episode]:
+        """See `complete`."""
+        if (world := self.problem.model) is None:
+            found = [np.zeros((len(each), self.problem.num_cells), np.float32) for each in some]
+        else:
+            found = beliefs(world, some)
+        for episode, belief in zip(some, found, strict=True):
+            yield replace(episode, belief=belief, probability=self._probability(episode))
+
+    def to_tensordict(self) -> TensorDict:
+        """`[S]` the steps of all episodes, as of `Episode.to_tensordict`, and the number of each, `episode`."""
+        parts = [
+            each.to_tensordict(self.problem).set("episode", torch.full((len(each),), number))
+            for number, each in enumerate(self)
+        ]
+        return cast(TensorDict, torch.cat(parts)) if parts else TensorDict({}, [0])
+
+    def page(self, file: str | Path, number: int = 0) -> Path:
+        """Write an episode as a web page that needs no network, and return its path.
+
+        Raises:
+            UserError: there is no such episode.
+        """
+        from trackmdp.episodes.page import page
+
+        place = Path(file)
+        write_text(place, page(self.problem, self._shown("page", number)))
+        return place
+
+    def video(self, file: str | Path, number: int = 0, *, speed: int = 4) -> Path:
+        """Write an episode as a `.gif` or `.mp4` of `speed` steps per second, and return its path (extra `video`).
+
+        Raises:
+            UserError: there is no such episode, another ending, or a package is missing.
+        """
+        from trackmdp.episodes.video import write_video
+
+        write_video(Path(file), self.problem, self._shown("video", number), speed)
+        return Path(file)
+
+    def _shown(self, call: str, number: int) -> Episode:
+        """An episode with its belief."""
+        if not 0 <= number < len(self):
+            raise UserError(f"{call}: episode {number}, expected 0 to {len(self) - 1}")
+        (episode,) = self._completed([self[number]])
+        return episode
 
     def _probability(self, episode: Episode) -> Floats:
         if self.policy is None:
@@ -191,7 +282,7 @@ def _summary(totals: Array) -> Simulation:
     The rows of `totals` are reward, steps in the grid, detections, sensors on by choice, safe actions, and steps.
     """
     reward, steps, detections, sensors, forced, length = totals
-    # An episode whose first step is the exit has no step in the grid, and no accuracy.
+    # An episode that starts with the exit has no step in the grid, and no accuracy.
     some = steps > 0
     return Simulation(
         episodes=len(reward),

@@ -15,8 +15,8 @@ from scipy import sparse
 from torch import Tensor
 
 from trackmdp.episodes.episode import Episode, Floats
-from trackmdp.world.model import Task
-from trackmdp.world.modes import HiddenWorld, Modelled
+from trackmdp.world.coverage import reported
+from trackmdp.world.model import Task, World
 
 
 class BeliefFilter:
@@ -47,13 +47,17 @@ class BeliefFilter:
         # Bayes with a perfect sensor: a miss has likelihood 0 where a sensor is on and 1 elsewhere.
         unseen = predicted * (~action if action.dtype == torch.bool else 1.0 - action)
         mass = unseen.sum(-1, keepdim=True)
-        grid = predicted / predicted.sum(-1, keepdim=True).clamp_min(torch.finfo(predicted.dtype).tiny)
+        grid = predicted / predicted.sum(-1, keepdim=True).clamp_min(
+            torch.finfo(predicted.dtype).tiny
+        )
         # `where` evaluates both sides; the clamps keep 0 / 0 out of the one that is not taken.
-        return torch.where(mass > 0, unseen / mass.clamp_min(torch.finfo(predicted.dtype).tiny), grid)
+        return torch.where(
+            mass > 0, unseen / mass.clamp_min(torch.finfo(predicted.dtype).tiny), grid
+        )
 
 
 def summed(into: sparse.csr_array, belief: Tensor) -> Tensor:
-    """`into` `[Y, X]` times each row of `belief` `[B, X]`, with sums whose order does not depend on B.
+    """`into` `[Y, X]` times each row of `belief` `[B, X]`, with sums in an order that does not depend on B.
 
     A product of dense matrices may add up in another order for one row than for many, which would make an episode
     differ in the last bit when it is simulated again alone; a sparse one adds up each result entry by entry.
@@ -61,28 +65,36 @@ def summed(into: sparse.csr_array, belief: Tensor) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray((into @ np.ascontiguousarray(belief.numpy().T)).T))
 
 
-def beliefs(world: Modelled, episodes: Sequence[Episode]) -> list[Floats]:
-    """For each episode `[T, M]`, the probability of each cell after a step's move, given what was observed before it.
+def beliefs(world: World, episodes: Sequence[Episode]) -> list[Floats]:
+    """For each episode `[T, M]`, the probability of each cell after a step's move, given the observations before it.
 
-    A row sums to the probability of no exit. Each is the same to the bit whatever the other episodes are. Targets with
-    a mode are followed as (cell, mode), through detections that do not tell it as well.
+    A row sums to the probability of no exit. Each is the same to the bit for any other episodes. Targets with a mode
+    are followed as (cell, mode), also through detections that do not reveal it.
     """
     exact = BeliefFilter(world.kernel)
-    modes = world.modes if isinstance(world, HiddenWorld) else 1
+    modes = world.modes
     cell = torch.arange(exact.num_cells) // modes  # of each hidden state
     cells = sparse.csr_array((np.ones(len(cell)), (cell.numpy(), np.arange(len(cell)))))
-    told = modes == world.revealed  # with a single mode, too
+    told = world.tells_all
     lengths = torch.tensor([len(episode) for episode in episodes])
     first = lengths.cumsum(0) - lengths
     action = torch.as_tensor(np.concatenate([_reported(world, episode) for episode in episodes]))
     target = torch.as_tensor(np.concatenate([episode.target for episode in episodes]))
     located = torch.as_tensor(np.concatenate([episode.located for episode in episodes]))
     # 0 where targets have none
-    mode = torch.as_tensor(np.concatenate([0 * each.target if each.mode is None else each.mode for each in episodes]))
+    mode = torch.as_tensor(
+        np.concatenate([0 * each.target if each.mode is None else each.mode for each in episodes])
+    )
     found = torch.zeros(len(target), world.num_cells)
-    start, first_mode = (torch.tensor([getattr(each, name) for each in episodes]) for name in ("start", "start_mode"))
-    # Where the mode is not told, any of the cell's is as likely at the start.
-    belief = exact.detect(start * modes + first_mode) if told else (cell == start[:, None]).double() / modes
+    start, first_mode = (
+        torch.tensor([getattr(each, name) for each in episodes]) for name in ("start", "start_mode")
+    )
+    # Where the mode is hidden, any of the cell's is as likely at the start.
+    belief = (
+        exact.detect(start * modes + first_mode)
+        if told
+        else (cell == start[:, None]).double() / modes
+    )
     rows = torch.arange(len(episodes))
     for t in range(int(lengths.max())):
         # Episodes that have ended leave the batch, `rows` says which ones the rows of `belief` belong to.
@@ -95,7 +107,7 @@ def beliefs(world: Modelled, episodes: Sequence[Episode]) -> list[Floats]:
         at = target[step] * located[step]
         if told:
             seen = exact.detect(at * modes + mode[step] * located[step])
-        else:  # what was predicted of the cell's modes
+        else:  # the predicted modes of the cell
             seen = exact.miss(predicted, cell != at[:, None])
         missed = exact.miss(predicted, action[step].repeat_interleave(modes, -1))
         belief = torch.where(located[step, None], seen, missed)
@@ -106,5 +118,7 @@ def _reported(world: Task, episode: Episode) -> npt.NDArray[Any]:
     """`[T, M]` probability that a step reports a target in each cell; the action itself where reports are certain."""
     if world.perfect and world.safe:
         return world.covered(episode.action)
+    chosen = sparse.csr_array(episode.action.astype(np.float64))
+    seen = reported(chosen, sparse.csr_array(world.sees_by_cell.T)).toarray()
     forced = episode.misses > world.t_max
-    return np.where(forced[:, None], world.safe_detection, episode.action * world.detection)
+    return np.where(forced[:, None], world.safe_detection, seen)

@@ -1,7 +1,7 @@
-"""The MCAP container, read strictly: every byte that is handed on has a checksum, and it has been checked.
+"""A log as an MCAP file: attachments and metadata by name, messages by time, each of them with a checksum.
 
-The mcap package checks neither attachments nor the summary, and looks for chunks through records without a checksum.
-Here the summary is checked first, and whatever lies outside it is compared with what the summary says of it.
+The mcap package parses the records and compares the checksums of chunks. It compares neither the summary's checksum,
+compared here at the opening, nor that over all data, compared by `check_data`.
 """
 
 from __future__ import annotations
@@ -9,204 +9,39 @@ from __future__ import annotations
 import struct
 import zlib
 from bisect import bisect_left
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack
 from io import BytesIO
 from itertools import takewhile
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import zstandard
-from mcap.data_stream import ReadDataStream, RecordBuilder
-from mcap.records import Attachment, AttachmentIndex, Channel, Chunk, ChunkIndex, Header, Metadata, MetadataIndex
+from mcap.reader import SeekingReader
+from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Message, Metadata
+from mcap.stream_reader import StreamReader, breakup_chunk
 
-from trackmdp import untrusted
 from trackmdp.errors import UserError
-from trackmdp.untrusted import reason
+from trackmdp.untrusted import decoded, opened
 
 MAGIC = b"\x89MCAP0\r\n"
-# A record is its opcode (u8), the length of its content (u64) and the content; a string is its length (u32) and UTF-8.
-# Every number is little-endian. A file's header record, right after the magic, for example:
-#     01 | 16 00 00 00 00 00 00 00 | 00 00 00 00 | 0e 00 00 00  74 72 61 63 ...
-#     HEADER, 22 bytes of content: profile "", then library, the 14 bytes of "trackmdp 0.2.0".
-HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
-ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = range(9, 16)
-_FOOTER_LENGTH = 1 + 8 + 20
-_CHUNK_LIMIT, _RECORD_LIMIT = 2**26, 2**30
-"""Bytes of the largest chunk, unpacked, and of the largest record: a damaged or hostile size must not fill the memory.
+_LARGEST_LOG, _LARGEST_RECORD, _LARGEST_CHUNK = 2**42, 2**30, 2**26
+"""Bytes: of a record, such as an attached problem; of a chunk when unpacked, which ends after a MiB or an episode."""
 
-A writer closes its chunk after one MiB or one episode's end; the longest record is an attached kernel.
-"""
+_FOOTER, _DATA_END = 9 + 20, 9 + 4
+"""Bytes of a record: opcode (1), length of its content (8) and content. All numbers are little-endian."""
 
-_LONGEST = 2**42
+Said = tuple[str, int, bytes]
+"""Topic, log time and content of a message."""
 
 
 class Damaged(Exception):
-    """A checksum or a structure that is not as it should be; the message says where."""
+    """A checksum or a structure differs from the expected one; the message names the place."""
 
 
-@contextmanager
-def reading(file: Path) -> Iterator[None]:
-    """Whatever damage makes raise inside ends in one line.
-
-    Raises:
-        UserError: something was damaged.
-    """
-    try:
-        yield
-    except UserError:
-        raise
-    except Exception as error:  # whatever mcap, JSON, NumPy and base64 raise over what a hostile log says
-        raise UserError(f"file={file}: damaged ({reason(error)}); recover=true saves what can be read") from error
-
-
-@dataclass(frozen=True)
-class Message:
-    """One message."""
-
-    topic: str
-    log_time: int
-    data: bytes
-
-
-class Container:
-    """A finished MCAP file, opened for random access.
-
-    Raises:
-        UserError: not an MCAP file, an unfinished one, or one whose summary is damaged.
-    """
-
-    def __init__(self, file: Path) -> None:
-        self.file = file
-        with ExitStack() as opened, reading(file):
-            self.stream = opened.enter_context(opened_log(file))
-            self.profile, self.made_by = self._header()
-            self._summary()
-            opened.pop_all()  # from here on it stays open
-
-    def _header(self) -> tuple[str, str]:
-        """Profile and library, the two strings of the header record."""
-        opcode, body = next(records(self.stream, len(MAGIC)), (0, b""))
-        if opcode != HEADER:
-            raise Damaged("its first record is not the header")
-        header = vars(_unchecked(Header, body))
-        return header["profile"], header["library"]
-
-    def _summary(self) -> None:
-        """Read the index of chunks, attachments and metadata; its checksum covers the footer as well."""
-        # A finished file ends in: the summary's records, the footer record, the magic bytes. The footer's content is
-        # where the summary starts, where its offsets start (unused here), and a CRC-32 over summary and footer.
-        self.length = self.stream.seek(0, 2)
-        if self.length < 2 * len(MAGIC) + _FOOTER_LENGTH:
-            raise UserError(_cut(self.file))
-        self.stream.seek(self.length - _FOOTER_LENGTH - len(MAGIC))
-        footer, magic = self.stream.read(_FOOTER_LENGTH), self.stream.read()
-        if magic != MAGIC:
-            raise UserError(_cut(self.file))
-        # A record is its opcode (1 byte), the length of its content (8 bytes), and the content.
-        opcode, size, self.summary_start, _, checksum = struct.unpack("<BQQQI", footer)
-        summary_length = self.length - _FOOTER_LENGTH - len(MAGIC) - self.summary_start
-        if (opcode, size) != (FOOTER, 20) or not len(MAGIC) < self.summary_start or summary_length <= 0:
-            raise Damaged("the footer")
-        if summary_length > _RECORD_LIMIT:
-            raise Damaged(f"a summary of {summary_length:,} bytes")
-        self.stream.seek(self.summary_start)
-        summary = self.stream.read(summary_length)
-        # zlib.crc32 takes the checksum so far: that of the summary goes on over the footer, opcode and length
-        # included, but for the four bytes of the checksum itself.
-        if zlib.crc32(footer[:-4], zlib.crc32(summary)) != checksum:
-            raise Damaged("the checksum of the summary")
-        self._index(summary)
-
-    def _index(self, summary: bytes) -> None:
-        self.channels: dict[int, str] = {}
-        self.chunks: list[ChunkIndex] = []
-        self.attachments: dict[str, tuple[int, int]] = {}
-        self.metadata: dict[str, tuple[int, int]] = {}
-        for opcode, data in _split(summary):
-            if opcode == CHUNK_INDEX:
-                self.chunks.append(_parsed(ChunkIndex, data))
-            elif opcode == CHANNEL:
-                channel = _parsed(Channel, data)
-                self.channels[channel.id] = channel.topic
-            elif opcode == ATTACHMENT_INDEX:
-                attachment = _parsed(AttachmentIndex, data)
-                self.attachments[attachment.name] = attachment.offset, attachment.length
-            elif opcode == METADATA_INDEX:
-                metadata = _parsed(MetadataIndex, data)
-                self.metadata[metadata.name] = metadata.offset, metadata.length
-        # Sorted for the bisection in `chunks_between`; a log's own order is the same.
-        self.chunks.sort(key=lambda chunk: chunk.message_start_time)
-        self._ends = [chunk.message_end_time for chunk in self.chunks]
-
-    def _record(self, opcode: int, offset: int, length: int) -> bytes:
-        """The content of the record that the summary says is there."""
-        # A checksum shows that the summary is what was written, not that its writer was honest: these numbers may be
-        # anything.
-        if not (9 <= length <= min(_RECORD_LIMIT, self.length) and 0 <= offset <= self.length - length):
-            raise Damaged(f"a record of {length:,} bytes at byte {offset:,}")
-        self.stream.seek(offset)
-        data = self.stream.read(length)
-        if len(data) != length or struct.unpack_from("<BQ", data) != (opcode, length - 9):
-            raise Damaged(f"the record at byte {offset}")
-        return data[9:]
-
-    def attachment(self, name: str) -> bytes:
-        """The content of the attachment `name`, its checksum checked."""
-        return self._named("attachment", name, self.attachments, ATTACHMENT, attachment_of)
-
-    def tell(self, name: str) -> dict[str, str]:
-        """The metadata called `name`; the container has no checksum for it."""
-        return self._named("metadata", name, self.metadata, METADATA, metadata_of)
-
-    def _named(
-        self, kind: str, name: str, places: Mapping[str, tuple[int, int]], opcode: int, parsed: Callable[..., Any]
-    ) -> Any:
-        if name not in places:
-            raise Damaged(f"no {kind} {name}")
-        # The name once more, in the record: an index made with two offsets exchanged has a correct checksum as well.
-        found, content = parsed(self._record(opcode, *places[name]))
-        if found != name:
-            raise Damaged(f"{kind} {name}")
-        return content
-
-    def chunks_between(self, begin: int, end: int) -> Iterator[ChunkIndex]:
-        """The chunks with messages from log time `begin` to `end`, in their order; logs are in order of time."""
-        # Chunks follow each other in time, so that the first one that ends at `begin` or later is found by bisection.
-        later = self.chunks[bisect_left(self._ends, begin) :]
-        return takewhile(lambda chunk: chunk.message_start_time <= end, later)
-
-    def messages(self, chunk: ChunkIndex) -> list[Message]:
-        """All messages of a chunk, its checksum checked."""
-        found, content = unpacked(self._record(CHUNK, chunk.chunk_start_offset, chunk.chunk_length))
-        # A chunk's checksum covers its content alone; its head is held against the summary, which has its own.
-        same = ("message_start_time", "message_end_time", "uncompressed_size", "compression")
-        differs = any(getattr(found, name) != getattr(chunk, name) for name in same)
-        if differs or len(found.data) != chunk.compressed_size:
-            raise Damaged(f"the chunk at byte {chunk.chunk_start_offset}")
-        # A copy, since a chunk may repeat the definitions of channels, which are added to what is handed over.
-        return list(messages_of(content, dict(self.channels)))
-
-    def check_data(self) -> None:
-        """Compare the checksum over all that lies before the summary; reads the whole file.
-
-        Raises:
-            Damaged: it differs.
-        """
-        # The record that closes the data section, 9 + 4 bytes before the summary, holds a CRC-32 of all before itself.
-        end = self.summary_start - 13
-        self.stream.seek(0)
-        checksum, left = 0, end
-        while left:
-            data = self.stream.read(min(left, 2**20))
-            checksum, left = zlib.crc32(data, checksum), left - len(data)
-        opcode, size, written = struct.unpack("<BQI", self.stream.read(13))
-        if (opcode, size) != (DATA_END, 4) or written not in (0, checksum):
-            raise Damaged("the checksum over the data section")
-        # Zero stands for `not computed` in the format. It is told apart, since the bytes may be whole.
-        if written == 0:
-            raise Damaged("no checksum over the data section")
+def reading(file: Path) -> AbstractContextManager[None]:
+    """Errors inside end in one line; see `untrusted.decoded`."""
+    return decoded(f"file={file}", "a whole log; recover=true saves its whole episodes")
 
 
 def opened_log(file: Path) -> BinaryIO:
@@ -215,132 +50,142 @@ def opened_log(file: Path) -> BinaryIO:
     Raises:
         UserError: it does not.
     """
-    stream = untrusted.opened(file, most=_LONGEST, source=f"file={file}", links=True)  # the user named this very file
-    start = stream.read(len(MAGIC))
-    if start != MAGIC:
+    source = f"file={file}"
+    stream = opened(
+        file, most=_LARGEST_LOG, source=source, links=True
+    )  # the user named this very file
+    if stream.read(len(MAGIC)) != MAGIC:
         stream.close()
-        what = "an empty file" if not start else "not an MCAP file"
-        raise UserError(f"file={file}: {what}, expected a log written with log=[mcap]")
+        raise UserError(f"{source}: not an MCAP file, expected a log written with log=[mcap]")
     return stream
 
 
-def _cut(file: Path) -> str:
-    return f"file={file}: cut off before its end; recover=true saves every episode that is whole"
-
-
-def records(stream: BinaryIO, offset: int) -> Iterator[tuple[int, bytes]]:
-    """Opcode and content of the records from `offset` on, up to the closing magic.
+class Container:
+    """A finished MCAP file, opened for random access.
 
     Raises:
-        Damaged: one reaches beyond the end of the file.
+        UserError: not an MCAP file, an unfinished one, or one with a damaged summary.
     """
-    length = stream.seek(0, 2)
-    while offset < length:
-        stream.seek(offset)
-        head = stream.read(9)
-        # read(9) returns the 8 bytes that are left.
-        if length - offset == len(MAGIC) and head == MAGIC:
-            return
-        size = int.from_bytes(head[1:], "little")
-        if len(head) < 9 or size > length - offset - 9:
-            raise Damaged(f"the record at byte {offset} reaches beyond the end of the file")
-        if head[0] == 0:  # no record has this opcode, but a sparse file holds nothing else, two thousand million times
-            raise Damaged(f"no record at byte {offset}")
-        if size > _RECORD_LIMIT:
-            raise Damaged(f"a record of {size:,} bytes at byte {offset}")
-        offset += 9 + size
-        yield head[0], stream.read(size)
+
+    def __init__(self, file: Path) -> None:
+        with ExitStack() as opened, reading(file):
+            self.stream = opened.enter_context(opened_log(file))
+            self._check_summary()
+            self.stream.seek(0)
+            reader = SeekingReader(self.stream, record_size_limit=_LARGEST_RECORD)
+            summary: Any = reader.get_summary()
+            self._topics = {key: channel.topic for key, channel in summary.channels.items()}
+            self._attachments = {each.name: each.offset for each in summary.attachment_indexes}
+            self._metadata = {each.name: each.offset for each in summary.metadata_indexes}
+            self._chunks: list[ChunkIndex] = sorted(
+                summary.chunk_indexes, key=lambda chunk: chunk.message_start_time
+            )
+            self._ends = [chunk.message_end_time for chunk in self._chunks]
+            opened.pop_all()  # from here on it stays open
+
+    def _check_summary(self) -> None:
+        """Compare the checksum of the index of chunks, attachments and metadata."""
+        # A file ends in: the summary's records, the footer record, the magic bytes. The footer holds the start of the
+        # summary, the start of its offsets (unused here), and a CRC-32 of summary and footer up to itself.
+        end = self.stream.seek(0, 2) - _FOOTER - len(MAGIC)
+        self.stream.seek(max(end, 0))
+        footer, magic = self.stream.read(_FOOTER), self.stream.read()
+        if magic != MAGIC:
+            raise UserError("cut off before its end; recover=true saves every whole episode")
+        self._start, _, checksum = struct.unpack_from("<QQI", footer, 9)
+        if not len(MAGIC) + _DATA_END <= self._start <= end <= self._start + _LARGEST_RECORD:
+            raise Damaged("the footer")
+        self.stream.seek(self._start)
+        if zlib.crc32(self.stream.read(end - self._start) + footer[:-4]) != checksum:
+            raise Damaged("the checksum of the summary")
+
+    def check_data(self) -> None:
+        """Compare the checksum of all that lies before the summary; reads the whole file.
+
+        Raises:
+            Damaged: it differs.
+        """
+        self.stream.seek(0)
+        checksum, left = 0, self._start - _DATA_END
+        while left:
+            piece = self.stream.read(min(left, 2**20))
+            checksum, left = zlib.crc32(piece, checksum), left - len(piece)
+        # The data section ends in a record of opcode 15 with its CRC-32.
+        if self.stream.read(_DATA_END) != struct.pack("<BQI", 15, 4, checksum):
+            raise Damaged("the checksum of the data section")
+
+    def attachment(self, name: str) -> bytes:
+        """The content of the attachment `name`."""
+        return self._named(Attachment, name, self._attachments).data
+
+    def metadata(self, name: str) -> dict[str, str]:
+        """The metadata `name`, for which the container has no checksum."""
+        return self._named(Metadata, name, self._metadata).metadata
+
+    def _named(self, kind: type[Any], name: str, offsets: dict[str, int]) -> Any:
+        if name not in offsets:
+            raise Damaged(f"no {kind.__name__.lower()} {name}")
+        found = record_of(frame_at(self.stream, offsets[name]))
+        if not isinstance(found, kind):
+            raise Damaged(f"{kind.__name__.lower()} {name}")
+        return found
+
+    def chunks_between(self, begin: int, end: int) -> Iterator[ChunkIndex]:
+        """The chunks with messages from log time `begin` to `end`, in their order; logs are in order of time."""
+        later = self._chunks[bisect_left(self._ends, begin) :]
+        return takewhile(lambda chunk: chunk.message_start_time <= end, later)
+
+    def messages(self, chunk: ChunkIndex) -> list[Said]:
+        """All messages of a chunk."""
+        found = record_of(frame_at(self.stream, chunk.chunk_start_offset))
+        if not isinstance(found, Chunk):
+            raise Damaged("a chunk")
+        return messages_of(found, self._topics)
 
 
-def _split(data: bytes) -> Iterator[tuple[int, bytes]]:
-    place = 0
-    while place < len(data):
-        opcode, size = struct.unpack_from("<BQ", data, place)
-        place += 9 + size
-        if place > len(data):
-            raise Damaged("a record that reaches beyond its section")
-        yield opcode, data[place - size : place]
+def frame_at(stream: BinaryIO, offset: int) -> bytes:
+    """The bytes of the record at `offset`; none where there is no record, or one that reaches beyond the file."""
+    stream.seek(offset)
+    head = stream.read(9)
+    size = int.from_bytes(head[1:], "little")
+    body = stream.read(size) if size <= _LARGEST_RECORD else b""
+    # No record has the opcode 0: it begins a hole of the file.
+    return head + body if len(head) == 9 and head[0] and len(body) == size else b""
 
 
-def _parsed(kind: Any, data: bytes) -> Any:
-    """The record of a kind of `mcap.records` from its content.
+def record_of(frame: bytes) -> Any:
+    """The record of `mcap.records` in the bytes of one record.
 
-    That reads fewer bytes where a length leads out of the content: what is parsed here is covered by a checksum, or
-    compared with something that is; else see `_unchecked`.
+    Raises:
+        Exception: it is damaged.
     """
-    return kind.read(ReadDataStream(BytesIO(data)))
+    return next(StreamReader(BytesIO(frame), skip_magic=True, emit_chunks=True).records)
 
 
-def _unchecked(kind: Any, data: bytes) -> Any:
-    """A record that no checksum covers: only what is written again alike is what was written.
+def messages_of(chunk: Chunk, topics: dict[int, str]) -> list[Said]:
+    """The messages of a chunk, its checksum compared.
 
-    A length that is a little wrong is read all the same by `_parsed`.
+    Args:
+        chunk: its record.
+        topics: of each channel; the chunk's own are added.
+
+    Raises:
+        Damaged: it is too large, or has no checksum.
     """
-    found, builder = _parsed(kind, data), RecordBuilder()
-    found.write(builder)
-    if builder.end()[9:] != data:
-        raise Damaged(f"the record {kind.__name__}")
+    size = chunk.uncompressed_size
+    # Before unpacking: zstd packs zeros by 30,000 to one, and a frame that names its own size is unpacked to that.
+    if size > _LARGEST_CHUNK or chunk.compression not in _SIZES:
+        raise Damaged(f"a chunk of {size:,} bytes, compressed by {chunk.compression or 'nothing'}")
+    if _SIZES[chunk.compression](chunk.data) not in (-1, size) or not chunk.uncompressed_crc:
+        raise Damaged("a chunk without a checksum, or of another size")
+    found = []
+    for record in breakup_chunk(chunk, validate_crc=True):
+        if isinstance(record, Message):
+            found.append((topics[record.channel_id], record.log_time, record.data))
+        elif isinstance(record, Channel):
+            topics[record.id] = record.topic
     return found
 
 
-def attachment_of(data: bytes) -> tuple[str, bytes]:
-    """Name and content of an attachment record, which ends in a CRC-32 of all before it."""
-    if zlib.crc32(data[:-4]) != int.from_bytes(data[-4:], "little"):
-        raise Damaged("the checksum of an attachment")
-    found = _parsed(Attachment, data)
-    return found.name, found.data
-
-
-def metadata_of(data: bytes) -> tuple[str, dict[str, str]]:
-    """Name and content of a metadata record."""
-    found = _unchecked(Metadata, data)
-    return found.name, found.metadata
-
-
-def unpacked(data: bytes) -> tuple[Chunk, bytes]:
-    """A chunk record, and its content.
-
-    Raises:
-        Damaged: the checksum is missing or wrong, or the compression cannot be undone.
-    """
-    chunk: Chunk = _parsed(Chunk, data)
-    size = chunk.uncompressed_size
-    # Before decompressing: zstd packs zeros by 30,000 to one.
-    if size > _CHUNK_LIMIT:
-        raise Damaged(f"a chunk of {size} bytes")
-    try:
-        content = _UNPACK[chunk.compression](chunk.data, size)
-    except (KeyError, zstandard.ZstdError, MemoryError) as error:
-        raise Damaged(f"a chunk that cannot be decompressed ({chunk.compression or 'none'})") from error
-    # A checksum of 0 means that none was written; our logs always have one.
-    if len(content) != size or zlib.crc32(content) != chunk.uncompressed_crc or chunk.uncompressed_crc == 0:
-        raise Damaged("the checksum of a chunk")
-    return chunk, content
-
-
-def _unzstd(packed: bytes, size: int) -> bytes:
-    """The content of a frame of `size` bytes.
-
-    A frame that names its own size is unpacked to that, whatever `max_output_size` says: 200 kB may name 2 GiB.
-    """
-    if zstandard.frame_content_size(packed) not in (-1, size):
-        raise Damaged("a chunk whose frame has another size")
-    return zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
-
-
-_UNPACK: dict[str, Callable[[bytes, int], bytes]] = {"": lambda packed, _: packed, "zstd": _unzstd}
-
-
-def messages_of(content: bytes, channels: dict[int, str]) -> Iterator[Message]:
-    """The messages of a chunk's content; channels it defines are added to `channels`."""
-    for opcode, data in _split(content):
-        if opcode == MESSAGE:
-            # MESSAGE: channel u16, sequence u32, log time u64, publish time u64, 22 bytes in all, then the data.
-            # Channels are defined before their first message, in the same chunk or an earlier one.
-            number, _, log_time, _ = struct.unpack_from("<HIQQ", data)
-            if number not in channels:
-                raise Damaged(f"a message of an unknown channel {number}")
-            yield Message(channels[number], log_time, data[22:])
-        elif opcode == CHANNEL:
-            channel = _parsed(Channel, data)
-            channels[channel.id] = channel.topic
+_SIZES: dict[str, Callable[[bytes], int]] = {"": len, "zstd": zstandard.frame_content_size}
+"""Compression -> bytes of the packed content when unpacked; -1 where it does not name them."""

@@ -11,6 +11,7 @@ import numpy.typing as npt
 import torch
 from tensordict import TensorDict
 
+from trackmdp.notebook.card import Card, Carded, decimal
 from trackmdp.world.model import BoolArray, Task
 from trackmdp.world.windows import Window
 
@@ -18,9 +19,9 @@ Floats: TypeAlias = npt.NDArray[np.float32]
 Integers: TypeAlias = npt.NDArray[np.int64]
 
 
-@dataclass(frozen=True, eq=False)
-class Episode:
-    """T steps of one target. Row t is step t: what was known and chosen before the move, what came of it after.
+@dataclass(frozen=True, eq=False, repr=False)
+class Episode(Carded):
+    """T steps of one target. Row t is step t: state and action before the move, outcome after it.
 
     Attributes:
         number: its place in the log.
@@ -62,6 +63,15 @@ class Episode:
     def __len__(self) -> int:
         return len(self.target)
 
+    def card(self) -> Card:
+        """Length, return, detections and end."""
+        end = "the target exited" if self.terminated else "truncated"
+        facts = {"steps": f"{len(self):,}; {end}", "start": f"cell {self.start}"}
+        facts["return"] = decimal(float(self.returns[-1]))
+        facts["located"] = f"in {int(self.located.sum()):,} steps"
+        facts["sensors per step"] = decimal(float(self.action.sum(1).mean()))
+        return Card(f"Episode: number {self.number}, seed {self.seed}", facts)
+
     @cached_property
     def last_cell(self) -> Integers:
         """`[T]` cell of the last detection before the step, x_{l(k)}."""
@@ -92,8 +102,12 @@ class Episode:
             task: of the world; with a window actions are in its local numbers, as the environment takes them, and with
                 `max_steps` there is a `step_count`.
         """
-        action = Window.of(task).to_local(torch.from_numpy(self.last_cell), torch.from_numpy(self.action)).numpy()
-        # The T + 1 states: each but the last is one in which an action was chosen, each but the first what came of it.
+        action = (
+            Window.of(task)
+            .to_local(torch.from_numpy(self.last_cell), torch.from_numpy(self.action))
+            .numpy()
+        )
+        # The T + 1 states: each but the last has an action, each but the first is an outcome.
         over = self.located[-1] or self.terminated
         misses = np.append(self.misses, 0 if over else min(self.misses[-1] + 1, task.t_max + 1))
         states = {
@@ -106,7 +120,10 @@ class Episode:
         current = {key: value[:-1] for key, value in states.items()}
         current |= {"action": action, **_ends(len(self), terminated=False, truncated=False)}
         following = {key: value[1:] for key, value in states.items()}
-        following |= {"reward": self.reward[:, None], **_ends(len(self), self.terminated, self.truncated)}
+        following |= {
+            "reward": self.reward[:, None],
+            **_ends(len(self), self.terminated, self.truncated),
+        }
         return TensorDict({**current, "next": following}, [len(self)])
 
 
@@ -117,12 +134,12 @@ def _history(action: BoolArray, misses: Integers, located: BoolArray, t_max: int
     repeated, comes behind all slots.
     """
     # Example: misses 0 1 2 0 (located by the third step), t_max = 2. In state 2, n = 2: slot 0 is the action of step 0,
-    # slot 1 that of step 1, slot 2 is empty.
+    # slot 1 the action of step 1, slot 2 is empty.
     slots = np.arange(t_max + 1)
     begin = np.where(located, np.arange(len(located)) + 1, 0)
     steps = np.concatenate([[0], np.maximum.accumulate(begin)])[:, None] + slots
     filled = slots < misses[:, None]
-    # Empty slots point at steps that are not theirs: they read step 0 instead, and the mask clears what they read.
+    # Empty slots would point at other steps: they read step 0 instead, and the mask clears the result.
     return action[np.where(filled, steps, 0)] & filled[..., None]
 
 
@@ -139,7 +156,11 @@ def last_cells(start: int, target: Integers, located: BoolArray) -> Integers:
 
 def _ends(steps: int, terminated: bool, truncated: bool) -> dict[str, Any]:
     flags = {name: np.zeros((steps, 1), dtype=bool) for name in ("done", "terminated", "truncated")}
-    for name, value in (("terminated", terminated), ("truncated", truncated), ("done", terminated or truncated)):
+    for name, value in (
+        ("terminated", terminated),
+        ("truncated", truncated),
+        ("done", terminated or truncated),
+    ):
         flags[name][-1] = value
     return flags
 
@@ -148,7 +169,9 @@ SCALARS = ("seed", "policy", "start", "start_mode", "terminated", "truncated")
 PER_STEP = ("target", "mode", "misses", "action", "located", "reward", "probability", "belief")
 
 
-def first_difference(logged: Episode, again: Episode, *, belief_tolerance: float = 0.0) -> str | None:
+def first_difference(
+    logged: Episode, again: Episode, *, belief_tolerance: float = 0.0
+) -> str | None:
     """Where two recordings of an episode part, in words; None where every bit is the same.
 
     Args:
@@ -163,7 +186,9 @@ def first_difference(logged: Episode, again: Episode, *, belief_tolerance: float
     steps = min(len(logged), len(again))
     known = [name for name in PER_STEP if name != "mode" or logged.mode is not None]
     found = [_differing(logged, again, name, steps, belief_tolerance) for name in known]
-    earliest = min((each for each in found if each is not None), default=None, key=lambda each: each[0])
+    earliest = min(
+        (each for each in found if each is not None), default=None, key=lambda each: each[0]
+    )
     if earliest is not None:
         return f"step {earliest[0]}, {earliest[1]}"
     if len(logged) != len(again):
@@ -171,7 +196,9 @@ def first_difference(logged: Episode, again: Episode, *, belief_tolerance: float
     return None
 
 
-def _differing(logged: Episode, again: Episode, name: str, steps: int, tolerance: float) -> tuple[int, str] | None:
+def _differing(
+    logged: Episode, again: Episode, name: str, steps: int, tolerance: float
+) -> tuple[int, str] | None:
     """The first step at which the arrays called `name` differ, and how."""
     mine, other = getattr(logged, name)[:steps], getattr(again, name)[:steps]
     differs = mine != other

@@ -2,7 +2,7 @@
 
 No belief between two safe actions is a point then, so that there is no table of plans, and no exact value. The filter
 weighs every report, and every silence of a sensor that is on. Both of its decisions look one step ahead, the clocked
-bound U (`solvers/bounds.py`) saying what follows. The sets are those of the clocked policy for the filtered belief β.
+bound U (`solvers/bounds.py`) as the value of the future. The sets are the clocked policy's for the filtered belief β.
 Of the cells reported it declares the likeliest, k, if r β_k + sum_j β_j (U(j, 0) - U(j, n + 1)) > 0: r is earned where
 that is true, and n counts on from the last declaration. A wrong one costs nothing by itself, and the belief remains.
 """
@@ -12,10 +12,10 @@ from __future__ import annotations
 import numpy as np
 
 from trackmdp.seeding import derive
-from trackmdp.solvers.alarms import check_alarms
 from trackmdp.solvers.bounds import clocked_table
-from trackmdp.solvers.recorded import ReplayedTracks
-from trackmdp.solvers.renewal import IndexArray
+from trackmdp.solvers.evaluation import ReplayedTracks
+from trackmdp.solvers.false_alarms import check_alarms
+from trackmdp.solvers.linear import IndexArray
 from trackmdp.world.model import Array, BoolArray, World
 from trackmdp.world.tracks import Problem
 
@@ -23,8 +23,10 @@ _NEVER = 1e-12
 """Stands for p_f = 0, so that the evidence of a report is finite."""
 
 
-def simulate_filter(world: Problem, false_alarm: float, episodes: int, *, seed: int = 0) -> ReplayedTracks:
-    """What the filter's policy earns and does on independent episodes.
+def simulate_filter(
+    world: Problem, false_alarm: float, episodes: int, *, seed: int = 0
+) -> ReplayedTracks:
+    """Totals of the filter's policy on independent episodes.
 
     Args:
         world: the problem; `detection` is p_d.
@@ -33,12 +35,14 @@ def simulate_filter(world: Problem, false_alarm: float, episodes: int, *, seed: 
         seed: of the draws.
 
     Raises:
-        UserError: what `trackmdp.solvers.alarms.believed` refuses as well.
+        UserError: same as in `trackmdp.solvers.false_alarms.believed`.
     """
     world = check_alarms(world, false_alarm)
     m, kernel = world.num_cells, world.kernel.toarray()
     edges, table = np.cumsum(kernel, axis=1), clocked_table(world).table
-    located = (table[:, :1] - table[:, 1:]).T  # [t_max + 1, M], what to know the cell is worth more than a miss
+    located = (
+        table[:, :1] - table[:, 1:]
+    ).T  # [t_max + 1, M], worth of knowing the cell over a miss
     rng = np.random.default_rng(derive(seed, "false_alarm"))
     target, totals, watched = rng.integers(m, size=episodes), np.zeros((6, episodes)), np.zeros(m)
     belief, misses, row = np.eye(m)[target], np.zeros(episodes, dtype=np.int64), np.arange(episodes)
@@ -66,28 +70,32 @@ def simulate_filter(world: Problem, false_alarm: float, episodes: int, *, seed: 
     return ReplayedTracks(totals[:5].T, totals[5], watched)
 
 
-def _declared(reward: float, belief: Array, reports: BoolArray, later: Array) -> tuple[BoolArray, IndexArray]:
+def _declared(
+    reward: float, belief: Array, reports: BoolArray, later: Array
+) -> tuple[BoolArray, IndexArray]:
     """`[E]` whether to declare the likeliest of the cells that reported, and `[E]` which it is.
 
     Args:
         reward: r.
         belief: `[E, M]`, after the reports.
         reports: `[E, M]`.
-        later: `[E, M]`, what the target's being located in each cell is worth more than going on without.
+        later: `[E, M]`, worth of the target located in each cell over a miss.
     """
     likely = np.where(reports, belief, 0.0)
     worth = reward * likely.max(axis=1) + (belief * later).sum(axis=1)
     return reports.any(axis=1) & (worth > 0), likely.argmax(axis=1)
 
 
-def _posterior(world: World, predicted: Array, on: BoolArray, reports: BoolArray, false_alarm: float) -> Array:
+def _posterior(
+    world: World, predicted: Array, on: BoolArray, reports: BoolArray, false_alarm: float
+) -> Array:
     """`[E, M]` the belief after the reports of the sensors `on`, given that the target is still in the grid.
 
-    All other sensors are as likely to report or not wherever it is: what tells a cell from the others is its own
-    sensor, whose report is p_d / p_f times as likely with the target there, and its silence (1 - p_d) / (1 - p_f).
+    All other sensors report independently of it: the evidence for a cell comes from its own sensor, with a report
+    p_d / p_f times as likely with the target there, and silence (1 - p_d) / (1 - p_f) times.
     """
     report = world.detection / max(false_alarm, _NEVER)
     evidence = np.where(reports, report, (1.0 - world.detection) / (1.0 - false_alarm))
     weight = predicted * np.where(on, evidence, 1.0)
-    # An exit leaves nothing that could be told of the cell; the episode ends, and the row is not read.
+    # After an exit there is no cell; the episode ends, and the row is not read.
     return weight / np.maximum(weight.sum(axis=1, keepdims=True), 1e-300)

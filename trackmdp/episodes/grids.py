@@ -1,11 +1,11 @@
-"""What viewers draw of a step, one `foxglove.Grid` for each layer: belief and policy, the cells sensed, the target.
+"""A step as viewers draw it, one `foxglove.Grid` for each layer: belief and policy, the cells sensed, the target.
 
-And where they look: a frame of coordinates in the middle of the part of a large grid that is worth looking at.
+The view: a frame of coordinates in the middle of the interesting part of a large grid.
 
 A layout for viewers that take Lichtblick's form: maps in layers, plots of the steps, where targets were located.
 
-`layout.json` is what the viewers export: two maps of three layers each (a field of `/grid`, over it the cells sensed,
-which the map of the policy leaves out, over those the target), whose cameras follow `/part`, the plots, and the last
+`layout.json` is an export of the viewers: two maps of three layers each (a field of `/grid`, over it the cells sensed,
+except on the policy's map, over those the target) with cameras that follow `/part`, the plots, and the last
 `/episode`.
 The lines of a plot are named by their colours in its title: a legend would lie over them.
 Of the times that Foxglove knows, Lichtblick draws lines for `receiveTime` alone, and it shows nothing of a layout
@@ -42,18 +42,25 @@ _TYPES = {np.dtype("<f4"): 7, np.dtype("u1"): 1}  # foxglove.NumericType
 
 
 def _constant(cell: np.dtype[Any], side: float = 1) -> bytes:
-    """What all messages of a layer of square cells say alike, without the braces."""
+    """The constant fields of all messages of a layer of square cells, without the braces."""
     fields = (cell.fields or {}).items()
     said = {
         "frame_id": "grid",
         "cell_size": {"x": side, "y": side},
         "cell_stride": cell.itemsize,
-        "fields": [{"name": name, "offset": offset, "type": _TYPES[kind]} for name, (kind, offset, *_) in fields],
+        "fields": [
+            {"name": name, "offset": offset, "type": _TYPES[kind]}
+            for name, (kind, offset, *_) in fields
+        ],
     }
     return json.dumps(said, separators=(",", ":")).encode()[1:-1]
 
 
-_GRID_SAYS, _ACTIVE_SAYS, _TARGET_SAYS = _constant(_CELL), _constant(_ACTIVE), _constant(_TARGET, side=0.5)
+_GRID_SAYS, _ACTIVE_SAYS, _TARGET_SAYS = (
+    _constant(_CELL),
+    _constant(_ACTIVE),
+    _constant(_TARGET, side=0.5),
+)
 
 _DOT = np.array([[[1]], [[0]]], np.uint8)
 """The target's layer, a single cell; 0 once it has exited."""
@@ -77,14 +84,25 @@ def grid_messages(
     exited = (episode.target == rows * columns).astype(int).tolist()
     at = np.stack(np.divmod(episode.target % (rows * columns), columns), axis=1).tolist()
     boxes = zip(_boxes(used), _boxes(active), at, _parts(episode, size), strict=True)
-    for t, ((top, bottom, left, right), (first, last, start, stop), (row, column), (y, x)) in enumerate(boxes):
+    for t, (
+        (top, bottom, left, right),
+        (first, last, start, stop),
+        (row, column),
+        (y, x),
+    ) in enumerate(boxes):
         seconds, rest = divmod(time_of(first_tick + t), 1_000_000_000)
         stamp = b'{"timestamp":{"sec":%d,"nsec":%d}' % (seconds, rest)
         yield {
-            "/grid": _grid(stamp, _GRID_SAYS, cells[t, top:bottom, left:right], left, rows - bottom, 0),
-            "/active": _grid(stamp, _ACTIVE_SAYS, sensed[t, first:last, start:stop], start, rows - last, 0.01),
+            "/grid": _grid(
+                stamp, _GRID_SAYS, cells[t, top:bottom, left:right], left, rows - bottom, 0
+            ),
+            "/active": _grid(
+                stamp, _ACTIVE_SAYS, sensed[t, first:last, start:stop], start, rows - last, 0.01
+            ),
             # half as wide as its cell, so that the layers beneath it show: in column 3 from x = 3.25 to 3.75
-            "/target": _grid(stamp, _TARGET_SAYS, _DOT[exited[t]], column + 0.25, rows - row - 0.75, 0.02),
+            "/target": _grid(
+                stamp, _TARGET_SAYS, _DOT[exited[t]], column + 0.25, rows - row - 0.75, 0.02
+            ),
             "/part": (
                 b'%s,"parent_frame_id":"grid","child_frame_id":"part","translation":{"x":%g,"y":%g,"z":0},'
                 b'"rotation":{"x":0,"y":0,"z":0,"w":1}}'
@@ -96,8 +114,8 @@ def grid_messages(
 def _parts(episode: Episode, size: tuple[int, int]) -> list[list[float]]:
     """Of each step the middle (y, x) of the part of the grid around the target, from the top left.
 
-    Of one that has exited, around where it was. Row 100 lies in the block of rows 99 to 107, in the middle of which,
-    at y = 103.5, a part is; rows 0 to 8 in that of y = 12.5, since a part does not reach beyond the grid.
+    After its exit, around its last place. Row 100 lies in the block of rows 99 to 107, and a part in its middle, at
+    y = 103.5; rows 0 to 8 lie in the block of y = 12.5, since a part does not reach beyond the grid.
     """
     rows, columns = size
     before = np.concatenate([[episode.start], episode.target[:-1]])
@@ -121,8 +139,10 @@ def _boxes(used: BoolArray) -> Iterator[tuple[int, int, int, int]]:
     return zip(*(each.tolist() for each in ends), strict=True)
 
 
-def _grid(stamp: bytes, says: bytes, cells: npt.NDArray[Any], x: float, y: float, z: float) -> bytes:
-    """The message of `cells` `[R, C]` whose lowest left corner is at (x, y, z)."""
+def _grid(
+    stamp: bytes, says: bytes, cells: npt.NDArray[Any], x: float, y: float, z: float
+) -> bytes:
+    """The message of `cells` `[R, C]` with the lowest left corner at (x, y, z)."""
     columns, stride = cells.shape[1], cells.dtype.itemsize
     # turned upside down, since a viewer's first row is the lowest
     data = base64.b64encode(cells[::-1].tobytes())
@@ -139,12 +159,18 @@ def read_grids(grids: Sequence[bytes], size: tuple[int, int]) -> tuple[Floats, F
         ValueError, KeyError, TypeError: one is none of a grid of `size`.
     """
     rows, columns = size
-    # zeros and not one block: memory is taken by what is written to it only, however many steps a log claims
+    # zeros and not one block: only written parts take memory, however many steps a log claims
     belief, policy = (np.zeros((len(grids), rows, columns), np.float32) for _ in range(2))
     for t, text in enumerate(grids):
         said = json.loads(text)
-        left, low, width = said["pose"]["position"]["x"], said["pose"]["position"]["y"], said["column_count"]
-        cells = np.frombuffer(base64.b64decode(said["data"], validate=True), _CELL).reshape(-1, width)[::-1]
+        left, low, width = (
+            said["pose"]["position"]["x"],
+            said["pose"]["position"]["y"],
+            said["column_count"],
+        )
+        cells = np.frombuffer(base64.b64decode(said["data"], validate=True), _CELL).reshape(
+            -1, width
+        )[::-1]
         top, bottom = rows - low - len(cells), rows - low
         if not (0 <= top < bottom <= rows and left >= 0 and left + width <= columns):
             raise ValueError("a grid that lies outside")
@@ -155,10 +181,12 @@ def read_grids(grids: Sequence[bytes], size: tuple[int, int]) -> tuple[Floats, F
 
 def layout(size: tuple[int, int]) -> dict[str, Any]:
     """The layout as plain values, for a grid of `size` (rows, columns)."""
-    made: dict[str, Any] = json.loads(files("trackmdp.episodes").joinpath("layout.json").read_text(encoding="utf-8"))
+    made: dict[str, Any] = json.loads(
+        files("trackmdp.episodes").joinpath("layout.json").read_text(encoding="utf-8")
+    )
     for panel in made["configById"].values():
         if "cameraState" in panel:
-            # Without perspective the distance is the height of what is seen, in cells: the part and a margin.
+            # Without perspective the distance is the height of the view, in cells: the part and a margin.
             panel["cameraState"]["distance"] = 1.2 * min(max(size), PART)
             panel["layers"] = {f"lines {place}": each for place, each in enumerate(_lines(size))}
     return made
@@ -173,7 +201,13 @@ def _lines(size: tuple[int, int]) -> list[dict[str, Any]]:
     count = -(-max(size) // side)
     # from the first to the last place that the square has along either side
     corners = (np.linspace([0, 0], np.array(size) - side, count).round() + side / 2).tolist()
-    same = {"layerId": "foxglove.Grid", "visible": True, "frameId": "grid", "size": side, "divisions": side}
+    same = {
+        "layerId": "foxglove.Grid",
+        "visible": True,
+        "frameId": "grid",
+        "size": side,
+        "divisions": side,
+    }
     same |= {"lineWidth": 1, "color": "#80808080"}
     return [same | {"position": [x, y, 0.005]} for y, x in corners]
 

@@ -19,23 +19,23 @@ from trackmdp.episodes.writer import EpisodeWriter
 from trackmdp.policies.policy import Policy, PolicyLike
 from trackmdp.training.callbacks import Callback, Training
 from trackmdp.training.evaluator import Score
-from trackmdp.world.modes import Modelled
-from trackmdp.world.tracks import Recorded
+from trackmdp.untrusted import reason
+from trackmdp.world.tracks import Problem
 
 
 class EpisodeLog:
     """`episodes.mcap` in a run's folder.
 
-    When the disk is full, or the file fails in another way, that is said once and logging is over; the run goes on, and
-    what was written stays under the `.part` name.
+    When the disk is full, or an episode or the file fails in another way, one line reports it and logging is over; the
+    run goes on, and the steps written stay under the `.part` name.
 
     Args:
         folder: the run's folder.
-        world: the world.
+        world: the world, or recorded tracks, along the held-out ones of which episodes are logged.
         seed: seed of the run, from which each episode's own derives.
         config: text of the run's `config.yaml`.
         layout: write a viewer's layout next to the log.
-        policies: resume the log of an earlier process after so many of its policies, and drop what it wrote later; None
+        policies: resume the log of an earlier process after so many of its policies, and drop the later ones; None
             to begin a new log beside it.
         tell: called with one line where logging is over, or goes on in another file.
     """
@@ -43,7 +43,7 @@ class EpisodeLog:
     def __init__(
         self,
         folder: Path,
-        world: Modelled,
+        world: Problem,
         *,
         seed: int,
         config: str,
@@ -85,24 +85,31 @@ class EpisodeLog:
         self._writer, self.episodes = taken, taken.episodes
         earlier.unlink()
 
-    def record(self, policy: PolicyLike, facts: Mapping[str, str], episodes: int, *names: str | int) -> None:
+    def record(
+        self, policy: PolicyLike, facts: Mapping[str, str], episodes: int, *names: str | int
+    ) -> None:
         """Simulate and log `episodes` episodes; their seeds are those called (`"episode"`, `names`, 0, 1, ...)."""
         if self._writer is not None:
-            self.add(simulate(self._world, policy, episodes, seed=self._seed, names=names), facts)
+            with self._over_at_failure():
+                made = simulate(self._world, policy, episodes, seed=self._seed, names=names)
+                self._add(made, facts)
 
     def add(self, episodes: Episodes, facts: Mapping[str, str]) -> None:
-        """Log simulated episodes; `facts` is what the log says of their policy, such as its `label`."""
-        if self._writer is None:
-            return
-        with self._over_at_failure():
-            policy = self._writer.add_policy(facts, episodes.policy)
-            for episode in episodes.complete():
-                self._writer.add(replace(episode, number=self.episodes, policy=policy))
-                self.episodes += 1
-            self._writer.flush()
+        """Log simulated episodes; `facts` describes their policy in the log, such as its `label`."""
+        if self._writer is not None:
+            with self._over_at_failure():
+                self._add(episodes, facts)
+
+    def _add(self, episodes: Episodes, facts: Mapping[str, str]) -> None:
+        assert self._writer is not None
+        policy = self._writer.add_policy(facts, episodes.policy)
+        for episode in episodes.complete():
+            self._writer.add(replace(episode, number=self.episodes, policy=policy))
+            self.episodes += 1
+        self._writer.flush()
 
     def sync(self) -> None:
-        """Put what has been recorded on the disk."""
+        """Put all recorded episodes on the disk."""
         if self._writer is not None:
             with self._over_at_failure():
                 self._writer.sync()
@@ -118,13 +125,13 @@ class EpisodeLog:
 
     @contextmanager
     def _over_at_failure(self) -> Iterator[None]:
-        """Where the file fails, say so, and let logging be over."""
+        """If the file fails, report it, and end logging."""
         try:
             yield
-        except OSError as error:
+        # Any failure: hours of training are worth more than the log of them, and the line gives the reason.
+        except Exception as error:
             part = self.file.with_name(f"{self.file.name}.part")
-            reason = (error.strerror or "cannot be written").lower()
-            self._tell(f"{part}: {reason}; no more episodes are logged")
+            self._tell(f"{part}: {reason(error)}; no more episodes are logged")
             if self._writer is not None:
                 self._writer.abandon()
                 self._writer = None
@@ -145,8 +152,8 @@ class EpisodeLogger(Callback):
         self._policies, self._lost = 0, ""
 
     def on_start(self, trainer: Training) -> None:
-        """Open the log; what an earlier process recorded after its last checkpoint is cut off."""
-        assert not isinstance(trainer.problem, Recorded)  # they are refused: there is no belief
+        """Open the log; episodes after the last checkpoint of an earlier process are cut off."""
+        problem = trainer.problem.selection  # held-out tracks are for the end
 
         def tell(line: str) -> None:
             self._lost = line
@@ -154,7 +161,7 @@ class EpisodeLogger(Callback):
 
         self._log = EpisodeLog(
             self._folder,
-            trainer.problem,
+            problem,
             seed=trainer.config.seed,
             config=config_text(trainer.config, trainer.folder),
             layout=self._cfg.layout,
@@ -164,21 +171,24 @@ class EpisodeLogger(Callback):
 
     def on_evaluation(self, trainer: Training, policy: Policy, score: Score) -> None:  # noqa: ARG002
         """Record episodes of this policy where they are due."""
-        iteration, every = trainer.position.iteration, trainer.config.evaluation.every * self._cfg.evaluations
+        iteration, every = (
+            trainer.position.iteration,
+            trainer.config.evaluation.every * self._cfg.evaluations,
+        )
         if iteration == 1 or trainer.due(every):
             facts = {"label": f"iteration {iteration}"}
             self._log.record(policy, facts, self._cfg.episodes, iteration)
-            # Also where logging is over: what a checkpoint holds must not depend on how full the disk was.
+            # Also where logging is over: a checkpoint must not depend on how full the disk was.
             self._policies += 1
 
     def on_end(self, trainer: Training) -> None:
-        """Finish the file, and say what was lost of it; where the run itself broke down, its own line says why."""
+        """Finish the file, and report lost parts of it; if the run itself failed, its own line gives the reason."""
         self._log.close()
         if self._lost and trainer.error is None:
             sys.stderr.write(f"trackmdp train: {self._lost}\n")
 
     def state_dict(self) -> dict[str, Any]:
-        """How many policies were handed to the log, whose episodes are on the disk from then on."""
+        """How many policies were handed to the log; their episodes are on the disk from then on."""
         self._log.sync()
         return {"policies": self._policies}
 

@@ -1,4 +1,4 @@
-"""Steps and episodes as messages, written as text directly: this is what logging spends its time on."""
+"""Steps and episodes as messages, written as text directly: most of the time of logging goes here."""
 
 from __future__ import annotations
 
@@ -49,11 +49,18 @@ def step_messages(episode: Episode, run: LoggedRun) -> Iterator[bytes]:
     steps, ids = np.nonzero(episode.action)
     # np.nonzero lists (step, sensor) in order of steps: steps 0 0 1 3 with sensors 2 5 4 0. searchsorted finds where
     # steps 1, 2, 3 begin, 2 3 3, and split makes of those [2 5] [4] [] [0].
-    active = [",".join(map(str, each.tolist())) for each in np.split(ids, np.searchsorted(steps, range(1, last + 1)))]
+    active = [
+        ",".join(map(str, each.tolist()))
+        for each in np.split(ids, np.searchsorted(steps, range(1, last + 1)))
+    ]
     known = (episode.misses, episode.last_cell, episode.action.sum(1), episode.forced(run.t_max))
     came = (target, x, y, episode.observation, episode.reward.astype(np.float64), episode.returns)
     # Of targets with a mode, one more entry at the end.
-    modes = [""] * len(episode) if episode.mode is None else [f',"mode":{mode}' for mode in episode.mode.tolist()]
+    modes = (
+        [""] * len(episode)
+        if episode.mode is None
+        else [f',"mode":{mode}' for mode in episode.mode.tolist()]
+    )
     # tolist() once for each column: Python's numbers are formatted several times faster than NumPy's scalars.
     for t, (n, cell, count, forced, at, at_x, at_y, obs, reward, total) in enumerate(
         zip(*(column.tolist() for column in (*known, *came)), strict=True)
@@ -74,11 +81,12 @@ def decode(row: dict[str, Any], steps: list[bytes], grids: list[bytes], run: Log
     """
     number, count = row["episode"], row["length"]
     said = [json.loads(step) for step in steps]
-    # Lengths first: what a row claims is no length to count up to.
+    # Lengths first: a row may claim any length.
     steps_of = ((each["episode"], each["t"]) for each in said)
-    if not len(said) == len(grids) == count or any(each != (number, t) for t, each in enumerate(steps_of)):
+    if not len(said) == len(grids) == count or any(
+        each != (number, t) for t, each in enumerate(steps_of)
+    ):
         raise UserError(f"episode={number}: its steps do not fit together")
-    run.check_steps(said)
     belief, probability = read_grids(grids, run.size)
     target = np.array([each["target"] for each in said], dtype=np.int64)
     action = np.zeros((count, run.sensors), dtype=bool)

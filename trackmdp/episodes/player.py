@@ -9,7 +9,7 @@ import sys
 import termios
 import time
 import tty
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -19,8 +19,7 @@ from rich.live import Live
 from rich.text import Text
 
 from trackmdp.episodes.episode import Episode
-from trackmdp.world.model import BoolArray, Task
-from trackmdp.world.modes import HiddenWorld
+from trackmdp.world.model import Task, World
 from trackmdp.world.render import FOUND, MISSED, ON, PICTURE_LEGEND, around, symbols
 
 WIDE, STEP = 37, 9
@@ -34,7 +33,7 @@ LEGEND = f"{FOUND} target, located   {MISSED} target, missed   {ON} sensor on   
 
 
 def outcome(episode: Episode, t: int, task: Task) -> str:
-    """What became of step `t`: exited, forced, detected or missed."""
+    """The outcome of step `t`: exited, forced, detected or missed."""
     if episode.target[t] == task.num_cells:
         return "exited"
     if episode.misses[t] > task.t_max:
@@ -47,28 +46,32 @@ def where(cell: int, columns: int) -> str:
     return f"row {cell // columns + 1}, column {cell % columns + 1}"
 
 
-def mode_words(world: HiddenWorld, mode: int) -> str:
+def mode_words(world: World, mode: int) -> str:
     """A mode in words: its number, as in the log, and how it moves on average."""
     down, across = world.drift[mode]
     speed = math.hypot(down, across)
     # Up is to smaller rows; eighths of a turn from the right, turning left.
     eighth = round(math.atan2(-down, across) / (math.pi / 4)) % 8
-    return f"mode {mode}" + (f" {_ARROWS[eighth]} {speed:.1f} cells a step" if speed > _STILL else "")
+    return f"mode {mode}" + (
+        f" {_ARROWS[eighth]} {speed:.1f} cells a step" if speed > _STILL else ""
+    )
 
 
 def sentence(episode: Episode, t: int, task: Task) -> str:
     """A step in one line; with the target's mode, where `task` is a world of targets that have one."""
     state = outcome(episode, t, task)
     place = where(int(episode.target[t]), task.columns)
-    words = {"exited": "the target has left the grid", "forced": f"safe action forced, target located in {place}"}
-    what = words.get(state, f"target {state} in {place}")
-    on = "" if state == "forced" else f"{int(episode.action[t].sum())} sensors on, "
-    mode = ""
-    if isinstance(task, HiddenWorld) and episode.mode is not None and episode.mode[t] >= 0:
-        mode = f" in {mode_words(task, int(episode.mode[t]))}"
+    words = {
+        "exited": "the target has left the grid",
+        "forced": f"safe action forced, target located in {place}",
+    }
+    found = words.get(state, f"target {state} in {place}")
+    if isinstance(task, World) and episode.mode is not None and episode.mode[t] >= 0:
+        found += f" in {mode_words(task, int(episode.mode[t]))}"
+    on = "" if state == "forced" else f"{episode.action[t].sum()} sensors on, "
+    reward = f"reward {episode.reward[t]:.2f}, total {episode.returns[t]:.2f}"
     return (
-        f"step {t + 1} of {len(episode)}: {what}{mode}; {on}{int(episode.misses[t])} misses before; "
-        f"reward {episode.reward[t]:.2f}, total {episode.returns[t]:.2f}"
+        f"step {t + 1} of {len(episode)}: {found}; {on}{episode.misses[t]} misses before; {reward}"
     )
 
 
@@ -80,29 +83,51 @@ def frame(episode: Episode, t: int, task: Task) -> str:
     on = task.covered(episode.action[t]) & (outcome(episode, t, task) != "forced")
     shades, found = np.array(list(_SHADES))[levels], bool(episode.located[t])
     marks = symbols(task.size, int(episode.target[t]), on, found=found, empty=shades)
-    down, across = _part(episode, t, task)
-    rows = [" ".join(row[across.start : across.stop]) for row in marks[down.start : down.stop]]
-    edge = "─" * (2 * len(across) + 1)
-    lines = [f"┌{edge}┐", *(f"│ {row} │" for row in rows), f"└{edge}┘"]
-    if (len(down), len(across)) != task.size:
-        cut = zip(("rows", "columns"), (down, across), task.size, strict=True)
-        # counted from 1, as in `where`
-        lines.append(", ".join(f"{name} {part[0] + 1} to {part[-1] + 1} of {length}" for name, part, length in cut))
-    return "\n".join(lines)
+    # Drawn around the target, or around its last cell before it left.
+    seen = [cell for cell in episode.target[max(t - 1, 0) : t + 1] if cell < task.num_cells]
+    at = seen[-1] if seen else episode.start
+    # Row 100 lies in the part of rows 99 to 107, with the middle 103.
+    middle = (place // STEP * STEP + STEP // 2 for place in divmod(int(at), task.columns))
+    parts = _parts(middle, task, WIDE)
+    rows = [" ".join(row) for row in marks[np.ix_(*parts)]]
+    edge = "─" * (2 * len(parts[1]) + 1)
+    return "\n".join(
+        [f"┌{edge}┐", *(f"│ {row} │" for row in rows), f"└{edge}┘", *_cut(task, parts)]
+    )
 
 
-def _part(episode: Episode, t: int, task: Task) -> tuple[range, range]:
-    """The rows and columns that are drawn: those around the target, or around where it was before it left."""
-    at = int(episode.target[t])
-    if at == task.num_cells:
-        at = int(episode.target[t - 1]) if t else int(episode.start)
-    # Row 100 lies in the part of rows 99 to 107, whose middle is 103.
-    row, column = (place // STEP * STEP + STEP // 2 for place in divmod(at, task.columns))
-    return around(row, task.rows, WIDE), around(column, task.columns, WIDE)
+def _parts(middle: Iterable[int], task: Task, wide: int) -> tuple[range, range]:
+    """The rows and columns that are drawn around a place of a large grid."""
+    row, column = middle
+    return around(row, task.rows, wide), around(column, task.columns, wide)
+
+
+def _cut(task: Task, parts: tuple[range, range]) -> list[str]:
+    """The part that is drawn, in words, counted from 1; nothing where it is the whole grid."""
+    if tuple(map(len, parts)) == task.size:
+        return []
+    cut = zip(("rows", "columns"), parts, task.size, strict=True)
+    return [", ".join(f"{name} {part[0] + 1} to {part[-1] + 1} of {n}" for name, part, n in cut)]
 
 
 KEYS = "space pause   ← → step   + - speed   home end   q quit"
-_ESCAPES = {"\x1b[C": "l", "\x1b[D": "h", "\x1b[H": "0", "\x1b[F": "$", "\x1b[1~": "0", "\x1b[4~": "$"}
+_ESCAPES = {
+    "\x1b[C": "l",
+    "\x1b[D": "h",
+    "\x1b[H": "0",
+    "\x1b[F": "$",
+    "\x1b[1~": "0",
+    "\x1b[4~": "$",
+}
+
+
+_MOVES: dict[str, Callable[[int, int], int]] = {
+    "l": lambda t, _: t + 1,
+    "h": lambda t, _: t - 1,
+    "0": lambda _, __: 0,
+    "$": lambda _, last: last,
+}
+"""Key -> the step that it leads to, of the present one and the last."""
 
 
 @dataclass
@@ -116,16 +141,14 @@ class Playing:
     over: bool = False
 
     def press(self, key: str) -> None:
-        """Do what a key asks for."""
-        key = _ESCAPES.get(key, key)
+        """Do the action of a key."""
+        key, last = _ESCAPES.get(key, key), self.steps - 1
         if key == " ":
             self.paused = not self.paused
-            if not self.paused and self.t == self.steps - 1:
+            if not self.paused and self.t == last:
                 self.t = 0
-        elif key in ("l", "h"):
-            self.paused, self.t = True, min(max(self.t + (1 if key == "l" else -1), 0), self.steps - 1)
-        elif key in ("0", "$"):
-            self.paused, self.t = True, 0 if key == "0" else self.steps - 1
+        elif key in _MOVES:
+            self.paused, self.t = True, min(max(_MOVES[key](self.t, last), 0), last)
         elif key in ("+", "-"):
             self.speed = min(max(self.speed * (2 if key == "+" else 0.5), 0.25), 256)
         elif key in ("q", "\x1b", "\x03"):
@@ -184,7 +207,6 @@ def _key(descriptor: int, timeout: float | None) -> str:
     return os.read(descriptor, 8).decode("utf-8", "replace") if ready else ""
 
 
-MARGIN = "   "
 PICTURE_WIDE = 21
 """Rows and columns of a grid that are drawn at most in each frame of a picture."""
 
@@ -201,25 +223,14 @@ def draw_picture(episodes: Sequence[Episode], task: Task, *, steps: int = 6) -> 
     """
     # Longer than `steps`: the picture is then full, and does not end with the exit.
     episode = next((each for each in episodes if len(each) > steps), None) or max(episodes, key=len)
-    shown = list(_steps(episode, task, steps))
-    way = np.divmod(np.array([cell for cell, _ in shown], dtype=np.int64), task.columns)
-    # around the middle of its way
-    middle = [(int(each.min()) + int(each.max())) // 2 if len(each) else 0 for each in way]
-    rows, columns = (around(place, length, PICTURE_WIDE) for place, length in zip(middle, task.size, strict=True))
-    part = slice(rows.start, rows.stop), slice(columns.start, columns.stop)
-    frames = (symbols(task.size, cell, on, found=bool(on[cell]))[part] for cell, on in shown)
-    pieces = [[f"step {k}", *map(" ".join, frame)] for k, frame in enumerate(frames, start=1)]
-    wide = [[row.ljust(max(map(len, column))) for row in column] for column in pieces]
-    lines = [MARGIN.join(parts) for parts in zip(*wide, strict=True)]
-    whole = (len(rows), len(columns)) == task.size
-    where = f"rows {rows[0]} to {rows[-1]} of {task.rows}, columns {columns[0]} to {columns[-1]} of {task.columns}"
-    return "\n".join([*(line.rstrip() for line in lines), "", *([] if whole else [where]), PICTURE_LEGEND, ""])
-
-
-def _steps(episode: Episode, task: Task, steps: int) -> Iterator[tuple[int, BoolArray]]:
-    """The target's cell and the cells sensed, `[M]`, of each step in the grid; all of them where the safe action is."""
-    forced = episode.forced(task.t_max)
-    for t, cell in enumerate(episode.target[:steps].tolist()):
-        # The cell numbered M stands for having left the grid.
-        if cell < task.num_cells:
-            yield cell, task.covered(episode.action[t]) | forced[t]
+    cells = [cell for cell in episode.target[:steps].tolist() if cell < task.num_cells]
+    way = np.array([divmod(cell, task.columns) for cell in cells or [episode.start]])
+    parts = _parts((int(each) for each in (way.min(0) + way.max(0)) // 2), task, PICTURE_WIDE)
+    columns = []
+    for t, cell in enumerate(cells):
+        on = task.covered(episode.action[t]) | (episode.misses[t] > task.t_max)
+        marks = symbols(task.size, cell, on, found=bool(on[cell]))[np.ix_(*parts)]
+        column = [f"step {t + 1}", *map(" ".join, marks)]
+        columns.append([row.ljust(max(map(len, column))) for row in column])
+    lines = ["   ".join(row).rstrip() for row in zip(*columns, strict=True)]
+    return "\n".join([*lines, "", *_cut(task, parts), PICTURE_LEGEND, ""])

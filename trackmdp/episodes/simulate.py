@@ -1,6 +1,6 @@
 """Simulating episodes in batches, each from its own generators, so that any one can be simulated again by itself.
 
-The log, the web page, the picture and the simulated figures of an evaluation are all made of what this module returns.
+The log, the web page, the picture and the simulated figures of an evaluation are all made of this module's `Episodes`.
 """
 
 from __future__ import annotations
@@ -15,19 +15,26 @@ from torch import Tensor
 
 from trackmdp.episodes.actors import Actor, States, actor_of
 from trackmdp.episodes.batch import Episodes
+from trackmdp.errors import UserError
 from trackmdp.policies.acting import Playback
 from trackmdp.policies.policy import PolicyLike
 from trackmdp.seeding import derive, preserved_global_rng
-from trackmdp.world.modes import check_revealed
-from trackmdp.world.outcomes import Costs, Reports
-from trackmdp.world.targets import Source, held_out_source
-from trackmdp.world.tracks import Problem
+from trackmdp.solvers.solve import named_policy
+from trackmdp.solvers.value import check_revealed
+from trackmdp.world.outcomes import Costs, Outcomes
+from trackmdp.world.paths import PathSampler, path_sampler
+from trackmdp.world.tracks import Problem, check_problem
 
-_BLOCK = 256  # draws taken from an episode's generator at a time; part of what a seed means, so never to be changed
+_BLOCK = 256  # draws taken from an episode's generator at a time; part of the meaning of a seed, so never to be changed
 
 
 def simulate(
-    problem: Problem, policy: PolicyLike | Playback, episodes: int, *, seed: int = 0, names: Sequence[str | int] = ()
+    problem: Problem,
+    policy: PolicyLike | Playback,
+    episodes: int,
+    *,
+    seed: int = 0,
+    names: Sequence[str | int] = (),
 ) -> Episodes:
     """Independent episodes of a policy, each followed to its own end.
 
@@ -35,15 +42,20 @@ def simulate(
 
     Args:
         problem: a world, in which targets start uniformly; or recorded tracks, of which held-out ones are drawn.
-        policy: a `Policy`; or a function or module, which is asked at every step if it draws, and is then the only
+        policy: as for `evaluate`; a function or module is asked at every step if it draws, and is then the only
             thing not reproduced by an episode's seed alone.
         episodes: how many.
         seed: seed of the run; episode i has the seed called ("episode", *names, i) of it.
-        names: further names of the seeds, to tell several simulations of a run apart.
+        names: further names of the seeds, different for each simulation of a run.
 
     Raises:
-        UserError: the policy is made for another grid, or is none.
+        UserError: the policy is made for another grid, or is none; `episodes` or `seed` is no such number.
     """
+    check_problem(problem, "simulate")
+    if not isinstance(episodes, (int, np.integer)) or episodes < 0:
+        raise UserError(f"simulate: episodes={episodes}, expected an integer >= 0")
+    if isinstance(policy, str):
+        policy = named_policy(problem, policy)
     return resimulate(problem, policy, episode_seeds(seed, episodes, *names))
 
 
@@ -54,16 +66,18 @@ def episode_seeds(seed: int, episodes: int, *names: str | int) -> list[int]:
 
 @torch.no_grad()
 def resimulate(problem: Problem, policy: PolicyLike | Playback, seeds: Sequence[int]) -> Episodes:
-    """One episode for each of `seeds`, in their order; each the same whatever the others are. See `simulate`."""
-    costs, reports, source = Costs(problem), Reports(problem), held_out_source(problem)
-    actor = actor_of(problem.task, policy, costs)
+    """One episode for each of `seeds`, in their order; each independent of the others. See `simulate`."""
+    outcomes, sampler = Outcomes(problem), path_sampler(problem, held_out=True)
+    actor = actor_of(problem.task, policy, Costs(problem))
     if actor.policy is not None:
-        check_revealed(problem, actor.policy.task.revealed)
-    at_once = [seeds[begin : begin + actor.most_rows] for begin in range(0, len(seeds), actor.most_rows)]
+        check_revealed(problem.motion, actor.policy)
+    at_once = [
+        seeds[begin : begin + actor.most_rows] for begin in range(0, len(seeds), actor.most_rows)
+    ]
     with preserved_global_rng():
-        # What a function or module draws from torch's global generator is then the same in every call.
+        # Draws of a function or module from torch's global generator are then the same in every call.
         torch.manual_seed(derive(seeds[0] if seeds else 0, "policy"))
-        parts = [_Batch(problem, source, actor, (costs, reports), some).run() for some in at_once]
+        parts = [_Batch(problem, sampler, actor, outcomes, some).run() for some in at_once]
     return Episodes.of(problem, actor.policy, seeds, parts)
 
 
@@ -72,8 +86,10 @@ class _Draws:
 
     _block: Tensor
 
-    def __init__(self, seeds: Sequence[int], draw: Callable[[int, torch.Generator], Tensor], *names: str) -> None:
-        # A generator for each episode, not one for the batch: what an episode draws must not depend on how many others
+    def __init__(
+        self, seeds: Sequence[int], draw: Callable[[int, torch.Generator], Tensor], *names: str
+    ) -> None:
+        # A generator for each episode, not one for the batch: its draws must not depend on how many others
         # run beside it, nor on when they end.
         seeds = [derive(seed, *names) for seed in seeds] if names else seeds
         self.generators, self._draw = [torch.Generator().manual_seed(seed) for seed in seeds], draw
@@ -84,7 +100,9 @@ class _Draws:
         # At steps 0, 256, 512, ...: all running episodes are at the same step, and refill together; ended ones draw no
         # more.
         if place == 0:
-            drawn = torch.stack([self._draw(_BLOCK, self.generators[row]) for row in states.row.tolist()])
+            drawn = torch.stack(
+                [self._draw(_BLOCK, self.generators[row]) for row in states.row.tolist()]
+            )
             if states.step:
                 self._block[states.row] = drawn
             else:
@@ -96,77 +114,99 @@ class _Batch:
     """Episodes stepped together; each leaves the batch with its end."""
 
     def __init__(
-        self, problem: Problem, source: Source, actor: Actor, rules: tuple[Costs, Reports], seeds: Sequence[int]
+        self,
+        problem: Problem,
+        sampler: PathSampler,
+        actor: Actor,
+        outcomes: Outcomes,
+        seeds: Sequence[int],
     ) -> None:
-        self._task, self._source, self._actor = problem, source, actor
-        self._costs, self._reports = rules
-        # What a policy remembers is its own; whatever else acts knows the cell.
+        self._task, self._sampler, self._actor = problem, sampler, actor
+        self._outcomes = outcomes
+        # A policy has keys of its own; all other actors know the cell.
         self._keys = (actor.policy.task if actor.policy else problem.remembering()).keys
         # Moves, choices and reports apart, so that two policies with one seed meet the same target.
-        self._moves, self._choices, self._seen = _Draws(seeds, source.draw), None, None
+        self._moves, self._choices, self._seen = _Draws(seeds, sampler.draw), None, None
         if size := actor.num_draws:
-            self._choices = _Draws(seeds, lambda count, rng: torch.rand(count, size, generator=rng), "policy")
-        if not self._reports.certain:
+            self._choices = _Draws(
+                seeds, lambda count, rng: torch.rand(count, size, generator=rng), "policy"
+            )
+        if not outcomes.certain:
             double = torch.float64
-            self._seen = _Draws(seeds, lambda count, rng: torch.rand(count, dtype=double, generator=rng), "report")
+            self._seen = _Draws(
+                seeds, lambda count, rng: torch.rand(count, dtype=double, generator=rng), "report"
+            )
         self._taken: list[dict[str, npt.NDArray[Any]]] = []
 
     def run(self) -> dict[str, npt.NDArray[Any]]:
         """Step until the last episode has ended; the columns of `Episodes`, those of one episode after another's."""
         # Before any move.
-        starts = [torch.randint(self._source.starts, (1,), generator=rng) for rng in self._moves.generators]
-        place = self._source.begin(torch.cat(starts))
-        start, mode = self._source.cell(place), self._source.mode(place)
+        starts = [
+            torch.randint(self._sampler.starts, (1,), generator=rng)
+            for rng in self._moves.generators
+        ]
+        place = self._sampler.begin(torch.cat(starts))
+        start, mode = self._sampler.cell(place), self._sampler.mode(place)
         key = self._keys.start(start, mode)
         at = States(torch.arange(len(start)), place, start, key, torch.zeros_like(start), step=0)
         while len(at.row):
             at = self._step(at)
-        columns = {name: np.concatenate([step[name] for step in self._taken]) for name in self._taken[0]}
+        columns = {
+            name: np.concatenate([step[name] for step in self._taken]) for name in self._taken[0]
+        }
         row = columns.pop("row")
         # Steps were taken in order of time; a stable sort by episode leaves them so within each. Example: the rows 0 1
         # 2, then 0 2, then 2 (episode 1 ended first): the order is 0 3 1 2 4 5, the sorted rows are 0 0 1 2 2 2,
         # `length` is 2 1 3.
         order = np.argsort(row, kind="stable")
-        begun = {"start": start.numpy(), "start_mode": (0 * start if mode is None else mode).numpy()}
-        return {name: column[order] for name, column in columns.items()} | begun | {"length": np.bincount(row)}
+        begun = {
+            "start": start.numpy(),
+            "start_mode": (0 * start if mode is None else mode).numpy(),
+        }
+        return (
+            {name: column[order] for name, column in columns.items()}
+            | begun
+            | {"length": np.bincount(row)}
+        )
 
     def _step(self, at: States) -> States:
         """One step of `TrackEnv`, of the episodes still running; the same order of events, the same arithmetic."""
         choice = self._actor.decide(at, None if self._choices is None else self._choices.at(at))
-        place = self._source.move(at.place, self._moves.at(at))
-        target = self._source.cell(place)
-        in_grid = target < self._task.num_cells
-        # A target that exited is at M, which is no column: it looks up the last cell, and `& in_grid` clears the
-        # answer.
-        sensed = choice.sensed(target.clamp_max(self._task.num_cells - 1)) & in_grid
-        forced = at.misses > self._task.t_max
+        place = self._sampler.move(at.place, self._moves.at(at))
+        target = self._sampler.cell(place)
+        # A target that exited is at M, which is no column: it looks up the last cell, and the answer is not used.
+        report = choice.report(target.clamp_max(self._task.num_cells - 1))
         seen = None if self._seen is None else self._seen.at(at)
-        located = (sensed | forced) & in_grid & self._reports.seen(target, forced, seen)
-        reward = self._costs.pseudo_reward(choice.spent, located, forced, in_grid)
+        outcome = self._outcomes(report, choice.spent, at.misses, target, seen)
+        in_grid, located = outcome.in_grid, outcome.located
         # An exit on the last step allowed is an exit (terminated), not a truncation.
         truncated = self._truncated(place, at.step) & in_grid
-        mode = self._source.mode(place)
+        mode = self._sampler.mode(place)
         columns = {"key": at.key} if self._keys.num_classes > 1 else {}
         columns |= {} if mode is None else {"mode": mode}
-        columns |= {"misses": at.misses, "target": target, "located": located, "reward": reward}
+        columns |= {"misses": at.misses, "target": target, "located": located}
+        columns |= {"reward": outcome.reward}
         columns |= {"row": at.row, "sensors": choice.count, "truncated": truncated}
-        bits = {} if choice.action is None else {"bits": np.packbits(choice.action.numpy(), axis=-1)}
-        self._taken.append({name: _narrow(column.numpy()) for name, column in columns.items()} | bits)
+        bits = (
+            {} if choice.action is None else {"bits": np.packbits(choice.action.numpy(), axis=-1)}
+        )
+        self._taken.append(
+            {name: _narrow(column.numpy()) for name, column in columns.items()} | bits
+        )
         # `[R']`, the positions of those still running: only they are carried over, so that a step's cost falls as
         # episodes end.
         going_on = (in_grid & ~truncated).nonzero().squeeze(-1)
         last_cell = torch.where(located, target, at.last_cell)
         known = self._keys.next(at.key, at.misses, target.clamp_max(self._task.num_cells - 1), mode)
         key = torch.where(located, known, at.key)
-        # The clock stands still while the safe action is repeated.
-        misses = torch.where(located, 0, (at.misses + 1).clamp_max(self._task.t_max + 1))
+        misses = self._outcomes.misses_after(at.misses, outcome)
         return States(at.row, place, last_cell, key, misses, at.step + 1).kept(going_on)
 
     def _truncated(self, place: Tensor, step: int) -> Tensor:
         """`[R]` whether this step is the last one allowed, or the last one recorded."""
         if self._task.max_steps is not None and step + 1 >= self._task.max_steps:
             return torch.ones_like(place, dtype=torch.bool)
-        stops = self._source.stops(place)
+        stops = self._sampler.stops(place)
         return torch.zeros_like(place, dtype=torch.bool) if stops is None else stops
 
 

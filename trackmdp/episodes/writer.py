@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
-import os
-import threading
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,18 +18,17 @@ from trackmdp.episodes.episode import Episode
 from trackmdp.episodes.grids import grid_messages
 from trackmdp.episodes.schema import LoggedRun, time_of
 from trackmdp.policies.policy import Policy
-from trackmdp.world.coverage import Coverage
-from trackmdp.world.files import csr_bytes, csr_in, npy_bytes
-from trackmdp.world.modes import HiddenWorld, Modelled
+from trackmdp.policies.saved import packed
+from trackmdp.untrusted import decoded
+from trackmdp.world.files import npz_bytes
+from trackmdp.world.problem_file import PROBLEM, problem_bytes, problem_in
+from trackmdp.world.tracks import Problem, Recorded
 
 FLUSH_STEPS = 100
 """An episode's end closes the chunk once so many steps are in it, and hands it to the operating system."""
 
-DENSE_CELLS = 64 * 64
-"""Cells up to which kernel and policies are written dense: 134 MB of kernel at that size."""
-
 _BYTES = "application/octet-stream"
-_MEDIA = {".yaml": "application/yaml", ".json": "application/json", ".npy": _BYTES, ".npz": _BYTES}
+_MEDIA = {".yaml": "application/yaml", ".json": "application/json", ".npz": _BYTES}
 
 
 class EpisodeWriter:
@@ -42,31 +41,34 @@ class EpisodeWriter:
     """
 
     @classmethod
-    def of(cls, file: Path, world: Modelled, *, facts: Mapping[str, str], config: str) -> EpisodeWriter:
-        """A log of `world`; `facts` is what else it says of the run, such as `seed`, `config` its `config.yaml`.
+    def of(
+        cls, file: Path, problem: Problem, *, facts: Mapping[str, str], config: str
+    ) -> EpisodeWriter:
+        """A log of `problem`, of recorded tracks those held out.
+
+        Args:
+            file: the log.
+            problem: where the episodes take place.
+            facts: further metadata of the run, such as `seed`.
+            config: its `config.yaml`.
 
         Raises:
-            UserError: the world is larger than a log may say.
+            UserError: the problem is too large for a log.
         """
-        tables = {"config.yaml": config.encode(), **_kernel(world), "cost.npy": npy_bytes(world.cost)}
-        if not (world.perfect and world.safe):
-            tables["sensors.npy"] = npy_bytes(np.stack([world.detection, world.safe_detection]))
-        if world.coverage is not None:
-            tables["footprints.npz"] = csr_bytes(world.coverage.matrix)
+        if isinstance(problem, Recorded):
+            judged = problem.held_out
+            problem = replace(problem, tracks=judged, validation=judged, loaded={})
+        tables = dict(zip(schema.TABLES, (config.encode(), problem_bytes(problem)), strict=True))
+        modes = getattr(problem, "modes", 1)
         said = {
             **schema.versions(),
             **facts,
             "format_version": schema.LOG_FORMAT,
-            "size": str(world.rows),
-            **({} if world.rows == world.columns else {"columns": str(world.columns)}),
-            **({} if world.window is None else {"window": str(world.window)}),
-            **({} if world.coverage is None else {"sensors": str(world.total_sensors)}),
-            **({"modes": str(world.modes), "revealed": str(world.revealed)} if isinstance(world, HiddenWorld) else {}),
-            "t_max": str(world.t_max),
-            "max_steps": "" if world.max_steps is None else str(world.max_steps),
-            # repr: the shortest text that reads back as the same float64.
-            "reward": repr(float(world.reward)),
-            "safe_cost": repr(float(world.safe_cost)),
+            "size": str(problem.rows),
+            **({} if problem.rows == problem.columns else {"columns": str(problem.columns)}),
+            **({} if problem.coverage is None else {"sensors": str(problem.total_sensors)}),
+            **({} if modes == 1 else {"modes": str(modes)}),
+            "t_max": str(problem.t_max),
             "tick_ns": str(schema.TICK_NS),
             **{f"{name}.sha256": schema.digest(content) for name, content in tables.items()},
         }
@@ -74,10 +76,9 @@ class EpisodeWriter:
 
     def __init__(self, file: Path, run: LoggedRun, tables: Mapping[str, bytes]) -> None:
         self.run = run
-        footprints = csr_in(tables["footprints.npz"]) if "footprints.npz" in tables else None
-        self._coverage = Coverage.of(footprints, run.cells)
+        with decoded(f"file={file}", "a log of trackmdp"):
+            self._coverage = problem_in(io.BytesIO(tables[PROBLEM])).coverage
         self.file, self.part = file, file.with_name(f"{file.name}.part")
-        self._lock, self._process = threading.RLock(), os.getpid()
         self._rows: list[dict[str, Any]] = []
         self.policies = self._unflushed = self._tick = 0
         # Opened here and not by the Writer, which closes a file of its own in finish(), before it could be synced.
@@ -87,11 +88,13 @@ class EpisodeWriter:
         self._writer.start(library=f"trackmdp {run.said['trackmdp']}")
         # Once, and the numbers kept: registering a topic a second time would make a second channel of the same name.
         more = schema.MODE if run.modes else {}
-        self._channels = {topic: self._register(topic, more.get(topic, {})) for topic in schema.SCHEMAS}
+        self._channels = {
+            topic: self._register(topic, more.get(topic, {})) for topic in schema.SCHEMAS
+        }
         self._tell(schema.RUN, run.said)
         for name, content in tables.items():
             self._attach(name, content)
-        # In the file at once: a log that is cut off later can be recovered only with what it starts with.
+        # In the file at once: a log that is cut off later can be recovered only with its head.
         self.flush()
 
     def _register(self, topic: str, more: dict[str, Any]) -> int:
@@ -110,24 +113,27 @@ class EpisodeWriter:
         """Add the policy of the episodes that follow; returns its number.
 
         Args:
-            facts: what the log says of it, for a reader: its `label`.
+            facts: description of the policy for readers of the log: its `label`.
             policy: from which `replay verify=true` simulates them again; None where there is none.
         """
-        kind, table = _described(policy, sparse=self.run.sparse)
-        if policy is not None and policy.task.keyed:
-            kind |= {name: str(getattr(policy.task, name)) for name in ("memory", "clip", "revealed")}
-        return self.copy_policy({**facts, **kind}, table)
+        if policy is None:
+            return self.copy_policy(facts, None)
+        if policy.task.keyed:
+            known = {
+                name: str(getattr(policy.task, name)) for name in ("memory", "clip", "revealed")
+            }
+            facts = {**facts, **known}
+        return self.copy_policy(facts, npz_bytes(packed(policy)))
 
     def copy_policy(self, facts: Mapping[str, str], table: bytes | None) -> int:
         """Add a policy as it was read from another log."""
-        with self._lock:
-            sha256 = schema.digest(table) if table is not None else ""
-            self._tell(f"{schema.POLICY}.{self.policies}", {**facts, "table.sha256": sha256})
-            if table is not None:
-                self._attach(self.run.policy_file(self.policies), table)
-            self.flush()
-            self.policies += 1
-            return self.policies - 1
+        sha256 = schema.digest(table) if table is not None else ""
+        self._tell(f"{schema.POLICY}.{self.policies}", {**facts, "table.sha256": sha256})
+        if table is not None:
+            self._attach(schema.policy_file(self.policies), table)
+        self.flush()
+        self.policies += 1
+        return self.policies - 1
 
     def add(self, episode: Episode) -> None:
         """Append an episode.
@@ -135,28 +141,26 @@ class EpisodeWriter:
         Raises:
             OSError: the disk is full, or the file cannot be written for another reason.
         """
-        # After a fork both processes would write through the same descriptor, one into the other's chunk.
-        if os.getpid() != self._process:
-            raise RuntimeError(f"{self.file}: opened by process {self._process}, written by {os.getpid()}")
-        # The mcap Writer is not thread-safe: messages from two threads mix within a chunk, and the file cannot be
-        # read.
-        with self._lock:
-            tick = self._tick if episode.first_tick is None else episode.first_tick
-            row = messages.row_of(episode, self.run.t_max, tick)
-            self._add_messages(episode, tick, row)
-            self._rows.append(row)
-            self._tick = tick + len(episode) + schema.GAP
-            self._unflushed += len(episode)
-            if self._unflushed >= FLUSH_STEPS:
-                self.flush()
+        tick = self._tick if episode.first_tick is None else episode.first_tick
+        row = messages.row_of(episode, self.run.t_max, tick)
+        self._add_messages(episode, tick, row)
+        self._rows.append(row)
+        self._tick = tick + len(episode) + schema.GAP
+        self._unflushed += len(episode)
+        if self._unflushed >= FLUSH_STEPS:
+            self.flush()
 
     def _add_messages(self, episode: Episode, tick: int, row: dict[str, Any]) -> None:
         if episode.belief is None or episode.probability is None:
-            raise ValueError(f"episode {episode.number}: without its belief; log those of `Episodes.complete`")
+            raise ValueError(
+                f"episode {episode.number}: without its belief; log those of `Episodes.complete`"
+            )
         # Before the first message of the episode: NaN is no JSON, and a time that does not fit into its field makes
         # the Writer raise within a chunk, which finish() could then no longer write.
         if not (np.isfinite(episode.reward).all() and 0 <= tick < 2**37):
-            raise ValueError(f"episode {episode.number}: a reward that is not finite, or a time out of range")
+            raise ValueError(
+                f"episode {episode.number}: a reward that is not finite, or a time out of range"
+            )
         add, channels = self._writer.add_message, self._channels
         steps = messages.step_messages(episode, self.run)
         covered = None if self._coverage is None else self._coverage.cells(episode.action)
@@ -173,42 +177,41 @@ class EpisodeWriter:
         """Close the chunk and hand it to the operating system: it then survives a kill of this process."""
         # The first flush closes the chunk of the Writer, the second empties Python's buffer; neither reaches the disk:
         # the bytes survive the end of this process, not a power failure.
-        with self._lock:
-            self._writer.flush()
-            self._stream.flush()
-            self._unflushed = 0
+        self._writer.flush()
+        self._stream.flush()
+        self._unflushed = 0
 
     def sync(self) -> None:
         """Close the chunk and put it on the disk: it then survives a power failure as well."""
-        with self._lock:
-            self.flush()
-            sync(self._stream, self.part)
+        self.flush()
+        sync(self._stream, self.part)
 
     def finish(self) -> Path:
         """Complete the file and give it its name; returns it."""
-        with self._lock:
-            index = json.dumps(self._rows, allow_nan=False, separators=(",", ":")).encode()
-            self.flush()
-            self._attach("episodes.json", index)
-            steps = sum(row["length"] for row in self._rows)
-            counts = {"episodes": str(len(self._rows)), "steps": str(steps), "policies": str(self.policies)}
-            self._tell(schema.END, {"complete": "true", **counts, "episodes.json.sha256": schema.digest(index)})
-            # finish() writes the summary: with it, under its `.part` name, the file is complete. Sync, then rename:
-            # whoever sees the final name sees all bytes. A kill before the rename leaves a `.part` that can be
-            # recovered.
-            self._writer.finish()
-            sync(self._stream, self.part)
-            self._stream.close()
+        index = json.dumps(self._rows, allow_nan=False, separators=(",", ":")).encode()
+        self.flush()
+        self._attach("episodes.json", index)
+        counts = {
+            "episodes": str(len(self._rows)),
+            "steps": str(sum(row["length"] for row in self._rows)),
+            "policies": str(self.policies),
+        }
+        self._tell(schema.END, {**counts, "episodes.json.sha256": schema.digest(index)})
+        # finish() writes the summary: with it, under its `.part` name, the file is complete. Sync, then rename: under
+        # the final name all bytes are on the disk. A `.part` that a kill leaves can be recovered.
+        self._writer.finish()
+        sync(self._stream, self.part)
+        self._stream.close()
         self.part.replace(self.file)
         sync_folder(self.file.parent)
         return self.file
 
     def abandon(self) -> None:
-        """Close the file as it is, under its `.part` name; what was flushed can be recovered."""
+        """Close the file as it is, under its `.part` name; all flushed messages can be recovered."""
         try:
             self._stream.close()
         except OSError:
-            # close() writes what is buffered, which fails again on a full disk, and would leave the descriptor open.
+            # close() writes the buffer, which fails again on a full disk, and would leave the descriptor open.
             self._stream.raw.close()
 
     def _tell(self, name: str, content: dict[str, str]) -> None:
@@ -217,32 +220,3 @@ class EpisodeWriter:
     def _attach(self, name: str, content: bytes) -> None:
         time = time_of(self._tick)
         self._writer.add_attachment(time, time, name, _MEDIA[Path(name).suffix], content)
-
-
-def _described(policy: Policy | None, *, sparse: bool) -> tuple[dict[str, str], bytes | None]:
-    """What a log says of how a policy acts, and its table.
-
-    `[keys, t_max+1, ceil(S/8)]`, eight sensors to a byte; where the kernel is `sparse` the CSR matrix of its sets, as
-    SciPy saves it.
-    """
-    if policy is None:
-        return {"kind": "unknown"}, None
-    if policy.k is not None:
-        return {"kind": "random_k", "k": str(policy.k)}, None
-    if not policy.deterministic:
-        return {"kind": "probabilities"}, None
-    if sparse:
-        if policy.sets is None:  # all on or none: as many as there are drawn, or not one, which needs no table
-            return {"kind": "random_k", "k": str(round((policy.probability or 0.0) * policy.task.total_sensors))}, None
-        return {"kind": "chains"}, csr_bytes(policy.sets)
-    return {"kind": "chains"}, npy_bytes(np.packbits(policy.dense(), axis=-1))
-
-
-def _kernel(world: Modelled) -> dict[str, bytes]:
-    """The attachment that holds the kernel: dense, for any reader, or as SciPy saves a CSR matrix.
-
-    That on a large grid, and of targets with a mode, whose kernel is on (cell, mode).
-    """
-    if world.num_cells > DENSE_CELLS or isinstance(world, HiddenWorld):
-        return {"kernel.npz": csr_bytes(world.kernel)}
-    return {"kernel.npy": npy_bytes(world.kernel.toarray())}

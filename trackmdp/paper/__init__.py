@@ -1,1 +1,1 @@
-"""What is about the paper alone: its worlds, printed numbers, theorems, calibration and critique."""
+"""The paper: its worlds, printed numbers, theorems, calibration and critique."""

@@ -1,7 +1,7 @@
 """The paper's unstated settings: its kernels, chosen by one rule, and the effect of border rule and T_max.
 
-The kernels are chosen by Q_MDP's exact accuracy against the printed column alone, never by what a learned policy does.
-What is computed stands beside the results as `paper.json`.
+The kernels are chosen by Q_MDP's exact accuracy against the printed column alone, never by a learned policy.
+The computed settings are stored beside the results as `paper.json`.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import numpy as np
 
 from trackmdp.durable import write_text
 from trackmdp.paper import theorems
-from trackmdp.paper.theorems import Check
+from trackmdp.paper.check import Check
 from trackmdp.paper.worlds import COSTS, PRINTED_QMDP, SUPPORTS, paper_kernel, paper_world
-from trackmdp.solvers import bounds, optimal, qmdp
-from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers import bounds, optimal, rules
+from trackmdp.solvers.value import evaluate
 from trackmdp.untrusted import decoded, read_object
 from trackmdp.world.kernels import Border
 from trackmdp.world.model import Array
@@ -29,7 +29,7 @@ from trackmdp.world.model import Array
 BORDER: Border = "renormalize"
 T_MAX = 1
 SEEDS = range(100)
-# The paper says nothing of moves that lead out of the grid. `inside` gives Q_MDP the same accuracy for every Z, so the
+# The paper does not define moves that lead out of the grid. `inside` gives Q_MDP the same accuracy for every Z, so the
 # paper cannot have used it; it is kept to show how far the figures move.
 _BORDERS: tuple[Border, ...] = ("renormalize", "clip", "inside", "exit")
 HORIZONS = (0, 1, 2)
@@ -65,7 +65,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class Setting:
-    """What one choice of the unstated settings does to the figures of a pair, over draws of the kernel.
+    """The figures of a pair under one choice of the unstated settings, over draws of the kernel.
 
     Attributes:
         border, t_max: the choice.
@@ -115,7 +115,9 @@ def sensitivity(draws: Sequence[int] = DRAWS) -> Iterator[Setting]:
         # Over all four prices at once, hence one number for Z that every price's `Setting` repeats.
         deviation = float(_deviations(support_size, figures[:, :, 0]).min())
         # `[prices, figures, (median, low, high)]`
-        spreads = np.stack([np.median(figures, axis=0), figures.min(axis=0), figures.max(axis=0)], axis=2)
+        spreads = np.stack(
+            [np.median(figures, axis=0), figures.min(axis=0), figures.max(axis=0)], axis=2
+        )
         for cost, spread in zip(COSTS, spreads.tolist(), strict=True):
             accuracy, simple, clocked = (Spread(*each) for each in spread)
             yield Setting(border, t_max, support_size, cost, accuracy, simple, clocked, deviation)
@@ -125,11 +127,11 @@ def _figures(border: Border, t_max: int, support_size: int, draws: Sequence[int]
     """`[draws, prices, 3]`, accuracy of Q_MDP in per cent, its AIHTR, and the clocked bound."""
     figures = np.empty((len(draws), len(COSTS), 3))
     for row, seed in enumerate(draws):
-        # One kernel for all four prices, as in Table II: the price changes what is sensed, never how the target moves.
+        # One kernel for all four prices, as in Table II: the price changes the sets, never the motion.
         kernel = paper_kernel(support_size, seed, border)
         for column, cost in enumerate(COSTS):
             world = paper_world(kernel, cost, t_max)
-            value = evaluate(world, qmdp.solve(world))
+            value = evaluate(world, rules.qmdp(world))
             figures[row, column] = 100.0 * value.accuracy, value.aihtr, bounds.clocked(world).mean()
     return figures
 
@@ -157,7 +159,7 @@ class Openings:
 
 
 def compute(say: Callable[[str], None]) -> Openings:
-    """All of it, in about half a minute; `say` is told what is under way."""
+    """All of it, in about half a minute; `say` is called with the name of each stage."""
     say("candidate kernels for the paper's worlds")
     every = [candidate for support_size in SUPPORTS for candidate in candidates(support_size)]
     say("the paper's unstated settings")
@@ -172,12 +174,18 @@ def checks(seed: int, *, border: str, t_max: int) -> list[Check]:
     """The paper's theorems on the world with Z = 5 at the lowest price, and the two remarks."""
     world = paper_world(paper_kernel(HARDEST, seed, border), COSTS[0], t_max)  # type: ignore[arg-type]
     solution = optimal.solve(world, tolerance=TOLERANCE)
-    return [*theorems.check_theorems(world, solution, TOLERANCE), *theorems.check_remarks(TOLERANCE)]
+    return [
+        *theorems.check_theorems(world, solution, TOLERANCE),
+        *theorems.check_remarks(TOLERANCE),
+    ]
 
 
 def save_openings(openings: Openings, folder: Path) -> None:
     """Write `paper.json`."""
-    write_text(folder / OPENINGS_FILE, json.dumps(_packed(openings), separators=(",", ":"), ensure_ascii=False) + "\n")
+    write_text(
+        folder / OPENINGS_FILE,
+        json.dumps(_packed(openings), separators=(",", ":"), ensure_ascii=False) + "\n",
+    )
 
 
 def load_openings(folder: Path) -> Openings | None:
@@ -189,12 +197,14 @@ def load_openings(folder: Path) -> Openings | None:
     file = folder / OPENINGS_FILE
     if not file.is_file():
         return None
-    with decoded(str(file), "what a report says of the paper"):
+    with decoded(str(file), "the paper's settings for a report"):
         return _unpacked(read_object(file))
 
 
 def _packed(openings: Openings) -> dict[str, Any]:
-    return {name: [_rounded(astuple(each)) for each in found] for name, found in vars(openings).items()}
+    return {
+        name: [_rounded(astuple(each)) for each in found] for name, found in vars(openings).items()
+    }
 
 
 def _rounded(value: Any) -> Any:
@@ -210,8 +220,20 @@ def _unpacked(plain: dict[str, Any]) -> Openings:
     return Openings(
         [Candidate(*row) for row in plain["candidates"]],
         [
-            Setting(border, t_max, z, cost, Spread(*accuracy), Spread(*qmdp), Spread(*clocked), deviation)
+            Setting(
+                border,
+                t_max,
+                z,
+                cost,
+                Spread(*accuracy),
+                Spread(*qmdp),
+                Spread(*clocked),
+                deviation,
+            )
             for border, t_max, z, cost, accuracy, qmdp, clocked, deviation in plain["settings"]
         ],
-        [Check(name, said, float(deviation), *rest) for name, said, deviation, *rest in plain["checks"]],
+        [
+            Check(name, statement, float(deviation), *rest)
+            for name, statement, deviation, *rest in plain["checks"]
+        ],
     )

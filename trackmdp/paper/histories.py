@@ -1,103 +1,132 @@
-"""Theorem 3 from a Q that knows no belief: the Track-MDP solved over its histories, for a world of a few cells.
+"""The Track-MDP solved over its histories, without any belief, for a few cells and sensors that never miss.
 
-A state is what the policy sees: the located cell x and the sets sensed since. How it moves on is summed over the
-target's single paths, so that a belief filter has no part in Q: that the estimate from Q is the belief is then a
-statement about two computations that share nothing but the world.
+A state is (x, h): the last located cell and the sets sensed since. Its moves are summed over the single paths of the
+target, so that a belief filter has no part in V and Q: Lemma 1 and Theorem 3, which equate Q and a belief, are then
+about two computations that share nothing but the world.
 """
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
 from trackmdp.solvers.pomdp import FiniteMdp
 from trackmdp.world.model import Array, BoolArray, World
 
-History = tuple[int, ...]
-"""Sets sensed since the last detection, each as its number in `actions`."""
+State: TypeAlias = tuple[int, tuple[int, ...]]
+"""Last located cell, and the sets sensed since, each as its row in `actions`."""
 
 
 @dataclass(frozen=True)
 class HistoryQ:
-    """The optimum over histories.
+    """The optimum over the histories that can happen.
 
     Attributes:
-        value: (x, history) -> V, for every history that can happen.
-        q: (x, history) -> `[2^M]` Q of every action; forced states have none.
-        inside: (x, history) -> probability that the target is still in the grid after the next move.
-        actions: `[2^M, M]` the set that each number stands for.
+        world: the problem.
+        actions: `[2^M, M]` all sets of sensors, the first cell being the highest bit of a set's number.
+        value: V of each state.
+        q: `[2^M]` Q of every action; none in a state in which the safe action is forced.
+        now: `[M]` probability of each cell, given the history.
+        inside: probability that the target is in the grid after the next move.
     """
 
-    value: dict[tuple[int, History], float]
-    q: dict[tuple[int, History], Array]
-    inside: dict[tuple[int, History], float]
+    world: World
     actions: BoolArray
+    value: dict[State, float]
+    q: dict[State, Array]
+    now: dict[State, Array]
+    inside: dict[State, float]
+
+    def without(self, cell: int) -> int:
+        """The number of the set of all sensors but the one in `cell`."""
+        return len(self.actions) - 1 - self.bit(cell)
+
+    def bit(self, cell: int) -> int:
+        """The number of the set of one cell."""
+        return 1 << (self.world.num_cells - 1 - cell)
 
 
 def solve_histories(world: World) -> HistoryQ:
-    """Policy iteration over all histories that can happen; 2^M actions in each."""
+    """Policy iteration over all histories that can happen, with 2^M actions in each."""
     m, kernel = world.num_cells, world.kernel.toarray()
     actions = np.array(list(itertools.product([False, True], repeat=m)))
-    states: list[tuple[int, History]] = [(x, ()) for x in range(m)]
+    states: list[State] = [(x, ()) for x in range(m)]
     index = {state: place for place, state in enumerate(states)}
-    problem, inside, rows = FiniteMdp(), {}, {}
+    problem, rows = FiniteMdp(), dict[State, int]()
+    now, inside = dict[State, Array](), dict[State, float]()
     for place, (x, history) in enumerate(states):  # grows while it is gone through
-        # `[M]`, conditioned on the misses of this history; its sum is below 1 by the probability of exit.
-        reach = _next_cells(kernel, x, [actions[number] for number in history])
+        now[x, history] = _position(kernel, x, [actions[number] for number in history])
+        reach = now[x, history] @ kernel
         inside[x, history] = float(reach.sum())
-        # n = t_max + 1: the safe action locates the target in any case, at price D, and only in the grid.
+        # n = t_max + 1: the safe action locates the target, at price D, if it is still in the grid.
         if len(history) == world.num_choices:
-            problem.add(place, (world.reward - world.safe_cost) * reach.sum(), list(range(m)), reach.tolist())
+            earned = (world.reward - world.safe_cost) * reach.sum()
+            problem.add(place, earned, list(range(m)), reach.tolist())
             continue
         rows[x, history] = len(problem.state)
         for number, action in enumerate(actions):
-            found = np.where(action, reach, 0.0)
+            found, missed = reach * action, float(reach[~action].sum())
             targets, probability = list(range(m)), found.tolist()
-            missed = float(reach[~action].sum())
             if missed > 0:
                 after = (x, (*history, number))
                 if after not in index:
                     index[after] = len(states)
                     states.append(after)
                 targets, probability = [*targets, index[after]], [*probability, missed]
-            # eq. reward_func: nothing is paid on the exit step, hence times the probability of still being in the
-            # grid.
+            # eq. reward_func: nothing is paid on the exit step, hence times the probability of staying.
             price = float(world.cost[action].sum()) * reach.sum()
             problem.add(place, world.reward * found.sum() - price, targets, probability)
     value, worth = problem.solve(len(states))
     q = {state: worth[row : row + len(actions)] for state, row in rows.items()}
-    return HistoryQ(dict(zip(states, value.tolist(), strict=True)), q, inside, actions)
+    found_value = dict(zip(states, value.tolist(), strict=True))
+    return HistoryQ(world, actions, found_value, q, now, inside)
 
 
-def estimates(world: World, solved: HistoryQ, state: tuple[int, History]) -> dict[int, float]:
-    """Cell -> its probability as Q tells it, for the cells whose miss leaves a history that can happen.
+def _position(kernel: Array, x: int, sets: list[BoolArray]) -> Array:
+    """`[M]` probability of each cell of a target that left `x` and that no set has seen, path by path."""
+    weight = np.zeros(len(kernel))
+    for path in itertools.product(range(len(kernel)), repeat=len(sets)):
+        if not any(sensed[cell] for sensed, cell in zip(sets, path, strict=True)):
+            before = (x, *path)
+            weight[before[-1]] += np.prod([kernel[a, b] for a, b in itertools.pairwise(before)])
+    return weight / weight.sum()
 
-    With every sensor on but the one at j, a miss says that the target is at j. So
+
+def estimates(solved: HistoryQ, state: State) -> dict[int, float]:
+    """Cell -> its probability from Q alone, for the cells at which a miss leaves a possible history.
+
+    With every sensor on but the one at j, a miss means that the target is at j. So
     Q(s, all) - Q(s, all but j) = p(j) (r + V(j) - V(x, {h, all but j})) - c_j p_in.
     """
     x, history = state
-    found, everything = {}, len(solved.actions) - 1
-    for j in range(world.num_cells):
-        others = everything - (1 << (world.num_cells - 1 - j))  # `product` counts the first cell as the highest bit
-        after = solved.value.get((x, (*history, others)))
+    found = {}
+    for j in range(solved.world.num_cells):
+        after = solved.value.get((x, (*history, solved.without(j))))
         if after is not None:
-            difference = float(solved.q[state][everything] - solved.q[state][others])
-            worth = world.reward + solved.value[j, ()] - after
-            found[j] = (difference + world.cost[j] * solved.inside[state]) / worth
+            paid = solved.world.cost[j] * solved.inside[state]
+            worth = solved.world.reward + solved.value[j, ()] - after
+            found[j] = (advantage(solved, state, j) + paid) / worth
     return found
 
 
-def filtered(world: World, solved: HistoryQ, state: tuple[int, History]) -> Array:
-    """`[M]` the belief filter's prediction at a history."""
+def advantage(solved: HistoryQ, state: State, j: int) -> float:
+    """Q(s, all) - Q(s, all but j)."""
+    q = solved.q[state]
+    return float(q[-1] - q[solved.without(j)])
+
+
+def filtered(solved: HistoryQ, state: State) -> Array:
+    """`[M]` the belief filter's prediction of the next cell."""
     import torch  # only here: solving needs none
 
     from trackmdp.episodes.belief import BeliefFilter
 
     x, history = state
-    filter_ = BeliefFilter(world.kernel)
+    filter_ = BeliefFilter(solved.world.kernel)
     predicted = filter_.predict(filter_.detect(torch.tensor([x])))
     for number in history:
         action = torch.as_tensor(solved.actions[number])[None]
@@ -105,15 +134,37 @@ def filtered(world: World, solved: HistoryQ, state: tuple[int, History]) -> Arra
     return np.asarray(predicted[0].numpy())
 
 
-def _next_cells(kernel: Array, x: int, sets: list[npt.NDArray[np.bool_]]) -> Array:
-    """`[M]` probability of each next cell, given that the target left `x` and no set has seen it: path by path."""
-    m, paths = len(kernel), np.zeros(len(kernel))
-    unseen = 0.0
-    for path in itertools.product(range(m), repeat=len(sets)):
-        before = [x, *path]
-        if any(sensed[cell] for sensed, cell in zip(sets, path, strict=True)):
+def miss_losses(solved: HistoryQ) -> Iterator[tuple[float, float]]:
+    """The excess in both inequalities of Lemma 1, for every history with a miss and every cell b it leaves possible.
+
+    W(b) is the worth of going on as V does while the target is at b. First (eq. vis_p1): W(b) - V(b, 0, {}). Second
+    (eq. vis_pr2): V(x, h) less the share of b, less V of the history with b added to its last set, both times the
+    probability of the rest; -inf where nothing is left.
+    """
+    for (x, history), now in solved.now.items():
+        if not history:
             continue
-        probability = float(np.prod([kernel[a, b] for a, b in itertools.pairwise(before)]))
-        unseen += probability
-        paths += probability * kernel[before[-1]]
-    return paths / unseen
+        going_on = _going_on(solved, (x, history))
+        for b in np.flatnonzero(now).tolist():
+            first = going_on[b] - solved.value[b, ()]
+            with_b = (x, (*history[:-1], history[-1] | solved.bit(b)))
+            second = -np.inf
+            if with_b in solved.value:
+                rest = solved.value[x, history] - now[b] * going_on[b]
+                second = rest - (1.0 - now[b]) * solved.value[with_b]
+            yield float(first), float(second)
+
+
+def _going_on(solved: HistoryQ, state: State) -> Array:
+    """`[M]` W: worth of the best plan of a state, the target being in each cell."""
+    world, (x, history) = solved.world, state
+    kernel = world.kernel.toarray()
+    located = world.reward + np.array([solved.value[j, ()] for j in range(world.num_cells)])
+    if state not in solved.q:
+        return kernel @ located - world.safe_cost * kernel.sum(axis=1)
+    number = int(solved.q[state].argmax())
+    action, after = solved.actions[number], (x, (*history, number))
+    # A history that cannot happen is not listed; its weight below is 0.
+    missed = _going_on(solved, after) if after in solved.value else np.zeros(world.num_cells)
+    paid = float(world.cost[action].sum()) * kernel.sum(axis=1)
+    return kernel @ np.where(action, located, missed) - paid

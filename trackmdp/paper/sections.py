@@ -11,7 +11,7 @@ import numpy as np
 
 from trackmdp.paper import calibration
 from trackmdp.paper.calibration import DRAWS, Candidate, Openings, Setting, Spread, chosen
-from trackmdp.paper.theorems import Check
+from trackmdp.paper.check import Check
 from trackmdp.paper.worlds import COSTS, PRINTED_QMDP, PRINTED_TMDP, SUPPORTS, pairs
 from trackmdp.reports.grouping import Study
 from trackmdp.reports.page import Part, Section
@@ -19,7 +19,7 @@ from trackmdp.reports.style import INK, LOOKS, Canvas, Figure, draw_figure, lege
 from trackmdp.reports.tables import Cell, Column, Table, paragraphs
 
 # One colour per Z through all figures of this part; they are those of methods, which do not occur here.
-COLOURS = {3: LOOKS["a2c"], 4: LOOKS["ppo"], 5: LOOKS["hindsight"]}
+COLOURS = dict(zip(SUPPORTS, (LOOKS[0], LOOKS[2], LOOKS[1]), strict=True))
 
 
 def candidates_table(every: Sequence[Candidate]) -> Table:
@@ -28,8 +28,13 @@ def candidates_table(every: Sequence[Candidate]) -> Table:
     columns = [Column("Z"), Column("seed"), Column("deviation", 2, "points")]
     columns += [Column(f"accuracy at c = {cost:g}", 2, "%") for cost in COSTS]
     ordered = sorted(every, key=lambda c: (c.support_size, c.deviation, c.seed))
-    rows = [[c.support_size, c.seed, c.deviation, *c.accuracy, seeds[c.support_size] == c.seed] for c in ordered]
-    return Table("calibration", f"All {len(rows)} candidate kernels", [*columns, Column("chosen")], rows)
+    rows = [
+        [c.support_size, c.seed, c.deviation, *c.accuracy, seeds[c.support_size] == c.seed]
+        for c in ordered
+    ]
+    return Table(
+        "calibration", f"All {len(rows)} candidate kernels", [*columns, Column("chosen")], rows
+    )
 
 
 def calibration_figure(every: Sequence[Candidate]) -> Figure:
@@ -39,13 +44,24 @@ def calibration_figure(every: Sequence[Candidate]) -> Figure:
     def paint(figure: Canvas) -> None:
         axes = figure.subplots()
         for support_size, style in COLOURS.items():
-            mine = sorted((c for c in every if c.support_size == support_size), key=lambda c: c.seed)
+            mine = sorted(
+                (c for c in every if c.support_size == support_size), key=lambda c: c.seed
+            )
             # One band per Z; within it the seed is the height, only to keep the dots apart.
             height = [support_size + 0.6 * (c.seed / len(mine) - 0.5) for c in mine]
-            axes.plot([c.deviation for c in mine], height, ".", color=style.colour, markersize=4, alpha=0.7)
+            axes.plot(
+                [c.deviation for c in mine],
+                height,
+                ".",
+                color=style.colour,
+                markersize=4,
+                alpha=0.7,
+            )
             best = next(c for c in mine if c.seed == seeds[support_size])
             place = support_size + 0.6 * (best.seed / len(mine) - 0.5)
-            axes.plot([best.deviation], [place], "o", color=INK, markersize=8, markerfacecolor="none")
+            axes.plot(
+                [best.deviation], [place], "o", color=INK, markersize=8, markerfacecolor="none"
+            )
             # To the left: the chosen one is the leftmost of its band, so that the label meets no other dot.
             label, at = f"seed {best.seed}", (best.deviation, place)
             axes.annotate(label, at, (-8, 0), textcoords="offset points", ha="right", va="center")
@@ -57,9 +73,7 @@ def calibration_figure(every: Sequence[Candidate]) -> Figure:
         tidy(axes)
 
     title = f"Candidate kernels by their distance to the printed Q_MDP accuracy, n = {len(every) // 3} for each Z"
-    best = {c.support_size: c for c in every if seeds[c.support_size] == c.seed}
-    text = "; ".join(f"Z = {z}: seed {c.seed}, {c.deviation:.2f} points" for z, c in sorted(best.items()))
-    return draw_figure(title, f"Chosen, {text}.", candidates_table(every), 2.8, paint)
+    return draw_figure(title, candidates_table(every), 2.8, paint)
 
 
 def fit_table(settings: Sequence[Setting]) -> Table:
@@ -67,11 +81,21 @@ def fit_table(settings: Sequence[Setting]) -> Table:
     fits: dict[tuple[str, int], dict[int, float]] = {}
     for setting in settings:
         # `deviation` covers all prices, so the settings of one Z that differ in c write the same number.
-        fits.setdefault((setting.border, setting.t_max), {})[setting.support_size] = setting.deviation
+        fits.setdefault((setting.border, setting.t_max), {})[setting.support_size] = (
+            setting.deviation
+        )
     ordered = sorted(fits.items(), key=lambda item: max(item[1].values()))
-    rows: list[list[Cell]] = [[*setting, *(fit[z] for z in SUPPORTS), max(fit.values())] for setting, fit in ordered]
-    columns = [Column("border"), Column("T_max"), *(Column(f"Z = {z}", 2, "points") for z in SUPPORTS)]
-    caption = f"Smallest deviation from the printed Q_MDP accuracy among {len(DRAWS)} draws, by setting"
+    rows: list[list[Cell]] = [
+        [*setting, *(fit[z] for z in SUPPORTS), max(fit.values())] for setting, fit in ordered
+    ]
+    columns = [
+        Column("border"),
+        Column("T_max"),
+        *(Column(f"Z = {z}", 2, "points") for z in SUPPORTS),
+    ]
+    caption = (
+        f"Smallest deviation from the printed Q_MDP accuracy among {len(DRAWS)} draws, by setting"
+    )
     return Table("fit", caption, [*columns, Column("worst of the three", 2, "points")], rows)
 
 
@@ -79,8 +103,15 @@ def sensitivity_table(settings: Sequence[Setting]) -> Table:
     """Median and range over draws of three figures, for every setting and pair."""
     columns = [Column("border"), Column("T_max"), Column("Z"), Column("c", 2)]
     for label, digits in (("Q_MDP accuracy %", 2), ("Q_MDP AIHTR", 1), ("clocked bound AIHTR", 1)):
-        columns += [Column(f"{label}, median", digits), Column("low", digits), Column("high", digits)]
-    rows = [[*at, *accuracy, *simple, *clocked] for *at, accuracy, simple, clocked, _ in map(astuple, settings)]
+        columns += [
+            Column(f"{label}, median", digits),
+            Column("low", digits),
+            Column("high", digits),
+        ]
+    rows = [
+        [*at, *accuracy, *simple, *clocked]
+        for *at, accuracy, simple, clocked, _ in map(astuple, settings)
+    ]
     caption = f"Median and range over {len(DRAWS)} draws of the kernel, by setting and pair"
     return Table("sensitivity", caption, columns, rows)
 
@@ -98,7 +129,12 @@ def sensitivity_figures(settings: Sequence[Setting]) -> list[Figure]:
 
 
 def _ranges(
-    name: str, label: str, settings: Sequence[Setting], of: Callable[[Setting], Spread], *, printed: bool = False
+    name: str,
+    label: str,
+    settings: Sequence[Setting],
+    of: Callable[[Setting], Spread],
+    *,
+    printed: bool = False,
 ) -> Figure:
     rows = list(dict.fromkeys((s.border, s.t_max) for s in settings))
 
@@ -107,14 +143,26 @@ def _ranges(
         # The three Z of a setting stand in one row, a little apart.
         for offset, support_size in zip((-0.24, 0.0, 0.24), COLOURS, strict=True):
             look = COLOURS[support_size]
-            middle, low, high = np.array([astuple(of(s)) for s in settings if s.support_size == support_size]).T
+            middle, low, high = np.array(
+                [astuple(of(s)) for s in settings if s.support_size == support_size]
+            ).T
             # `[2, settings]`, lengths below and above the median. The range, not a confidence interval: how far the
             # draw of the kernel moves a figure.
             bars, y = np.stack([middle - low, high - middle]), np.arange(len(rows)) + offset
-            points: Any = {"fmt": look.marker, "color": look.colour, "markersize": 3.5, "elinewidth": 1.2}
+            points: Any = {
+                "fmt": look.marker,
+                "color": look.colour,
+                "markersize": 3.5,
+                "elinewidth": 1.2,
+            }
             axes.errorbar(middle, y, xerr=bars, label=f"Z = {support_size}", **points)
             if printed:
-                axes.axvline(PRINTED_QMDP[support_size, COSTS[0]], color=look.colour, linewidth=0.8, linestyle=":")
+                axes.axvline(
+                    PRINTED_QMDP[support_size, COSTS[0]],
+                    color=look.colour,
+                    linewidth=0.8,
+                    linestyle=":",
+                )
         axes.set_yticks(range(len(rows)), [f"{border}, T_max {t_max}" for border, t_max in rows])
         # The first setting on top, as in the table.
         axes.invert_yaxis()
@@ -123,20 +171,28 @@ def _ranges(
         legend(figure, axes)
 
     under = f"under the paper's unstated settings, c = {settings[0].cost:g}"
-    title = f"{label} {under}: median and range, n = {len(DRAWS)} draws"
-    ends = [of(setting).median for setting in settings]
-    text = f"Medians from {min(ends):.1f} to {max(ends):.1f}." + (" Dotted: the printed values." if printed else "")
-    columns = [Column("border"), Column("T_max"), Column("Z"), Column("median", 2), Column("low", 2), Column("high", 2)]
-    numbers: list[list[Cell]] = [[s.border, s.t_max, s.support_size, *astuple(of(s))] for s in settings]
+    dotted = "; dotted: the printed values" if printed else ""
+    title = f"{label} {under}: median and range, n = {len(DRAWS)} draws{dotted}"
+    columns = [
+        Column("border"),
+        Column("T_max"),
+        Column("Z"),
+        Column("median", 2),
+        Column("low", 2),
+        Column("high", 2),
+    ]
+    numbers: list[list[Cell]] = [
+        [s.border, s.t_max, s.support_size, *astuple(of(s))] for s in settings
+    ]
     table = Table(f"sensitivity-{name}", title, columns, numbers)
-    return draw_figure(title, text, table, 4.2, paint)
+    return draw_figure(title, table, 4.2, paint)
 
 
 def sections(study: Study, openings: Openings) -> list[Section]:
     """The sections that follow those of any sweep."""
     chosen = pairs(study)
-    said: list[Part] = [f"<p>{_about_accuracy(study, chosen)}</p>", accuracy_table(study, chosen)]
-    accuracy = Section("accuracy", "The paper's Table II: accuracy", said)
+    parts: list[Part] = [f"<p>{_about_accuracy(study, chosen)}</p>", accuracy_table(study, chosen)]
+    accuracy = Section("accuracy", "The paper's Table II: accuracy", parts)
     return [*([accuracy] if chosen else []), _worlds(openings), _critique(study, chosen, openings)]
 
 
@@ -144,40 +200,57 @@ def accuracy_table(study: Study, chosen: Mapping[tuple[int, float], str]) -> Tab
     """Table II of the paper beside exact accuracies: of Q_MDP, and of each method the mean over seeds."""
     rows: list[list[Cell]] = []
     # The order of Table II: by price, and Z = 5, 4, 3 within one.
-    for (support_size, cost), world in sorted(chosen.items(), key=lambda item: (item[0][1], -item[0][0])):
-        first = study.in_world(world)[0]
-        row: list[Cell] = [support_size, cost, PRINTED_QMDP[support_size, cost], 100 * first.figure("qmdp_accuracy")]
+    for (support_size, cost), world in sorted(
+        chosen.items(), key=lambda item: (item[0][1], -item[0][0])
+    ):
+        row: list[Cell] = [
+            support_size,
+            cost,
+            PRINTED_QMDP[support_size, cost],
+            100 * study.reference(world, "Q_MDP", "accuracy"),
+        ]
         row.append(PRINTED_TMDP[support_size, cost])
         for method in study.methods:
             values = [100 * run.figure("accuracy") for run in study.of(world, method)]
             row += [float(np.mean(values)) if values else None, len(values)]
         rows.append(row)
-    columns = [Column("Z"), Column("c", 2), Column("Q_MDP, printed", 2, "%"), Column("Q_MDP, exact", 2, "%")]
+    columns = [
+        Column("Z"),
+        Column("c", 2),
+        Column("Q_MDP, printed", 2, "%"),
+        Column("Q_MDP, exact", 2, "%"),
+    ]
     columns.append(Column("TMDP, printed", 2, "%"))
     for method in study.methods:
         columns += [Column(method, 2, "%"), Column("n")]
-    return Table("accuracy", "Table II: tracking accuracy, printed and exact; n seeds each", columns, rows)
+    return Table(
+        "accuracy", "Table II: tracking accuracy, printed and exact; n seeds each", columns, rows
+    )
 
 
 def _about_accuracy(study: Study, chosen: Mapping[tuple[int, float], str]) -> str:
-    """What the printed accuracies can be held against, and that the learned ones are not reproduced."""
-    told, printed = paragraphs("trackmdp.paper"), PRINTED_TMDP.values()
-    a2c = [100 * run.figure("accuracy") for world in chosen.values() for run in study.of(world, "a2c")]
-    # Said only where the two ranges are apart; where they overlap nothing is claimed.
+    """The reference of the printed accuracies, and the learned accuracies that differ from them."""
+    words, printed = paragraphs("trackmdp.paper"), PRINTED_TMDP.values()
+    a2c = [
+        100 * run.figure("accuracy") for world in chosen.values() for run in study.of(world, "a2c")
+    ]
+    # Only where the two ranges are apart; where they overlap nothing is claimed.
     if not a2c or min(a2c) <= max(printed):
-        return told["accuracy"]
+        return words["accuracy"]
     theirs, ours = (f"{min(each):.1f} to {max(each):.1f} %" for each in (printed, a2c))
-    return f"{told['accuracy']} {told['not reproduced'].format(theirs=theirs, ours=ours)}"
+    return f"{words['accuracy']} {words['not reproduced'].format(theirs=theirs, ours=ours)}"
 
 
 def _worlds(openings: Openings) -> Section:
     best = fit_table(openings.settings)
     # `fit_table` puts the best setting first.
     border, t_max, *_, worst = best.rows[0]
-    told = paragraphs("trackmdp.paper")
-    fit = told["fit"].format(border=border, t_max=t_max, worst=worst, draws=len(DRAWS))
+    words = paragraphs("trackmdp.paper")
+    fit = words["fit"].format(border=border, t_max=t_max, worst=worst, draws=len(DRAWS))
     first, *_, last = calibration.SEEDS
-    rule = told["rule"].format(first=first, last=last, t_max=calibration.T_MAX, border=calibration.BORDER)
+    rule = words["rule"].format(
+        first=first, last=last, t_max=calibration.T_MAX, border=calibration.BORDER
+    )
     drawn = sensitivity_figures(openings.settings)
     figure = calibration_figure(openings.candidates)
     parts: list[Part] = [f"<p>{rule}</p>", [figure], f"<p>{fit}</p>", best, drawn]
@@ -188,47 +261,88 @@ def _worlds(openings: Openings) -> Section:
 def _critique(study: Study, chosen: Mapping[tuple[int, float], str], openings: Openings) -> Section:
     bounds = bounds_table(study, chosen)
     text = _points(study, bounds, chosen, openings.checks)
-    return Section("critique", "Where the paper is silent or wrong", [text, bounds, checks_table(openings.checks)])
+    return Section(
+        "critique",
+        "Where the paper is silent or wrong",
+        [text, bounds, checks_table(openings.checks)],
+    )
 
 
 def checks_table(found: Iterable[Check]) -> Table:
     """Every statement checked, with its largest deviation; -inf where there was no case to check."""
     rows: list[list[Cell]] = [
-        [c.name, c.statement, None if c.deviation == float("-inf") else f"{c.deviation:.1e}", c.verdict, c.note]
+        [
+            c.name,
+            c.statement,
+            None if c.deviation == float("-inf") else f"{c.deviation:.1e}",
+            c.verdict,
+            c.note,
+        ]
         for c in found
     ]
-    columns = [Column("theorem"), Column("statement"), Column("largest deviation"), Column("verdict"), Column("note")]
+    columns = [
+        Column("theorem"),
+        Column("statement"),
+        Column("largest deviation"),
+        Column("verdict"),
+        Column("note"),
+    ]
     caption = f"The paper's statements on the world with Z = {calibration.HARDEST}, c = {COSTS[0]}"
     return Table("theorems", caption, columns, rows)
 
 
 def bounds_table(study: Study, pairs: Mapping[tuple[int, float], str]) -> Table:
-    """The bounds of each pair beside the optimum: where the printed one is below what a policy earns."""
+    """The bounds of each pair beside the optimum: marked where the printed one is below a policy's value."""
     rows: list[list[Cell]] = []
     for (support_size, cost), world in pairs.items():
         # Bounds are the world's, so that any run has them; the bracket of the optimum is the best that some run found.
-        run, best, upper = study.in_world(world)[0], study.lower(world), study.upper(world)
-        printed = run.figure("bound_paper")
+        best, upper = study.lower(world), study.upper(world)
+        printed, valid, clocked = (
+            study.reference(world, f"{name} bound", "aihtr")
+            for name in ("printed", "valid", "clocked")
+        )
         # Relative: the solver's bracket is closed to rounding of values that grow with the episode's length.
         proved = None if best is None else upper - best <= 1e-6 * max(1.0, abs(best))
         # eq. upper_bound_v charges sensors on the exit step, the reward (eq. reward_func) does not: a policy may earn
         # more.
         below = None if best is None else best > printed + 1e-9
-        row: list[Cell] = [support_size, cost, run.figure("qmdp_aihtr"), best, upper, proved]
-        rows.append([*row, run.figure("bound_clocked"), run.figure("bound_valid"), printed, below])
+        simple = study.reference(world, "Q_MDP", "aihtr")
+        row: list[Cell] = [support_size, cost, simple, best, upper, proved]
+        rows.append([*row, clocked, valid, printed, below])
     columns = [Column("Z"), Column("c", 2), Column("Q_MDP", 3), Column("optimum, attained", 4)]
-    columns += [Column("optimum, at most", 4), Column("proved"), Column("clocked bound", 3), Column("valid bound", 3)]
+    columns += [
+        Column("optimum, at most", 4),
+        Column("proved"),
+        Column("clocked bound", 3),
+        Column("valid bound", 3),
+    ]
     columns += [Column("printed bound", 3), Column("printed bound is exceeded")]
-    return Table("bounds", "AIHTR: Q_MDP, the proved bracket of the optimum, and the bounds, exactly", columns, rows)
+    return Table(
+        "bounds",
+        "AIHTR: Q_MDP, the proved bracket of the optimum, and the bounds, exactly",
+        columns,
+        rows,
+    )
 
 
-def _points(study: Study, table: Table, pairs: Mapping[tuple[int, float], str], found: Sequence[Check]) -> str:
+def _points(
+    study: Study, table: Table, pairs: Mapping[tuple[int, float], str], found: Sequence[Check]
+) -> str:
     """The headings and paragraphs of `critique.txt`, in the order of the paper, with the figures of this sweep."""
     forms = ("as printed", "exact form")
-    printed, exact = (next(each for each in found if each.name == f"Theorem 3, {form}") for form in forms)
-    facts = _exit_price(table, found) | {"printed": printed, "exact": exact} | _hardest(study, pairs)
-    points = ((head, text.format(**facts)) for head, text in paragraphs("trackmdp.paper", "critique.txt").items())
-    return "".join(f"<h3>{html.escape(head)}</h3><p>{html.escape(body)}</p>" for head, body in points)
+    printed, exact = (
+        next(each for each in found if each.name == f"Theorem 3, {form}") for form in forms
+    )
+    facts = (
+        _exit_price(table, found) | {"printed": printed, "exact": exact} | _hardest(study, pairs)
+    )
+    points = (
+        (head, text.format(**facts))
+        for head, text in paragraphs("trackmdp.paper", "critique.txt").items()
+    )
+    return "".join(
+        f"<h3>{html.escape(head)}</h3><p>{html.escape(body)}</p>" for head, body in points
+    )
 
 
 def _exit_price(table: Table, found: Sequence[Check]) -> dict[str, Any]:
@@ -243,7 +357,7 @@ def _hardest(study: Study, pairs: Mapping[tuple[int, float], str]) -> dict[str, 
     """How tight the clocked bound is, and where it is not attained."""
     short = {}
     for (support_size, cost), world in pairs.items():
-        bound, best = study.in_world(world)[0].figure("bound_clocked"), study.lower(world)
+        bound, best = study.reference(world, "clocked bound", "aihtr"), study.lower(world)
         # U is the optimum where its policy leaves at most one cell of positive probability unsensed; elsewhere the
         # optimum takes a search, and may lie below.
         if best is not None and bound - best > 1e-6 * max(1.0, abs(bound)):

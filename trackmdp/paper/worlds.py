@@ -19,20 +19,24 @@ COSTS = (0.16, 0.18, 0.2, 0.22)
 SIZE, REWARD = 10, 1.0
 """N, and r."""
 _MOTION: dict[str, Any] = {"radius": 1, "low_probability": 0.15, "exit_probability": 0.005}
-"""Of the kernel; T_max, the border rule and the draw of the kernel the paper does not say."""
+"""Of the kernel; the paper gives no T_max, border rule or draw of the kernel."""
 
 
 def _printed(*rows: tuple[float, float, float, float]) -> Mapping[tuple[int, float], float]:
-    """By (Z, c), what is printed for each Z, one number a price."""
+    """By (Z, c), the printed numbers: a row for each Z, one number a price."""
     return dict(zip(product(SUPPORTS, COSTS), chain(*rows), strict=True))
 
 
 # The drop at Z = 5, c = 0.22: all probabilities lie below c/r, and Q_MDP senses only when it is forced (remark on
 # Figure z_5).
-PRINTED_QMDP = _printed((90.74, 90.74, 90.74, 90.74), (88.82, 88.82, 88.82, 88.82), (89.95, 89.95, 89.95, 54.3))
+PRINTED_QMDP = _printed(
+    (90.74, 90.74, 90.74, 90.74), (88.82, 88.82, 88.82, 88.82), (89.95, 89.95, 89.95, 54.3)
+)
 """Table II, accuracy of Q_MDP in per cent, by (Z, c)."""
 
-PRINTED_TMDP = _printed((92.39, 92.06, 93.23, 87.18), (94.28, 95.56, 89.7, 88.85), (93.75, 94.94, 92.45, 90.21))
+PRINTED_TMDP = _printed(
+    (92.39, 92.06, 93.23, 87.18), (94.28, 95.56, 89.7, 88.85), (93.75, 94.94, 92.45, 90.21)
+)
 """Table II, accuracy of the paper's learned policy in per cent, by (Z, c)."""
 
 _FIXED = {
@@ -44,7 +48,7 @@ _FIXED = {
     "cost.reward": REWARD,
     "cost.safe": None,
 }
-"""What the paper says of its worlds."""
+"""The paper's settings of its worlds."""
 
 
 def paper_kernel(support_size: int, seed: int, border: Border) -> Array:
@@ -55,7 +59,9 @@ def paper_kernel(support_size: int, seed: int, border: Border) -> Array:
 def paper_world(kernel: Array, cost: float, t_max: int) -> World:
     """The paper's world with this kernel `[100, 100]`: the safe action costs as much as all sensors, D = N² c."""
     m = SIZE**2
-    return World(kernel, SIZE, cost=np.full(m, cost), safe_cost=m * cost, t_max=t_max, reward=REWARD)
+    return World(
+        kernel, SIZE, cost=np.full(m, cost), safe_cost=m * cost, t_max=t_max, reward=REWARD
+    )
 
 
 def pairs(study: Study) -> dict[tuple[int, float], str]:
@@ -69,7 +75,9 @@ def pairs(study: Study) -> dict[tuple[int, float], str]:
         settings = runs[0].settings
         pair: Any = settings.get("kernel.support_size"), settings.get("cost.sensor")
         # T_max, border and seed of the kernel are not compared: the paper does not give them.
-        if any(settings.get(key) != value for key, value in _FIXED.items()) or pair not in [*PRINTED_QMDP]:
+        if any(settings.get(key) != value for key, value in _FIXED.items()) or pair not in [
+            *PRINTED_QMDP
+        ]:
             continue  # a list, as prices may be a list, which has no hash
         if pair not in found or len(study.in_world(found[pair])) < len(runs):
             found[pair] = world

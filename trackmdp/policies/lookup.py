@@ -13,14 +13,16 @@ from trackmdp.world.windows import Window
 
 def in_window(task: Task, sets: sparse.csr_array) -> sparse.csr_array:
     """`[R, K]`, the sets `[R, S]` of a policy in the local numbers of the window around each row's located cell."""
-    if task.window is None:
+    if task.numbered is None:
         return sets
     row = np.repeat(np.arange(sets.shape[0]), np.diff(sets.indptr))
     start = torch.as_tensor(task.keys.cell(row // task.num_choices))
     # Local numbers are in the order of the cells they stand for, so that the columns of a row stay in order. A policy
     # of this task has no sensor outside the window, so that each has one below K.
     local = Window.of(task).find(start, torch.as_tensor(sets.indices, dtype=torch.int64)).numpy()
-    return sparse.csr_array((sets.data, local, sets.indptr), shape=(sets.shape[0], task.num_sensors))
+    return sparse.csr_array(
+        (sets.data, local, sets.indptr), shape=(sets.shape[0], task.num_sensors)
+    )
 
 
 class DenseTable:
@@ -86,23 +88,3 @@ class SparseTable:
         wanted = row * self._columns + column
         found = torch.searchsorted(self._place, wanted).clamp_max(len(self._place) - 1)
         return self._data[found] * (self._place[found] == wanted)
-
-
-class WindowTable:
-    """Rows with every sensor of the window on, in local numbers.
-
-    There are as many different ones as ways in which the border cuts off a window, (2W + 1)² at most: they stay in the
-    caches, which a table of all M (t_max + 1) rows does not.
-
-    Args:
-        task: the window, and a memory of the cell alone.
-        device: where rows are looked up.
-    """
-
-    def __init__(self, task: Task, device: torch.device) -> None:
-        self.device, self._choices, self._window = device, task.num_choices, Window.of(task, device)
-
-    def __call__(self, row: Tensor) -> Tensor:
-        """`[*B, K]` bool of `row` `[*B]`."""
-        cell = row.reshape(-1).div(self._choices, rounding_mode="floor")
-        return self._window.inside(cell).view(*row.shape, -1)

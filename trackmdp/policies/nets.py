@@ -1,14 +1,14 @@
 """Networks of a Track-MDP: encoder of its state, subset policies with one Bernoulli per sensor, values, additive Q.
 
 The encoder is a linear layer that never multiplies by the zeros of a one-hot. `CellClockNet` is over (last cell, steps
-since detection), which is what a deterministic policy depends on: after a miss the next state is known in advance, so
+since detection), the state that a deterministic policy depends on: after a miss the next state is known in advance, so
 along its own path the action history follows from these two. It is a table of chains, one per located cell, and a net
 may be run on all of its rows at once.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import ClassVar
 
 import torch
@@ -19,23 +19,27 @@ from torch import distributions as dist
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import ProbabilisticActor, ValueOperator
 
-from trackmdp.policies.unroll import state_keys
+from trackmdp.policies.forms import state_keys
 from trackmdp.world.model import Task
 from trackmdp.world.windows import Window
 
-_PAIRS = 2**16  # of cells, once for each class of keys, whose displacements are kept; 16 x 16 cells have as many
+_PAIRS = (
+    2**16
+)  # of cells, once for each class of keys, with displacements kept in memory; 16 x 16 cells have as many
 
 
 class StateEncoder(nn.Module):
     """`[..., hidden]` features of (last_cell, steps_since_detection, action_history), and of `key` where there is one.
 
     Equal to a linear layer on the one-hot cell, the one-hot n, their product and the history bits, followed by ReLU.
-    Embeddings stand for the one-hots, and the history is multiplied only where n > 0 (most rows have none). What a key
-    shares with others (`KeySpace.contexts`), and the key, have each an embedding of the product with n: seldom seen
-    keys are known by their cell and by their displacement or mode.
+    Embeddings stand for the one-hots, and the history is multiplied only where n > 0 (most rows have none). The
+    contexts that a key shares with others (`KeySpace.contexts`), and the key, have each an embedding of the product
+    with n: seldom seen keys are known by their cell and by their displacement or mode.
     """
 
-    def __init__(self, task: Task, hidden: int, *, scale: float = 0.1, history_scale: float = 0.1) -> None:
+    def __init__(
+        self, task: Task, hidden: int, *, scale: float = 0.1, history_scale: float = 0.1
+    ) -> None:
         super().__init__()
         self.stages = task.t_max + 2
         self.cell = nn.Embedding(task.num_cells, hidden)
@@ -44,7 +48,9 @@ class StateEncoder(nn.Module):
         self.history = nn.Linear(task.num_choices * task.num_sensors, hidden)
         self.keys = task.keys
         # The first context is of all keys alike, as is `stage`.
-        counts = [count for _, count in task.keys.contexts(torch.zeros(1))[1:]] if task.keyed else []
+        counts = (
+            [count for _, count in task.keys.contexts(torch.zeros(1))[1:]] if task.keyed else []
+        )
         self.known = nn.ModuleList(nn.Embedding(count * self.stages, hidden) for count in counts)
         for table in (self.cell, self.stage, self.cell_and_stage, *self.known):
             nn.init.normal_(table.weight, std=scale)
@@ -52,7 +58,11 @@ class StateEncoder(nn.Module):
         nn.init.zeros_(self.history.bias)
 
     def forward(
-        self, last_cell: Tensor, steps_since_detection: Tensor, action_history: Tensor, key: Tensor | None = None
+        self,
+        last_cell: Tensor,
+        steps_since_detection: Tensor,
+        action_history: Tensor,
+        key: Tensor | None = None,
     ) -> Tensor:
         """Features of a batch of any shape `[...]`; `action_history` is `[..., t_max+1, K]`."""
         shape = last_cell.shape
@@ -97,10 +107,12 @@ class RelativeBias(nn.Module):
     def __init__(self, task: Task) -> None:
         super().__init__()
         side, places = 2 * task.columns - 1, (2 * task.rows - 1) * (2 * task.columns - 1)
-        # Sensors with footprints stand at no cell: each has a number of its own, whatever the cell.
-        self._whole = task.window is None and task.coverage is None
+        # Sensors with footprints stand at no cell: each has a number of its own, the same for every cell.
+        self._whole = task.numbered is None and task.coverage is None
         self.classes, self.stages = task.keys.num_classes, task.t_max + 2
-        self.table = nn.Parameter(torch.zeros(self.classes * self.stages, places if self._whole else task.num_sensors))
+        self.table = nn.Parameter(
+            torch.zeros(self.classes * self.stages, places if self._whole else task.num_sensors)
+        )
         # Displacements (row, column) from (1 - rows, 1 - columns) to (rows - 1, columns - 1), row by row; (0, 0) is the
         # one in the middle. On 3 x 3, side 5, from cell 4 (code 6) to cell 5 (code 7): 7 - 6 + 12, right of the middle.
         cell = torch.arange(task.num_cells if self._whole else 0)
@@ -110,11 +122,19 @@ class RelativeBias(nn.Module):
         few = self._whole and self.classes * len(code) ** 2 <= _PAIRS
         kept = code - code.unsqueeze(-1) + places // 2 if few else None
         self.register_buffer("_index", kept, persistent=False)
-        self.register_buffer("_code", code if self._whole and kept is None else None, persistent=False)
+        self.register_buffer(
+            "_code", code if self._whole and kept is None else None, persistent=False
+        )
 
-    def forward(self, last_cell: Tensor, steps_since_detection: Tensor, key: Tensor | None = None) -> Tensor:
+    def forward(
+        self, last_cell: Tensor, steps_since_detection: Tensor, key: Tensor | None = None
+    ) -> Tensor:
         """`[..., K]` of a batch of any shape `[...]`."""
-        row = steps_since_detection if key is None else key % self.classes * self.stages + steps_since_detection
+        row = (
+            steps_since_detection
+            if key is None
+            else key % self.classes * self.stages + steps_since_detection
+        )
         if self._index is not None:
             m = len(self._index)
             rows = self.table[:, self._index].view(-1, m)
@@ -126,7 +146,7 @@ class RelativeBias(nn.Module):
         return self.table.view(-1)[middle.unsqueeze(-1) + self._code]
 
 
-# A logit whose sigmoid is 0 in float32: no draw from [0, 1) is below it, and log-probability and entropy are 0.
+# A logit with a sigmoid of 0 in float32: no draw from [0, 1) is below it, and log-probability and entropy are 0.
 _NEVER = -200.0
 
 
@@ -168,7 +188,7 @@ def make_actor(task: Task, hidden: int, initial_logit: float) -> ProbabilisticAc
     head = nn.Linear(hidden, task.num_sensors)
     nn.init.orthogonal_(head.weight, gain=0.01)
     nn.init.constant_(head.bias, initial_logit)
-    window = None if task.window is None else Window.of(task)
+    window = None if task.numbered is None else Window.of(task)
     network = _Logits(StateNetwork(task, hidden, head), RelativeBias(task), window)
     return ProbabilisticActor(
         TensorDictModule(network, in_keys=state_keys(task), out_keys=["logits"]),
@@ -179,13 +199,15 @@ def make_actor(task: Task, hidden: int, initial_logit: float) -> ProbabilisticAc
 
 
 class _Logits(nn.Module):
-    """A network's logits on top of those that all cells share."""
+    """A network's logits on top of the logits that all cells share."""
 
     def __init__(self, network: StateNetwork, shared: RelativeBias, window: Window | None) -> None:
         super().__init__()
         self.network, self.shared, self.window = network, shared, window
 
-    def forward(self, last_cell: Tensor, steps_since_detection: Tensor, action_history: Tensor, *key: Tensor) -> Tensor:
+    def forward(
+        self, last_cell: Tensor, steps_since_detection: Tensor, action_history: Tensor, *key: Tensor
+    ) -> Tensor:
         own = self.network(last_cell, steps_since_detection, action_history, *key)
         logits = own + self.shared(last_cell, steps_since_detection, *key)
         if self.window is None:
@@ -202,7 +224,9 @@ def make_critic(task: Task, hidden: int) -> ValueOperator:
     return ValueOperator(StateNetwork(task, hidden, head), in_keys=state_keys(task))
 
 
-_ALL_ON = 0.5  # sensors start a little above zero: what can be left out is learned, not what must be found
+_ALL_ON = (
+    0.5  # sensors start a little above zero: the needless ones are learned, not the needed ones
+)
 
 
 class AdditiveQ(nn.Module):
@@ -218,12 +242,13 @@ class AdditiveQ(nn.Module):
         self.t_max = task.t_max
         self.encoder = StateEncoder(task, hidden, scale=1.0, history_scale=0.03)
         self.base, self.sensor = nn.Linear(hidden, 1), nn.Linear(hidden, task.num_sensors)
+        self.shared = RelativeBias(task)
         for head, start in ((self.base, 0.0), (self.sensor, _ALL_ON)):
             nn.init.orthogonal_(head.weight, gain=0.01)
             nn.init.constant_(head.bias, start)
-        price = torch.as_tensor(task.cost, dtype=torch.float32).clamp_min(0.01 * task.reward)
-        self.window = Window.of(task) if task.window is not None else None
-        # What lies outside the grid, cell M, has no price: there q_j is 0, and the sensor off.
+        price = torch.as_tensor(task.paid, dtype=torch.float32).clamp_min(0.01 * task.reward)
+        self.window = Window.of(task) if task.numbered is not None else None
+        # Cell M, outside the grid, has no price: there q_j is 0, and the sensor off.
         unit = price if self.window is None else nn.functional.pad(price, (0, 1))
         self.unit = nn.Buffer(scale * unit)
 
@@ -233,8 +258,13 @@ class AdditiveQ(nn.Module):
         """V `[..., 1]` and q `[..., K]`, the latter 0 where the safe action is forced and outside the grid."""
         features = self.encoder(last_cell, steps_since_detection, action_history, *key)
         free = (steps_since_detection <= self.t_max).unsqueeze(-1)
-        unit = self.unit if self.window is None else self.unit[self.window.around(last_cell)]
-        return self.base(features), unit * self.sensor(features) * free
+        unit = self.units(last_cell)
+        worth = self.sensor(features) + self.shared(last_cell, steps_since_detection, *key)
+        return self.base(features), unit * worth * free
+
+    def units(self, last_cell: Tensor) -> Tensor:
+        """Prices `[K]`, or in a window `[..., K]`, of the sensors that can be chosen, scaled as rewards are."""
+        return self.unit if self.window is None else self.unit[self.window.around(last_cell)]
 
 
 def joint_value(values: TensorDictBase, action: Tensor) -> Tensor:
@@ -245,43 +275,53 @@ def joint_value(values: TensorDictBase, action: Tensor) -> Tensor:
 
 
 class EpsilonFlip(TensorDictModuleBase):
-    """The greedy subset {j : q_j > 0}; while exploring, each sensor is flipped with probability epsilon.
+    """The greedy subset {j : q_j > 0}; while exploring, sensor j is flipped with probability ε / max(1, |q_j| / c_j).
 
+    A flip costs |q_j|, so that exploring costs at most ε c_j for each sensor. With ε for all, a sensor of use is left
+    out as often as a useless one is on; these misses are dear, and their noise hides the prices of the others.
     Sensors without a value stay off: those outside the grid, and all where the safe action is forced.
 
     Args:
-        epsilon: that probability.
+        epsilon: ε.
+        units: gives the c_j at `last_cell`, in the units of the values; None for a constant probability.
     """
 
-    in_keys: ClassVar = ["sensor_value"]
+    in_keys: ClassVar = ["sensor_value", "last_cell"]
     out_keys: ClassVar = ["action"]
 
-    def __init__(self, epsilon: float) -> None:
+    def __init__(self, epsilon: float, units: Callable[[Tensor], Tensor] | None = None) -> None:
         super().__init__()
-        self.epsilon = nn.Buffer(torch.tensor(epsilon))
+        self.epsilon, self._units = nn.Buffer(torch.tensor(epsilon)), units
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action` `[*B, K]`."""
         value = tensordict["sensor_value"]
         greedy = value > 0
         if exploration_type() is ExplorationType.RANDOM:
-            greedy = greedy ^ (torch.rand(value.shape, device=value.device) < self.epsilon) & (value != 0)
+            chance = self.epsilon * (value != 0)
+            if self._units is not None:
+                # Outside the grid unit and value are 0, and so is the chance.
+                unit = self._units(tensordict["last_cell"])
+                chance = chance * unit / torch.maximum(unit, value.abs()).clamp_min(1e-30)
+            greedy = greedy ^ (torch.rand(value.shape, device=value.device) < chance)
         return tensordict.set("action", greedy)
 
 
 def make_qvalue(task: Task, hidden: int, scale: float) -> TensorDictModule:
     """State -> `base` `[B, 1]`, `sensor_value` `[B, K]`, for rewards multiplied by `scale`."""
-    return TensorDictModule(AdditiveQ(task, hidden, scale), in_keys=state_keys(task), out_keys=["base", "sensor_value"])
+    return TensorDictModule(
+        AdditiveQ(task, hidden, scale), in_keys=state_keys(task), out_keys=["base", "sensor_value"]
+    )
 
 
 class CellClockNet(nn.Module):
     """One hidden layer over embeddings of the cell, of the clock and of the pair, added up; or a plain table.
 
-    A hidden layer's decoder learns from all rows what belongs together; a table of outputs has a number for each row
+    A hidden layer's decoder learns common patterns from all rows; a table of outputs has a number for each row
     and output, and takes a hundredth of the time.
 
     With `classes` a cell has as many rows, numbered cell · C + class as keys are (`KeySpace`). Then cell and class have
-    each an embedding of their own with the clock, beside that of the key: keys that are seldom seen are known by these.
+    each an embedding of their own with the clock, beside the key's: rare keys are known by these.
 
     Args:
         num_cells: M; with classes M · C.
@@ -320,10 +360,12 @@ class CellClockNet(nn.Module):
             return
 
         def normal(*shape: int, std: float) -> nn.Parameter:
-            return nn.Parameter(std * torch.randn(shape, generator=generator, device=generator.device))
+            return nn.Parameter(
+                std * torch.randn(shape, generator=generator, device=generator.device)
+            )
 
-        # [M, 1, H] + [C, H] + [M, C, H] broadcast to [M, C, H]: cell and clock share what they can, the pair learns the
-        # rest.
+        # [M, 1, H] + [C, H] + [M, C, H] broadcast to [M, C, H]: cell and clock share the common part, the pair
+        # learns the rest.
         self.cell = normal(num_cells, 1, hidden, std=0.3)
         self.clock = normal(num_clocks, hidden, std=0.3)
         self.pair = normal(num_cells, num_clocks, hidden, std=0.3)

@@ -18,30 +18,34 @@ from scipy import sparse
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torchrl.envs.transforms import Transform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from trackmdp.errors import UserError
-from trackmdp.policies.lookup import DenseTable, SparseTable, WindowTable, in_window
-from trackmdp.policies.saved import load_policy, save_policy
-from trackmdp.policies.table import PolicyTable
-from trackmdp.policies.unroll import (
+from trackmdp.policies.forms import (
     STATE_KEYS,
     TAKE_ITS_MODE,
     DrawsError,
     Rule,
     acting,
-    draws,
+    adapted,
     function_rule,
     known_task,
-    mixture,
     module_rule,
-    unrolled,
+    rule_of,
+    transformed,
 )
+from trackmdp.policies.lookup import DenseTable, SparseTable, in_window
+from trackmdp.policies.saved import load_policy, save_policy
+from trackmdp.policies.table import PolicyTable
+from trackmdp.policies.tracker import Tracker
+from trackmdp.policies.unroll import draws, mixture, unrolled
 from trackmdp.world.model import Array, Task
 from trackmdp.world.windows import Window
 
-PolicyLike: TypeAlias = "PolicyTable | TensorDictModuleBase | Callable[..., Any]"
-"""A policy or its table, a TensorDict module, or a function as `Policy.from_function` takes it."""
+PolicyLike: TypeAlias = Any
+"""A policy or its table, a TensorDict module, a function as `Policy.from_function` takes it, or an object that holds a
+policy: a `Run`, a `Solution`, a dense table, a model of Stable-Baselines3."""
 
 _DENSE = 2**24  # entries; a table of no more is looked up dense, the faster of the two ways to act
 
@@ -49,8 +53,8 @@ _DENSE = 2**24  # entries; a table of no more is looked up dense, the faster of 
 class Policy(TensorDictModuleBase, PolicyTable):
     """A policy of a Track-MDP, and a TensorDict module that acts it out.
 
-    Either `sets` or `probability` is given. What a policy learned, solved, recorded or written by hand has in common is
-    this table; an actor net or a function becomes one with `from_module` or `from_function`.
+    Either `sets` or `probability` is given. This table is common to policies that are learned, solved, recorded or
+    written by hand; an actor net or a function becomes one with `from_module` or `from_function`.
 
     Args:
         task: grid, costs and limits.
@@ -63,10 +67,10 @@ class Policy(TensorDictModuleBase, PolicyTable):
 
     Attributes:
         deterministic: whether the policy is the same function of the state each time.
-        generator: what `forward` draws from where the policy is not deterministic; None for torch's global one.
+        generator: of the draws of `forward`, where the policy is not deterministic; None for torch's global one.
 
     Raises:
-        UserError: the shape is not that of the task's states, or an entry is no probability.
+        UserError: the shape does not fit the task's states, or an entry is no probability.
     """
 
     in_keys: list[str] = list(STATE_KEYS)  # noqa: RUF012 (each policy may have its own)
@@ -86,31 +90,38 @@ class Policy(TensorDictModuleBase, PolicyTable):
             self.in_keys = ["last_cell", "key", "steps_since_detection"]
         self.generator: torch.Generator | None = None
         self._lookup: DenseTable | SparseTable | None = None
-        self._local: DenseTable | SparseTable | WindowTable | None = None  # of the window's sensors alone
-        self._everything = probability == 1.0 and not task.order
+        self._local: DenseTable | SparseTable | None = None  # of the window's sensors alone
+
+    def __repr__(self) -> str:
+        # The card, not the list of parts that torch shows of a module.
+        return PolicyTable.__repr__(self)
 
     @classmethod
     def from_table(cls, table: PolicyTable) -> Policy:
-        """The policy that acts as a table says."""
+        """The policy that acts by a table."""
         return cls(table.task, table.sets, probability=table.probability, k=table.k)
 
     @classmethod
     def random_k(cls, task: Task, k: int) -> Policy:
         """Of the sensors that can be chosen k, drawn anew at every step, each subset of that size equally likely.
 
-        In a window that the border leaves fewer than k sensors, all of them are on.
+        Where fewer than k can be chosen, as in a window at the border, all of them are on.
         """
-        if task.window is None:
+        if task.window is None and task.available.all():
             return cls(task, probability=k / task.total_sensors, k=k)
         near = PolicyTable.all_on(task).sets
         assert near is not None
         count = np.diff(near.indptr)
         # Each sensor's own probability of being among the k of its window.
         share = np.repeat(np.minimum(k / count, 1.0), count)
-        return cls(task, sparse.csr_array((share, near.indices, near.indptr), shape=near.shape), k=k)
+        return cls(
+            task, sparse.csr_array((share, near.indices, near.indptr), shape=near.shape), k=k
+        )
 
     @classmethod
-    def from_function(cls, task: Task, function: Callable[..., Any], *, check: bool = True) -> Policy:
+    def from_function(
+        cls, task: Task, function: Callable[..., Any], *, check: bool = True
+    ) -> Policy:
         """The table of `function(last_cell [B], steps_since_detection [B], action_history [B, t_max+1, K])`.
 
         It returns bool `[B, K]`, a tensor or an array, and is called for all M * (t_max + 1) states, a few blocks of
@@ -125,27 +136,48 @@ class Policy(TensorDictModuleBase, PolicyTable):
             UserError: it draws, or it returns something else.
         """
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            return cls._unrolled(task.remembering(), function_rule(task, function), "cpu", check=check)
+            return cls._unrolled(
+                task.remembering(), function_rule(task, function), "cpu", check=check
+            )
 
     @classmethod
     def from_module(
-        cls, task: Task, module: TensorDictModuleBase, *, device: torch.device | str = "cpu", check: bool = True
+        cls,
+        task: Task,
+        module: TensorDictModuleBase,
+        *,
+        transform: Transform | None = None,
+        device: torch.device | str = "cpu",
+        check: bool = True,
     ) -> Policy:
         """The table of a TensorDict module that reads the keys of a state and writes `action`; see `from_function`.
 
-        One that does not read `key` knows the cell alone.
+        A module that does not read `key` knows the cell alone; one that reads `observation` is given the
+        `ObservationVector`. The module is run with TorchRL's exploration type DETERMINISTIC: a stochastic actor is
+        taken at its mode.
 
-        The module is run with TorchRL's exploration type DETERMINISTIC: a stochastic actor is taken at its mode.
+        Args:
+            task: grid, costs and limits.
+            module: the actor.
+            transform: of the `TransformedEnv` that it acts in, such as
+                ``Compose(ObservationVector(), ObservationNorm(...))``.
+            device: device of the module.
+            check: see `from_function`.
         """
         with set_exploration_type(ExplorationType.DETERMINISTIC):
+            module = module if transform is None else transformed(module, transform)
             known = known_task(task, module)
             return cls._unrolled(known, module_rule(known, module), device, check=check)
 
     @classmethod
-    def _unrolled(cls, task: Task, rule: Rule, device: torch.device | str, *, check: bool) -> Policy:
+    def _unrolled(
+        cls, task: Task, rule: Rule, device: torch.device | str, *, check: bool
+    ) -> Policy:
         sets = unrolled(task, rule, torch.device(device))
         if check and draws(task, rule, torch.device(device), sets):
-            raise DrawsError(f"policy: draws at random, so that it has no exact value; {TAKE_ITS_MODE}")
+            raise DrawsError(
+                f"policy: draws at random, so that it has no exact value; {TAKE_ITS_MODE}"
+            )
         return cls(task, sets)
 
     # Acting.
@@ -155,11 +187,13 @@ class Policy(TensorDictModuleBase, PolicyTable):
         """Uniform draws that one decision takes: none, or one per sensor."""
         return 0 if self.deterministic else self.task.total_sensors
 
-    def act(self, key: Tensor, steps_since_detection: Tensor, draws: Tensor | None = None) -> Tensor:
+    def act(
+        self, key: Tensor, steps_since_detection: Tensor, draws: Tensor | None = None
+    ) -> Tensor:
         """`[*B, S]` bool, the sensors on, as a function of state and draws.
 
         Args:
-            key: `[*B]` int64, what was remembered at the last detection; the cell, where that is all.
+            key: `[*B]` int64, the memory of the last detection; the cell, where that is all.
             steps_since_detection: `[*B]` int64; where the safe action is forced the last set stands in, unused.
             draws: `[*B, num_draws]` uniform in [0, 1), where the policy is not deterministic.
         """
@@ -186,17 +220,15 @@ class Policy(TensorDictModuleBase, PolicyTable):
 
     def seeing(self, key: Tensor, steps_since_detection: Tensor) -> Tensor:
         """`[*B, M]` with which a sensor that is on sees each cell: `probabilities`, but for footprints."""
-        coverage = self.task.coverage
-        if coverage is None:
+        if self.task.coverage is None:
             return self.probabilities(key, steps_since_detection)
         if self.sets is None:
-            assert self.probability is not None
-            share = torch.as_tensor(coverage.share(self.probability, self.k), device=key.device)
+            share = torch.as_tensor(self.share, device=key.device)
             return share.float().expand(*key.shape, -1)
         return looked_up(self.seen, key.device)(self.row(key, steps_since_detection))
 
     def row(self, key: Tensor, steps_since_detection: Tensor) -> Tensor:
-        """`[*B]`, the row of `sets` for a state; where the safe action is forced, that of the last free choice."""
+        """`[*B]`, the row of `sets` for a state; where the safe action is forced, the row of the last free choice."""
         return key * self.task.num_choices + steps_since_detection.clamp_max(self.task.t_max)
 
     def lookup(self, device: torch.device) -> DenseTable | SparseTable:
@@ -206,31 +238,49 @@ class Policy(TensorDictModuleBase, PolicyTable):
         return self._lookup
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write `action` `[*B, K]`: over all cells, or in the local numbers of the window around `last_cell`."""
+        """Write `action` `[*B, K]`: over all cells, or in the local numbers of the window around `last_cell`.
+
+        Raises:
+            UserError: a cell, a key or a number of misses is none of this policy's task.
+        """
         last_cell, n = tensordict["last_cell"], tensordict["steps_since_detection"]
         key = tensordict["key"] if self.task.keyed else last_cell
+        _check_range("key" if self.task.keyed else "last_cell", key, self.task.num_keys)
+        _check_range("steps_since_detection", n, self.task.num_choices + 1)
         if self.deterministic:
             return tensordict.set("action", self._near(key, n))
         # A generator draws on its own device only.
         device = last_cell.device if self.generator is None else self.generator.device
-        draws = torch.rand((*last_cell.shape, self.num_draws), generator=self.generator, device=device)
+        draws = torch.rand(
+            (*last_cell.shape, self.num_draws), generator=self.generator, device=device
+        )
         action = self.act(key, n, draws)
-        if self.task.window is not None:
+        if self.task.numbered is not None:
             action = Window.of(self.task, last_cell.device).to_local(last_cell, action)
         return tensordict.set("action", action)
 
     def _near(self, key: Tensor, steps_since_detection: Tensor) -> Tensor:
         """`[*B, K]` bool, the action of a deterministic policy as the environment takes it."""
-        if self.task.window is None:
+        if self.task.numbered is None:
             return self.act(key, steps_since_detection)
         if self.sets is None:
             shape = (*key.shape, self.task.num_sensors)
             return torch.zeros(shape, dtype=torch.bool, device=key.device)
-        if self._everything and (self._local is None or self._local.device != key.device):
-            self._local = WindowTable(self.task, key.device)
         if self._local is None or self._local.device != key.device:
             self._local = looked_up(in_window(self.task, self.sets), key.device)
         return self._local(self.row(key, steps_since_detection))
+
+    def tracker(
+        self,
+        cell: int | None = None,
+        *,
+        at: tuple[float, float] | None = None,
+        mode: int | None = None,
+        seed: int = 0,
+        world: Any = None,
+    ) -> Tracker:
+        """A tracker that follows one target with this policy from its detection in `cell` on; see `Tracker`."""
+        return Tracker(self, cell, at=at, mode=mode, seed=seed, world=world)
 
     # Files.
 
@@ -251,22 +301,26 @@ class Policy(TensorDictModuleBase, PolicyTable):
 def as_policy(task: Task, policy: PolicyLike) -> Policy:
     """Anything that acts as a `Policy`.
 
-    A stochastic actor of TorchRL is the mixture that it draws from, unless `set_exploration_type` says otherwise.
+    A stochastic actor of TorchRL is the mixture that it draws from, unless `set_exploration_type` chooses its mode.
 
     Args:
-        task: what it acts in.
-        policy: a `Policy`, a TensorDict module, which is asked where its first weight is, or a function.
+        task: in which it acts.
+        policy: a `Policy`, an object that holds one (`trackmdp.policies.forms.adapted`), a TensorDict module, which is
+            asked on the device of its first weight, or a function.
 
     Raises:
-        DrawsError: a module or function draws at random with probabilities that are not known, or depend on what it
-            drew before; `Policy.random_k` and tables of probabilities may draw.
+        DrawsError: a module or function draws at random with probabilities that are not known, or depend on its
+            earlier draws; `Policy.random_k` and tables of probabilities may draw.
         UserError: it belongs to another grid, or is not of these forms.
     """
+    policy = adapted(task, policy)
     if not isinstance(policy, PolicyTable):
         where = _device_of(policy)
         with acting():
             known = known_task(task, policy)
-            chances = mixture(known, policy, where) if isinstance(policy, TensorDictModuleBase) else None
+            chances = (
+                mixture(known, policy, where) if isinstance(policy, TensorDictModuleBase) else None
+            )
             if chances is not None:
                 return Policy(known, chances)
             return Policy._unrolled(known, rule_of(known, policy), where, check=True)
@@ -274,24 +328,27 @@ def as_policy(task: Task, policy: PolicyLike) -> Policy:
     return policy if isinstance(policy, Policy) else Policy.from_table(policy)
 
 
-def actor_table(task: Task, actor: TensorDictModuleBase, *, device: torch.device, check: bool = True) -> Policy:
+def actor_table(
+    task: Task, actor: TensorDictModuleBase, *, device: torch.device, check: bool = True
+) -> Policy:
     """The table of a learner's actor; a `Policy` is one already."""
     if isinstance(actor, Policy):
         return actor
     return Policy.from_module(task, actor, device=device, check=check)
 
 
-def rule_of(task: Task, policy: TensorDictModuleBase | Callable[..., Any]) -> Rule:
-    """A TensorDict module or a function as a rule.
+def _check_range(name: str, values: Tensor, count: int) -> None:
+    """See that all entries are of 0 ... `count` - 1; a negative one would count from the end.
 
     Raises:
-        UserError: it is neither, or the module reads or writes other keys.
+        UserError: one is not.
     """
-    if isinstance(policy, TensorDictModuleBase):
-        return module_rule(task, policy)
-    if callable(policy):
-        return function_rule(task, policy)
-    raise UserError(f"policy: expected a Policy, a TensorDict module or a function, got {type(policy).__name__}")
+    # On another device the look would wait for all work under way there; in a graph it cannot be.
+    if values.device.type != "cpu" or torch.compiler.is_compiling() or not values.numel():
+        return
+    for value in torch.stack(torch.aminmax(values)).tolist():
+        if not 0 <= value < count:
+            raise UserError(f"policy: {name}={value}, expected 0 to {count - 1}")
 
 
 def _device_of(policy: TensorDictModuleBase | Callable[..., Any]) -> torch.device:

@@ -12,21 +12,20 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
 
 from trackmdp.durable import write_bytes, write_json
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
-from trackmdp.untrusted import decoded, opened, read_object
-from trackmdp.world.files import LARGE, load_npz, npz_bytes, whole_csr
+from trackmdp.untrusted import LARGE, decoded, load_npz, opened, read_object
+from trackmdp.world.files import npz_bytes, whole_csr
 from trackmdp.world.model import Array, Task
+from trackmdp.world.problem_file import as_arrays, from_arrays
 
 LISTED_CELLS = 20_000
 """Cells up to which sets and values are written as JSON."""
 
-_TASK = ("size", "cost", "t_max", "safe_cost", "reward", "max_steps", "window", "markov")
-_SENSORS, _KNOWN = ("detection", "safe_detection"), ("memory", "clip", "revealed")
-"""Written where a sensor or the safe action may miss; where more than the cell is known at a detection."""
+_TASK = "task_"
+"""Begins the names of the arrays of a policy's task (`trackmdp.world.problem_file`)."""
 
 
 def save_policy(file: Path, policy: PolicyTable, value: Array | None = None, **more: Array) -> None:
@@ -35,20 +34,12 @@ def save_policy(file: Path, policy: PolicyTable, value: Array | None = None, **m
     Args:
         file: to write.
         policy: its table or its one probability, and how many sensors it draws.
-        value: `[M]`, what an episode is worth from each cell.
+        value: `[M]`, the expected reward of an episode from each cell.
         **more: further `[M]` arrays that go with it.
     """
-    names = _TASK if policy.task.perfect and policy.task.safe else (*_TASK, *_SENSORS)
-    content: dict[str, Any] = {f"task_{name}": _number(getattr(policy.task, name)) for name in names}
-    if policy.task.coverage is not None:  # the cells of each sensor, one sensor after another, and where each begins
-        cells = policy.task.coverage.matrix
-        content |= {"footprint_cells": cells.indices.astype(np.int32), "footprint_begin": cells.indptr.astype(np.int64)}
-    if policy.task.memory != "cell":  # what is not there is the paper's
-        content |= {"task_memory": np.str_(policy.task.memory), "task_clip": np.int64(policy.task.clip)}
-    if policy.task.revealed > 1:
-        content["task_revealed"] = np.int64(policy.task.revealed)
+    task = as_arrays({f"{_TASK}{name}": given for name, given in policy.task.given.items()})
     values = more if value is None else {"value": value, **more}
-    write_bytes(file, npz_bytes(content | packed(policy) | values))
+    write_bytes(file, npz_bytes(task | packed(policy) | values))
 
 
 def load_policy(file: Path) -> tuple[PolicyTable, Array | None]:
@@ -59,7 +50,8 @@ def load_policy(file: Path) -> tuple[PolicyTable, Array | None]:
     """
     with opened(file, most=LARGE) as stream, decoded(str(file), "a policy"):
         content = load_npz(stream)
-        task = _task(content)
+        own = {name: array for name, array in content.items() if name.startswith(_TASK)}
+        task = Task(**from_arrays({name.removeprefix(_TASK): own[name] for name in own}))
         value = content.get("value")
         if value is not None and (value.shape != (task.num_cells,) or value.dtype != np.float64):
             raise ValueError(f"values {value.dtype} {value.shape} for {task.num_cells} cells")
@@ -67,12 +59,15 @@ def load_policy(file: Path) -> tuple[PolicyTable, Array | None]:
 
 
 def packed(policy: PolicyTable) -> dict[str, Any]:
-    """What a policy does, as plain arrays: its table or its one probability, and how many sensors it draws."""
+    """A policy as plain arrays: its table or its one probability, and how many sensors it draws."""
     if policy.sets is None:
         content: dict[str, Any] = {"probability": np.float64(policy.probability)}
     else:
         # Fixed integer widths: SciPy's own choice depends on the number of entries, and the bytes would with it.
-        content = {"indices": policy.sets.indices.astype(np.int32), "indptr": policy.sets.indptr.astype(np.int64)}
+        content = {
+            "indices": policy.sets.indices.astype(np.int32),
+            "indptr": policy.sets.indptr.astype(np.int64),
+        }
         if not policy.deterministic:  # else every entry stored is a sensor on
             content["data"] = policy.sets.data
     return content if policy.k is None else content | {"k": np.int64(policy.k)}
@@ -92,6 +87,10 @@ def unpacked_policy(task: Task, content: Mapping[str, npt.NDArray[Any]]) -> Poli
     sets = whole_csr(data, indices, indptr, (task.num_keys * task.num_choices, task.total_sensors))
     if not np.isfinite(sets.data).all():
         raise UserError("a probability that is not finite")
+    entries = sets.nnz
+    sets.sum_duplicates()
+    if sets.nnz != entries:
+        raise UserError("a sensor that stands twice in a set")
     return PolicyTable(task, sets, k=k)
 
 
@@ -116,7 +115,7 @@ def write_sets(folder: Path, policy: PolicyTable, **arrays: Array) -> dict[str, 
 
 
 def read_sets(task: Task, file: str | Path) -> PolicyTable:
-    """The policy in a `sets.json`, or in a `sets.npz` or `policy.npz`, for `task`; what it remembers is its own.
+    """The policy in a `sets.json`, or in a `sets.npz` or `policy.npz`, for `task`; its memory is its own.
 
     Raises:
         UserError: the file is missing or damaged, holds something else, or is for another grid or t_max.
@@ -133,7 +132,9 @@ def read_sets(task: Task, file: str | Path) -> PolicyTable:
     content = read_object(file, most=LARGE)
     with decoded(str(file), "sets"):
         memory = content.get("memory", {"kind": "cell", "clip": 2})
-        own = task.remembering(memory["kind"], clip=memory["clip"], revealed=memory.get("revealed", 1))
+        own = task.remembering(
+            memory["kind"], clip=memory["clip"], revealed=memory.get("revealed", 1)
+        )
         return _listed(own, content)
 
 
@@ -144,35 +145,16 @@ def _listed(task: Task, content: dict[str, Any]) -> PolicyTable:
     if content["size"] != list(task.size):  # as many cells in other rows would fit
         raise ValueError(f"size {content['size']}, rows and columns; expected {list(task.size)}")
     keys, count = content["sets"], task.num_keys
-    # Counted first: what a stranger's file says is remembered may make any number of keys.
-    if content["t_max"] != task.t_max or len(keys) != count or any(str(key) not in keys for key in range(count)):
-        raise ValueError(f"{len(keys)} plans, t_max {content['t_max']}; expected {count}, {task.t_max}")
+    # Counted first: the memory in a stranger's file may make any number of keys.
+    if (
+        content["t_max"] != task.t_max
+        or len(keys) != count
+        or any(str(key) not in keys for key in range(count))
+    ):
+        raise ValueError(
+            f"{len(keys)} plans, t_max {content['t_max']}; expected {count}, {task.t_max}"
+        )
     rows = [each for key in range(count) for each in keys[str(key)]]
     pointer = np.cumsum([0, *map(len, rows)])
     indices = np.array([each for row in rows for each in row], dtype=np.int64)
     return unpacked_policy(task, {"indices": indices, "indptr": pointer})
-
-
-def _number(value: Any) -> npt.NDArray[Any]:
-    """A number, a pair or an array; NaN for None."""
-    return np.asarray(np.nan if value is None else value)
-
-
-def _plain(array: npt.NDArray[Any]) -> Any:
-    """What `_number` made an array of."""
-    return array if array.ndim else None if array != array else array.item()
-
-
-def _task(content: dict[str, npt.NDArray[Any]]) -> Task:
-    given = {name: _plain(content[f"task_{name}"]) for name in _TASK}
-    given |= {name: _plain(content[f"task_{name}"]) for name in (*_SENSORS, *_KNOWN) if f"task_{name}" in content}
-    rows, columns = map(int, given["size"])
-    return Task(**given, coverage=_read_footprints(content, rows * columns))
-
-
-def _read_footprints(content: dict[str, npt.NDArray[Any]], cells: int) -> sparse.csr_array | None:
-    """`[S, M]` bool of what `save_policy` wrote; None where it wrote nothing."""
-    if "footprint_cells" not in content:
-        return None
-    indices, indptr = content["footprint_cells"], content["footprint_begin"]
-    return whole_csr(np.ones(len(indices), dtype=bool), indices, indptr, (len(indptr) - 1, cells))

@@ -1,4 +1,4 @@
-"""What a policy does in every state, as a table: the part of a policy that planning and exact evaluation need.
+"""A policy's table: its sets or probabilities in every state, as planning and exact evaluation need them.
 
 It loads without torch, so that solving a world from the command line does not wait for it; `Policy` adds the acting.
 """
@@ -7,21 +7,140 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
 from trackmdp.errors import UserError
+from trackmdp.notebook.card import Card, Carded, decimal, grid_words
 from trackmdp.world.checks import short_indices
-from trackmdp.world.model import Array, BoolArray, Task, apart
+from trackmdp.world.coverage import reported, shared_out
+from trackmdp.world.model import Array, BoolArray, Task, window_cells
+
+_AT_ONCE = 2**19
+"""Entries looked up at once: some 16 MB of intermediate arrays, however large the grid."""
 
 
-class PolicyTable:
+class SetTable:
+    """Sets of sensors in rows, t_max + 1 for each plan: the input of exact evaluation.
+
+    Args:
+        task: sensors and prices.
+        sets: `[plans * (t_max + 1), S]` sparse, bool or probabilities; row `plan * (t_max + 1) + n` is the set after n
+            misses. None: `probability` for every sensor in every row.
+        plans: number of plans.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        sets: sparse.csr_array | None,
+        plans: int,
+        *,
+        probability: float | None = None,
+        k: int | None = None,
+    ) -> None:
+        self.task, self.sets, self.plans, self.probability, self.k = (
+            task,
+            sets,
+            plans,
+            probability,
+            k,
+        )
+        self.deterministic = (
+            probability in (0.0, 1.0) if sets is None else bool(sets.dtype == np.bool_)
+        )
+
+    def sensed_by(self, task: Task) -> SetTable:
+        """The same sets with the sensors of `task`, which may report with other probabilities."""
+        if np.array_equal(self.task.detection, task.detection):
+            return self
+        return SetTable(task, self.sets, self.plans, probability=self.probability, k=self.k)
+
+    def chosen(self, n: int, plans: npt.NDArray[Any], sensors: npt.NDArray[Any]) -> Array:
+        """`[E]` probability that `sensors` `[E]` are on, after n misses in each plan `[E]`."""
+        if self.sets is None:
+            return np.full(len(plans), float(self.probability or 0.0))
+        return _looked_up(self._sets, self.task.num_choices, n, plans, sensors)
+
+    def reports(self, n: int, plans: npt.NDArray[Any], cells: npt.NDArray[Any]) -> Array:
+        """`[E]` probability that a target in `cells` `[E]` is reported after n misses in each plan."""
+        task = self.task
+        if task.coverage is None:
+            return self.chosen(n, plans, cells) * task.detects(cells)
+        if self.sets is None:
+            return self._share[cells]
+        return _looked_up(self._reports, task.num_choices, n, plans, cells)
+
+    def spent(self, n: int, price: Array) -> Array:
+        """`[plans]` expected price of the sensors on after n misses; `price` `[S]` is per sensor."""
+        if self.sets is None:
+            assert self.probability is not None
+            return np.full(self.plans, self.probability * float(price.sum()))
+        # Rows n, n + (t_max + 1), ...: those of (0, n), (1, n), ..., one per plan.
+        rows = self.sets[n :: self.task.num_choices]
+        return rows.astype(np.float64) @ price
+
+    def watched(self, used: Array) -> Array:
+        """`[M]` how often each cell is covered, where the sets are used `[plans * (t_max + 1)]` often."""
+        if self.sets is None:
+            return used.sum() * self.share
+        return used @ self.seen
+
+    @cached_property
+    def seen(self) -> sparse.csr_array:
+        """`[plans * (t_max + 1), M]`, probability that each cell is sensed; `sets` itself without footprints."""
+        coverage = self.task.coverage
+        if coverage is None:
+            return self.sets
+        found = reported(self.sets, sparse.csr_array(self._covers.T.tocsr()))
+        return found.astype(np.bool_) if self.deterministic else found
+
+    @cached_property
+    def reporting(self) -> sparse.csr_array:
+        """`[plans * (t_max + 1), M]`, probability of a report of a target in each cell; bool where all are certain."""
+        task = self.task
+        if task.coverage is not None and not task.perfect:
+            return reported(self.sets, sparse.csr_array(task.sees_by_cell.T.tocsr()))
+        if task.perfect:
+            return self.seen
+        assert self.sets is not None
+        return sparse.csr_array(self.sets.multiply(task.detection))
+
+    @cached_property
+    def _share(self) -> Array:
+        """`[M]`, the same of a report."""
+        return self._shared_out(self.task.sees_by_cell)
+
+    @cached_property
+    def share(self) -> Array:
+        """`[M]`, probability of covering each cell, of a policy without sets, in every state."""
+        return self._shared_out(self._covers)
+
+    def _shared_out(self, sees_by_cell: sparse.csr_array) -> Array:
+        count = int(self.task.available.sum())
+        return shared_out(sees_by_cell, float(self.probability or 0.0), self.k, count)
+
+    @property
+    def _covers(self) -> sparse.csr_array:
+        """`[M, S]` 1.0 where a sensor covers a cell."""
+        return sparse.csr_array(self.task.sees_by_cell > 0, dtype=np.float64)
+
+    @cached_property
+    def _sets(self) -> Entries:
+        return _entries(self.sets)
+
+    @cached_property
+    def _reports(self) -> Entries:
+        return _entries(self.reporting)
+
+
+class PolicyTable(Carded, SetTable):
     """Which sensors are on n misses after the target was located: one open-loop plan for each key (`world/memory.py`).
 
-    With `task.memory` "cell" the key is the located cell x. What a policy remembers is its own: a policy of one memory
+    With `task.memory` "cell" the key is the located cell x. A policy has its own memory: a policy of one memory
     may be valued in a task of another.
 
     Args:
@@ -30,8 +149,8 @@ class PolicyTable:
             that left `key`; S = M, a sensor in each cell, or the sensors of `task.coverage`. Bool entries are sensors
             on; entries in (0, 1] are the probabilities of switching them on, independently of each other and of the
             history.
-        probability: the same for every sensor in every state, instead of `sets`; in a task with a window, for every
-            sensor in the window of the located cell, which is then written out as `sets`.
+        probability: the same for every sensor in every state, instead of `sets`; where not all sensors exist or lie in
+            the window of the located cell, it holds for the others and is written out as `sets`.
         k: exactly k sensors are on, each such subset equally likely; `sets` or `probability` then has each sensor's
             share of them, which is all that exact values depend on.
 
@@ -39,7 +158,7 @@ class PolicyTable:
         deterministic: whether the policy is the same function of the state each time.
 
     Raises:
-        UserError: the shape is not that of the task's states, or an entry is no probability.
+        UserError: the shape does not fit the task's states, or an entry is no probability.
     """
 
     def __init__(
@@ -56,12 +175,30 @@ class PolicyTable:
             raise UserError(f"policy: expected a probability between 0 and 1, got {probability}")
         if k is not None and not 0 <= k <= task.total_sensors:
             raise UserError(f"policy: expected k from 0 to {task.total_sensors} sensors, got {k}")
-        self.task, self.probability, self.k = task.task, probability, k
-        self.sets = None if sets is None else _checked(task, sets)
-        if probability and task.window is not None:
-            # Which sensors there are depends on where the target was located: no longer the same everywhere.
-            self.sets, self.probability = _window_sets(task, probability), None
-        self.deterministic = probability in (0.0, 1.0) if self.sets is None else self.sets.dtype == np.bool_
+        sets = None if sets is None else _checked(task, sets)
+        if probability and (task.window is not None or not task.available.all()):
+            sets, probability = _choosable_sets(task, probability), None
+        super().__init__(task.task, sets, task.num_keys, probability=probability, k=k)
+
+    def card(self) -> Card:
+        """Size, memory and the mean number of sensors on."""
+        task = self.task
+        drawn = f"exactly {self.k} sensors" if self.k is not None else "each sensor on its own"
+        facts = {
+            "T_max": f"{task.t_max}",
+            "memory": f"{task.memory}, {task.num_keys:,} keys",
+            "choice": "deterministic" if self.deterministic else f"drawn, {drawn}",
+        }
+        if task.window is not None:
+            facts["window"] = f"{task.window} cells around the last located cell"
+        for n, count in enumerate(self._mean_sensors()):
+            facts[f"sensors on at n = {n}"] = f"{decimal(count, 2)} of {task.total_sensors:,}"
+        return Card(f"{type(self).__name__}: {grid_words(task.size)}", facts)
+
+    def _mean_sensors(self) -> list[float]:
+        """Mean number of sensors on at n = 0 ... t_max, over all keys."""
+        one = np.ones(self.task.total_sensors)
+        return [float(self.spent(n, one).mean()) for n in range(self.task.num_choices)]
 
     @classmethod
     def all_on(cls, task: Task) -> Self:
@@ -75,15 +212,27 @@ class PolicyTable:
 
     @classmethod
     def from_dense(cls, task: Task, table: npt.NDArray[np.generic]) -> Self:
-        """A policy from `[keys, t_max + 1, S]`, bool or probabilities."""
+        """A policy from `[keys, t_max + 1, S]`, bool or probabilities.
+
+        Raises:
+            UserError: it has another shape, or holds other things than real numbers.
+        """
+        if table.dtype.kind not in "biuf":
+            raise UserError(f"policy: a table of {table.dtype}, expected bool or probabilities")
         expected = (task.num_keys, task.num_choices, task.total_sensors)
         if table.shape != expected:
-            raise UserError(f"policy: expected shape {expected} (keys, t_max + 1, sensors), got {table.shape}")
-        return cls(task, sparse.csr_array(np.ascontiguousarray(table).reshape(-1, task.total_sensors)))
+            raise UserError(
+                f"policy: expected shape {expected} (keys, t_max + 1, sensors), got {table.shape}"
+            )
+        return cls(
+            task, sparse.csr_array(np.ascontiguousarray(table).reshape(-1, task.total_sensors))
+        )
 
     @classmethod
-    def from_sensed(cls, task: Task, parts: Sequence[tuple[npt.NDArray[Any], npt.NDArray[Any]]]) -> Self:
-        """A policy that does not draw, from what is on at n = 0 ... t_max: the keys and the sensors, `[Q]` each."""
+    def from_sensed(
+        cls, task: Task, parts: Sequence[tuple[npt.NDArray[Any], npt.NDArray[Any]]]
+    ) -> Self:
+        """A policy that does not draw, from the keys and their sensors on, `[Q]` each, at n = 0 ... t_max."""
         # Key x after n misses is row x (t_max + 1) + n: with t_max = 1, (x, n) = (3, 1) is row 7.
         # rows of several n interleave, so that the table is sorted once all are there
         rows = np.concatenate([keys * task.num_choices + n for n, (keys, _) in enumerate(parts)])
@@ -93,63 +242,8 @@ class PolicyTable:
         table.sort_indices()
         return cls(task, short_indices(table))
 
-    # What exact evaluation reads, for arrays of any E.
-
-    def on(self, n: int, rows: npt.NDArray[Any], cells: npt.NDArray[Any]) -> Array:
-        """`[E]` probability that a sensor on sees `cells` `[E]`, n misses after the detection of key `rows` `[E]`."""
-        if self.sets is None:
-            assert self.probability is not None
-            if self.task.coverage is not None:
-                return self.task.coverage.share(self.probability, self.k)[cells]
-            return np.full(len(rows), self.probability)
-        # Entry (row r, column j) of the table has the number r * M + j; the numbers of those stored are in order.
-        # With M = 4 and t_max = 1: located in 2, after 1 miss, sensor 3 is entry (2 * 2 + 1) * 4 + 3 = 23.
-        wanted = (np.asarray(rows, dtype=np.int64) * self.task.num_choices + n) * self.task.num_cells + cells
-        place = np.searchsorted(self._entries, wanted)
-        found: BoolArray = self._entries[place] == wanted
-        if self.deterministic:
-            return found.astype(np.float64)
-        return np.where(found, np.append(self.seen.data, 0.0)[place], 0.0)
-
-    def chosen(self, n: int, rows: npt.NDArray[Any], sensors: npt.NDArray[Any]) -> Array:
-        """`[E]` probability that `sensors` `[E]` are on, n misses after the detection of key `rows` `[E]`."""
-        if self.task.coverage is None:
-            return self.on(n, rows, sensors)
-        if self.sets is None:
-            return np.full(len(rows), self.probability)
-        # Entry by entry: with footprints only planners ask, for the few pairs of their layers.
-        wanted = np.asarray(rows) * self.task.num_choices + n
-        return np.asarray(self.sets[wanted, sensors], dtype=np.float64)
-
-    def spent(self, n: int, price: Array) -> Array:
-        """`[keys]` expected price of the sensors on, n misses after each key; `price` `[S]` is per sensor."""
-        if self.sets is None:
-            assert self.probability is not None
-            return np.full(self.task.num_keys, self.probability * price.sum())
-        # Rows n, n + (t_max + 1), ...: those of (0, n), (1, n), ..., one per key.
-        rows = self.sets[n :: self.task.num_choices]
-        return rows.astype(np.float64) @ price
-
-    def watched(self, used: Array) -> Array:
-        """`[M]` how often each cell is seen by a sensor, where the sets are used `[keys * (t_max + 1)]` often."""
-        if self.sets is None:
-            every = np.zeros(self.task.num_cells, dtype=np.int64)
-            return used.sum() * self.on(0, every, np.arange(self.task.num_cells))
-        return used @ self.seen
-
-    @cached_property
-    def seen(self) -> sparse.csr_array:
-        """`[keys * (t_max + 1), M]`, which cells the sets see, or with what probability: `sets`, but for footprints."""
-        return self.sets if self.task.coverage is None else self.task.coverage.seen(self.sets)
-
-    @cached_property
-    def _entries(self) -> npt.NDArray[np.int64]:
-        """`[nnz + 1]` sorted numbers r * M + j of the entries of `seen`, closed by the largest int64 as a sentinel."""
-        row = np.repeat(np.arange(self.seen.shape[0], dtype=np.int64), np.diff(self.seen.indptr))
-        return np.append(row * self.task.num_cells + self.seen.indices, np.iinfo(np.int64).max)
-
     def check_fits(self, task: Task) -> None:
-        """Refuse a task of another grid, of other footprints or of another t_max.
+        """Refuse a task of another grid, of other footprints, of another t_max, or without a sensor that may be on.
 
         Raises:
             UserError: it is.
@@ -158,8 +252,15 @@ class PolicyTable:
         if not (mine is other or (mine is not None and mine.same_as(other))):
             raise UserError("policy: made for sensors of other footprints than the world's")
         if (self.task.size, self.task.t_max) != (task.size, task.t_max):
-            theirs, ours = (f"{each.rows} x {each.columns} cells, t_max {each.t_max}" for each in (self.task, task))
+            theirs, ours = (
+                f"{each.rows} x {each.columns} cells, t_max {each.t_max}"
+                for each in (self.task, task)
+            )
             raise UserError(f"policy: made for {theirs}; expected {ours}")
+        gone = self.task.available & ~task.available
+        on = gone.nonzero()[0] if self.sets is None else self.sets.indices[gone[self.sets.indices]]
+        if len(on) and self.probability != 0.0:
+            raise UserError(f"policy: sensor {on[0]} may be on; the world has none there")
 
     def dense(self) -> BoolArray:
         """`[keys, t_max + 1, S]`, the sets of a deterministic policy, a byte each, so for small worlds alone.
@@ -177,28 +278,50 @@ class PolicyTable:
     def as_lists(self) -> dict[str, Any]:
         """Plain lists, as `sets.json` has them: rows and columns, t_max, and each key's sensors on at n = 0 ... t_max.
 
-        With `task.memory` "cell" the keys are the located cells; else `memory` says how they are numbered, and
-        where a detection tells the mode its kind is "cell", each cell's classes being the modes. Where
-        sensors do not each cover the cell of their number, `footprints` says which cells each covers.
+        With `task.memory` "cell" the keys are the located cells; else `memory` holds their formulas, and where a
+        detection reveals the mode its kind is "cell", each cell's classes being the modes. Where sensors do not each
+        cover the cell of their number, `footprints` lists the cells of each.
         """
-        m, choices = self.task.num_cells, self.task.num_choices
-        if self.sets is None:
-            each = list(range(self.task.total_sensors)) if self.probability == 1.0 else []
-            return self._of_task() | {"sets": {str(cell): [each] * choices for cell in range(m)}}
-        lists = [part.tolist() for part in np.split(self.sets.indices, self.sets.indptr[1:-1])]
-        sets = {str(key): lists[key * choices : (key + 1) * choices] for key in range(self.task.num_keys)}
+        keys, steps = range(self.task.num_keys), range(self.task.num_choices)
+        sets = {str(key): [self.sensors(key, n) for n in steps] for key in keys}
         return self._of_task() | {"sets": sets}
 
+    def sensors(self, key: int, misses: int) -> list[int]:
+        """The sensors with a probability above 0, n misses after the detection that left `key`."""
+        if self.sets is None:
+            return list(range(self.task.total_sensors)) if self.probability else []
+        found: list[int] = self.sets.indices[self._entries_of(key, misses)].tolist()
+        return found
+
+    def chances(self, key: int, misses: int) -> Array:
+        """The probabilities of `sensors`."""
+        if self.sets is None:
+            return np.full(len(self.sensors(key, misses)), self.probability, dtype=np.float64)
+        return self.sets.data[self._entries_of(key, misses)].astype(np.float64)
+
+    def _entries_of(self, key: int, misses: int) -> slice:
+        """The entries of a row of `sets`."""
+        assert self.sets is not None
+        row = key * self.task.num_choices + misses
+        return slice(*self.sets.indptr[row : row + 2])
+
     def _of_task(self) -> dict[str, Any]:
-        """What a reader of the lists has to know; what is not there is the paper's."""
+        """The facts that a reader of the lists needs; missing ones have the paper's values."""
         task = self.task
-        told: dict[str, Any] = {"size": list(task.size), "t_max": task.t_max}
+        facts: dict[str, Any] = {"size": list(task.size), "t_max": task.t_max}
         if task.coverage is not None:
-            told["footprints"] = task.coverage.as_lists()
+            facts["footprints"] = task.coverage.as_lists()
+        if task.place is not None:
+            facts["place"] = task.place.facts()
         if task.keyed:
-            told["memory"] = {"kind": task.memory, "clip": task.clip, "classes": task.keys.num_classes}
-            told["memory"] |= {"revealed": task.revealed} if task.revealed > 1 else {}
-        return told
+            facts["memory"] = {
+                "kind": task.memory,
+                "clip": task.clip,
+                "classes": task.keys.num_classes,
+            }
+            facts["memory"] |= {"revealed": task.revealed} if task.revealed > 1 else {}
+            facts["memory"] |= task.keys.recipe()
+        return facts
 
 
 def _checked(task: Task, sets: sparse.csr_array) -> sparse.csr_array:
@@ -209,7 +332,9 @@ def _checked(task: Task, sets: sparse.csr_array) -> sparse.csr_array:
     """
     expected = (task.num_keys * task.num_choices, task.total_sensors)
     if sets.shape != expected:
-        raise UserError(f"policy: expected sets of shape {expected} (keys (t_max + 1), sensors), got {sets.shape}")
+        raise UserError(
+            f"policy: expected sets of shape {expected} (keys (t_max + 1), sensors), got {sets.shape}"
+        )
     sets = sparse.csr_array(sets, copy=True)
     if sets.dtype != np.bool_:
         if not ((sets.data >= 0) & (sets.data <= 1)).all():
@@ -218,25 +343,60 @@ def _checked(task: Task, sets: sparse.csr_array) -> sparse.csr_array:
         sets = sets.astype(np.bool_ if np.isin(sets.data, (0, 1)).all() else np.float64)
     sets.sum_duplicates()  # sorts the columns of each row as well
     sets.eliminate_zeros()
-    if task.window is not None:
-        start = task.keys.cell(np.repeat(np.arange(sets.shape[0]), np.diff(sets.indptr)) // task.num_choices)
-        far = apart(task.columns, start, sets.indices) > task.window
-        if far.any():
-            x, cell = int(start[far][0]), int(sets.indices[far][0])
-            raise UserError(f"policy: sensor {cell} cannot be chosen from cell {x} with grid.window={task.window}")
+    keys = np.repeat(np.arange(sets.shape[0]), np.diff(sets.indptr)) // task.num_choices
+    start = task.keys.cell(keys)
+    possible = task.choosable(start, sets.indices)
+    if possible is not None and not possible.all():
+        x, sensor = int(start[~possible][0]), int(sets.indices[~possible][0])
+        why = f"with grid.window={task.window}" if task.available[sensor] else "for there is none"
+        raise UserError(f"policy: sensor {sensor} cannot be chosen from cell {x}, {why}")
     return sets
 
 
-def _window_sets(task: Task, probability: float) -> sparse.csr_array:
-    """`[keys (t_max + 1), M]`, every sensor of the window around each located cell, with one probability."""
-    assert task.window is not None
-    # A cell is near where its row is and its column is: the Kronecker product of both.
-    reach = (min(task.window, side - 1) for side in task.size)
-    rows, columns = (
-        sum(sparse.eye_array(side, k=k) for k in range(-far, far + 1))
-        for side, far in zip(task.size, reach, strict=True)
-    )
-    near = sparse.kron(rows, columns, format="csr") * probability
-    near.sort_indices()
+def _choosable_sets(task: Task, probability: float) -> sparse.csr_array:
+    """`[keys (t_max + 1), S]`, every sensor that can be chosen from each located cell, with one probability."""
+    if task.window is None:
+        near = sparse.csr_array(np.tile(task.available, (task.num_cells, 1)))
+    elif task.coverage is None:
+        near = window_cells(task.size, task.window)
+    else:
+        near = task.sensors_near
+    near = sparse.csr_array(near.multiply(task.available) * probability)
+    near.eliminate_zeros()
     near = short_indices(sparse.csr_array(near, dtype=np.float64 if probability < 1 else np.bool_))
     return near[np.repeat(np.arange(task.num_cells), task.keys.num_classes * task.num_choices)]
+
+
+class Entries(NamedTuple):
+    """The entries of a table for look-up.
+
+    Attributes:
+        numbers: `[nnz + 1]` sorted numbers r · columns + j of the entries, closed by the largest int64 as a sentinel.
+        values: `[nnz + 1]`, float64, of the sentinel 0.
+        columns: of the table.
+    """
+
+    numbers: npt.NDArray[np.int64]
+    values: Array
+    columns: int
+
+
+def _entries(table: sparse.csr_array) -> Entries:
+    row = np.repeat(np.arange(table.shape[0], dtype=np.int64), np.diff(table.indptr))
+    numbers = np.append(row * table.shape[1] + table.indices, np.iinfo(np.int64).max)
+    return Entries(numbers, np.append(table.data, 0.0).astype(np.float64), table.shape[1])
+
+
+def _looked_up(
+    table: Entries, choices: int, n: int, keys: npt.NDArray[Any], columns: npt.NDArray[Any]
+) -> Array:
+    """`[E]`, the entries of row key (t_max + 1) + n in `columns`."""
+    # With 4 columns and t_max = 1: located in 2, after 1 miss, sensor 3 is entry (2 * 2 + 1) * 4 + 3 = 23.
+    found = np.empty(len(columns))
+    for begin in range(0, len(columns), _AT_ONCE):
+        part = slice(begin, begin + _AT_ONCE)
+        row = np.asarray(keys[part], dtype=np.int64) * choices + n
+        wanted = row * table.columns + columns[part]
+        place = np.searchsorted(table.numbers, wanted)
+        found[part] = np.where(table.numbers[place] == wanted, table.values[place], 0.0)
+    return found

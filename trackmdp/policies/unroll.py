@@ -1,14 +1,13 @@
-"""From any deterministic rule to a table, by calling it on every state that it can reach.
+"""Tables of rules: a rule that does not draw is asked for its action in every state that it can reach.
 
-After a miss the next state is known in advance: the same located cell, n + 1, and the history with the set just chosen.
-So M * (t_max + 1) states, visited in order of n, determine a policy that does not draw. Where it reads `key` as well,
-what is remembered at a detection, it has as many plans as there are keys.
+After a miss the next state is known in advance: the same located cell, n + 1, and the history with the last set. So
+M * (t_max + 1) states, visited in order of n, determine a policy that does not draw; where it reads `key` as well, keys
+take the place of the M cells.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,105 +16,23 @@ from scipy import sparse
 from tensordict import TensorDict
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor, distributions
-from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
+from torchrl.envs.utils import ExplorationType, exploration_type
 
-from trackmdp.errors import UserError
+from trackmdp.policies.forms import (
+    TAKE_ITS_MODE,
+    DrawsError,
+    Rule,
+    module_rule,
+    observed,
+    state_keys,
+)
 from trackmdp.seeding import preserved_global_rng
+from trackmdp.world.actions import ActionMask
 from trackmdp.world.model import Task
 from trackmdp.world.windows import Window
 
-STATE_KEYS = ("last_cell", "steps_since_detection", "action_history")
-
-Rule: TypeAlias = Callable[..., Tensor]
-"""`last_cell` `[B]`, `steps_since_detection` `[B]`, `action_history` `[B, t_max+1, K]`, and `key` `[B]` where the task
-has keys -> bool `[B, K]`.
-
-K = M, or with a window the sensors around `last_cell`, in the local numbers of `Window`."""
-
-TAKE_ITS_MODE = "simulate it, or take its mode by Policy.from_module"
-
-
-class DrawsError(UserError):
-    """An exact value was asked of something that has none: it draws at random, or keeps a state of its own."""
-
-
-def acting() -> set_exploration_type:
-    """What the caller chose by `set_exploration_type`; where nothing is chosen a policy acts as it explores, RANDOM.
-
-    A TorchRL actor would otherwise be valued at its mode without a word, although it draws while collecting.
-    """
-    return set_exploration_type(exploration_type() or ExplorationType.RANDOM)
-
-
-_HISTORY_AT_ONCE = 2**22  # entries of the action history in one block; a net's activations follow from it
-
-
-def state_keys(task: Task) -> list[str]:
-    """What is observed of a state: `key` as well, where a policy knows more at a detection than the cell."""
-    return [*STATE_KEYS, "key"] if task.keyed else list(STATE_KEYS)
-
-
-def known_task(task: Task, policy: object) -> Task:
-    """The task as `policy` knows it: a module that does not read `key`, and any function, knows the cell alone."""
-    return task if "key" in getattr(policy, "in_keys", ()) else task.remembering()
-
-
-def function_rule(task: Task, function: Callable[..., Any]) -> Rule:
-    """A user's function as a rule, what it returns checked.
-
-    Raises:
-        UserError: when asked, it returns something else than bool `[B, K]`.
-    """
-
-    def rule(last_cell: Tensor, steps_since_detection: Tensor, action_history: Tensor) -> Tensor:
-        action = torch.as_tensor(function(last_cell, steps_since_detection, action_history))
-        return _checked(action, (len(last_cell), task.num_sensors), "the function returned")
-
-    return rule
-
-
-def module_rule(task: Task, module: TensorDictModuleBase) -> Rule:
-    """A TensorDict module as a rule; it reads the keys of a state and writes `action`.
-
-    Raises:
-        UserError: it reads or writes other keys, or its action has another form.
-    """
-    # A table has a row for each state of these keys; one that reads more, its own past say, is no function of them.
-    known = state_keys(task)
-    others = [str(key) for key in module.in_keys if key not in known]
-    if (kept := kept_keys(module)) and set(others) <= {*kept, "is_init"}:
-        raise DrawsError(f"policy: keeps {', '.join(kept)} from step to step, so it has no exact value; simulate it")
-    if others:
-        raise UserError(f"policy: the module reads {', '.join(others)}, expected {', '.join(known)} at most")
-    if "action" not in module.out_keys:
-        raise UserError("policy: the module writes no action")
-
-    def rule(*state: Tensor) -> Tensor:
-        batch = TensorDict(dict(zip(known, state, strict=True)), state[0].shape, device=state[0].device)
-        return module_action(task, module, batch)
-
-    return rule
-
-
-def module_action(task: Task, module: TensorDictModuleBase, batch: TensorDict) -> Tensor:
-    """The action of a module in `batch` `[B]`, to which it writes; bool `[B, K]`.
-
-    Raises:
-        UserError: the action has another form.
-    """
-    return _checked(module(batch)["action"], (len(batch), task.num_sensors), "the module's action is")
-
-
-def kept_keys(module: TensorDictModuleBase) -> list[str]:
-    """What a recurrent module reads that it wrote at the step before, under `next`, as TorchRL's GRU and LSTM do."""
-    return [str(key) for key in module.in_keys if ("next", key) in module.out_keys]
-
-
-def _checked(action: Tensor, shape: tuple[int, int], what: str) -> Tensor:
-    if action.dtype != torch.bool or tuple(action.shape) != shape:
-        form = f"{str(action.dtype).removeprefix('torch.')} {list(action.shape)}"
-        raise UserError(f"policy: {what} {form}, expected bool {list(shape)}")
-    return action
+_HISTORY_AT_ONCE = 2**22
+"""Entries of the action history in one block; the size of a net's activations follows from it."""
 
 
 def unrolled(task: Task, rule: Rule, device: torch.device) -> sparse.csr_array:
@@ -128,49 +45,55 @@ def unrolled(task: Task, rule: Rule, device: torch.device) -> sparse.csr_array:
 
 
 def draws(task: Task, rule: Rule, device: torch.device, sets: sparse.csr_array) -> bool:
-    """Whether a rule that was unrolled to `sets` draws: asked again it answers otherwise, or uses torch's generators.
+    """Whether a rule with the table `sets` draws: asked again it answers otherwise, or uses torch's generators.
 
     The first test finds any source of randomness that changes some answer; the second also finds one that seldom does,
     if it is one of torch's global generators, which TorchRL's modules draw from.
     """
     with preserved_global_rng():
-        torch.manual_seed(torch.initial_seed() + 1)  # another place in the random stream than the first time
+        # Another place in the random stream than the first time.
+        torch.manual_seed(torch.initial_seed() + 1)
         before = _generator_states()
         again = _table(task, rule, device)
-        moved = any(not torch.equal(*pair) for pair in zip(before, _generator_states(), strict=True))
+        moved = any(
+            not torch.equal(*pair) for pair in zip(before, _generator_states(), strict=True)
+        )
     same = np.array_equal(again.indptr, sets.indptr) and np.array_equal(again.indices, sets.indices)
     return moved or not same
 
 
-def mixture(task: Task, module: TensorDictModuleBase, device: torch.device) -> sparse.csr_array | None:
-    """`[keys * (t_max + 1), S]` float64, with what probability a stochastic actor switches each sensor on.
+def mixture(
+    task: Task, module: TensorDictModuleBase, device: torch.device
+) -> sparse.csr_array | None:
+    """`[keys * (t_max + 1), S]` float64, the probability with which a stochastic actor switches each sensor on.
 
     Exact values need no more than these where they do not depend on the history: the next state then depends on the
-    sensor at the target's cell alone, and the price is a sum over the sensors.
+    sensors that cover the target's cell alone, and the price is a sum over the sensors.
 
     Args:
-        task: what it acts in.
+        task: the task it acts in.
         module: a module of TorchRL; its distribution must be a Bernoulli per sensor.
-        device: where to ask it.
+        device: device of the module.
 
     Returns:
         None where the module has no such distribution, or is asked for its mode.
 
     Raises:
-        DrawsError: the probabilities depend on the history, that is on what was drawn before.
+        DrawsError: the probabilities depend on the history, that is on earlier draws.
         UserError: it reads or writes other keys.
     """
     stochastic = isinstance(module, ProbabilisticTensorDictSequential)
     if not stochastic or exploration_type() != ExplorationType.RANDOM:
         return None
-    module_rule(task, module)  # refuses keys that are not its business
+    module_rule(task, module)  # refuses other keys
     names = state_keys(task)
 
     def probabilities(filled: bool) -> Rule:
         def rule(*state: Tensor) -> Tensor:
             known = torch.full_like(state[2], filled) & _taken(state[1], state[2])
-            batch = TensorDict(dict(zip(names, (*state[:2], known, *state[3:]), strict=True)), state[0].shape)
-            chances = _bernoulli(module.get_dist(batch.to(device)))
+            rows = dict(zip(names, (*state[:2], known, *state[3:]), strict=True))
+            batch = TensorDict(rows, state[0].shape).to(device)
+            chances = _bernoulli(module.get_dist(observed(task, module, batch)))
             if chances is None or chances.shape != (len(state[0]), task.num_sensors):
                 raise _NoProbabilitiesError
             return chances
@@ -180,12 +103,15 @@ def mixture(task: Task, module: TensorDictModuleBase, device: torch.device) -> s
     try:
         with preserved_global_rng():
             # Two histories as far apart as can be: a network that reads them at all answers otherwise.
-            none, full = (_table(task, probabilities(filled), device, torch.float64) for filled in (False, True))
+            none, full = (
+                _table(task, probabilities(filled), device, torch.float64)
+                for filled in (False, True)
+            )
     except _NoProbabilitiesError:
         return None
     if (none != full).nnz:
         raise DrawsError(
-            f"policy: its probabilities depend on the sets that it drew before, so no exact value; {TAKE_ITS_MODE}"
+            f"policy: its probabilities depend on earlier draws, so it has no exact value; {TAKE_ITS_MODE}"
         )
     return none
 
@@ -196,7 +122,8 @@ class _NoProbabilitiesError(Exception):
 
 def _taken(misses: Tensor, history: Tensor) -> Tensor:
     """`[B, t_max+1, 1]` bool, the slots of a history that hold an action after `misses` `[B]`."""
-    return (torch.arange(history.shape[1], device=misses.device) < misses.unsqueeze(1)).unsqueeze(-1)
+    slots = torch.arange(history.shape[1], device=misses.device)
+    return (slots < misses.unsqueeze(1)).unsqueeze(-1)
 
 
 def _bernoulli(found: distributions.Distribution) -> Tensor | None:
@@ -207,12 +134,14 @@ def _bernoulli(found: distributions.Distribution) -> Tensor | None:
 
 
 @torch.no_grad()
-def _table(task: Task, rule: Rule, device: torch.device, dtype: torch.dtype = torch.bool) -> sparse.csr_array:
-    """A rule's answers of any dtype as rows of a table; where they are bool, each is remembered as the set chosen."""
+def _table(
+    task: Task, rule: Rule, device: torch.device, dtype: torch.dtype = torch.bool
+) -> sparse.csr_array:
+    """Answers of a rule, of any dtype, as rows of a table; bool answers are remembered as the set chosen."""
     k, choices = task.num_sensors, task.num_choices
     # One key takes a history of (t_max + 1) K bools; blocks keep all of them from being there at once.
     at_once = max(1, _HISTORY_AT_ONCE // (choices * k))
-    window = Window.of(task, device)
+    window, mask = Window.of(task, device), ActionMask(task, device)
     columns, values, lengths = [], [], []
     for begin in range(0, task.num_keys, at_once):
         keys = torch.arange(begin, min(begin + at_once, task.num_keys), device=device)
@@ -221,6 +150,8 @@ def _table(task: Task, rule: Rule, device: torch.device, dtype: torch.dtype = to
         on = _followed(rule, task, keys, dtype).reshape(-1, k)
         if window.is_local:
             on *= window.inside(cells).repeat_interleave(choices, dim=0).cpu().numpy()
+        if mask.observed:
+            on *= mask(cells).repeat_interleave(choices, dim=0).cpu().numpy()
         # Row-major order: flat place p of [rows, K] is column p mod K. Without a window K = S and columns are sensors.
         place = np.flatnonzero(on)
         chosen = place % k
@@ -229,7 +160,7 @@ def _table(task: Task, rule: Rule, device: torch.device, dtype: torch.dtype = to
             chosen = window.around(cells).cpu().numpy()[place // (k * choices), chosen]
         columns.append(chosen)
         values.append(on.reshape(-1)[place])
-        # Sensors on per row, whose running sum is the CSR row pointer.
+        # Sensors on per row; their running sum is the CSR row pointer.
         lengths.append(np.count_nonzero(on, axis=1))
     indptr = np.concatenate([[0], np.cumsum(np.concatenate(lengths))])
     found = np.concatenate(values), np.concatenate(columns), indptr
@@ -242,13 +173,13 @@ def _followed(rule: Rule, task: Task, keys: Tensor, dtype: torch.dtype) -> npt.N
     # Slot n is written after the call for n: at n misses the rule sees slots 0 ... n - 1, as in the environment.
     history = torch.zeros(len(cells), choices, task.num_sensors, dtype=dtype, device=cells.device)
     for n in range(choices):
-        # Copies, for a rule may keep what it is given, or write to it.
+        # Copies, for a rule may keep its arguments, or write to them.
         state = cells.clone(), torch.full_like(cells, n), history.to(torch.bool, copy=True)
         history[:, n] = rule(*state, *(key.clone() for key in known))
     return history.cpu().numpy()
 
 
 def _generator_states() -> list[Tensor]:
-    """Of torch's global generators, the CPU's and those of all GPUs in use."""
-    gpus = torch.cuda.get_rng_state_all() if torch.cuda.is_available() and torch.cuda.is_initialized() else []
-    return [torch.get_rng_state(), *gpus]
+    """States of torch's global generators, on the CPU and on all GPUs in use."""
+    in_use = torch.cuda.is_available() and torch.cuda.is_initialized()
+    return [torch.get_rng_state(), *(torch.cuda.get_rng_state_all() if in_use else [])]

@@ -1,1 +1,1 @@
-"""What is made of results: pictures, and reports on whole sweeps."""
+"""Pictures of results, and reports on whole sweeps."""

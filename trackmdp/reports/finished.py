@@ -1,164 +1,170 @@
-"""Read a finished run from its folder: options, figures and learning curve, or the reason why that is not possible."""
+"""One finished run in its folder: options, figures, learning curve, and its policy cell by cell."""
 
 from __future__ import annotations
 
 import csv
 import io
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy import sparse
 
-from trackmdp.config.tree import flatten, plain_mapping
-from trackmdp.config.untrusted import MAX_BYTES
+from trackmdp.config.tree import flatten
 from trackmdp.errors import UserError
 from trackmdp.policies.saved import load_policy
 from trackmdp.policies.table import PolicyTable
-from trackmdp.reports.checks import LARGEST_FIGURE, check_origin, checked_figures, checked_settings
-from trackmdp.reports.results import FIGURES, Anomaly, CurvePoint, FinishedRun, Sensed, printable_settings
-from trackmdp.solvers.renewal import IndexArray, per_row
-from trackmdp.training.folders import FAILED_FILE, SUMMARY, check_files, read_summary, run_of
-from trackmdp.untrusted import decoded, known_object, printable, read_text
-from trackmdp.world.model import Array
+from trackmdp.reports.maps import MOST_MAP_CELLS
+from trackmdp.reports.results import FIGURES, HELD_OUT, FinishedRun, Mapped, checked_run
+from trackmdp.solvers import bounds, rules
+from trackmdp.solvers.hidden import averaged
+from trackmdp.solvers.linear import DIRECT_CELLS, IndexArray, per_row
+from trackmdp.solvers.value import evaluate, key_visits
+from trackmdp.training.folders import METRICS, SUMMARY, check_files, read_summary
+from trackmdp.untrusted import LARGE, decoded, parse_yaml, read_text
+from trackmdp.world.model import Array, World
+from trackmdp.world.problem_file import PROBLEM, read_problem
 
 MOST_POINTS = 16
-"""Points kept of a learning curve: evenly spaced in the logarithm of the iteration."""
+"""Points kept of a learning curve, evenly spaced in the logarithm of the iteration."""
 
-_TABLE = 2**28
-"""Bytes of the longest `metrics.csv`: two million rows."""
-
-
-def read_run(folder: Path, name: str) -> tuple[FinishedRun, Mapping[str, Any]] | Anomaly:
-    """A run and its summary, or why there is none."""
-    place = folder / name
-    if name.encode(errors="replace").decode() != name:  # in the tables it has to be text
-        return Anomaly(name, "its folder's name is not UTF-8")
-    if (place / FAILED_FILE).is_file():
-        reason = known_object(place / FAILED_FILE).get("reason", "no reason given")
-        return Anomaly(name, f"failed: {printable(str(reason))}")
-    if not place.is_dir() or not (place / "config.yaml").is_file():
-        return Anomaly(name, "not started")
-    # The summary is written last: without it a run is under way or was killed, and its figures are not final.
-    if not (place / SUMMARY).is_file():
-        running = run_of(place).state == "running"
-        return Anomaly(name, "still running" if running else f"cut: it has no {SUMMARY}")
-    try:
-        summary = read_summary(place)
-        check_files(place, summary, "config.yaml")
-        settings = printable_settings(flatten(plain_config(place)))
-        # A config of another version may lack what runs are grouped by: that is told of this run, and the others are
-        # used.
-        with decoded(str(place / "config.yaml"), "the config of a run"):
-            checked_settings(settings)
-        with decoded(str(place / SUMMARY), "the summary of a run"):
-            if not isinstance(summary["config_sha256"], str):
-                raise TypeError("config_sha256: expected a digest")
-            for key in ("versions", "machine"):
-                check_origin(key, summary.get(key, {}))
-            return FinishedRun(name, settings, _figures(summary), summary["config_sha256"]), summary
-    except UserError as error:
-        return Anomaly(name, str(error).replace(f"{place}/", ""))
+_TRACKED = {name: name.removeprefix("held_out_") for name in HELD_OUT}
+_BOUNDS = {"printed bound": "paper", "valid bound": "valid", "clocked bound": "clocked"}
 
 
-def plain_config(place: Path) -> Mapping[str, Any]:
-    """The plain config of a run, which another version may have written.
+def read_run(place: Path, name: str) -> tuple[FinishedRun, Mapping[str, Any]]:
+    """The run in the folder `place`, and its summary.
 
     Raises:
-        UserError: it cannot be read.
+        UserError: a file is missing, damaged, or of another run.
     """
-    file = place / "config.yaml"
-    return plain_mapping(read_text(file, most=MAX_BYTES), str(file))
+    summary = read_summary(place)
+    check_files(place, summary, "config.yaml")
+    config = parse_yaml(read_text(place / "config.yaml"), str(place / "config.yaml"))
+    curve = read_curve(place, summary) if (place / METRICS).is_file() else []
+    with decoded(str(place / SUMMARY), "the summary of a run"):
+        return (
+            checked_run(name, flatten(config), _figures(summary), _references(summary), curve),
+            summary,
+        )
 
 
-def _figures(summary: Mapping[str, Any]) -> dict[str, float | None]:
-    """`FIGURES` of a summary; on recorded tracks there is no Q_MDP, no bound and no optimum."""
-    groups = {"qmdp": summary["qmdp"], "bound": summary["bounds"], "optimal": summary["optimal"]}
-    raw = {key: summary[key] for key in ("frames", "wall_seconds", "cpu_seconds")} | summary["policy"]
-    raw |= {f"{group}_{key}": value for group, values in groups.items() for key, value in (values or {}).items()}
-    return checked_figures({key: raw.get(key) for key in FIGURES})
+def _figures(summary: Mapping[str, Any]) -> dict[str, Any]:
+    """`FIGURES` of a summary, and `HELD_OUT` where there are validation tracks."""
+    validation, policy = summary.get("validation"), summary["policy"]
+    solved = {f"optimal_{key}": value for key, value in (summary["optimal"] or {}).items()}
+    # On recordings figures are compared, and options chosen, by the validation tracks alone.
+    known = {**summary, **(validation or policy), **solved}
+    held_out = {name: policy.get(own) for name, own in _TRACKED.items()} if validation else {}
+    return {name: known.get(name) for name in FIGURES} | held_out
 
 
-def read_curve(file: Path) -> list[CurvePoint]:
-    """The points of a run's `metrics.csv` at which the policy was evaluated, thinned; none where it cannot be read."""
-    try:
-        text = read_text(file, most=_TABLE)
-        with decoded(str(file), "a learning curve"):
-            points = _points(text)
-    except UserError:
-        return []
+def _references(summary: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Figures of other policies and bounds in the same world; on recordings those on the held-out tracks."""
+    if held_out := summary.get("held_out"):
+        return {
+            name: {key: figures[own]["mean"] for key, own in _TRACKED.items()}
+            for name, figures in held_out["figures"].items()
+            if name != "policy"
+        }
+    policies = {"Q_MDP": summary["qmdp"], **summary.get("references", {})}
+    found = {
+        name: {key: each.get(key) for key in _TRACKED.values()}
+        for name, each in policies.items()
+        if each
+    }
+    bounds_known = {name: summary["bounds"].get(key) for name, key in _BOUNDS.items()}
+    return found | {
+        name: {"aihtr": value} for name, value in bounds_known.items() if value is not None
+    }
+
+
+def read_curve(place: Path, summary: Mapping[str, Any]) -> Sequence[Sequence[float]]:
+    """Points (frames, seconds, AIHTR) of the evaluations in `metrics.csv`, thinned to `MOST_POINTS`.
+
+    Raises:
+        UserError: the file is damaged or of another run.
+    """
+    file = place / METRICS
+    check_files(place, summary, METRICS)
+    with decoded(str(file), "a learning curve"):
+        rows = csv.DictReader(io.StringIO(read_text(file, most=LARGE), newline=""))
+        columns = ("frames", "seconds", "aihtr")
+        # An iteration without an evaluation has an empty field.
+        points = [tuple(float(row[key]) for key in columns) for row in rows if row["aihtr"]]
     if len(points) <= MOST_POINTS:
         return points
-    # More points early, where a curve moves; the last one always, since it is what the run came to.
     wanted = np.geomspace(1, len(points), MOST_POINTS).round().astype(int) - 1
-    return [points[place] for place in sorted({*wanted.tolist(), len(points) - 1})]
+    return [points[place] for place in np.unique(wanted)]
 
 
-def _points(text: str) -> list[CurvePoint]:
-    """The points, in the order of iterations as they were written."""
-    points: list[CurvePoint] = []
-    for row in csv.DictReader(io.StringIO(text, newline="")):
-        # Most iterations are not evaluated, and have an empty field.
-        if not row.get("aihtr"):
-            continue
-        last = points[-1] if points else CurvePoint(0, 0, 0.0, 0.0)
-        point = CurvePoint(int(row["iteration"]), int(row["frames"]), float(row["seconds"]), float(row["aihtr"]))
-        if not (
-            last.iteration < point.iteration < LARGEST_FIGURE and max(last.frames, 1) <= point.frames < LARGEST_FIGURE
-        ):
-            raise ValueError("iterations or frames that do not grow")
-        if not (
-            0 <= point.seconds < LARGEST_FIGURE and math.isfinite(point.aihtr) and abs(point.aihtr) < LARGEST_FIGURE
-        ):
-            raise ValueError("a number out of range")
-        points.append(point)
-    return points
-
-
-def read_sensed(file: Path, size: tuple[int, int], t_max: Any, visits: Callable[[PolicyTable], Array]) -> Sensed:
-    """Read a policy back.
-
-    Args:
-        file: of a run.
-        size: rows and columns of the run's grid.
-        t_max: of the run, as its config has it.
-        visits: `[keys]` of a policy that remembers or is told more than the cell, how often it comes to each key: its
-            plans for one cell are averaged with these weights.
+def read_map(place: Path, run: FinishedRun, world: str, method: str) -> Mapped | None:
+    """The policy of the run in the folder `place`, cell by cell; None on recordings, which have no motion.
 
     Raises:
-        UserError: the file is missing or damaged, or holds something else, as the policy of another grid or t_max.
+        UserError: a file is missing, damaged, or of another run.
     """
-    table, value = load_policy(file)
-    # First of all: a table of one size and visits of another would be taken together below, at any length.
-    if (table.task.size, table.task.t_max) != (size, t_max):
-        raise UserError(f"{file}: not the policy of this run (of another grid or t_max)")
-    if value is None:
-        raise UserError(f"{file}: not the policy of a run (it has no values)")
-    if not (np.abs(value) < LARGEST_FIGURE).all():
-        raise UserError(f"{file}: not the policy of a run (a value out of range)")
+    check_files(place, read_summary(place), "policy.npz", PROBLEM)
+    problem = read_problem(place / PROBLEM).model
+    if problem is None:
+        return None
+    table, value = load_policy(place / "policy.npz")
+    if table.task.size != problem.size or table.task.t_max != problem.t_max or value is None:
+        raise UserError(f"{place / 'policy.npz'}: not the policy of this run")
     if not table.deterministic:
-        raise UserError("policy: draws its sets at random, so that there is no table of them")
+        raise UserError(f"{place / 'policy.npz'}: sets drawn at random, so that there is no map")
+    sets = sensed_cells(table)
+    if table.task.keyed:
+        sets = averaged_sets(table, sets, key_visits(problem, table))
+    kernel, bound, simple = _references_by_cell(problem)
+    return Mapped(
+        *(world, method, run.seed, table.task.size),
+        averaged=table.task.keyed,
+        sets=sets.astype(np.float64),
+        value=value,
+        kernel=kernel,
+        bound=bound,
+        qmdp=simple,
+    )
+
+
+def sensed_cells(table: PolicyTable) -> sparse.csr_array:
+    """`[keys (t_max + 1), M]` bool: cells in view of the sensors that a deterministic policy switches on."""
     task = table.task
-    # One probability for all sensors is written out: all of them on, on a grid small enough, or none.
     shape = (task.num_keys * task.num_choices, task.total_sensors)
-    sets = table.sets
-    if sets is None:
-        sets = sparse.csr_array(table.dense().reshape(shape) if table.probability else shape, dtype=bool)
-    sets = sets if task.coverage is None else task.coverage.seen(sets)
-    return Sensed(_averaged(table, sets, visits(table)) if task.keyed else sets, value)
+    # A probability of 1 or 0 stands for all sensors on or none.
+    whole = table.dense().reshape(shape) if table.probability else shape
+    sets = sparse.csr_array(whole, dtype=bool) if table.sets is None else table.sets
+    return PolicyTable(task, sets).seen
 
 
-def _averaged(policy: PolicyTable, sets: sparse.csr_array, visits: Array) -> sparse.csr_array:
-    """`[M (t_max + 1), M]`, means of `sets` `[keys (t_max + 1), M]` over the keys of each cell."""
-    task = policy.task
+def averaged_sets(table: PolicyTable, sets: sparse.csr_array, visits: Array) -> sparse.csr_array:
+    """`[M (t_max + 1), M]`, means of `sets` `[keys (t_max + 1), M]` over the keys of each cell.
+
+    Args:
+        table: the policy.
+        sets: see `sensed_cells`.
+        visits: `[keys]`, weights: expected visits of each key.
+    """
+    task = table.task
     keys: IndexArray = np.arange(task.num_keys)
     cells = task.keys.cell(keys)
-    # no cell without visits: episodes start anywhere
+    # Episodes start in every cell: no sum of visits is 0.
     share = visits / per_row(cells, visits, task.num_cells)[cells]
     means = sparse.csr_array((share, (cells, keys)), shape=(task.num_cells, task.num_keys))
-    # Row x (t_max + 1) + n of the result is that of the keys at the same n.
-    found = sparse.kron(means, sparse.eye_array(task.num_choices), format="csr") @ sets.astype(np.float64)
-    found.sort_indices()
-    return sparse.csr_array(found)
+    # Row x (t_max + 1) + n of the result: the mean of rows key (t_max + 1) + n over the keys of x.
+    found = sparse.kron(means, sparse.eye_array(task.num_choices), format="csr") @ sets.astype(
+        np.float64
+    )
+    return sparse.csr_array(found).sorted_indices()
+
+
+def _references_by_cell(problem: World) -> tuple[sparse.csr_array, Array, Array]:
+    """Motion `[M, M]`, clocked bound `[M]` and value of Q_MDP `[M]`."""
+    world, bound = averaged(problem), bounds.clocked(problem)
+    m = world.num_cells
+    kernel = world.kernel if m <= MOST_MAP_CELLS else sparse.csr_array(world.kernel.shape)
+    # Q_MDP on a large grid takes minutes and gigabytes where it senses little.
+    simple = evaluate(problem, rules.qmdp(world)).value if m <= DIRECT_CELLS else np.full(m, np.nan)
+    return kernel, bound, simple

@@ -1,24 +1,28 @@
-"""Runs in groups: the world a run took place in, the method that learned, and the seed within them."""
+"""Runs in groups: the world of a run, the method that learned, and the seeds within them."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from trackmdp.reports.results import FinishedRun
 
-# The order of legends and tables, the same in every report; an algorithm that is not listed comes after these.
-ORDER = ("a2c", "hindsight", "ppo", "dqn", "learned_kernel")
+# Order of legends and tables; other algorithms follow.
+ORDER = ("a2c", "hindsight", "ppo", "dqn", "model_based")
 SHORT = {"kernel.support_size": "Z", "cost.sensor": "c", "grid.size": "N", "grid.t_max": "T_max"}
-WORLD = ("grid.", "kernel.", "cost.")
-TOLD = "kernel.homogeneous"
-"""What a learner is told of the motion; it is the method's, not the world's."""
-# What these hold changes how or how long a run is carried out, or which draw it is, not what is learned from.
-NOT_METHOD = ("seed", "quiet", "device", "threads", "resume", "init_from")
-NOT_METHOD_GROUPS = ("log.", "checkpoint.", "evaluation.", "optimal.")
+OPEN = 5e-5
+"""Regret per step that no figure of four digits shows: a narrower bracket is an optimum."""
+_WORLD = ("grid.", "kernel.", "cost.", "sensor.")
+_KNOWLEDGE = "kernel.homogeneous"
+"""An option of the kernel that only the learner reads."""
+# Options of no effect on the learned policy, or of its draw.
+_IGNORED = ("seed", "quiet", "device", "threads", "resume", "init_from")
+_IGNORED_GROUPS = ("log.", "checkpoint.", "evaluation.", "optimal.")
+
+Options = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -26,141 +30,185 @@ class Study:
     """Runs by world and method.
 
     Attributes:
-        runs: all of them.
         worlds: labels, in order.
         methods: labels, in order.
-        groups: (world, method) -> its runs, by seed; in the order of worlds, then of methods.
+        groups: (world, method) -> runs by seed; in the order of worlds, then of methods.
     """
 
-    runs: Sequence[FinishedRun]
     worlds: Sequence[str]
     methods: Sequence[str]
     groups: Mapping[tuple[str, str], Sequence[FinishedRun]]
 
     def of(self, world: str, method: str) -> Sequence[FinishedRun]:
-        """The runs of a method in a world, one per seed."""
+        """Runs of a method in a world, one per seed."""
         return self.groups.get((world, method), ())
 
     def in_world(self, world: str) -> list[FinishedRun]:
         """All runs in a world."""
         return [run for method in self.methods for run in self.of(world, method)]
 
-    def known(self, world: str, *names: str) -> list[float]:
-        """The figures of these names that the runs in a world have."""
-        found = [run.figures[name] for run in self.in_world(world) for name in names]
-        return [value for value in found if value is not None]
+    def by_method(self, method: str) -> list[FinishedRun]:
+        """All runs of a method."""
+        return [run for world in self.worlds for run in self.of(world, method)]
+
+    @property
+    def recorded(self) -> bool:
+        """Whether some runs learned from recordings."""
+        return any(
+            "held_out_aihtr" in run.figures for group in self.groups.values() for run in group
+        )
+
+    def references(self) -> list[str]:
+        """Names of the policies and bounds that runs are compared with."""
+        return [
+            *dict.fromkeys(
+                name for group in self.groups.values() for run in group for name in run.references
+            )
+        ]
+
+    def title(self, reference: str) -> str:
+        """The name of a policy or bound as it is shown: `best known` is the optimum where all brackets are closed."""
+        closed = all(self.bracket(world) < OPEN for world in self.worlds)
+        return "optimum" if closed and reference == "best known" else reference
+
+    def value(self, world: str, run: FinishedRun, key: str) -> float:
+        """A figure of a run, or its `regret` per step to the best upper bound; nan where unknown."""
+        return self.regret(run, world) if key == "regret" else run.figure(key)
+
+    def values(self, world: str, method: str, key: str) -> list[float]:
+        """The known values of a figure of all runs of a method in a world."""
+        return _known(self.value(world, run, key) for run in self.of(world, method))
+
+    def regrets(self, method: str) -> list[list[float]]:
+        """Regret per step of the runs of a method, by world; without worlds that have no bound."""
+        groups = [self.values(world, method, "regret") for world in self.worlds]
+        return [group for group in groups if group]
+
+    def reference(self, world: str, name: str, key: str) -> float:
+        """The same of another policy or bound in a world, the largest where runs differ."""
+        runs = self.in_world(world)
+        if key == "regret":
+            return self.regret(runs[0], world, self.reference(world, name, "aihtr"))
+        found = (run.references.get(name, {}).get(key) for run in runs)
+        return max(_known(found), default=math.nan)
 
     def upper(self, world: str) -> float:
-        """The best proved upper bound on the AIHTR in a world; nan where there is none, as on recorded tracks."""
-        # A bound holds for the world, whichever run found it: the least of all is the tightest.
-        return min(self.known(world, "optimal_upper", "bound_clocked"), default=math.nan)
+        """Least proved upper bound on the AIHTR in a world; nan on recordings."""
+        proved = [run.figure("optimal_upper") for run in self.in_world(world)]
+        return min(
+            _known([*proved, self.reference(world, "clocked bound", "aihtr")]), default=math.nan
+        )
 
     def lower(self, world: str) -> float | None:
-        """The best AIHTR that the solver attained in a world."""
-        return max(self.known(world, "optimal_lower"), default=None)
+        """Best AIHTR of a policy of the solver in a world."""
+        found = (run.figure("optimal_lower") for run in self.in_world(world))
+        return max(_known(found), default=None)
 
     def best(self, world: str) -> float:
-        """The AIHTR of the best policy known in a world, the solver's or a run's; nan where no bound is known."""
-        if math.isnan(self.upper(world)):
-            return math.nan
-        return max(self.known(world, "optimal_lower", "qmdp_aihtr", "aihtr"), default=math.nan)
+        """AIHTR of the best policy known in a world."""
+        learned = [run.figure("aihtr") for run in self.in_world(world)]
+        return max(_known([*learned, self.lower(world), self.reference(world, "Q_MDP", "aihtr")]))
 
     def regret(self, run: FinishedRun, world: str, aihtr: float | None = None) -> float:
-        """Distance per step to the best proved upper bound, of the run's policy or of one that earns `aihtr`."""
+        """Distance per step from the best upper bound to the AIHTR of the run, or to `aihtr`; nan without a bound."""
         earned = run.figure("aihtr") if aihtr is None else aihtr
-        # Per step, so that worlds whose targets stay for a different time can be averaged.
+        # Per step: worlds with different lengths of stay can be averaged.
         return (self.upper(world) - earned) / run.figure("expected_length")
 
     def bracket(self, world: str) -> float:
-        """Per step, how far the regrets in a world may be too large: from the best policy known to the bound."""
-        run = self.in_world(world)[0]
-        return self.regret(run, world, self.best(world))
+        """Largest error per step of the regrets in a world: from the best policy known to the bound."""
+        return self.regret(self.in_world(world)[0], world, self.best(world))
 
-    def regrets(self, world: str, method: str) -> list[float]:
-        """Regret per step of each run; none where no bound is known."""
-        known = not math.isnan(self.upper(world))
-        return [self.regret(run, world) for run in self.of(world, method)] if known else []
+
+def _known(values: Iterable[float | None]) -> list[float]:
+    return [value for value in values if value is not None and math.isfinite(value)]
 
 
 def study(runs: Sequence[FinishedRun]) -> Study:
-    """Group `runs`; labels name only what differs between them."""
-    varied = _varied(runs)
-    labels = {run.name: (_world_label(run, varied), _method_label(run, varied)) for run in runs}
-    # Reversed, so that the first of the runs with one label decides: later entries of a dict overwrite.
-    order = {labels[run.name]: _order(run, varied) for run in reversed(runs)}
-    groups: dict[tuple[str, str], list[FinishedRun]] = {}
-    for run in sorted(runs, key=lambda run: (order[labels[run.name]], run.seed, run.name)):
-        groups.setdefault(labels[run.name], []).append(run)
-    worlds = dict.fromkeys(world for world, _ in sorted(groups, key=lambda label: order[label][0]))
-    methods = dict.fromkeys(method for _, method in sorted(groups, key=lambda label: order[label][1]))
-    return Study(runs, list(worlds), list(methods), groups)
-
-
-def world_key(run: FinishedRun) -> str:
-    """The same for runs in the same world."""
-    return json.dumps({key: value for key, value in run.settings.items() if _of_world(key)}, sort_keys=True)
+    """Group runs; a label names the options that differ between them."""
+    worlds = _labels(
+        runs, "kernel.name", _world_options, named=("kernel.support_size", "cost.sensor")
+    )
+    methods = _labels(runs, "algo.name", _method_options)
+    groups: dict[tuple[str, str], list[FinishedRun]] = {
+        (world, method): [] for world in worlds.values() for method in methods.values()
+    }
+    for run in sorted(runs, key=lambda run: (run.seed, run.name)):
+        groups[worlds[run.name], methods[run.name]].append(run)
+    # Not every method ran in every world.
+    filled = {labels: group for labels, group in groups.items() if group}
+    return Study([*dict.fromkeys(worlds.values())], [*dict.fromkeys(methods.values())], filled)
 
 
 def _of_world(key: str) -> bool:
-    return key.startswith(WORLD) and key != TOLD
+    return key.startswith(_WORLD) and key != _KNOWLEDGE
 
 
-def _varied(runs: Sequence[FinishedRun]) -> list[str]:
-    """Options that go into labels: they differ within an algorithm (or a world) and no earlier one determines them."""
-    values: dict[str, dict[str, set[str]]] = {}
-    for run in runs:
-        for key, value in run.settings.items():
-            # Per algorithm: that PPO and A2C have other learning rates does not tell two runs of PPO apart.
-            owner = "" if _of_world(key) else run.algo
-            values.setdefault(key, {}).setdefault(owner, set()).add(json.dumps(value))
-    found = [key for key, owned in values.items() if any(len(each) > 1 for each in owned.values())]
-    found = [key for key in found if key not in NOT_METHOD and not key.startswith(NOT_METHOD_GROUPS)]
-    kept: list[str] = []
-    # Options with a short name first, since of two that go together the one found first is kept.
-    for key in sorted(found, key=lambda key: (not _of_world(key), key not in SHORT, key)):
-        # A sweep over the price may set another option along with it; a label that names both says one thing twice.
-        if key != "algo.name" and not any(_follows(runs, key, other) for other in kept):
+def _world_options(run: FinishedRun) -> Options:
+    found = {key: value for key, value in run.settings.items() if _of_world(key)}
+    # The options with a short name first: of options that vary together the first one is named.
+    return {key: found[key] for key in SHORT if key in found} | found
+
+
+def _method_options(run: FinishedRun) -> Options:
+    return {
+        key: value
+        for key, value in run.settings.items()
+        if not _of_world(key) and key not in _IGNORED and not key.startswith(_IGNORED_GROUPS)
+    }
+
+
+def _labels(
+    runs: Sequence[FinishedRun],
+    head: str,
+    options: Callable[[FinishedRun], Options],
+    named: Sequence[str] = (),
+) -> dict[str, str]:
+    """Name of each run -> label of its world or method, in the order of the labels.
+
+    Args:
+        runs: all runs.
+        head: option with the name of the kernel or the algorithm, which begins a label.
+        options: the options of the world or the method of a run.
+        named: options that every label names, whether they differ or not.
+    """
+    found = {run.name: options(run) for run in runs}
+    keys = [*dict.fromkeys((*named, *_varied([*found.values()], head)))]
+
+    def order(run: FinishedRun) -> Any:
+        name = found[run.name][head]
+        place = ORDER.index(name) if name in ORDER else len(ORDER)
+        return place, name, [_sortable(found[run.name].get(key)) for key in keys]
+
+    return {run.name: _label(found[run.name], head, keys) for run in sorted(runs, key=order)}
+
+
+def _varied(settings: Sequence[Options], head: str) -> list[str]:
+    """Options that differ between runs of one `head`, without options that follow from an earlier one."""
+    texts = [{key: json.dumps(value) for key, value in each.items()} for each in settings]
+
+    def values(*keys: str) -> int:
+        return len({tuple(each.get(key) for key in keys) for each in texts})
+
+    kept = [head]
+    for key in dict.fromkeys(key for each in settings for key in each):
+        # As many triples as pairs: the value of `key` follows from the other two.
+        if all(values(head, other, key) > values(head, other) for other in kept):
             kept.append(key)
-    return kept
+    return kept[1:]
 
 
-def _follows(runs: Iterable[FinishedRun], key: str, other: str) -> bool:
-    """Whether `key` is determined by `other` on these runs; both belong to the world, or both to the method."""
-    if _of_world(key) != _of_world(other):
-        return False
-    seen: dict[str, str] = {}
-    pairs = [(run.algo + json.dumps(run.settings.get(other)), json.dumps(run.settings.get(key))) for run in runs]
-    # Whether `other` -> `key` is a function on these runs.
-    return all(seen.setdefault(mine, its) == its for mine, its in pairs)
+def _label(options: Options, head: str, keys: Sequence[str]) -> str:
+    parts = [f"{_short(key)}={_text(options[key])}" for key in keys if options.get(key) is not None]
+    name = str(options[head])
+    # Z stands for the kernel of the paper.
+    return ", ".join(parts if name == "random_support" else [name, *parts])
 
 
-def _world_label(run: FinishedRun, varied: Sequence[str]) -> str:
-    # Z and c name the paper's worlds, also where a sweep has one value of them.
-    always = ["kernel.support_size", "cost.sensor"]
-    keys = [*always, *(key for key in varied if _of_world(key) and key not in always)]
-    named = [f"{_short(key)}={_text(run.settings[key])}" for key in keys if run.settings.get(key) is not None]
-    kernel = run.settings.get("kernel.name")
-    return ", ".join(named if kernel == "random_support" else [str(kernel), *named])
-
-
-def _method_label(run: FinishedRun, varied: Sequence[str]) -> str:
-    keys = [key for key in varied if not _of_world(key) and key in run.settings]
-    return ", ".join([run.algo, *(f"{_short(key)}={_text(run.settings[key])}" for key in keys)])
-
-
-def _order(run: FinishedRun, varied: Sequence[str]) -> tuple[Any, Any]:
-    world = [_sortable(run.settings.get(key)) for key in [*SHORT, *varied] if key in SHORT or _of_world(key)]
-    place = ORDER.index(run.algo) if run.algo in ORDER else len(ORDER)
-    method = [_sortable(run.settings.get(key)) for key in varied if not _of_world(key)]
-    return world, (place, run.algo, method)
-
-
-def _sortable(value: Any) -> tuple[int, float, str]:
-    # Numbers by size, 0.16 before 0.2; everything else after them by its text. The pair keeps the two from being
-    # compared.
-    if isinstance(value, (int, float)) and not isinstance(value, bool):
-        return 0, float(value), ""
-    return 1, 0.0, json.dumps(value)
+def _sortable(value: Any) -> tuple[float, str]:
+    """Numbers by size, 0.16 before 0.2; other values after them by their text."""
+    number = isinstance(value, (int, float))
+    return (float(value), "") if number else (math.inf, json.dumps(value))
 
 
 def _short(key: str) -> str:

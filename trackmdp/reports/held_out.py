@@ -1,9 +1,11 @@
-"""The page of a policy on recorded tracks: what it earns beside others, where it senses, and one track step by step."""
+"""The page of a policy on recorded tracks: its reward beside others, its sensors on the map, one track step by step."""
 
 from __future__ import annotations
 
 import html
+import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,18 +13,31 @@ import numpy as np
 from trackmdp.episodes.episode import Episode
 from trackmdp.reports.page import Report, Section
 from trackmdp.reports.tables import Cell, Column, Table, paragraphs
-from trackmdp.solvers.recorded import ReplayedTracks
+from trackmdp.solvers.evaluation import ReplayedTracks
 from trackmdp.world.gridding import said
 from trackmdp.world.model import Array
-from trackmdp.world.tracks import Recorded, Tracks
+from trackmdp.world.tracks import Recorded
 
 _STEPS = 8
 """Steps of a track that are drawn."""
 _MOST_TRACKS = 400
-"""Tracks whose lines are drawn; the others count in the shades."""
-_FIGURES = {"reward_per_step": ("reward per step", 1, 4), "accuracy": ("located, %", 100, 1)}
-_FIGURES |= {"sensors_per_step": ("sensors per step", 1, 2)}
-"""Figure -> its column, factor and decimals."""
+"""Tracks with a line; all of them count in the shades."""
+_FIGURES = {
+    "reward_per_step": Column("reward per step", 4),
+    "accuracy": Column("located", 1, "%"),
+    "sensors_per_step": Column("sensors per step", 2),
+    "aihtr": Column("AIHTR", 2),
+}
+
+
+@dataclass(frozen=True)
+class Extent:
+    """Rows and columns of a grid, from `top` and `left` on."""
+
+    top: int
+    left: int
+    rows: int
+    columns: int
 
 
 def recorded_page(
@@ -36,58 +51,115 @@ def recorded_page(
 
     Args:
         problem: the tracks and the task.
-        subject: what "policy" is called.
+        subject: name of the policy.
         report: of `HeldOutEvaluator`.
-        replayed: name of a policy in the report -> what it did on the held-out tracks; the policies that are drawn.
+        replayed: name of a policy in the report -> its actions on the held-out tracks; the policies that are drawn.
         episodes: the same names -> each policy on some held-out tracks, the same for all.
     """
-    names = {name: subject if name == "policy" else name for name in report["figures"]}
-    about = (
+    # `trained` adds the file of the checkpoint to the name of the algorithm.
+    own = subject.partition(", ")[0]
+    names = {name: own if name == "policy" else name for name in report["figures"]}
+    chosen = {
+        name: max(each, key=lambda one: len(np.unique(one.target[:_STEPS])))
+        for name, each in episodes.items()
+    }
+    part = _part(problem, chosen.values())
+    tracks = len(next(iter(episodes.values())))
+    where = (
+        f"Drawn: rows {part.top + 1} to {part.top + part.rows}, columns {part.left + 1} to "
+        f"{part.left + part.columns}, the dashed frame in the maps."
+    )
+    note = f"{paragraphs('trackmdp.reports')['steps'].format(steps=_STEPS, tracks=tracks)} {where}"
+    strips = [
+        f"<h3>{html.escape(names[name])}</h3>{_strip(problem, each, part)}"
+        for name, each in chosen.items()
+    ]
+    sections = [
+        Section("earns", "Rewards", [_table(names, report)]),
+        Section("where", "Sensors on the map", [_maps(problem, names, replayed, part)]),
+        Section(
+            "steps", "One held-out track, step by step", [f"<p>{html.escape(note)}</p>", *strips]
+        ),
+    ]
+    return Report(_about(problem, report), sections, title="A policy on recorded tracks")
+
+
+def _about(problem: Recorded, report: Mapping[str, Any]) -> str:
+    prices = " to ".join(
+        f"{each:g}" for each in np.unique([problem.cost.min(), problem.cost.max()])
+    )
+    text = (
         f"{report['tracks']:,} held-out tracks, {report['learned_from']:,} to learn from, {report['validation']:,} to "
         f"choose by; {problem.rows} x {problem.columns} cells, T_max {problem.t_max}, r {problem.reward:g}, "
-        f"c {' to '.join(f'{each:g}' for each in {problem.cost.min(): 0, problem.cost.max(): 0})}, "
-        f"D {problem.safe_cost:g}. "
+        f"c {prices}, D {problem.safe_cost:g}."
     )
-    shares = {name: each.watched / max(each.totals[:, 1].sum(), 1) for name, each in replayed.items()}
-    most = max(float(share.max()) for share in shares.values())
-    maps = [_figure(_recording(problem), "The held-out tracks, on the cells they visit (stronger: more often).")]
-    for name, share in shares.items():
-        about_it = f"share of steps in which a cell is sensed, at most {share.max():.1%}; same shades in all."
-        drawing = _svg(problem.size, _shaded(problem, share / (most or 1.0)))
-        maps.append(_figure(drawing, f"{names[name]}: {about_it}"))
-    chosen = {name: max(each, key=lambda one: len(np.unique(one.target[:_STEPS]))) for name, each in episodes.items()}
-    part = _part(problem, chosen.values())
-    strips = [f"<h3>{html.escape(names[name])}</h3>{_strip(problem, each, part)}" for name, each in chosen.items()]
-    note = f"<p>{paragraphs('trackmdp.reports')['steps'].format(steps=_STEPS)}</p>"
-    sections = [
-        Section("earns", "What it earns", [_table(names, report)]),
-        Section("where", "Where it senses", [f'<div class="figures">{"".join(maps)}</div>']),
-        Section("steps", "One held-out track, step by step", [note, *strips]),
-    ]
-    about += f"Loaded: {said(problem.loaded)}." if problem.loaded else ""
-    return Report(html.escape(about), sections, title="A policy on recorded tracks")
+    return f"{text} Loaded: {said(problem.loaded)}." if problem.loaded else text
 
 
 def _table(names: Mapping[str, str], report: Mapping[str, Any]) -> Table:
     columns = [Column("policy")]
-    for label, _, digits in _FIGURES.values():
-        columns += [Column(label, digits), Column("95 %")]
+    for column in _FIGURES.values():
+        columns += [column, Column("95 % from", column.digits), Column("to", column.digits)]
     rows: list[list[Cell]] = []
     for name, figures in report["figures"].items():
         row: list[Cell] = [names[name]]
-        for key, (_, factor, digits) in _FIGURES.items():
-            mean, low, high = (figures[key][end] for end in ("mean", "low", "high"))
-            ends = [Column("", digits).text(None if end is None else factor * end) for end in (low, high)]
-            row += [factor * mean, " ... ".join(ends)]
+        for key, column in _FIGURES.items():
+            ends = (figures[key][end] for end in ("mean", "low", "high"))
+            factor = 100 if column.unit == "%" else 1
+            row += [None if end is None else factor * end for end in ends]
         rows.append(row)
     caption = f"Means over {report['tracks']:,} held-out tracks with 95 % intervals over targets"
     return Table("held-out", caption, columns, rows)
 
 
-def _recording(problem: Recorded) -> str:
-    """The cells shaded by visits, and the tracks as lines from cell to cell."""
-    tracks: Tracks = problem.held_out
+def _maps(
+    problem: Recorded,
+    names: Mapping[str, str],
+    replayed: Mapping[str, ReplayedTracks],
+    part: Extent,
+) -> str:
+    """The recording, and for each policy the share of steps in which a cell is sensed, in the same shades."""
+    tracks = problem.held_out
     visits = np.bincount(tracks.cells, minlength=problem.num_cells).astype(np.float64)
+    frame = _box(part, 'stroke="var(--text)" stroke-dasharray=".4 .3"')
+    recording = _map(
+        problem, visits, visits.max(), f"{visits.max():,.0f} visits", _lines(problem) + frame
+    )
+    drawn = [_figure(recording, "The held-out tracks, on the cells they visit.")]
+    shares = {
+        name: each.watched / max(each.totals[:, 1].sum(), 1) for name, each in replayed.items()
+    }
+    most = max(float(share.max()) for share in shares.values()) or 1.0
+    for name, share in shares.items():
+        caption = f"{names[name]}: share of the steps in which a cell is sensed."
+        drawn.append(_figure(_map(problem, share, most, f"{most:.1%}", frame), caption))
+    return f'<div class="figures">{"".join(drawn)}</div>'
+
+
+def _map(problem: Recorded, values: Array, most: float, label: str, above: str) -> str:
+    """Cells shaded by `values` `[M]` from 0 to `most`; below them a legend of the shades, a scale bar and north."""
+    shades = (f'<span style="opacity:{(k / 4) ** 0.5:.2f}">■</span>' for k in range(1, 5))
+    legend = f'0 <span style="color:var(--blue)">{"".join(shades)}</span> {html.escape(label)}'
+    if place := problem.place:
+        length = _round_length(problem.columns * place.cell / 3)
+        wide = 100 * length / (problem.columns * place.cell)
+        north = "north" if place.crs else "y"
+        words = f"{length:g}{' m' if place.crs else ''}; {north} points {'down' if place.downwards else 'up'}"
+        legend += f'<div style="border-top:3px solid;width:{wide:.1f}%"></div>{words}'
+    whole = Extent(0, 0, problem.rows, problem.columns)
+    drawing = _svg(whole, f"{_shaded(problem, values / most)}{above}")
+    return f'{drawing}<div class="legend">{legend}</div>'
+
+
+def _round_length(most: float) -> float:
+    """The largest of 1, 2, 5, 10, ... that is at most `most`."""
+    power = 10.0 ** math.floor(math.log10(most))
+    return max(factor * power for factor in (1, 2, 5) if factor * power <= most)
+
+
+def _lines(problem: Recorded) -> str:
+    """Tracks as lines from cell to cell."""
+    tracks = problem.held_out
     drawn = np.linspace(0, len(tracks) - 1, min(len(tracks), _MOST_TRACKS)).astype(np.int64)
     x, y = tracks.cells % problem.columns + 0.5, tracks.cells // problem.columns + 0.5
     paths = (
@@ -96,52 +168,61 @@ def _recording(problem: Recorded) -> str:
     )
     lines = "".join(f'<polyline points="{path}"/>' for path in paths)
     style = 'fill="none" stroke="var(--vermilion)" stroke-width=".08" stroke-opacity=".35" stroke-linejoin="round"'
-    return _svg(problem.size, f"{_shaded(problem, visits / visits.max())}<g {style}>{lines}</g>")
+    return f"<g {style}>{lines}</g>"
 
 
 def _shaded(problem: Recorded, share: Array) -> str:
-    """Squares of the cells with `share` `[M]` above 0; their opacity grows with its root, so that small ones show."""
-    places = zip(np.flatnonzero(share > 0), share[share > 0] ** 0.5, strict=True)
-    corners = ((cell % problem.columns, cell // problem.columns, depth) for cell, depth in places)
-    squares = (f'<path d="M{x} {y}h1v1h-1z" fill-opacity="{depth:.2f}"/>' for x, y, depth in corners)
+    """Squares of the cells with `share` `[M]` above 0; their opacity is its root, so that small shares are seen."""
+    cells = np.flatnonzero(share > 0).tolist()
+    places = (f"M{cell % problem.columns} {cell // problem.columns}h1v1h-1z" for cell in cells)
+    squares = (
+        f'<path d="{place}" fill-opacity="{share[cell] ** 0.5:.2f}"/>'
+        for place, cell in zip(places, cells, strict=True)
+    )
     return f'<g fill="var(--blue)">{"".join(squares)}</g>'
 
 
-def _part(problem: Recorded, episodes: Iterable[Episode]) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Rows and columns of the smallest part of the grid with all that is drawn of some episodes, and its corner."""
+def _part(problem: Recorded, episodes: Iterable[Episode]) -> Extent:
+    """The smallest part of the grid with all that is drawn of some episodes."""
     seen = np.zeros(problem.num_cells + 1, dtype=bool)  # the exit is cell M
     for episode in episodes:
         seen[[episode.start, *episode.target[:_STEPS]]] = True
         seen[:-1] |= problem.covered(episode.action[:_STEPS]).any(axis=0)
     rows, columns = np.divmod(np.flatnonzero(seen[:-1]), problem.columns)
-    return (int(np.ptp(rows)) + 1, int(np.ptp(columns)) + 1), (int(rows.min()), int(columns.min()))
+    top, left = int(rows.min()), int(columns.min())
+    return Extent(top, left, int(np.ptp(rows)) + 1, int(np.ptp(columns)) + 1)
 
 
-def _strip(problem: Recorded, episode: Episode, part: tuple[tuple[int, int], tuple[int, int]]) -> str:
+def _strip(problem: Recorded, episode: Episode, part: Extent) -> str:
     """The first steps of an episode, side by side."""
     frames, forced = [], episode.forced(problem.t_max)
-    for t, cell in enumerate(episode.target[:_STEPS].tolist()):
+    cells = [int(episode.start), *episode.target[:_STEPS].tolist()]
+    for t, cell in enumerate(cells[1:]):
         on = problem.covered(episode.action[t]) & (not forced[t])
-        body = _shaded(problem, on.astype(np.float64))
+        body, event = _shaded(problem, on.astype(np.float64)), "left"
         if cell < problem.num_cells:
-            x, y = cell % problem.columns + 0.5, cell // problem.columns + 0.5
-            before = int(episode.target[t - 1] if t else episode.start)
-            line = f'<path d="M{x} {y}L{before % problem.columns + 0.5} {before // problem.columns + 0.5}"/>'
-            disc = f'<circle cx="{x}" cy="{y}" r=".3" fill="var(--{"vermilion" if episode.located[t] else "page"})"/>'
+            (y, x), (before_y, before_x) = (
+                divmod(each, problem.columns) for each in (cell, cells[t])
+            )
+            line = f'<path d="M{x + 0.5} {y + 0.5}L{before_x + 0.5} {before_y + 0.5}"/>'
+            fill = "vermilion" if episode.located[t] else "page"
+            disc = f'<circle cx="{x + 0.5}" cy="{y + 0.5}" r=".3" fill="var(--{fill})"/>'
             body += f'<g stroke="var(--vermilion)" stroke-width=".12">{line}{disc}</g>'
-            what = "safe action" if forced[t] else f"{int(episode.action[t].sum())} on"
-        else:
-            what = "left"
-        frames.append(f'<div>{_svg(part[0], body, part[1])}<span class="faint">{t + 1}: {what}</span></div>')
+            event = "safe action" if forced[t] else f"{int(episode.action[t].sum())} on"
+        frames.append(f'<div>{_svg(part, body)}<span class="faint">{t + 1}: {event}</span></div>')
     style = "display:grid;gap:10px;grid-template-columns:repeat(auto-fill,minmax(120px,1fr))"
     return f'<div style="{style}">{"".join(frames)}</div>'
 
 
-def _svg(size: Iterable[int], body: str, corner: tuple[int, int] = (0, 0)) -> str:
-    """A drawing in units of cells, of `size` rows and columns from `corner` on, with a line around it."""
-    (rows, columns), (top, left) = size, corner
-    box = f'<path d="M{left} {top}h{columns}v{rows}h-{columns}z" fill="none" stroke="var(--line)" stroke-width=".1"/>'
-    view = f"{left - 0.1:g} {top - 0.1:g} {columns + 0.2:g} {rows + 0.2:g}"
+def _box(part: Extent, style: str) -> str:
+    edge = f"M{part.left} {part.top}h{part.columns}v{part.rows}h-{part.columns}z"
+    return f'<path d="{edge}" fill="none" stroke-width=".1" {style}/>'
+
+
+def _svg(part: Extent, body: str) -> str:
+    """A drawing in units of cells: a part of the grid with a line around it."""
+    view = f"{part.left - 0.1:g} {part.top - 0.1:g} {part.columns + 0.2:g} {part.rows + 0.2:g}"
+    box = _box(part, 'stroke="var(--line)"')
     return f'<svg class="chart" viewBox="{view}" aria-hidden="true">{body}{box}</svg>'
 
 

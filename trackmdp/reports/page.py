@@ -1,39 +1,31 @@
-"""A report: the figures and tables of stored results, and the HTML page with them."""
+"""A report: figures and tables of stored results, and the HTML page with them."""
 
 from __future__ import annotations
 
 import html
-import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from typing import Any, TypeAlias
 
 from trackmdp.reports import figures, idea, maps, summaries
 from trackmdp.reports.grouping import Study, study
-from trackmdp.reports.results import MotionTable, Results, Sensed
+from trackmdp.reports.results import Mapped, Results
 from trackmdp.reports.style import Figure, Say
 from trackmdp.reports.tables import Table, paragraphs
 from trackmdp.untrusted import printable
-from trackmdp.world.model import grid_size
-
-PROSE = paragraphs("trackmdp.reports")
-# All of them would be dozens of figures; the policies that are not drawn are in `policies.npz`.
-MAPPED = 2
-"""Methods and worlds whose policies are drawn on the page."""
-
 
 Part: TypeAlias = "str | Table | Sequence[Figure]"
 
 
 @dataclass(frozen=True)
 class Section:
-    """A heading with what stands under it.
+    """A heading and the parts below it.
 
     Attributes:
-        anchor: its id on the page.
-        heading: its title.
+        anchor: id on the page.
+        heading: title.
         parts: HTML, tables, and rows of figures.
         files: tables that are written but not shown.
     """
@@ -51,7 +43,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Report:
-    """All that is written."""
+    """A page: one line about the runs, sections, title."""
 
     about: str
     sections: Sequence[Section]
@@ -70,18 +62,26 @@ class Report:
         return [part for part in parts if isinstance(part, Table)]
 
     def html(self) -> str:
-        """The page."""
-        # One file without anything loaded from elsewhere: it can be mailed, and opened without a network.
+        """The page: one file, which loads nothing."""
         page = files("trackmdp.reports").joinpath("report.html").read_text(encoding="utf-8")
-        nav = "".join(f'<li><a href="#{s.anchor}">{html.escape(s.heading)}</a></li>' for s in self.sections)
-        body = "\n".join(section.html() for section in self.sections)
-        texts = {"@TITLE@": html.escape(self.title), "@ABOUT@": self.about, "@NAV@": nav, "@BODY@": body}
-        # in one pass: what is put in may hold a mark itself, as a folder's name
+        links = (
+            f'<li><a href="#{s.anchor}">{html.escape(s.heading)}</a></li>' for s in self.sections
+        )
+        texts = {
+            "@TITLE@": html.escape(self.title),
+            "@ABOUT@": html.escape(self.about),
+            "@NAV@": "".join(links),
+            "@BODY@": "\n".join(section.html() for section in self.sections),
+        }
+        # In one pass: a text may hold a mark itself, as the name of a folder.
         return printable(re.sub("|".join(texts), lambda mark: texts[mark[0]], page))
 
 
 def build(
-    results: Results, threshold: float | None = None, extra: Sequence[Section] = (), say: Say = lambda line: None
+    results: Results,
+    threshold: float | None = None,
+    extra: Sequence[Section] = (),
+    say: Say = lambda line: None,
 ) -> Report:
     """The report of stored results.
 
@@ -89,26 +89,31 @@ def build(
         results: of the sweep.
         threshold: regret per step up to which runs are counted; None for no count.
         extra: further sections, shown before the list of all runs.
-        say: told what is under way.
+        say: receives progress.
     """
-    missing = Section("missing", "What is missing", [summaries.missing_table(results.anomalies)])
+    missing = [Section("missing", "Missing runs", [summaries.missing_table(results.anomalies)])]
     if not results.runs:
-        return Report(_about(results), [missing])
+        return Report(_about(results), missing)
     say("figures")
     grouped = study(results.runs)
-    outcome: list[Part] = [summaries.methods_table(grouped, threshold)]
-    # Said beside the first table: a method that was stopped early is easily taken for a weak one.
-    if cut := summaries.shortened(grouped):
-        said = html.escape("; ".join(cut))
-        outcome.append(f"<p>Fewer env steps than the algorithm's own options give it: {said}.</p>")
-    sections = [Section("outcome", "Outcome", outcome)]
-    sections += [missing] if results.anomalies else []
-    sections += _idea(results, grouped)
-    sections += [*_against_cost(grouped, threshold), *_learning(results, grouped, threshold), *_maps(results, grouped)]
-    by_group = replace(summaries.groups_table(grouped, threshold), folded="By world and method")
-    runs = Section("runs", "All runs", [by_group, replace(summaries.runs_table(grouped), folded="Every run")])
-    made = Section("made", "How it was made", [_made(results.manifest)])
-    return Report(_about(results), [*sections, *extra, runs, made])
+    sections = [
+        Section("outcome", "Outcome", _outcome(grouped, threshold)),
+        *(missing if results.anomalies else []),
+        *_section("idea", "Why few sensors are enough", _story(results.maps)),
+        *_section("prices", "Against the price of a sensor", _prices(grouped, threshold)),
+        *_section("learning", "Learning", _learning(grouped, threshold)),
+        *_section("maps", "Policies, cell by cell", _maps(results.maps)),
+        *extra,
+        Section("runs", "All runs", _runs(grouped, threshold)),
+        Section("words", "Words", [_facts(paragraphs("trackmdp.reports", "words.txt"))]),
+        Section("made", "How it was made", [_facts(_made(results.manifest))]),
+    ]
+    return Report(_about(results), sections)
+
+
+def _section(anchor: str, heading: str, parts: Sequence[Part]) -> list[Section]:
+    """A section, unless it is empty."""
+    return [Section(anchor, heading, parts)] if parts else []
 
 
 def _part(part: Part) -> str:
@@ -121,74 +126,94 @@ def _part(part: Part) -> str:
     return f'<div class="{kind}">{"".join(figure.html() for figure in part)}</div>'
 
 
+def _paragraph(text: str) -> str:
+    return f"<p>{html.escape(text)}</p>"
+
+
+def _prose(name: str) -> str:
+    return _paragraph(paragraphs("trackmdp.reports")[name])
+
+
 def _about(results: Results) -> str:
     manifest = results.manifest
-    machines = manifest.get("machines") or []
-    where = "; ".join(f"{m.get('processor', '?')}, {m.get('cores', '?')} cores" for m in machines)
-    hours = float(manifest.get("wall_seconds", 0)) / 3600
     planned = manifest.get("planned")
-    count = f"{len(results.runs)} of {planned} planned runs" if planned else f"{len(results.runs)} runs"
+    count = f"{len(results.runs)} of {planned} planned" if planned else f"{len(results.runs)}"
+    machines = manifest.get("machines", ())
+    where = "; ".join(f"{m.get('processor', '?')}, {m.get('cores', '?')} cores" for m in machines)
+    hours = manifest.get("wall_seconds", 0) / 3600
     took = f"{hours:.1f} hours" if hours >= 1 else f"{60 * hours:.1f} minutes"
-    return html.escape(f"{count}, {took} of run time in all{', on ' + where if where else ''}.")
+    return f"{count} runs, {took} of run time in all{', on ' + where if where else ''}."
 
 
-def _against_cost(grouped: Study, threshold: float | None) -> list[Section]:
-    found = figures.panels(grouped)
-    if not found:
-        return []
-    note = f"<p>{PROSE['prices']}</p>"
-    above = [figures.against_cost(grouped, panel) for panel in found]
-    # No regret where a world has no proved bound, as one on recorded tracks.
-    bounded = [panel for panel in found if not any(math.isnan(grouped.upper(world)) for world in panel.worlds)]
-    below = [figures.regret_against_cost(grouped, panel, threshold) for panel in bounded]
-    return [Section("figures", "Against the price of a sensor", [below, note, above])]
+def _outcome(grouped: Study, threshold: float | None) -> list[Part]:
+    # Beside the first table: a method that was stopped early is easily taken for a weak one.
+    short = "; ".join(summaries.shortened(grouped))
+    note = f"Fewer env steps than by default: {short}."
+    return [summaries.outcome_table(grouped, threshold), *([_paragraph(note)] if short else [])]
 
 
-def _learning(results: Results, grouped: Study, threshold: float | None) -> list[Section]:
-    drawn = [figures.curves(grouped, results.curves, by) for by in ("frames", "seconds")]
+def _story(drawn: Sequence[Mapped]) -> list[Part]:
+    """An example of a miss, by the best policy with one."""
+    ordered = sorted(drawn, key=lambda each: float((each.bound - each.value).mean()))
+    figure = next(filter(None, map(idea.idea_figure, ordered)), None)
+    return [_prose("idea"), [figure]] if figure else []
+
+
+def _prices(grouped: Study, threshold: float | None) -> list[Part]:
+    parts: list[Part] = [_prose("prices")]
+    for panel in figures.panels(grouped):
+        drawn = (
+            figures.against_price(grouped, panel, key, threshold) for key in figures.QUANTITIES
+        )
+        parts.append([*filter(None, drawn)])
+    return parts if len(parts) > 1 else []
+
+
+def _learning(grouped: Study, threshold: float | None) -> list[Part]:
+    drawn = [figures.learning(grouped, by) for by in ("frames", "seconds")]
     shown = [figure for figure in (*drawn, figures.profiles(grouped, threshold)) if figure]
-    return [Section("learning", "Learning curves and profiles", [shown])] if shown else []
+    late = "".join(
+        _paragraph(f"{method} learns at the end of a run, after {steps:,.0f} env steps: no curve.")
+        for method, steps in figures.late_learners(grouped).items()
+    )
+    return [*([late] if late else []), *([shown] if shown else [])]
 
 
-def _idea(results: Results, grouped: Study) -> list[Section]:
-    """An example of a miss, by the first policy that is kept and allows for one."""
-    for (world, method), run in ((group, run) for group, runs in grouped.groups.items() for run in runs):
-        if run.name in results.policies and run.name in results.motions:
-            size, where = grid_size(run.settings["grid.size"]), f"{method}, {world}, seed {run.seed} (n = 1)"
-            if drawn := idea.idea_figure(results.policies[run.name], results.motions[run.name], size, where):
-                return [Section("idea", "Why few sensors are enough", [[drawn]])]
-    return []
-
-
-def _maps(results: Results, grouped: Study) -> list[Section]:
-    """Policies and values in the first and the last world."""
-    found = list[tuple[str, str, Sensed, MotionTable, tuple[int, int]]]()
-    # The first and the last world differ most, since worlds are in the order of Z and c; a dict, as they may be the
-    # same.
-    for world in dict.fromkeys((grouped.worlds[0], grouped.worlds[-1])):
-        motion = next((results.motions[r.name] for r in grouped.in_world(world) if r.name in results.motions), None)
-        for method in grouped.methods[:MAPPED]:
-            run = next((run for run in grouped.of(world, method) if run.name in results.policies), None)
-            if run is not None and motion is not None:
-                name, where = figures.slug(f"{method}-{world}"), f"{method}, {world}, seed {run.seed} (n = 1)"
-                found.append((name, where, results.policies[run.name], motion, grid_size(run.settings["grid.size"])))
-    if not found:
+def _maps(drawn: Sequence[Mapped]) -> list[Part]:
+    worlds = {each.world: [one for one in drawn if one.world == each.world] for each in drawn}
+    if not worlds:
         return []
-    scales = maps.value_scales((policy, motion) for _, _, policy, motion, _ in found)
-    note = f"<p>{PROSE['maps']}</p>"
-    large = any(len(policy.value) > maps.MOST_MAP_CELLS for _, _, policy, _, _ in found)
-    values, sets = [maps.value_map(*each, scales) for each in found], [maps.policy_map(*each) for each in found]
-    return [Section("maps", "Policies and values, cell by cell", [values, "" if large else note, sets])]
+    ends = maps.shades(maps.missing(group) for group in worlds.values())
+    values = [maps.missing_map(figures.slug(w), group, ends) for w, group in worlds.items()]
+    sets = [maps.policy_map(figures.slug(f"{each.method}-{each.world}"), each) for each in drawn]
+    large = any(len(each.value) > maps.MOST_MAP_CELLS for each in drawn)
+    return [_prose("missing"), values, "" if large else _prose("sets"), sets]
 
 
-def _made(manifest: Any) -> str:
+def _runs(grouped: Study, threshold: float | None) -> list[Part]:
+    by_group, every = summaries.groups_table(grouped, threshold), summaries.runs_table(grouped)
+    return [replace(by_group, folded="By world and method"), replace(every, folded="Every run")]
+
+
+def _made(manifest: Mapping[str, Any]) -> dict[str, str]:
     facts = {"Command": manifest.get("line") or "not recorded"}
     for key, label in (("versions", "Versions"), ("machines", "Machine")):
         for entry in manifest.get(key, []):
-            text = ", ".join(f"{name} {value}" for name, value in entry.items() if name != "runs" and value is not None)
-            facts[f"{label}, {entry['runs']} runs"] = text
-    seconds = [f"{manifest.get(key, 0):,.0f} s {key.split('_')[0]}" for key in ("wall_seconds", "cpu_seconds")]
-    facts["Run time"] = ", ".join(seconds)
-    facts["Intervals"] = PROSE["intervals"]
-    items = "".join(f"<div><dt>{html.escape(k)}</dt><dd>{html.escape(v)}</dd></div>" for k, v in facts.items())
-    return f'<dl class="facts">{items}</dl><p class="faint">Numbers in full: the CSV files beside this page.</p>'
+            shown = (
+                f"{name} {it}" for name, it in entry.items() if name != "runs" and it is not None
+            )
+            facts[f"{label}, {entry['runs']} runs"] = ", ".join(shown)
+    times = (f"{manifest.get(f'{kind}_seconds', 0):,.0f} s {kind}" for kind in ("wall", "cpu"))
+    return facts | {
+        "Run time": ", ".join(times),
+        "Intervals": paragraphs("trackmdp.reports")["intervals"],
+        "All digits": "the CSV files beside this page",
+    }
+
+
+def _facts(facts: Mapping[str, str]) -> str:
+    """A list of terms and texts."""
+    items = (
+        f"<div><dt>{html.escape(k)}</dt><dd>{html.escape(v)}</dd></div>" for k, v in facts.items()
+    )
+    return f'<dl class="facts">{"".join(items)}</dl>'

@@ -1,12 +1,8 @@
-"""One table, three forms: HTML that sorts, CSV to the last digit, LaTeX to be pasted.
-
-The paragraphs of reports stand in text files: a line with what each is called, then the paragraph itself.
-"""
+"""One table, three forms: HTML that sorts, CSV to the last digit, LaTeX to be pasted. Paragraphs from text files."""
 
 from __future__ import annotations
 
 import html
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -16,20 +12,25 @@ from typing import Any, TypeAlias
 from trackmdp.durable import csv_text
 from trackmdp.untrusted import no_formula, printable
 
+Cell: TypeAlias = "float | int | str | bool | None"
+
+_LATEX = {letter: f"\\{letter}" for letter in "{}$&%#_"} | {
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+}
+_LATEX |= {"^": r"\textasciicircum{}", "≤": r"$\le$", "±": r"$\pm$", "–": "--", "²": "$^2$"}
+
 
 @cache
 def paragraphs(package: str, file: str = "prose.txt") -> dict[str, str]:
-    """Name -> paragraph of a text file in a package; what stands in braces is filled in by `str.format`."""
+    """Name -> paragraph of a text file in a package: a line with the name, then the text; braces as in `str.format`."""
     text = files(package).joinpath(file).read_text(encoding="utf-8")
     return {name: " ".join(lines) for name, *lines in map(str.splitlines, text.split("\n\n"))}
 
 
-Cell: TypeAlias = "float | int | str | bool | None"
-
-LONG = 60
-"""A cell of more characters than this may be broken over lines."""
-_LATEX = {letter: f"\\{letter}" for letter in "{}$&%#_"} | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}"}
-_LATEX |= {"^": r"\textasciicircum{}", "≤": r"$\le$", "±": r"$\pm$", "–": "--", "²": "$^2$"}
+def is_known(value: Cell) -> bool:
+    """Whether a cell has a value."""
+    return value is not None and value == value  # nan differs from itself
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class Column:
 
     Attributes:
         label: heading.
-        digits: decimals of a number; None for as they are.
+        digits: decimals of a number; None: as many as it has.
         unit: shown in the heading.
     """
 
@@ -53,7 +54,7 @@ class Column:
 
     def text(self, value: Cell) -> str:
         """A cell as it is shown."""
-        if value is None or (isinstance(value, float) and math.isnan(value)):
+        if value is None or not is_known(value):
             return "–"
         if isinstance(value, bool):
             return "yes" if value else "no"
@@ -61,18 +62,20 @@ class Column:
             return printable(value)
         if self.digits is None:
             return f"{value:,}" if isinstance(value, int) else f"{value:g}"
-        # -0.0004 with three digits is "-0.000": shown as 0.000, since the sign of a rounding error is no result. The
-        # minus is the typographic one, as in the figures.
-        shown = f"{value:,.{self.digits}f}"
-        zero = f"{0.0:,.{self.digits}f}"
-        return zero if shown.lstrip("+-") == zero else shown.replace("-", "−")
+        # The sign of a rounding error, as in -0.000, is no result.
+        shown, zero = f"{value:,.{self.digits}f}", f"{0.0:.{self.digits}f}"
+        return zero if shown.lstrip("-") == zero else shown.replace("-", "−")
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rows under columns; `name` is that of its files, `caption` says what it shows, with n.
+    """Rows under columns.
 
-    On a page one with a text in `folded` shows when that is pressed.
+    Attributes:
+        name: of its files.
+        caption: content, with n.
+        columns, rows: a cell of each row for each column. Columns without any value are in the CSV file only.
+        folded: on a page, the text to press before the table is shown.
     """
 
     name: str
@@ -82,62 +85,74 @@ class Table:
     folded: str = ""
 
     def csv(self) -> str:
-        """All digits; an empty field where there is nothing."""
-        return csv_text([column.heading for column in self.columns], (map(_plain, row) for row in self.rows))
+        """All digits; an empty field for no value."""
+        heads = [column.heading for column in self.columns]
+        return csv_text(heads, (map(_plain, row) for row in self.rows))
 
     def latex(self) -> str:
         """A `tabular` with horizontal rules; it needs no package."""
-        # Words to the left, numbers to the right, as their digits are compared from the right.
-        align = "".join("l" if self._is_text(place) else "r" for place in range(len(self.columns)))
-        head = " & ".join(rf"\textbf{{{_escape(column.heading)}}}" for column in self.columns)
-        body = [" & ".join(_escape(c.text(v)) for c, v in zip(self.columns, row, strict=True)) for row in self.rows]
-        # In one line: what follows a line break would no longer be a comment.
+        columns = [self.columns[place] for place in self._shown]
+        align = "".join("l" if self._texts[place] else "r" for place in self._shown)
+        head = " & ".join(rf"\textbf{{{_escape(column.heading)}}}" for column in columns)
+        body = [
+            " & ".join(_escape(self.columns[place].text(row[place])) for place in self._shown)
+            for row in self.rows
+        ]
+        # In one line: the rest after a line break would be no comment.
         above = [f"% {' '.join(self.caption.split())}", rf"\begin{{tabular}}{{{align}}}"]
         lines = [r"\hline", rf"{head} \\", r"\hline", *(rf"{line} \\" for line in body), r"\hline"]
         return "\n".join([*above, *lines, r"\end{tabular}", ""])
 
     def html(self) -> str:
-        """A table whose columns sort when their heading's button is pressed."""
+        """A table with columns that sort when their heading is pressed."""
         heads = "".join(
-            f'<th scope="col"{self._side(place)}><button type="button">{html.escape(column.heading)}</button></th>'
-            for place, column in enumerate(self.columns)
+            f'<th scope="col"{self._side(place)}><button type="button">'
+            f"{html.escape(self.columns[place].heading)}</button></th>"
+            for place in self._shown
         )
         rows = "\n".join(f"<tr>{self._cells(row)}</tr>" for row in self.rows)
         caption = html.escape(self.caption)
+        # A wide table scrolls within its own box; `tabindex` lets the keyboard scroll it too.
         shown = (
-            # A wide table scrolls within its own box; `tabindex` lets the keyboard scroll it too.
             f'<div class="scroll" tabindex="0" role="region" aria-label="{caption}"><table class="sortable">'
             f"<caption>{caption}</caption><thead><tr>{heads}</tr></thead>\n<tbody>{rows}</tbody></table></div>"
         )
-        return f"<details><summary>{html.escape(self.folded)}</summary>{shown}</details>" if self.folded else shown
+        if not self.folded:
+            return shown
+        return f"<details><summary>{html.escape(self.folded)}</summary>{shown}</details>"
 
     def _cells(self, row: Sequence[Cell]) -> str:
         cells = []
-        for place, (column, value) in enumerate(zip(self.columns, row, strict=True)):
-            text = html.escape(column.text(value))
-            mark = ' class="wide"' if len(text) > LONG else ""
-            number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-            # The page sorts by the full number; the text of the cell is rounded and has separators.
+        for place in self._shown:
+            value, text = row[place], html.escape(self.columns[place].text(row[place]))
+            number = isinstance(value, (int, float)) and not self._texts[place] and is_known(value)
+            # The page sorts by the full number; the text is rounded and has separators.
             sort = f' data-v="{value!r}"' if number else ""
-            cells.append(f"<td{mark or self._side(place)}{sort}>{text}</td>")
+            cells.append(f"<td{self._side(place)}{sort}>{text}</td>")
         return "".join(cells)
 
     def _side(self, place: int) -> str:
-        return "" if self._is_text(place) else ' class="n"'
+        return "" if self._texts[place] else ' class="n"'
 
-    def _is_text(self, place: int) -> bool:
-        return self._texts[place]
+    @cached_property
+    def _known(self) -> list[list[Cell]]:
+        """Values of each column; made once, as every cell asks."""
+        places = range(len(self.columns))
+        return [[row[place] for row in self.rows if is_known(row[place])] for place in places]
+
+    @cached_property
+    def _shown(self) -> list[int]:
+        """Places of the columns with a value; of all columns where there are no rows."""
+        return [place for place, values in enumerate(self._known) if values or not self.rows]
 
     @cached_property
     def _texts(self) -> list[bool]:
-        """Whether each column is one of words; made once, as every cell asks."""
-        known = [[row[place] for row in self.rows if row[place] is not None] for place in range(len(self.columns))]
-        # a column in which nothing is known stands as its numbers would
-        return [bool(values) and all(isinstance(value, (str, bool)) for value in values) for values in known]
+        """Whether each column is one of words."""
+        return [all(isinstance(value, (str, bool)) for value in values) for values in self._known]
 
 
 def _plain(value: Cell) -> Any:
-    if value is None or (isinstance(value, float) and math.isnan(value)):
+    if not is_known(value):
         return ""
     if isinstance(value, str):
         return no_formula(printable(value))
@@ -145,5 +160,4 @@ def _plain(value: Cell) -> Any:
 
 
 def _escape(text: str) -> str:
-    # letter by letter: what stands for one is not looked at again
     return "".join(_LATEX.get(letter, letter) for letter in " ".join(text.split()))

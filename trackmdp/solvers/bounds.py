@@ -1,24 +1,40 @@
-"""Upper bounds on what any policy can earn: the paper's as printed, a valid one, and the clocked one."""
+"""Upper bounds on the value of any policy (theory.md#bounds).
+
+All of them grant the tracker knowledge that it does not have: the hidden state of the target before or after each step.
+They hold for every memory. With one mode the state is the cell.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy import sparse
 
-from trackmdp.solvers.cover import Cover, Covering
-from trackmdp.solvers.renewal import RenewalSystem, accumulate, expected_steps, per_row, row_index
+from trackmdp.solvers.choose import Decisions, Own, priced
+from trackmdp.solvers.cover import Shared
+from trackmdp.solvers.linear import (
+    RenewalSystem,
+    accumulate,
+    expected_steps,
+    grid_of,
+    per_row,
+    row_index,
+    still_to_come,
+)
+from trackmdp.solvers.sensing import sensing
 from trackmdp.world.model import Array, BoolArray, World
 
 
 @dataclass(frozen=True)
 class ClockedBound:
-    """The clocked bound (theory: the position is revealed after every action, but the clock n runs on).
+    """The clocked bound: the state is revealed after every action, but the clock n runs on.
 
     Attributes:
-        table: `[M, t_max + 2]`, U(x, n): the most that can follow n misses with the target known to be at x.
+        table: `[Z, t_max + 2]`, U(z, n): the most that can follow n misses with the target known to be in state z.
         error: no entry of the exact table is larger by more; 0 where its systems were factorised.
     """
 
@@ -27,105 +43,154 @@ class ClockedBound:
 
     @property
     def value(self) -> Array:
-        """`[M]`, no less than U(x, 0) >= V*(x)."""
+        """`[Z]`, no less than U(z, 0) >= V*(z)."""
         return self.table[:, 0] + self.error
 
 
 def paper(world: World) -> Array:
     """`[M]` V*_QMDP of eq. upper_bound_v as printed: sensors are paid for on the exit step as well.
 
-    The reward is not, so this can lie below what a policy attains; see `valid`. It knows no `max_steps`.
+    The reward is not, so this can lie below the value of a policy; see `valid`. It knows no `max_steps`.
     """
-    p = world.kernel.data
     # max{P_xj r - c_j, 0} for each possible move: here c_j is not multiplied by the probability of staying in the grid,
     # which is the difference to `_best_step`.
-    gain = p * world.detects(world.kernel.indices) * world.reward
-    return accumulate(world.kernel, _free(world, gain, np.ones(world.num_cells)), world.size)
+    gain = _free(world, _earned(world), np.ones(world.num_states))
+    return of_cells(world, accumulate(world.kernel, gain, grid_of(world)))
 
 
 def valid(world: World) -> Array:
-    """`[M]` the position is revealed after every action, costs are charged like the reward: a true bound.
+    """`[M]` the state is revealed before every action, costs are charged like the reward: a true bound.
 
     Each step is worth the best free choice or, where D is less than that choice, the safe action; a window, which
     only takes choices away, is left out of account here and in `clocked`.
     """
+    return of_cells(world, valid_states(world))
+
+
+def valid_states(world: World) -> Array:
+    """`[Z]` of `valid`."""
     if world.max_steps is not None:
         return _truncated_valid(world, world.max_steps)
-    return accumulate(world.kernel, _best_step(world), world.size)
+    return accumulate(world.kernel, _best_step(world), grid_of(world))
 
 
 def clocked(world: World) -> Array:
     """`[M]` the clocked bound U(x, 0): V* <= U <= `valid`."""
     if world.max_steps is not None:
-        return _truncated_clocked(world, world.max_steps)
-    return clocked_table(world).value
+        return of_cells(world, _truncated_clocked(world, world.max_steps))
+    return of_cells(world, clocked_table(world).value)
+
+
+def of_cells(world: World, value: Array) -> Array:
+    """`[M]` means of `value` `[Z]` over the modes of each cell, all as likely at an episode's start."""
+    return value if world.modes == 1 else value.reshape(world.num_cells, world.modes).mean(axis=1)
+
+
+def _earned(world: World) -> Array:
+    """`[E]` reward of a report after each possible move."""
+    return world.kernel.data * world.reward
+
+
+def safe_gain(world: World) -> Array:
+    """`[Z]` expected reward of one safe action before which the target is in each state."""
+    gain: Array = (world.reward - world.safe_cost) * world.stay_probability
+    if world.safe:
+        return gain
+    missed = 1.0 - world.safe_detection[world.motion.cell]
+    return gain - world.reward * (world.kernel @ missed)
 
 
 def _best_step(world: World) -> Array:
-    """`[M]` the most that one step is worth from a known position: the best free choice or the safe action."""
-    report = world.kernel.data * world.detects(world.kernel.indices)
+    """`[Z]` the most that one step is worth from a known state: the best free choice or the safe action."""
     # The reward is 0 on the exit step, costs included (eq. reward_func), so a sensor costs c_j P_in(x).
-    free = _free(world, report * world.reward, world.stay_probability)
+    free = _free(world, _earned(world), world.stay_probability)
     # D is free to be anything: a safe action cheaper than the sensors it stands for is worth more than any free choice,
     # and would lie above the bound if it were left out.
-    return np.maximum(free, world.safe_gain)
+    return np.maximum(free, safe_gain(world))
 
 
-def _free(world: World, gain: Array, charge: Array) -> Array:
-    """`[M]` the most that one free choice gains, of `gain` `[E]` for each move and prices times `charge` `[M]`."""
-    if (covering := _covering(world)) is not None:
-        return covering.best(gain, covering.price(world.cost, charge)).upper
-    # Sensors add up: each is on where it gains, and a cell that cannot be reached never is.
-    rows, cells = row_index(world.kernel), world.kernel.indices
-    return per_row(rows, np.maximum(gain - world.cost[cells] * charge[rows], 0.0), world.num_cells)
+@lru_cache(maxsize=1)
+def _moves(world: World) -> Decisions:
+    """The sensors that may report the target after one move from a known state; one entry for each of the kernel."""
+    # int32: kept as long as the world is used.
+    rows, to = row_index(world.kernel).astype(np.int32), world.kernel.indices
+    cells = to if world.modes == 1 else world.motion.cell[to]
+    return sensing(world, rows, cells, world.num_states, distinct=world.modes == 1)
+
+
+def _free(world: World, gain: Array, charge: Array, *, exact: bool = False) -> Array:
+    """`[Z]` the most that one free choice gains, of `gain` `[E]` for each move and prices times `charge` `[Z]`."""
+    moves = _moves(world)
+    price = priced(moves, world, charge[:, None])[:, 0]
+    if isinstance(moves, Shared):
+        return moves.cover(gain, price, exact=exact).upper
+    return moves.upper(gain, price)
+
+
+def _sums(moves: Decisions, values: Array, count: int) -> Array:
+    """`[Z, C]` sums of `values` `[G, C]` over the decisions of each state."""
+    return np.stack([per_row(moves.rows, each, count) for each in values.T], axis=1)
 
 
 def one_set(world: World, detected: Array, missed: Array) -> Array:
-    """`[M]` the most that one set is worth from a known position: r + V (`detected`, `[M]`), or else `missed` `[M]`."""
-    gain = world.kernel.data * world.detects(world.kernel.indices) * (detected - missed)[world.kernel.indices]
+    """`[Z]` the most that one set is worth from a known state: r + V (`detected`, `[Z]`), or else `missed` `[Z]`."""
+    gain = world.kernel.data * (detected - missed)[world.kernel.indices]
     return world.kernel @ missed + _free(world, gain, world.stay_probability)
 
 
 @lru_cache(maxsize=1)
-def _covering(world: World) -> Covering | None:
-    """Which sensors see the target after one move from a known position; None where each covers its own cell."""
-    return Covering.of(world, row_index(world.kernel), world.kernel.indices)
-
-
-@lru_cache(maxsize=1)
 def clocked_table(world: World) -> ClockedBound:
-    """U(x, n) by policy iteration, each policy valued by one sparse solve.
+    """U(z, n) by policy iteration, each policy valued by one sparse solve.
 
-    U(x, t_max + 1) = sum_j P_xj (r - D + U(j, 0)), and
-    U(x, n) = sum_j max{P_xj [p_d (r + U(j, 0)) + (1 - p_d) U(j, n + 1)] - c_j P_in(x), P_xj U(j, n + 1)}.
-    Where the safe action may miss, U(x, t_max + 1) = sum_j P_xj [p_s (r + U(j, 0)) + (1 - p_s) U(j, t_max + 1) - D].
-    A bound for any p_d; not tight below 1, since a miss then never tells where the target is.
+    U(z, t_max + 1) = sum_z' P_zz' (r - D + U(z', 0)), and with A a set of sensors and b(z') the probability of a report
 
-    Where sensors have footprints, the choice at (x, n) is a coverage problem: U(x, n) = sum_j P_xj U(j, n + 1) plus the
-    most that the union of a set's footprints gains, less the prices of the set. Its linear relaxation stands for it,
-    which bounds it from above (`cover`); see `exact_clocked_table`.
+    U(z, n) = max_A sum_z' P_zz' [b (r + U(z', 0)) + (1 - b) U(z', n + 1)] - c(A) P_in(z).
 
-    The greedy policy of a table Û within rho of its own equation gives U <= Û + rho · (longest expected episode): the
-    clocked process is left at every step with the target's probability of exit, whatever is chosen.
+    Where the safe action may miss, U(z, t_max + 1) = sum_z' P_zz' [p_s (r + U(z', 0)) + (1 - p_s) U(z', t_max + 1) -
+    D]. A bound for any p_d; not tight below 1, since a miss then never reveals where the target is.
+
+    Where sensors share cells, the choice at (z, n) is a coverage problem. Its linear relaxation stands for it, which
+    bounds it from above (`cover`); see `exact_clocked_table`.
+
+    The greedy policy of a table Û within rho of its own equation gives U <= Û + rho · (longest expected episode): under
+    every policy the clocked process ends at each step with the target's probability of exit.
     """
     return _clocked(world, exact=False)
 
 
 @lru_cache(maxsize=1)
 def exact_clocked_table(world: World) -> ClockedBound:
-    """U(x, n) with the coverage problems of footprints solved over sets, not relaxed; otherwise `clocked_table`."""
+    """U(z, n) with the coverage problems of footprints solved over sets, not relaxed; otherwise `clocked_table`."""
     return _clocked(world, exact=True) if world.coverage is not None else clocked_table(world)
 
 
+@dataclass(frozen=True)
+class _Choices:
+    """The sets from each state after n = 0 ... t_max misses.
+
+    Attributes:
+        on: `[G, t_max + 1]`; shares, where sensors share cells.
+        report: `[E, t_max + 1]`, probability of a report after each possible move.
+        paid: `[Z, t_max + 1]`, expected prices.
+    """
+
+    on: Array | BoolArray
+    report: Array | BoolArray
+    paid: Array
+
+    def same_as(self, other: _Choices) -> bool:
+        """Whether the same is sensed, at the same price: other sensors may see the same cells."""
+        same = bool((self.report == other.report).all())
+        return same and (self.on is other.on or bool((self.paid == other.paid).all()))
+
+
 def _clocked(world: World, *, exact: bool) -> ClockedBound:
-    """U(x, n) by policy iteration."""
-    # all on is a policy of finite value; from there each round is worth more, and there are finitely many policies
-    # [t_max + 1, E], one choice per n and possible move: with the position known, sets need not be the same for all
-    # paths.
+    """U(z, n) by policy iteration."""
+    # All on is a policy of finite value; from there each round is worth more, and there are finitely many policies.
     choices = _all_on(world)
     table, solved = _value(world, choices)
     while True:
-        improved = _improve(world, table, choices, exact=exact)
+        improved = _improved(world, table, choices, exact=exact)
         if improved.same_as(choices):
             break
         candidate, solved = _value(world, improved, table)
@@ -133,159 +198,151 @@ def _clocked(world: World, *, exact: bool) -> ClockedBound:
             break
         choices, table = improved, candidate
     # Iterated solves leave Û off by a little, and so do linear programs; with rho the excess of one improvement step
-    # over Û, and at most `longest` steps to collect it on, U <= Û + longest * rho (theory-extensions, section 0).
+    # over Û, and at most `longest` steps to collect it on, U <= Û + longest * rho (theory.md#bounds).
     sure = solved and world.coverage is None
     error = 0.0 if sure else float(expected_steps(world).max()) * _excess(world, table, exact=exact)
     return ClockedBound(table, error)
 
 
-@dataclass(frozen=True)
-class _Choices:
-    """What is sensed from each position after n misses.
-
-    Attributes:
-        sensed: `[t_max + 1, E]`, whether each possible move is; with footprints a share, where fractions are allowed.
-        paid: `[t_max + 1, M]`, with footprints the price of the sensors on; None where the moves sensed tell.
-    """
-
-    sensed: Array | BoolArray
-    paid: Array | None = None
-
-    def same_as(self, other: _Choices) -> bool:
-        """Whether the same is sensed, at the same price: other sensors may see the same cells."""
-        return bool((self.sensed == other.sensed).all()) and (
-            self.paid is None or other.paid is None or bool((self.paid == other.paid).all())
-        )
+def _chosen(world: World, on: Array | BoolArray, report: Array | BoolArray) -> _Choices:
+    moves = _moves(world)
+    price = priced(moves, world, world.stay_probability[:, None])
+    return _Choices(on, report, _sums(moves, on * price, world.num_states))
 
 
 def _all_on(world: World) -> _Choices:
-    sensed = np.ones((world.num_choices, world.kernel.nnz), dtype=bool)
-    if world.coverage is None:
-        return _Choices(sensed)
-    price = world.cost.sum() * world.stay_probability
-    return _Choices(sensed * (world.coverage.degree[world.kernel.indices] > 0), np.tile(price, (world.num_choices, 1)))
+    moves = _moves(world)
+    shape = (len(moves.rows), world.num_choices)
+    on = np.ones(shape, dtype=bool) & world.available[moves.sensors, None]
+    return _chosen(world, on, moves.report(on))
 
 
-def _covered(world: World, table: Array, *, exact: bool) -> list[Cover]:
-    """The coverage problems after 0 ... t_max misses, of what seeing the target gains over `table`."""
-    cells, covering = world.kernel.indices, _covering(world)
-    assert covering is not None
-    price = covering.price(world.cost, world.stay_probability)
-    gains = world.kernel.data * (world.reward + table[cells, 0] - table[cells, 1:].T)
-    return [covering.best(gain, price, exact=exact) for gain in gains]
+def _reports_worth(world: World, table: Array, n: int) -> Array:
+    """`[E]` worth of a report over a miss after each possible move, n misses before it."""
+    over_miss = world.reward + table[:, 0] - table[:, n + 1]
+    worth: Array = world.kernel.data * over_miss[world.kernel.indices]
+    return worth
 
 
-def _gains(world: World, table: Array) -> tuple[Array, Array]:
-    """`[t_max + 1, E]` what sensing a possible move earns, and what leaving it unsensed does."""
-    rows, cells, p = row_index(world.kernel), world.kernel.indices, world.kernel.data
-    detected, missed = world.reward + table[cells, 0], table[cells, 1:].T
-    worth = detected - (1.0 - world.detects(cells)) * (detected - missed)
-    return p * worth - world.cost[cells] * world.stay_probability[rows], p * missed
-
-
-def _improve(world: World, table: Array, choices: _Choices, *, exact: bool) -> _Choices:
+def _improved(world: World, table: Array, choices: _Choices, *, exact: bool) -> _Choices:
     """The best choices, one step ahead; a tie leaves the present one."""
-    if (covering := _covering(world)) is not None:
-        found, price = _covered(world, table, exact=exact), covering.price(world.cost, world.stay_probability)
-        paid = [per_row(covering.rows, each.on * price, world.num_cells) for each in found]
-        return _Choices(np.stack([each.seen for each in found]), np.stack(paid))
-    rows, cells, p = row_index(world.kernel), world.kernel.indices, world.kernel.data
-    # Both sides of the comparison are multiplied by the probability p of the move; what a sensor that is on misses is
-    # worth p (1 - p_d) U(j, n + 1) on both, so that it is on iff p p_d (r + U(j, 0) - U(j, n + 1)) > c p_in.
-    cost = world.cost[cells] * world.stay_probability[rows]
-    gain = p * world.detects(cells) * (world.reward + table[cells, 0] - table[cells, 1:].T) - cost
-    # without a margin, rounding could switch a tied choice to and fro for ever
+    moves, free = _moves(world), range(world.num_choices)
+    price = priced(moves, world, world.stay_probability[:, None])
+    if isinstance(moves, Shared):
+        found = [
+            moves.cover(_reports_worth(world, table, n), price[:, 0], exact=exact) for n in free
+        ]
+        on, seen = (
+            np.stack([getattr(each, name) for each in found], axis=1) for name in ("on", "seen")
+        )
+        return _chosen(world, on, seen)
+    assert isinstance(moves, Own)
+    # Both sides of the comparison are multiplied by the probability p of the move; a target missed by a sensor that is
+    # on is worth p (1 - p_d) U(j, n + 1) on both: it is on iff p p_d (r + U(j, 0) - U(j, n + 1)) > c p_in.
+    on = np.zeros(choices.on.shape, dtype=bool)
+    # Without a margin, rounding could switch a tied choice to and fro for ever.
     tie = 1e-12 * (1.0 + np.abs(table).max())
-    return _Choices(np.where(np.abs(gain) <= tie, choices.sensed, gain > 0))
+    for n in free:
+        gain = (moves.gained(_reports_worth(world, table, n)[:, None]) - price)[:, 0]
+        on[:, n] = np.where(np.abs(gain) <= tie, choices.on[:, n], gain > 0)
+    return _chosen(world, on, moves.report(on))
 
 
-def _best_choices(world: World, table: Array, *, exact: bool) -> list[Array]:
-    """For n = 0 ... t_max `[M]`, what the best choice and then `table` are worth; with footprints no less than that."""
-    rows = row_index(world.kernel)
-    if world.coverage is not None:
-        covers = _covered(world, table, exact=exact)
-        return [world.kernel @ later + each.upper for later, each in zip(table[:, 1:].T, covers, strict=True)]
-    return [per_row(rows, np.maximum(on, off), world.num_cells) for on, off in zip(*_gains(world, table), strict=True)]
+def _best_choices(world: World, table: Array, *, exact: bool = False) -> Array:
+    """`[Z, t_max + 1]`, the best choice and then `table`; with footprints no less than that."""
+    best: Array = world.kernel @ table[:, 1:]
+    for n in range(world.num_choices):
+        worth = _reports_worth(world, table, n)
+        best[:, n] += _free(world, worth, world.stay_probability, exact=exact)
+    return best
 
 
 def _excess(world: World, table: Array, *, exact: bool) -> float:
     """The most by which the best choices, one step ahead, exceed `table`."""
-    best = _best_choices(world, table, exact=exact)
     # The last column has no choice: the safe action is forced.
-    best.append(world.kernel @ _after_safe_action(world, table))
-    return max(float((np.stack(best, axis=1) - table).max()), 0.0)
+    last = world.kernel @ _after_safe_action(world, table)
+    best = np.column_stack([_best_choices(world, table, exact=exact), last])
+    return max(float((best - table).max()), 0.0)
 
 
 def _after_safe_action(world: World, table: Array) -> Array:
-    """`[M]` worth of the target being in each cell when the safe action has been carried out, its price included."""
+    """`[Z]` worth of the target in each state when the safe action has been carried out, its price included."""
     located = world.reward - world.safe_cost + table[:, 0]
-    return located - world.safe_misses * (world.reward + table[:, 0] - table[:, -1])
+    if world.safe:
+        return located
+    missed = 1.0 - world.safe_detection[world.motion.cell]
+    return located - missed * (world.reward + table[:, 0] - table[:, -1])
 
 
 def _value(world: World, choices: _Choices, guess: Array | None = None) -> tuple[Array, bool]:
-    """`[M, t_max + 2]` U of the given choices, and whether it is exact; `guess` is a table near to it.
+    """`[Z, t_max + 2]` U of the given choices, and whether it is exact; `guess` is a table near to it.
 
     U(., n) = earned[n] + reach[n] U(., 0), from the last n backwards: after the safe action reach is P; before it, a
-    sensor that is on reaches a located cell with p_d, and what it misses, like what is unsensed, goes on with
-    reach[n + 1]. Where the safe action may miss, U(., t_max + 1) is unknown as well, and reach has 2M columns.
+    report leads to a located state, and a miss goes on with reach[n + 1]. Where the safe action may miss,
+    U(., t_max + 1) is unknown as well, and reach has 2Z columns.
     """
-    moves, rows, cells = world.kernel, row_index(world.kernel), world.kernel.indices
+    moves, rows = world.kernel, row_index(world.kernel)
     # With t_max = 1: reach[2] = P, reach[1] = hit_1 + miss_1 P, reach[0] = hit_0 + miss_0 reach[1]. Only the last is
     # solved with; the others give U(., n) by one product each.
-    earned, reach = [world.safe_gain], [moves]
+    earned, reach = [safe_gain(world)], [moves]
     if not world.safe:
-        lost = sparse.csr_array(moves.multiply(world.safe_misses))
+        lost = sparse.csr_array(moves.multiply(1.0 - world.safe_detection[world.motion.cell]))
         reach = [sparse.csr_array(sparse.hstack([moves - lost, lost]))]
-    # What a sensed move earns at once; the value of being located is in `reach`.
-    reports = world.detects(cells)
-    gain = moves.data * reports * world.reward
-    if choices.paid is None:
-        gain = gain - world.cost[cells] * world.stay_probability[rows]
+    gain = _earned(world)
     for n in reversed(range(world.num_choices)):
-        choice = choices.sensed[n]
-        hit, miss = _masked(moves, choice * reports), _masked(moves, 1.0 - choice * reports)
+        report = choices.report[:, n]
+        hit, miss = _masked(moves, report), _masked(moves, 1.0 - report)
         hit.resize(reach[0].shape)
-        now = per_row(rows, gain * choice, world.num_cells)
-        now = now if choices.paid is None else now - choices.paid[n]
+        now = per_row(rows, gain * report, world.num_states) - choices.paid[:, n]
         earned.insert(0, now + miss @ earned[0])
         reach.insert(0, hit + miss @ reach[0])
-    unknown = slice(1) if world.safe else slice(None, None, world.num_choices)  # U(., 0), and U(., t_max + 1)
-    system = RenewalSystem(sparse.csr_array(sparse.vstack(reach[unknown])), world.size)
+    # U(., 0), and U(., t_max + 1)
+    unknown = slice(1) if world.safe else slice(None, None, world.num_choices)
+    size = grid_of(world)
+    system = RenewalSystem(sparse.csr_array(sparse.vstack(reach[unknown])), size)
     start = None if guess is None else guess.T[unknown].ravel()
     located = system.solve(np.concatenate(earned[unknown]), start)
-    return np.stack([b + k @ located for b, k in zip(earned, reach, strict=True)], axis=1), system.exact
+    table = [b + k @ located for b, k in zip(earned, reach, strict=True)]
+    return np.stack(table, axis=1), system.exact
 
 
-def _masked(moves: sparse.csr_array, keep: Array) -> sparse.csr_array:
-    kept = sparse.csr_array((moves.data * keep, moves.indices, moves.indptr), shape=moves.shape, copy=True)
+def _masked(moves: sparse.csr_array, keep: npt.NDArray[Any]) -> sparse.csr_array:
+    kept = sparse.csr_array(
+        (moves.data * keep, moves.indices, moves.indptr), shape=moves.shape, copy=True
+    )
     kept.eliminate_zeros()
     return kept
 
 
 def _truncated_valid(world: World, max_steps: int) -> Array:
-    """`[M]` the valid bound on episodes of at most `max_steps` steps."""
-    best, value = _best_step(world), np.zeros(world.num_cells)
-    for _ in range(max_steps):
+    """`[Z]` the valid bound on episodes of at most `max_steps` steps."""
+    best, value = _best_step(world), np.zeros(world.num_states)
+    for h in range(1, max_steps + 1):
         before, value = value, best + world.kernel @ value
-        if np.array_equal(before, value):  # the target is gone to the last bit: nothing changes from here on
-            break
+        more = _more(world, before, value, max_steps - h)
+        if more is not None:
+            return value + more
     return value
 
 
-def _truncated_clocked(world: World, max_steps: int) -> Array:
-    """`[M]` the clocked bound on episodes of at most `max_steps` steps.
+def _more(world: World, before: Array, value: Array, left: int) -> float | None:
+    """See `still_to_come`."""
+    change = float(np.abs(value - before).max())
+    return still_to_come(world, change, float(np.abs(value).max()), left)
 
-    The optimum over policies that may also depend on the steps left, so a bound for those that may not.
+
+def _truncated_clocked(world: World, max_steps: int) -> Array:
+    """`[Z]` the clocked bound on episodes of at most `max_steps` steps.
+
+    The optimum over policies that may also depend on the steps left, so a bound for all other policies as well.
     """
-    moves, m = world.kernel, world.num_cells
-    rows, cells, p = row_index(moves), moves.indices, moves.data
-    # U_h(x, n) with h steps left, from U_0 = 0: each round adds one step in front.
-    table = np.zeros((m, world.num_choices + 1))
-    for _ in range(max_steps):
-        best = _best_choices(world, table, exact=False)
+    # U_h(z, n) with h steps left, from U_0 = 0: each round adds one step in front.
+    table = np.zeros((world.num_states, world.num_choices + 1))
+    for h in range(1, max_steps + 1):
         # n = t_max + 1: r - D, and located again, whose clock is 0; or missed, and the safe action again.
-        forced = per_row(rows, p * _after_safe_action(world, table)[cells], m)
-        before, table = table, np.stack([*best, forced], axis=1)
-        if np.array_equal(before, table):
-            break
+        forced = world.kernel @ _after_safe_action(world, table)
+        before, table = table, np.column_stack([_best_choices(world, table), forced])
+        more = _more(world, before, table, max_steps - h)
+        if more is not None:
+            return table[:, 0] + more
     return table[:, 0]

@@ -19,7 +19,9 @@ class Budget:
     def left(self) -> bool:
         """Whether there is work left to do."""
         # A limit that has passed stays passed: the rounds after it end one by one.
-        self.timed_out = self.timed_out or (self._ends is not None and time.monotonic() >= self._ends)
+        self.timed_out = self.timed_out or (
+            self._ends is not None and time.monotonic() >= self._ends
+        )
         return self.spent < self.nodes and not self.timed_out
 
     def run(self, tree: Tree, go_on: Callable[[Tree], bool]) -> None:
@@ -46,7 +48,7 @@ class Shares:
     def run(self, done: int, regions: int, tree: Tree) -> None:
         """Run a tree of the next region, `done` of all `regions` being done.
 
-        With 60 of 100 regions done and 800 nodes left, it has 800 / 40 = 20: what it leaves over goes to the others.
+        With 60 of 100 regions done and 800 nodes left, it has 800 / 40 = 20; unused nodes go to the others.
         """
         self._passed(done / regions)
         most = (self._ends - self._budget.spent) / (regions - done)

@@ -1,4 +1,4 @@
-"""What branch and bound has open: info states with cells to decide on, and partial choices of their next set."""
+"""Open work of branch and bound: info states with cells to decide on, and partial choices of their next set."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.solvers.joint import Next
-from trackmdp.solvers.renewal import IndexArray, row_index
+from trackmdp.solvers.linear import IndexArray, row_index
 from trackmdp.world.model import Array, BoolArray
 
 
 @dataclass(frozen=True)
 class Frontier:
-    """B info states whose next set is to be chosen, with the K cells (padded) where leaving might pay.
+    """B info states that need a next set, with the K cells (padded) where leaving might pay.
 
     Attributes:
         start: `[B]`, the problem (located cell) they belong to.
         sets_left: sets still to be chosen, the next one included.
         relaxed: `[B]`, earned so far plus the bound on the rest with every cell at its better choice.
-        cells, mass, regret: `[B, K]`; `mass` is what sensing locates, `regret` what it costs against the bound on
-            leaving.
+        cells, mass, regret: `[B, K]`; `mass` is located by sensing, `regret` is the cost of sensing against the bound
+            on leaving.
         before: `[B, M]`, undetected mass before the target moves.
         missed: `[B, M]`, mass that all sensors together would miss; None where no sensor misses.
         count: `[B]`, cells that are not padding.
@@ -55,15 +55,15 @@ class Frontier:
         kept: IndexArray,
         origin: Origin | None,
     ) -> Frontier:
-        """The states `kept`, with the entries of `moved` whose `regret` is positive, the likeliest first."""
+        """The states `kept`, with the entries of `moved` of positive `regret`, the likeliest first."""
         # The entries of `moved` are a ragged table: row s has count[s] of them. They are set into rectangles [B, K];
-        # the column of an entry is its number among those of its row: rows (0, 0, 2) have columns (0, 1, 0).
+        # the column of an entry is its number within its row: rows (0, 0, 2) have columns (0, 1, 0).
         # place[s] is the row of state s in the new batch, -1 for one that is not kept.
         place = np.full(len(start), -1)
         place[kept] = np.arange(len(kept))
         rows = place[row_index(moved)]
         entry = np.flatnonzero((regret > 0) & (rows >= 0))
-        # a cell whose regret is not positive is sensed in every choice, and is not decided on
+        # a cell without positive regret is sensed in every choice; there is nothing to decide
         entry = entry[np.lexsort((-moved.data[entry], rows[entry]))]
         count = np.bincount(rows[entry], minlength=len(kept))
         column = np.arange(len(entry)) - np.repeat(np.cumsum(count) - count, count)
@@ -73,7 +73,16 @@ class Frontier:
         mass[rows[entry], column] = moved.data[entry]
         loss[rows[entry], column] = regret[entry]
         source = None if origin is None else origin.pick(kept)
-        states = start[kept], sets_left, relaxed[kept], cells, mass, loss, count, np.zeros((shape[0], shape[1] + 1))
+        states = (
+            start[kept],
+            sets_left,
+            relaxed[kept],
+            cells,
+            mass,
+            loss,
+            count,
+            np.zeros((shape[0], shape[1] + 1)),
+        )
         return cls(*states, before[kept], None, None, source)
 
 
@@ -81,7 +90,7 @@ class Frontier:
 class Choices:
     """P partial choices of the next set: the first `decided` cells of each state are left (`left`) or sensed.
 
-    `relaxed` `[P]` has the undecided cells at their better choice; `lost` is what those left lose together.
+    `relaxed` `[P]` has the undecided cells at their better choice; `lost` is the joint loss of the cells left.
     """
 
     frontier: Frontier
@@ -131,7 +140,11 @@ class Origin:
     def of(cls, batches: list[Choices]) -> Origin:
         """One state per choice, in order: batches of 2 and 3 rows have batch 0 0 1 1 1 and place 0 1 0 1 2."""
         sizes = [len(each.state) for each in batches]
-        return cls(batches, np.repeat(np.arange(len(sizes)), sizes), np.concatenate([np.arange(n) for n in sizes]))
+        return cls(
+            batches,
+            np.repeat(np.arange(len(sizes)), sizes),
+            np.concatenate([np.arange(n) for n in sizes]),
+        )
 
     def pick(self, kept: IndexArray) -> Origin:
         """Where the states `kept` came from."""
@@ -158,7 +171,7 @@ class LeftOut:
     def has(self, rows: IndexArray, cells: IndexArray) -> BoolArray:
         """Whether problem `rows` leaves `cells` out, in the shape that the two have together."""
         # With M = 16 and the keys 37, 41 (cells 5 and 9 of problem 2), (2, 9) gives 41: found at place 1; (2, 6) gives
-        # 38: place 1 as well, another key. `minimum` is for keys beyond the last one, whose place is the length.
+        # 38: place 1 as well, another key. `minimum` is for keys beyond the last one: their place is the length.
         wanted = rows * self.num_cells + cells
         place = np.minimum(np.searchsorted(self.keys, wanted), max(len(self.keys) - 1, 0))
         return self.keys[place] == wanted if len(self.keys) else np.zeros(wanted.shape, dtype=bool)

@@ -1,23 +1,23 @@
-"""Upper bounds on what undetected mass is worth, positions being revealed one move late.
+"""Upper bounds on the worth of undetected mass, positions being revealed one move late.
 
 F_h(z) is the largest expected reward of h more sets for undetected mass z (see `branch`). Let the target's cell before
-its last move be revealed, but not where it went from there: what is left is P_i, the moves out of i, without those to
-cells just searched in vain. G_h(i, N) >= F_h of the mass of P_i on N, for each of the 2^Z sets N of successors of i.
+its last move be revealed, but not the move: the mass left is P_i, the moves out of i, without moves to cells just
+searched in vain. G_h(i, N) >= F_h of the mass of P_i on N, for each of the 2^Z sets N of successors of i.
 With z that mass and the price c_k |z| of each sensor k divided among the cells j of N that lead to k, for any division
 
     F_h(z) <= sum_j max_L [z_j T_h(j, L) - sum_{k not in L} price_jk],      sum_j price_jk = c_k |z|,
     T_h(j, L) = sum_{k not in L} P_jk (r + V(k)) + G_{h-1}(j, L),           L a set of successors of j, those left.
 
-For the same sensors may be on for all j, at the price of one set; and F_{h-1} is sublinear, so that what is left of all
-j together is worth no more than each by itself. This is the Lagrangian of "all j have the same set", with the prices as
-multipliers. Shares in proportion to the flow z_j P_jk are close to the best ones, and a few subgradient steps follow:
-those who want a sensor pay more, those who do not pay less. G_1 is exact, as each sensor of the last set is decided by
+The reason: the same sensors may be on for all j, at the price of one set; and F_{h-1} is sublinear, so the mass left of
+all j together is worth no more than the sum of its parts. This is the Lagrangian of "all j have the same set", with the
+prices as multipliers. Shares in proportion to the flow z_j P_jk are close to the best ones, and a few subgradient steps
+follow: cells j that want a sensor pay more, the others less. G_1 is exact, as each sensor of the last set is decided by
 itself; so is R_2, R_h(j) = max_L [T_h(j, L) - price of the other successors] >= F_h(e_j).
 
 A target in a or in b, .5 each, goes on to k from a with .6. With c_k = .5 the sensor costs .5 for a gain of .3 (r = 1);
 if a or b were revealed at once it would cost .25, and pay. Here a bears the whole price, b not leading to k.
 
-A sensor that is on misses a share 1 - p_d, and so much of what it covers is left as well.
+A sensor that is on misses a share 1 - p_d, and this share of its mass is left as well.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.solvers.choices import LeftOut
-from trackmdp.solvers.renewal import IndexArray, per_row, row_index
+from trackmdp.solvers.linear import IndexArray, per_row, row_index
 from trackmdp.world.model import Array, World
 
 STEPS = 6
@@ -46,8 +46,8 @@ class Delayed:
     """The tables of one search, the value of locating the target given.
 
     Attributes:
-        revealed: R_0 ... R_H, each `[M]`: no less than what so many sets are worth from a known position.
-        left: G_0 ... G_{H-1}, each `[M, 2^Z]`; bit b of the second index says that successor b is left.
+        revealed: R_0 ... R_H, each `[M]`: no less than the worth of so many sets from a known position.
+        left: G_0 ... G_{H-1}, each `[M, 2^Z]`; bit b of the second index: successor b is left.
         successors: `[M, Z]`, padded with 0.
     """
 
@@ -88,11 +88,11 @@ class Delayed:
 
 
 class _Moves:
-    """The moves out of each cell as rectangles, and what sets of them find.
+    """The moves out of each cell as rectangles, and the worth found by sets of them.
 
     Attributes:
         to: `[M, Z]`, the cells moved to, padded with 0.
-        found: `[M, 2^Z]`, what sensing the successors that are not left finds, at its worth.
+        found: `[M, 2^Z]`, worth found by sensing the successors that are not left.
         own_price: `[M, 2^Z]`, price of these sensors with the target known to move out of the cell.
     """
 
@@ -108,15 +108,17 @@ class _Moves:
         is_left = (np.arange(2**width)[:, None] >> np.arange(width)) % 2 > 0
         self._sensed = (~is_left).astype(float)
         reports = np.broadcast_to(world.detects(self.to), self.to.shape)
-        self._reports, self._detected, self._cost = reports, detected, world.cost
+        self._reports, self._detected, self._cost = reports, detected, world.prices
         self._inside = world.stay_probability
         # [M, 2^Z, Z], the mass left at each successor
         self._mass = p[:, None] * (1.0 - self._sensed * reports[:, None])
         self.found = (p * reports * detected[self.to]) @ self._sensed.T
-        self.own_price = (self._there * world.cost[self.to]) @ self._sensed.T * self._inside[:, None]
+        self.own_price = (
+            (self._there * world.prices[self.to]) @ self._sensed.T * self._inside[:, None]
+        )
 
     def none_left(self, missed: Array) -> Array:
-        """G_0: `missed` `[M]` is what each position is worth after the last set."""
+        """G_0: `missed` `[M]` is the worth of each position after the last set."""
         return np.einsum("msz,mz->ms", self._mass, missed[self.to])
 
     def next_table(self, worth: Array, ends: Array, *, separable: bool) -> Array:
@@ -132,13 +134,20 @@ class _Moves:
                 table[part, some] = self._bound(part, some, worth, ends, separable=separable)
         return table
 
-    def _bound(self, part: slice, some: slice, worth: Array, ends: Array, *, separable: bool) -> Array:
-        """The table of the states `[C, S]`: cells `part` whose successors in the sets `some` are left."""
+    def _bound(
+        self, part: slice, some: slice, worth: Array, ends: Array, *, separable: bool
+    ) -> Array:
+        """The table of the states `[C, S]`: cells `part`, with their successors in the sets `some` left."""
         to, mass = self.to[part], self._mass[part, some]
         count, z = len(to), to.shape[1]
         # the moves two steps on, a pair (a, b) of successor and its successor in one index a Z + b
-        after, real = self.to[to].reshape(count, -1), (self._there[part, :, None] & self._there[to]).reshape(count, -1)
-        same = ((after[:, :, None] == after[:, None, :]) & real[:, :, None] & real[:, None, :]).astype(float)
+        after, real = (
+            self.to[to].reshape(count, -1),
+            (self._there[part, :, None] & self._there[to]).reshape(count, -1),
+        )
+        same = (
+            (after[:, :, None] == after[:, None, :]) & real[:, :, None] & real[:, None, :]
+        ).astype(float)
         flow = (mass[..., None] * self._p[to][:, None]).reshape(*mass.shape[:2], -1)
         takes_part = (flow > 0).astype(float)
         total, sharing = flow @ same, np.maximum(takes_part @ same, 1.0)
@@ -155,7 +164,9 @@ class _Moves:
         for step in range(STEPS):
             each = gross - share.reshape(*mass.shape, z) @ self._sensed.T
             chosen = each.argmax(axis=3)
-            best = np.minimum(best, np.take_along_axis(each, chosen[..., None], axis=3)[..., 0].sum(axis=2))
+            best = np.minimum(
+                best, np.take_along_axis(each, chosen[..., None], axis=3)[..., 0].sum(axis=2)
+            )
             on = self._sensed[chosen].reshape(flow.shape) * takes_part
             share += price * (0.5 / (1.0 + 0.3 * step)) * (on - (on @ same) / sharing) * takes_part
         return best

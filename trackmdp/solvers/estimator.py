@@ -11,15 +11,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import sparse
 
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers.inner import InnerProblem
 from trackmdp.solvers.known import tables, up_to
-from trackmdp.solvers.layers import Layer, layer_sets, reachable_layers
-from trackmdp.solvers.prediction import renewal
-from trackmdp.solvers.renewal import IndexArray, accumulate, per_row
-from trackmdp.solvers.search import InnerProblem
+from trackmdp.solvers.linear import IndexArray, per_row
+from trackmdp.solvers.renewal import Renewal
+from trackmdp.solvers.value import evaluate, key_visits
+from trackmdp.solvers.walk import Step
 from trackmdp.world.model import Array, BoolArray, World
 
 _MOST_NODES = 100_000
@@ -28,7 +27,7 @@ _MOST_NODES = 100_000
 
 @dataclass(frozen=True)
 class PositionEstimate:
-    """What Q says about the next position, at every info state that a policy can be in after n misses.
+    """Estimates of the next position by Q, at every info state that a policy can be in after n misses.
 
     Attributes:
         n: misses so far.
@@ -50,7 +49,7 @@ class PositionEstimate:
 
 @dataclass(frozen=True)
 class EstimatorAccuracy:
-    """Share of missed steps whose position is estimated right; 1 where nothing is ever missed.
+    """Share of missed steps with a correct estimate of the position; 1 where nothing is ever missed.
 
     Attributes:
         paper: argmax of the paper's form.
@@ -71,14 +70,14 @@ def positions(world: World, policy: PolicyTable, value: Array) -> list[PositionE
     Q-values are those of playing best from a known position, V = `value` once located: the optimal policy's own
     where `policy` and `value` are optimal.
     """
-    layers = reachable_layers(world, world.num_choices)
+    renewal = Renewal(world, world.motion)
     # W after n + 1 misses, best play from a known position: there are t_max - n sets left then.
-    later = tables(InnerProblem.of(world, layers, value), slack=1e-9, run=up_to(_MOST_NODES))[::-1]
+    later = tables(InnerProblem.of(renewal, value), slack=1e-9, run=up_to(_MOST_NODES))[::-1]
     mass, estimates = np.ones(world.num_cells), []
-    for n, sensed in enumerate(layer_sets(layers, policy)):
-        predicted = mass @ layers[n + 1].moves
-        before = per_row(layers[n].rows, mass, world.num_cells)
-        estimates.append(_estimate(world, n, layers[n + 1], predicted, before, value, later[n], ~sensed))
+    for n, (step, sensed) in enumerate(zip(renewal.steps, renewal.sets(policy), strict=False)):
+        predicted = mass @ step.moves
+        before = per_row(step.before, mass, world.num_cells)
+        estimates.append(_estimate(world, step, predicted, before, value, later[n], ~sensed))
         mass = predicted * ~sensed
     return estimates
 
@@ -92,7 +91,7 @@ def accuracy(world: World, policy: PolicyTable, value: Array | None = None) -> E
         value: `[M]`, V of the Q-values; the policy's own where not given.
     """
     own = evaluate(world, policy).value if value is None else value
-    visits = _visits(world, policy)
+    visits = key_visits(world, policy)
     missed, right = 0.0, np.zeros(3)
     for estimate in positions(world, policy, own):
         # Expected number of such misses per episode: renewals in the row's cell, times the joint probability within
@@ -107,21 +106,31 @@ def accuracy(world: World, policy: PolicyTable, value: Array | None = None) -> E
 
 
 def _estimate(
-    world: World, n: int, layer: Layer, predicted: Array, before: Array, value: Array, later: Array, unsensed: BoolArray
+    world: World,
+    step: Step,
+    predicted: Array,
+    before: Array,
+    value: Array,
+    later: Array,
+    unsensed: BoolArray,
 ) -> PositionEstimate:
-    # joint probabilities become beliefs: divided by that of the misses so far
+    # joint probabilities become beliefs: divided by the probability of the misses so far
     reached = np.flatnonzero(predicted > 0)
-    rows, cells = layer.rows[reached], layer.cells[reached]
+    rows, cells = step.rows[reached], step.states[reached]
     p = predicted[reached] / before[rows]
     inside = per_row(rows, p, world.num_cells)[rows]
     # Q(s, ã) and Q(s, ã_x) share all terms but those of x.
     all_on = p * (world.reward + value[cells]) - world.cost[cells] * inside
     difference = all_on - p * later[cells]
     paper = (difference + world.cost[cells]) / world.reward
-    # Where being detected is worth nothing, Q says nothing about x, and the estimate is 0.
+    # Where a detection is worth nothing, Q contains nothing about x, and the estimate is 0.
     worth = world.reward + value[cells] - later[cells]
-    exact = np.divide(difference + world.cost[cells] * inside, worth, out=np.zeros_like(p), where=worth != 0.0)
-    return PositionEstimate(n, rows, cells, p, paper, exact, predicted[reached] * unsensed[reached])
+    exact = np.divide(
+        difference + world.cost[cells] * inside, worth, out=np.zeros_like(p), where=worth != 0.0
+    )
+    return PositionEstimate(
+        step.n, rows, cells, p, paper, exact, predicted[reached] * unsensed[reached]
+    )
 
 
 def _best(rows: IndexArray, score: Array, allowed: BoolArray) -> IndexArray:
@@ -131,13 +140,3 @@ def _best(rows: IndexArray, score: Array, allowed: BoolArray) -> IndexArray:
     rounded = score[entries].round(9)
     order = entries[np.lexsort((entries, -rounded, rows[entries]))]
     return order[np.unique(rows[order], return_index=True)[1]]
-
-
-def _visits(world: World, policy: PolicyTable) -> Array:
-    """`[M]` expected renewals that start in each cell, per episode from a uniform start: s (I - T)^-1."""
-    # T, the sum over the steps of a renewal; visits w solve w = s + w T, that is (I - T^T) w = s.
-    hits = [hit for hit, _ in renewal(world, policy)]
-    located = sum(hits, sparse.csr_array(hits[0].shape))
-    start = np.zeros(located.shape[0])
-    start[: world.num_cells] = 1.0 / world.num_cells
-    return accumulate(sparse.csr_array(located.T), start, world.size)[: world.num_cells]

@@ -1,18 +1,24 @@
-"""What a policy earns and does: the figures of an evaluation, however they were found."""
+"""The figures of an evaluation: rewards, detections, sensors, steps, from any method."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
+from trackmdp.notebook.card import Card, Carded, Facts, decimal, percent
+from trackmdp.statistics import MeanInterval, ratio
 from trackmdp.world.model import Array
 
+IndexArray: TypeAlias = npt.NDArray[np.integer[Any]]
 
-@dataclass(frozen=True)
-class Evaluation:
-    """What a policy earns; single figures are pooled over a uniform start.
+
+@dataclass(frozen=True, repr=False)
+class Evaluation(Carded):
+    """The figures of a policy; single figures are pooled over a uniform start.
 
     Attributes:
         aihtr: mean of `value` (paper, Section VII-A).
@@ -25,6 +31,7 @@ class Evaluation:
         detections, sensors, safe_actions: `[M]`, the same of these; None where they were not asked for
             (`evaluate`, `per_cell`) and the system was too large to factorise.
         error: no entry of `value` is farther from the exact one; 0 where the system was factorised.
+        starts: `[F]`, value of each start of an episode: of each hidden state, or of each recorded track.
     """
 
     aihtr: float
@@ -38,6 +45,26 @@ class Evaluation:
     sensors: Array | None
     safe_actions: Array | None
     error: float = 0.0
+    starts: Array = field(default_factory=lambda: np.zeros(0))
+
+    def card(self) -> Card:
+        """AIHTR, accuracy, sensors and lengths."""
+        cells = f"{len(self.value):,} start cells" if len(self.value) else "all start cells"
+        return Card(f"Evaluation: {cells}", self.facts())
+
+    def facts(self) -> Facts:
+        """The figures of the card."""
+        found = {"AIHTR": decimal(self.aihtr), "accuracy": percent(self.accuracy)}
+        found["sensors per step"] = decimal(self.sensors_per_step, 2)
+        found["safe actions per episode"] = decimal(self.safe_per_episode)
+        found["steps per episode"] = decimal(self.expected_length, 1)
+        known = self.value[~np.isnan(self.value)]  # no recorded track starts in the other cells
+        if len(known):
+            ends = decimal(float(known.min())), decimal(float(known.max()))
+            found["value V(x)"] = f"{ends[0]} to {ends[1]}"
+        if self.error:
+            found["error"] = f"at most {self.error:.1g} in a value"
+        return found
 
 
 def regret_per_step(upper_aihtr: float, evaluation: Evaluation) -> float:
@@ -46,11 +73,11 @@ def regret_per_step(upper_aihtr: float, evaluation: Evaluation) -> float:
 
 
 def pooled(totals: Iterable[Array | float], error: float = 0.0) -> Evaluation:
-    """An evaluation from what an episode comes to from each start cell, pooled over a uniform start.
+    """An evaluation from the totals of an episode from each start cell, pooled over a uniform start.
 
     Args:
         totals: reward, steps in the grid, detections, sensors on, safe actions, steps: `[M]` each; or of the third to
-            the fifth a mean, where start cells were not told apart.
+            the fifth a mean, without figures for each start cell.
         error: see `Evaluation`.
     """
     value, steps, detections, sensors, safe, length = map(np.asarray, totals)
@@ -68,4 +95,78 @@ def pooled(totals: Iterable[Array | float], error: float = 0.0) -> Evaluation:
         sensors=sensors if sensors.ndim else None,
         safe_actions=safe if safe.ndim else None,
         error=error,
+        starts=value,
     )
+
+
+def by_start(starts: IndexArray, totals: Array, num_cells: int, error: float = 0.0) -> Evaluation:
+    """An evaluation from the totals of F episodes, each as likely.
+
+    Args:
+        starts: `[F]` cells in which they start.
+        totals: `[F, 6]` reward, steps in the grid, detections, sensors on, safe actions, steps.
+        num_cells: M; values of cells in which none starts are nan.
+        error: see `Evaluation`.
+    """
+    together = pooled(totals.T, error)
+    if len(starts) == num_cells and (np.diff(starts) == 1).all():
+        return together
+    count = np.bincount(starts, minlength=num_cells)
+    with np.errstate(invalid="ignore"):
+        # 0 / 0 is nan on purpose: 0 would read as a worth.
+        cells = [np.bincount(starts, column, num_cells) / count for column in totals.T[:5]]
+    value, steps, detections, sensors, safe = cells
+    return replace(
+        together,
+        value=value,
+        steps=steps,
+        detections=detections,
+        sensors=sensors,
+        safe_actions=safe,
+    )
+
+
+@dataclass(frozen=True)
+class ReplayedTracks:
+    """Totals of a policy on K tracks, each from its first cell to its end.
+
+    Attributes:
+        totals: `[K, 5]` reward, steps in the grid, detections, sensors on by choice, safe actions; expected ones where
+            the policy draws or a sensor may miss.
+        length: `[K]` steps, the exit step included.
+        watched: `[M]` steps in which each cell was sensed, of all tracks together; the safe action is not counted.
+    """
+
+    totals: Array
+    length: Array
+    watched: Array
+
+    def evaluation(self, starts: IndexArray, num_cells: int) -> Evaluation:
+        """The figures of all tracks together, and by start cell, nan where no track starts; `starts` is `[K]`."""
+        return by_start(starts, np.column_stack([self.totals, self.length]), num_cells)
+
+    def intervals(self, names: IndexArray) -> dict[str, MeanInterval]:
+        """Figure -> its mean over tracks and its interval; `names` `[K]` are those of the targets.
+
+        Targets are taken as independent. Tracks of one name are not: they are pieces of one target's path, cut where
+        it was not seen, and counted as so many targets they would make every interval too narrow.
+        """
+        # Example: the names 4 7 7 are the targets 0 1 1, of which the second has the sums of two tracks.
+        target = np.unique(names, return_inverse=True)[1]
+        columns = (*self.totals.T, self.length, np.ones(len(names)))
+        sums = (np.bincount(target, column).astype(np.float64) for column in columns)
+        reward, steps, detections, sensors, safe, length, tracks = sums
+        return {
+            "aihtr": ratio(reward, tracks),
+            "reward_per_step": ratio(reward, length),
+            "accuracy": _complement(ratio(steps - detections, steps, events=True)),
+            "sensors_per_step": ratio(sensors, steps),
+            "safe_per_episode": ratio(safe, tracks, events=True),
+            "expected_length": ratio(length, tracks),
+        }
+
+
+def _complement(missed: MeanInterval) -> MeanInterval:
+    """1 less a share, with its interval."""
+    low, high = (None if end is None else 1.0 - end for end in (missed.high, missed.low))
+    return MeanInterval(1.0 - missed.mean, None if low is None else max(low, 0.0), high, missed.n)

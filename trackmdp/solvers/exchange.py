@@ -1,203 +1,351 @@
-"""Exchange: change one or two cells of one set, choose all later sets anew, and only then judge.
+"""Exchange: change one or two sensors of one set, choose all later sets anew, and only then judge (theory.md#exchange).
 
-The ascent of `search` changes one set at a time and stops where two would have to change together: leaving a cell out
-of one set pays only if a later set looks for the target where it then may be. So every candidate, the set of step t
-with one or two cells flipped, is held while the sets after it are chosen anew by a forward-and-backward sweep; then
-sweeps go over all of its sets, and what is worth more than the plan at hand, in exact expectation, replaces it.
-How that is worked out is in `plans`.
+Ascent changes one set at a time and stops where two would have to change together: to leave a cell out of one set pays
+only if a later set looks for the target where it then may be. So every candidate, the set of step t with one or two
+sensors flipped, is held while the sets after it are chosen anew by a forward-and-backward sweep; then sweeps go over
+all of its sets, and a candidate of more worth than the plan at hand, in exact expectation, replaces it.
+
+The candidates of all rows are worked on together, as columns (`plans`). With E_t entries at step t and Z successors per
+state, a sweep over all H = t_max + 1 steps takes 2 C Z (E_0 + ... + E_H-1) multiplications, C = 33, and the candidates
+of the H - 1 steps take about three sweeps each. Some 3 H + 10 arrays of 8 C E bytes are alive at once, E being the
+largest E_t of a part: rows are gone through in parts, so that one array holds about `MOST_NUMBERS` numbers, or those of
+one row.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 from scipy import sparse
 
 from trackmdp.policies.table import PolicyTable
 from trackmdp.seeding import derive
-from trackmdp.solvers import qmdp, search
 from trackmdp.solvers.bounds import one_set
-from trackmdp.solvers.layers import Layer, layer_sets, policy_table, reachable_layers
-from trackmdp.solvers.plans import Chains, ChainStep, exchanged_parts, parts
-from trackmdp.solvers.renewal import IndexArray, per_row
-from trackmdp.solvers.search import InnerProblem, located_value
+from trackmdp.solvers.linear import IndexArray, forced_worth, per_row
+from trackmdp.solvers.plans import Layout, Plans, Turn
+from trackmdp.solvers.renewal import Renewal
+from trackmdp.solvers.search import (
+    Found,
+    ascended,
+    candidates_of,
+    clocked_sets,
+    columns_of,
+    follow_credit,
+    risen,
+    shares,
+)
 from trackmdp.world.model import Array, BoolArray, World
 
+MOST_NUMBERS = 2**17
+"""Numbers in one array of a part, 1 MB: larger parts leave the caches, and took twice the time."""
+SINGLES, PAIRED = 12, 7
+"""Sensors of one set that are flipped alone, and how many of these in pairs: those closest to a change first."""
+LATER_SWEEPS, ALL_SWEEPS = 1, 2
+"""Sweeps over the sets after the flip alone, then over all sets. More of the first gained nothing on drifts and walks;
+with one of the second, regrets of .001 to .004 are left there."""
 OTHERS, PRICES_OFF, _STEPS, MOST_STARTED = 4, 0.2, 5, 500
 """Other searches from t_max 2 on, how far the prices that lead them are off (standard deviation of their logarithms),
 the steps of their homotopies, and the cells up to which they are made. On nine worlds of 9 x 9 and 10 x 10 cells four
 gained up to .0007 per step, on diagonal walks .002 to .007, twelve as much again or less; prices .1 or .4 off gained no
 more, nor did moves that are off, or 30 steps, for twice the time."""
+_SEEN = 1e-12
+"""Keys with fewer visits an episode keep their plans: nothing is gained by them."""
+
+GoOn: TypeAlias = Callable[[], bool]
+"""Asked before each part whether to look further."""
+
+
+def _always() -> bool:
+    return True
+
+
+def _flips() -> BoolArray:
+    """`[SINGLES + 1, C]` whether each candidate flips the sensor of each rank; the last row is for all others."""
+    pairs = [*((rank,) for rank in range(SINGLES)), *itertools.combinations(range(PAIRED), 2)]
+    flipped = np.zeros((SINGLES + 1, len(pairs)), dtype=bool)
+    for candidate, ranks in enumerate(pairs):
+        flipped[list(ranks), candidate] = True
+    return flipped
+
+
+FLIPPED = _flips()
 
 
 def solve(world: World, starts: int = OTHERS) -> PolicyTable:
-    """The policy of `search`, improved by exchange, and from t_max 2 on by what `starts` other searches find."""
-    found = search.solve(world)
-    if world.coverage is not None:
-        return found
-    layers = reachable_layers(world, world.num_choices)
-    sets = exchanged(world, layers, layer_sets(layers, found))
-    if world.num_choices > 2:
-        sets = best_of(world, layers, sets, other_starts(world, layers, starts))
-    return policy_table(world, layers, sets)
-
-
-def other_starts(world: World, layers: list[Layer], count: int) -> Iterator[list[BoolArray]]:
-    """What `search` finds where the prices that lead it are a little off; nothing on large grids."""
-    rng = np.random.default_rng(derive(0, "exchange", "starts"))
-    for _ in range(count if world.num_cells <= MOST_STARTED else 0):
-        other = replace(world, cost=world.cost * np.exp(PRICES_OFF * rng.standard_normal(world.num_cells)))
-        yield search.follow_credit(other, layers, layer_sets(layers, qmdp.clocked_policy(other)), _STEPS)
-
-
-def best_of(
-    world: World,
-    layers: list[Layer],
-    sets: list[BoolArray],
-    others: Iterable[list[BoolArray]],
-    value: Array | None = None,
-    *,
-    go_on: Callable[[], bool] = lambda: True,
-) -> list[BoolArray]:
-    """From each located cell the best plan that exchange makes of `sets` or of any of the `others`.
-
-    Each cell takes a plan of its own, V given, so that no cell's value is lower than with `sets`; arguments as of
-    `exchanged`.
-    """
-    located = np.ones(world.num_cells)
-    value = located_value(world, layers, sets) if value is None else value
-    for other in others:
-        problem = InnerProblem.of(world, layers, value)
-        ascended = problem.ascend(other, located, sweeps=10)
-        # Where these are the plans at hand, exchange has been tried.
-        found = exchange(problem, ascended, located, _changed(layers, sets, ascended), go_on)
-        worth = problem.worth(sets, located)
-        better = problem.worth(found, located) > worth + 1e-10 * (1.0 + np.abs(worth))
-        if better.any():
-            sets = [np.where(better[layer.rows], *on) for layer, *on in zip(layers[1:], found, sets, strict=True)]
-            value = located_value(world, layers, sets, value)
-    return exchanged(world, layers, sets, value, go_on=go_on)
+    """The policy of `search`, improved by exchange, and from t_max 2 on by the results of `starts` other searches."""
+    renewal = Renewal(world, world.motion)
+    first = Found(renewal, clocked_sets(renewal, world))
+    after = follow_credit(renewal, world, first)
+    policy = exchanged(renewal, after if after.aihtr >= first.aihtr else first)
+    if world.num_choices > 2 and renewal.size is not None:
+        policy = best_of(renewal, policy, other_starts(renewal, world, starts))
+    return renewal.table(policy.sets)
 
 
 def improve(world: World, policy: PolicyTable, *, once: bool = False) -> PolicyTable:
-    """What exchange, or `once` a first round of it, makes of a deterministic `policy`; no cell's value is lower.
+    """The result of exchange (`once`: one round of it) from a deterministic `policy`; its AIHTR is no lower."""
+    renewal = Renewal(world, world.motion)
+    return renewal.table(exchanged(renewal, Found(renewal, renewal.sets(policy)), once=once).sets)
 
-    Exchange is of cells, one sensor in each: sets of sensors with footprints ascend, by `search`.
+
+def other_starts(
+    renewal: Renewal, world: World, count: int, steps: int = _STEPS, sweeps: int = 3
+) -> Iterator[list[BoolArray]]:
+    """The results of `search` with prices a little off; nothing on large grids."""
+    rng = np.random.default_rng(derive(0, "exchange", "starts"))
+    for _ in range(count if world.num_cells <= MOST_STARTED else 0):
+        off = np.exp(PRICES_OFF * rng.standard_normal(world.total_sensors))
+        other = replace(world, cost=world.cost * off)
+        led = renewal.priced_as(other)
+        first = Found(led, clocked_sets(led, other))
+        yield follow_credit(led, other, first, steps, sweeps).sets
+
+
+def best_of(
+    renewal: Renewal,
+    policy: Found,
+    others: Iterable[list[BoolArray]],
+    *,
+    go_on: GoOn = _always,
+) -> Found:
+    """For each key the best plan that exchange makes of `policy` or of any of the `others`.
+
+    Each key takes a plan of its own, V given, so that with one event a key no value is lower than with `policy`.
     """
-    layers = reachable_layers(world, world.num_choices)
-    sets = layer_sets(layers, policy)
-    if world.coverage is not None:
-        return policy_table(world, layers, search.ascended(world, layers, sets))
-    return policy_table(world, layers, exchanged(world, layers, sets, once=once))
+    for other in others:
+        plans = renewal.problem(policy.value, shares(renewal, policy))
+        after = columns_of(plans.ascend(candidates_of(other), sweeps=10))
+        # Where these are the plans at hand, exchange has been tried.
+        tried = exchange(plans, after, rows_changed(plans.layout, policy.sets, after), go_on)
+        worth, other_worth = (
+            plans.worth(candidates_of(each))[:, 0] for each in (policy.sets, tried)
+        )
+        better = other_worth > worth + 1e-10 * (1.0 + np.abs(worth))
+        sets = [
+            np.where(better[turn.choice.rows], new, old)
+            for turn, new, old in zip(plans.turns, tried, policy.sets, strict=True)
+        ]
+        policy = risen(renewal, policy, plans, sets) or policy
+        if not go_on():
+            break
+    return exchanged(renewal, policy, go_on=go_on)
 
 
 def exchanged(
-    world: World,
-    layers: list[Layer],
-    sets: list[BoolArray],
-    value: Array | None = None,
-    *,
-    go_on: Callable[[], bool] = lambda: True,
-    once: bool = False,
-) -> list[BoolArray]:
-    """Policy iteration by exchange, until the mean value no longer grows; no cell's value is lower than before.
+    renewal: Renewal, policy: Found, *, go_on: GoOn = _always, once: bool = False, rounds: int = 40
+) -> Found:
+    """Policy iteration by exchange, until the AIHTR no longer grows.
 
     Args:
-        world: the problem.
-        layers: possible positions, from all located cells to those after t_max + 1 moves.
-        sets: where to start, sensed entries of each layer but the first.
-        value: `[M]`, that of `sets`, where known.
+        renewal: the problem.
+        policy: where to start.
         go_on: asked before each part whether to look further.
         once: end after the first round, which gains most of it.
+        rounds: at most so many.
     """
-    located, everywhere = np.ones(world.num_cells), np.ones(world.num_cells, dtype=bool)
-    value = located_value(world, layers, sets) if value is None else value
+    everywhere = np.ones(len(renewal.plans), dtype=bool)
     tried = everywhere
-    while True:
-        problem = InnerProblem.of(world, layers, value)
-        candidate = exchange(problem, problem.ascend(sets, located, sweeps=10), located, tried, go_on)
-        changed = _changed(layers, sets, candidate)
-        better = located_value(world, layers, candidate, value) if changed.any() else value
-        # Plans that are each worth no less, V given, make a policy of no less value anywhere (policy improvement), so
-        # that the sum says whether there is any gain; the margin is rounding.
-        if better.sum() > value.sum() + 1e-12 * np.abs(value).sum():
+    for _ in range(1 if once else rounds):
+        if policy.visits is None:
+            plans = renewal.problem(policy.value)
+            some = tried & could_gain(renewal, plans, policy)
+        else:
+            plans = renewal.problem(policy.value, policy.visits)
+            normal = renewal.count - renewal.events.forced
+            some = tried & (
+                per_row(renewal.owner[:normal], policy.visits[:normal], len(tried)) > _SEEN
+            )
+        sets = columns_of(plans.ascend(candidates_of(policy.sets), sweeps=10))
+        sets = exchange(plans, sets, some, go_on)
+        better = risen(renewal, policy, plans, sets)
+        if better is not None:
             # Where nothing was gained nothing is tried again, until the others have settled as well: V has then moved.
-            sets, value, tried = candidate, better, changed
+            moved = rows_changed(plans.layout, policy.sets, sets)
+            policy, tried = better, moved
         elif tried.all() or not go_on():
-            return sets
+            break
         else:
             tried = everywhere
-        if once:
-            return sets
+    if renewal.task.coverage is not None:
+        policy = ascended(renewal, policy)
+    return policy
 
 
-def _changed(layers: list[Layer], before: list[BoolArray], after: list[BoolArray]) -> BoolArray:
-    """`[M]` from which located cells the sets differ."""
-    changed = np.zeros(len(layers[0].rows), dtype=bool)
-    for layer, old, new in zip(layers[1:], before, after, strict=True):
-        changed[layer.rows[old != new]] = True
-    return changed
+def could_gain(renewal: Renewal, plans: Plans, policy: Found) -> BoolArray:
+    """`[K]`, whether a plan is worth less than it could be if the position were revealed after every set."""
+    if renewal.size is None:
+        return np.ones(len(renewal.plans), dtype=bool)
+    world = renewal.world
+    detected = world.reward + policy.value[: world.num_cells]
+    most = revealed(world, detected, forced_worth(world, detected), plans.length)
+    return hopeful(plans, policy.sets, most)
+
+
+def hopeful(plans: Plans, sets: Sequence[BoolArray], most: Array) -> BoolArray:
+    """`[K]`, whether plans `sets` are worth less than `most` `[K]`."""
+    worth = plans.worth(candidates_of(sets))[:, 0]
+    return most - worth > 1e-9 * (1.0 + np.abs(worth))
+
+
+def revealed(world: World, detected: Array, missed: Array, length: int) -> Array:
+    """`[Z]` worth of the best plan if the state were revealed after each set; no plan is worth more."""
+    worth = missed
+    for _ in range(length):
+        worth = one_set(world, detected, worth)
+    return worth
+
+
+def rows_changed(
+    layout: Layout, before: Sequence[BoolArray], after: Sequence[BoolArray]
+) -> BoolArray:
+    """`[K]`, the rows in which the sets differ."""
+    found = np.zeros(layout.count, dtype=bool)
+    for turn, old, new in zip(layout.turns, before, after, strict=True):
+        found[turn.choice.rows[old != new]] = True
+    return found
 
 
 def exchange(
-    problem: InnerProblem,
-    sets: list[BoolArray],
-    mass: Array,
-    tried: BoolArray | None = None,
-    go_on: Callable[[], bool] = lambda: True,
+    plans: Plans, sets: Sequence[BoolArray], rows: BoolArray, go_on: GoOn = _always
 ) -> list[BoolArray]:
-    """Plans worth no less than `sets` from each located cell, the value of locating the target given.
+    """Plans worth no less than `sets` to any row; those end where ascent by itself ends.
 
     Args:
-        problem: the search from each located cell.
-        sets: sensed entries of each layer but the first; left as they are.
-        mass: `[E]`, undetected mass on the first layer.
-        tried: `[M]`, the located cells whose plans may change; None for all.
-        go_on: asked before each part whether to look further.
+        plans: the problem of each row.
+        sets: `[G]` for each step; left as they are.
+        rows: `[K]`, the rows of the plans that may change.
+        go_on: see `GoOn`.
     """
-    worth = problem.worth(sets, mass)
-    # A located cell whose plan is worth what it could be if the position were revealed after every set is done with.
-    could_gain = revealed(problem, mass) - worth > 1e-9 * (1.0 + np.abs(worth))
-    cells = np.flatnonzero(could_gain if tried is None else could_gain & tried)
-    rows = len(could_gain)
-    entries = np.max([np.bincount(layer.rows, minlength=rows) for layer in problem.layers], axis=0)[cells]
-    each = itertools.takewhile(lambda _: go_on(), parts(entries))
-    return exchanged_parts(sets, (_chains(problem, mass, cells[part]) for part in each))
+    improved = [on.copy() for on in sets]
+    if plans.length < 2 or not rows.any():  # the last set is always a best answer
+        return improved
+    cutter = _Cutter(plans, np.flatnonzero(rows))
+    for part in itertools.takewhile(lambda _: go_on(), cutter.parts()):
+        some, decisions = cutter.cut(part)
+        found = _Exchange(some).run(
+            [on[place] for on, place in zip(improved, decisions, strict=True)]
+        )
+        for on, place, plan in zip(improved, decisions, found, strict=True):
+            on[place] = plan
+    return improved
 
 
-def _chains(problem: InnerProblem, mass: Array, cells: IndexArray) -> tuple[Chains, Sequence[IndexArray]]:
-    """The searches from the located `cells`, in order, and which entries of each layer but the first are theirs."""
-    world, layers = problem.world, problem.layers
-    # Entries are in order of their located cells: looking at no others, all parts of a grid together see each once.
-    low, high = cells[0], cells[-1] + 1
-    place = np.full(high - low, -1)
-    place[cells - low] = np.arange(len(cells))
-    spans = [slice(*np.searchsorted(layer.rows, (low, high))) for layer in layers]
-    theirs = [place[layer.rows[span] - low] for layer, span in zip(layers, spans, strict=True)]
-    kept = [span.start + np.flatnonzero(row >= 0) for span, row in zip(spans, theirs, strict=True)]
-    rows = [row[row >= 0] for row in theirs]
-    steps = []
-    for t, layer in enumerate(layers[1:], start=1):
-        entries, there, before = kept[t], layer.cells[kept[t]], kept[t - 1]
-        number = np.cumsum(theirs[t] >= 0) - 1
-        moves = layer.moves[before]  # to entries of the same located cells, which are all kept
-        renamed = (moves.data, number[moves.indices - spans[t].start], moves.indptr)
-        kept_moves = sparse.csr_array(renamed, shape=(len(before), len(entries)))
-        chance = np.broadcast_to(world.detects(there), there.shape)
-        stay = world.stay_probability[layers[t - 1].cells[before]]
-        allowed = layer.allowed[entries] if problem.windowed and layer.allowed is not None else None
-        worth, price = problem.detected[there], world.cost[there]
-        steps.append(ChainStep(rows[t], kept_moves, worth, chance, price, stay, allowed=allowed))
-    missed = problem.missed[layers[-1].cells[kept[-1]]]
-    return Chains(rows[0], mass[kept[0]], steps, missed), kept[1:]
+class _Cutter:
+    """Cuts plans into parts of some of the rows, in order.
+
+    Args:
+        plans: to be cut.
+        rows: `[L]`, the rows that are wanted, in order.
+    """
+
+    def __init__(self, plans: Plans, rows: IndexArray) -> None:
+        self._plans, self._rows = plans, rows
+        number = np.full(plans.layout.count, -1)
+        number[rows] = np.arange(len(rows))
+        # Of each step the wanted entries in order of their rows, and where those of each row begin.
+        self._order, self._begin = [], []
+        for owner in plans.layout.rows:
+            mine = np.flatnonzero(number[owner] >= 0)
+            mine = mine[np.argsort(number[owner[mine]], kind="stable")]
+            count = np.bincount(number[owner[mine]], minlength=len(rows))
+            self._order.append(mine)
+            self._begin.append(np.concatenate([[0], np.cumsum(count)]))
+
+    def parts(self) -> Iterator[slice]:
+        """Ranges of the wanted rows, as many at once as `MOST_NUMBERS` allows."""
+        # Rows with 40, 50 and 30 entries, and room for 100: their sums 40, 90, 120 fall into the parts 0, 0, 1.
+        entries = np.max([np.diff(begin) for begin in self._begin], axis=0)
+        number = (np.cumsum(entries) - 1) // max(1, MOST_NUMBERS // FLIPPED.shape[1])
+        ends = [0, *(np.flatnonzero(np.diff(number)) + 1).tolist(), len(entries)]
+        yield from (slice(low, high) for low, high in itertools.pairwise(ends) if high > low)
+
+    def cut(self, part: slice) -> tuple[Plans, list[IndexArray]]:
+        """The plans of a part, and which decisions are theirs, for each step."""
+        plans, rows = self._plans, self._rows[part]
+        kept = [
+            np.sort(order[begin[part.start] : begin[part.stop]])
+            for order, begin in zip(self._order, self._begin, strict=True)
+        ]
+        local = np.searchsorted(rows, plans.layout.rows[0][kept[0]])
+        turns: list[Turn] = []
+        decisions: list[IndexArray] = []
+        start = local
+        for turn, before, now in zip(plans.turns, kept, kept[1:], strict=False):
+            mine = np.flatnonzero(np.isin(turn.choice.rows, rows))
+            choice = turn.choice.part(mine, now, rows)
+            moves = _columns(turn.moves[before], now)
+            local = np.searchsorted(rows, turn.rows[now])
+            turns.append(Turn(local, moves, turn.stay[before], choice, turn.price[mine]))
+            decisions.append(mine)
+        detected = [each[now, 0] for each, now in zip(plans.detected, kept[1:], strict=True)]
+        layout = Layout(start, turns, len(rows))
+        last = plans.missed[kept[-1], 0]
+        return Plans(layout, plans.mass[kept[0], 0], detected, last), decisions
 
 
-def revealed(problem: InnerProblem, mass: Array) -> Array:
-    """`[M]` the worth of the best plans if the position were revealed after every set; no plan is worth more."""
-    origin, worth = problem.layers[0], problem.missed
-    for _ in range(problem.length):
-        worth = one_set(problem.world, problem.detected, worth)
-    return per_row(origin.rows, mass * worth[origin.cells], problem.world.num_cells)
+def _columns(matrix: sparse.csr_array, kept: IndexArray) -> sparse.csr_array:
+    """The columns `kept` of a matrix that has entries in no others."""
+    place = np.searchsorted(kept, matrix.indices)
+    return sparse.csr_array((matrix.data, place, matrix.indptr), shape=(matrix.shape[0], len(kept)))
+
+
+@dataclass(frozen=True)
+class _Exchange:
+    """Candidates of some plans."""
+
+    plans: Plans
+
+    def run(self, sets: Sequence[BoolArray]) -> list[BoolArray]:
+        """The better plans `[G]` for each step."""
+        plans, plan = self.plans, candidates_of(sets)
+        worth = plans.worth(plan)
+        for step in range(1, plans.length):
+            mass = plans.pushed(plan, step)
+            first = plan[step - 1] ^ FLIPPED[self.ranks(step, plan, mass)]
+            # The sets before the flip are held in these sweeps, so that they need no more than the mass that is left.
+            left = plans.missing(step, first, mass)
+            later = plans.ascend(plan[step:], mass=left, since=step, sweeps=LATER_SWEEPS)
+            every = plans.ascend([*plan[: step - 1], first, *later], sweeps=ALL_SWEEPS)
+            plan, worth = self.better(plan, worth, every)
+        return columns_of(plan)
+
+    def better(
+        self, plan: list[BoolArray], worth: Array, candidates: list[BoolArray]
+    ) -> tuple[list[BoolArray], Array]:
+        """The best candidate of each row in place of its plan, if it is worth more; and its worth."""
+        reached = self.plans.worth(candidates)
+        best = reached.argmax(axis=1)[:, None]
+        most = np.take_along_axis(reached, best, axis=1)
+        gains = most > worth + 1e-10 * (1.0 + np.abs(worth))
+        chosen = []
+        for turn, on, old in zip(self.plans.turns, candidates, plan, strict=True):
+            rows, wide = turn.choice.rows, np.broadcast_to(on, (len(on), reached.shape[1]))
+            new = np.take_along_axis(wide, best[rows], axis=1)
+            chosen.append(np.where(gains[rows], new, old))
+        return chosen, np.where(gains, most, worth)
+
+    def ranks(self, step: int, plan: list[BoolArray], mass: Array) -> IndexArray:
+        """`[G]` how near each decision at `step` is to the other choice, 0 the nearest; SINGLES: never flipped."""
+        plans, choice = self.plans, self.plans.turns[step - 1].choice
+        later = plans.after(plan[step - 1 :], step - 1)[0]
+        gain = mass * (plans.detected[step - 1] - later)
+        margin = choice.margin(plan[step - 1], gain, plans.priced(step, mass))
+        possible = choice.gained(mass)[:, 0] > 0
+        rank = np.minimum(ranked(choice.rows, margin, possible), SINGLES)
+        if choice.allowed is not None:
+            possible &= choice.allowed[:, 0]
+        return np.where(possible, rank, SINGLES)
+
+
+def ranked(rows: IndexArray, margin: Array, possible: BoolArray) -> IndexArray:
+    """`[G]` place of each decision among those of its row, least margin first, the impossible ones last."""
+    order = np.lexsort((margin, ~possible, rows))
+    # Decisions are in order of their rows, and ranks run from 0 within each: with rows 0 0 1 1 1 the first are
+    # 0 0 2 2 2, and the ranks of `order` 0 1 0 1 2.
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order)) - np.searchsorted(rows, rows)
+    return rank

@@ -1,4 +1,4 @@
-"""What cells left unsensed lose together, those decided on and those that are not: the bound inside branch and bound.
+"""Joint loss of cells left unsensed, decided on or undecided: the bound inside branch and bound.
 
 Let D be the cells left unsensed and U those still undecided, z the undetected mass. One more set for all of it, then
 the position revealed, is worth at most (`Tree._one_more_set`)
@@ -6,14 +6,14 @@ the position revealed, is worth at most (`Tree._one_more_set`)
     sum_j z_j rho_j + sum_i max{0, sum_j z_j b_ji},   b_ji = P_ji w_i - c_i p_in(j),   w_i = r + V(i) - R(i),
 
 rho_j = sum_i P_ji R(i): sensing i next gains w_i where the target goes on to i, and costs c_i wherever it comes from.
-With S_i = sum_{j in D} z_j b_ji, what a cell k of U adds depends on D: where S_i > 0, sensor i will be on and k pays
-for it; where S_i < 0, k alone has to make it worth while. Dividing S_i among the cells of U, each with a share
+With S_i = sum_{j in D} z_j b_ji, the addition of a cell k of U depends on D: where S_i > 0, sensor i will be on and k
+pays for it; where S_i < 0, k alone has to make it worth while. Dividing S_i among the cells of U, each with a share
 s_ik >= 0 and sum_k s_ik <= 1, max{0, a + b} <= max{0, a} + max{0, b} gives
 
     max{0, S_i + sum_k z_k b_ki} <= max{0, S_i} + sum_k [max{0, s_ik S_i + z_k b_ki} - max{0, s_ik S_i}],
 
-a sum over the cells of U, in which each is decided by itself. Shares in proportion to |z_k b_ki|, over the k whose sign
-is opposite to that of S_i, make cell k lose |z_k b_ki| min{1, |S_i| / sum_k |z_k b_ki|} at i.
+a sum over the cells of U, in which each is decided by itself. Shares in proportion to |z_k b_ki|, over the k of sign
+opposite to S_i, make cell k lose |z_k b_ki| min{1, |S_i| / sum_k |z_k b_ki|} at i.
 
 Two cells, each of mass 1, that lead to different next cells with w = 1 and c = .3: b = .7 at the own next cell, -.3 at
 the other one. With the first left, S = (.7, -.3), and the second has to pay .3 for the first's sensor and loses .3 at
@@ -26,11 +26,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trackmdp.solvers.renewal import IndexArray
+from trackmdp.solvers.linear import IndexArray
 from trackmdp.world.model import Array, BoolArray, World
 
 MOST_ENTRIES = 1 << 15
-"""Entries b_ji handled at once: what is a quarter of a megabyte stays in the cache."""
+"""Entries b_ji handled at once: a quarter of a megabyte stays in the cache."""
 _WIDEST = 1 << 13
 """Pairs (cell, next cell) of one state above which it is not looked at: the sums would take longer than they save."""
 
@@ -63,9 +63,15 @@ class Joint:
         rows = np.repeat(np.arange(m), count)
         column = np.arange(kernel.nnz) - np.repeat(kernel.indptr[:-1], count)
         # Cell M stands for no cell: a move to it has probability 0, its sensor costs and gains nothing.
-        self._to, self._p = np.full((m + 1, count.max(initial=0)), m), np.zeros((m + 1, count.max(initial=0)))
+        self._to, self._p = (
+            np.full((m + 1, count.max(initial=0)), m),
+            np.zeros((m + 1, count.max(initial=0))),
+        )
         self._to[rows, column], self._p[rows, column] = kernel.indices, kernel.data
-        self._inside, self._cost = np.append(world.stay_probability, 0.0), np.append(world.cost, 0.0)
+        self._inside, self._cost = (
+            np.append(world.stay_probability, 0.0),
+            np.append(world.prices, 0.0),
+        )
         self._revealed = [np.append(known, 0.0) for known in revealed]
         self._detected = np.append(detected, 0.0)
 
@@ -98,7 +104,7 @@ class Joint:
         left: BoolArray,
         decided: int,
     ) -> tuple[Array, Array]:
-        """What the cells left lose, and what each undecided one would add to it at least if it were left as well.
+        """Loss of the cells left, and the least addition of each undecided cell if it were left as well.
 
         Args:
             after: of the states.
@@ -137,19 +143,21 @@ class Joint:
         ends, known = self._revealed[sets_left - 1], self._revealed[sets_left]
         to, place = self._to[cells], after.place.astype(np.intp)
         moved = mass[:, :, None] * self._p[cells]
-        # z_j b_ji, [B, K, I]: the price of every next cell, and the gain at those that j leads to
+        # z_j b_ji, [B, K, I]: the price of every next cell, and the gain at the successors of j
         gain = (mass * -self._inside[cells])[:, :, None] * self._cost[after.cells][:, None, :]
         state, cell = np.ogrid[: len(cells), : cells.shape[1]]
         gain[state[:, :, None], cell[:, :, None], place] += moved * (self._detected - ends)[to]
-        # R_{h-1} z less the linear part of one more set: what revealing is worth more where nothing is sensed next
+        # R_{h-1} z less the linear part of one more set: worth of revealing where nothing is sensed next
         revealed = mass * known[cells] - (moved * ends[to]).sum(axis=2)
         size = np.abs(gain)
         each = gain[where]  # [P, K, I]
         summed = np.matmul(left[:, None, :].astype(float), each)[:, 0]
         lost = (left * revealed[where]).sum(axis=1) - np.maximum(summed, 0.0).sum(axis=1)
-        # sums over the undecided cells of what is positive and of what is negative, [B, I]
+        # sums of the positive and of the negative terms over the undecided cells, [B, I]
         total, whole = gain[:, decided:].sum(axis=1), size[:, decided:].sum(axis=1)
-        opposite = np.where(summed > 0, (0.5 * (whole - total))[where], (0.5 * (whole + total))[where])
+        opposite = np.where(
+            summed > 0, (0.5 * (whole - total))[where], (0.5 * (whole + total))[where]
+        )
         most = np.maximum(np.abs(summed), opposite)
         # min{1, |S_i| / sum}, with the sign of S_i
         share = np.divide(summed, most, out=np.zeros_like(summed), where=most > 0)

@@ -10,50 +10,77 @@ from scipy import sparse
 
 from trackmdp.solvers.branch import Tree
 from trackmdp.solvers.delayed import Delayed
-from trackmdp.solvers.search import InnerProblem
+from trackmdp.solvers.inner import InnerProblem
 from trackmdp.world.model import Array, BoolArray
 
 
-def first_guess(problem: InnerProblem, known: list[Array], mass: Array) -> list[BoolArray]:
+def first_guess(
+    problem: InnerProblem, known: list[Array], mass: Array | None = None
+) -> list[BoolArray]:
     """Sets found by a homotopy from the credit r + V - R, `known` being R_0 ... R_{H-1}; see `search`."""
-    # with H sets, after set t there are H - 1 - t left: credit_t(j) = r + V(j) - R_{H-1-t}(j)
+    # With H sets, after set t there are H - 1 - t left: credit_t(j) = r + V(j) - R_{H-1-t}(j).
     credit = [problem.detected - known[problem.length - 1 - t] for t in range(problem.length)]
-    sets = problem.none_sensed()
-    for optimism in np.linspace(1.0, 0.0, 11):
-        sets = problem.ascend(sets, mass, sweeps=3, optimism=float(optimism), credit=credit)
-    return sets
+    return problem.guess(credit, mass)
 
 
 def tables(
-    problem: InnerProblem, *, slack: float, run: Callable[[Tree], None], known: list[Array] | None = None
+    problem: InnerProblem,
+    *,
+    slack: float,
+    run: Callable[[Tree], None],
+    known: list[Array] | None = None,
 ) -> list[Array]:
     """R_0 ... R_{H-1} of a `problem` of length H, each `[M]`; upper bounds where `run` ends a search early.
 
     Args:
-        problem: whose window is left out of account: the position j is revealed in the middle of a plan made in any x,
-            and a window around x says nothing about j. R is then a bound for every x, and exact without a window.
+        problem: its window is left out of account: the position j is revealed in the middle of a plan made in any x,
+            and a window around x does not limit j. R is then a bound for every x, and exact without a window.
         slack: worth that may be missed.
         run: runs the tree of one table, to its end or not.
         known: R_0, R_1, ..., as far as they are known already.
     """
-    problem, mass = replace(problem, windowed=False), np.ones(problem.world.num_cells)
     known = [problem.missed] if known is None else known[: problem.length]
     for sets in range(len(known), problem.length):
-        # R_h needs h layers only, the first ones of those that are there
-        part = replace(problem, layers=problem.layers[: sets + 1])
-        tree = Tree(part, known, part.worth(first_guess(part, known, mass), mass), slack)
+        # R_h needs the first h steps only.
+        part = replace(problem, first=0, length=sets, windowed=False)
+        tree = Tree(part, known, part.worth(first_guess(part, known)), slack)
         run(tree)
         known.append(tree.upper())
     return known
 
 
 def planted(
-    problem: InnerProblem, lower: Array, slack: float, run: Callable[[Tree], None], mass: sparse.csr_array | None = None
+    problem: InnerProblem,
+    lower: Array,
+    slack: float,
+    run: Callable[[Tree], None],
+    mass: sparse.csr_array | None = None,
 ) -> Tree:
     """The tree of a `problem`, not searched yet, with the tightest tables there are; `run` makes them, see `Tree`."""
     delayed = Delayed.of(problem.world, problem.detected, problem.missed, problem.length)
-    known = tables(problem, slack=slack, run=run, known=None if delayed is None else delayed.revealed)
+    revealed = None if delayed is None else delayed.revealed
+    known = tables(problem, slack=slack, run=run, known=revealed)
     return Tree(problem, known, lower, slack, mass, delayed)
+
+
+def adopted(
+    problem: InnerProblem, sets: list[BoolArray], tree: Tree, mass: Array | None = None
+) -> list[BoolArray] | None:
+    """`sets` `[G]` with the better plans that a tree has found, from `mass` `[E]`; None if there are none.
+
+    Without a `mass` it is 1 in each located cell.
+    """
+    better, left = tree.improvements()
+    if not better.any():
+        return None
+    found, mass = [], np.ones(problem.world.num_cells) if mass is None else mass
+    for turn, on, out in zip(problem.layout.turns, sets, left, strict=True):
+        mass = mass @ turn.moves
+        # A plan of the tree senses every possible cell but those left out.
+        rows, cells = turn.choice.rows, turn.choice.sensors
+        found.append(np.where(better[rows], (mass > 0) & ~out.has(rows, cells), on))
+        mass = mass * (1.0 - turn.choice.report(found[-1][:, None])[:, 0])
+    return found
 
 
 def up_to(nodes: int) -> Callable[[Tree], None]:

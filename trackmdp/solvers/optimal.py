@@ -2,10 +2,10 @@
 
 With V the value of the policy at hand, a plan nu from x is worth at most V(x) + eps_nu and leads to the next located
 cell by K_nu: V* - V <= max_nu eps_nu + K_nu (V* - V). Let the target pay e(X_s) >= 0 at every step s, located or not:
-phi = (I - P)^-1 e is what a path pays, whatever is sensed, and phi = e(x) + sum_t z_t e + K_nu phi, z_t the undetected
-mass after the t-th set of nu. If e(x) + sum_t z_t e >= eps_nu for every plan that is not ruled out, then phi >= max_nu
-eps_nu + K_nu phi, hence V* <= V + phi. With e = max_nu eps_nu the inequality holds; what is paid between two detections
-lets e be less.
+phi = (I - P)^-1 e is the payment of a path under every policy, and phi = e(x) + sum_t z_t e + K_nu phi, z_t the
+undetected mass after the t-th set of nu. If e(x) + sum_t z_t e >= eps_nu for every plan that is not ruled out, then
+phi >= max_nu eps_nu + K_nu phi, hence V* <= V + phi. With e = max_nu eps_nu the inequality holds; the payments between
+two detections let e be less.
 """
 
 from __future__ import annotations
@@ -19,24 +19,25 @@ import numpy as np
 
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers import qmdp
-from trackmdp.solvers.bounds import exact_clocked_table
+from trackmdp.solvers.bounds import exact_clocked_table, of_cells
 from trackmdp.solvers.branch import Tree
 from trackmdp.solvers.budget import Budget, Shares
-from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import Evaluation
-from trackmdp.solvers.exchange import best_of, exchanged, other_starts
-from trackmdp.solvers.known import planted
-from trackmdp.solvers.layers import Layer, layer_sets, policy_table, reachable_layers
-from trackmdp.solvers.regions import adopted, improved, proved, region_side
-from trackmdp.solvers.renewal import RenewalSystem, expected_steps
-from trackmdp.solvers.search import InnerProblem, follow_credit
+from trackmdp.solvers.exchange import best_of, exchanged, other_starts, revealed
+from trackmdp.solvers.inner import InnerProblem
+from trackmdp.solvers.known import adopted, planted
+from trackmdp.solvers.linear import RenewalSystem, expected_steps, forced_worth, grid_of
+from trackmdp.solvers.listing import best_plans
+from trackmdp.solvers.regions import improved, proved, region_side
+from trackmdp.solvers.renewal import Renewal
+from trackmdp.solvers.rules import clocked_policy
+from trackmdp.solvers.search import Found, clocked_sets, follow_credit
 from trackmdp.solvers.solution import SearchProgress, Solution
-from trackmdp.solvers.two_sets import best_plans
-from trackmdp.world.model import Array, BoolArray, World
+from trackmdp.solvers.value import evaluate
+from trackmdp.world.model import Array, World
 
 ROUNDING = 1e-10
-"""Relative gap that is not told from rounding, whatever the tolerance."""
+"""Relative gap that counts as rounding, at any tolerance."""
 FIRST_NODES = 100_000
 """Nodes before the first round's improvements are used; twice as many in each later round. Not seconds, so that the
 same world gives the same policy on any machine."""
@@ -66,26 +67,32 @@ def solve(
 
     The budget is work, so that a world has the same bracket on a busy and on an idle machine. Where the clocked policy
     attains the clocked bound, as it does wherever at most one possible cell is ever left unsensed, nothing is
-    searched. Ctrl-C ends a search like the budget does: the bracket so far is returned. Where sensors have footprints
-    there is no tree: up to t_max = 1 all plans are gone through (`two_sets`), above the bracket is that of policy
-    iteration, with the best set at each step, and of the clocked bound.
+    searched. Ctrl-C ends a search like the budget does: the bracket so far is returned. The tree decides cell by cell:
+    where sensors have footprints, or a detection reveals a mode, plans are listed (`listing`) as far as there are few,
+    else the bracket is between policy iteration, with the best set at each step, and the clocked bound.
 
     Args:
-        world: the problem with its motion model.
+        world: the problem with its motion model; a detection reveals the whole state.
         nodes: choices of branch and bound, all trees together; some 100,000 a second.
-        time_limit: seconds after which to stop before; what is returned then depends on the machine, and says so
-            (`Solution.timed_out`). None: no limit.
+        time_limit: seconds after which to stop before; the result then depends on the machine, and has
+            `Solution.timed_out`. None: no limit.
         tolerance: bracket that counts as closed, relative to the value.
-        memory: bytes that may be used, about, such as ``"2GiB"``; None: what the machine has left. A grid that needs
+        memory: bytes that may be used, about, such as ``"2GiB"``; None: the machine's free memory. A grid that needs
             more, or has more than 20,000 cells, is searched region by region.
-        start: a deterministic policy that is known, such as a learned one: what is returned is no worse.
-        on_progress: told how far the search has come.
+        start: a deterministic policy that is known, such as a learned one: the result is no worse. One that
+            remembers more than a detection reveals is left out.
+        on_progress: called with the progress of the search.
     """
     if world.max_steps is not None:
-        raise UserError(f"grid.max_steps={world.max_steps}: only whole episodes are solved, expected null")
-    side = region_side(world, memory)
-    # Sensors with footprints have no tree, and so no regions.
-    side = side if world.coverage is None else None
+        raise UserError(
+            f"grid.max_steps={world.max_steps}: only whole episodes are solved, expected null"
+        )
+    if world.memory != "cell":  # the state is known at a detection: more of the past is of no use
+        world = world.but(memory="cell")
+    if start is not None and start.task.num_keys != world.num_keys:
+        start = None
+    cells = world.coverage is None and world.modes == 1
+    side = region_side(world, memory) if cells else None  # there are no regions without a tree
     run = _Run(world, Budget(nodes, time_limit), tolerance, start, on_progress, side)
     interrupted = False
     try:
@@ -106,36 +113,48 @@ class _Run:
     on_progress: Callable[[SearchProgress], None] | None
     side: int | None
     restarted: bool = False
-    found: PolicyTable | None = None
+    other: PolicyTable | None = None
 
     def __post_init__(self) -> None:
-        # U(x, 0) >= V*(x) before anything is searched; `tighten` only lowers it.
+        # U(z, 0) >= V*(z) before anything is searched; `tighten` only lowers it.
         self.bound = exact_clocked_table(self.world).value
-        self.policy = qmdp.clocked_policy(self.world)
-        self.evaluation: Evaluation = evaluate(self.world, self.policy, guess=self.bound, per_cell=False)
+        self.trees = self.world.coverage is None and self.world.modes == 1
+        if self.world.modes == 1:
+            self.policy = clocked_policy(self.world)
+        else:
+            self.policy = self.renewal.table(clocked_sets(self.renewal, self.world))
+        self.evaluation = self.valued(self.policy, self.bound)
+
+    def valued(self, policy: PolicyTable, guess: Array) -> Evaluation:
+        return evaluate(self.world, policy, guess=guess, per_cell=False)
 
     @property
     def value(self) -> Array:
-        """`[M]`, of the policy at hand."""
-        return self.evaluation.value
+        """`[Z]`, of the policy at hand."""
+        return self.evaluation.starts
 
     def use(self, policy: PolicyTable) -> bool:
         """Take `policy` as the one at hand if it is better."""
-        evaluation = evaluate(self.world, policy, guess=self.value, per_cell=False)
+        evaluation = self.valued(policy, self.value)
         # By more than rounding, so that another way to write the same policy changes nothing.
-        better = bool(evaluation.value.sum() > self.value.sum() + 1e-13 * np.abs(self.value).sum())
+        better = bool(evaluation.starts.sum() > self.value.sum() + 1e-13 * np.abs(self.value).sum())
         if better:
             self.policy, self.evaluation = policy, evaluation
         return better
 
     @cached_property
-    def layers(self) -> list[Layer]:
-        """Where plans of the whole grid are made: not there where it is searched region by region."""
-        return reachable_layers(self.world, self.world.num_choices)
+    def renewal(self) -> Renewal:
+        """Plans of the whole grid: not there where it is searched region by region."""
+        return Renewal(self.world, self.world.motion)
+
+    @property
+    def here(self) -> Found:
+        """The policy at hand."""
+        return Found(self.renewal, self.renewal.sets(self.policy))
 
     @cached_property
     def paths(self) -> RenewalSystem:
-        return RenewalSystem(self.world.kernel, self.world.size)
+        return RenewalSystem(self.world.kernel, grid_of(self.world))
 
     @cached_property
     def longest(self) -> float:
@@ -172,19 +191,16 @@ class _Run:
         if self.side is not None:
             self.search_regions(self.side)
             return
-        layers = self.layers
-        # first the policy, then the proof: branch and bound is the faster the better its start
-        self.use(policy_table(self.world, layers, follow_credit(self.world, layers, layer_sets(layers, self.policy))))
-        if self.world.coverage is None:
-            self.use(self.exchanged(layer_sets(layers, self.policy)))
-        # Last: what the search finds by itself is the same whatever is handed to it.
+        # First the policy, then the proof: branch and bound is the faster the better its start.
+        self.use(self.renewal.table(follow_credit(self.renewal, self.world, self.here).sets))
+        self.use(self.exchanged(self.here))
+        # Last: the search's own result does not depend on `start`.
         if self.start is not None:
             self.use(self.start)
         self.report()
         patience = FIRST_NODES
-        # The tree decides which cells to leave out, one by one, and knows no sensors that cover several.
         while self.open():
-            improved = self.round(patience) if self.world.coverage is None else self.covered_round()
+            improved = self.round(patience) if self.trees else self.listed_round()
             self.report()
             # No better plan: the tree was searched to its end, or the budget is spent.
             if not improved:
@@ -199,7 +215,7 @@ class _Run:
         patience = max(FIRST_NODES, NODES_A_CELL * self.world.num_cells)
         while self.open():
             self.improve_regions(side)
-            # Last: what the search finds by itself is the same whatever is handed to it.
+            # Last: the search's own result does not depend on `start`.
             if self.start is not None:
                 self.use(self.start)
             if not self.open():
@@ -207,7 +223,9 @@ class _Run:
             shares = Shares(self.budget, patience, self.clock("branch and bound"))
             # e(x) = eps_x pays for every plan of x (see the module), and asks for one tree at a time; `payment` asks
             # for all of them at once.
-            short, policy = proved(self.world, self.policy, self.value, side, self.slack, shares.run)
+            short, policy = proved(
+                self.world, self.policy, self.value, side, self.slack, shares.run
+            )
             self.pay(short)
             better = self.use(policy)
             self.report()
@@ -217,7 +235,7 @@ class _Run:
             patience *= 2
 
     def improve_regions(self, side: int) -> None:
-        """Rounds of ascent and exchange, until one closes little of what was open before the first."""
+        """Rounds of ascent and exchange, until one closes little of the gap left before the first."""
         gap = gained = float((self.bound - self.value).mean())
         while gained > WORTH_A_ROUND * gap and self.open():
             before, passed = float(self.value.mean()), self.clock("policy iteration")
@@ -226,7 +244,7 @@ class _Run:
             self.report()
 
     def clock(self, stage: str) -> Callable[[float], bool]:
-        """Told the share of a round that is done, it reports how long the rest will take; whether to go on."""
+        """A function of the share of a round that is done: it reports the time left, and returns whether to go on."""
         began = time.monotonic()
 
         def passed(share: float) -> bool:
@@ -238,17 +256,17 @@ class _Run:
 
     def restart(self) -> bool:
         """Search from other starts; whether that gave a better policy, to be used next."""
-        world, layers = self.world, self.layers
-        sets, others = layer_sets(layers, self.policy), other_starts(world, layers, RESTARTS)
-        found = policy_table(world, layers, best_of(world, layers, sets, others, self.value, go_on=self.budget.left))
-        better = evaluate(world, found, guess=self.value).value.sum() > self.value.sum()
-        self.found = found if better else None
+        others = other_starts(self.renewal, self.world, RESTARTS)
+        best = best_of(self.renewal, self.here, others, go_on=self.budget.left)
+        table = self.renewal.table(best.sets)
+        better = bool(self.valued(table, self.value).starts.sum() > self.value.sum())
+        self.other = table if better else None
         return better
 
     @property
     def problem(self) -> InnerProblem:
         """The search from each located cell, over the policy at hand."""
-        return InnerProblem.of(self.world, self.layers, self.value)
+        return InnerProblem.of(self.renewal, self.value)
 
     def round(self, patience: int) -> bool:
         """Search the renewals of the policy at hand; whether a better policy was found."""
@@ -259,47 +277,50 @@ class _Run:
         tree = planted(self.problem, self.value, self.slack, run)
         try:
             self.explore(tree, patience)
-        finally:  # what was found and proved is kept when the user interrupts as well
+        finally:  # results and proofs so far are kept also when the user interrupts
             self.tighten(tree)
             improved = self.adopt(tree)
             # only here: until then the tree's bounds are those over the policy it was grown from
-            if self.found is not None:
-                improved = self.use(self.found) or improved
-                self.found = None
+            if self.other is not None:
+                improved = self.use(self.other) or improved
+                self.other = None
         return improved
 
-    def covered_round(self) -> bool:
-        """As `round`, by `two_sets`."""
-        if self.world.num_choices != 2:
-            return False
+    def listed_round(self) -> bool:
+        """As `round`, by a list of all plans."""
 
         def looked_at(plans: int) -> bool:
             self.budget.spent += plans
             return self.budget.left()
 
-        found = best_plans(self.problem, layer_sets(self.layers, self.policy), self.slack, looked_at)
-        if found is None:
+        renewal, world, here = self.renewal, self.world, self.here
+        plans = renewal.problem(here.value)
+        detected = world.reward + self.value
+        one_more = revealed(world, detected, forced_worth(world, detected), 1)
+        states = renewal.steps[-3].states if world.t_max else renewal.states[: world.num_states]
+        listed = best_plans(plans, here.sets, self.slack, one_more[states], looked_at)
+        if listed is None:
             return False
-        self.pay(np.maximum(found[0] - self.value, 0.0))  # e(x) = eps_x pays for every plan of x (see the module)
-        return self.use(policy_table(self.world, self.layers, found[1]))
+        # e(x) = eps_x pays for every plan of x (see the module).
+        self.pay(np.maximum(listed.most - self.value, 0.0))
+        return self.use(renewal.table(listed.sets))
 
     def adopt(self, tree: Tree) -> bool:
         """Use the better plans that the tree has found; whether the policy is better with them."""
-        sets = adopted(self.problem, layer_sets(self.layers, self.policy), tree)
-        return sets is not None and self.use(self.exchanged(sets))
+        sets = adopted(self.problem, self.renewal.sets(self.policy), tree)
+        return sets is not None and self.use(self.exchanged(Found(self.renewal, sets)))
 
-    def exchanged(self, sets: list[BoolArray]) -> PolicyTable:
-        """The policy that exchange makes of `sets`."""
-        better = exchanged(self.world, self.layers, sets, go_on=self.budget.left)
-        return policy_table(self.world, self.layers, better)
+    def exchanged(self, policy: Found) -> PolicyTable:
+        """The result of exchange from `policy`."""
+        return self.renewal.table(exchanged(self.renewal, policy, go_on=self.budget.left).sets)
 
     def explore(self, tree: Tree, patience: int) -> None:
         """Run the tree until it is closed or the budget is spent.
 
         Every `patience` nodes it also ends if the improvements found close a good part of the bracket: the next round
-        starts from a better policy, but most of what this tree has ruled out has to be ruled out again.
+        starts from a better policy, but has to rule out again most of the plans that this tree has ruled out.
         """
-        # Nodes, not seconds, also between two reports: `tighten` takes the least of what it is shown.
+        # Nodes, not seconds, also between two reports: `tighten` takes the least of the bounds at these reports.
         step = max(NODES_BETWEEN_REPORTS, 10 * self.world.num_cells)
         next_report, next_look = step, patience
 
@@ -324,7 +345,7 @@ class _Run:
         self.budget.run(tree, go_on)
 
     def tighten(self, tree: Tree) -> None:
-        """Use what the tree has proved so far, for any V, also one off by its error."""
+        """Use the tree's bounds so far, for any V, also one off by its error."""
         self.pay(payment(tree, self.value))
 
     def pay(self, paid: Array) -> None:
@@ -333,15 +354,26 @@ class _Run:
         self.bound = np.minimum(self.bound, self.value + self.paths.upper(paid, self.longest))
 
     def solution(self, interrupted: bool) -> Solution:
-        bound, certified = np.maximum(self.bound, self.value), self.certified
-        seconds, timed_out = time.monotonic() - self.budget.started, self.budget.timed_out and not certified
+        bound = of_cells(self.world, np.maximum(self.bound, self.value))
+        certified = self.certified
+        seconds, timed_out = (
+            time.monotonic() - self.budget.started,
+            self.budget.timed_out and not certified,
+        )
         return Solution(
-            self.policy, self.evaluation, bound, certified, seconds, self.budget.spent, interrupted, timed_out
+            self.policy,
+            self.evaluation,
+            bound,
+            certified,
+            seconds,
+            self.budget.spent,
+            interrupted,
+            timed_out,
         )
 
 
 def payment(tree: Tree, value: Array) -> Array:
-    """`[M]` e >= 0 with e(x) + sum_t z_t e >= eps_nu for each plan nu of x, whatever part of the tree was searched."""
+    """`[M]` e >= 0 with e(x) + sum_t z_t e >= eps_nu for each plan nu of x, also of a tree searched in part."""
     # `rate` falls where e rises. rate(0) will do, and with e also rate(rate(e)) <= e: from e >= rate(e) follows
     # rate(e) <= rate(rate(e)), and from that rate(rate(rate(e))) <= rate(rate(e)).
     paid = np.maximum(tree.rate(value, np.zeros_like(value)), 0.0)

@@ -1,14 +1,14 @@
 """Sub-grids with a hand-off: square blocks of a large grid plan or learn alone, and the whole is valued at the end.
 
-Each block sees its own cells and a halo of some cells around them; what lies farther away is the exit. It owns the
-plans of its own cells alone: whoever owns the cell the target was last located in decides, also about sensors beyond
-its border. That is all the hand-off there is.
+Each block sees its own cells and a halo of some cells around them; all farther cells are the exit. It owns only the
+plans of its own cells: the owner of the cell of the last detection decides, also about sensors beyond its border. There
+is no other hand-off.
 
 From a located cell the target comes at most R (t_max + 2) cells far before it is located again, R being the reach of a
 move, so that with a halo as wide a block knows all that its plans depend on but the worth of the places where the
 target is located next. An error of that worth that is the same in all of them changes no decision: only where two
-places are off by different amounts do plans differ, and that difference fades with each renewal (theory-extensions:
-section 1). What is left is not guessed but proved: policy and bound are those of the whole grid.
+places are off by different amounts do plans differ, and that difference fades with each renewal
+(theory.md#regions-and-blocks). The remaining loss is proved, not guessed: policy and bound are for the whole grid.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from trackmdp.config.partition import PartitionConfig
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.evaluation import Evaluation
-from trackmdp.solvers.renewal import IndexArray, row_index
+from trackmdp.solvers.linear import IndexArray, row_index
 from trackmdp.solvers.workers import Crew, Made, in_turn
 from trackmdp.world.model import BoolArray, World, apart
 
@@ -50,7 +50,10 @@ class Block:
     @property
     def mine(self) -> BoolArray:
         """`[L]`, which of the cells seen are its own."""
-        row, column = (np.isin(np.array(seen), np.array(own)) for seen, own in zip(self.seen, self.own, strict=True))
+        row, column = (
+            np.isin(np.array(seen), np.array(own))
+            for seen, own in zip(self.seen, self.own, strict=True)
+        )
         return (row[:, None] & column).ravel()
 
 
@@ -76,18 +79,21 @@ def blocks(size: tuple[int, int], side: int, halo: int) -> list[Block]:
         return range(max(begin - halo, 0), min(end + halo, length))
 
     return [
-        Block((range(*rows), range(*columns)), (widened(*rows, size[0]), widened(*columns, size[1])))
+        Block(
+            (range(*rows), range(*columns)), (widened(*rows, size[0]), widened(*columns, size[1]))
+        )
         for rows, columns in product(pairwise(cuts[0]), pairwise(cuts[1]))
     ]
 
 
 def sub_world(world: World, seen: Rectangle) -> World:
-    """The world inside a rectangle of the grid; whoever leaves it has exited."""
+    """The world inside a rectangle of the grid; a target that leaves it has exited."""
     rows, columns = seen
     cells = cells_of(seen, world.columns)
     kernel = within(world.kernel[cells], world, seen)
     own = {name: getattr(world, name)[cells] for name in ("cost", "detection", "safe_detection")}
-    return World.of(world, kernel, size=(len(rows), len(columns)), **own)
+    # Its corner is another one.
+    return World.of(world, kernel, size=(len(rows), len(columns)), place=None, **own)
 
 
 def within(matrix: sparse.csr_array, world: World, seen: Rectangle) -> sparse.csr_array:
@@ -99,7 +105,9 @@ def within(matrix: sparse.csr_array, world: World, seen: Rectangle) -> sparse.cs
     row, column = row - rows.start, column - columns.start
     inside = (row >= 0) & (row < len(rows)) & (column >= 0) & (column < len(columns))
     place = (row_index(matrix)[inside], (row * len(columns) + column)[inside])
-    return type(matrix)((matrix.data[inside], place), shape=(matrix.shape[0], len(rows) * len(columns)))
+    return type(matrix)(
+        (matrix.data[inside], place), shape=(matrix.shape[0], len(rows) * len(columns))
+    )
 
 
 def plan_by_blocks(
@@ -109,10 +117,10 @@ def plan_by_blocks(
 
     Args:
         world: the whole grid.
-        plan: finds the deterministic policy of a block, whatever the clock says; pickled where there are workers.
+        plan: finds the deterministic policy of a block, independent of the clock; pickled where there are workers.
         block: side of the blocks.
         halo: cells around its own that a block knows of; None: `default_halo`.
-        run: who plans.
+        run: runs the plans of the blocks.
 
     Raises:
         UserError: a policy that draws was planned.
@@ -122,14 +130,18 @@ def plan_by_blocks(
 
     def some(job: int) -> list[tuple[int, World, Block]]:
         # with their worlds: no worker needs the rest of the grid
-        return [(n, sub_world(world, parts[n].seen), parts[n]) for n in range(ends[job], ends[job + 1])]
+        return [
+            (n, sub_world(world, parts[n].seen), parts[n]) for n in range(ends[job], ends[job + 1])
+        ]
 
     done = run(_PlanJob(plan, world.columns), Made(len(ends) - 1, some))
     return PolicyTable.from_sensed(world, end_to_end(done))
 
 
-def narrow_halo(world: World, partition: PartitionConfig, upper: float, found: Evaluation) -> str | None:
-    """What to say of a halo that may lose something: the most it can have lost; None of one that is wide enough."""
+def narrow_halo(
+    world: World, partition: PartitionConfig, upper: float, found: Evaluation
+) -> str | None:
+    """Warning for a halo that may lose something, with the most it can have lost; None if it is wide enough."""
     wide = default_halo(world)
     if partition.block is None or partition.halo is None or partition.halo >= wide:
         return None
@@ -155,8 +167,12 @@ class _PlanJob:
         table.check_fits(world)
         if not table.deterministic:
             raise UserError("partition.block: expected a policy that does not draw")
-        # A single probability of 0 or 1 for all sensors says nothing about the world beyond the halo.
-        sets = table.sets if table.sets is not None else PolicyTable.from_dense(world, table.dense()).sets
+        # A single probability of 0 or 1 for all sensors gives no sets beyond the halo.
+        sets = (
+            table.sets
+            if table.sets is not None
+            else PolicyTable.from_dense(world, table.dense()).sets
+        )
         assert sets is not None
         # Row 7 of a table with two choices is cell 3 after one miss.
         cell, n = np.divmod(row_index(sets), world.num_choices)
@@ -166,9 +182,12 @@ class _PlanJob:
 
 
 def end_to_end(parts: Sequence[Sequence[Pairs]]) -> list[Pairs]:
-    """What several parts sense at each n, end to end."""
+    """The sensed pairs of several parts at each n, end to end."""
     return [
-        (np.concatenate([cells for cells, _ in step]), np.concatenate([sensors for _, sensors in step]))
+        (
+            np.concatenate([cells for cells, _ in step]),
+            np.concatenate([sensors for _, sensors in step]),
+        )
         for step in zip(*parts, strict=True)
     ]
 

@@ -13,7 +13,7 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.errors import UserError
-from trackmdp.solvers.renewal import accumulate
+from trackmdp.solvers.linear import accumulate
 from trackmdp.world.model import Array, BoolArray, World
 
 DIGITS = 12
@@ -41,17 +41,21 @@ class FiniteMdp:
     reward: list[float] = field(default_factory=list)
     successors: list[tuple[list[int], list[float]]] = field(default_factory=list)
 
-    def add(self, state: int, reward: float, successors: list[int], probability: list[float]) -> None:
+    def add(
+        self, state: int, reward: float, successors: list[int], probability: list[float]
+    ) -> None:
         """Append an action of `state`, which has to be the last state or the one after it."""
         self.state.append(state)
         self.reward.append(reward)
         self.successors.append((successors, probability))
 
     def solve(self, states: int) -> tuple[Array, Array]:
-        """Policy iteration: the optimal value `[states]`, and what each row is worth."""
+        """Policy iteration: the optimal value `[states]`, and the worth of each row."""
         columns = [column for successors, _ in self.successors for column in successors]
         data = [p for _, probability in self.successors for p in probability]
-        pointer = np.concatenate([[0], np.cumsum([len(successors) for successors, _ in self.successors])])
+        pointer = np.concatenate(
+            [[0], np.cumsum([len(successors) for successors, _ in self.successors])]
+        )
         moves = sparse.csr_array((data, columns, pointer), shape=(len(self.state), states))
         reward, state = np.array(self.reward), np.array(self.state)
         # Rows of states 0 0 0 1 1 2 give first = (0, 3, 5), the segments that reduceat takes the maximum over.
@@ -63,7 +67,9 @@ class FiniteMdp:
             better = best > worth[choice] + 1e-12 * (1.0 + np.abs(value).max())
             if not better.any():
                 return value, worth
-            attained = np.flatnonzero(worth >= best[state])  # of each state the first row that does counts
+            attained = np.flatnonzero(
+                worth >= best[state]
+            )  # of each state the first row that does counts
             choice = np.where(better, attained[np.searchsorted(attained, first)], choice)
             value = accumulate(moves[choice], reward[choice])
 
@@ -89,7 +95,9 @@ def _enumerate(world: World, most_beliefs: int) -> tuple[FiniteMdp, int]:
         # After t_max + 1 misses the safe action is forced: one action, and every position is located.
         if n == world.num_choices:
             located = belief @ forced
-            problem.add(i, world.reward * float(located.sum()) - float(belief @ price), *_sparse(located))
+            problem.add(
+                i, world.reward * float(located.sum()) - float(belief @ price), *_sparse(located)
+            )
             continue
         for action in _subsets(predicted > 0):
             found = np.where(action, predicted * world.detection, 0.0)
@@ -106,7 +114,9 @@ def _enumerate(world: World, most_beliefs: int) -> tuple[FiniteMdp, int]:
             paid = float(world.cost[action].sum() * predicted.sum())
             problem.add(i, world.reward * float(found.sum()) - paid, targets, probability)
         if len(beliefs) > most_beliefs:
-            raise UserError(f"grid.size={world.rows}: more than {most_beliefs} belief states, expected a smaller world")
+            raise UserError(
+                f"grid.size={world.rows}: more than {most_beliefs} belief states, expected a smaller world"
+            )
     return problem, len(beliefs)
 
 
@@ -119,7 +129,7 @@ def _subsets(possible: BoolArray) -> BoolArray:
 
 
 def _safe_action(world: World, kernel: Array) -> tuple[Array, Array]:
-    """`[M, M]` where the safe action locates the target in the end, by the cell it is in, and `[M]` what that costs.
+    """`[M, M]` by its cell, where the safe action locates the target in the end, and `[M]` the cost until then.
 
     Repeated until it locates: with L = P (1 - p_s), the sum of all L^k is (I - L)^-1.
     """
@@ -134,5 +144,5 @@ def _sparse(vector: Array) -> tuple[list[int], list[float]]:
 
 
 def _key(belief: Array, n: int) -> tuple[int, bytes]:
-    # + 0.0 turns -0.0 into 0.0, whose bytes differ.
+    # + 0.0 turns -0.0 into 0.0: their bytes differ.
     return n, (belief.round(DIGITS) + 0.0).tobytes()

@@ -4,7 +4,7 @@ The value V of being located given, the best plan of each located cell is a prob
 t_max + 1 moves. So a region, a square block of located cells with a halo of R (t_max + 1) cells, has all that its plans
 depend on: V and the worth of the safe action come from the whole grid, and nothing is lost at its border, unlike where
 blocks plan without knowing V (`partition`). Plans of all regions together, each worth no less than before, make a
-policy of no less value anywhere, and what is proved of each plan bounds the whole (`optimal`).
+policy of no less value anywhere, and the bounds of the plans bound the whole (`optimal`).
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from scipy import sparse
 from trackmdp.errors import UserError
 from trackmdp.machine import free_bytes, gib, parse_bytes
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers import qmdp
+from trackmdp.solvers import rules
 from trackmdp.solvers.branch import Tree
-from trackmdp.solvers.evaluate import evaluate
-from trackmdp.solvers.exchange import exchange, revealed
-from trackmdp.solvers.known import planted
-from trackmdp.solvers.layers import Layer, layer_sets, reachable_layers
+from trackmdp.solvers.exchange import exchange, hopeful, revealed
+from trackmdp.solvers.inner import InnerProblem
+from trackmdp.solvers.known import adopted, planted
+from trackmdp.solvers.linear import DIRECT_CELLS, IndexArray, forced_worth
 from trackmdp.solvers.partition import Pairs, blocks, cells_of, end_to_end, reach, sub_world, within
-from trackmdp.solvers.prediction import followed
-from trackmdp.solvers.renewal import DIRECT_CELLS, IndexArray, forced_worth
-from trackmdp.solvers.search import InnerProblem
+from trackmdp.solvers.renewal import Renewal
+from trackmdp.solvers.search import candidates_of, columns_of
+from trackmdp.solvers.value import evaluate
 from trackmdp.solvers.workers import Crew, Made, in_turn
 from trackmdp.world.model import Array, BoolArray, World
 
@@ -45,9 +45,9 @@ class _Region:
     """The plans of the located cells of a block, cells numbered as in the rectangle that it sees.
 
     Attributes:
-        world: what it sees.
+        world: the part of the world that it sees.
         cells: `[L]`, numbers of the region's cells on the whole grid.
-        own: `[L]`, the located cells whose plans belong to it.
+        own: `[L]`, the located cells of its plans.
         policy: the one at hand.
         value: `[L]`, V.
         detected, missed: `[L]`, as of `InnerProblem`.
@@ -62,32 +62,34 @@ class _Region:
     missed: Array
 
     @cached_property
-    def layers(self) -> list[Layer]:
-        """Where the target may be after each move from each of its cells."""
-        return reachable_layers(self.world, self.world.num_choices)
-
-    @cached_property
     def problem(self) -> InnerProblem:
         """The search from each of its cells; plans of cells of the halo are not looked at."""
-        return InnerProblem(self.world, self.layers, self.detected, self.missed)
+        renewal = Renewal(self.world, self.world.motion)
+        return InnerProblem(renewal, self.detected, self.missed, self.world.num_choices)
 
     @cached_property
     def sets(self) -> list[BoolArray]:
-        """Sensed entries of each layer but the first, those of the policy at hand."""
-        return layer_sets(self.layers, self.policy)
+        """The sets of the policy at hand."""
+        return self.problem.renewal.sets(self.policy)
+
+    @cached_property
+    def most(self) -> Array:
+        """`[L]` worth of the best plans if the position were revealed after every set."""
+        return revealed(self.world, self.detected, self.missed, self.world.num_choices)
 
     def improved(self) -> list[Pairs]:
-        """What is sensed after ascent and exchange; see `sensed`."""
-        located = np.ones(len(self.cells))
-        return self.sensed(
-            exchange(self.problem, self.problem.ascend(self.sets, located, sweeps=10), located, self.own)
-        )
+        """The sensors on after ascent and exchange; see `sensed`."""
+        plans = self.problem.plans()
+        sets = columns_of(plans.ascend(candidates_of(self.sets), sweeps=10))
+        return self.sensed(exchange(plans, sets, self.own & hopeful(plans, sets, self.most)))
 
     def sensed(self, sets: Sequence[BoolArray]) -> list[Pairs]:
-        """What `sets` sense at each n, of its own located cells, numbered as on the whole grid."""
-        kept = [on & self.own[layer.rows] for layer, on in zip(self.layers[1:], sets, strict=True)]
-        parts = zip(self.layers[1:], kept, strict=True)
-        return [(self.cells[layer.rows[on]], self.cells[layer.cells[on]]) for layer, on in parts]
+        """The sensors on at each n, of its own located cells, numbered as on the whole grid."""
+        found = []
+        for choice, on in zip(self.problem.renewal.choices, sets, strict=True):
+            mine = on & self.own[choice.rows]
+            found.append((self.cells[choice.rows[mine]], self.cells[choice.sensors[mine]]))
+        return found
 
 
 def region_side(world: World, memory: str | None = None) -> int | None:
@@ -96,13 +98,15 @@ def region_side(world: World, memory: str | None = None) -> int | None:
     It does not depend on the machine: with a `memory` of its own a region is made smaller, never larger.
 
     Raises:
-        UserError: no region is small enough for `memory`, or for what the machine has left.
+        UserError: no region is small enough for `memory`, or for the machine's free memory.
     """
     whole, limit = _whole_bytes(world), free_bytes() if memory is None else parse_bytes(memory)
     if world.num_cells <= DIRECT_CELLS and whole + _region_bytes(world, max(world.size)) <= limit:
         return None
     room, smallest = (ROOM, SMALLEST_SIDE) if memory is None else (min(ROOM, limit - whole), 1)
-    fits = [side for side in range(smallest, LARGEST_SIDE + 1) if _region_bytes(world, side) <= room]
+    fits = [
+        side for side in range(smallest, LARGEST_SIDE + 1) if _region_bytes(world, side) <= room
+    ]
     side = max(fits, default=smallest)
     if (needed := whole + _region_bytes(world, side)) > limit:
         said = f"{gib(limit)} are available" if memory is None else "expected at least that"
@@ -112,25 +116,32 @@ def region_side(world: World, memory: str | None = None) -> int | None:
 
 
 def _whole_bytes(world: World) -> int:
-    """About the memory, Python included, of what is there for the whole grid: bounds, policies, their systems.
+    """About the memory, Python included, for the whole grid: bounds, policies, their systems.
 
     The most that is held at once is the prediction of the policy that senses least, the clocked one, while it is
     valued: some 200 bytes an entry, measured on 160 x 160 cells at T_max 1 to 3 and c = .16 and .22.
     """
     moves = world.kernel.nnz / world.num_cells
-    return int(70 * 2**20 + world.num_cells * (150 * (1 + moves) + 200 * max(moves, _predicted(world))))
+    return int(
+        70 * 2**20 + world.num_cells * (150 * (1 + moves) + 200 * max(moves, _predicted(world)))
+    )
 
 
 def _predicted(world: World) -> float:
     """Where the target may be after t_max misses: entries per located cell, as they are in the middle of the grid.
 
-    At T_max 3 these are 3 cells at c = .16, where what is likely is sensed, and 82 at c = .22, where nothing is.
+    At T_max 3 these are 3 cells at c = .16, where likely cells are sensed, and 82 at c = .22, where none is.
     """
     if world.num_cells <= PATCH**2:  # too few for their memory to matter
         return 0.0
-    rows, columns = (range(max(side - PATCH, 0) // 2, min(side + PATCH, 2 * side) // 2) for side in world.size)
+    rows, columns = (
+        range(max(side - PATCH, 0) // 2, min(side + PATCH, 2 * side) // 2) for side in world.size
+    )
     patch = sub_world(world, (rows, columns))
-    return max(len(seen.rows) for seen in followed(patch, qmdp.clocked_policy(patch))) / patch.num_cells
+    return (
+        max(len(seen.rows) for seen in rules.predictions(patch, rules.clocked_policy(patch)))
+        / patch.num_cells
+    )
 
 
 def _region_bytes(world: World, side: int) -> int:
@@ -141,7 +152,7 @@ def _region_bytes(world: World, side: int) -> int:
     for step in range(1, world.num_choices + 1):
         # After t moves of up to R cells the target is within a window of 2 R t + 1 rows and columns.
         after = min(entries * moves, (halo // world.num_choices * step + 1) ** 2, world.num_cells)
-        # 24 bytes for each move while a layer is made, 60 in all for what is kept of each of its entries
+        # 24 bytes for each move while a layer is made, 60 in all for each entry kept
         each, entries = each + 24 * entries * moves + 60 * after, after
     return seen * each
 
@@ -167,14 +178,14 @@ def _regions(world: World, policy: PolicyTable, value: Array, side: int) -> Made
 def improved(
     world: World, policy: PolicyTable, value: Array, side: int, passed: Callable[[float], bool]
 ) -> PolicyTable:
-    """The policy that ascent and exchange make of `policy`, whose value is `value` `[M]`; worth no less anywhere.
+    """The policy that ascent and exchange make of `policy`, worth `value` `[M]`; worth no less anywhere.
 
     Args:
         world: the problem.
         policy: where to start.
         value: `[M]`, V.
         side: located cells of a region, in each direction.
-        passed: told the share of the regions that are done; whether to look further.
+        passed: called with the share of the regions done; returns whether to look further.
     """
     found, regions, go_on = [], _regions(world, policy, value, side), True
     for number, region in enumerate(regions, start=1):
@@ -183,7 +194,9 @@ def improved(
     return PolicyTable.from_sensed(world, end_to_end(found))
 
 
-def settled(world: World, policy: PolicyTable, side: int, rounds: int, run: Crew = in_turn) -> PolicyTable:
+def settled(
+    world: World, policy: PolicyTable, side: int, rounds: int, run: Crew = in_turn
+) -> PolicyTable:
     """The policy after at most `rounds` of `improved`, each done by `run`, fewer where no value grows.
 
     Blocks that planned without each other's values leave plans that none of them would change: .006 per step at
@@ -195,7 +208,7 @@ def settled(world: World, policy: PolicyTable, side: int, rounds: int, run: Crew
             world, end_to_end(run(_Region.improved, _regions(world, policy, value, side)))
         )
         after = evaluate(world, candidate, guess=value, per_cell=False).value
-        # As in `exchange`: no value is lower, so that the sum tells; the margin is rounding.
+        # As in `exchange`: no value is lower, so the sum decides; the margin is rounding.
         if after.sum() <= value.sum() + 1e-12 * np.abs(value).sum():
             break
         policy, value = candidate, after
@@ -203,7 +216,12 @@ def settled(world: World, policy: PolicyTable, side: int, rounds: int, run: Crew
 
 
 def proved(
-    world: World, policy: PolicyTable, value: Array, side: int, slack: float, run: Callable[[int, int, Tree], None]
+    world: World,
+    policy: PolicyTable,
+    value: Array,
+    side: int,
+    slack: float,
+    run: Callable[[int, int, Tree], None],
 ) -> tuple[Array, PolicyTable]:
     """Search the plans of all located cells that may not be the best by branch and bound, region by region.
 
@@ -213,12 +231,16 @@ def proved(
         value: `[M]`, its value.
         side: located cells of a region, in each direction.
         slack: worth of a plan that may be missed.
-        run: runs a tree as far as the budget allows; told how many regions are done, and of how many.
+        run: runs a tree as far as the budget allows, given how many regions are done, and of how many.
 
     Returns:
-        `[M]` no less than what any plan is worth more than V, and the policy with the better plans found.
+        `[M]` no less than the gain of any plan over V, and the policy with the better plans found.
     """
-    short, found, regions = np.full(world.num_cells, slack), [], _regions(world, policy, value, side)
+    short, found, regions = (
+        np.full(world.num_cells, slack),
+        [],
+        _regions(world, policy, value, side),
+    )
     for number, region in enumerate(regions):
         sets, excess = _closed(region, slack, partial(run, number, len(regions)))
         own = region.own
@@ -227,41 +249,23 @@ def proved(
     return short, PolicyTable.from_sensed(world, end_to_end(found))
 
 
-def _closed(region: _Region, slack: float, run: Callable[[Tree], None]) -> tuple[list[BoolArray], Array]:
-    """Better plans, and `[L]` what a plan of each own cell may be worth more than V."""
-    problem, located = region.problem, np.ones(len(region.cells))
-    most = revealed(problem, located) - region.value
+def _closed(
+    region: _Region, slack: float, run: Callable[[Tree], None]
+) -> tuple[list[BoolArray], Array]:
+    """Better plans, and `[L]` the largest possible gain over V of a plan of each own cell."""
+    problem, most = region.problem, region.most - region.value
     open_ = np.flatnonzero(region.own & (most > slack))
     if not len(open_):
         return region.sets, most
-    # One problem per cell, so that the window of problem x is that around cell x; those that are closed have no mass,
-    # and nothing is better than what they have.
-    start = np.zeros(len(located))
+    # One problem per cell, so that the window of problem x is the window around cell x; closed cells have mass 0 and
+    # no better plan.
+    start = np.zeros(len(region.cells))
     start[open_] = 1.0
     mass = sparse.csr_array(sparse.diags_array(start))
     mass.eliminate_zeros()
-    lower = np.full(len(located), np.inf)
+    lower = np.full(len(region.cells), np.inf)
     lower[open_] = region.value[open_]
     tree = planted(problem, lower, slack, run, mass)
     run(tree)
     most[open_] = np.minimum(most, tree.upper() - region.value)[open_]
     return adopted(problem, region.sets, tree) or region.sets, most
-
-
-def adopted(
-    problem: InnerProblem, sets: list[BoolArray], tree: Tree, mass: Array | None = None
-) -> list[BoolArray] | None:
-    """`sets` with the better plans that a tree has found, from `mass` `[E]`; None if there are none.
-
-    Without a `mass` it is 1 in each located cell.
-    """
-    better, left = tree.improvements()
-    if not better.any():
-        return None
-    found, mass = [], np.ones(problem.world.num_cells) if mass is None else mass
-    for layer, on, out in zip(problem.layers[1:], sets, left, strict=True):
-        mass = mass @ layer.moves
-        # a plan of the tree senses every possible cell but those left out
-        found.append(np.where(better[layer.rows], (mass > 0) & ~out.has(layer.rows, layer.cells), on))
-        mass = mass * (1.0 - found[-1] * problem.world.detects(layer.cells))
-    return found

@@ -1,4 +1,4 @@
-"""What solving a world gives: a policy, what it earns, and what is proved about the best there is."""
+"""The result of solving a world: a policy, its figures, and a proved bound on every policy."""
 
 from __future__ import annotations
 
@@ -8,19 +8,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from trackmdp.notebook.card import Card, Carded, decimal, grid_words
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.bounds import clocked
-from trackmdp.solvers.evaluate import evaluate
 from trackmdp.solvers.evaluation import Evaluation
+from trackmdp.solvers.value import evaluate
 from trackmdp.world.model import Array, World
 
 if TYPE_CHECKING:  # torch is loaded where a policy is to act
     from trackmdp.policies.policy import Policy
 
 
-@dataclass(frozen=True)
-class Solution:
-    """The best policy found and what is proved about it.
+@dataclass(frozen=True, repr=False)
+class Solution(Carded):
+    """The best policy found and the bounds proved for it.
 
     Attributes:
         table: the sets of the policy; `policy` acts them out.
@@ -42,6 +43,20 @@ class Solution:
     interrupted: bool
     timed_out: bool = False
 
+    def card(self) -> Card:
+        """The bracket and the figures of the policy."""
+        task = self.table.task
+        gap = max(0.0, self.upper - self.lower)
+        facts = {
+            f"{self.title} AIHTR": decimal(self.lower, 4),
+            "upper bound": f"{decimal(self.upper, 4)}; {self.ended}, gap {gap:.2g}",
+            "search": f"{self.nodes:,} nodes, {self.seconds:.2g} s",
+        }
+        title = f"Solution: {grid_words(task.size)}, T_max {task.t_max}"
+        figures = self.evaluation.facts()
+        del figures["AIHTR"]  # the lower end of the bracket
+        return Card(title, facts | figures)
+
     @cached_property
     def policy(self) -> Policy:
         """The policy as a TensorDict module."""
@@ -58,6 +73,11 @@ class Solution:
     def lower(self) -> float:
         """The policy's AIHTR."""
         return self.evaluation.aihtr
+
+    @property
+    def title(self) -> str:
+        """Name of the policy in tables: the optimum only where it is proved."""
+        return "optimal" if self.certified else "best known"
 
     @property
     def ended(self) -> str:
@@ -78,8 +98,8 @@ class Solution:
 class SearchProgress:
     """How far a search has come: the bracket around the optimal AIHTR, and seconds and nodes so far.
 
-    `stage` says what is being done and `left` how many seconds more that will take, where a grid is gone through region
-    by region.
+    `stage` names the work in progress; `left` is the estimate of its remaining seconds, where a grid is gone through
+    region by region.
     """
 
     lower: float
@@ -90,8 +110,10 @@ class SearchProgress:
     left: float | None = None
 
 
-def bracketed(world: World, table: PolicyTable, seconds: float, tolerance: float = 1e-6) -> Solution:
-    """A policy found in another way, in `seconds`, with the clocked bound as what is proved."""
+def bracketed(
+    world: World, table: PolicyTable, seconds: float, tolerance: float = 1e-6
+) -> Solution:
+    """A policy found in another way, in `seconds`, with the clocked bound as the proved one."""
     evaluation = evaluate(world, table, per_cell=False)
     bound = np.maximum(clocked(world), evaluation.value)
     gap = float((bound - evaluation.value).mean()) + evaluation.error

@@ -1,11 +1,11 @@
-"""One verb for every solver, by name: those of this package and those of installed plugins."""
+"""One verb for every solver, by name: of this package and of installed plugins."""
 
 from __future__ import annotations
 
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from inspect import signature
 from typing import TYPE_CHECKING, Any
 
@@ -15,15 +15,12 @@ from trackmdp.config.partition import SweptPartitionConfig
 from trackmdp.config.registry import make, maker
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers.keyed import averaged
-from trackmdp.solvers.keyed_search import solve_keys
 from trackmdp.solvers.partition import blocks, narrow_halo, plan_by_blocks
 from trackmdp.solvers.regions import settled
 from trackmdp.solvers.solution import SearchProgress, Solution, bracketed
 from trackmdp.solvers.workers import Crew, crew
 from trackmdp.world.model import World
-from trackmdp.world.modes import HiddenWorld, Modelled
-from trackmdp.world.tracks import Problem
+from trackmdp.world.tracks import Problem, check_problem, modelled
 
 if TYPE_CHECKING:  # torch is loaded where a policy is to act
     from trackmdp.policies.policy import Policy
@@ -33,7 +30,7 @@ _SWEEPS = 10
 
 
 def solve(
-    world: Modelled,
+    world: World,
     solver: str = default("solver", "solve"),
     *,
     nodes: int = default("solver.nodes", "solve"),
@@ -45,17 +42,17 @@ def solve(
     sweeps: int | None = default("partition.sweeps", "solve"),
     **options: Any,
 ) -> Solution:
-    """The policy that a solver finds for `world`, what it earns, and an upper bound on what any policy earns.
+    """The policy that a solver finds for `world`, its figures, and an upper bound for every policy.
 
-    The defaults are those of `conf/`, the checks those of ``trackmdp solve``.
+    Defaults and checks are the same as of ``trackmdp solve``.
 
     Args:
-        world: the problem with its motion model. With a hidden mode the policy remembers what `world.memory` says, and
-            is found by policy iteration over keys, whatever the solver.
+        world: the problem with its motion model. With hidden modes `optimal` searches over keys of `world.memory`, and
+            the others take the next move to depend on the cell alone, as it does on average.
         solver: ``optimal``, ``clocked``, ``qmdp``, ``fcr``, ``lookahead``, or one of an installed plugin.
         nodes: work after which `optimal` stops closing the bracket, the same on every machine.
         time_limit: seconds after which it stops even so; None: never. Neither is an option of the others.
-        on_progress: told how far a search has come, about once a second.
+        on_progress: called with the progress of a search, about once a second.
         block: side of the blocks that plan for themselves (`trackmdp.solvers.partition`); None: the whole grid at once.
         halo: cells around its own that a block knows of; None: as many as lose nothing.
         workers: processes that plan blocks; the result does not depend on it.
@@ -72,47 +69,82 @@ def solve(
         >>> solution.certified and solution.upper - solution.lower < 1e-6 * abs(solution.upper)
         True
     """
+    check_problem(world, "solve")
     own = {f"solver.{name}": value for name, value in options.items()}
     named = given({"solver": solver, "solver.nodes": nodes, "solver.time_limit": time_limit})
     of_blocks = {"block": block, "halo": halo, "workers": workers, "sweeps": sweeps}
-    cfg = compose("solve", named | own | given({f"partition.{name}": value for name, value in of_blocks.items()}))
+    cfg = compose(
+        "solve",
+        named | own | given({f"partition.{name}": value for name, value in of_blocks.items()}),
+    )
     solution = run_solver(world, cfg.solver, on_progress, cfg.partition)
-    if isinstance(world, World) and (said := narrow_halo(world, cfg.partition, solution.upper, solution.evaluation)):
+    said = narrow_halo(world, cfg.partition, solution.upper, solution.evaluation)
+    if said:
         warnings.warn(said, stacklevel=2)
     return solution
 
 
 def run_solver(
-    world: Modelled,
+    world: World,
     choice: BaselineConfig,
     on_progress: Callable[[SearchProgress], None] | None = None,
     partition: SweptPartitionConfig | None = None,
+    start: PolicyTable | None = None,
 ) -> Solution:
-    """What the solver of a config finds; a policy without a proof is bracketed by the clocked bound."""
-    if isinstance(world, HiddenWorld):
-        return solve_keys(world)
-    if not isinstance(world, World):
-        raise UserError(f"solver={choice.name}: needs a motion model; recorded tracks have none")
+    """The policy of a config's solver; one without a proof is bracketed by the clocked bound.
+
+    From `start`, a known policy, those solvers begin that take one; the policy is then no worse.
+    """
+    world = modelled(world, f"solver={choice.name}")
+    if not world.tells_all or (world.modes > 1 and choice.name != "optimal"):
+        return _modes(world, choice, start)
+    # The state is known at a detection: more of the past is of no use.
+    world = world.but(memory="cell")
     if world.coverage is not None and partition is not None and partition.block is not None:
-        raise UserError(f"partition.block={partition.block}: expected null with sensors that have footprints")
+        raise UserError(
+            f"partition.block={partition.block}: expected null with sensors that have footprints"
+        )
     started = time.monotonic()
     if partition is not None and partition.block is not None:
         workers = min(partition.workers, len(blocks(world.size, partition.block, halo=0)))
         with crew(workers, partition.cluster) as run:
             table = by_blocks(world, choice, partition, run)
         return bracketed(world, table, time.monotonic() - started)
-    watched = {"on_progress": on_progress} if "on_progress" in signature(maker(choice)).parameters else {}
-    made = make(choice, world, **watched)
-    return made if isinstance(made, Solution) else bracketed(world, made, time.monotonic() - started)
+    taken = signature(maker(choice)).parameters
+    offered: dict[str, Any] = {"on_progress": on_progress}
+    if start is not None:
+        offered["start"] = start
+    made = make(choice, world, **{name: each for name, each in offered.items() if name in taken})
+    return (
+        made if isinstance(made, Solution) else bracketed(world, made, time.monotonic() - started)
+    )
 
 
-def by_blocks(world: World, choice: BaselineConfig, partition: SweptPartitionConfig, run: Crew) -> PolicyTable:
+def _modes(world: World, choice: BaselineConfig, start: PolicyTable | None) -> Solution:
+    """As `run_solver`, where modes are hidden, or the solver does not read them."""
+    from trackmdp.solvers import hidden
+
+    if choice.name == "optimal":
+        return hidden.solve(world, start=start)
+    started = time.monotonic()
+    made = make(choice, hidden.averaged(world))
+    table = made.table if isinstance(made, Solution) else made
+    return bracketed(world, table, time.monotonic() - started)
+
+
+def by_blocks(
+    world: World, choice: BaselineConfig, partition: SweptPartitionConfig, run: Crew
+) -> PolicyTable:
     """The policy that `run` plans block by block and, with ``solver=optimal``, settles over the whole grid."""
     assert partition.block is not None
-    # Other solvers' plans are what they are; what a narrow halo loses stays to be seen, unless asked otherwise.
-    sweeps = (_SWEEPS if partition.halo is None else 0) if partition.sweeps is None else partition.sweeps
+    # Other solvers' plans stay as they are, so a narrow halo shows its loss, unless asked otherwise.
+    sweeps = (
+        (_SWEEPS if partition.halo is None else 0) if partition.sweeps is None else partition.sweeps
+    )
     table = plan_by_blocks(world, _Planner(choice), partition.block, partition.halo, run)
-    return settled(world, table, partition.block, sweeps, run) if choice.name == "optimal" else table
+    return (
+        settled(world, table, partition.block, sweeps, run) if choice.name == "optimal" else table
+    )
 
 
 @dataclass(frozen=True)
@@ -136,13 +168,19 @@ def baseline_policy(problem: Problem, choice: BaselineConfig) -> Policy:
     """
     from trackmdp.policies.policy import as_policy
 
-    if isinstance(problem, HiddenWorld) and choice.reads_motion:
-        if choice.name == "optimal":
-            return solve_keys(problem).policy
-        problem = averaged(problem)
-    if choice.reads_motion and not isinstance(problem, World):
-        raise UserError(f"baseline={choice.name}: needs a motion model; recorded tracks have none")
-    if choice.whole_episodes:
-        problem = replace(problem, max_steps=None)
+    if choice.reads_motion:
+        world = modelled(problem, f"baseline={choice.name}")
+        if choice.whole_episodes:
+            world = world.but(max_steps=None)
+        return run_solver(world, choice).policy
     made = make(choice, problem)
     return made.policy if isinstance(made, Solution) else as_policy(problem, made)
+
+
+def named_policy(problem: Problem, name: str) -> Policy:
+    """The policy of a baseline by its name, with the options of `conf/`.
+
+    Raises:
+        UserError: there is no such baseline, it needs an option, or a motion model that the problem does not have.
+    """
+    return baseline_policy(problem, compose("evaluate", {"baseline": name}).baseline)

@@ -17,6 +17,7 @@ from typing import Any, Protocol, TypeVar
 
 from trackmdp.cluster import joining
 from trackmdp.errors import Preempted, UserError, require
+from trackmdp.imports import safe_children
 from trackmdp.signals import HEARD, handled
 
 Piece = TypeVar("Piece")
@@ -27,7 +28,7 @@ _ATTEMPTS = 3
 
 
 class Crew(Protocol):
-    """Who does jobs."""
+    """Runs jobs."""
 
     def __call__(self, work: Callable[[Piece], Result], jobs: Sequence[Piece]) -> list[Result]:
         """Some work done to each of the jobs, in their order; both are pickled where there are workers.
@@ -59,8 +60,10 @@ class Made(Sequence[Piece]):
 
 
 @contextmanager
-def crew(workers: int = 1, cluster: str | None = None, key: str = "partition.cluster") -> Iterator[Crew]:
-    """Workers that stay from one call to the next; what an error or a signal leaves of them is ended.
+def crew(
+    workers: int = 1, cluster: str | None = None, key: str = "partition.cluster"
+) -> Iterator[Crew]:
+    """Workers that stay from one call to the next; after an error or a signal the remaining ones are ended.
 
     Args:
         workers: processes; one: this one.
@@ -89,23 +92,25 @@ def _processes(workers: int) -> Iterator[Crew]:
             left = [number for number in range(len(jobs)) if number not in results]
             futures = {number: _submit(pool, work, jobs[number]) for number in left}
             for number, future in futures.items():
-                # a worker died: what it and the others had not finished is done again
+                # a worker died: all unfinished jobs are run again
                 with suppress(BrokenProcessPool):
                     results[number] = future.result()
             if len(results) == len(jobs):
                 return [results[number] for number in range(len(jobs))]
             pool.shutdown()
             pool = _pool(workers)
-        raise UserError(f"partition.workers={workers}: workers died {_ATTEMPTS} times, expected enough memory for each")
+        raise UserError(
+            f"partition.workers={workers}: workers died {_ATTEMPTS} times, expected enough memory for each"
+        )
 
     try:
         yield run
     except BaseException:
         for worker in list((pool._processes or {}).values()):
-            worker.terminate()  # SIGTERM: who learns saves what there is, and is waited for
+            worker.terminate()  # SIGTERM: a learner saves its state, and is waited for
         raise
     finally:
-        pool.shutdown(cancel_futures=True)  # what was not begun is not begun any more
+        pool.shutdown(cancel_futures=True)  # no further job begins
 
 
 _ended: list[Preempted] = []
@@ -118,23 +123,25 @@ def _pool(workers: int) -> ProcessPoolExecutor:
         return ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), end_with_parent)
 
 
-def _submit(pool: ProcessPoolExecutor, work: Callable[[Piece], Result], job: Piece) -> Future[Result]:
+def _submit(
+    pool: ProcessPoolExecutor, work: Callable[[Piece], Result], job: Piece
+) -> Future[Result]:
     with _starting():
         return pool.submit(_done, work, job)
 
 
 @contextmanager
 def _starting() -> Iterator[None]:
-    """While workers may be started, which are then deaf to what goes to the whole group of processes.
+    """Block SIGINT and SIGUSR1 while workers start; they inherit the mask.
 
-    This one hears it, and ends them with SIGTERM; what comes meanwhile it hears afterwards.
+    This process notes the signals, ends the workers with SIGTERM, and raises the signals again at the end.
     """
     heard: list[int] = []
-    # Blocked, which a process inherits: one that is told while it still imports would write a traceback. Noted all the
-    # same, since another thread may be the one that is told; a worker left half started writes a traceback as well.
+    # A process that gets a signal while it still imports would write a traceback, so would a worker left half started.
+    # The handler notes the signal all the same, since another thread may receive it.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGUSR1})
     try:
-        with handled(lambda number, _: heard.append(number), *HEARD):
+        with handled(lambda number, _: heard.append(number), *HEARD), safe_children():
             yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
@@ -154,7 +161,7 @@ def _done(work: Callable[[Piece], Result], job: Piece) -> Result:
 
 
 def end_with_parent() -> None:
-    """End this process with the one that spawned it, which cannot tell it to end when it is killed."""
+    """End this process with the one that spawned it, which cannot end it when it is killed."""
 
     def wait() -> None:
         parent = multiprocessing.parent_process()
@@ -178,16 +185,20 @@ def _ray(workers: int, cluster: str, key: str) -> Iterator[Crew]:
             ray.init(logging_level=logging.ERROR, log_to_driver=False, **where)
 
     def run(work: Callable[[Piece], Result], jobs: Sequence[Piece]) -> list[Result]:
-        # Ray itself begins a task again whose worker or machine was lost.
+        # Ray itself begins a task again if its worker or machine was lost.
         task: Any = ray.remote(num_cpus=1, max_retries=_ATTEMPTS - 1)(lambda job: work(job))
         tasks = [task.remote(job) for job in jobs]
         try:
             with _cancelled(ray, tasks):
                 return list(ray.get(tasks))
-        except ray.exceptions.RayTaskError as error:  # an error of the work itself, as it would be raised here
+        except (
+            ray.exceptions.RayTaskError
+        ) as error:  # an error of the work itself, as it would be raised here
             raise error.cause from None
         except ray.exceptions.RayError as error:
-            raise UserError(f"{key}={cluster}: a worker was lost {_ATTEMPTS} times ({error})") from error
+            raise UserError(
+                f"{key}={cluster}: a worker was lost {_ATTEMPTS} times ({error})"
+            ) from error
 
     try:
         yield run
@@ -199,7 +210,7 @@ def _ray(workers: int, cluster: str, key: str) -> Iterator[Crew]:
 @contextmanager
 def _cancelled(ray: Any, tasks: Sequence[Any]) -> Iterator[None]:
     """On an error or a signal, end the tasks that are under way and wait for them; begin no others."""
-    before = {number: told for number in HEARD if callable(told := signal.getsignal(number))}
+    before = {number: old for number in HEARD if callable(old := signal.getsignal(number))}
     heard: list[signal.Signals] = []
 
     def interrupt(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
@@ -211,7 +222,7 @@ def _cancelled(ray: Any, tasks: Sequence[Any]) -> Iterator[None]:
             yield
     except BaseException:
         for task in tasks:
-            ray.cancel(task)  # SIGINT: who learns saves what there is
+            ray.cancel(task)  # SIGINT: a learner saves its state
         ray.wait(tasks, num_returns=len(tasks))
         for number in heard[:1]:
             before[number](number, None)

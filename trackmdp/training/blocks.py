@@ -1,47 +1,47 @@
-"""Learning by blocks: each block is a run of its own, in a folder of its own, and the whole grid values what they find.
+"""Learning by blocks: each block is a run of its own, in a folder of its own, and the whole grid values the policies.
 
-A block collects and learns in its own cells and its halo, where whoever leaves them has exited (`solvers/partition`).
-Its targets start in all of these cells alike, so that every block gets its share of the frames. What was finished is
+A block collects and learns in its own cells and its halo, where leaving them is the exit (`solvers/partition`).
+Its targets start in all of these cells alike, so that every block gets its share of the frames. Finished blocks are
 not learned again on resume, and a block that was interrupted goes on from its own checkpoint.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from rich.console import Console
 
+from trackmdp.algos.estimates.alike import cell_classes
 from trackmdp.config import TrainConfig, load_run_config
+from trackmdp.config.given import GivenKernelConfig, GivenSensorConfig
 from trackmdp.config.learning import AlgoConfig, file_of_classes
 from trackmdp.config.partition import PartitionConfig
-from trackmdp.config.sensing import MissConfig, PaperCostConfig, PerfectSensorConfig
-from trackmdp.config.world import TableConfig
+from trackmdp.config.sensing import PaperCostConfig, PerfectSensorConfig
 from trackmdp.durable import own_folder, write_bytes, write_json
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.seeding import derive, preserved_global_rng
 from trackmdp.signals import HEARD, handled, stop
-from trackmdp.solvers.alike import cell_classes
 from trackmdp.solvers.partition import Block, blocks, default_halo, narrow_halo, plan_by_blocks
 from trackmdp.solvers.workers import crew
 from trackmdp.training.callbacks import Callback, Learning, Position
 from trackmdp.training.display import make_console
 from trackmdp.training.evaluator import Score, make_evaluator
 from trackmdp.training.folders import SUMMARY, finished, read_summary
-from trackmdp.training.inputs import CLASSES, short, write_inputs
+from trackmdp.training.inputs import as_word, identity, problem_of, with_own_classes, write_inputs
 from trackmdp.training.lock import locked
 from trackmdp.training.run import complete, load_run
-from trackmdp.training.state import identity
 from trackmdp.training.trainer import Trainer
 from trackmdp.untrusted import decoded
-from trackmdp.world.files import npy_bytes
 from trackmdp.world.model import World
-from trackmdp.world.tracks import Problem
+from trackmdp.world.problem_file import PROBLEM, problem_bytes, problem_digest
+from trackmdp.world.tracks import Problem, modelled
 
 
 def make_trainer(
@@ -51,16 +51,22 @@ def make_trainer(
     folder: Path | None = None,
     callbacks: Sequence[Callback] = (),
     console: Console | None = None,
+    nets: Mapping[str, Any] | None = None,
 ) -> Learning:
     """The trainer of the whole grid, or of its blocks where `partition.block` is set; arguments as for `Trainer`.
 
     Raises:
-        UserError: callbacks are given for blocks, or as `Trainer` raises it.
+        UserError: callbacks or networks are given for blocks, or as `Trainer` raises it.
     """
     if config.partition.block is None:
-        return Trainer(problem, config, folder=folder, callbacks=callbacks, console=console)
-    if callbacks:
-        raise UserError("callbacks: expected none with partition.block, whose blocks may learn in other processes")
+        return Trainer(
+            problem, config, folder=folder, callbacks=callbacks, console=console, nets=nets
+        )
+    if callbacks or nets:
+        raise UserError(
+            f"{'callbacks' if callbacks else 'actor, critic'}: expected none with partition.block, whose blocks may "
+            "learn in other processes"
+        )
     return BlockTrainer(problem, config, folder, console)
 
 
@@ -70,7 +76,7 @@ class BlockTrainer(Learning):
     Learners are given the tasks of their blocks alone. Each block's run is written to `blocks/NUMBER` in the folder.
 
     Attributes:
-        position: after `run`, the frames of all blocks and what they have earned there.
+        position: after `run`, the frames of all blocks and their rewards.
     """
 
     def policy(self) -> Policy:
@@ -83,46 +89,53 @@ class BlockTrainer(Learning):
         Raises:
             UserError, Preempted, RunError: as `Trainer.run` of a block.
         """
-        world, cfg, began = self.problem, self.config.partition, time.monotonic()
-        assert isinstance(world, World)  # the config refuses all others
+        world = modelled(self.problem, "partition.block")
+        cfg, began = self.config.partition, time.monotonic()
         halo, side = default_halo(world) if cfg.halo is None else cfg.halo, cfg.block
         assert side is not None
         parts = blocks(world.size, side, halo)
         with ExitStack() as opened:
             place = self.folder or Path(opened.enter_context(TemporaryDirectory()))
-            resumed = self.folder is not None and _resumed(self.config, place)
-            # A block hears signals while it learns; here they end what is between two blocks, and all workers.
+            resumed = self.folder is not None and _resumed(self.config, world, place)
+            # A block handles signals while it learns; here they end the work between two blocks, and all workers.
             opened.enter_context(handled(stop, *HEARD))
             # Before anything is written: where there is no such cluster, no run has begun.
             run = opened.enter_context(crew(min(cfg.workers, len(parts)), cfg.cluster))
             if self.folder is not None:
                 write_inputs(self.config, world, place, resumed=resumed)
-                write_json(place / "plan.json", {"blocks": len(parts)})  # for those who watch the run
+                write_json(place / "plan.json", {"blocks": len(parts)})  # for `watch`
             own_folder(place / "blocks")
-            learner = _BlockLearner(self.config, place.absolute() / "blocks", parts)
+            config = with_own_classes(self.config, place) if resumed else self.config
+            learner = _BlockLearner(config, place.absolute() / "blocks", parts)
             table = plan_by_blocks(world, learner, side, halo, run)
             with decoded(str(place / "blocks"), "the runs of blocks"):
                 ends = [read_summary(learner.place(number)) for number in range(len(parts))]
-                earned = sum(end["frames"] * end["while_collecting"]["reward_per_frame"] for end in ends)
+                earned = sum(
+                    end["frames"] * end["while_collecting"]["reward_per_frame"] for end in ends
+                )
                 frames = sum(end["frames"] for end in ends)
         self._policy, self.evaluator = Policy.from_table(table), make_evaluator(world)
         self.position = Position(0, frames, time.monotonic() - began, earned)
         score = self.evaluator.score(self._policy)
-        if said := narrow_halo(world, cfg, self.evaluator.upper, score.evaluation):
-            self.console.print(f"warning: {said}")
+        if warning := narrow_halo(world, cfg, self.evaluator.upper, score.evaluation):
+            self.console.print(f"warning: {warning}")
         return score
 
 
-def _resumed(config: TrainConfig, folder: Path) -> bool:
+def _resumed(config: TrainConfig, problem: Problem, folder: Path) -> bool:
     """Whether the folder holds this run already.
 
     Raises:
-        UserError: it holds another one, whose results are then still as they were.
+        UserError: it holds another one; its results stay as they were.
     """
     if not (folder / "config.yaml").is_file():
         return False
-    if identity(load_run_config(folder), folder) != identity(config, folder):
-        raise UserError(f"{folder}: holds a run with another config, which cannot change on resume")
+    saved = load_run_config(folder)
+    before = identity(saved, folder, problem_of(saved, folder))
+    if before != identity(config, folder, problem):
+        raise UserError(
+            f"{folder}: holds a run with another config or problem, which cannot change on resume"
+        )
     return True
 
 
@@ -154,7 +167,9 @@ class _BlockLearner:
                     complete(Trainer(world, config, folder=folder))
         run = load_run(folder)
         how = "finished before" if before else f"{run.summary['wall_seconds']:.1f} s"
-        console.print(f"block {number + 1} of {len(self.parts)}: AIHTR {run.evaluation.aihtr:,.2f} in it, {how}")
+        console.print(
+            f"block {number + 1} of {len(self.parts)}: AIHTR {run.evaluation.aihtr:,.2f} in it, {how}"
+        )
         return run.policy
 
     def place(self, number: int) -> Path:
@@ -162,34 +177,38 @@ class _BlockLearner:
         return self.folder / f"{number:05d}"
 
     def _config(self, number: int, world: World, folder: Path) -> TrainConfig:
-        """The config of a block's own run, in which its world is described by numbers and a table."""
+        """The config of a block's own run, with the world of the block as its problem."""
         cfg, seen = self.config, sum(len(part.seen[0]) * len(part.seen[1]) for part in self.parts)
         # The frames of the run are shared out by the cells that blocks see, halos included.
         share = -(-cfg.collector.total_frames * world.num_cells // seen)
         certain = world.perfect and world.safe
+        price = as_word(world.cost, folder)
         return replace(
             cfg,
             seed=derive(cfg.seed, "block", number),
             grid=replace(cfg.grid, size=list(world.size)),
-            kernel=TableConfig(path=str(folder / "kernel.npz")),
-            cost=PaperCostConfig(reward=world.reward, sensor=short(world.cost), safe=world.safe_cost),
-            sensor=PerfectSensorConfig()
-            if certain
-            else MissConfig(p_d=short(world.detection), p_s=short(world.safe_detection)),
-            algo=self._algo(number, folder),
-            collector=replace(cfg.collector, total_frames=max(share, cfg.collector.frames_per_batch)),
+            kernel=GivenKernelConfig(
+                motion=True, modes=1, reveals=False, digest=problem_digest(world)[:16]
+            ),
+            cost=PaperCostConfig(reward=world.reward, sensor=price, safe=world.safe_cost),
+            sensor=PerfectSensorConfig() if certain else GivenSensorConfig(wide=False),
+            algo=self._algo(number, world, folder),
+            collector=replace(
+                cfg.collector, total_frames=max(share, cfg.collector.frames_per_batch)
+            ),
             optimal=replace(cfg.optimal, enabled=False),
             partition=PartitionConfig(block=None, halo=None, workers=1, cluster=None),
             resume="auto",
             quiet=True,
         )
 
-    def _algo(self, number: int, folder: Path) -> AlgoConfig:
-        """The algorithm, with the block's part of the classes of cells where a file holds those of the whole grid."""
+    def _algo(self, number: int, world: World, folder: Path) -> AlgoConfig:
+        """The algorithm, with the block's part of the classes of cells where a file gives those of the whole grid."""
         algo, size = self.config.algo, self.config.grid.sides
-        classes, (rows, columns) = cell_classes(file_of_classes(algo), size), self.parts[number].seen
+        classes = cell_classes(file_of_classes(algo), size)
         if classes is None:
             return algo
+        rows, columns = self.parts[number].seen
         part = classes.reshape(size)[rows.start : rows.stop, columns.start : columns.stop]
-        write_bytes(folder / CLASSES, npy_bytes(part.ravel()))
-        return replace(algo, share_cells=str(folder / CLASSES))  # type: ignore[call-arg]
+        write_bytes(folder / PROBLEM, problem_bytes(world, part.ravel()))
+        return replace(algo, share_cells=str(folder / PROBLEM))  # type: ignore[call-arg]

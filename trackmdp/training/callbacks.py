@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # the display of a planner is no reason to load torch
     from trackmdp.world.tracks import Problem
 
 Row = Mapping[str, float | int | None]
-"""Figures of one iteration by their names, as `metrics.csv` has them; None for what was not measured."""
+"""Figures of one iteration by their names, as `metrics.csv` has them; None for missing figures."""
 
 
 @dataclass(frozen=True)
@@ -40,19 +40,21 @@ class Learning:
     Args:
         problem: the world, or recorded tracks. A learner is given its task alone.
         config: the checked config of `trackmdp train`.
-        folder: what the run writes to; None to write nothing.
+        folder: of the run's files; None to write nothing.
         console: where progress is shown; None for nowhere.
 
     Attributes:
         evaluator: gives figures of policies, and upper bounds. From the start of `run` on.
-        callbacks: what is told of the run.
+        callbacks: called during the run.
         start: where an earlier process left the run.
         position: how far the run is.
     """
 
     evaluator: Evaluator
 
-    def __init__(self, problem: Problem, config: TrainConfig, folder: Path | None, console: Console | None) -> None:
+    def __init__(
+        self, problem: Problem, config: TrainConfig, folder: Path | None, console: Console | None
+    ) -> None:
         self.problem, self.config, self.folder = problem, config, folder
         self.console = console or Console(quiet=True)
         self.callbacks: list[Callback] = []
@@ -68,7 +70,7 @@ class Learning:
 
 
 class Training(Learning):
-    """What a callback may read of the run: the trainer, `trackmdp.training.trainer.Trainer`, which describes each."""
+    """The run as callbacks may read it: the trainer, `trackmdp.training.trainer.Trainer`, which describes each."""
 
     device: torch.device
     algorithm: Algorithm
@@ -116,7 +118,7 @@ class Callback:
     def on_end(self, trainer: Training) -> None:
         """The run is over, however it ended: `trainer.error` is None where all iterations are done.
 
-        Called in reverse order, once for every callback whose `on_start` returned.
+        Called in reverse order, once for every callback after its `on_start`.
         """
 
     def state_dict(self) -> dict[str, Any]:

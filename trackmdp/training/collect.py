@@ -14,6 +14,7 @@ from torchrl.collectors import BaseCollector, Collector, MultiAsyncCollector, Mu
 from trackmdp.config import TrainConfig
 from trackmdp.config.learning import CollectorConfig, RayWorkersConfig, WorkersConfig
 from trackmdp.config.registry import maker
+from trackmdp.imports import safe_children
 from trackmdp.seeding import derive
 from trackmdp.solvers.workers import end_with_parent
 from trackmdp.training.machine import make_device
@@ -22,14 +23,27 @@ from trackmdp.world.tracks import Problem
 
 
 def make_collector(
-    cfg: TrainConfig, problem: Problem, policy: TensorDictModuleBase, device: torch.device, *, done: int = 0
+    cfg: TrainConfig,
+    problem: Problem,
+    policy: TensorDictModuleBase,
+    device: torch.device,
+    *,
+    done: int = 0,
 ) -> BaseCollector:
-    """The source of the frames that are left after the first `done`, made by what the config names."""
-    return maker(cfg.collector)(problem, policy, cfg.collector, seed=cfg.seed, device=device, done=done)
+    """The source of the frames that are left after the first `done`, from the config's collector."""
+    return maker(cfg.collector)(
+        problem, policy, cfg.collector, seed=cfg.seed, device=device, done=done
+    )
 
 
 def single(
-    problem: Problem, policy: TensorDictModuleBase, cfg: CollectorConfig, *, seed: int, device: torch.device, done: int
+    problem: Problem,
+    policy: TensorDictModuleBase,
+    cfg: CollectorConfig,
+    *,
+    seed: int,
+    device: torch.device,
+    done: int,
 ) -> BaseCollector:
     """A collector of batches `[B, time]` in this process; its frames are env steps.
 
@@ -61,9 +75,12 @@ def _in_workers(
     """A collector of TorchRL's `kind` in worker processes; arguments as for `single`."""
     env = _env_options(cfg, seed)
     # A resumed run's workers have streams of their own (`done`), not the first ones again.
-    workers = [partial(_worker_env, problem, f"{worker}-{done}", env) for worker in range(cfg.workers)]
+    workers = [
+        partial(_worker_env, problem, f"{worker}-{done}", env) for worker in range(cfg.workers)
+    ]
     threads = {"num_threads": torch.get_num_threads(), "num_sub_threads": cfg.threads}
-    return kind(workers, policy, **threads, **_common(cfg, device, done))
+    with safe_children():
+        return kind(workers, policy, **threads, **_common(cfg, device, done))
 
 
 multi_sync = partial(_in_workers, MultiSyncCollector)
@@ -73,7 +90,13 @@ multi_async = partial(_in_workers, MultiAsyncCollector)
 
 
 def ray(
-    problem: Problem, policy: TensorDictModuleBase, cfg: RayWorkersConfig, *, seed: int, device: torch.device, done: int
+    problem: Problem,
+    policy: TensorDictModuleBase,
+    cfg: RayWorkersConfig,
+    *,
+    seed: int,
+    device: torch.device,
+    done: int,
 ) -> BaseCollector:
     """A collector in the workers of a Ray cluster; arguments as for `single`.
 
@@ -83,7 +106,10 @@ def ray(
     from trackmdp.training import on_ray
 
     env = _env_options(cfg, seed)
-    workers = [partial(_remote_env, problem, f"{worker}-{done}", env, cfg.threads) for worker in range(cfg.workers)]
+    workers = [
+        partial(_remote_env, problem, f"{worker}-{done}", env, cfg.threads)
+        for worker in range(cfg.workers)
+    ]
     return on_ray.make_ray_collector(workers, policy, cfg, _common(cfg, device, done))
 
 
@@ -99,9 +125,10 @@ def _common(cfg: CollectorConfig, device: torch.device, done: int) -> dict[str, 
     """
     return {
         "frames_per_batch": cfg.frames_per_batch,
-        # What is left, rounded up to whole batches: 100,000 frames in batches of 30,000 are 120,000, or 60,000 where
+        # The rest, rounded up to whole batches: 100,000 frames in batches of 30,000 are 120,000, or 60,000 where
         # 60,000 are done.
-        "total_frames": -(-(cfg.total_frames - done) // cfg.frames_per_batch) * cfg.frames_per_batch,
+        "total_frames": -(-(cfg.total_frames - done) // cfg.frames_per_batch)
+        * cfg.frames_per_batch,
         # True would wrap the environment in an InitTracker: a transformed environment does not call the environment's
         # own `_step_and_maybe_reset`, and is slower. Left unset, TorchRL warns.
         "auto_register_policy_transforms": False,
@@ -115,7 +142,7 @@ def _common(cfg: CollectorConfig, device: torch.device, done: int) -> dict[str, 
 def _worker_env(world: Problem, worker: str, env: dict[str, Any]) -> TrackEnv:
     """Built in a worker process: its own stream for the targets, and for the actions sampled there."""
     # Ctrl-C, and a scheduler's SIGTERM, go to the workers as well. They must not die of them: the learner would wait
-    # for an answer of theirs while it should save. It tells them to end, and kills those that do not.
+    # for an answer of theirs while it should save. It requests their end, and kills the others.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     end_with_parent()

@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 import sys
 import time
-from typing import Any
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, TypeVar
 
 from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -25,18 +27,25 @@ def make_console(quiet: bool) -> Console:
     """Standard output; lines of any length stay whole when piped."""
     piped = not sys.stdout.isatty()
     return _Console(
-        quiet=quiet, markup=False, emoji=False, highlight=False, soft_wrap=piped, width=160 if piped else None
+        quiet=quiet,
+        markup=False,
+        emoji=False,
+        highlight=False,
+        soft_wrap=piped,
+        width=160 if piped else None,
     )
 
 
 class _Console(Console):
-    """Shows text as it is: what stands in a folder's name or a log's label is neither markup nor a control sequence."""
+    """Shows text as it is: a folder's name or a log's label is neither markup nor a control sequence."""
 
     def render_str(self, text: str, **options: Any) -> Text:
         return super().render_str(printable(text), **options)
 
     def status(self, status: RenderableType, **options: Any) -> Status:
-        return super().status(Text(printable(status)) if isinstance(status, str) else status, **options)
+        return super().status(
+            Text(printable(status)) if isinstance(status, str) else status, **options
+        )
 
 
 class Display(Callback):
@@ -44,7 +53,7 @@ class Display(Callback):
 
     Args:
         console: where; a bar at a terminal, else a line now and then.
-        title: what the run is called there.
+        title: name of the run.
     """
 
     def __init__(self, console: Console, title: str) -> None:
@@ -52,11 +61,11 @@ class Display(Callback):
         self._bar: Progress | None = None
 
     def on_start(self, trainer: Training) -> None:
-        """Begin the bar where the run is; what an earlier process did does not count for the speed."""
+        """Begin the bar where the run is; iterations of an earlier process do not count for the speed."""
         self._first = trainer.position
         self._started = self._last_line = time.monotonic()
         if self._console.is_terminal and not self._console.quiet:
-            # What is left of the line after title, figures and time: a line that wraps scrolls at each refresh.
+            # The rest of the line after title, figures and time: a line that wraps scrolls at each refresh.
             room = self._console.width - len(self._title) - _FIGURES_WIDTH
             bar = [BarColumn(min(40, room))] if room > 3 else []
             columns = (
@@ -94,13 +103,44 @@ class Display(Callback):
     def _line(self, iteration: int, iterations: int, figures: str) -> None:
         """A line after the first iteration, after the last, and every two seconds between."""
         now, first = time.monotonic(), self._first.iteration
-        # The first line at once, so that whoever waits sees the speed; the last one, so that a log ends at 100 %.
+        # The first line at once, so that a waiting user sees the speed; the last one, so that a log ends at 100 %.
         ends = iteration in (first + 1, iterations)
         if not ends and now - self._last_line < _SECONDS_BETWEEN_LINES:
             return
         self._last_line = now
         left = (now - self._started) / (iteration - first) * (iterations - iteration)
-        self._console.print(f"{self._title}: {100 * iteration // iterations:3d} %  {figures}  {left:,.0f} s left")
+        self._console.print(
+            f"{self._title}: {100 * iteration // iterations:3d} %  {figures}  {left:,.0f} s left"
+        )
+
+
+_T = TypeVar("_T")
+
+
+@contextmanager
+def reporting(
+    console: Console, title: str, line_of: Callable[[_T], str]
+) -> Iterator[Callable[[_T], None]]:
+    """Show a search as it goes on: one changing line at a terminal, a plain line now and then when piped.
+
+    Args:
+        console: where.
+        title: before each line.
+        line_of: a progress in words.
+    """
+    last = time.monotonic()
+    with console.status(title) as status:
+
+        def show(progress: _T) -> None:
+            nonlocal last
+            line = f"{title}: {line_of(progress)}"
+            if console.is_terminal:
+                status.update(line)
+            elif time.monotonic() - last >= _SECONDS_BETWEEN_LINES:
+                last = time.monotonic()
+                console.print(line)
+
+        yield show
 
 
 def table(title: str, columns: list[str], rows: list[list[str]]) -> Table:
@@ -115,18 +155,25 @@ def table(title: str, columns: list[str], rows: list[list[str]]) -> Table:
 
 def show_held_out(console: Console, subject: str, report: dict[str, Any]) -> None:
     """The figures of a policy beside those of the references, with their intervals."""
-    shown: dict[str, tuple[Any, ...]] = {"aihtr": ("AIHTR", 2), "reward_per_step": ("reward per step", 4)}
+    shown: dict[str, tuple[Any, ...]] = {
+        "aihtr": ("AIHTR", 2),
+        "reward_per_step": ("reward per step", 4),
+    }
     shown |= {"accuracy": ("accuracy", 2, 100.0, " %"), "sensors_per_step": ("sensors per step", 2)}
     rows = []
     # Figure by figure, policies under each other: side by side the intervals would be wider than 80 columns.
     for key, (label, *form) in shown.items():
         rows.append([label, ""])
         for name, figures in report["figures"].items():
-            rows.append([f"  {subject if name == 'policy' else name}", with_interval(figures[key], *form)])
+            rows.append(
+                [f"  {subject if name == 'policy' else name}", with_interval(figures[key], *form)]
+            )
     console.print(table(f"{report['tracks']} held-out tracks", ["", "mean (95 % interval)"], rows))
 
 
-def with_interval(interval: dict[str, float | None], digits: int, scale: float = 1.0, unit: str = "") -> str:
+def with_interval(
+    interval: dict[str, float | None], digits: int, scale: float = 1.0, unit: str = ""
+) -> str:
     """A mean with its interval in brackets."""
     known = [interval[key] for key in ("mean", "low", "high")]
     mean, low, high = ("–" if value is None else f"{scale * value:,.{digits}f}" for value in known)

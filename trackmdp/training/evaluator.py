@@ -7,24 +7,20 @@ from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
 
-import numpy as np
 from scipy import sparse
 
+from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
+from trackmdp.algos.estimates.path_plans import choose_plan
 from trackmdp.config.registry import choice_values
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers import bounds, qmdp
-from trackmdp.solvers.evaluate import evaluate
-from trackmdp.solvers.evaluation import Evaluation, regret_per_step
-from trackmdp.solvers.kernel_estimate import KernelEstimate
-from trackmdp.solvers.keyed import averaged
-from trackmdp.solvers.keyed_search import mode_bound
-from trackmdp.solvers.path_exchange import choose_plan
-from trackmdp.solvers.recorded import ReplayedTracks, replay
+from trackmdp.solvers import bounds, rules
+from trackmdp.solvers.evaluation import Evaluation, ReplayedTracks, regret_per_step
+from trackmdp.solvers.hidden import averaged
+from trackmdp.solvers.value import evaluate, replay
 from trackmdp.world.model import World
-from trackmdp.world.modes import HiddenWorld, Modelled
 from trackmdp.world.tracks import Problem, Recorded, Tracks
 
-_PER_CELL = ("value", "steps", "detections", "sensors", "safe_actions")
+_PER_START = ("value", "steps", "detections", "sensors", "safe_actions", "starts")
 
 ESTIMATED = "Q_MDP of the estimated kernel"
 """Q_MDP for the motion as the tracks to learn from show it."""
@@ -52,7 +48,10 @@ class Score:
     def regret(self) -> str:
         """The regret as it is printed: one number, or the range where its ends differ in four digits."""
         # Adding 0.0 turns the -0.0 that rounding leaves into 0.0.
-        low, high = (f"{round(end, 4) + 0.0:.4f}" for end in (self.regret_per_step_lower, self.regret_per_step))
+        low, high = (
+            f"{round(end, 4) + 0.0:.4f}"
+            for end in (self.regret_per_step_lower, self.regret_per_step)
+        )
         if high <= low or math.isnan(self.regret_per_step):
             return f"regret per step {high} to the upper bound"
         return f"regret per step {low} to the best policy known, {high} to the upper bound"
@@ -85,7 +84,9 @@ class Evaluator:
 
     def _score(self, evaluation: Evaluation) -> Score:
         best = max(self.lower, evaluation.aihtr) if not math.isnan(self.lower) else math.nan
-        return Score(evaluation, regret_per_step(self.upper, evaluation), regret_per_step(best, evaluation))
+        return Score(
+            evaluation, regret_per_step(self.upper, evaluation), regret_per_step(best, evaluation)
+        )
 
     def report(self, policy: PolicyTable) -> dict[str, Any] | None:  # noqa: ARG002
         """Figures with confidence intervals beside those of the references; None where all figures are exact."""
@@ -100,23 +101,20 @@ class Evaluator:
 class ExactEvaluator(Evaluator):
     """Evaluates with the motion model.
 
-    Where targets have a mode the bound knows it at all times, and Q_MDP plans with cells alone.
+    Where modes are hidden the bounds know them, and Q_MDP plans with cells alone.
 
     Args:
         world: the task and the motion. The paper's bound knows no `max_steps` and is None where the world has one.
     """
 
-    def __init__(self, world: Modelled) -> None:
+    def __init__(self, world: World) -> None:
         super().__init__(world)
-        if isinstance(world, HiddenWorld):
-            self.upper = float(mode_bound(world)[:, 0].mean())
-            self.qmdp = evaluate(world, qmdp.solve(averaged(world)))
-        else:
-            if world.max_steps is None:
-                self.bounds["paper"] = float(bounds.paper(world).mean())
-            self.bounds["valid"], self.upper = float(bounds.valid(world).mean()), float(bounds.clocked(world).mean())
-            self.qmdp = evaluate(world, qmdp.solve(world))
-        self.bounds["clocked"], self.lower = self.upper, self.qmdp.aihtr
+        if world.max_steps is None:
+            self.bounds["paper"] = float(bounds.paper(world).mean())
+        self.bounds["valid"] = float(bounds.valid(world).mean())
+        self.upper = self.bounds["clocked"] = float(bounds.clocked(world).mean())
+        self.qmdp = evaluate(world, rules.qmdp(averaged(world)))
+        self.lower = self.qmdp.aihtr
 
 
 def make_evaluator(problem: Problem) -> Evaluator:
@@ -127,7 +125,7 @@ def make_evaluator(problem: Problem) -> Evaluator:
 class HeldOutEvaluator(Evaluator):
     """Evaluates on every held-out track, from its first cell to its end; scores are those of the validation tracks.
 
-    Whatever is looked at while learning, or to choose between policies, is a score: the best of many policies on the
+    Every figure used while learning, or to choose between policies, is a score: the best of many policies on the
     held-out tracks would be the luckiest there. Without a motion model there are no bounds, no Q_MDP and no regret:
     `upper` and the scores' regrets are nan.
 
@@ -146,58 +144,75 @@ class HeldOutEvaluator(Evaluator):
         return Score(evaluate(self.world.selection, policy), math.nan, math.nan)
 
     def replayed(self, policy: PolicyTable) -> ReplayedTracks:
-        """What a policy did on the held-out tracks."""
+        """The totals of a policy on the held-out tracks."""
         return replay(self.world, self.tracks, policy)
 
     @cached_property
     def references(self) -> dict[str, PolicyTable]:
         """The policies that a learned one is compared with, by their names in tables."""
         task = self.world
-        kernel = estimated_kernel(task.tracks, task.size)
-        world = World.of(task, kernel, max_steps=None, window=None, memory="cell")
         found: dict[str, PolicyTable] = {}
-        # Only what remembers more is compared with it; and counts take sensors of one cell that never miss.
-        if task.keyed and task.perfect and task.safe and task.coverage is None:
-            gamma, rounds = (choice_values("algo", "path_counts", {})[name] for name in ("gamma", "rounds"))
+        # Only a policy that remembers more is compared with it.
+        if task.keyed:
+            gamma, rounds = (
+                choice_values("algo", "model_based")[name] for name in ("gamma", "rounds")
+            )
             cell = task.remembering()
-            plan = choose_plan(cell, task.tracks, judge=task.validation, discount=gamma, rounds=rounds)
+            plan = choose_plan(
+                cell, task.tracks, judge=task.validation, discount=gamma, rounds=rounds
+            )
             found[CELL_ALONE] = plan.policy
         fixed = {"all on": PolicyTable.all_on(task), "no sensors": PolicyTable.none(task)}
-        return found | fixed | {ESTIMATED: qmdp.solve(world)}
+        return found | fixed | {ESTIMATED: estimated_qmdp(task)}
 
     def report(self, policy: PolicyTable) -> dict[str, Any]:
-        """What is written of a policy: its figures on the held-out tracks beside those of the references."""
+        """The report on a policy: its figures on the held-out tracks beside the references'."""
         policies = {"policy": policy, **self.references}
-        found = {name: self.replayed(each).intervals(self.tracks.names) for name, each in policies.items()}
-        figures = {name: {key: asdict(interval) for key, interval in each.items()} for name, each in found.items()}
-        counts = {"learned_from": self.world.tracks, "validation": self.world.validation, "tracks": self.tracks}
+        found = {
+            name: self.replayed(each).intervals(self.tracks.names)
+            for name, each in policies.items()
+        }
+        figures = {
+            name: {key: asdict(interval) for key, interval in each.items()}
+            for name, each in found.items()
+        }
+        counts = {
+            "learned_from": self.world.tracks,
+            "validation": self.world.validation,
+            "tracks": self.tracks,
+        }
         return {name: len(part) for name, part in counts.items()} | {"figures": figures}
+
+
+def estimated_qmdp(task: Recorded) -> PolicyTable:
+    """Q_MDP of the kernel estimated from the tracks to learn from."""
+    kernel = estimated_kernel(task.tracks, task.size)
+    return rules.qmdp(World.of(task, kernel, max_steps=None, window=None, memory="cell"))
 
 
 def estimated_kernel(tracks: Tracks, size: tuple[int, int]) -> sparse.csr_array:
     """`[M, M]` the motion as `tracks` show it: posterior mean, the prior of a row counting as one move."""
     estimate = KernelEstimate(size, weight=1.0, exit_weight=1.0)
-    line = tracks.closed(estimate.num_cells)
-    moves = np.ones(len(line.cells), dtype=bool)
-    # Example: the tracks 3 4 (exit) and 7 8 stand end to end as cells = 3 4 M 7 8 with first = 0 3 5. Every place but
-    # a track's last one (2 and 4) begins a move: 3 to 4, 4 to M, 7 to 8.
-    moves[line.first[1:] - 1] = False
-    at = np.flatnonzero(moves)
-    estimate.add_moves(line.cells[at], line.cells[at + 1])
+    estimate.add_moves(*tracks.steps(estimate.num_cells))
     estimate.fit(1)
     # `[M, M + 1]`, the last column being the exit, which a kernel `[M, M]` leaves to its rows' missing mass.
     return sparse.csr_array(estimate.mean()[:, :-1])
 
 
-def while_collecting(upper: float, evaluation: Evaluation, reward: float, frames: int) -> dict[str, float]:
-    """What the frames of a run have earned on average, and how far that is below the best rate known.
+def while_collecting(
+    upper: float, evaluation: Evaluation, reward: float, frames: int
+) -> dict[str, float]:
+    """The mean reward of a run's frames, and its distance to the best rate known.
 
     That rate is `upper` over the expected length of an episode, which no policy changes; `reward` is the frames' sum.
     """
     earned = reward / frames
-    return {"reward_per_frame": earned, "regret_per_frame": upper / evaluation.expected_length - earned}
+    return {
+        "reward_per_frame": earned,
+        "regret_per_frame": upper / evaluation.expected_length - earned,
+    }
 
 
 def figures(evaluation: Evaluation) -> dict[str, Any]:
     """The single figures of an evaluation, as they stand in `summary.json`."""
-    return {key: value for key, value in asdict(evaluation).items() if key not in _PER_CELL}
+    return {key: value for key, value in asdict(evaluation).items() if key not in _PER_START}

@@ -1,28 +1,26 @@
-"""What runs and sweeps leave in their folders: `summary.json`, and the state that others read, also while they run.
+"""Files of runs and sweeps: `summary.json`, and their state for other processes, also while they run.
 
-A summary holds what came out of a run, a digest of each file it belongs to, and one of itself. So a summary, a kernel,
-a config or a policy copied from another run, or changed by hand, is noticed by whoever reads the results. The digests
-are no signatures: who means to deceive can compute them anew.
+A summary holds the results of a run, a digest of each file it belongs to, and one of itself. So a summary, a kernel,
+a config or a policy copied from another run, or changed by hand, is noticed when the results are read. The digests
+are no signatures: a forger can compute them anew.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from trackmdp.config import TrainConfig
-from trackmdp.config.tree import config_digest
+from trackmdp.config import TrainConfig, load_run_config
 from trackmdp.durable import write_json, write_sealed
 from trackmdp.errors import UserError
 from trackmdp.training.lock import is_locked
 from trackmdp.untrusted import known_object, opened, read_object, unsealed
 
-SUMMARY = "summary.json"
-_FILES = ("config.yaml", "kernel.npz", "tracks.json", "policy.npz")
+CONFIG, SUMMARY, METRICS = "config.yaml", "summary.json", "metrics.csv"
+_FILES = (CONFIG, "problem.npz", METRICS, "policy.npz")
 _LARGEST = 2**36
 PLAN, FAILED_FILE, DONE = "sweep.json", "failed.json", "done.json"
 """Files: of a sweep; of a run that failed, of a run of another command than `train` that ended."""
@@ -49,25 +47,30 @@ def finished(cfg: TrainConfig, folder: Path) -> dict[str, Any] | None:
     """The summary of a run that has nothing left to do; None where there is none, or one of another config."""
     try:
         summary = read_summary(folder)
+        check_files(folder, summary, CONFIG)
+        saved = load_run_config(folder)
     except UserError:
         return None
-    # `quiet` changes what is shown and nothing else, but stands in the config: both texts are this run.
-    mine = [config_digest(dataclasses.replace(cfg, quiet=quiet), folder) for quiet in (True, False)]
-    return summary if summary.get("config_sha256") in mine else None
+    # `quiet` changes the terminal alone, but is in the config.
+    return summary if replace(cfg, resume=None, quiet=saved.quiet) == saved else None
 
 
 def check_files(folder: Path, summary: Mapping[str, Any], *names: str) -> None:
-    """See that the files `names`, by default all, are those that the run of `summary` left.
+    """Check that the files `names`, by default all, are the ones that the run of `summary` left.
 
     Raises:
         UserError: one is missing, or is another.
     """
     known = summary.get("files")
     if not isinstance(known, Mapping):
-        raise UserError(f"{folder / SUMMARY}: names no files; it is by another version of this program")
+        raise UserError(
+            f"{folder / SUMMARY}: names no files; it is by another version of this program"
+        )
     for name in names or known:
         if name not in known or known[name] != _digest(folder / name):
-            raise UserError(f"{folder / name}: not the file that this run left, as its {SUMMARY} has it")
+            raise UserError(
+                f"{folder / name}: not the file that this run left, as its {SUMMARY} has it"
+            )
 
 
 def _digest(file: Path) -> str:
@@ -94,7 +97,9 @@ class RunState:
     result: Mapping[str, Any] = field(default_factory=dict)
 
 
-def write_plan(sweep: Path, command: str, line: str, jobs: Sequence[tuple[str, Sequence[str]]]) -> None:
+def write_plan(
+    sweep: Path, command: str, line: str, jobs: Sequence[tuple[str, Sequence[str]]]
+) -> None:
     """Write `sweep.json`: all runs planned, each with the name of its folder and its overrides."""
     planned = [{"folder": name, "overrides": list(words)} for name, words in jobs]
     write_json(sweep / PLAN, {"command": command, "line": line, "jobs": planned})
@@ -104,12 +109,14 @@ def read_plan(sweep: Path) -> dict[str, Any]:
     """The content of `sweep.json`: `command`, `line` and `jobs`.
 
     Raises:
-        UserError: the folder is not that of a sweep.
+        UserError: the folder is no sweep's.
     """
     content = known_object(sweep / PLAN, most=PLAN_BYTES)
     jobs = content.get("jobs")
     whole = isinstance(jobs, list) and all(
-        isinstance(job, dict) and isinstance(job.get("folder"), str) and isinstance(job.get("overrides"), list)
+        isinstance(job, dict)
+        and isinstance(job.get("folder"), str)
+        and isinstance(job.get("overrides"), list)
         for job in jobs
     )
     if not whole or not content.keys() >= {"command", "line"}:
@@ -121,9 +128,11 @@ def runs_of(sweep: Path) -> list[RunState]:
     """All runs of a sweep, in the order planned.
 
     Raises:
-        UserError: the folder is not that of a sweep.
+        UserError: the folder is no sweep's.
     """
-    return [run_of(sweep / job["folder"], tuple(job["overrides"])) for job in read_plan(sweep)["jobs"]]
+    return [
+        run_of(sweep / job["folder"], tuple(job["overrides"])) for job in read_plan(sweep)["jobs"]
+    ]
 
 
 def run_of(folder: Path, overrides: tuple[str, ...] = ()) -> RunState:

@@ -1,110 +1,69 @@
-"""Inputs of a run in its folder: `config.yaml`, `kernel.npz` or `tracks.json`, footprints, tracks of no other file."""
+"""Inputs of a run in its folder: `config.yaml` and `problem.npz`, which a resumed or evaluated run is read from."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
+import hashlib
+from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-from scipy import sparse
-
+from trackmdp.algos.estimates.alike import cell_classes
 from trackmdp.config import TrainConfig
+from trackmdp.config.checks import own_paths
 from trackmdp.config.learning import file_of_classes
+from trackmdp.config.resume import fixed_options
 from trackmdp.config.tree import config_text
 from trackmdp.durable import write_bytes, write_text
-from trackmdp.errors import UserError
-from trackmdp.solvers.alike import cell_classes
-from trackmdp.untrusted import parse_json, read_bytes
-from trackmdp.world.files import LARGE, csr_bytes, npy_bytes
+from trackmdp.world.make import make_problem
 from trackmdp.world.model import Array
-from trackmdp.world.track_files import recording_bytes
-from trackmdp.world.tracks import Problem, Recorded
-
-KERNEL, TRACKS = "kernel.npz", "tracks.json"
-"""The motion, or how many recorded tracks of which content."""
-RECORDING = "recording.npz"
-"""The tracks of a run that was begun in Python, which may have been read from any file, or from none."""
-FOOTPRINTS = "footprints.npz"
-"""The cells that each sensor covers, where that is not its own cell alone."""
-CLASSES = "classes.npy"
-"""The class of each cell, where a file says which cells are alike (`algo.share_cells`)."""
-
-
-def short(values: Array) -> float | list[float]:
-    """One number where all cells have the same, else one for each: as an option has it."""
-    return float(values[0]) if (values == values[0]).all() else values.tolist()
+from trackmdp.world.problem_file import PROBLEM, problem_bytes, problem_digest, read_problem
+from trackmdp.world.tracks import Problem
 
 
 def write_inputs(config: TrainConfig, problem: Problem, folder: Path, *, resumed: bool) -> None:
-    """Write the kernel, or which tracks these are, the classes of cells and the config; tracks in no file, too.
+    """Write the problem, with the classes of cells that a file gives the learner, and the config.
 
-    Raises:
-        UserError: the run that is resumed was begun with another kernel, other tracks or other classes.
+    A resumed run keeps its `problem.npz`: `identity` has shown that it is the same.
     """
-    contents = _contents(problem)
-    classes = cell_classes(file_of_classes(config.algo), problem.size)
-    if classes is not None:
-        contents[CLASSES] = npy_bytes(classes)
-    own = folder.absolute() / RECORDING
-    # Before anything is written: a run that is refused must keep the inputs that its results belong to. And what was
-    # checked stays: only the process that read the positions can say what it left out of them.
-    if resumed:
-        _check(contents, folder)
-    else:
-        if isinstance(problem, Recorded) and getattr(config.kernel, "path", None) == str(own):
-            contents[RECORDING] = recording_bytes(problem)
-        for name, content in contents.items():
-            write_bytes(folder / name, content)
-    # The config last: with it the folder is that of a run, and all that it names must be there.
+    if not resumed:
+        classes = cell_classes(file_of_classes(config.algo), problem.size)
+        write_bytes(folder / PROBLEM, problem_bytes(problem, classes))
+    # The config last: with it the folder is a run's, and all that belongs to it must be there.
     write_text(folder / "config.yaml", config_text(config, folder))
 
 
-def check_inputs(problem: Problem, folder: Path) -> None:
-    """See that the folder's run learned in this world, or from these tracks.
+def problem_of(config: TrainConfig, folder: Path) -> Problem:
+    """The problem of the run in `folder`; before it has begun, the one that its config describes.
 
     Raises:
-        UserError: its kernel, its footprints, or which tracks it names, is missing, damaged or another.
+        UserError: a file is missing, damaged or malformed.
     """
-    _check(_contents(problem), folder)
+    begun = (folder / "config.yaml").is_file()
+    return read_problem(folder / PROBLEM) if begun else make_problem(config)
 
 
-def _check(contents: Mapping[str, bytes], folder: Path) -> None:
-    for name, content in contents.items():
-        stored = read_bytes(folder / name, most=LARGE)
-        if stored != content and not (name == TRACKS and _counted(stored) == _counted(content)):
-            raise UserError(f"{folder / name}: not what the run's config describes now; a run's inputs cannot change")
+def with_own_classes(config: TrainConfig, folder: Path) -> TrainConfig:
+    """The config of a begun run with the classes of cells in its own file, independent of the user's."""
+    if file_of_classes(config.algo) is None:
+        return config
+    algo = replace(config.algo, share_cells=str(folder / PROBLEM))  # type: ignore[call-arg]
+    return replace(config, algo=algo)
 
 
-def _counted(content: bytes) -> Any:
-    """What `tracks.json` says of the tracks; what was left out of a file of positions does not count."""
-    try:
-        said = parse_json(content, TRACKS)
-    except UserError:
-        return None
-    return {**said, "loaded": None} if isinstance(said, dict) else None
+def as_word(values: Array, folder: Path) -> float | str:
+    """Numbers per cell or sensor as an option: the one number that all have, or the file of the run's arrays."""
+    same = (values == values[0]).all()
+    return float(values[0]) if same else str(folder.absolute() / PROBLEM)
 
 
-def _contents(problem: Problem) -> dict[str, bytes]:
-    """Name -> content of the files that describe the problem; the same problem, the same bytes."""
-    contents = {TRACKS: _described(problem)} if isinstance(problem, Recorded) else {KERNEL: _saved(problem.kernel)}
-    if problem.coverage is not None:
-        contents[FOOTPRINTS] = _saved(problem.coverage.matrix)
-    return contents
+def identity(config: TrainConfig, folder: Path, problem: Problem) -> str:
+    """SHA-256 of the problem and of all options that must not change when the run in `folder` is resumed."""
+    # repr writes floats with all digits, so that equal hashes mean equal options.
+    options = repr(fixed_options(own_paths(config, folder)))
+    return hashlib.sha256(f"{options} {_digest(problem)}".encode()).hexdigest()
 
 
-def _saved(matrix: sparse.csr_array) -> bytes:
-    """A CSR matrix as SciPy saves it, its indices of one width, whatever its size and whatever is fastest."""
-    wide = (matrix.data, matrix.indices.astype(np.int64), matrix.indptr.astype(np.int64))
-    return csr_bytes(sparse.csr_array(wide, shape=matrix.shape))
-
-
-def _described(problem: Recorded) -> bytes:
-    """How many tracks and points of which content, as JSON."""
-    parts = {"learned_from": problem.tracks, "validation": problem.validation, "held_out": problem.held_out}
-    content = {
-        name: {"tracks": len(part), "cells": len(part.cells), "sha256": part.digest()} for name, part in parts.items()
-    }
-    content |= {"loaded": dict(problem.loaded)} if problem.loaded else {}
-    return (json.dumps(content, indent=2) + "\n").encode()
+@lru_cache(maxsize=1)
+def _digest(problem: Problem) -> str:
+    """`problem_digest`, kept: a large problem takes a second, and each checkpoint asks for it."""
+    return problem_digest(problem)

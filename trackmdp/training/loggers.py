@@ -6,11 +6,15 @@ import csv
 import math
 import os
 import secrets
+import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
+
+import numpy as np
 
 from trackmdp.config import CsvConfig, MlflowConfig, TrainConfig, WandbConfig, to_dict, to_yaml
 from trackmdp.config.loggers import RowsConfig
@@ -18,14 +22,15 @@ from trackmdp.config.registry import maker
 from trackmdp.config.tree import flatten
 from trackmdp.durable import own_folder, reopen, sync
 from trackmdp.errors import Preempted, RunError
+from trackmdp.notebook.drawing import drawn
 from trackmdp.training.callbacks import Callback, Row, Training
 from trackmdp.training.evaluator import figures
 from trackmdp.untrusted import decoded, opened
 
 
 def make_loggers(cfg: TrainConfig, folder: Path) -> list[Callback]:
-    """What the run writes of itself while it learns, each made by what its choice names."""
-    # metrics.csv is written whatever the log is: reports and `Run.metrics` read it. `csv` stays first, with the options
+    """The loggers of a run, each made by the maker of its choice."""
+    # metrics.csv is written beside every log: reports and `Run.columns` read it. `csv` stays first, with the options
     # of its own where it is chosen.
     chosen = {"csv": CsvConfig(every=1)} | cfg.log
     # Each is imported by the name in its schema, since the packages it may need (mcap) are not to load without it.
@@ -50,6 +55,7 @@ class RowLogger(Callback):
 
     def write(self, row: Row) -> None:
         """Append `row`."""
+        raise NotImplementedError
 
 
 class CsvLogger(RowLogger):
@@ -62,7 +68,7 @@ class CsvLogger(RowLogger):
     _position = 0  # bytes that an earlier process left
 
     def on_start(self, trainer: Training) -> None:  # noqa: ARG002
-        """Open the file; what an earlier process wrote after its last checkpoint is cut off.
+        """Open the file; rows of an earlier process after its last checkpoint are cut off.
 
         Raises:
             UserError: the file is a link, or not the one that the earlier process left.
@@ -71,8 +77,8 @@ class CsvLogger(RowLogger):
         # The columns are read and checked before the file is opened for writing: a file that is refused
         # stays as it was.
         names = _names(self._path, self._position) if self._position else None
-        mode = "r+" if self._position else "w"
-        self._file = os.fdopen(reopen(self._path, mode), "r+", newline="", encoding="utf-8")
+        descriptor = reopen(self._path, empty=not self._position)
+        self._file = os.fdopen(descriptor, "r+", newline="", encoding="utf-8")
         self._writer: csv.DictWriter[str] | None = None
         if names is not None:
             self._writer = csv.DictWriter(self._file, fieldnames=names)
@@ -108,8 +114,82 @@ class CsvLogger(RowLogger):
         self._position = state["position"]
 
 
-class TensorboardLogger(RowLogger):
-    """TensorBoard event files in `tensorboard/`, the same figures over frames."""
+def _names(file: Path, position: int) -> list[str]:
+    """The columns of a table that has at least `position` bytes.
+
+    Raises:
+        UserError: it has fewer, or is no such table.
+    """
+    with opened(file, most=2**36) as stream, decoded(str(file), "the metrics of this run"):
+        head = stream.readline(2**16)
+        stream.seek(position - 1)
+        # Shorter than at the checkpoint, or without a row's end there: the file was changed meanwhile, and cut at this
+        # byte it would end in half a row.
+        if stream.read(1) != b"\n":
+            raise ValueError(f"no row ends at byte {position:,}, where the checkpoint was saved")
+        names = next(csv.reader([head.decode("utf-8")], strict=True))
+        if names[0] != "iteration":
+            raise ValueError(f"the first column is {names[0]}, expected iteration")
+        return names
+
+
+class ResultLogger(RowLogger):
+    """Logs rows, and at the end of a whole run its figures, its pictures and its policy."""
+
+    def on_end(self, trainer: Training) -> None:
+        """Log the results, unless the run broke off, and close."""
+        if trainer.error is None:
+            pictures = {name: drawn(each) for name, each in pictures_of(trainer).items()}
+            with tempfile.TemporaryDirectory() as folder:
+                policy = Path(folder) / "policy.npz"
+                trainer.policy().save(policy)
+                self.results(final_figures(trainer), pictures, policy, trainer)
+        self.close(trainer.error)
+
+    def results(
+        self,
+        figures: Mapping[str, float],
+        pictures: Mapping[str, Any],
+        policy: Path,
+        trainer: Training,
+    ) -> None:
+        """Log the final figures, pictures of PIL by their names, and the file of the policy."""
+        raise NotImplementedError
+
+    def close(self, error: BaseException | None) -> None:
+        """End the log of a run, which ended by `error`."""
+        raise NotImplementedError
+
+
+def pictures_of(trainer: Training) -> dict[str, Any]:
+    """Name -> picture of the policy, its values and some episodes; none where matplotlib is not installed."""
+    if find_spec("matplotlib") is None:
+        return {}
+    from trackmdp.notebook.pictures import Heat, picture_of
+
+    policy, problem = trainer.policy(), trainer.problem
+    found = {"policy": picture_of(policy), "world": picture_of(problem)}
+    value = trainer.score.evaluation.value
+    if value.shape == (problem.num_cells,) and np.isfinite(value).any():
+        label = "V(x), reward per episode"
+        found["value"] = Heat("value by start cell", value.reshape(problem.size), label)
+    return {name: each for name, each in found.items() if each is not None}
+
+
+def final_figures(trainer: Training) -> dict[str, float]:
+    """`final/...`: the figures of the last policy and its regret."""
+    score = trainer.score
+    found = figures(score.evaluation) | {"regret_per_step": score.regret_per_step}
+    return {f"final/{key}": value for key, value in known(found).items()}
+
+
+def known(row: Row) -> dict[str, float | int]:
+    """The measurements that are finite numbers."""
+    return {key: value for key, value in row.items() if value is not None and math.isfinite(value)}
+
+
+class TensorboardLogger(ResultLogger):
+    """TensorBoard event files in `tensorboard/`: figures over frames, pictures, options and final figures."""
 
     name = "tensorboard"
 
@@ -119,8 +199,8 @@ class TensorboardLogger(RowLogger):
 
         folder, frames = self._folder / "tensorboard", trainer.position.frames
         own_folder(folder)
-        # TensorBoard reads all event files of a folder together and cannot be told to drop a part of one; a
-        # new file with purge_step hides the events of that step and later ones.
+        # TensorBoard reads all event files of a folder together and cannot drop a part of one; a new file with
+        # purge_step hides the events of that step and later ones.
         self._events = SummaryWriter(folder, purge_step=frames + 1 if frames else None)
         self._events.add_text("config", f"```yaml\n{to_yaml(trainer.config)}\n```", frames)
 
@@ -129,49 +209,29 @@ class TensorboardLogger(RowLogger):
         for key, value in known(row).items():
             self._events.add_scalar(key, value, row["frames"])
 
-    def on_end(self, trainer: Training) -> None:
-        """Write the final figures, and close the file."""
-        for key, value in final_figures(trainer).items():
-            self._events.add_scalar(key, value, trainer.position.frames)
+    def results(
+        self,
+        figures: Mapping[str, float],
+        pictures: Mapping[str, Any],
+        policy: Path,  # noqa: ARG002  TensorBoard keeps no files
+        trainer: Training,
+    ) -> None:
+        """Add pictures, the final figures, and for the view of hyperparameters the options."""
+        frames = trainer.position.frames
+        for name, picture in pictures.items():
+            self._events.add_image(name, np.asarray(picture), frames, dataformats="HWC")
+        for key, value in figures.items():
+            self._events.add_scalar(key, value, frames)
+        options = {key: str(value) for key, value in flatten(to_dict(trainer.config)).items()}
+        # In the same folder: by default a run of its own, named by the time, would appear beside this one.
+        self._events.add_hparams(options, dict(figures), run_name=".", global_step=frames)
+
+    def close(self, error: BaseException | None) -> None:  # noqa: ARG002
+        """Close the file."""
         self._events.close()
 
 
-def final_figures(trainer: Training) -> dict[str, float]:
-    """`final/...`: the figures of the last policy and its regret, once all iterations are done; none before."""
-    if trainer.error is not None:
-        return {}
-    score = trainer.score
-    found = figures(score.evaluation) | {"regret_per_step": score.regret_per_step}
-    return {f"final/{key}": value for key, value in known(found).items()}
-
-
-def known(row: Row) -> dict[str, float | int]:
-    """What was measured, and is a finite number."""
-    return {key: value for key, value in row.items() if value is not None and math.isfinite(value)}
-
-
-def _names(file: Path, position: int) -> list[str]:
-    """The columns of a table whose first `position` bytes hold, read before anything in it is changed.
-
-    Raises:
-        UserError: those bytes are not there, or are no such table.
-    """
-    with opened(file, most=2**36) as stream, decoded(str(file), "the metrics of this run"):
-        head = stream.readline(2**16)
-        # Shorter than the checkpoint remembers, or without a row's end there: the file was changed or
-        # replaced meanwhile, and truncating it at this byte would leave half a row.
-        if stream.seek(0, os.SEEK_END) < position:
-            raise ValueError(f"{stream.tell():,} bytes, the checkpoint was saved after {position:,}")
-        stream.seek(position - 1)
-        if stream.read(1) != b"\n":
-            raise ValueError(f"no row ends at byte {position:,}, where the checkpoint was saved")
-        names = next(csv.reader([head.decode("utf-8")], strict=True))
-        if "frames" not in names or len(set(names)) < len(names):
-            raise ValueError("its first line does not name the columns")
-    return names
-
-
-class _Tracker(RowLogger):
+class _Tracker(ResultLogger):
     """Logs to a run that has an id of its own, under which a resumed one goes on."""
 
     _id = ""  # until the run is begun
@@ -186,7 +246,7 @@ class _Tracker(RowLogger):
 
 
 class WandbLogger(_Tracker):
-    """Weights & Biases through TorchRL's logger: config, a row per logged iteration over frames, final figures.
+    """Weights & Biases: config, a row per logged iteration over frames, final figures, pictures, the policy.
 
     A resumed run goes on under the same id. Offline each process leaves a folder `wandb/offline-run-*` of its own;
     `wandb sync` puts them together.
@@ -205,38 +265,53 @@ class WandbLogger(_Tracker):
             # Reports of wandb's own faults would go out over the network all the same.
             os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
         import wandb
-        from torchrl.record.loggers.wandb import WandbLogger as TorchrlLogger
 
         own_folder(self._folder / "wandb")
         self._id = self._id or secrets.token_hex(4)
-        # No console capture, machine statistics or code: what is logged is the run's figures.
-        quiet: dict[str, Any] = dict.fromkeys(("silent", "x_disable_stats", "disable_code", "disable_git"), True)
+        # No console capture, machine statistics or code: only the run's figures are logged.
+        off = ("silent", "x_disable_stats", "disable_code", "disable_git")
+        quiet: dict[str, Any] = dict.fromkeys(off, True)
         quiet |= {"console": "off", "x_save_requirements": False}
         with _answering("wandb"):
-            self._logger = TorchrlLogger(
-                self._folder.resolve().name,
-                save_dir=self._folder,
+            self._run = wandb.init(
+                name=self._folder.resolve().name,
+                dir=self._folder,
                 id=self._id,
+                resume="allow",
                 project=self._cfg.project,
-                # TorchRL's own `offline` would set WANDB_MODE for the whole process.
-                mode=self._cfg.mode,
-                log_env_packages=False,
+                mode=cast(Any, self._cfg.mode),
                 config=to_dict(trainer.config),
                 settings=wandb.Settings(**quiet),
             )
 
     def write(self, row: Row) -> None:
         """Log the row."""
-        self._logger.log_metrics(known(row), step=row["frames"], override_global_step=True)
+        self._run.log(known(row), step=int(row["frames"] or 0))
 
-    def on_end(self, trainer: Training) -> None:
-        """Leave the final figures in the run's summary, and close it."""
-        self._logger.experiment.summary.update(final_figures(trainer))
-        self._logger.experiment.finish(exit_code=0 if trainer.error is None else 1)
+    def results(
+        self,
+        figures: Mapping[str, float],
+        pictures: Mapping[str, Any],
+        policy: Path,
+        trainer: Training,
+    ) -> None:
+        """Log the pictures, leave the final figures in the summary, and add the policy as an artifact."""
+        import wandb
+
+        images = {name: wandb.Image(picture) for name, picture in pictures.items()}
+        self._run.log(images, step=trainer.position.frames)
+        self._run.summary.update(dict(figures))
+        artifact = wandb.Artifact(f"policy-{self._id}", type="model")
+        artifact.add_file(str(policy))
+        self._run.log_artifact(artifact)
+
+    def close(self, error: BaseException | None) -> None:
+        """Close the run."""
+        self._run.finish(exit_code=0 if error is None else 1)
 
 
 class MlflowLogger(_Tracker):
-    """MLflow: the options as parameters, a row per logged iteration over frames, final figures.
+    """MLflow: the options as parameters, a row per logged iteration over frames, final figures, pictures, the policy.
 
     By MLflow's client itself, for TorchRL's logger always begins another run. A resumed run goes on with the same one;
     rows that an earlier process logged after its last checkpoint are not logged twice.
@@ -255,10 +330,10 @@ class MlflowLogger(_Tracker):
         """
         if self._cfg.uri is None:
             # SQLite would follow a link out of the folder; an empty file is a new database to it.
-            os.close(reopen(self._folder / "mlflow.db", "r+"))
+            os.close(reopen(self._folder / "mlflow.db"))
             # Reports of how mlflow is used would go out over the network from a run that is to stay here.
             os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
-        # Its database tells on standard error what tables it makes.
+        # Its database reports on standard error which tables it makes.
         os.environ.setdefault("MLFLOW_LOGGING_LEVEL", "WARNING")
         from mlflow import MlflowClient
 
@@ -276,12 +351,18 @@ class MlflowLogger(_Tracker):
         from mlflow.entities import Param
 
         found = self._client.get_experiment_by_name(self._cfg.experiment)
-        # Where artifacts would lie must be said: the default is a folder where the command was typed.
+        # The default place of artifacts is a folder where the command was typed.
         place = (self._folder.resolve() / "mlflow").as_uri() if self._cfg.uri is None else None
-        number = found.experiment_id if found else self._client.create_experiment(self._cfg.experiment, place)
+        number = (
+            found.experiment_id
+            if found
+            else self._client.create_experiment(self._cfg.experiment, place)
+        )
         run = self._client.create_run(number, run_name=self._folder.resolve().name)
         self._id = run.info.run_id
-        options = [Param(key, str(value)) for key, value in flatten(to_dict(trainer.config)).items()]
+        options = [
+            Param(key, str(value)) for key, value in flatten(to_dict(trainer.config)).items()
+        ]
         for begin in range(0, len(options), 100):  # no more are taken at a time
             self._client.log_batch(self._id, params=options[begin : begin + 100])
 
@@ -296,15 +377,28 @@ class MlflowLogger(_Tracker):
 
         now = int(time.time() * 1000)
         with _answering("mlflow"):
-            self._client.log_batch(self._id, metrics=[Metric(key, value, now, frames) for key, value in row.items()])
+            self._client.log_batch(
+                self._id, metrics=[Metric(key, value, now, frames) for key, value in row.items()]
+            )
 
-    def on_end(self, trainer: Training) -> None:
-        """Log the final figures, and how the run ended."""
-        error = trainer.error
-        if final := final_figures(trainer):
-            self._log(final, trainer.position.frames)
-        ended = "FINISHED" if error is None else "KILLED" if isinstance(error, Preempted) else "FAILED"
-        self._client.set_terminated(self._id, ended)
+    def results(
+        self,
+        figures: Mapping[str, float],
+        pictures: Mapping[str, Any],
+        policy: Path,
+        trainer: Training,
+    ) -> None:
+        """Log the final figures, and pictures and policy as artifacts."""
+        self._log(figures, trainer.position.frames)
+        with _answering("mlflow"):
+            for name, picture in pictures.items():
+                self._client.log_image(self._id, picture, f"{name}.png")
+            self._client.log_artifact(self._id, policy)
+
+    def close(self, error: BaseException | None) -> None:
+        """Note how the run ended."""
+        ended = "KILLED" if isinstance(error, Preempted) else "FAILED"
+        self._client.set_terminated(self._id, "FINISHED" if error is None else ended)
 
 
 @contextmanager
@@ -312,6 +406,6 @@ def _answering(name: str) -> Iterator[None]:
     """One line where a logger cannot do its work; the run can be resumed."""
     try:
         yield
-    except Exception as error:  # whatever the package, its network or its database raises
+    except Exception as error:  # any error of the package, its network or its database
         reason = " ".join(str(error).split()) or type(error).__name__
         raise RunError(f"log=[{name}]: {reason}") from error

@@ -1,4 +1,4 @@
-"""The machine: its devices by their names, the memory that a run needs of it, what is told of it beside a figure."""
+"""The machine: its devices by their names, the memory that a run needs of it, and its description beside a figure."""
 
 from __future__ import annotations
 
@@ -33,11 +33,13 @@ def make_device(name: str, key: str = "device") -> torch.device:
             return device
     except RuntimeError:  # an index that is no C integer
         pass
-    raise UserError(f"{key}={name}: no such device here ({count} CUDA devices found); use cpu or auto")
+    raise UserError(
+        f"{key}={name}: no such device here ({count} CUDA devices found); use cpu or auto"
+    )
 
 
 def check_memory(cfg: TrainConfig, task: Task, device: torch.device) -> str:
-    """One line about the memory that the run needs and what there is on `device`.
+    """One line about the memory that the run needs and the memory free on `device`.
 
     Raises:
         UserError: it cannot fit; the option that takes most of it is named.
@@ -85,4 +87,7 @@ def _processor() -> str:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
         return platform.processor()
-    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
+    return next(
+        (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")),
+        platform.machine(),
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -20,14 +21,17 @@ _STORE = 2**30
 
 
 def make_ray_collector(
-    envs: Sequence[Callable[[], TrackEnv]], policy: TensorDictModuleBase, cfg: RayWorkersConfig, common: dict[str, Any]
+    envs: Sequence[Callable[[], TrackEnv]],
+    policy: TensorDictModuleBase,
+    cfg: RayWorkersConfig,
+    common: dict[str, Any],
 ) -> BaseCollector:
-    """A collector whose batches `[B, time]` hold the rows of all workers, one after the other.
+    """A collector of batches `[B, time]` with the rows of all workers, one after the other.
 
     Args:
         envs: makes the environments of each worker.
         policy: gets new weights at `update_policy_weights_`.
-        cfg: the cluster, and what each worker takes of it.
+        cfg: the cluster, and each worker's share of it.
         common: the options that every collector has.
 
     Raises:
@@ -54,15 +58,25 @@ def make_ray_collector(
 
 
 class _Collector(RayCollector):
-    """Says in the terms of the other collectors that a worker was lost."""
+    """Raises the error of the other collectors where a worker is lost."""
 
     def iterator(self) -> Iterator[TensorDictBase]:
-        from ray.exceptions import RayError
-
-        try:
+        with _losing():
             yield from super().iterator()
-        except RayError as error:
-            raise RuntimeError(f"a worker was lost: {str(error).splitlines()[0]}") from error
+
+    def update_policy_weights_(self, *args: Any, **options: Any) -> None:
+        with _losing():
+            super().update_policy_weights_(*args, **options)
+
+
+@contextmanager
+def _losing() -> Iterator[None]:
+    from ray.exceptions import RayError
+
+    try:
+        yield
+    except RayError as error:
+        raise RuntimeError(f"a worker was lost: {str(error).splitlines()[0]}") from error
 
 
 def _rows(batch: TensorDictBase) -> TensorDictBase:
@@ -79,5 +93,10 @@ def _cluster(cfg: RayWorkersConfig) -> dict[str, Any]:
         return {"address": cfg.address, **quiet}
     cpus = max(1, round(cfg.workers * cfg.cpus_per_worker))
     # "local": without an address Ray would join a cluster that runs here, or the one that RAY_ADDRESS names.
-    started = {"address": "local", "num_cpus": cpus, "object_store_memory": _STORE, "include_dashboard": False}
+    started = {
+        "address": "local",
+        "num_cpus": cpus,
+        "object_store_memory": _STORE,
+        "include_dashboard": False,
+    }
     return started | quiet

@@ -8,6 +8,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -19,37 +20,37 @@ from trackmdp.algos.common import make_algorithm
 from trackmdp.config import load_run_config
 from trackmdp.config.tree import config_digest
 from trackmdp.errors import UserError
+from trackmdp.notebook.card import NONE, Card, Carded, decimal, grid_words
 from trackmdp.policies.policy import Policy, actor_table
 from trackmdp.policies.saved import load_policy
+from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import optimal
 from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.solution import Solution
 from trackmdp.training import checkpoint
 from trackmdp.training.callbacks import Callback, Learning, Row, Training
-from trackmdp.training.evaluator import Score, figures, while_collecting
+from trackmdp.training.evaluator import Evaluator, Score, figures, while_collecting
 from trackmdp.training.folders import SUMMARY, check_files, read_summary, write_summary
-from trackmdp.training.inputs import check_inputs
+from trackmdp.training.inputs import problem_of, with_own_classes
 from trackmdp.training.machine import machine
 from trackmdp.training.state import load_learned
-from trackmdp.untrusted import decoded, read_text
-from trackmdp.world.files import LARGE
-from trackmdp.world.make import make_problem
-from trackmdp.world.model import Array, World
-from trackmdp.world.tracks import Problem, Recorded
+from trackmdp.untrusted import LARGE, decoded, read_text
+from trackmdp.world.model import Array
+from trackmdp.world.tracks import Problem
 
 _PACKAGES = ("torch", "torchrl", "tensordict", "hydra-core", "numpy", "scipy")
 Metrics = dict[str, list[float | int | None]]
-"""Columns by their names, as in `metrics.csv`: one value for each logged iteration, None for what was not measured."""
+"""Columns by their names, as in `metrics.csv`: one value for each logged iteration, None for missing figures."""
 
 
-@dataclass(frozen=True, eq=False)
-class Run:
+@dataclass(frozen=True, eq=False, repr=False)
+class Run(Carded):
     """A training run that has ended.
 
     Attributes:
-        policy: what was learned.
+        policy: the learned one.
         evaluation: its figures, exact where there is a motion model, else on the held-out tracks.
-        metrics: figures of the iterations, of recorded tracks on the validation ones.
+        columns: figures of the iterations, of recorded tracks on the validation ones; see `metrics`.
         summary: the content of `summary.json`.
         folder: where its files are; None where none were written.
         solution: the optimum, or a bracket of it, where it was solved for at the end.
@@ -57,10 +58,40 @@ class Run:
 
     policy: Policy
     evaluation: Evaluation
-    metrics: Metrics
+    columns: Metrics
     summary: dict[str, Any]
     folder: Path | None = None
     solution: Solution | None = None
+
+    @property
+    def metrics(self) -> Any:
+        """The columns as a DataFrame, or as they are where pandas is not installed (extra `tracks`)."""
+        if find_spec("pandas") is None:
+            return self.columns
+        from pandas import DataFrame
+
+        return DataFrame(self.columns)
+
+    def card(self) -> Card:
+        """Algorithm, budget, figures, bound and folder."""
+        summary, task = self.summary, self.policy.task
+        facts = {
+            "size": f"{grid_words(task.size)}, T_max {task.t_max}",
+            "budget": f"{summary.get('frames', 0):,} frames, seed {summary.get('seed')}",
+        }
+        bounds = summary.get("bounds") or {}
+        if bounds.get("clocked") is not None:
+            facts["bound"] = f"AIHTR at most {decimal(bounds['clocked'])} (clocked)"
+        if optimal := summary.get("optimal"):
+            proved = "certified" if optimal["certified"] else "not closed"
+            facts["bound"] = f"AIHTR at most {decimal(optimal['upper'])} ({proved})"
+        if (regret := decimal(summary.get("regret_per_step"), 4)) != NONE:
+            facts["regret per step"] = regret  # on recorded tracks there is none
+        facts["folder"] = "none, in memory" if self.folder is None else str(self.folder)
+        shown = ("AIHTR", "accuracy", "sensors per step", "steps per episode")
+        learned = self.evaluation.facts()
+        facts |= {name: learned[name] for name in shown}
+        return Card(f"Run: {summary.get('algo')}", facts)
 
 
 class _Rows(Callback):
@@ -87,11 +118,15 @@ def complete(trainer: Learning) -> Run:
     score = trainer.run()
     policy = trainer.policy()
     solution = _solve(trainer, policy)
-    # Exact figures are those that were scored; on recorded tracks the held-out ones are looked at here for the first
+    # Exact figures were scored already; on recorded tracks the held-out ones are looked at here for the first
     # time.
-    final = trainer.evaluator.evaluate(policy) if isinstance(trainer.problem, Recorded) else score.evaluation
+    final = (
+        trainer.evaluator.evaluate(policy) if trainer.problem.model is None else score.evaluation
+    )
     if solution is not None:
-        score = trainer.evaluator.tighten(solution.lower, solution.upper, score)  # keeps the evaluation that it is of
+        score = trainer.evaluator.tighten(
+            solution.lower, solution.upper, score
+        )  # keeps the evaluation that it is of
     times = {
         "wall_seconds": time.monotonic() - began + trainer.start.seconds,
         "cpu_seconds": time.process_time() - used,
@@ -107,23 +142,23 @@ def complete(trainer: Learning) -> Run:
 
 
 def _solve(trainer: Learning, learned: Policy) -> Solution | None:
-    """The certified optimum, where it is asked for; there is none for episodes truncated by `grid.max_steps`.
+    """The certified optimum, where it is asked for, of whole episodes, and where a detection reveals the state.
 
-    The search also starts from what was learned: a policy that learning has found is known, and counts as such.
+    The search also starts from the learned policy.
     """
-    cfg, problem = trainer.config.optimal, trainer.problem
-    if not cfg.enabled or problem.max_steps is not None or not isinstance(problem, World):
+    cfg, world = trainer.config.optimal, trainer.problem.model
+    if not cfg.enabled or world is None or world.max_steps is not None or not world.tells_all:
         return None
     start = learned if learned.deterministic else None
     with trainer.console.status(f"solving for the optimum, at most {cfg.nodes:,} nodes"):
-        return optimal.solve(problem, nodes=cfg.nodes, time_limit=cfg.time_limit, start=start)
+        return optimal.solve(world, nodes=cfg.nodes, time_limit=cfg.time_limit, start=start)
 
 
 def load_run(folder: str | Path) -> Run:
     """A finished run from its folder.
 
     Raises:
-        UserError: the folder is not that of a finished run, or a file in it is damaged.
+        UserError: the folder is no finished run's, or a file in it is damaged.
     """
     place = Path(folder)
     if not (place / SUMMARY).is_file():
@@ -131,17 +166,27 @@ def load_run(folder: str | Path) -> Run:
     summary = read_summary(place)
     check_files(place, summary)
     table, value = load_policy(place / "policy.npz")
-    return Run(Policy.from_table(table), _evaluation(place, summary, value), read_metrics(place), summary, place)
+    return Run(
+        Policy.from_table(table),
+        _evaluation(place, summary, value),
+        read_metrics(place),
+        summary,
+        place,
+    )
 
 
 def _evaluation(folder: Path, summary: Mapping[str, Any], value: Array | None) -> Evaluation:
-    """The figures of the summary and the values of the policy; what else is known per cell is not kept in a folder."""
+    """The figures of the summary and the values of the policy; other figures per cell are not kept in a folder."""
     with decoded(str(folder / SUMMARY), "the summary of a run"):
         known = {field.name for field in fields(Evaluation)}
-        figures: dict[str, Any] = {name: _number(it) for name, it in summary["policy"].items() if name in known}
+        figures: dict[str, Any] = {
+            name: _number(it) for name, it in summary["policy"].items() if name in known
+        }
         cells = 0 if value is None else len(value)
         unknown: dict[str, Any] = dict.fromkeys(known - {*figures, "value"}, np.full(cells, np.nan))
-        return Evaluation(value=np.full(cells, np.nan) if value is None else value, **unknown, **figures)
+        return Evaluation(
+            value=np.full(cells, np.nan) if value is None else value, **unknown, **figures
+        )
 
 
 def _number(value: Any) -> float:
@@ -171,7 +216,11 @@ def _cell(text: str) -> float | int | None:
 
 
 def summarize(
-    trainer: Learning, final: Evaluation, score: Score, solution: Solution | None, times: dict[str, float]
+    trainer: Learning,
+    final: Evaluation,
+    score: Score,
+    solution: Solution | None,
+    times: dict[str, float],
 ) -> dict[str, Any]:
     """The figures of a run that has ended; on recorded tracks there are no bounds, no Q_MDP and no regret.
 
@@ -186,7 +235,6 @@ def summarize(
     config, evaluator, end = trainer.config, trainer.evaluator, trainer.position
     return {
         "algo": config.algo.name,
-        "credit": config.algo.credit,
         "seed": config.seed,
         "frames": end.frames,
         **times,
@@ -194,40 +242,54 @@ def summarize(
         "validation": None if final is score.evaluation else figures(score.evaluation),
         "qmdp": figures(evaluator.qmdp) if evaluator.qmdp else None,
         "bounds": evaluator.bounds,
-        "optimal": {key: getattr(solution, key) for key in ("lower", "upper", "certified", "timed_out")}
+        "references": references(evaluator, solution),
+        "optimal": {
+            key: getattr(solution, key) for key in ("lower", "upper", "certified", "timed_out")
+        }
         if solution
         else None,
         "regret_per_step": score.regret_per_step,
         "regret_per_step_lower": score.regret_per_step_lower,
         "while_collecting": while_collecting(evaluator.upper, final, end.reward, end.frames),
         "held_out": evaluator.report(trainer.policy()),
+        "place": trainer.problem.place.facts() if trainer.problem.place else None,
         "versions": {"trackmdp": __version__, "python": platform.python_version()}
         | {name: version(name) for name in _PACKAGES},
-        "machine": machine(),
+        "machine": machine()
+        | {"torch_threads": config.threads},  # the process has its own back by now
         "config_sha256": config_digest(config, trainer.folder),
     }
 
 
-def trained(run: str, device: torch.device, *, best: bool = False) -> tuple[Problem, Policy, str]:
-    """Where a run learned, the policy of its newest checkpoint, or of the best one, and what to call it.
+def references(evaluator: Evaluator, solution: Solution | None) -> dict[str, Any]:
+    """Figures of the policies that a learned one is compared with, beside Q_MDP; none on recorded tracks."""
+    if evaluator.qmdp is None:
+        return {}
+    fixed = {"all on": PolicyTable.all_on, "no sensors": PolicyTable.none}
+    found = {name: evaluator.evaluate(make(evaluator.world)) for name, make in fixed.items()}
+    if solution is not None:
+        found["best known"] = solution.evaluation
+    return {name: figures(each) for name, each in found.items()}
 
-    Of a run by blocks it is the run's own.
+
+def trained(run: str, device: torch.device, *, best: bool = False) -> tuple[Problem, Policy, str]:
+    """Where a run learned, the policy of its newest checkpoint, or of the best one, and its name.
+
+    A run by blocks has no checkpoint: the policy is the one in `policy.npz`.
 
     Raises:
         UserError: that is no run, or the checkpoint is missing, damaged or another run's.
     """
     cfg, folder = load_run_config(run), Path(run)
-    world = make_problem(cfg)
+    world = problem_of(cfg, folder)
     if cfg.partition.block is not None:
         if best:
             raise UserError(
                 f"checkpoint=best: expected newest for run={run}, whose blocks have checkpoints of their own"
             )
-        check_inputs(world, folder)
         return world, load_run(folder).policy, f"{cfg.algo.name}, by blocks"
-    algorithm = make_algorithm(cfg, world, device)
+    algorithm = make_algorithm(with_own_classes(cfg, folder), world.task, device)
     file = folder / "checkpoints" / checkpoint.BEST if best else checkpoint.newest(folder)
-    load_learned(algorithm, cfg, file, device)
-    check_inputs(world, folder)
+    load_learned(algorithm, cfg, world, file, device)
     policy = actor_table(world.task, algorithm.actor, device=device)
     return world, policy, f"{cfg.algo.name}, {file.name}"

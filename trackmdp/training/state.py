@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import time
 from collections.abc import Mapping
@@ -15,31 +14,23 @@ from torchrl.collectors import BaseCollector, Collector
 
 from trackmdp.algos.common import Algorithm
 from trackmdp.config import CheckpointConfig, TrainConfig
-from trackmdp.config.checks import own_paths
-from trackmdp.config.tree import fixed_options, flatten
+from trackmdp.config.tree import flatten
 from trackmdp.errors import Preempted, UserError
 from trackmdp.policies.policy import Policy
 from trackmdp.training import checkpoint
 from trackmdp.training.callbacks import Callback, Position, Row, Training
 from trackmdp.training.evaluator import Score
+from trackmdp.training.inputs import identity
 from trackmdp.untrusted import decoded
+from trackmdp.world.tracks import Problem
 
 _EXACT = ("torch", "torchrl", "tensordict", "numpy", "scipy", "hydra-core", "trackmdp")
-_PARTS = {"format", "iteration", "identity", "versions", "algorithm", "collector", "random", "position", "callbacks"}
-"""Of the state of a run: what `capture` takes, and the two that `checkpoint.save` adds."""
-
 _NOT_WEIGHTS = {"optimizer", "buffer", "generator"}
 _SAVING = 50  # seconds of training to one of saving, at least
 
 
-def identity(cfg: TrainConfig, folder: Path) -> str:
-    """SHA-256 of all options that must not change when the run in `folder` is resumed."""
-    # repr writes floats with all digits, so that equal hashes mean equal options.
-    return hashlib.sha256(repr(fixed_options(own_paths(cfg, folder))).encode()).hexdigest()
-
-
 def capture(trainer: Training, folder: Path) -> dict[str, Any]:
-    """Everything that the next iteration depends on, and what has been written so far.
+    """Everything that the next iteration depends on, and the files written so far.
 
     Networks, optimizers, schedules and buffers; rows in mid-episode and the environment's generators; how far the run
     is; states of the callbacks by their names, such as how many bytes of `metrics.csv` there are.
@@ -47,11 +38,13 @@ def capture(trainer: Training, folder: Path) -> dict[str, Any]:
     collector = trainer.collector
     cuda = torch.cuda.get_rng_state_all() if torch.cuda.is_available() else []
     return {
-        "identity": identity(trainer.config, folder),
+        "identity": identity(trainer.config, folder, trainer.problem),
         "versions": {name: version(name) for name in _EXACT},
         "algorithm": trainer.algorithm.state_dict(),
-        # None for collectors in worker processes, whose environments cannot be asked: they begin new episodes.
-        "collector": {"environment": collector.env.snapshot()} if isinstance(collector, Collector) else None,
+        # None for collectors in worker processes: their environments cannot be saved and begin new episodes.
+        "collector": {"environment": collector.env.snapshot()}
+        if isinstance(collector, Collector)
+        else None,
         "random": {"cpu": torch.get_rng_state(), "cuda": cuda},
         "position": vars(trainer.position),
         "callbacks": {each.name: each.state_dict() for each in trainer.callbacks if each.name},
@@ -73,7 +66,9 @@ def restore(state: Mapping[str, Any], algorithm: Algorithm, collector: BaseColle
     return Position(**state["position"])
 
 
-def find(cfg: TrainConfig, folder: Path, device: torch.device) -> tuple[dict[str, Any] | None, list[str]]:
+def find(
+    cfg: TrainConfig, problem: Problem, folder: Path, device: torch.device
+) -> tuple[dict[str, Any] | None, list[str]]:
     """The state to resume from, None to start anew; and a line for each checkpoint that had to be passed over.
 
     `resume=auto` and a run's folder fall back to the newest checkpoint that can be read and is this run's; a checkpoint
@@ -94,12 +89,14 @@ def find(cfg: TrainConfig, folder: Path, device: torch.device) -> tuple[dict[str
         try:
             state = checkpoint.load(file, device)
             # Refused before anything is put back: half a state would be worse than none.
-            _check(state, cfg, file)
+            _check(state, cfg, problem, file)
         except UserError as error:
             passed_over.append(str(error))
             continue
         return {**state, "file": str(file)}, passed_over
-    raise UserError(f"resume={cfg.resume}: no checkpoint to resume from ({'; '.join(passed_over) or 'there is none'})")
+    raise UserError(
+        f"resume={cfg.resume}: no checkpoint to resume from ({'; '.join(passed_over) or 'there is none'})"
+    )
 
 
 def take_weights(algorithm: Algorithm, run: Path, device: torch.device) -> list[str]:
@@ -122,53 +119,67 @@ def take_weights(algorithm: Algorithm, run: Path, device: torch.device) -> list[
                 tensor.copy_(given[name])
                 taken.append(name)
     if not taken:
-        raise UserError(f"init_from={run}: none of its weights has the name and shape of one of ours")
+        raise UserError(
+            f"init_from={run}: none of its weights has the name and shape of one of ours"
+        )
     algorithm.load_state_dict(own)
     return taken
 
 
-def load_learned(algorithm: Algorithm, cfg: TrainConfig, file: Path, device: torch.device) -> None:
-    """Put the learner of a checkpoint of the run `cfg` back, to use what it has learned.
+def load_learned(
+    algorithm: Algorithm, cfg: TrainConfig, problem: Problem, file: Path, device: torch.device
+) -> None:
+    """Put the learner of a checkpoint of the run `cfg` back, to use its policy.
 
     Raises:
-        UserError: the checkpoint is damaged, belongs to a run with another config, or does not fit.
+        UserError: the checkpoint is damaged, belongs to another run, or does not fit.
     """
     state = checkpoint.load(file, device)
-    _check_identity(state, cfg, file)
+    _check_identity(state, cfg, problem, file)
     with decoded(str(file), "a state that fits this run"):
         algorithm.load_state_dict(state["algorithm"])
 
 
-def _check_identity(state: Mapping[str, Any], cfg: TrainConfig, file: Path) -> None:
-    if state.get("identity") != identity(cfg, file.parent.parent):  # RUN/checkpoints/iteration-00000012.pt
-        raise UserError(f"{file}: belongs to a run with another config")
+def _check_identity(
+    state: Mapping[str, Any], cfg: TrainConfig, problem: Problem, file: Path
+) -> None:
+    folder = file.parent.parent  # RUN/checkpoints/iteration-00000012.pt
+    if state.get("identity") != identity(cfg, folder, problem):
+        raise UserError(f"{file}: belongs to a run with another config or problem")
 
 
-def _check(state: Mapping[str, Any], cfg: TrainConfig, file: Path) -> None:
+def _check(state: Mapping[str, Any], cfg: TrainConfig, problem: Problem, file: Path) -> None:
     """See that the state is one to resume from, before anything of it is used."""
-    _check_identity(state, cfg, file)
+    _check_identity(state, cfg, problem, file)
     with decoded(str(file), "the state of a run"):
         if state["versions"].keys() != set(_EXACT):
             raise ValueError(f"versions of other packages than {', '.join(_EXACT)}")
         # Another version may draw or round otherwise: the run would go on, but not as the one that was interrupted.
         for name, written in state["versions"].items():
             if written != version(name):
-                raise UserError(f"{file}: written with {name} {written}, this is {version(name)}; expected the same")
+                raise UserError(
+                    f"{file}: written with {name} {written}, this is {version(name)}; expected the same"
+                )
         at = Position(**state["position"])
-        # 2^53: up to there a float holds every integer, as metrics and JSON readers need.
-        if any(type(each) is not int or not 0 <= each < 2**53 for each in (at.iteration, at.frames)):
-            raise ValueError("a position that is none")
-        if not (0 <= at.seconds < math.inf and math.isfinite(at.reward)) or at.iteration != state["iteration"]:
-            raise ValueError("a position that is none")
-        # No part more either: what nothing here reads was not written here.
-        if state.keys() != _PARTS:
-            raise ValueError(f"parts {sorted(map(str, state.keys() ^ _PARTS))} missing or too many")
+        # A negative or a far position would end the run at once, as if it were done.
+        if at.iteration != state["iteration"] or not 0 <= at.frames < 2**53:
+            raise ValueError(f"a position at iteration {at.iteration}, {at.frames} frames")
+        if Checkpoints.name not in state["callbacks"]:
+            raise ValueError("no states of callbacks: their files would begin anew")
 
 
 def _weights(state: Mapping[str, Any]) -> list[tuple[str, torch.Tensor]]:
     """The floating-point tensors of an algorithm's state that belong to networks."""
-    named = ((name, value) for name, value in flatten(state).items() if not _NOT_WEIGHTS & {*name.split(".")})
-    return [(name, value) for name, value in named if isinstance(value, torch.Tensor) and value.is_floating_point()]
+    named = (
+        (name, value)
+        for name, value in flatten(state).items()
+        if not _NOT_WEIGHTS & {*name.split(".")}
+    )
+    return [
+        (name, value)
+        for name, value in named
+        if isinstance(value, torch.Tensor) and value.is_floating_point()
+    ]
 
 
 class Checkpoints(Callback):
@@ -198,7 +209,7 @@ class Checkpoints(Callback):
             checkpoint.point(file, best=self._is_best)
 
     def on_evaluation(self, trainer: Training, policy: Policy, score: Score) -> None:  # noqa: ARG002
-        """Remember what the policy of this iteration attains."""
+        """Keep the AIHTR of this iteration's policy."""
         self._evaluated = trainer.position.iteration, score.evaluation.aihtr
 
     def on_update(self, trainer: Training, row: Row) -> None:  # noqa: ARG002
@@ -229,19 +240,27 @@ class Checkpoints(Callback):
 
     def _is_planned(self, trainer: Training) -> bool:
         """Whether this iteration is saved in every run of this config, cut or not."""
-        return trainer.position.iteration == trainer.iterations or self._passes_multiple(trainer.position)
+        return trainer.position.iteration == trainer.iterations or self._passes_multiple(
+            trainer.position
+        )
 
     def save(self, trainer: Training) -> None:
-        """Save the run as it is, and tell the callbacks."""
+        """Save the run as it is, and call the callbacks."""
         begin = time.monotonic()
         # Where checkpoints are counted in frames, one that a signal or the clock asked for is none of the candidates:
         # else which one is the best would depend on where the run was cut.
-        aihtr = self._attained(trainer) if not self._cfg.every or self._is_planned(trainer) else -math.inf
+        aihtr = (
+            self._attained(trainer)
+            if not self._cfg.every or self._is_planned(trainer)
+            else -math.inf
+        )
         self._is_best, self._best = aihtr > self._best, max(self._best, aihtr)
         # `_best` and `_is_best` are part of the state, so they are set before it is taken. The logs are called before
         # this callback: the lengths of files in their states include this iteration's row and episodes.
         state = capture(trainer, self._folder.parent)
-        file = checkpoint.save(self._folder, trainer.position.iteration, state, keep=self._cfg.keep, best=self._is_best)
+        file = checkpoint.save(
+            self._folder, trainer.position.iteration, state, keep=self._cfg.keep, best=self._is_best
+        )
         # Measured, since saving a large replay buffer to a slow disk may take longer than the interval asked for.
         self._saved, self._rest = trainer.position, _SAVING * (time.monotonic() - begin)
         for callback in trainer.callbacks:
@@ -250,7 +269,7 @@ class Checkpoints(Callback):
     def _attained(self, trainer: Training) -> float:
         """AIHTR of the very policy that is saved.
 
-        That of the last evaluation may be of an earlier policy, and of another one in a run that was resumed in
+        The last evaluation may be of an earlier policy, and of another one in a run that was resumed in
         between: best.pt would depend on where a run was cut.
         """
         iteration, aihtr = self._evaluated

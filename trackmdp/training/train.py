@@ -2,38 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModuleBase,
+    TensorDictSequential,
+)
 
-from trackmdp.config import GROUPS, SELECTORS, TrainConfig, options
-from trackmdp.config.compose import compose
+from trackmdp.config import GROUPS, TrainConfig, options
+from trackmdp.config.compose import compose, default, given
 from trackmdp.config.loggers import require_packages
 from trackmdp.errors import UserError
 from trackmdp.seeding import preserved_global_rng
 from trackmdp.training.blocks import make_trainer
 from trackmdp.training.callbacks import Callback
 from trackmdp.training.display import make_console
-from trackmdp.training.inputs import FOOTPRINTS, RECORDING, short
+from trackmdp.training.inputs import as_word
 from trackmdp.training.lock import locked
 from trackmdp.training.run import Run, complete
-from trackmdp.world.make import sensor_words
-from trackmdp.world.model import World
-from trackmdp.world.modes import HiddenWorld
-from trackmdp.world.tracks import Problem
+from trackmdp.untrusted import reason
+from trackmdp.world.make import OF_TASK
+from trackmdp.world.observation import ObservationVector
+from trackmdp.world.problem_file import problem_digest
+from trackmdp.world.tracks import Problem, check_problem
 
 
 def train(
     problem: Problem,
-    algo: str = "hindsight",
+    algo: str = default("algo"),
     *,
     seed: int = 0,
     folder: str | Path | None = None,
     progress: bool = False,
     callbacks: Sequence[Callback] = (),
+    actor: TensorDictModuleBase | None = None,
+    critic: TensorDictModuleBase | None = None,
     **options: Any,
 ) -> Run:
     """Learn a sensing policy without the motion model, and evaluate it exactly.
@@ -44,12 +52,16 @@ def train(
 
     Args:
         problem: the world, or recorded tracks; the learner is given its task alone.
-        algo: name of the algorithm, as in `trackmdp train algo=...`.
+        algo: name of the algorithm, as in `trackmdp train algo=...`; by default `model_based`: its estimate follows
+            the problem.
         seed: every random draw of the run derives from it; torch's global generators are left as they were.
         folder: made if it is missing, and written to as the command does; None to write nothing. With
             ``resume="auto"`` a run in it is resumed.
         progress: show it at the terminal.
         callbacks: see `trackmdp.training.callbacks`.
+        actor: of `a2c` and `ppo`, in place of theirs: a `ProbabilisticActor` with `return_log_prob=True` that reads
+            keys of the state, or `observation` (`ObservationVector`). It is trained in place, in memory alone.
+        critic: of the same: a module that reads such keys and writes `state_value` `[B, 1]`.
         options: those of the command line. A name without a dot that the command does not have is the algorithm's;
             a dict holds several options of one node.
 
@@ -58,59 +70,83 @@ def train(
         RunError: learning or writing broke down.
         Preempted: a signal ended the run; with a folder it can be resumed.
     """
+    check_problem(problem, "train")
+    for each in callbacks:
+        if not isinstance(each, Callback):
+            raise UserError(f"callbacks: a {type(each).__name__}, expected a Callback")
     place = None if folder is None else Path(folder)
-    given = {_key(name): value for name, value in options.items()} | {"algo": algo, "seed": seed, "quiet": not progress}
-    config: TrainConfig = compose("train", given | _described(problem, place))
+    if place is None and options.get("log"):
+        raise UserError(f"log={options['log']}: expected folder=FOLDER beside it, for its files")
+    nets = _nets(problem, {"actor": actor, "critic": critic}, place)
+    typed = {_key(name): value for name, value in options.items()}
+    typed |= given({"algo": algo}) | {"seed": seed, "quiet": not progress}
+    config: TrainConfig = compose("train", typed | _words(problem, place))
     if place is not None:
         require_packages(config.log)
-        place.mkdir(parents=True, exist_ok=True)
+        try:
+            place.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UserError(f"folder={folder}: cannot be made ({reason(error)})") from None
         if config.resume is None and (place / "config.yaml").is_file():
-            raise UserError(f"folder={folder}: holds a run already; resume it by resume='auto', or choose another one")
+            raise UserError(
+                f"folder={folder}: holds a run already; resume it by resume='auto', or choose another one"
+            )
     with locked(place, "folder") if place else nullcontext(), preserved_global_rng():
         console = make_console(quiet=not progress)
-        return complete(make_trainer(problem, config, folder=place, callbacks=callbacks, console=console))
+        return complete(
+            make_trainer(
+                problem, config, folder=place, callbacks=callbacks, console=console, nets=nets
+            )
+        )
+
+
+def _nets(
+    problem: Problem, given: Mapping[str, TensorDictModuleBase | None], folder: Path | None
+) -> dict[str, TensorDictModuleBase]:
+    """The networks that are given, behind an `ObservationVector` where they read one.
+
+    Raises:
+        UserError: they are of another kind, or a folder is given, from which they could not be read back.
+    """
+    found = {name: net for name, net in given.items() if net is not None}
+    for name, net in found.items():
+        wanted = {"actor": "action_log_prob", "critic": "state_value"}[name]
+        if wanted not in getattr(net, "out_keys", ()):
+            raise UserError(
+                f"{name}: a {type(net).__name__}, expected a module that writes {wanted}"
+            )
+        if folder is not None:
+            raise UserError(f"folder={folder}: expected None with {name}: its class is in no file")
+        if "observation" in net.in_keys:
+            # An actor's parts one by one: only the last of a sequence may draw.
+            drawing = isinstance(net, ProbabilisticTensorDictSequential)
+            whole = ProbabilisticTensorDictSequential if drawing else TensorDictSequential
+            found[name] = whole(ObservationVector(problem.task), *(net if drawing else [net]))
+    return found
 
 
 def _key(name: str) -> str:
     """The option, or group of them, that an argument names."""
-    known = "." in name or name in options(TrainConfig) or name in SELECTORS or name in GROUPS
+    known = "." in name or name in options(TrainConfig) or name in GROUPS
     return name if known else f"algo.{name}"
 
 
-def _described(problem: Problem, folder: Path | None) -> dict[str, Any]:
-    """The options that a problem made in Python is described by: what is in memory counts, and the folder keeps it."""
-    price = problem.cost
-    given: dict[str, Any] = {
+def _words(problem: Problem, folder: Path | None) -> dict[str, Any]:
+    """The options that a problem made in Python has words for; its arrays are in the run's `problem.npz`."""
+    words: dict[str, Any] = {}
+    for name, option in OF_TASK.items():
+        value = getattr(problem, name)
+        array = isinstance(value, np.ndarray)
+        words[option] = as_word(value, folder or Path()) if array else value
+    if problem.memory == "cell":
+        words.pop("task.clip")  # nothing reads it
+    if not (problem.perfect and problem.safe and problem.coverage is None):
+        words |= {"sensor": "given", "sensor.wide": problem.coverage is not None}
+    return words | {
         "grid.size": problem.rows if problem.rows == problem.columns else list(problem.size),
-        "grid.t_max": problem.t_max,
-        "grid.max_steps": problem.max_steps,
-        "grid.window": problem.window,
-        "task.memory": problem.memory,
-        "cost.reward": problem.reward,
-        "cost.sensor": short(price),
-        # null means the sum of all prices: that is what most problems have, up to the rounding of a sum in another
-        # order.
-        "cost.safe": None if np.isclose(problem.safe_cost, price.sum(), rtol=1e-15) else problem.safe_cost,
+        "kernel": "given",
+        "kernel.motion": problem.model is not None,
+        "kernel.modes": getattr(problem, "modes", 1),
+        "kernel.reveals": problem.revealed > 1,
+        "kernel.digest": problem_digest(problem)[:16],
     }
-    given |= sensor_words(short(problem.detection), short(problem.safe_detection))
-    if problem.coverage is not None:
-        given |= {"sensor": "footprint", "sensor.path": str((folder or Path()).absolute() / FOOTPRINTS)}
-    if problem.memory != "cell":
-        given["task.clip"] = problem.clip
-    if isinstance(problem, World):
-        where = (folder or Path()).absolute() / "kernel.npz"
-        return given | {"kernel": "table", "kernel.path": str(where)}
-    if isinstance(problem, HiddenWorld):
-        if folder is not None:
-            raise UserError("folder: a world with a hidden mode made in Python is in no file; expected folder=None")
-        # `heading` stands for any: the world is in memory
-        return given | {"kernel": "heading", "kernel.reveals": problem.revealed > 1}
-    # Without a folder a path must be given all the same, and nothing reads it: the tracks are in memory.
-    tracks = {
-        "kernel": "tracks",
-        "kernel.path": str((folder or Path()).absolute() / RECORDING),
-        "kernel.markov": problem.markov,
-        "kernel.starts": "anywhere" if problem.anywhere else "first",
-        "kernel.min_length": 1,  # however short they are, they were taken
-    }
-    return given | tracks

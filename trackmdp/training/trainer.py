@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +24,7 @@ from trackmdp.training.callbacks import Callback, Position, Row, Training
 from trackmdp.training.collect import make_collector
 from trackmdp.training.display import Display
 from trackmdp.training.evaluator import Score, make_evaluator, while_collecting
-from trackmdp.training.inputs import write_inputs
+from trackmdp.training.inputs import with_own_classes, write_inputs
 from trackmdp.training.loggers import make_loggers
 from trackmdp.training.machine import check_memory, make_device
 from trackmdp.training.state import Checkpoints, find, restore, take_weights
@@ -41,6 +41,7 @@ class Trainer(Training):
         folder: where inputs, logs and checkpoints are written; None to write nothing.
         callbacks: are called after the logs that the config names, before the checkpoints.
         console: see there.
+        nets: `actor` and `critic` of the user's own, where the algorithm takes them.
 
     Attributes:
         algorithm: the learner; its `actor` is evaluated. From the start of `run` on, as the following ones.
@@ -49,10 +50,10 @@ class Trainer(Training):
         start: where an earlier process left the run.
         position: how far the run is.
         score: of the last evaluation.
-        error: what ended the run before its time, None otherwise.
+        error: the reason of an early end, None otherwise.
 
     Raises:
-        UserError: the config asks for what is not there, or for more memory than there is.
+        UserError: the config names something missing, or needs more memory than there is.
     """
 
     def __init__(
@@ -63,10 +64,15 @@ class Trainer(Training):
         folder: Path | None = None,
         callbacks: Sequence[Callback] = (),
         console: Console | None = None,
+        nets: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__(problem, config, folder, console)
+        self._nets = nets
         self.device = make_device(config.device)
-        self.callbacks = [*callbacks, Display(self.console, f"{config.algo.name} seed {config.seed}")]
+        self.callbacks = [
+            *callbacks,
+            Display(self.console, f"{config.algo.name} seed {config.seed}"),
+        ]
         if folder is not None:
             # Order: logs, the user's callbacks, checkpoints, display. A checkpoint holds how far the logs are written,
             # so that they must have written this iteration's row before it is saved; the display shows it afterwards.
@@ -89,7 +95,7 @@ class Trainer(Training):
         """
         began = time.monotonic()
         with ExitStack() as opened:
-            # The number of threads is the whole process's: whoever calls `train` from Python gets their own back.
+            # The number of threads is the whole process's: a caller of `train` from Python gets the former number back.
             opened.callback(torch.set_num_threads, torch.get_num_threads())
             torch.set_num_threads(self.config.threads)
             self._build(opened)
@@ -109,21 +115,29 @@ class Trainer(Training):
                 # on_end is called after this, and reads it: only Preempted leaves a state that is worth saving.
                 self.error = error
                 raise
-        self.position = replace(self.position, seconds=time.monotonic() - began + self.start.seconds)
+        self.position = replace(
+            self.position, seconds=time.monotonic() - began + self.start.seconds
+        )
         return self.score
 
     def _build(self, opened: ExitStack) -> None:
         """Learner, collector and evaluator; put back from the checkpoint where the run is resumed."""
         config, problem, folder = self.config, self.problem, self.folder
-        state, skipped = (None, []) if folder is None else find(config, folder, self.device)
+        state: dict[str, Any] | None = None
+        skipped: list[str] = []
+        if folder is not None:
+            state, skipped = find(config, problem, folder, self.device)
         for line in skipped:
             self.console.print(f"passed over: {line}")
         # Networks are initialised from torch's global generator, so that it is seeded before anything is built.
         seed_global(config.seed)
-        self.algorithm = make_algorithm(config, problem.task, self.device)
-        done = state["position"]["frames"] if state else 0
-        self.collector = make_collector(config, problem, self.algorithm.policy, self.device, done=done)
-        # At once, so that worker processes end as well if what follows (a damaged checkpoint, say) raises.
+        own = config if state is None or folder is None else with_own_classes(config, folder)
+        self.algorithm = make_algorithm(own, problem.task, self.device, self._nets)
+        done = Position(**state["position"]).frames if state else 0
+        self.collector = make_collector(
+            config, problem, self.algorithm.policy, self.device, done=done
+        )
+        # At once, so that worker processes end as well if a later step raises (a damaged checkpoint).
         opened.callback(self.collector.shutdown)
         self.evaluator = make_evaluator(problem)
         self.start = self._restore(state)
@@ -131,7 +145,7 @@ class Trainer(Training):
         if folder is not None:
             write_inputs(config, problem, folder, resumed=state is not None)
             plan = {"iterations": self.iterations, "upper_bound": self.evaluator.upper}
-            write_json(folder / "plan.json", plan)  # for those who watch the run
+            write_json(folder / "plan.json", plan)  # for `watch`
 
     def _restore(self, state: dict[str, Any] | None) -> Position:
         """The position after the last checkpoint, or at the start, perhaps with the weights of another run."""
@@ -142,7 +156,9 @@ class Trainer(Training):
                         callback.load_state_dict(state["callbacks"][callback.name])
             with decoded(state["file"], "a state that fits this run"):
                 start = restore(state, self.algorithm, self.collector)
-            self.console.print(f"resumes after iteration {start.iteration}, {start.frames:,} frames")
+            self.console.print(
+                f"resumes after iteration {start.iteration}, {start.frames:,} frames"
+            )
             return start
         if self.config.init_from is not None:
             taken = take_weights(self.algorithm, Path(self.config.init_from), self.device)
@@ -157,10 +173,14 @@ class Trainer(Training):
         for iteration in range(self.position.iteration + 1, self.iterations + 1):
             batch = self._collect(iteration)
             # Summed before learning: an algorithm may scale the rewards of its batch in place.
-            frames, earned = (0, 0.0) if batch is None else (batch.numel(), batch["next", "reward"].sum().item())
+            frames, earned = (
+                (0, 0.0) if batch is None else (batch.numel(), batch["next", "reward"].sum().item())
+            )
             diagnostics = self._learn(batch, iteration)
             before, elapsed = self.position, time.monotonic() - self._began
-            self.position = Position(iteration, before.frames + frames, elapsed, before.reward + earned)
+            self.position = Position(
+                iteration, before.frames + frames, elapsed, before.reward + earned
+            )
             self._account(diagnostics, earned / frames if frames else None)
             if self._signals.received and iteration < self.iterations:
                 raise Preempted(self._signals.received)
@@ -189,7 +209,9 @@ class Trainer(Training):
         try:
             diagnostics = self.algorithm.step(batch)
         except FloatingPointError as error:
-            raise RunError(f"iteration {iteration}: {error}; the last checkpoint holds a good state") from error
+            raise RunError(
+                f"iteration {iteration}: {error}; the last checkpoint holds a good state"
+            ) from error
         if batch is not None:
             self._send_weights(iteration)
         return diagnostics
@@ -199,13 +221,13 @@ class Trainer(Training):
             with _named(iteration), self._watch.waiting():
                 self.collector.update_policy_weights_()
         except RunError:
-            # The signal ended the workers too. What was learned is counted and saved, and then the run ends: nobody
+            # The signal ended the workers too. The last update is counted and saved, and then the run ends: nobody
             # needs these weights, unless this was the last iteration, after which nobody does either.
             if not self._signals.heard():
                 raise
 
     def _account(self, diagnostics: dict[str, float], earned: float | None) -> None:
-        """Evaluate where that is due, and tell the callbacks; `earned`: mean reward of the batch's frames, if any."""
+        """Evaluate where that is due, and call the callbacks; `earned`: mean reward of the batch's frames, if any."""
         evaluated = self.position.iteration == 1 or self.due(self.config.evaluation.every)
         if evaluated:
             policy = self._revalue()
@@ -235,7 +257,9 @@ class Trainer(Training):
         }
         # No policy changes the expected length, but each rounds it otherwise; a fixed policy's is the same to the bit
         # wherever a run was cut and resumed.
-        so_far = while_collecting(self.evaluator.upper, self.evaluator.qmdp or evaluation, at.reward, at.frames)
+        so_far = while_collecting(
+            self.evaluator.upper, self.evaluator.qmdp or evaluation, at.reward, at.frames
+        )
         return {
             "iteration": at.iteration,
             "frames": at.frames,
@@ -250,7 +274,7 @@ class Trainer(Training):
 
 @contextmanager
 def _named(iteration: int) -> Iterator[None]:
-    """Say where and why collecting broke down."""
+    """Name the iteration and the reason if collecting fails."""
     try:
         yield
     except (RuntimeError, OSError) as error:

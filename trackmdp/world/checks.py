@@ -1,7 +1,8 @@
-"""What makes a sparse matrix the kernel of a grid."""
+"""Checks of kernels and of numbers per cell or sensor."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
@@ -15,9 +16,12 @@ from trackmdp.errors import UserError
 from trackmdp.world.rows import pairwise_row_sums
 
 Range: TypeAlias = tuple[Callable[[npt.NDArray[np.float64]], npt.NDArray[np.bool_]], str]
-"""Which of some numbers are allowed, and in words; a nan is in no range."""
+"""A test of numbers, and its range in words."""
 
-PRICES: Range = (lambda price: (price >= 0) & (price <= LARGEST_PRICE), "a number from 0 to 1e15")
+PRICES: Range = (
+    lambda price: np.isnan(price) | ((price >= 0) & (price <= LARGEST_PRICE)),
+    "a number from 0 to 1e15, or nan where there is no sensor",
+)
 PROBABILITIES: Range = (lambda p: (p > 0) & (p <= 1), "a probability above 0, at most 1")
 
 
@@ -25,7 +29,8 @@ def canonical_kernel(kernel: Any, source: str = "kernel") -> sparse.csr_array:
     """A table, sparse or dense, as a CSR matrix of float64 with sorted indices, no duplicates and no explicit zeros.
 
     Raises:
-        UserError: it is no square table of real numbers; `source` is named at the start of the message.
+        UserError: it is no square table of real numbers, or its indices lead out of it; `source` is named at the start
+            of the message.
     """
     table = kernel if sparse.issparse(kernel) else np.asarray(kernel)
     # bool, signed, unsigned, float: complex numbers would lose their imaginary part below.
@@ -34,6 +39,12 @@ def canonical_kernel(kernel: Any, source: str = "kernel") -> sparse.csr_array:
     if table.ndim != 2 or table.shape[0] != table.shape[1]:
         raise UserError(f"{source}: expected a square table, got shape {table.shape}")
     canonical = sparse.csr_array(table, dtype=np.float64, copy=True)
+    try:
+        canonical.check_format(
+            full_check=True
+        )  # SciPy reads outside its memory where an index is wrong
+    except ValueError as error:
+        raise UserError(f"{source}: not a sparse matrix ({error})") from None
     canonical.sum_duplicates()
     canonical.eliminate_zeros()
     return short_indices(canonical)
@@ -42,30 +53,39 @@ def canonical_kernel(kernel: Any, source: str = "kernel") -> sparse.csr_array:
 def short_indices(matrix: sparse.csr_array) -> sparse.csr_array:
     """The same matrix with int32 indices, where they are enough: half the memory, and products read half as much.
 
-    SciPy takes the widest integer among what a matrix is made of, so that one array of int64 spreads to all.
+    SciPy takes the widest integer among a matrix's parts, so that one array of int64 spreads to all.
     """
     if max(*matrix.shape, matrix.nnz) > np.iinfo(np.int32).max:
         return matrix
-    pointers = (matrix.indices.astype(np.int32, copy=False), matrix.indptr.astype(np.int32, copy=False))
+    pointers = (
+        matrix.indices.astype(np.int32, copy=False),
+        matrix.indptr.astype(np.int32, copy=False),
+    )
     return sparse.csr_array((matrix.data, *pointers), shape=matrix.shape)
 
 
-def one_each(source: str, given: npt.ArrayLike, count: int, each: str, allowed: Range) -> npt.NDArray[np.float64]:
+def one_each(
+    source: str, given: npt.ArrayLike, count: int | tuple[int, int], each: str, allowed: Range
+) -> npt.NDArray[np.float64]:
     """`[count]` numbers, from one for all or from one for each.
 
     Args:
-        source: what messages begin with.
+        source: beginning of each message.
         given: a number, or a list.
-        count: how many there are to be.
-        each: what each is of: a cell, or a sensor.
+        count: how many there are to be; of rows and columns their product, and the numbers may be `[rows, columns]`.
+        each: name of one item: a cell, or a sensor.
         allowed: which of some numbers are in range, and the range in words.
 
     Raises:
         UserError: another number of numbers, or one out of range.
     """
     values = np.asarray(given, dtype=np.float64)
+    if isinstance(count, tuple):
+        values = values.ravel() if values.shape == count else values
+        count = math.prod(count)
     if values.shape not in ((), (count,)):
-        raise UserError(f"{source}: {values.size} values, expected one number or {count} (one per {each})")
+        found = f"{values.size} values" if values.ndim < 2 else f"an array {list(values.shape)}"
+        raise UserError(f"{source}: {found}, expected one number or {count} (one per {each})")
     within, expected = allowed
     if not (fine := np.asarray(within(values))).all():
         bad = int(np.flatnonzero(~fine)[0])
@@ -74,9 +94,14 @@ def one_each(source: str, given: npt.ArrayLike, count: int, each: str, allowed: 
 
 
 def check_kernel(
-    kernel: sparse.csr_array, size: tuple[int, int], *, truncates: bool, source: str = "kernel", modes: int = 1
+    kernel: sparse.csr_array,
+    size: tuple[int, int],
+    *,
+    truncates: bool,
+    source: str = "kernel",
+    modes: int = 1,
 ) -> None:
-    """See that `kernel` is one for this grid; else say which rule it breaks, and where.
+    """Check that `kernel` is one for this grid; the error names the broken rule and the place.
 
     Args:
         kernel: canonical candidate `[M, M]`.
@@ -90,7 +115,9 @@ def check_kernel(
     """
     m, (rows, columns) = kernel.shape[0], size
     if m != rows * columns:
-        raise UserError(f"{source}: {m} rows, but a {rows}x{columns} grid has {rows * columns} cells")
+        raise UserError(
+            f"{source}: {m} rows, but a {rows}x{columns} grid has {rows * columns} cells"
+        )
     if not (finite := np.isfinite(kernel.data)).all():
         raise UserError(f"{source}: row {_row(kernel, ~finite)} holds a value that is not finite")
     if (negative := kernel.data < 0).any():
@@ -98,10 +125,14 @@ def check_kernel(
     sums = pairwise_row_sums(kernel)
     if (high := sums > 1 + 1e-9).any():
         row = int(np.flatnonzero(high)[0])
-        raise UserError(f"{source}: row {row} sums to {sums[row]:.6g}, expected at most 1 (the rest is the exit)")
+        raise UserError(
+            f"{source}: row {row} sums to {sums[row]:.6g}, expected at most 1 (the rest is the exit)"
+        )
     if not truncates and not (leaves := _can_exit(kernel, sums)).all():
         cell = int(np.flatnonzero(~leaves)[0]) // modes
-        raise UserError(f"{source}: from cell {cell} the target never exits, so no episode ends; set grid.max_steps")
+        raise UserError(
+            f"{source}: from cell {cell} the target never exits, so no episode ends; set grid.max_steps"
+        )
 
 
 def _can_exit(kernel: sparse.csr_array, sums: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from trackmdp.errors import UserError, require
-from trackmdp.untrusted import reason
+from trackmdp.errors import UserError
 from trackmdp.world.model import Array
+from trackmdp.world.place import Place, projected, projection
 from trackmdp.world.positions import Positions
 from trackmdp.world.tracks import Tracks, ends_of
 
@@ -33,8 +32,8 @@ class Gridding:
         max_gap: longest time between two reports that is bridged, by a straight line; seconds.
         shortest: fewest cells of a track.
         exits: whether a target has left the grid at its last report.
-        origin: the corner of the grid with the smallest coordinates, in those of the file; None: the grid's middle is
-            that of the positions.
+        origin: the corner of the grid with the smallest coordinates, in the file's coordinates; None: grid and
+            positions have the same middle.
         crs: projected coordinate system for degrees, such as ``EPSG:2056``; None: the UTM zone of the median.
     """
 
@@ -48,25 +47,26 @@ class Gridding:
     crs: str | None = None
 
 
-def to_tracks(positions: Positions, grid: Gridding, source: str) -> tuple[Tracks, dict[str, int]]:
-    """The tracks, and how many of what was read, cut or dropped.
+def to_tracks(
+    positions: Positions, grid: Gridding, source: str
+) -> tuple[Tracks, dict[str, int], Place]:
+    """The tracks, the counts of reports read, cut or dropped, and the place of the grid.
 
     A path is cut where no report came for longer than `max_gap`, and where it is outside of the grid. Its pieces are
     tracks of the same name; one that ends by leaving the grid has an exit.
 
     Args:
         positions: of all targets.
-        grid: what to make of them.
-        source: what a message begins with.
+        grid: size, cells and steps of the tracks.
+        source: begins a message.
 
     Raises:
         UserError: the projection does not fit the positions, or no track is left.
     """
-    x, y, origin = _projected(positions, grid, source)
-    flat = replace(positions, x=x, y=y)
-    place, x, y, last = _sampled(flat, grid)
-    cells = _cells(x, y, _corner(flat, grid, origin), grid, downwards=positions.downwards)
-    tracks, counts = _cut(cells, place, last, flat.track, grid)
+    flat, place = _placed(positions, grid, source)
+    begin, x, y, last = _sampled(flat, grid)
+    cells = place.cells(x, y, grid.size)
+    tracks, counts = _cut(cells, begin, last, flat.track, grid)
     gaps = int(_breaks(flat, grid).sum()) - len(np.unique(flat.track))
     report = {
         "reports read": positions.read,
@@ -78,38 +78,27 @@ def to_tracks(positions: Positions, grid: Gridding, source: str) -> tuple[Tracks
     }
     if not len(tracks):
         raise UserError(f"{source}: no track of at least {grid.shortest} cells; {said(report)}")
-    return tracks, report
+    return tracks, report, place
 
 
 def said(report: Mapping[str, int]) -> str:
-    """The report in one line, without what did not happen."""
+    """The report in one line, without the counts of 0."""
     return ", ".join(f"{count:,} {what}" for what, count in report.items() if count)
 
 
-def _projected(positions: Positions, grid: Gridding, source: str) -> tuple[Array, Array, tuple[float, float] | None]:
-    """x, y and the origin in metres."""
-    if not positions.geographic:
-        if grid.crs is not None:
-            raise UserError(f"{source}: has x and y, which are not projected; kernel.crs={grid.crs} is for lat and lon")
-        return positions.x, positions.y, grid.origin
-    require("pyproj", "tracks", source)
-    from pyproj import CRS, Transformer
-    from pyproj.exceptions import ProjError
-
-    code = grid.crs or _utm(positions, source)
-    try:
-        crs = CRS.from_user_input(code)
-        units = {axis.unit_name for axis in crs.axis_info}
-        if not crs.is_projected or units != {"metre"}:
-            raise UserError(f"kernel.crs={code}: {crs.name}, expected a projected coordinate system in metres")
-        forward = Transformer.from_crs("EPSG:4326", crs, always_xy=True)
-    except ProjError as error:
-        raise UserError(f"kernel.crs={code}: no known coordinate system ({reason(error)})") from None
-    x, y = forward.transform(positions.x, positions.y)
-    corner = None if grid.origin is None else tuple(map(float, forward.transform(*grid.origin)))
-    if corner is not None and not np.isfinite(corner).all():
-        raise UserError(f"kernel.origin={list(grid.origin or ())}: outside of {code}, expected lon, lat within it")
-    return np.asarray(x), np.asarray(y), corner  # type: ignore[return-value]  # inf where the projection does not reach
+def _placed(positions: Positions, grid: Gridding, source: str) -> tuple[Positions, Place]:
+    """The positions in metres, and the place of the grid."""
+    code, flat = None, positions
+    if positions.geographic:
+        code = grid.crs or _utm(positions, source)
+        x, y = map(np.asarray, projection(code).transform(positions.x, positions.y))
+        flat = replace(positions, x=x, y=y)  # inf where the projection does not reach
+    elif grid.crs is not None:
+        raise UserError(
+            f"{source}: has x and y, which are not projected; grid.crs={grid.crs} is for lat and lon"
+        )
+    corner = _middle(flat, grid) if grid.origin is None else projected(code, grid.origin)
+    return flat, Place(corner, grid.cell, code, positions.downwards)
 
 
 def _utm(positions: Positions, source: str) -> str:
@@ -119,7 +108,7 @@ def _utm(positions: Positions, source: str) -> str:
     if high - low > _WIDEST or abs(latitude) > 84:
         raise UserError(
             f"{source}: from {low:.1f} to {high:.1f} degrees of longitude, at latitude {latitude:.1f}, is no part of "
-            "one UTM zone; expected kernel.crs, a projection in metres such as EPSG:6933 (world) or EPSG:3035 (Europe)"
+            "one UTM zone; expected grid.crs, a projection in metres such as EPSG:6933 (world) or EPSG:3035 (Europe)"
         )
     # Zones of 6 degrees from 180 W on: 8.5 E is in 1 + floor(188.5 / 6) = 32. The code of the north serves the south
     # too, where y is then negative: only differences count here.
@@ -151,7 +140,9 @@ def _sampled(positions: Positions, grid: Gridding) -> tuple[np.ndarray, Array, A
     with np.errstate(over="ignore"):  # inf is too many, and refused as such
         whole = np.floor(length / grid.step + 1e-6) + 1
     if whole.sum() > _MOST:
-        raise UserError(f"kernel.step={grid.step:g}: makes {whole.sum():.3g} steps of it, expected at most {_MOST:,}")
+        raise UserError(
+            f"kernel.step={grid.step:g}: makes {whole.sum():.3g} steps of it, expected at most {_MOST:,}"
+        )
     count = whole.astype(np.int64)
     # All paths one after the other on one axis of time, for one call of interp. Example: reports at 7 9 | 3 5 8 with a
     # pause of 1 between the paths stand at 0 2 | 3 5 8, and with a step of 2 are sampled at 0 2 | 3 5 7.
@@ -168,35 +159,22 @@ def _sampled(positions: Positions, grid: Gridding) -> tuple[np.ndarray, Array, A
     return start[of], x, y, final[of]
 
 
-def _corner(positions: Positions, grid: Gridding, origin: tuple[float, float] | None) -> tuple[float, float]:
-    """The least x and y of the grid, in metres."""
-    if origin is not None:
-        return origin
+def _middle(positions: Positions, grid: Gridding) -> tuple[float, float]:
+    """The smallest x and y of the grid, in metres, if grid and positions have the same middle."""
     # Half way between the 1st and the 99th percentile: a few reports from nowhere do not move the grid.
-    sides = (grid.size[1], grid.size[0])
     known = [column[np.isfinite(column)] for column in (positions.x, positions.y)]
-    middle = [float(np.percentile(column, (1, 99)).mean()) if len(column) else math.nan for column in known]
-    return middle[0] - sides[0] * grid.cell / 2, middle[1] - sides[1] * grid.cell / 2
-
-
-def _cells(x: Array, y: Array, corner: Sequence[float], grid: Gridding, *, downwards: bool) -> np.ndarray:
-    """`[S]` the cell of each sample, -1 outside of the grid.
-
-    Example: with corner (0, 0), cells of 10 and a 2 x 3 grid, (25, 5) is in column 2 and, y upwards, in the lower row:
-    cell 1 · 3 + 2 = 5. (30, 5) is outside: a cell has its left and lower edges, not the others.
-    """
+    # Without one the grid may lie anywhere.
+    x, y = (
+        float(np.percentile(column, (1, 99)).mean()) if len(column) else 0.0 for column in known
+    )
     rows, columns = grid.size
-    with np.errstate(invalid="ignore", over="ignore"):  # inf, where the projection does not reach
-        column, up = (np.floor((each - low) / grid.cell) for each, low in zip((x, y), corner, strict=True))
-        inside = (column >= 0) & (column < columns) & (up >= 0) & (up < rows)
-        row = up if downwards else rows - 1 - up
-        return np.where(inside, row * columns + column, -1.0).astype(np.int64)
+    return x - columns * grid.cell / 2, y - rows * grid.cell / 2
 
 
 def _cut(
     cells: np.ndarray, place: np.ndarray, last: np.ndarray, track: np.ndarray, grid: Gridding
 ) -> tuple[Tracks, dict[str, int]]:
-    """The runs of cells inside the grid, those that are long enough."""
+    """The runs of cells inside the grid, of sufficient length."""
     inside = cells >= 0
     same = np.diff(place) == 0
     # A run begins where the one before is of another path or outside, and ends likewise.
@@ -212,7 +190,9 @@ def _cut(
     made = Tracks(cells[inside][chosen], ends_of(lengths[kept]), exits, track[place[begins]][kept])
     counts = {
         "steps outside of the grid": int((~inside).sum()),
-        f"steps in {int((~kept).sum()):,} tracks of fewer than {grid.shortest} cells": int(lengths[~kept].sum()),
+        f"steps in {int((~kept).sum()):,} tracks of fewer than {grid.shortest} cells": int(
+            lengths[~kept].sum()
+        ),
         "steps kept": len(made.cells),
         "tracks kept": len(made),
     }

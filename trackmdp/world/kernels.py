@@ -24,7 +24,7 @@ Border: TypeAlias = Literal["renormalize", "inside", "clip", "exit"]
 _Offsets: TypeAlias = npt.NDArray[np.int64]
 
 _CELLS_AT_ONCE = 2**15
-"""Rows made together: what is drawn and thrown away again stays small beside the kernel."""
+"""Rows made together: rejected draws stay small beside the kernel."""
 
 
 def random_support(
@@ -43,7 +43,9 @@ def random_support(
     With a single position left, that one has all of 1 - exit_probability.
     """
     grid, window, rng = grid_size(size), _window(radius), np.random.default_rng(seed)
-    lows = [_one_low(count, low_probability, exit_probability) for count in range(1, support_size + 1)]
+    lows = [
+        _one_low(count, low_probability, exit_probability) for count in range(1, support_size + 1)
+    ]
     weights = np.array([np.pad(low, (0, support_size - len(low))) for low in lows])
     # Row k - 1 of `weights` is for k positions left, padded with zeros to Z; totals[k - 1] is its sum, 1 - p_exit.
     totals = np.array([low.sum() for low in lows])
@@ -58,7 +60,14 @@ def random_support(
             order = np.take_along_axis(order, np.argsort(~inside, axis=1, kind="stable"), axis=1)
             count = np.minimum(inside.sum(axis=1), support_size)
         blocks.append(
-            _place(grid, cells, window[order[:, :support_size]], weights[count - 1], totals[count - 1], border)
+            _place(
+                grid,
+                cells,
+                window[order[:, :support_size]],
+                weights[count - 1],
+                totals[count - 1],
+                border,
+            )
         )
     return canonical_kernel(sparse.vstack(blocks))
 
@@ -116,7 +125,9 @@ def _window(radius: int) -> _Offsets:
 def _blocks(grid: tuple[int, int]) -> list[_Offsets]:
     """All cells in order, some at a time."""
     m = grid[0] * grid[1]
-    return [np.arange(begin, min(begin + _CELLS_AT_ONCE, m)) for begin in range(0, m, _CELLS_AT_ONCE)]
+    return [
+        np.arange(begin, min(begin + _CELLS_AT_ONCE, m)) for begin in range(0, m, _CELLS_AT_ONCE)
+    ]
 
 
 def _one_low(count: int, low: float, exit_probability: float) -> Array:
@@ -143,7 +154,7 @@ def _place(
 ) -> sparse.csr_array:
     """`[B, M]` the kernel rows of `cells` `[B]`: `weights` `[B, K]` put at `offsets` `[B, K, 2]`.
 
-    What falls outside is treated as `border` says; with `renormalize` and `inside` a row still sums to its entry of
+    Positions outside are treated by the rule `border`; with `renormalize` and `inside` a row still sums to its entry of
     `totals` `[B]`, and where they leave no position at all the target stays.
     """
     position = np.stack(np.divmod(cells, grid[1]), axis=-1)[:, None] + offsets
@@ -170,7 +181,7 @@ def _place(
 def _homogeneous(
     size: Size, window: _Offsets, weights: Array, exit_probability: float, border: Border
 ) -> sparse.csr_array:
-    """The kernel whose rows all have `weights` `[K]` at the offsets `window` `[K, 2]`."""
+    """The kernel with `weights` `[K]` in every row, at the offsets `window` `[K, 2]`."""
     grid, scaled = grid_size(size), weights * (1.0 - exit_probability)
 
     def rows(cells: npt.NDArray[np.int64]) -> sparse.csr_array:

@@ -1,31 +1,31 @@
-"""From names and options, or from a config, to a world or to recorded tracks; and what the group `sensor` offers."""
+"""From names and options, or from a config, to a world or to recorded tracks; and the makers of the group `sensor`."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
+import difflib
+from collections.abc import Mapping, Sequence
 from inspect import signature
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from trackmdp.config import WorldConfig
 from trackmdp.config.compose import compose, default, given
-from trackmdp.config.options import options, refuse
+from trackmdp.config.options import GROUPS, options
 from trackmdp.config.registry import make, maker
 from trackmdp.config.sensing import lattice
 from trackmdp.errors import UserError
 from trackmdp.world.checks import PRICES, PROBABILITIES, canonical_kernel, check_kernel
 from trackmdp.world.coverage import Coverage, discs
 from trackmdp.world.files import per_cell, read_matrix
-from trackmdp.world.model import Size, World, grid_size
-from trackmdp.world.modes import HiddenWorld, Modelled
-from trackmdp.world.track_files import read_recording, read_track_file
-from trackmdp.world.tracks import Problem, Recorded, split
+from trackmdp.world.model import TASK_BYTES, Size, World, check_fits, grid_size
+from trackmdp.world.place import Place
+from trackmdp.world.track_files import read_track_file
+from trackmdp.world.tracks import Problem, Recorded, modelled, split
 
-_OF_TASK = {
+OF_TASK = {
     "size": "grid.size",
     "t_max": "grid.t_max",
     "max_steps": "grid.max_steps",
@@ -37,6 +37,13 @@ _OF_TASK = {
     "clip": "task.clip",
 }
 """Arguments of `make_world` and `load_tracks` -> options of the command line."""
+
+_OF_PLACE = {name: f"grid.{name}" for name in ("cell", "origin", "crs")}
+
+
+_KERNEL_BYTES = 500
+"""Bytes of each cell while a motion kernel is made. Measured on 1,500 x 1,500 cells: random_walk 570, random_support
+580, drift 940."""
 
 
 def make_world(
@@ -53,8 +60,11 @@ def make_world(
     safe_detection: npt.ArrayLike | str = 1.0,
     memory: str = default("task.memory"),
     clip: int = default("task.clip"),
+    cell: float | None = default("grid.cell"),
+    origin: Sequence[float] | None = default("grid.origin"),
+    crs: str | None = default("grid.crs"),
     **kernel_options: Any,
-) -> Modelled:
+) -> World:
     """A world with one of the motion kernels; for a table of your own take `World` itself.
 
     The defaults are those of `conf/`, and the checks those of the command line.
@@ -72,13 +82,16 @@ def make_world(
         window: W; only sensors up to W rows and columns from the last located cell can be chosen. None: all can.
         detection: p_d, how likely a sensor that is on reports the target in its cell; as `cost`, in (0, 1].
         safe_detection: p_s, the same of the safe action, which is repeated until it locates; as `detection`.
-        memory: what a policy remembers at a detection, as in `load_tracks`; the cell, unless targets have a mode.
-        clip: rows and columns up to which displacements are told apart.
+        memory: the policy's key at a detection, as in `load_tracks`; the cell, unless targets have a mode.
+        clip: rows and columns up to which displacements are distinguished.
+        cell: side of a cell, in metres or units of x and y; with `origin` it gives the grid a place (`World.place`).
+        origin: corner of the grid with the least coordinates, (x, y), or (lon, lat) with `crs`.
+        crs: code of the projection of lat and lon to metres, such as ``EPSG:2056``.
         **kernel_options: the kernel's own, such as ``support_size=5`` (``trackmdp solve --help`` lists them), or
-            ``reveals=True`` where detections tell the mode.
+            ``reveals=True`` where detections reveal the mode.
 
     Returns:
-        A `World`, or a `HiddenWorld` where targets have a mode.
+        The world, its `modes` above 1 where targets have a mode.
 
     Raises:
         UserError: a name, a type or a range is wrong, or the kernel breaks a rule.
@@ -89,13 +102,17 @@ def make_world(
         >>> make_world("heading", size=4, reveals=True).num_keys
         128
     """
-    made = make_problem(compose("solve", given({"kernel": kernel}) | _words(locals(), kernel_options)))
-    assert not isinstance(made, Recorded)  # there is nothing to solve for
-    return made
+    if hasattr(kernel, "shape"):
+        raise UserError(
+            f"make_world: kernel: a {type(kernel).__name__}, expected a name; World(kernel, size, cost=..., t_max=...) "
+            "takes a table"
+        )
+    words = given({"kernel": kernel}) | _words(locals(), kernel_options)
+    return modelled(make_problem(compose("compare", words)), f"kernel={kernel}")
 
 
 def load_tracks(
-    path: str | Path,
+    path: str | Path | Any,
     size: Size = default("grid.size"),
     *,
     t_max: int = default("grid.t_max"),
@@ -108,6 +125,9 @@ def load_tracks(
     safe_detection: npt.ArrayLike | str = 1.0,
     memory: str = default("task.memory"),
     clip: int = default("task.clip"),
+    cell: float | None = default("grid.cell"),
+    origin: Sequence[float] | None = default("grid.origin"),
+    crs: str | None = default("grid.crs"),
     **track_options: Any,
 ) -> Recorded:
     """Recorded tracks in place of a motion model: most to learn from, some to choose by, some held out to evaluate on.
@@ -115,8 +135,8 @@ def load_tracks(
     Args:
         path: a file of cells (.csv or .npz with columns track, cell, or row and column, and, if wanted, step), or one
             of positions: a table (.csv, .parquet) of id, time and x, y or lat, lon, as of AIS and ADS-B; GeoJSON; GPX;
-            MOT-Challenge text; SUMO's fcd-output. Positions need `step` and `cell`; see `Recorded.loaded` for what
-            was left out.
+            MOT-Challenge text; SUMO's fcd-output. Positions need `step` and `cell`; see `Recorded.loaded` for the
+            counts of omitted ones, `Recorded.place` for where the grid lies. Or such a table as a DataFrame of pandas.
         size: N of an N x N grid, or (rows, columns).
         t_max: see `make_world`, as for the following.
         cost: c.
@@ -126,11 +146,14 @@ def load_tracks(
         window: W.
         detection: p_d.
         safe_detection: p_s.
-        memory: what a policy remembers at a detection: ``cell``, ``displacement``, ``displacement_gap`` or
+        memory: the policy's key at a detection: ``cell``, ``displacement``, ``displacement_gap`` or
             ``two_displacements``.
-        clip: rows and columns up to which displacements are told apart.
-        **track_options: those of ``kernel=tracks`` (``trackmdp train kernel=tracks --help``): `format`, `step`, `cell`,
-            `max_gap`, `origin`, `crs`, `ends`, `starts`, `held_out`, `validation`, `seed`, `min_length`, `markov`.
+        clip: rows and columns up to which displacements are distinguished.
+        cell: see `make_world`; of positions the side of a cell is needed, the others follow from them.
+        origin: see `cell`.
+        crs: see `cell`.
+        **track_options: those of ``kernel=tracks`` (``trackmdp train kernel=tracks --help``): `format`, `step`,
+            `columns`, `max_gap`, `ends`, `starts`, `held_out`, `validation`, `seed`, `min_length`, `markov`.
 
     Raises:
         UserError: the file is not of that form, a track is too short, or an option is wrong.
@@ -138,32 +161,33 @@ def load_tracks(
     Example:
         ``load_tracks("ais.csv", (40, 60), cell=500, step=60, max_gap=600, ends="cut")``
     """
-    # Of the options of `train` only those of the problem matter; the algorithm is one that may remember anything.
-    words = {"kernel": "tracks", "kernel.path": path, "algo": "path_counts"} | _words(locals(), track_options)
-    made = make_problem(compose("train", words))
-    assert isinstance(made, Recorded)
-    return made
+    in_memory = hasattr(path, "columns") and hasattr(path, "to_numpy")
+    if not (in_memory or isinstance(path, str | Path)):
+        raise UserError(
+            f"load_tracks: a {type(path).__name__}, expected the path of a file, or a DataFrame"
+        )
+    source = "DataFrame.parquet" if in_memory else path  # a table of positions
+    words = {"kernel": "tracks", "kernel.path": source} | _words(locals(), track_options)
+    made = make_problem(compose("compare", words), frame=path if in_memory else None)
+    return cast(Recorded, made)
 
 
-def make_problem(cfg: WorldConfig) -> Problem:
+def make_problem(cfg: WorldConfig, *, frame: Any = None) -> Problem:
     """The world a config describes, or its recorded tracks.
 
+    Args:
+        cfg: the config.
+        frame: positions as a DataFrame of pandas, in place of the file of `kernel=tracks`.
+
     Raises:
-        UserError: a file is missing or malformed, or the kernel or a track breaks a rule.
+        UserError: the grid does not fit into memory, a file is missing or malformed, or the kernel or a track breaks a
+            rule.
     """
-    if cfg.kernel.hides:
-        return _hidden(cfg)
+    bytes_each = _KERNEL_BYTES if cfg.kernel.is_motion else TASK_BYTES
+    check_fits("grid.size", cfg.grid.size, bytes_each)
     if cfg.kernel.is_motion:
         return build_world(cfg)
-    return make(cfg.kernel, cfg.grid.size, **of_task(cfg))
-
-
-def _hidden(cfg: WorldConfig) -> HiddenWorld:
-    """The world of a target with a mode, which a detection tells where `kernel.reveals` says so."""
-    own = {name: getattr(cfg.kernel, name) for name in options(type(cfg.kernel))}
-    reveals = own.pop("reveals")
-    kernel, modes = maker(cfg.kernel)(cfg.grid.size, **own)
-    return HiddenWorld(kernel, cfg.grid.size, modes=modes, **of_task(cfg), revealed=modes if reveals else 1)
+    return make(cfg.kernel, cfg.grid.size, where=cfg.grid.place, frame=frame, **of_task(cfg))
 
 
 def build_world(cfg: WorldConfig) -> World:
@@ -172,13 +196,17 @@ def build_world(cfg: WorldConfig) -> World:
     Raises:
         UserError: a file is missing or malformed, or the kernel breaks a rule (`checks.check_kernel`).
     """
+    (rows, columns), source, modes = cfg.grid.sides, cfg.kernel.source, {}
+    own = {name: getattr(cfg.kernel, name) for name in options(type(cfg.kernel))}
+    reveals = own.pop("reveals", False)
+    made = maker(cfg.kernel)(cfg.grid.size, **own)
     if cfg.kernel.hides:
-        raise refuse("kernel", cfg.kernel.name, "a kernel without a hidden mode")
-    size, source = cfg.grid.sides, cfg.kernel.source
+        made, count = made
+        modes, columns = {"modes": count, "reveals": reveals}, columns * count
     # `World` checks again; here the message names the option at fault (`source`).
-    kernel = canonical_kernel(make(cfg.kernel, cfg.grid.size), source)
-    check_kernel(kernel, size, truncates=cfg.grid.max_steps is not None, source=source)
-    return World(kernel, size, **of_task(cfg))
+    kernel = canonical_kernel(made, source)
+    check_kernel(kernel, (rows, columns), truncates=cfg.grid.max_steps is not None, source=source)
+    return World(kernel, cfg.grid.sides, **of_task(cfg), **modes)
 
 
 def recorded(
@@ -193,48 +221,87 @@ def recorded(
     seed: int,
     min_length: int | None,
     markov: bool,
+    where: dict[str, Any],
+    frame: Any,
+    columns: list[str] | None,
     **others: Any,
 ) -> Recorded:
     """The recorded tracks in a file, in their three parts; see `TracksConfig` for the options.
 
-    A `recording.npz`, which a run keeps of tracks that were in memory, has the parts and the ends of its own.
-
     Raises:
         UserError: the file is missing or malformed, a track is too short, or one of the three parts would be empty.
     """
-    gridding = {name: others.pop(name) for name in ("step", "cell", "max_gap", "origin", "crs")}
+    gridding = where | {name: others.pop(name) for name in ("step", "max_gap")}
     of_task = others | {"markov": markov, "anywhere": starts == "anywhere"}
-    if (kept := read_recording(path, math.prod(grid_size(size)))) is not None:
-        return Recorded(kept[0], size, validation=kept[1], held_out=kept[2], **of_task)
     # A located cell, t_max + 1 free choices and the forced step: t_max + 3 cells, the segment that hindsight learns
     # from.
-    shortest = max(min_length or of_task["t_max"] + 3, 1 if ends == "exit" else 2)  # a cut track of one has no step
-    tracks, loaded = read_track_file(path, grid_size(size), ends == "exit", shortest, format, gridding)
+    shortest = max(
+        min_length or of_task["t_max"] + 3, 1 if ends == "exit" else 2
+    )  # a cut track of one has no step
+    tracks, loaded, place = read_track_file(
+        path if frame is None else frame,
+        grid_size(size),
+        ends == "exit",
+        shortest,
+        format,
+        gridding | {"columns": columns},
+    )
     mine, chosen, judged = split(tracks, held_out, validation, seed)
-    return Recorded(mine, size, validation=chosen, held_out=judged, loaded=loaded, **of_task)
+    return Recorded(
+        mine, size, validation=chosen, held_out=judged, loaded=loaded, place=place, **of_task
+    )
 
 
 def paper_cost(
-    size: Size, *, reward: float, sensor: float | list[float] | str, safe: float | None, sensors: int | None = None
+    size: Size,
+    *,
+    reward: float,
+    sensor: float | list[float] | str,
+    safe: float | None,
+    sensors: int | None = None,
 ) -> dict[str, Any]:
     """r, c and D as arguments of `Task`; `sensors` is their number where there is not one in each cell.
 
     Raises:
         UserError: a file of prices is missing or malformed, or does not have one price per sensor.
     """
-    return {"reward": reward, "cost": per_cell("cost.sensor", sensor, size, PRICES, sensors), "safe_cost": safe}
+    return {
+        "reward": reward,
+        "cost": per_cell("cost.sensor", sensor, size, PRICES, sensors),
+        "safe_cost": safe,
+    }
 
 
-def _words(arguments: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
-    """What was given to `make_world` or `load_tracks`, and the kernel's own `options`, by the command line's names."""
-    of_task = {option: arguments[name] for name, option in _OF_TASK.items()}
-    own = {f"kernel.{name}": value for name, value in options.items()}
-    return given(of_task | sensor_words(arguments["detection"], arguments["safe_detection"]) | own)
+def _words(arguments: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+    """The arguments given to `make_world` or `load_tracks`, and the `own` options of a kernel, by command-line names.
+
+    Raises:
+        UserError: an option of no kernel resembles an argument.
+    """
+    of_kernels = {name for schema in GROUPS["kernel"].values() for name in options(schema)}
+    for name in own.keys() - of_kernels:
+        if close := difflib.get_close_matches(name, OF_TASK, n=1):
+            raise UserError(f"{name}: unknown argument, did you mean {close[0]}?")
+    arguments = {name: _flat(value, arguments["size"]) for name, value in arguments.items()}
+    of_task = {option: arguments[name] for name, option in (OF_TASK | _OF_PLACE).items()}
+    of_kernel = {f"kernel.{name}": value for name, value in own.items()}
+    of_sensor = sensor_words(arguments["detection"], arguments["safe_detection"])
+    return given(of_task | of_sensor | of_kernel)
+
+
+def _flat(value: Any, size: Size) -> Any:
+    """An argument `[rows, columns]` as one number for each cell; any other as it is."""
+    if not isinstance(value, list | np.ndarray) or np.ndim(value) != 2:
+        return value
+    return np.ravel(value).tolist() if np.shape(value) == grid_size(size) else value
 
 
 def sensor_words(detection: Any, safe_detection: Any) -> dict[str, Any]:
     """p_d and p_s by the names of the command line; nothing where all are 1, so that no sensor misses."""
-    if all(not isinstance(p, (str, Path)) and np.all(np.asarray(p) == 1.0) for p in (detection, safe_detection)):
+    if all(
+        not isinstance(p, (str, Path)) and np.all(np.asarray(p) == 1.0)
+        for p in (detection, safe_detection)
+    ):
         return {}
     return {"sensor": "miss", "sensor.p_d": detection, "sensor.p_s": safe_detection}
 
@@ -242,21 +309,25 @@ def sensor_words(detection: Any, safe_detection: Any) -> dict[str, Any]:
 def of_task(cfg: WorldConfig) -> dict[str, Any]:
     """Costs and limits of a world config, as arguments of `Task`."""
     sensors: dict[str, Any] = make(cfg.sensor, cfg.grid.size)
-    # Prices per sensor: how many those are is told to costs that ask for it.
-    told = {}
-    if (coverage := sensors.get("coverage")) is not None and "sensors" in signature(maker(cfg.cost)).parameters:
-        told = {"sensors": coverage.num_sensors}
-    costs: dict[str, Any] = make(cfg.cost, cfg.grid.size, **told)
+    count = {}
+    if (coverage := Coverage.of(sensors.get("coverage"), cfg.grid.num_cells)) is not None:
+        sensors["coverage"] = coverage
+        if "sensors" in signature(maker(cfg.cost)).parameters:  # prices per sensor, not per cell
+            count = {"sensors": coverage.num_sensors}
+    costs: dict[str, Any] = make(cfg.cost, cfg.grid.size, **count)
     limits = {"t_max": cfg.grid.t_max, "max_steps": cfg.grid.max_steps, "window": cfg.grid.window}
-    return costs | sensors | limits | cfg.remembered
+    place = {"place": Place.of(**cfg.grid.place)} if cfg.kernel.is_motion else {}
+    return costs | sensors | limits | place | cfg.remembered
 
 
 def perfect(size: Size) -> dict[str, Any]:  # noqa: ARG001
-    """No sensor misses, which is what a `Task` takes for granted."""
+    """No sensor misses, the default of a `Task`."""
     return {}
 
 
-def miss(size: Size, *, p_d: float | list[float] | str, p_s: float | list[float] | str) -> dict[str, Any]:
+def miss(
+    size: Size, *, p_d: float | list[float] | str, p_s: float | list[float] | str
+) -> dict[str, Any]:
     """p_d of the sensors and p_s of the safe action.
 
     Raises:
@@ -277,18 +348,29 @@ def false_alarm(size: Size, *, p_d: float | list[float] | str, p_f: float) -> di
     return {"detection": per_cell("sensor.p_d", p_d, size, PROBABILITIES)}
 
 
-def footprint(size: Size, *, radius: float, spacing: int, path: str | None) -> dict[str, Any]:
-    """Discs of `radius` around the places of a lattice, or the footprints in a file.
+def footprint(
+    size: Size,
+    *,
+    radius: float,
+    spacing: int,
+    path: str | None,
+    p_d: float | list[float] | str,
+    p_s: float | list[float] | str,
+) -> dict[str, Any]:
+    """Discs of `radius` around the places of a lattice, or the footprints in a file; p_d and p_s as of `miss`.
 
     Raises:
-        UserError: the file is missing or malformed, or holds no footprints on this grid.
+        UserError: a file is missing or malformed, or does not fit this grid.
     """
     rows, columns = grid_size(size)
+    missing = miss(size, p_d=p_d, p_s=p_s)
     if path is not None:
         table = read_matrix("sensor.path", path, name="coverage")
         try:
-            return {"coverage": Coverage.of(table, rows * columns)}
-        except UserError as error:  # the option at fault is told with it
-            raise UserError(f"sensor.path={path}: {str(error).removeprefix('coverage: ')}") from error
-    places = np.stack(np.meshgrid(lattice(rows, spacing), lattice(columns, spacing), indexing="ij"), axis=-1)
-    return {"coverage": Coverage.of(discs((rows, columns), places.reshape(-1, 2), radius), rows * columns)}
+            return missing | {"coverage": Coverage.of(table, rows * columns)}
+        except UserError as error:  # with the option at fault
+            fault = str(error).removeprefix("coverage: ")
+            raise UserError(f"sensor.path={path}: {fault}") from error
+    places = np.meshgrid(lattice(rows, spacing), lattice(columns, spacing), indexing="ij")
+    seen = discs((rows, columns), np.stack(places, axis=-1).reshape(-1, 2), radius)
+    return missing | {"coverage": Coverage.of(seen, rows * columns)}

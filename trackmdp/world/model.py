@@ -1,7 +1,8 @@
-"""What a tracking task is, and the world it takes place in."""
+"""The tracking task, and the world it takes place in."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
@@ -14,9 +15,13 @@ from scipy import sparse
 from trackmdp.config.sensing import LARGEST_PRICE
 from trackmdp.config.world import MEMORIES
 from trackmdp.errors import UserError
+from trackmdp.machine import free_bytes, gib
+from trackmdp.notebook.card import Card, Carded, Facts, grid_words, span
 from trackmdp.world.checks import PRICES, PROBABILITIES, canonical_kernel, check_kernel, one_each
 from trackmdp.world.coverage import Coverage
 from trackmdp.world.memory import KeySpace
+from trackmdp.world.motion import Motion
+from trackmdp.world.place import Place
 from trackmdp.world.rows import pairwise_row_sums
 
 Array: TypeAlias = npt.NDArray[np.float64]
@@ -27,7 +32,7 @@ Size: TypeAlias = int | Sequence[int]
 
 
 class TaskOptions(TypedDict, total=False):
-    """What the constructors of `World`, `HiddenWorld` and `Recorded` hand on to that of `Task`."""
+    """Arguments that the constructors of `World` and `Recorded` hand on to `Task`'s."""
 
     cost: Required[npt.ArrayLike]
     t_max: Required[int]
@@ -42,7 +47,11 @@ class TaskOptions(TypedDict, total=False):
     memory: str
     clip: int
     revealed: int
+    place: Place | None
 
+
+NEVER = 1e30
+"""Price of a sensor that does not exist, for planners; finite, so that times no mass it is 0."""
 
 _NULLABLE = ("max_steps", "window")
 _GIVEN: Any = 1.0
@@ -50,36 +59,40 @@ _SUM: Any = None
 """Defaults of a task that its constructor makes arrays and a price of."""
 
 
-@dataclass(frozen=True, eq=False)
-class Task:
-    """What the tracker knows: the grid, the rewards, the costs and the limits, but not the motion.
+@dataclass(frozen=True, eq=False, repr=False)
+class Task(Carded):
+    """The tracker's knowledge: the grid, the rewards, the costs and the limits, but not the motion.
 
     A learner is given a `Task`, never a `World`, so that it cannot read the kernel. Cells are numbered row by row: the
     cell in row i and column j is i · columns + j.
 
     Attributes:
         size: (rows, columns) of the grid; the constructor takes one number for a square grid.
-        cost: `[S]`, c: the price of each sensor switched on for one step; the constructor takes one number for all.
+        cost: `[S]`, c: the price of each sensor switched on for one step, nan where there is no sensor; the constructor
+            takes one number for all.
         t_max: T_max; the controller chooses freely at n = 0 ... t_max.
-        safe_cost: D, the price of the safe action, forced after t_max + 1 misses in a row; default: the sum of `cost`.
+        safe_cost: D, the price of the safe action, forced after t_max + 1 misses in a row; default: the sum of all
+            prices.
         reward: r, earned when the target is sensed.
         max_steps: episodes are truncated after this many steps; None for never.
-        window: W; only the sensors up to W rows and columns from the last located cell can be chosen. None: all can.
+        window: W; only the sensors up to W rows and columns from the last located cell can be chosen, those with a
+            footprint where a cell of it is. None: all can.
         detection: `[M]`, p_d per cell, in (0, 1]: how likely a sensor that is on reports the target in its cell; the
             constructor takes one number for all cells.
         safe_detection: `[M]`, p_s per cell, in (0, 1]: the same of the safe action; below 1 it is repeated, at D each,
             until it locates the target.
         coverage: the cells that each of the S sensors covers, where that is not its own cell alone; the constructor
-            takes a table or sparse matrix `[S, M]` of 0 and 1. None: S = M, sensor s covers cell s.
-        markov: whether the next move depends on what a detection tells alone, the cell or, where it does, cell and
-            mode, so that a learner may put paths together from moves seen on different ones.
-        memory: what a policy remembers at a detection, one of `trackmdp.config.world.MEMORIES`; see `KeySpace`.
-        clip: rows and columns up to which remembered displacements are told apart.
-        revealed: modes of the target that a detection tells apart; 1 where it tells the cell alone.
+            takes a table or sparse matrix `[S, M]` of 0 and 1, or of probabilities that a sensor reports a target
+            there, which are multiplied by p_d. None: S = M, sensor s covers cell s.
+        markov: whether the next move depends on the content of a detection alone, the cell or, where it reveals it,
+            cell and mode, so that a learner may put paths together from moves seen on different ones.
+        memory: the policy's key at a detection, one of `trackmdp.config.world.MEMORIES`; see `KeySpace`.
+        clip: rows and columns up to which remembered displacements are distinguished.
+        revealed: modes of the target that a detection distinguishes; 1 where it reveals the cell alone.
+        place: where the grid lies, for `cell_of` and `place_of`; None: not known.
 
     Raises:
-        UserError: a number is out of its range, `cost` does not have one price per sensor, or footprints go together
-            with a window, with sensors that miss, or with a memory of more than the cell.
+        UserError: a number is out of its range, or `cost` does not have one price per sensor.
     """
 
     size: tuple[int, int]
@@ -97,41 +110,65 @@ class Task:
     memory: str = "cell"
     clip: int = 2
     revealed: int = 1
+    place: Place | None = None
 
     def __post_init__(self) -> None:
         if self.memory not in MEMORIES:
             raise UserError(f"memory={self.memory}: expected one of {', '.join(MEMORIES)}")
+        if not isinstance(self.place, Place | None):
+            raise UserError(f"place: a {type(self.place).__name__}, expected a Place or None")
         size = rows, columns = grid_size(self.size)
+        check_fits("size", self.size, TASK_BYTES)
         footprints = Coverage.of(self.coverage, rows * columns)
-        count, each = (rows * columns, "cell") if footprints is None else (footprints.num_sensors, "sensor")
+        count, each = (size, "cell") if footprints is None else (footprints.num_sensors, "sensor")
         prices = one_each("cost", self.cost, count, each, PRICES)
-        safe = prices.sum() if self.safe_cost is _SUM else self.safe_cost
+        if np.isnan(prices).all():
+            raise UserError("cost: nan for every sensor, expected one or more prices")
+        safe = np.nansum(prices) if self.safe_cost is _SUM else self.safe_cost
         checked: dict[str, Any] = {"size": size, "cost": prices, "coverage": footprints}
         checked["safe_cost"] = _price("safe_cost", safe, LARGEST_PRICE * prices.size)
         checked["reward"] = _price("reward", self.reward)
         for name in ("detection", "safe_detection"):
-            checked[name] = one_each(name, getattr(self, name), rows * columns, "cell", PROBABILITIES)
-        for name, lowest in (("t_max", 0), ("max_steps", 1), ("window", 0), ("clip", 1), ("revealed", 1)):
+            checked[name] = one_each(name, getattr(self, name), size, "cell", PROBABILITIES)
+        for name, lowest in (
+            ("t_max", 0),
+            ("max_steps", 1),
+            ("window", 0),
+            ("clip", 1),
+            ("revealed", 1),
+        ):
             value = getattr(self, name)
-            checked[name] = None if value is None and name in _NULLABLE else _at_least(lowest, name, value)
+            checked[name] = (
+                None if value is None and name in _NULLABLE else _at_least(lowest, name, value)
+            )
         for name, value in checked.items():
             object.__setattr__(self, name, value)  # the dataclass is frozen
-        # Keys are counted up to t_max + 1 misses, and a safe action that misses is repeated.
-        if self.memory != "cell" and not self.safe:
-            raise UserError(f"memory={self.memory}: with a safe action that may miss, expected cell")
-        if self.memory != "cell" and self.revealed > 1:
-            raise UserError(f"memory={self.memory}: where a detection tells the mode, expected cell")
-        if footprints is not None:
-            self._check_footprints()
 
-    def _check_footprints(self) -> None:
-        """Refuse what sensors that cover several cells do not go together with."""
-        if self.window is not None:
-            raise UserError(f"window={self.window}: expected None with coverage, whose sensors lie at no cell")
-        if self.memory != "cell":
-            raise UserError(f"memory={self.memory}: expected cell with coverage")
-        if not (self.perfect and self.safe):
-            raise UserError("detection, safe_detection: expected 1 with coverage; within a footprint nothing is missed")
+    def cell_of(self, lat_or_x: float, lon_or_y: float) -> int:
+        """The cell of a position: (lat, lon) where the grid lies on a map, else (x, y).
+
+        Raises:
+            UserError: it is outside of the grid, or the place of the grid is not known.
+        """
+        return self._placed("cell_of").cell_of((lat_or_x, lon_or_y), self.size)
+
+    def place_of(self, cell: int) -> tuple[float, float]:
+        """The position of the middle of a cell, (lat, lon) where the grid lies on a map, else (x, y).
+
+        Raises:
+            UserError: there is no such cell, or the place of the grid is not known.
+        """
+        place = self._placed("place_of")
+        if not 0 <= cell < self.num_cells:
+            raise UserError(f"place_of({cell}): expected a cell from 0 to {self.num_cells - 1}")
+        return place.place_of(int(cell), self.size)
+
+    def _placed(self, call: str) -> Place:
+        if self.place is None:
+            raise UserError(
+                f"{call}: the place of the grid is not known, expected tracks loaded from positions, or a `place`"
+            )
+        return self.place
 
     @property
     def rows(self) -> int:
@@ -160,13 +197,19 @@ class Task:
 
     @property
     def num_sensors(self) -> int:
-        """K, the sensors that can be chosen from one located cell: S, or (2W+1)² with a window."""
-        return self.total_sensors if self.window is None else (2 * self.window + 1) ** 2
+        """K, numbers of sensors in an action: S, or (2W+1)² within a window."""
+        return self.total_sensors if self.numbered is None else (2 * self.numbered + 1) ** 2
+
+    @property
+    def numbered(self) -> int | None:
+        """W, where sensors are numbered within the window around the located cell; None: over the whole grid."""
+        return self.window if self.coverage is None else None
 
     @cached_property
     def perfect(self) -> bool:
-        """Whether every sensor that is on reports the target in its cell."""
-        return bool((self.detection == 1.0).all())
+        """Whether every sensor that is on reports the target in the cells that it covers."""
+        certain = self.coverage is None or self.coverage.perfect
+        return certain and bool((self.detection == 1.0).all())
 
     @cached_property
     def safe(self) -> bool:
@@ -181,6 +224,53 @@ class Task:
         """`[..., M]`, the cells that the sensors of `action` `[..., S]` see: the action itself, but for footprints."""
         return action if self.coverage is None else self.coverage.cells(action)
 
+    @cached_property
+    def available(self) -> BoolArray:
+        """`[S]`, whether there is a sensor."""
+        return ~np.isnan(self.cost)
+
+    @cached_property
+    def paid(self) -> Array:
+        """`[S]` prices of the sensors; 0 where there is none."""
+        return np.where(self.available, self.cost, 0.0)
+
+    @cached_property
+    def prices(self) -> Array:
+        """`[S]` prices for a planner: where there is no sensor so high that none is ever worth it."""
+        return np.where(self.available, self.cost, NEVER)
+
+    def choosable(
+        self, start: npt.NDArray[Any] | None, sensors: npt.NDArray[Any]
+    ) -> BoolArray | None:
+        """`[E]`, whether `sensors` `[E]` exist and can be chosen, the target last located in `start` `[E]`.
+
+        Without `start` the window is left out of account. None: all can.
+        """
+        possible = None if self.available.all() else self.available[sensors]
+        if self.window is None or start is None:
+            return possible
+        if self.coverage is None:
+            near = apart(self.columns, start, sensors) <= self.window
+        else:
+            # SciPy gives a sparse array, not one of bools, where no pair is asked for.
+            near = self.sensors_near[start, sensors] if len(start) else np.zeros(0, dtype=np.bool_)
+        return near if possible is None else near & possible
+
+    @cached_property
+    def sensors_near(self) -> sparse.csr_array:
+        """`[M, S]` bool, the sensors with a cell of their footprint in the window around each cell."""
+        assert self.coverage is not None
+        assert self.window is not None
+        around = window_cells(self.size, self.window)
+        return sparse.csr_array(around.astype(np.int32) @ (self.coverage.by_cell > 0)) > 0
+
+    @cached_property
+    def sees_by_cell(self) -> sparse.csr_array:
+        """`[M, S]` CSR, probability that a sensor that is on reports a target in a cell."""
+        if self.coverage is None:
+            return sparse.diags_array(self.detection, format="csr")
+        return sparse.csr_array(self.coverage.matrix.multiply(self.detection).T.tocsr())
+
     @property
     def safe_misses(self) -> Array | float:
         """`[M]` 1 - p_s; simply 0.0 where the safe action always locates."""
@@ -188,7 +278,7 @@ class Task:
 
     @cached_property
     def keys(self) -> KeySpace:
-        """What a policy may remember at a detection; with `memory` "cell" the keys are the cells, or (cell, mode)."""
+        """The keys that a policy may have at a detection; with `memory` "cell" the cells, or (cell, mode)."""
         return KeySpace(self.size, self.t_max, self.memory, self.clip, self.revealed)
 
     def remembering(self, memory: str = "cell", *, clip: int = 2, revealed: int = 1) -> Task:
@@ -206,14 +296,44 @@ class Task:
         return self.keys.num_classes > 1
 
     @property
-    def pair_bytes(self) -> int:
-        """Bytes that exact evaluation takes where targets have a mode (`HiddenWorld`)."""
-        return 0
-
-    @property
     def num_keys(self) -> int:
         """Plans of a policy, one for each key."""
         return self.keys.num_keys
+
+    def card(self) -> Card:
+        """Size, prices and limits."""
+        return Card(f"{type(self).__name__}: {grid_words(self.size)}", self.facts())
+
+    def facts(self) -> Facts:
+        """The figures of the card."""
+        misses = "1 miss" if self.t_max == 0 else f"{self.num_choices} misses"
+        found = {
+            "T_max": f"{self.t_max}",
+            "price": f"{span(np.nanmin(self.cost), np.nanmax(self.cost))} per sensor and step",
+            "safe action": f"D = {self.safe_cost:g}, forced after {misses}",
+            "reward": f"{self.reward:g} per detection",
+            "sensors": self._sensor_words(),
+        }
+        if self.keyed:
+            found["memory"] = f"{self.memory}, {self.num_keys:,} keys"
+        if self.max_steps is not None:
+            found["max_steps"] = f"{self.max_steps:,}"
+        return found
+
+    def _sensor_words(self) -> str:
+        """Number, reach and reliability of the sensors."""
+        words = [f"{self.available.sum():,}, one per cell"]
+        if self.coverage is not None:
+            covered = np.diff(self.coverage.matrix.indptr)
+            words = [
+                f"{self.available.sum():,}, each over {span(covered.min(), covered.max())} cells"
+            ]
+        if self.window is not None:
+            words.append(f"up to {self.window} cells from the last located cell")
+        for name, chances in (("p_d", self.detection), ("p_s", self.safe_detection)):
+            if (chances < 1.0).any():
+                words.append(f"{name} {span(chances.min(), chances.max())}")
+        return "; ".join(words)
 
     @property
     def task(self) -> Task:
@@ -222,56 +342,139 @@ class Task:
 
     @property
     def given(self) -> dict[str, Any]:
-        """All that a `Task` holds, as arguments of its constructor and of that of `World`."""
+        """All that a `Task` holds, as arguments of its constructor and of `World`'s."""
         return {name: getattr(self, name) for name in Task.__dataclass_fields__}
 
 
-@dataclass(frozen=True, eq=False, init=False)
+@dataclass(frozen=True, eq=False, init=False, repr=False)
 class World(Task):
     """A task together with the target's motion (paper, Section II), which solvers may read and learners may not.
 
+    The target has a hidden state z = cell · modes + mode. With one mode, the default, the state is the cell.
+
     Args:
-        kernel: `[M, M]` table of P, sparse or dense.
+        kernel: `[Z, Z]` table of P, sparse or dense, Z = M · modes.
         size: see `Task`, as are all further arguments.
+        modes: H, modes of the target in each cell, such as headings or regimes.
+        reveals: whether a detection reveals the mode as well (Doppler, AIS).
 
     Attributes:
-        kernel: `[M, M]` canonical CSR matrix P of float64, without explicit zeros; row i sums to 1 - p_exit(i).
+        kernel: `[Z, Z]` canonical CSR matrix of float64, without explicit zeros; row z sums to 1 - p_exit(z).
+        modes: H.
 
     Raises:
         UserError: `kernel` is no sub-stochastic table for this grid, or without `max_steps` some cell has no way out.
     """
 
     kernel: sparse.csr_array
+    modes: int
 
     def __init__(
         self,
         kernel: sparse.sparray | sparse.spmatrix | npt.NDArray[np.generic],
         size: Size,
+        *,
+        modes: int = 1,
+        reveals: bool = False,
         **of_task: Unpack[TaskOptions],
     ) -> None:
-        super().__init__(size, **of_task)  # type: ignore[arg-type]  # which makes arrays of them
-        # Checked after it is canonical: duplicates are added up and zeros dropped, so that the checks see what solvers
-        # will.
+        modes = _at_least(1, "modes", modes)
+        known = modes if reveals else of_task.get("revealed", 1)
+        if known not in (1, modes):
+            raise UserError(f"revealed={known}: expected 1 or {modes}, the modes of the target")
+        own = {"revealed": known} | ({"markov": known == modes} if modes > 1 else {})
+        super().__init__(size, **(of_task | own))  # type: ignore[arg-type]  # which makes arrays of them
+        # Checked in canonical form: duplicates are added up and zeros dropped, as solvers will see it.
         canonical = canonical_kernel(kernel)
-        check_kernel(canonical, self.size, truncates=self.max_steps is not None)
-        object.__setattr__(self, "kernel", canonical)
+        # As if every hidden state were a cell of a grid with H times as many columns.
+        shape = (self.rows, self.columns * modes)
+        check_kernel(canonical, shape, truncates=self.max_steps is not None, modes=modes)
+        object.__setattr__(self, "kernel", canonical)  # the dataclass is frozen
+        object.__setattr__(self, "modes", modes)
 
     @classmethod
-    def of(cls, task: Task, kernel: sparse.sparray | npt.NDArray[np.generic], **changes: Any) -> World:
-        """The world of a task with a `kernel` `[M, M]`; `changes` are arguments that differ from the task's."""
+    def of(
+        cls, task: Task, kernel: sparse.sparray | npt.NDArray[np.generic], **changes: Any
+    ) -> World:
+        """The world of a task with a `kernel` `[Z, Z]`; `changes` are arguments that differ from the task's."""
         return cls(kernel, **(task.given | changes))
+
+    def but(self, **changes: Any) -> World:
+        """The same motion in a task that differs in `changes`."""
+        return World(self.kernel, modes=self.modes, **(self.given | changes))
+
+    def facts(self) -> Facts:
+        """The figures of the card, those of the motion among them."""
+        if self.modes == 1:
+            return super().facts() | {"motion": motion_words(self.kernel, "cell")}
+        shown = "shown by a detection" if self.revealed > 1 else "hidden"
+        motion = motion_words(self.kernel, "state")
+        return super().facts() | {"motion": motion, "modes": f"{self.modes}, {shown}"}
+
+    @property
+    def model(self) -> World:
+        """The world itself; of recorded tracks None."""
+        return self
+
+    @property
+    def selection(self) -> World:
+        """The problem that learning evaluates on: of recorded tracks the validation part."""
+        return self
+
+    @property
+    def tells_all(self) -> bool:
+        """Whether a detection reveals the whole state: there is one mode, or it is shown."""
+        return self.revealed == self.modes
+
+    @property
+    def num_states(self) -> int:
+        """Z = M · H."""
+        return self.num_cells * self.modes
+
+    @cached_property
+    def motion(self) -> Motion:
+        """The target as a chain of hidden states."""
+        states = np.arange(self.num_states)
+        return Motion(self.kernel, states // self.modes, states, self.stay_probability, self.modes)
+
+    @cached_property
+    def drift(self) -> Array:
+        """`[H, 2]` mean rows and columns of a step in each mode, over all cells alike: the look of a mode."""
+        moves = self.kernel.tocoo()
+        before, (cell, mode) = moves.row // self.modes, np.divmod(moves.col, self.modes)
+        steps = (
+            cell // self.columns - before // self.columns,
+            cell % self.columns - before % self.columns,
+        )
+        weight = np.maximum(np.bincount(mode, moves.data, self.modes), 1e-300)
+        return np.stack(
+            [np.bincount(mode, moves.data * step, self.modes) / weight for step in steps], axis=1
+        )
 
     @cached_property
     def stay_probability(self) -> Array:
-        """`[M]` probability of still being in the grid after one step, 1 - p_exit."""
+        """`[Z]` probability of still being in the grid after one step, 1 - p_exit."""
         # Not kernel.sum(axis=1), which may differ in the last digit from the sums of the same kernel written out.
         return pairwise_row_sums(self.kernel)
 
-    @cached_property
-    def safe_gain(self) -> Array:
-        """`[M]` expected reward of one safe action when the target is in each cell: r sum_j P_xj p_s(j) - D P_in(x)."""
-        gain: Array = (self.reward - self.safe_cost) * self.stay_probability
-        return gain if self.safe else gain - self.reward * (self.kernel @ (1.0 - self.safe_detection))
+
+def motion_words(kernel: sparse.csr_array, state: str) -> str:
+    """Successors of a state and the probability of leaving the grid, averaged over all rows of `kernel`."""
+    rows = kernel.shape[0]
+    left = max(0.0, 1.0 - float(kernel.sum()) / rows)
+    return f"{kernel.nnz / rows:.3g} successors per {state}, exit probability {left:.3g} (means)"
+
+
+def window_cells(size: tuple[int, int], window: int) -> sparse.csr_array:
+    """`[M, M]` bool, the cells up to `window` rows and columns away from each cell."""
+    # A cell is near where its row is and its column is: the Kronecker product of both.
+    rows, columns = (
+        sum(sparse.eye_array(side, k=k) for k in range(-far, far + 1))
+        for side, far in zip(size, (min(window, side - 1) for side in size), strict=True)
+    )
+    near = sparse.csr_array(sparse.kron(rows, columns, format="csr"), dtype=np.bool_)
+    near.sort_indices()
+    return near
 
 
 def apart(columns: int, start: npt.NDArray[Any], end: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -287,9 +490,34 @@ def grid_size(size: Size) -> tuple[int, int]:
         UserError: these are no whole numbers of at least 1.
     """
     pair = (size, size) if isinstance(size, (int, np.integer)) else tuple(size)
-    if len(pair) != 2 or not all(isinstance(side, (int, np.integer)) and side >= 1 for side in pair):
+    if len(pair) != 2 or not all(
+        isinstance(side, (int, np.integer)) and side >= 1 for side in pair
+    ):
         raise UserError(f"size={size}: expected an integer >= 1, or two of them, rows and columns")
     return int(pair[0]), int(pair[1])
+
+
+TASK_BYTES = 24
+"""Bytes of each cell of any task: its price, p_d and p_s."""
+
+
+def check_fits(key: str, size: Size, cell_bytes: int) -> None:
+    """See that a grid fits into free memory, before any of it is asked for.
+
+    Without it a system that promises more than it has (Linux does) kills the process, or another one, and no message
+    is left.
+
+    Args:
+        key: the option or argument, for messages.
+        size: of the grid.
+        cell_bytes: needed for each cell at the least.
+
+    Raises:
+        UserError: it does not fit.
+    """
+    needed, free = math.prod(grid_size(size)) * cell_bytes, free_bytes()
+    if needed > free:
+        raise UserError(f"{key}={size}: needs about {gib(needed)}, {gib(free)} are available")
 
 
 def _price(name: str, value: float, most: float = LARGEST_PRICE) -> float:

@@ -1,27 +1,25 @@
 """Targets with a hidden mode: the next move depends on the cell and on a mode, such as a heading, that is not shown.
 
-A hidden state is z = cell · H + mode, H modes in every cell. The tracker sees cells alone, so that what it knows at a
-detection is what it remembers (`task.memory`), not the state; or the state itself, where a detection tells the mode too
-(`kernel.reveals`: Doppler, AIS).
+A hidden state is z = cell · H + mode, H modes in every cell. The tracker sees cells alone: at a detection it knows its
+key (`task.memory`), not the state; or the state itself, where a detection reveals the mode (`kernel.reveals`: Doppler,
+AIS).
 
-A target first changes its mode, by a table S of its own, then moves as the new mode says: Q((x, u), (y, v)) =
+A target first changes its mode, by a table S of its own, then moves by the new mode: Q((x, u), (y, v)) =
 S(u, v) P_v(x, y).
 
 Targets that move at a velocity, in metres and seconds, on a grid of cells: constant velocity, coordinated turn.
 
 The models of Bar-Shalom, Li and Kirubarajan (2001): in each step v' = R(ω) v + w, R(ω) a turn by ω, w the noise, and
 the target moves by v'. On a grid neither the velocity nor the displacement is rounded, which would lose every speed
-under half a cell, but dithered: a number y becomes floor(ξ + y), ξ uniform in [0, 1), whose mean is y exactly, and
-whose variance is f (1 - f), f the fractional part of y. A velocity is so brought to the next multiples of the spacing,
+under half a cell, but dithered: a number y becomes floor(ξ + y), ξ uniform in [0, 1), with mean y exactly and variance
+f (1 - f), f the fractional part of y. A velocity is so brought to the next multiples of the spacing,
 and a displacement to whole cells: ξ is then where in its cell the target is, which the grid forgets.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, TypeAlias, Unpack
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -30,117 +28,11 @@ from scipy.special import ndtr
 
 from trackmdp.config.options import GROUPS
 from trackmdp.config.registry import make
-from trackmdp.errors import UserError
 from trackmdp.world.checks import canonical_kernel, check_kernel
-from trackmdp.world.model import Array, Size, Task, TaskOptions, World, grid_size
-from trackmdp.world.rows import pairwise_row_sums
+from trackmdp.world.model import Array, Size, grid_size
 
 _HEADINGS = np.array([(0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1), (1, 0), (1, 1)])
 """Rows and columns of a step; 0 is to the right, and each of the eight turns left by 45 degrees."""
-
-
-@dataclass(frozen=True, eq=False, init=False)
-class HiddenWorld(Task):
-    """A task together with the motion of a target whose mode is hidden.
-
-    Args:
-        kernel: `[M · H, M · H]` sub-stochastic, sparse or dense, on the hidden states z = cell · H + mode.
-        modes: H.
-        size: of the grid; further arguments are those of `Task`, `revealed` being 1, or H where a detection tells the
-            mode.
-
-    Attributes:
-        kernel: canonical CSR; row z sums to 1 - p_exit(z).
-        modes: H.
-
-    Raises:
-        UserError: the kernel is none for this grid, or the safe action may miss.
-    """
-
-    kernel: sparse.csr_array
-    modes: int
-
-    def __init__(
-        self,
-        kernel: sparse.sparray | npt.NDArray[np.generic],
-        size: Size,
-        *,
-        modes: int,
-        **of_task: Unpack[TaskOptions],
-    ) -> None:
-        # Where a detection tells the mode, what comes next depends on what it tells alone.
-        super().__init__(size, **(of_task | {"markov": of_task.get("revealed", 1) == modes}))  # type: ignore[arg-type]  # as in `World`
-        if not self.safe:
-            raise UserError("kernel: with a hidden mode the safe action must not miss")
-        if self.revealed not in (1, modes):
-            raise UserError(f"revealed={self.revealed}: expected 1 or {modes}, the modes of the target")
-        if self.window is not None or self.max_steps is not None:
-            raise UserError("kernel: with a hidden mode, expected grid.window=null and grid.max_steps=null")
-        if self.coverage is not None:
-            raise UserError("kernel: with a hidden mode, expected sensors that each cover one cell")
-        canonical = canonical_kernel(kernel)
-        # As if every hidden state were a cell of a grid with H times as many columns.
-        check_kernel(canonical, (self.rows, self.columns * modes), truncates=False, modes=modes)
-        for name, value in (("kernel", canonical), ("modes", modes)):
-            object.__setattr__(self, name, value)  # the dataclass is frozen
-
-    def but(self, **changes: Any) -> HiddenWorld:
-        """The same motion in a task that differs in `changes`."""
-        return HiddenWorld(self.kernel, modes=self.modes, **(self.given | changes))
-
-    @cached_property
-    def pair_bytes(self) -> int:
-        """About what following the target from every pair (key, mode) takes (`trackmdp.solvers.keyed`).
-
-        Counted on 256 hidden states, or all: where the target may be after 1 ... t_max + 2 moves, and the moves there.
-        """
-        start = np.unique(np.linspace(0, self.num_states - 1, 256).astype(np.int64))
-        moves = sparse.csr_array(self.kernel.astype(bool))
-        reached = sparse.csr_array(
-            (np.ones(len(start), dtype=bool), (np.arange(len(start)), start)), shape=(len(start), self.num_states)
-        )
-        fan, places, steps = np.diff(moves.indptr), 0, [0]
-        for _ in range(self.num_choices + 1):
-            steps.append(int(fan[reached.indices].sum()))
-            reached = reached @ moves
-            places += reached.nnz
-        # Measured: 64 bytes a place, 12 a move, and 48 more while the last moves are sorted.
-        pairs = self.num_keys if self.revealed > 1 else self.num_keys * self.modes
-        return int((64 * places + 12 * sum(steps) + 48 * steps[-1]) * pairs / len(start))
-
-    @property
-    def num_states(self) -> int:
-        """M · H."""
-        return self.num_cells * self.modes
-
-    @cached_property
-    def drift(self) -> Array:
-        """`[H, 2]` mean rows and columns of a step in each mode, over all cells alike: what a mode looks like."""
-        moves = self.kernel.tocoo()
-        before, (cell, mode) = moves.row // self.modes, np.divmod(moves.col, self.modes)
-        steps = (cell // self.columns - before // self.columns, cell % self.columns - before % self.columns)
-        weight = np.maximum(np.bincount(mode, moves.data, self.modes), 1e-300)
-        return np.stack([np.bincount(mode, moves.data * step, self.modes) / weight for step in steps], axis=1)
-
-    @cached_property
-    def stay_probability(self) -> Array:
-        """`[M · H]` probability of still being in the grid after one step."""
-        return pairwise_row_sums(self.kernel)
-
-
-Modelled: TypeAlias = World | HiddenWorld
-"""A task with a motion model."""
-
-
-def check_revealed(problem: Task, told: int) -> None:
-    """See that a policy that knows `told` modes apart at a detection can act in `problem`; 1 where it knows none.
-
-    Raises:
-        UserError: the targets have other modes, or none.
-    """
-    modes = problem.modes if isinstance(problem, HiddenWorld) else 1
-    if told not in (1, modes):
-        raise UserError(f"policy: made for targets with {told} modes; expected {modes}")
 
 
 def turning_back(
@@ -178,10 +70,14 @@ def turning_back(
     begin = cell * modes + before[:, None]
     begin, weight = (np.broadcast_to(each, end.shape).ravel() for each in (begin, weight))
     some, states = weight > 0, rows * columns * modes
-    return sparse.csr_array((weight[some], (begin[some], end.ravel()[some])), shape=(states, states))
+    return sparse.csr_array(
+        (weight[some], (begin[some], end.ravel()[some])), shape=(states, states)
+    )
 
 
-def heading_kernel(size: Size, *, keep: float, go: float, exit_probability: float) -> tuple[sparse.csr_array, int]:
+def heading_kernel(
+    size: Size, *, keep: float, go: float, exit_probability: float
+) -> tuple[sparse.csr_array, int]:
     """Eight headings: kept with `keep`, else turned by 45 degrees to either side; then a step that way with `go`.
 
     At the border the target turns back: it stays in its cell, with the opposite heading. It leaves the grid from
@@ -198,7 +94,9 @@ def heading_kernel(size: Size, *, keep: float, go: float, exit_probability: floa
     return turning_back(size, switch, offsets, shares, (modes + 4) % 8, exit_probability), 8
 
 
-def regimes(size: Size, *, stay: float | list[float], regimes: list[dict[str, Any]]) -> tuple[sparse.csr_array, int]:
+def regimes(
+    size: Size, *, stay: float | list[float], regimes: list[dict[str, Any]]
+) -> tuple[sparse.csr_array, int]:
     """The regime is kept with `stay`, else any other is as likely; then the target moves by the new one's kernel.
 
     Args:
@@ -212,10 +110,14 @@ def regimes(size: Size, *, stay: float | list[float], regimes: list[dict[str, An
     Raises:
         UserError: a table is no kernel for this grid.
     """
-    kernels = [_regime(size, f"kernel.regimes[{place}]", entry) for place, entry in enumerate(regimes)]
+    kernels = [
+        _regime(size, f"kernel.regimes[{place}]", entry) for place, entry in enumerate(regimes)
+    ]
     count = len(kernels)
     kept = np.broadcast_to(np.asarray(stay, dtype=np.float64), (count,))
-    return switching(kernels, np.where(np.eye(count) > 0, kept[:, None], (1.0 - kept[:, None]) / (count - 1))), count
+    return switching(
+        kernels, np.where(np.eye(count) > 0, kept[:, None], (1.0 - kept[:, None]) / (count - 1))
+    ), count
 
 
 def switching(kernels: list[sparse.csr_array], switch: Array) -> sparse.csr_array:
@@ -224,7 +126,10 @@ def switching(kernels: list[sparse.csr_array], switch: Array) -> sparse.csr_arra
     Q((x, u), (y, v)) = S(u, v) P_v(x, y): the Kronecker product of P_v and of S with its column v alone, for each v.
     """
     columns = np.eye(len(kernels))
-    parts = [sparse.kron(kernel, sparse.csr_array(switch * own)) for kernel, own in zip(kernels, columns, strict=True)]
+    parts = [
+        sparse.kron(kernel, sparse.csr_array(switch * own))
+        for kernel, own in zip(kernels, columns, strict=True)
+    ]
     return sparse.csr_array(sum(parts[1:], parts[0]))
 
 
@@ -246,8 +151,8 @@ def constant_velocity(size: Size, **motion: float) -> tuple[sparse.csr_array, in
 
     Args:
         size: of the grid.
-        motion: `cell`, its side, m; `step`, its time, s; `speed`, the greatest along rows and along columns, m/s (a
-            faster target has that); `spacing` of the velocities that are told apart, along either, m/s; `noise`,
+        motion: `cell`, its side, m; `step`, its time, s; `speed`, the greatest along rows and along columns, m/s
+            (faster targets are held to it); `spacing` of the velocities, along either, m/s; `noise`,
             standard deviation of the acceleration along either, m/s², the same for the whole step; `exit_probability`
             of leaving the grid, from anywhere.
 
@@ -257,13 +162,15 @@ def constant_velocity(size: Size, **motion: float) -> tuple[sparse.csr_array, in
     return _turning(size, np.zeros(1), np.ones((1, 1)), **motion)
 
 
-def coordinated_turn(size: Size, *, turn_rate: float, stay: float, **motion: float) -> tuple[sparse.csr_array, int]:
+def coordinated_turn(
+    size: Size, *, turn_rate: float, stay: float, **motion: float
+) -> tuple[sparse.csr_array, int]:
     """A turn by ω in {-ω0, 0, ω0} in each step: v' = R(ω) v + w.
 
     Args:
         size: of the grid.
         turn_rate: ω0 in degrees/s.
-        stay: probability that ω is what it was; else each of the other two is as likely.
+        stay: probability that ω stays the same; else each of the other two is as likely.
         motion: see `constant_velocity`.
 
     Returns:
@@ -292,20 +199,24 @@ def _turning(
         sine, cosine = math.sin(math.radians(rate * step)), math.cos(math.radians(rate * step))
         turned = velocity @ np.array([[cosine, sine], [-sine, cosine]])
         # The new turn first, from whichever it was, then the velocity that it leads to.
-        switch[..., turn] = change[:, turn, None] * _changes(turned, velocity, spacing, noise * step)[:, None]
+        switch[..., turn] = (
+            change[:, turn, None] * _changes(turned, velocity, spacing, noise * step)[:, None]
+        )
     modes = turns * len(velocity)
     offsets, shares = steps_of(velocity.repeat(turns, axis=0) * step / cell)
     # Velocities are listed symmetrically about 0, so that the opposite of the k-th is the k-th from the end. Turning
     # back keeps the turn.
     opposite = (np.arange(len(velocity))[::-1, None] * turns + np.arange(turns)).ravel()
-    return turning_back(size, switch.reshape(modes, modes), offsets, shares, opposite, exit_probability), modes
+    return turning_back(
+        size, switch.reshape(modes, modes), offsets, shares, opposite, exit_probability
+    ), modes
 
 
 def dithered(mean: Array, deviation: float, reach: int) -> Array:
     """`[..., 2 reach + 1]` probability of each whole number from -reach to reach for floor(ξ + mean + w).
 
-    ξ is uniform in [0, 1), w normal with `deviation`, cut off at 4 of them. The mean is exact; the variance is that of
-    w, and f (1 - f) averaged over it. What lies beyond `reach` counts as that.
+    ξ is uniform in [0, 1), w normal with `deviation`, cut off at 4 of them. The mean is exact; the variance is w's plus
+    the mean of f (1 - f) over w. Numbers beyond `reach` count as `reach`.
     """
     whole = np.arange(-reach, reach + 1) - mean[..., None]
     # floor(ξ + y) <= k has the probability (k + 1 - y)_+ - (k - y)_+: 1 up to y = k, then falling to 0 at k + 1.

@@ -1,10 +1,10 @@
-"""Recorded positions of targets, report by report, and readers of what people have them in.
+"""Recorded positions of targets, report by report, and readers of the usual files.
 
-A reader takes an open file and returns `Positions`; what it must leave out it counts. Reading is left to well-kept
+A reader takes an open file and returns `Positions`; reports that are left out are counted. Reading is left to well-kept
 libraries (the extra `tracks`), each imported when a file of its kind is met: tables of CSV and Parquet with their usual
 columns, those of AIS and ADS-B among them, GeoJSON, GPX, MOT-Challenge text, SUMO's fcd-output.
 
-Whatever a reader raises over a damaged file ends in one line (`track_files.read_positions`). XML is refused where it
+Any error of a reader over a damaged file ends in one line (`track_files.read_positions`). XML is refused where it
 declares a document type: no entity is ever expanded, and nothing is fetched.
 """
 
@@ -72,7 +72,14 @@ class Positions:
 
 
 def table_of(
-    ids: Any, times: Any, x: Any, y: Any, piece: Any = 0, *, dropped: Mapping[str, int] | None = None, **are: Any
+    ids: Any,
+    times: Any,
+    x: Any,
+    y: Any,
+    piece: Any = 0,
+    *,
+    dropped: Mapping[str, int] | None = None,
+    **are: Any,
 ) -> Positions:
     """`Positions` of columns as a file has them, in any order, some of them perhaps empty.
 
@@ -82,15 +89,20 @@ def table_of(
         x: to the right, or degrees of longitude.
         y: upwards, or degrees of latitude.
         piece: numbers of the pieces that the file itself keeps apart; 0: each target's path is one.
-        dropped: what was left out before.
+        dropped: reports left out before.
         are: `geographic` and `downwards`, as of `Positions`.
     """
     import pandas as pd
 
-    frame = pd.DataFrame({"id": ids, "time": _seconds(pd.Series(times)), "x": _number(x), "y": _number(y)})
+    frame = pd.DataFrame(
+        {"id": ids, "time": _seconds(pd.Series(times)), "x": _number(x), "y": _number(y)}
+    )
     frame["piece"] = piece
-    # inf is no position either; AIS says 91 and 181 degrees where the receiver of a ship knows none.
-    good = np.isfinite(frame[["time", "x", "y"]].to_numpy(dtype=np.float64)).all(axis=1) & frame["id"].notna()
+    # inf is no position either; AIS gives 91 and 181 degrees where the receiver of a ship knows none.
+    good = (
+        np.isfinite(frame[["time", "x", "y"]].to_numpy(dtype=np.float64)).all(axis=1)
+        & frame["id"].notna()
+    )
     good &= ((frame["x"].abs() <= 180) & (frame["y"].abs() <= 90)) | (not are.get("geographic"))
     kept = frame[good].copy()
     kept["track"] = np.unique(kept["id"].astype(str), return_inverse=True)[1]
@@ -99,8 +111,12 @@ def table_of(
     once = ~kept.duplicated(["track", "piece", "time"])
     counts = {NO_POSITION: int((~good).sum()), REPEATED: int((~once).sum())}
     kept = kept[once].copy()
-    kept["piece"] = kept[["track", "piece"]].ne(kept[["track", "piece"]].shift()).any(axis=1).cumsum() - 1
-    kinds = dict.fromkeys(("track", "piece"), np.int64) | dict.fromkeys(("time", "x", "y"), np.float64)
+    kept["piece"] = (
+        kept[["track", "piece"]].ne(kept[["track", "piece"]].shift()).any(axis=1).cumsum() - 1
+    )
+    kinds = dict.fromkeys(("track", "piece"), np.int64) | dict.fromkeys(
+        ("time", "x", "y"), np.float64
+    )
     columns = {name: kept[name].to_numpy(kind) for name, kind in kinds.items()}
     return Positions(**columns, **are, dropped={**(dropped or {}), **counts})
 
@@ -133,35 +149,58 @@ _PER_POINT = ("times", "coordTimes", "timestamps")
 """Properties of a line that hold one time for each of its points, as converters of GPX write them."""
 
 
-def position_table(stream: BinaryIO) -> Positions:
-    """A table of CSV or Parquet."""
-    # Parquet begins with these four bytes, whatever the file is called.
+def frame_positions(frame: Any, own: Sequence[str] = ()) -> Positions:
+    """Positions in a DataFrame of pandas.
+
+    Args:
+        frame: a row for each report.
+        own: names of its columns, such as ``id:device_id``; by default those of `ALIASES`.
+
+    Raises:
+        ValueError: a column is missing, or holds something else.
+    """
+    columns = _chosen_columns(map(str, frame.columns), own)
+    return table_of(*(frame[name] for name in columns.values()), geographic="lon" in columns)
+
+
+def position_table(stream: BinaryIO, own: Sequence[str] = ()) -> Positions:
+    """A table of CSV or Parquet; `own` as of `frame_positions`."""
+    # Parquet begins with these four bytes, under any file name.
     parquet = stream.read(4) == b"PAR1"
     stream.seek(0)
     names = _parquet_names(stream) if parquet else first_line(stream)
-    columns = _chosen_columns(names)
+    columns = _chosen_columns(names, own)
     table = _read_parquet(stream, columns) if parquet else _read_csv(stream, names, columns)
     return table_of(*(table[name] for name in columns.values()), geographic="lon" in columns)
 
 
-def _chosen_columns(names: Iterable[str]) -> dict[str, str]:
+def _chosen_columns(names: Iterable[str], own: Sequence[str]) -> dict[str, str]:
     """Our name -> the name in the file, of id, time and then the position.
 
     Raises:
         ValueError: one is missing, or there are both x, y and lon, lat.
     """
     known = {name.strip().lower(): name for name in names}
-    found = {own: next((known[each] for each in usual if each in known), None) for own, usual in ALIASES.items()}
+    usual = ALIASES | {
+        name: (column.lower(),) for name, _, column in (each.partition(":") for each in own)
+    }
+    found = {
+        name: next((known[each] for each in columns if each in known), None)
+        for name, columns in usual.items()
+    }
     pairs = [pair for pair in (("x", "y"), ("lon", "lat")) if all(found[name] for name in pair)]
-    missing = [f"{name} ({', '.join(ALIASES[name])})" for name in ("id", "time") if not found[name]]
+    missing = [
+        f"{name} ({', '.join(usual[name][:3])})" for name in ("id", "time") if not found[name]
+    ]
     if missing or len(pairs) != 1:
         wanted = [*missing, *(["either x, y or lat, lon"] if len(pairs) != 1 else [])]
-        raise ValueError(f"columns {', '.join(known)[:80]}: expected {' and '.join(wanted)}")
+        hint = "" if own else ", or kernel.columns=[id:NAME,...]"
+        raise ValueError(f"columns {', '.join(known)[:80]}: expected {' and '.join(wanted)}{hint}")
     return {name: str(found[name]) for name in ("id", "time", *pairs[0])}
 
 
 def _read_csv(stream: BinaryIO, names: Sequence[str], columns: Mapping[str, str]) -> Any:
-    """The columns, of a stream whose first line has been read."""
+    """The columns, of a stream after its first line."""
     from pyarrow import csv
 
     here = stream.tell()
@@ -171,9 +210,13 @@ def _read_csv(stream: BinaryIO, names: Sequence[str], columns: Mapping[str, str]
     # Ids as text: the 0012 of a transponder is not 12, and hexadecimal ones such as 4e5 are no powers of ten. Arrow,
     # since pandas takes a line with a column too many for a good one where only some columns are wanted.
     options = csv.ConvertOptions(
-        include_columns=list(columns.values()), column_types={columns["id"]: "string"}, strings_can_be_null=True
+        include_columns=list(columns.values()),
+        column_types={columns["id"]: "string"},
+        strings_can_be_null=True,
     )
-    return csv.read_csv(stream, csv.ReadOptions(column_names=names), convert_options=options).to_pandas()
+    return csv.read_csv(
+        stream, csv.ReadOptions(column_names=names), convert_options=options
+    ).to_pandas()
 
 
 def _parquet_names(stream: BinaryIO) -> list[str]:
@@ -183,8 +226,12 @@ def _parquet_names(stream: BinaryIO) -> list[str]:
     file = parquet.ParquetFile(stream)
     # Some bytes of a file may unfold to any number of equal values: its own claims are held against the limit first.
     groups = (file.metadata.row_group(place) for place in range(file.metadata.num_row_groups))
-    widest = max(8, *(column.length for column in file.schema))  # of numbers, and of bytes of a fixed length
-    _check_unfolded(max(sum(group.total_byte_size for group in groups), widest * file.metadata.num_rows))
+    widest = max(
+        8, *(column.length for column in file.schema)
+    )  # of numbers, and of bytes of a fixed length
+    _check_unfolded(
+        max(sum(group.total_byte_size for group in groups), widest * file.metadata.num_rows)
+    )
     return [column.name for column in file.schema_arrow if not types.is_nested(column.type)]
 
 
@@ -192,13 +239,20 @@ def _read_parquet(stream: BinaryIO, columns: Mapping[str, str]) -> Any:
     from pyarrow import compute, parquet, types
 
     stream.seek(0)
-    # Texts as a dictionary, as they are stored: one text of megabytes may be that of every row.
-    table = parquet.read_table(stream, columns=list(columns.values()), read_dictionary=list(columns.values()))
+    # Texts as a dictionary, as they are stored: every row may have the same text of megabytes.
+    table = parquet.read_table(
+        stream, columns=list(columns.values()), read_dictionary=list(columns.values())
+    )
     for place, column in enumerate(table.columns):
         if types.is_dictionary(column.type):
-            lengths = [compute.take(compute.binary_length(part.dictionary), part.indices) for part in column.chunks]
+            lengths = [
+                compute.take(compute.binary_length(part.dictionary), part.indices)
+                for part in column.chunks
+            ]
             _check_unfolded(sum(compute.sum(each).as_py() or 0 for each in lengths))
-            table = table.set_column(place, table.column_names[place], column.cast(column.type.value_type))
+            table = table.set_column(
+                place, table.column_names[place], column.cast(column.type.value_type)
+            )
     return table.to_pandas()
 
 
@@ -227,7 +281,9 @@ def _feature(feature: Mapping[str, Any], number: int) -> Iterator[tuple[Any, ...
     # A feature without a geometry is allowed, and is nowhere.
     geometry, properties = feature["geometry"] or {}, feature.get("properties") or {}
     named = {name.lower(): value for name, value in properties.items()}
-    own = next((named[name] for name in ALIASES["id"] if named.get(name) is not None), feature.get("id"))
+    own = next(
+        (named[name] for name in ALIASES["id"] if named.get(name) is not None), feature.get("id")
+    )
     kind = geometry.get("type")
     if kind == "Point":
         time = next((named[name] for name in ALIASES["time"] if name in named), None)
@@ -240,7 +296,9 @@ def _feature(feature: Mapping[str, Any], number: int) -> Iterator[tuple[Any, ...
     per_point = {**properties, **properties.get("coordinateProperties", {})}
     times = next((per_point[name] for name in _PER_POINT if name in per_point), None)
     if times is None:
-        raise ValueError(f"feature {number + 1}: expected a time for each point, as {' or '.join(_PER_POINT)}")
+        raise ValueError(
+            f"feature {number + 1}: expected a time for each point, as {' or '.join(_PER_POINT)}"
+        )
     # Lines without an id must not become one target: two with the id 3 are two pieces of one path, two without are two.
     name = f"line {number}" if own is None else own
     for place, (line, stamps) in enumerate(zip(lines, [times] if single else times, strict=True)):
@@ -275,7 +333,7 @@ def mot(stream: BinaryIO) -> Positions:
     if table.shape[1] < 6:
         raise ValueError(f"{table.shape[1]} columns, expected frame, id, left, top, width, height")
     frame, own, left, top, width, height = (table[place] for place in range(6))
-    # In ground truth a confidence of 0 marks what is not to be counted; detections that no tracker has seen have the
+    # In ground truth a confidence of 0 marks boxes that do not count; detections that no tracker has seen have the
     # id -1.
     ignored = (table[6] == 0) if table.shape[1] > 6 else frame != frame
     nobody = (own < 0) & ~ignored
@@ -286,7 +344,7 @@ def mot(stream: BinaryIO) -> Positions:
 
 
 def sumo(stream: BinaryIO) -> Positions:
-    """What SUMO's ``--fcd-output`` writes: each time step with the vehicles and persons there, in metres."""
+    """The output of SUMO's ``--fcd-output``: each time step with the vehicles and persons there, in metres."""
     from defusedxml.ElementTree import iterparse
 
     rows: list[tuple[Any, ...]] = []
@@ -301,11 +359,13 @@ def sumo(stream: BinaryIO) -> Positions:
         elif element.tag in ("vehicle", "person"):
             rows.append((element.attrib["id"], time, element.attrib["x"], element.attrib["y"]))
         elif element.tag == "timestep":
-            root.clear()  # what has been read is let go: files of gigabytes are usual
+            root.clear()  # finished elements are let go: files of gigabytes are usual
     own, times, x, y = _columns(rows, 4)
     return table_of(own, [float(each) for each in times], x, y)
 
 
 def _columns(rows: Sequence[tuple[Any, ...]], count: int) -> list[list[Any]]:
     """The columns of rows; empty ones where there are no rows."""
-    return [list(column) for column in zip(*rows, strict=True)] if rows else [[] for _ in range(count)]
+    return (
+        [list(column) for column in zip(*rows, strict=True)] if rows else [[] for _ in range(count)]
+    )

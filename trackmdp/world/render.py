@@ -11,14 +11,18 @@ import numpy.typing as npt
 from trackmdp.world.model import BoolArray
 
 FOUND, MISSED, ON, OFF = "●", "○", "▪", "·"
-PICTURE_LEGEND = f"{FOUND} target, detected   {MISSED} target, missed   {ON} sensor on   {OFF} sensor off"
+PICTURE_LEGEND = (
+    f"{FOUND} target, detected   {MISSED} target, missed   {ON} sensor on   {OFF} sensor off"
+)
 
-# Red, green, blue; told apart in grey as well, and by those who see no red.
+# Red, green, blue; distinct in grey as well, and without red.
 _COLOURS = {FOUND: (0, 90, 181), MISSED: (220, 50, 32), ON: (255, 194, 10), OFF: (238, 238, 238)}
 _SIDE, _GAP = 16, 1  # pixels of a cell, and of the white line around it
 
 
-def symbols(size: Sequence[int], cell: int, on: BoolArray, *, found: bool, empty: Any = OFF) -> npt.NDArray[np.str_]:
+def symbols(
+    size: Sequence[int], cell: int, on: BoolArray, *, found: bool, empty: Any = OFF
+) -> npt.NDArray[np.str_]:
     """`[rows, columns]` symbols, `empty` where no sensor is on; the target's cell M, exited, is on no grid."""
     marks = np.where(on, ON, empty)
     if cell < len(marks):
@@ -47,12 +51,21 @@ def text_rows(size: Sequence[int], cell: int, on: BoolArray, *, found: bool) -> 
     return [" ".join(row) for row in symbols(size, cell, on, found=found)]
 
 
+def picture(
+    mode: str, size: Sequence[int], cell: int, on: BoolArray, *, found: bool
+) -> npt.NDArray[np.uint8] | str:
+    """The grid as `pixels` in the mode "rgb_array", else as text with its legend; arguments as for `text_rows`."""
+    if mode == "rgb_array":
+        return pixels(size, cell, on, found=found)
+    return "\n".join([*text_rows(size, cell, on, found=found), PICTURE_LEGEND])
+
+
 def pixels(size: Sequence[int], cell: int, on: BoolArray, *, found: bool) -> npt.NDArray[np.uint8]:
     """`[16 rows, 16 columns, 3]` red, green and blue; arguments as for `text_rows`."""
     marks = symbols(size, cell, on, found=found)
     picture = np.full((*marks.shape, _SIDE, _SIDE, 3), 255, dtype=np.uint8)
     for symbol, colour in _COLOURS.items():
-        # A boolean index picks whole tiles, [hits, side, side, 3], whose inner part gets the colour.
+        # A boolean index picks whole tiles, [hits, side, side, 3], and their inner part gets the colour.
         tiles = picture[marks == symbol]
         tiles[:, _GAP:-_GAP, _GAP:-_GAP] = colour
         picture[marks == symbol] = tiles

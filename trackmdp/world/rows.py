@@ -17,8 +17,8 @@ def pairwise_row_sums(matrix: sparse.csr_array) -> npt.NDArray[np.float64]:
 
     Whether a kernel is handed over dense or sparse must not show in a single digit. numpy adds pairwise: a row of M
     numbers is halved until at most 128 are left, those are added in 8 interleaved lanes, and all partial sums meet in
-    a binary tree. Zeros change no sum, so only the entries climb that tree: `_leaves` gives each column a code whose
-    bits are its way up, lanes first, and two partial sums of a row meet once their codes agree.
+    a binary tree. Zeros change no sum, so only the entries climb that tree: `_leaves` gives each column a code, its way
+    up in bits, lanes first, and two partial sums of a row meet once their codes agree.
     """
     rows = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
     codes = _codes(matrix.shape[1])[matrix.indices]
@@ -32,7 +32,9 @@ def pairwise_row_sums(matrix: sparse.csr_array) -> npt.NDArray[np.float64]:
     return total
 
 
-def merged(rows: np.ndarray, codes: np.ndarray, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def merged(
+    rows: np.ndarray, codes: np.ndarray, sums: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Partial sums of one row and one code added up, in their order."""
     new = np.ones(len(rows), dtype=bool)
     new[1:] = (rows[1:] != rows[:-1]) | (codes[1:] != codes[:-1])

@@ -4,41 +4,56 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, TypeAlias
-
-import numpy as np
+from typing import Any, TypeAlias
 
 from trackmdp.errors import UserError, require
 from trackmdp.untrusted import decoded, opened
-from trackmdp.world.files import LARGE, column_names, load_npz, npz_bytes, once
+from trackmdp.world.files import column_names, once
 from trackmdp.world.gridding import Gridding, to_tracks
-from trackmdp.world.positions import ALIASES, LONGEST, Positions, geojson, gpx, mot, position_table, sumo
-from trackmdp.world.tracks import Recorded, Tracks, check_tracks, read_tracks
+from trackmdp.world.place import Place
+from trackmdp.world.positions import (
+    ALIASES,
+    LONGEST,
+    Positions,
+    frame_positions,
+    geojson,
+    gpx,
+    mot,
+    position_table,
+    sumo,
+)
+from trackmdp.world.tracks import Tracks, check_tracks, read_tracks
 
 _GAP = 3
 """Steps that are bridged where no `kernel.max_gap` is given."""
 
-Reader: TypeAlias = Callable[[BinaryIO], Positions]
+Reader: TypeAlias = Callable[..., Positions]
 
 
 _READERS: dict[str, tuple[Sequence[str], str, Sequence[str], Reader]] = {
     "points": ((".parquet",), "a table of positions", ("pandas", "pyarrow"), position_table),
-    "geojson": ((".geojson", ".json"), "GeoJSON with the times of its points", ("pandas",), geojson),
+    "geojson": (
+        (".geojson", ".json"),
+        "GeoJSON with the times of its points",
+        ("pandas",),
+        geojson,
+    ),
     "gpx": ((".gpx",), "a GPX track log", ("gpxpy", "defusedxml", "pandas"), gpx),
     "mot": ((".txt",), "MOT-Challenge text", ("pandas",), mot),
     "sumo": ((".xml",), "SUMO's fcd-output", ("defusedxml", "pandas"), sumo),
 }
-"""Format -> how its files end, what a message calls it, the modules it takes, and what reads it."""
+"""Format -> endings of its files, its name in messages, the modules it needs, and its reader."""
 
 _FORMATS = {".npz": "cells"} | {end: kind for kind, (ends, *_) in _READERS.items() for end in ends}
 
 
-def read_positions(path: str | Path, kind: str) -> Positions:
+def read_positions(path: str | Path, kind: str, columns: Sequence[str] = ()) -> Positions:
     """The positions in a file.
 
     Args:
         path: the file; it may be a link, since the user named it.
         kind: one of the choices of `kernel.format` but `cells`.
+        columns: names of the columns of a table (`kernel.columns`).
 
     Raises:
         UserError: there is no such file, it is too large, not of that form, or without reports.
@@ -47,107 +62,95 @@ def read_positions(path: str | Path, kind: str) -> Positions:
     _, words, needed, reader = _READERS[kind]
     for module in needed:
         require(module, "tracks", source)
-    with opened(Path(path), most=LONGEST, source=source, links=True) as stream, decoded(source, words):
-        found = reader(stream)
+    if columns and kind != "points":
+        raise UserError(f"kernel.columns={list(columns)}: only for a table of positions")
+    with (
+        opened(Path(path), most=LONGEST, source=source, links=True) as stream,
+        decoded(source, words),
+    ):
+        found = reader(stream, columns) if columns else reader(stream)
     if not len(found.time):
         raise UserError(f"{source}: no positions, expected {words} ({found.read} reports read)")
     return found
 
 
 def read_track_file(
-    path: str | Path, size: tuple[int, int], exits: bool, shortest: int, format: str | None, gridding: Mapping[str, Any]
-) -> tuple[Tracks, Mapping[str, int]]:
-    """The tracks in a file, and how many of what was read, cut and dropped; of cells nothing is dropped.
+    path: Any,
+    size: tuple[int, int],
+    exits: bool,
+    shortest: int,
+    format: str | None,
+    given: Mapping[str, Any],
+) -> tuple[Tracks, Mapping[str, int], Place | None]:
+    """The tracks in a file, the counts of reports read, cut and dropped, and the place of the grid.
+
+    Of cells nothing is dropped, and their place is the one by hand.
 
     Args:
-        path: the file.
+        path: the file, or positions as a DataFrame of pandas.
         size: rows and columns of the grid.
         exits: whether the target left the grid at the end of each track.
         shortest: fewest cells of a track.
         format: one of the choices of `kernel.format`; None: by the ending of the name and the columns.
-        gridding: `step`, `cell`, `max_gap`, `origin` and `crs`, None where not given (`Gridding`).
+        given: `step`, `cell`, `max_gap`, `origin` and `crs` (`Gridding`), and `columns`; None where not given.
 
     Raises:
         UserError: the file is not of that form, an option is missing or does not go with it, or no track is left.
     """
-    kind, source = format or _format_of(path), f"kernel.path={path}"
-    given = {name: value for name, value in gridding.items() if value is not None}
+    own = {name: value for name, value in given.items() if value is not None}
+    columns = tuple(own.pop("columns", ()))
+    in_memory = not isinstance(path, str | Path)
+    source = "load_tracks" if in_memory else f"kernel.path={path}"
+    kind = "points" if in_memory or columns else format or _format_of(path)
     if kind == "cells":
-        if given:
-            name, value = next(iter(given.items()))
-            raise UserError(f"kernel.{name}={value}: only for positions; {source} holds cells")
-        return check_tracks(read_tracks(path, size, exits=exits), shortest, source), {}
-    for name, what in (("step", "seconds from one cell to the next"), ("cell", "the side of a cell in metres")):
-        if name not in given:
-            raise UserError(f"kernel.{name}: missing, expected {what}; {source} holds positions")
-    if "origin" in given:
-        given["origin"] = tuple(map(float, given["origin"]))  # of a list no hash can be taken, by which `once` keeps
-    own = {"max_gap": _GAP * given["step"]} | given
-    made = Gridding(size=size, shortest=shortest, exits=exits, **own)
-    return once(_on_grid, path, kind, made)
+        for name in ("step", "max_gap"):
+            if name in own:
+                raise UserError(
+                    f"kernel.{name}={own[name]}: only for positions; {source} holds cells"
+                )
+        place = Place.of(*(given[name] for name in ("cell", "origin", "crs")))
+        return check_tracks(read_tracks(path, size, exits=exits), shortest, source), {}, place
+    for option, expected in (
+        ("kernel.step", "seconds from one cell to the next"),
+        ("grid.cell", "the side of a cell in metres"),
+    ):
+        if option.partition(".")[2] not in own:
+            raise UserError(f"{option}: missing, expected {expected}; {source} holds positions")
+    if "origin" in own:
+        # Of a list no hash can be taken, by which `once` keeps.
+        own["origin"] = tuple(map(float, own["origin"]))
+    made = Gridding(
+        size=size, shortest=shortest, exits=exits, **({"max_gap": _GAP * own["step"]} | own)
+    )
+    if in_memory:
+        with decoded(source, "a table of positions"):
+            positions = frame_positions(path, columns)
+        return to_tracks(positions, made, source)
+    return once(_on_grid, path, format or kind, made, columns)
 
 
-def _on_grid(path: str | Path, kind: str, grid: Gridding) -> tuple[Tracks, Mapping[str, int]]:
+def _on_grid(
+    path: str | Path, kind: str, grid: Gridding, columns: Sequence[str]
+) -> tuple[Tracks, Mapping[str, int], Place]:
     """See `read_track_file`."""
-    return to_tracks(read_positions(path, kind), grid, f"kernel.path={path}")
+    return to_tracks(read_positions(path, kind, columns), grid, f"kernel.path={path}")
 
 
 def _format_of(path: str | Path) -> str:
-    """The format that the file's name stands for; of a .csv the columns tell.
+    """The format that the file's name stands for; of a .csv the columns decide.
 
     Raises:
         UserError: the ending stands for none.
     """
     suffix = Path(path).suffix.lower()
     if suffix == ".csv":
+        names = {name.strip().lower() for name in column_names("kernel.path", path)}
         positions = {name for own in ("x", "y", "lat", "lon") for name in ALIASES[own]}
-        return "points" if positions & {name.lower() for name in column_names("kernel.path", path)} else "cells"
+        of_cells = names & {"track", "cell", "row", "column"} and not names & positions
+        return "cells" if of_cells else "points"
     if suffix not in _FORMATS:
         known = ", ".join([".csv", *_FORMATS])
-        raise UserError(f"kernel.path={path}: expected a file that ends with one of {known}, or kernel.format")
-    return _FORMATS[suffix]
-
-
-_PARTS = ("tracks", "validation", "held_out")
-_KINDS = {"cells": "i", "first": "i", "exits": "b", "names": "i"}
-"""Array of `Tracks` -> kind of its numbers."""
-
-
-def recording_bytes(problem: Recorded) -> bytes:
-    """The content of `recording.npz`; the same tracks, the same bytes."""
-    return npz_bytes({f"{part}_{name}": getattr(getattr(problem, part), name) for part in _PARTS for name in _KINDS})
-
-
-def read_recording(path: str | Path, num_cells: int) -> tuple[Tracks, Tracks, Tracks] | None:
-    """The tracks to learn from, to choose by and held out; None where the file has not these, but columns.
-
-    Raises:
-        UserError: the file is missing or damaged, or a cell lies outside a grid of so many cells.
-    """
-    source = f"kernel.path={path}"
-    if Path(path).suffix != ".npz":
-        return None
-    with opened(Path(path), most=LARGE, source=source, links=True) as stream, decoded(source, "recorded tracks"):
-        arrays = load_npz(stream)
-        if set(arrays) != {f"{part}_{name}" for part in _PARTS for name in _KINDS}:
-            return None
-        learned, chosen, judged = (
-            _part({name: arrays[f"{part}_{name}"] for name in _KINDS}, num_cells) for part in _PARTS
+        raise UserError(
+            f"kernel.path={path}: expected a file that ends with one of {known}, or kernel.format"
         )
-    return learned, chosen, judged
-
-
-def _part(arrays: dict[str, Any], num_cells: int) -> Tracks:
-    for name, array in arrays.items():
-        if array.ndim != 1 or array.dtype.kind != _KINDS[name]:
-            raise ValueError(f"{name} of {array.dtype}, shape {array.shape}")
-    tracks = Tracks(
-        **{name: array if _KINDS[name] == "b" else array.astype(np.int64) for name, array in arrays.items()}
-    )
-    # Whoever replays them takes `first` for places in `cells`, and a cell for a place in tables of the grid.
-    whole = len(tracks.first) == len(tracks) + 1 == len(tracks.names) + 1 and len(tracks) > 0
-    if not (whole and tracks.first[0] == 0 and tracks.first[-1] == len(tracks.cells) and (tracks.lengths > 0).all()):
-        raise ValueError("tracks that do not follow each other")
-    if not ((tracks.cells >= 0) & (tracks.cells < num_cells)).all():
-        raise ValueError(f"a cell outside the grid of {num_cells} cells")
-    return tracks
+    return _FORMATS[suffix]

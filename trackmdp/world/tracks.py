@@ -10,12 +10,14 @@ from typing import TypeAlias, Unpack
 
 import numpy as np
 import numpy.typing as npt
+from scipy import sparse
 
 from trackmdp.errors import UserError
+from trackmdp.notebook.card import Facts
 from trackmdp.seeding import derive
 from trackmdp.world.files import once, read_columns
 from trackmdp.world.model import Array, BoolArray, Size, Task, TaskOptions, World, grid_size
-from trackmdp.world.modes import HiddenWorld
+from trackmdp.world.motion import Motion
 
 Indices: TypeAlias = npt.NDArray[np.int64]
 
@@ -63,13 +65,47 @@ class Tracks:
         # max_steps moves have max_steps + 1 cells. A track cut short has no exit any more; one of max_steps + 1 cells
         # leaves on a step too many.
         kept = np.minimum(lengths, max_steps + 1)
-        return Tracks(self.cells[step <= max_steps], ends_of(kept), self.exits & (lengths <= max_steps), self.names)
+        return Tracks(
+            self.cells[step <= max_steps],
+            ends_of(kept),
+            self.exits & (lengths <= max_steps),
+            self.names,
+        )
 
     def closed(self, num_cells: int) -> Tracks:
         """The tracks with the exit, a cell called M, as the last one where the target left."""
         # np.insert takes places in the old array: M goes before the first cell of the next track.
         cells = np.insert(self.cells, self.first[1:][self.exits], num_cells)
         return Tracks(cells, ends_of(self.lengths + self.exits), self.exits, self.names)
+
+    def steps(self, num_cells: int) -> tuple[Indices, Indices]:
+        """Cells before and after every step, `[K]` each; M after an exit."""
+        # Example: the tracks 3 4 (exit) and 7 8 stand end to end as cells = 3 4 M 7 8 with first = 0 3 5. Every place
+        # but a track's last one (2 and 4) begins a step: 3 to 4, 4 to M, 7 to 8.
+        line = self.closed(num_cells)
+        begins = np.ones(len(line.cells), dtype=bool)
+        begins[line.first[1:] - 1] = False
+        at = np.flatnonzero(begins)
+        return line.cells[at], line.cells[at + 1]
+
+    def motion(self, *, anywhere: bool = False) -> Motion:
+        """The tracks as a chain of their P points, each followed by the next one with probability 1.
+
+        Episodes start with a track, or with `anywhere` at any point that has a next step.
+        """
+        # Track 3 4, which exits, and track 7 8, which stops: points 0 1 2 3, moves from 0 to 1 and from 2 to 3. Point 1
+        # has none, so that the target exits; point 3 has none either, but the recording stops there.
+        points, last = len(self.cells), self.first[1:] - 1
+        goes_on = np.ones(points, dtype=bool)
+        goes_on[last] = False
+        ends = np.zeros(points, dtype=bool)
+        ends[last] = ~self.exits
+        count = ends_of(goes_on.astype(np.int64))
+        moves = sparse.csr_array(
+            (np.ones(count[-1]), np.flatnonzero(goes_on) + 1, count), shape=(points, points)
+        )
+        first = np.flatnonzero(~ends) if anywhere else self.first[:-1]
+        return Motion(moves, self.cells, first, goes_on.astype(np.float64), ends=ends)
 
     def digest(self) -> str:
         """SHA-256 of all that was recorded."""
@@ -79,16 +115,16 @@ class Tracks:
         return digest.hexdigest()
 
 
-@dataclass(frozen=True, eq=False, init=False)
+@dataclass(frozen=True, eq=False, init=False, repr=False)
 class Recorded(Task):
-    """A task whose target is known from recorded tracks alone.
+    """A task with recorded tracks in place of a motion model.
 
     Attributes:
         tracks: those to learn from.
         validation: those to choose between policies by (best.pt, Optuna's trials); nothing learns from them.
-        held_out: those to evaluate on at the end; no learner and no choice sees them.
+        held_out: tracks to evaluate on at the end; no learner and no choice sees them.
         anywhere: episodes begin at any recorded point, not only with a track.
-        loaded: how many of what was read, cut and dropped where positions were brought onto the grid.
+        loaded: counts of positions and tracks read, cut and dropped on the way from positions to the grid.
     """
 
     tracks: Tracks
@@ -114,14 +150,58 @@ class Recorded(Task):
         for name, value in own.items():
             object.__setattr__(self, name, value)  # the dataclass is frozen
 
+    def facts(self) -> Facts:
+        """The figures of the card, those of the recording among them."""
+        parts = {"to learn from": self.tracks, "to choose by": self.validation}
+        parts["held out"] = self.held_out
+        counts = ", ".join(f"{len(part):,} {name}" for name, part in parts.items())
+        points = sum(len(part.cells) for part in parts.values())
+        begin = "at any point of a track" if self.anywhere else "with a track"
+        recording = {"tracks": counts, "points": f"{points:,}; episodes begin {begin}"}
+        return super().facts() | recording
+
+    @property
+    def model(self) -> None:
+        """No motion model."""
+
+    @property
+    def motion(self) -> Motion:
+        """The held-out tracks, on which policies are valued, cut off after `max_steps`."""
+        return self.held_out.limited(self.max_steps).motion()
+
     @property
     def selection(self) -> Recorded:
         """The same task, evaluated on the validation tracks in place of the held-out ones."""
         return replace(self, held_out=self.validation)
 
 
-Problem: TypeAlias = World | Recorded | HiddenWorld
-"""What learning and evaluation take place in: a world with its motion model, whose modes may be hidden, or tracks."""
+Problem: TypeAlias = World | Recorded
+"""The subject of learning and evaluation: a world with its motion model, or recorded tracks."""
+
+
+def check_problem(problem: object, caller: str) -> None:
+    """Check the first argument of a public function.
+
+    Raises:
+        UserError: it is neither a world nor recorded tracks.
+    """
+    if not isinstance(problem, Problem):
+        kind = problem.__name__ if isinstance(problem, type) else type(problem).__name__
+        raise UserError(
+            f"{caller}: the first argument is a {kind}, expected a world (make_world, World) or recorded "
+            "tracks (load_tracks)"
+        )
+
+
+def modelled(problem: Problem, caller: str) -> World:
+    """The problem, if it has a motion model.
+
+    Raises:
+        UserError: it is recorded tracks.
+    """
+    if problem.model is None:
+        raise UserError(f"{caller}: needs a motion model, expected a world, not recorded tracks")
+    return problem.model
 
 
 def read_tracks(path: str | Path, size: Size, *, exits: bool) -> Tracks:
@@ -176,11 +256,13 @@ def check_tracks(tracks: Tracks, shortest: int, source: str) -> Tracks:
     return tracks
 
 
-def split(tracks: Tracks, held_out: float, validation: float, seed: int) -> tuple[Tracks, Tracks, Tracks]:
+def split(
+    tracks: Tracks, held_out: float, validation: float, seed: int
+) -> tuple[Tracks, Tracks, Tracks]:
     """Three parts drawn at random: to learn from, to choose between policies by, and held out for the last figures.
 
-    Tracks of one name stay together: the pieces of one target's path are alike, and a part that has one of them would
-    tell of the others.
+    Tracks of one name stay together: the pieces of one target's path are alike, and a piece in one part would be
+    information about the others.
 
     Args:
         tracks: all of them.
@@ -209,7 +291,9 @@ def draw_parts(tracks: Tracks, counts: Sequence[int], seed: int) -> list[Tracks]
     names, of_name = np.unique(tracks.names, return_inverse=True)
     # Example: of 10 names, with counts 2 and 1, the permutation 7 2 9 0 ... puts 7 and 2 into part 0 and 9 into part 1.
     part = np.full(len(names), len(counts))
-    part[np.random.default_rng(seed).permutation(len(names))[: sum(counts)]] = np.repeat(np.arange(len(counts)), counts)
+    part[np.random.default_rng(seed).permutation(len(names))[: sum(counts)]] = np.repeat(
+        np.arange(len(counts)), counts
+    )
     return [tracks.select(part[of_name] == each) for each in range(len(counts) + 1)]
 
 
@@ -223,7 +307,9 @@ def _integers(source: str, name: str, column: Array) -> Indices:
     bad = ~(np.abs(column) < 2**53) | (column != np.floor(column))
     if bad.any():
         entry = int(np.flatnonzero(bad)[0])
-        raise UserError(f"{source}: {name} of entry {entry + 1} is {column[entry]}, expected an integer")
+        raise UserError(
+            f"{source}: {name} of entry {entry + 1} is {column[entry]}, expected an integer"
+        )
     return column.astype(np.int64)
 
 
@@ -249,4 +335,6 @@ def _check_steps(source: str, track: Indices, step: Indices) -> None:
     at = int(np.flatnonzero(bad)[0])
     if jump[at] == 0:
         raise UserError(f"{source}: track {track[at]} has step {step[at]} twice")
-    raise UserError(f"{source}: track {track[at]} has a gap: step {step[at + 1]} follows step {step[at]}")
+    raise UserError(
+        f"{source}: track {track[at]} has a gap: step {step[at + 1]} follows step {step[at]}"
+    )

@@ -1,14 +1,14 @@
-"""The sensors that can be chosen from a located cell, a square window around it or all of the grid, and what they see.
+"""The sensors that can be chosen from a located cell: a square window around it or all of the grid.
 
-What is chosen, remembered or learned per located cell is kept in the window's own numbering, so that it costs K numbers
+Choices, memories and estimates per located cell are kept in the window's own numbering, so that they cost K numbers
 and not M. With radius 1 on 6 columns, seen from cell 7 (row 1, column 1), the K = 9 sensors of the window are
 
     local   0 1 2        cell   0  1  2
             3 4 5               6  7  8
             6 7 8              12 13 14
 
-and seen from cell 0 the local sensors 0, 1, 2, 3 and 6 lie outside the grid: nothing is there, and what is switched on
-there costs and senses nothing.
+and seen from cell 0 the local sensors 0, 1, 2, 3 and 6 lie outside the grid: nothing is there; switched on, they cost
+and sense nothing.
 """
 
 from __future__ import annotations
@@ -34,7 +34,9 @@ class Window(nn.Module):
 
     _cells: Tensor | None
 
-    def __init__(self, size: Task | Size, radius: int | None, device: torch.device | str = "cpu") -> None:
+    def __init__(
+        self, size: Task | Size, radius: int | None, device: torch.device | str = "cpu"
+    ) -> None:
         super().__init__()
         self.rows, self.columns = size.size if isinstance(size, Task) else grid_size(size)
         self.num_cells, self.radius = self.rows * self.columns, radius
@@ -46,24 +48,27 @@ class Window(nn.Module):
         self._find_tables(device)
 
     def _find_tables(self, device: torch.device | str) -> None:
-        """What `find` and `inside` look up, for windows with a radius."""
+        """The tables that `find` and `inside` look up, for windows with a radius."""
         if self.radius is None:
             return
         radius, side, k = self.radius, 2 * self.radius + 1, self.width
         # Seen from x, cell y lies in line d = S·(row y - row x + W) + (column y - column x + W). With lines of length
         # S = columns + side no two places share a d: a column too far to the left ends up behind the side of the line
-        # above, one too far to the right behind that of its own. Radius 1, 6 columns, S = 9: from 7 to 6 it is 9·1+0,
+        # above, one too far to the right behind its own line's. Radius 1, 6 columns, S = 9: from 7 to 6 it is 9·1+0,
         # local 3; from 7 to 11 (4 to the right) 9·1+5, behind the side of 3: not in the window.
         line = self.columns + side
         place = torch.arange(side * line, device=device)
         local = torch.where(place % line < side, place // line * side + place % line, k)
         outside = torch.full((1,), k, device=device)
         self._slots = nn.Buffer(torch.cat([outside, local, outside]), persistent=False)
-        code, exited = line * self._row + self._column, 4 * line * (self.rows + side)  # which lies behind every line
+        code, exited = (
+            line * self._row + self._column,
+            4 * line * (self.rows + side),
+        )  # which lies behind every line
         self._code = nn.Buffer(torch.cat([code, code.new_tensor([exited])]), persistent=False)
         # + 1: place 0 of the table stands for all that lies before it
         corner = code - radius * (line + 1) - 1
-        # A path may go on from M once its target has exited: it has the place of cell 0, told apart by callers.
+        # A path may go on from M once its target has exited: it has the place of cell 0; callers distinguish the two.
         self._corner = nn.Buffer(torch.cat([corner, corner[:1]]), persistent=False)
         groups = self.groups()
         first = torch.full((int(groups.max()) + 1,), self.num_cells, device=device)
@@ -74,13 +79,15 @@ class Window(nn.Module):
     @classmethod
     def of(cls, task: Task, device: torch.device | str = "cpu") -> Window:
         """The sensors that can be chosen in `task` (`grid.window`)."""
-        return cls(task, task.window, device)
+        return cls(task, task.numbered, device)
 
     @classmethod
     def reaching(cls, size: Task | Size, radius: int, device: torch.device | str = "cpu") -> Window:
         """A window of that radius, or the whole grid where that has no more cells; holds all cells in reach."""
         rows, columns = size.size if isinstance(size, Task) else grid_size(size)
-        return cls((rows, columns), radius if (2 * radius + 1) ** 2 < rows * columns else None, device)
+        return cls(
+            (rows, columns), radius if (2 * radius + 1) ** 2 < rows * columns else None, device
+        )
 
     @property
     def is_local(self) -> bool:
@@ -97,7 +104,9 @@ class Window(nn.Module):
     def around(self, start: Tensor) -> Tensor:
         """`[*B, K]` int64, the cells of the window of `start` `[*B]`; M where it lies outside the grid."""
         if self.radius is None:
-            return torch.arange(self.num_cells, device=start.device).expand(*start.shape, self.num_cells)
+            return torch.arange(self.num_cells, device=start.device).expand(
+                *start.shape, self.num_cells
+            )
         side = 2 * self.radius + 1
         step = torch.arange(side**2, device=start.device)
         row = (self._row[start] - self.radius).unsqueeze(-1) + step // side
@@ -135,7 +144,7 @@ class Window(nn.Module):
         if self.radius is None:
             return local
         spread = local.new_zeros(*local.shape[:-1], self.num_cells + 1)
-        # Column M takes what lies outside the grid and is cut off again.
+        # Column M takes the entries outside the grid and is cut off again.
         return spread.scatter_(-1, self.around(start), local)[..., : self.num_cells]
 
     def to_local(self, start: Tensor, everywhere: Tensor) -> Tensor:
@@ -152,9 +161,11 @@ class Window(nn.Module):
         With int64 `classes` `[M]` of the cells, also where each cell of the window is of the same class.
         """
         if classes is not None and (classes != classes[0]).any():
-            known = torch.cat([torch.unique(classes, return_inverse=True)[1], classes.new_tensor([-1])])
+            known = torch.cat(
+                [torch.unique(classes, return_inverse=True)[1], classes.new_tensor([-1])]
+            )
             return torch.unique(known[self.cells], dim=0, return_inverse=True)[1]
-        # Rows, and columns, whose distances to their two borders agree: N numbers are sorted and not all M cells, which
+        # Rows, and columns, of equal distances to their two borders: N numbers are sorted and not all M cells, which
         # learners that ask for a window in each batch would notice. Each row meets each column.
         rows, columns = (self._alike(side) for side in (self.rows, self.columns))
         return (rows[:, None] * (columns.max() + 1) + columns).ravel()
@@ -166,40 +177,11 @@ class Window(nn.Module):
         return torch.unique(margins, dim=0, return_inverse=True)[1]
 
 
-class Sight:
-    """What a task's sensors see, on one device.
-
-    Args:
-        task: its sensors.
-        device: where the tensors live.
-        everywhere: actions are over all sensors, also where the task has a window.
-    """
-
-    def __init__(self, task: Task, device: torch.device | str = "cpu", *, everywhere: bool = False) -> None:
-        self._window = Window(task, None if everywhere else task.window, device)
-        self._covering: Tensor | None = None
-        if task.coverage is None:
-            return
-        # [M + 1, d], the sensors that cover each cell, filled up with S, which there is none of; nothing covers M, the
-        # place of a target that has exited. Three cells covered by sensors 0, 0 1 and none of two, and M: 0 2, 0 1,
-        # 2 2, 2 2.
-        table, degree = task.coverage.by_cell, torch.as_tensor(task.coverage.degree)
-        covering = torch.full((task.num_cells + 1, int(degree.max())), task.coverage.num_sensors)
-        covering[:-1][torch.arange(covering.shape[1]) < degree.unsqueeze(1)] = torch.as_tensor(table.indices).long()
-        self._covering = covering.to(device)
-
-    def sees(self, action: Tensor, last: Tensor, target: Tensor) -> Tensor:
-        """`[B]` bool, whether `action` `[B, K]`, chosen from `last` `[B]`, senses `target` `[B]`; never at M."""
-        if self._covering is not None:
-            return nn.functional.pad(action, (0, 1)).gather(1, self._covering[target]).any(-1)
-        # The sensor that could see the target: K, none, where it has exited or left the window.
-        sensor, width = self._window.find(last, target), action.shape[1]
-        # Indexing needs a valid number, so K is clamped to K - 1, and what was read there is discarded by the
-        # comparison.
-        return action.gather(1, sensor.clamp_max(width - 1).unsqueeze(1)).squeeze(1) & (sensor < width)
-
-
 def _at(table: Tensor, index: Tensor) -> Tensor:
     """`table` `[N]` at an `index` of any shape; for a batch of 4,096 `table[index]` takes three times as long."""
     # For the environment's batches, a row of numbers, reshaping would take as long as looking them up.
-    return table.index_select(0, index) if index.ndim == 1 else _at(table, index.reshape(-1)).view(index.shape)
+    return (
+        table.index_select(0, index)
+        if index.ndim == 1
+        else _at(table, index.reshape(-1)).view(index.shape)
+    )

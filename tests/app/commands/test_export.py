@@ -12,21 +12,32 @@ import numpy as np
 import pytest
 import torch
 
+import trackmdp as tm
 from tests.training.runs import train
 from trackmdp.app.cli import main
+from trackmdp.policies.saved import read_sets
 from trackmdp.training.run import trained
 from trackmdp.world.model import BoolArray
 
+INPUTS = """
+import sys, numpy as np
+states = np.load("states.npz")
+cells, steps, first = states["cells"], states["steps"], str(states["first"])
+"""
 PROGRAMS = {
     "onnx": """
 import onnxruntime
 session = onnxruntime.InferenceSession("policy.onnx", providers=["CPUExecutionProvider"])
-actions, = session.run(["action"], {"last_cell": cells, "steps_since_detection": steps})
+actions, = session.run(["action"], {first: cells, "steps_since_detection": steps})
+about = session.get_modelmeta().custom_metadata_map
 """,
-    "torch_export": """
+    "pt2": """
 import torch
-policy = torch.export.load("policy.pt2").module()
-actions = policy(torch.as_tensor(cells), torch.as_tensor(steps)).numpy()
+files = {"about.txt": ""}
+program = torch.export.load("policy.pt2", extra_files=files)
+assert program.graph_signature.user_inputs == (first, "steps_since_detection")
+actions = program.module()(torch.as_tensor(cells), torch.as_tensor(steps)).numpy()
+about = dict(line.split(": ", 1) for line in files["about.txt"].splitlines())
 """,
 }
 
@@ -41,26 +52,75 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def reachable(chains: BoolArray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Every cell, every number of steps since a detection there, and the action: all sensors once it is forced."""
     m, choices, _ = chains.shape
-    cells, steps = (grid.ravel() for grid in np.meshgrid(np.arange(m), np.arange(choices + 2), indexing="ij"))
+    cells, steps = (
+        grid.ravel() for grid in np.meshgrid(np.arange(m), np.arange(choices + 2), indexing="ij")
+    )
     forced = (steps >= choices)[:, None]
     return cells, steps, chains[cells, np.minimum(steps, choices - 1)] | forced
 
 
-@pytest.mark.parametrize("form", ["onnx", pytest.param("torch_export", marks=pytest.mark.slow)])
-def test_a_program_without_this_package_gets_the_same_sets(form: str, run: Path, tmp_path: Path) -> None:
-    assert main(["export", f"run={run}", f"format={form}", f"hydra.run.dir={tmp_path}"]) == 0
+FORMS = ["onnx", pytest.param("pt2", marks=pytest.mark.slow)]
+
+
+def asked(form: str, run: Path, folder: Path, first: str) -> dict[str, str]:
+    """Export a run, and compare all actions in a program without this package; returns the metadata that it reads."""
+    assert main(["export", f"run={run}", f"format={form}", f"hydra.run.dir={folder}"]) == 0
     chains = trained(str(run), torch.device("cpu"))[1].dense()
     assert len(np.unique(chains.reshape(-1, chains.shape[2]), axis=0)) > 3
     cells, steps, actions = reachable(chains)
-    np.savez(tmp_path / "states.npz", cells=cells, steps=steps)
-    program = (
-        "import sys, numpy as np\nstates = np.load('states.npz')\ncells, steps = states['cells'], states['steps']\n"
-    )
-    program += PROGRAMS[form] + "np.save('actions.npy', actions)\nassert 'trackmdp' not in sys.modules\n"
-    subprocess.run([sys.executable, "-c", program], cwd=tmp_path, check=True)
-    exported = np.load(tmp_path / "actions.npy", allow_pickle=False)
-    assert exported.dtype == np.bool_
-    assert np.array_equal(exported, actions)
+    np.savez(folder / "states.npz", cells=cells, steps=steps, first=first)
+    program = INPUTS + PROGRAMS[form] + "np.savez('out.npz', actions=actions, **about)\n"
+    program += "assert 'trackmdp' not in sys.modules\n"
+    subprocess.run([sys.executable, "-c", program], cwd=folder, check=True)
+    exported = dict(np.load(folder / "out.npz", allow_pickle=False))
+    found = exported.pop("actions")
+    assert found.dtype == np.bool_
+    assert np.array_equal(found, actions)
+    return {name: str(value) for name, value in exported.items()}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_program_without_this_package_gets_the_same_sets(
+    form: str, run: Path, tmp_path: Path
+) -> None:
+    about = asked(form, run, tmp_path, "last_cell")
+    assert {about[name] for name in ("rows", "columns")} == {"3"}
+    assert "key_next" not in about
+
+
+@pytest.fixture(scope="module")
+def remembering(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run on 3 x 4 cells, whose policy remembers a displacement."""
+    folder, parts = tmp_path_factory.mktemp("export") / "keys", {"size": (3, 4), "clip": 1}
+    world = tm.make_world("heading", memory="displacement", cost=0.2, **parts)
+    few = {"total_frames": 1024, "frames_per_batch": 512, "envs": 64, "updates": 4, "hidden": 8}
+    tm.train(world, "hindsight", folder=folder, **few, **{"optimal.enabled": False})
+    return folder
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_with_a_memory_the_input_is_a_key_whose_formula_is_in_the_metadata(
+    form: str, remembering: Path, tmp_path: Path
+) -> None:
+    """Located in 1, missed once, then located in 6: (1, 1) down and across is number 8, class 9 of 10."""
+    about = asked(form, remembering, tmp_path, "key")
+    assert (about["rows"], about["columns"], about["memory"]) == ("3", "4", "displacement")
+    known = {"cell": 1}
+    exec(about["key_start"], {"max": max, "min": min}, known)
+    assert known["key"] == 10
+    known |= {"cell": 6, "misses": 1}
+    exec(about["key_next"], {"max": max, "min": min}, known)
+    assert known["key"] == 69
+
+
+def test_sets_hold_the_formula_too(remembering: Path, tmp_path: Path) -> None:
+    words = ["format=sets", "quiet=true", f"hydra.run.dir={tmp_path}"]
+    assert main(["export", f"run={remembering}", *words]) == 0
+    written = json.loads((tmp_path / "sets.json").read_text(encoding="utf-8"))
+    assert written["memory"]["key_start"] == "key = cell * 10"
+    policy = trained(str(remembering), torch.device("cpu"))[1]
+    again = read_sets(policy.task, tmp_path / "sets.json")
+    assert np.array_equal(again.dense(), policy.dense())
 
 
 def test_sets_are_lists_of_cells(run: Path) -> None:
@@ -71,8 +131,15 @@ def test_sets_are_lists_of_cells(run: Path) -> None:
     assert written["sets"]["4"] == [np.flatnonzero(on).tolist() for on in chains[4]]
 
 
-def test_the_best_checkpoint_is_one_that_is_kept_beside_the_newest(run: Path, tmp_path: Path) -> None:
-    assert main(["export", f"run={run}", "format=sets", "checkpoint=best", f"hydra.run.dir={tmp_path}"]) == 0
+def test_the_best_checkpoint_is_one_that_is_kept_beside_the_newest(
+    run: Path, tmp_path: Path
+) -> None:
+    assert (
+        main(
+            ["export", f"run={run}", "format=sets", "checkpoint=best", f"hydra.run.dir={tmp_path}"]
+        )
+        == 0
+    )
     best = trained(str(run), torch.device("cpu"), best=True)[1].dense()
     written = json.loads((tmp_path / "sets.json").read_text(encoding="utf-8"))
     assert written["sets"]["0"] == [np.flatnonzero(on).tolist() for on in best[0]]
@@ -83,7 +150,7 @@ def test_the_best_checkpoint_is_one_that_is_kept_beside_the_newest(run: Path, tm
     [
         ([], "run: missing, expected the folder of a run"),
         (["run=nowhere"], "run=.*nowhere: no such folder"),
-        (["run={run}", "format=pickle"], "format=pickle: expected one of torch_export, onnx, sets"),
+        (["run={run}", "format=pickle"], "format=pickle: expected one of onnx, pt2, sets, geojson"),
     ],
 )
 def test_mistakes_end_in_one_line(

@@ -17,14 +17,16 @@ SHORT = "quiet=true grid.size=3 collector.total_frames=2048 collector.frames_per
 DEFAULTS = {
     f"{file.parent.name}.{key}": source
     for file in Path(conf_dir()).glob("*/*.yaml")
-    for key, source in re.findall(r"^(\w+): \$\{([\w.]+)\}", file.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    for key, source in re.findall(
+        r"^(\w+): \$\{([\w.]+)\}", file.read_text(encoding="utf-8"), flags=re.MULTILINE
+    )
 }
 """Option -> the option it takes its value from, unless typed: reading the first reads the second."""
 
 
 OF_BLOCKS = {"partition.halo", "partition.workers", "partition.cluster"}
 """Read where there are blocks alone, which `test_blocks` learns by."""
-MIXED = " algo.updates=2 algo.collect=mixed collector.frames_per_batch=512 algo.explore.until=0.9"
+MIXED = " algo=hindsight algo.updates=2 algo.collect=mixed collector.frames_per_batch=512 algo.explore.until=0.9"
 
 
 def never_read(command: str, words: str, folder: Path) -> set[str]:
@@ -40,9 +42,10 @@ def test_train_reads_every_option(algo: str, tmp_path: Path) -> None:
     words += (
         MIXED
         if issubclass(GROUPS["algo"][algo], PerSensorConfig)
-        else " algo.prioritized.enabled=true"
-        if algo == "dqn"
-        else ""
+        else {
+            "dqn": " algo.prioritized.enabled=true",
+            "model_based": " algo.sensing=chosen algo.warm_up=1024 algo.estimate=paths",
+        }.get(algo, "")
     )
     assert never_read("train", words, tmp_path) == OF_BLOCKS
 
@@ -55,13 +58,24 @@ def test_collectors_with_workers_read_every_option(collector: str, tmp_path: Pat
 
 @pytest.mark.parametrize("baseline", BASELINES)
 def test_evaluate_reads_every_option(baseline: str, tmp_path: Path) -> None:
-    assert not never_read("evaluate", f"baseline={baseline} grid.size=3 quiet=true episodes=10", tmp_path)
+    assert not never_read(
+        "evaluate", f"baseline={baseline} grid.size=3 quiet=true episodes=10", tmp_path
+    )
 
 
 @pytest.mark.parametrize("solver", GROUPS["solver"])
 def test_solve_reads_every_option(solver: str, tmp_path: Path) -> None:
     # with blocks, without which nothing of `partition` but its block is read
-    assert not never_read("solve", f"solver={solver} grid.size=3 quiet=true partition.block=2", tmp_path)
+    assert not never_read(
+        "solve", f"solver={solver} grid.size=3 quiet=true partition.block=2", tmp_path
+    )
+
+
+@pytest.mark.parametrize("solver", GROUPS["solver"])
+def test_frontier_reads_every_option(solver: str, tmp_path: Path) -> None:
+    assert not never_read(
+        "frontier", f"solver={solver} grid.size=3 quiet=true resolution=0.1", tmp_path
+    )
 
 
 def test_verify_reads_every_option(tmp_path: Path) -> None:

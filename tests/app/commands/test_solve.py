@@ -19,7 +19,7 @@ from tests.typed import ENVIRONMENT
 from trackmdp.app.cli import main
 from trackmdp.policies import saved
 from trackmdp.solvers import bounds
-from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers.value import evaluate
 
 
 def read(folder: Path, name: str) -> dict[str, Any]:
@@ -35,8 +35,12 @@ def chains_of(policy: dict[str, Any], cells: int) -> np.ndarray:
     return chains
 
 
-def test_solution_json_holds_the_certified_optimum(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["solve", "cost.sensor=0.22", "grid.t_max=2", f"hydra.run.dir={tmp_path / 'a'}"]) == 0
+def test_solution_json_holds_the_certified_optimum(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert (
+        main(["solve", "cost.sensor=0.22", "grid.t_max=2", f"hydra.run.dir={tmp_path / 'a'}"]) == 0
+    )
     solution = read(tmp_path / "a", "solution.json")
     world = paper_world(5, 0.22, 2)
     assert solution["certified"] is True
@@ -48,12 +52,24 @@ def test_solution_json_holds_the_certified_optimum(tmp_path: Path, capsys: pytes
     assert solution["bounds"]["clocked"] == pytest.approx(bounds.clocked(world).mean())
     assert solution["seconds"] > 0
     assert solution["nodes"] == 0  # positions revealed one move late prove it without a search
-    assert "certified: bracket 90.484474" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "certified: bracket 90.484474" in printed and "│ optimal" in printed
 
 
 @pytest.mark.parametrize("solver", ["qmdp", "fcr", "lookahead", "clocked"])
 def test_other_solvers_are_bracketed_by_the_clocked_bound(tmp_path: Path, solver: str) -> None:
-    assert main(["solve", f"solver={solver}", "grid.size=4", "quiet=true", f"hydra.run.dir={tmp_path / 'a'}"]) == 0
+    assert (
+        main(
+            [
+                "solve",
+                f"solver={solver}",
+                "grid.size=4",
+                "quiet=true",
+                f"hydra.run.dir={tmp_path / 'a'}",
+            ]
+        )
+        == 0
+    )
     solution = read(tmp_path / "a", "solution.json")
     assert solution["lower"] <= solution["upper"] == pytest.approx(solution["bounds"]["clocked"])
 
@@ -63,11 +79,20 @@ def test_quiet_says_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert capsys.readouterr().out == ""
 
 
-def test_verify_prints_and_writes_every_check(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_verify_prints_and_writes_every_check(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["verify", "grid.size=4", f"hydra.run.dir={tmp_path / 'a'}"]) == 0
     checks = read(tmp_path / "a", "verification.json")["checks"]
     names = {check["name"] for check in checks}
-    assert {"Theorem 1", "Theorem 2", "Lemma 1, first", "Theorem 3, exact form", "Q_MDP", "the printed bound"} <= names
+    assert {
+        "Theorem 1",
+        "Theorem 2",
+        "Lemma 1, first",
+        "Theorem 3, exact form",
+        "Q_MDP",
+        "the printed bound",
+    } <= names
     assert all(check["passed"] for check in checks)
     printed = capsys.readouterr().out
     verdicts = [check["verdict"] for check in checks]
@@ -88,7 +113,9 @@ def test_solve_verify(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["solve", "verify"])
-def test_cut_episodes_are_refused(tmp_path: Path, command: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_cut_episodes_are_refused(
+    tmp_path: Path, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main([command, "grid.max_steps=10", f"hydra.run.dir={tmp_path / 'a'}"]) == 2
     assert capsys.readouterr().err.startswith(f"trackmdp {command}: grid.max_steps=10: ")
     assert not (tmp_path / "a").exists()
@@ -96,9 +123,23 @@ def test_cut_episodes_are_refused(tmp_path: Path, command: str, capsys: pytest.C
 
 @pytest.mark.slow
 def test_ctrl_c_prints_and_saves_the_bracket(tmp_path: Path) -> None:
-    world = ["kernel=random_walk", "kernel.diagonal=true", "grid.t_max=3", "solver.nodes=1_000_000_000"]
-    words = [sys.executable, "-m", "trackmdp.app.cli", "solve", *world, f"hydra.run.dir={tmp_path / 'a'}"]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    world = [
+        "kernel=random_walk",
+        "kernel.diagonal=true",
+        "grid.t_max=3",
+        "solver.nodes=1_000_000_000",
+    ]
+    words = [
+        sys.executable,
+        "-m",
+        "trackmdp.app.cli",
+        "solve",
+        *world,
+        f"hydra.run.dir={tmp_path / 'a'}",
+    ]
+    with subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
         assert process.stdout is not None
         for line in process.stdout:
             if "bracket" in line:  # the search is on
@@ -107,6 +148,7 @@ def test_ctrl_c_prints_and_saves_the_bracket(tmp_path: Path) -> None:
         printed, errors = process.communicate(timeout=60)
     assert process.returncode == 130
     assert "interrupted: bracket" in printed
+    assert "│ best known" in printed and "│ optimal" not in printed
     assert errors == "trackmdp solve: interrupted\n"
     solution = read(tmp_path / "a", "solution.json")
     assert solution["interrupted"] is True
@@ -123,21 +165,40 @@ def test_the_sets_of_a_solution_are_valued_again_by_evaluate(
     assert main(["solve", *world, f"hydra.run.dir={tmp_path / 'a'}"]) == 0
     name = "sets.json" if listed > 16 else "sets.npz"
     assert f"sets in {name}" in " ".join(capsys.readouterr().out.split())
-    words = ["baseline=sets", f"baseline.file={tmp_path / 'a' / name}", f"hydra.run.dir={tmp_path / 'b'}"]
+    words = [
+        "baseline=sets",
+        f"baseline.file={tmp_path / 'a' / name}",
+        f"hydra.run.dir={tmp_path / 'b'}",
+    ]
     assert main(["evaluate", *world, *words, "episodes=20", "log=[mcap]"]) == 0
-    assert read(tmp_path / "b", "evaluation.json")["exact"]["aihtr"] == read(tmp_path / "a", "solution.json")["lower"]
+    assert (
+        read(tmp_path / "b", "evaluation.json")["exact"]["aihtr"]
+        == read(tmp_path / "a", "solution.json")["lower"]
+    )
     assert (tmp_path / "b" / name).is_file()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM, signal.SIGUSR1])
-def test_a_signal_to_the_group_ends_all_workers_in_one_line(tmp_path: Path, kind: signal.Signals) -> None:
+def test_a_signal_to_the_group_ends_all_workers_in_one_line(
+    tmp_path: Path, kind: signal.Signals
+) -> None:
     words = "solve grid.size=60 grid.t_max=2 cost.sensor=0.22 partition.block=5 partition.workers=2"
-    program = [sys.executable, "-m", "trackmdp.app.cli", *words.split(), f"hydra.run.dir={tmp_path / 'a'}"]
-    with subprocess.Popen(program, stderr=subprocess.PIPE, text=True, start_new_session=True, env=ENVIRONMENT) as run:
+    program = [
+        sys.executable,
+        "-m",
+        "trackmdp.app.cli",
+        *words.split(),
+        f"hydra.run.dir={tmp_path / 'a'}",
+    ]
+    with subprocess.Popen(
+        program, stderr=subprocess.PIPE, text=True, start_new_session=True, env=ENVIRONMENT
+    ) as run:
         try:
             # a worker that still imports would be the first to write a traceback
-            while len(members(run.pid)) < 4 and run.poll() is None:  # with Python's own tracker of semaphores
+            while (
+                len(members(run.pid)) < 4 and run.poll() is None
+            ):  # with Python's own tracker of semaphores
                 pass
             os.killpg(run.pid, kind)
             said = run.stderr.read()  # type: ignore[union-attr]  # until the last of them has ended
@@ -157,3 +218,13 @@ def members(group: int) -> list[str]:
             state, _, of, *_ = file.read_text().rpartition(")")[2].split()
             found += [file.parent.name] if int(of) == group and state != "Z" else []
     return found
+
+
+@pytest.mark.parametrize("words", [["solve"], ["evaluate", "baseline=qmdp"]])
+def test_a_grid_that_cannot_fit_into_memory_is_refused_in_one_line(
+    empty_folder: Path, capsys: pytest.CaptureFixture[str], words: list[str]
+) -> None:
+    assert main([*words, "kernel=random_walk", "grid.size=1000000000", "cost.safe=16"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "grid.size=1000000000: needs about" in line
+    assert not list(empty_folder.iterdir())

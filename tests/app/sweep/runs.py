@@ -21,6 +21,7 @@ TINY = (
     "collector.total_frames=2048",
     "collector.frames_per_batch=1024",
     "collector.envs=64",
+    "algo=hindsight",
     "algo.updates=4",
     "algo.hidden=8",
     "optimal.nodes=100000",

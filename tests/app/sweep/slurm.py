@@ -25,19 +25,30 @@ def sbatch(script: str) -> None:
 def begin(task: int | None) -> None:
     """Run the script of a task of the array, as a batch step does: a shell that calls srun."""
     name = JOB if task is None else f"{JOB}_{task}"
-    mine = {"SLURM_JOB_ID": name, "SLURM_NTASKS": "1", "SLURM_JOB_NUM_NODES": "1", "SLURM_NODEID": "0"}
+    mine = {
+        "SLURM_JOB_ID": name,
+        "SLURM_NTASKS": "1",
+        "SLURM_JOB_NUM_NODES": "1",
+        "SLURM_NODEID": "0",
+    }
     mine |= {"SLURM_PROCID": "0", "SLURM_LOCALID": "0"}
     if task is not None:
         mine |= {"SLURM_ARRAY_JOB_ID": JOB, "SLURM_ARRAY_TASK_ID": str(task)}
     log = (STATE / f"{name}.out").open("a")
     process = subprocess.Popen(
-        ["bash", STATE / "script"], env=os.environ | mine, stdout=log, stderr=log, start_new_session=True
+        ["bash", STATE / "script"],
+        env=os.environ | mine,
+        stdout=log,
+        stderr=log,
+        start_new_session=True,
     )
     (STATE / f"{name}.json").write_text(json.dumps({"task": task, "pid": process.pid}))
 
 
 def srun(*words: str) -> None:
-    command = words[next(place for place, word in enumerate(words) if Path(word).name.startswith("python")) :]
+    command = words[
+        next(place for place, word in enumerate(words) if Path(word).name.startswith("python")) :
+    ]
     (STATE / f"{os.environ['SLURM_JOB_ID']}.pid").write_text(str(os.getpid()))
     os.execvp(command[0], command)
 

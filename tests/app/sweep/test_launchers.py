@@ -24,7 +24,9 @@ SLOW = ("algo.updates=100000", "algo.updates_per_iteration=10", "checkpoint.seco
 """A run that goes on until it is stopped."""
 
 needs = {
-    name: pytest.mark.skipif(importlib.util.find_spec(name) is None, reason=f"{name} is not installed")
+    name: pytest.mark.skipif(
+        importlib.util.find_spec(name) is None, reason=f"{name} is not installed"
+    )
     for name in ("joblib", "submitit", "ray")
 }
 
@@ -55,7 +57,11 @@ def holder(run: Path, sweep: Any) -> int:
     while sweep.poll() is None:
         for process in Path("/proc").iterdir():
             try:
-                opened = [str(each.readlink()) for each in (process / "fd").iterdir()] if process.name.isdigit() else []
+                opened = (
+                    [str(each.readlink()) for each in (process / "fd").iterdir()]
+                    if process.name.isdigit()
+                    else []
+                )
             except OSError:
                 continue
             if str(run / ".lock") in opened and int(process.name) != os.getpid():
@@ -93,11 +99,23 @@ def test_every_launcher_has_the_results_of_the_basic_one(
     ("launcher", "words"),
     [
         pytest.param("basic", [], marks=pytest.mark.slow),
-        *(pytest.param(*item.values, marks=[*item.marks, often]) for item, often in zip(LAUNCHERS, OFTEN, strict=True)),
+        *(
+            pytest.param(*item.values, marks=[*item.marks, often])
+            for item, often in zip(LAUNCHERS, OFTEN, strict=True)
+        ),
     ],
 )
-def test_a_run_that_is_killed_leaves_the_others(launcher: str, words: list[str], tmp_path: Path, basic: Path) -> None:
-    process = begin(tmp_path, launcher, *words, "seed=0,1,2,-1", "algo.updates=300", "algo.updates_per_iteration=1")
+def test_a_run_that_is_killed_leaves_the_others(
+    launcher: str, words: list[str], tmp_path: Path, basic: Path
+) -> None:
+    process = begin(
+        tmp_path,
+        launcher,
+        *words,
+        "seed=0,1,2,-1",
+        "algo.updates=300",
+        "algo.updates_per_iteration=1",
+    )
     wait_for(lambda: (tmp_path / "all/sweep.json").is_file(), process)
     run = next(each.folder for each in runs_of(tmp_path / "all") if "seed=1" in each.overrides)
     os.kill(holder(run, process), signal.SIGKILL)
@@ -111,20 +129,37 @@ def test_a_run_that_is_killed_leaves_the_others(launcher: str, words: list[str],
 @pytest.mark.slow
 def test_slurm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, basic: Path) -> None:
     state = slurm(tmp_path, monkeypatch)
-    words = ["hydra.launcher.partition=short", "hydra.launcher.mem_gb=2", "hydra.launcher.timeout_min=30"]
+    words = [
+        "hydra.launcher.partition=short",
+        "hydra.launcher.mem_gb=2",
+        "hydra.launcher.timeout_min=30",
+    ]
     finish(tmp_path, "submitit_slurm", *words, status=2)
     assert (tmp_path / "all/runs.csv").read_bytes() == (basic / "runs.csv").read_bytes()
     script = (state / "script").read_text()
-    for line in ("--array=0-3%4", "--partition=short", "--mem=2GB", "--time=30", "--cpus-per-task=1"):
+    for line in (
+        "--array=0-3%4",
+        "--partition=short",
+        "--mem=2GB",
+        "--time=30",
+        "--cpus-per-task=1",
+    ):
         assert f"#SBATCH {line}\n" in script
     assert "#SBATCH --signal=USR2@120\n" in script
 
 
 @needs["submitit"]
 @pytest.mark.slow
-def test_a_preempted_run_saves_is_requeued_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_preempted_run_saves_is_requeued_and_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     state = slurm(tmp_path, monkeypatch)
-    words = ["algo.updates=400", "algo.updates_per_iteration=1", "checkpoint.seconds=null", "seed=0"]
+    words = [
+        "algo.updates=400",
+        "algo.updates_per_iteration=1",
+        "checkpoint.seconds=null",
+        "seed=0",
+    ]
     process = begin(tmp_path, "submitit_slurm", *words)
     wait_for(lambda: (tmp_path / "all/sweep.json").is_file(), process)
     (run,) = runs_of(tmp_path / "all")
@@ -182,8 +217,15 @@ def test_a_signal_stops_the_sweep_in_order(launcher: str, number: int, tmp_path:
 
 
 @pytest.mark.parametrize("launcher", SLOW_AND_LONG)
-def test_a_sweep_killed_three_times_has_the_results_of_one_never_killed(launcher: str, tmp_path: Path) -> None:
-    words = ["seed=range(3)", "algo.updates=300", "algo.updates_per_iteration=1", "checkpoint.seconds=0.2"]
+def test_a_sweep_killed_three_times_has_the_results_of_one_never_killed(
+    launcher: str, tmp_path: Path
+) -> None:
+    words = [
+        "seed=range(3)",
+        "algo.updates=300",
+        "algo.updates_per_iteration=1",
+        "checkpoint.seconds=0.2",
+    ]
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     for folder in (whole, cut):
         folder.mkdir()
@@ -204,9 +246,15 @@ def test_a_sweep_killed_three_times_has_the_results_of_one_never_killed(launcher
     assert (cut / "all/runs.csv").read_bytes() == (whole / "all/runs.csv").read_bytes()
 
 
-@pytest.mark.parametrize(("launcher", "extra"), [("joblib", "sweep"), ("submitit_local", "slurm"), ("ray", "ray")])
+@pytest.mark.parametrize(
+    ("launcher", "extra"), [("joblib", "sweep"), ("submitit_local", "slurm"), ("ray", "ray")]
+)
 def test_a_launcher_that_is_not_installed_names_its_extra(
-    launcher: str, extra: str, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    launcher: str,
+    extra: str,
+    here: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert swept("seed=0", f"hydra/launcher={launcher}") == 2
@@ -222,7 +270,9 @@ def test_slurm_is_refused_where_there_is_none(
 ) -> None:
     monkeypatch.setenv("PATH", str(here))
     assert swept("seed=0", "hydra/launcher=submitit_slurm") == 2
-    assert capsys.readouterr().err.startswith("trackmdp train: hydra/launcher=submitit_slurm: expected a machine from")
+    assert capsys.readouterr().err.startswith(
+        "trackmdp train: hydra/launcher=submitit_slurm: expected a machine from"
+    )
 
 
 def test_options_of_a_launcher_are_checked(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -231,7 +281,10 @@ def test_options_of_a_launcher_are_checked(here: Path, capsys: pytest.CaptureFix
             "hydra/launcher=joblib hydra.launcher.n_jobs=0",
             "hydra.launcher.n_jobs=0: expected an integer from 1 to 1024",
         ),
-        ("hydra/launcher=jobli", "hydra/launcher=jobli: expected one of basic, joblib, ray, submitit_local, "),
+        (
+            "hydra/launcher=jobli",
+            "hydra/launcher=jobli: expected one of basic, joblib, ray, submitit_local, ",
+        ),
         ("hydra/sweeper=basic", "hydra/sweeper: expected one of blocks, optuna"),
         ("hydra/launcher=joblib hydra.launcher.jobs=2", "Could not override 'hydra.launcher.jobs'"),
     ):

@@ -18,7 +18,9 @@ from trackmdp.config import conf_dir
 from trackmdp.errors import UserError
 
 
-def planned(blocks: Sequence[str], *typed: str, sweep: Path = Path("none"), more: Sequence[str] = ()) -> list[str]:
+def planned(
+    blocks: Sequence[str], *typed: str, sweep: Path = Path("none"), more: Sequence[str] = ()
+) -> list[str]:
     """Folder names of a sweep; `more` stands for what an experiment sets."""
 
     def composed(words: Sequence[str]) -> DictConfig:
@@ -74,7 +76,9 @@ def test_words_that_make_no_grid(blocks: list[str], words: list[str], message: s
 
 
 def test_words_to_hydra_are_no_part_of_a_run() -> None:
-    assert run_words(["seed=1", "hydra.sweep.dir=x", "hydra/launcher=joblib", "+hydra.x=1"]) == ["seed=1"]
+    assert run_words(["seed=1", "hydra.sweep.dir=x", "hydra/launcher=joblib", "+hydra.x=1"]) == [
+        "seed=1"
+    ]
 
 
 def test_folders_say_what_tells_the_runs_apart() -> None:
@@ -122,6 +126,13 @@ def test_the_sweep_has_the_same_folder_in_whatever_order_it_is_typed(words: list
 def test_a_run_cannot_be_told_to_go_on_elsewhere() -> None:
     register()
     with initialize_config_dir(config_dir=conf_dir(), version_base="1.3"):
-        jobs = plan("train", Path("none"), lambda words: compose("train", overrides=list(words)), [["resume=runs/a"]])
+        jobs = plan(
+            "train",
+            Path("none"),
+            lambda words: compose("train", overrides=list(words)),
+            [["resume=runs/a"]],
+        )
     assert jobs[0].cfg is None
-    assert jobs[0].refusal.startswith(f"resume={Path.cwd() / 'runs/a'}: expected null or auto in a sweep")
+    assert jobs[0].refusal.startswith(
+        f"resume={Path.cwd() / 'runs/a'}: expected null or auto in a sweep"
+    )

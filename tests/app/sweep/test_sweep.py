@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
@@ -21,7 +22,7 @@ from tests.typed import stub
 from trackmdp.app.cli import main
 from trackmdp.app.sweep.plan import Job
 from trackmdp.app.sweep.process import stop_signal
-from trackmdp.app.sweep.sweep import sweep, write_table
+from trackmdp.app.sweep.sweep import show_runs, sweep, write_table
 from trackmdp.durable import write_sealed
 from trackmdp.errors import Preempted, RunError, UserError
 from trackmdp.reports.gather import planned
@@ -50,25 +51,38 @@ status = main({line})
 sys.exit(str((status, sorted({{"torch", "torchrl", "scipy"}} & set(sys.modules)))))
 """
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    again = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)
+    again = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False
+    )
     assert again.stderr == "(0, [])\n"
     assert "2 runs, 2 of them done before -> multirun/train-" in again.stdout
     assert "2 skipped; " in again.stdout
     assert (sweep / "runs.csv").read_bytes() == first
     after = {file: file.stat().st_mtime_ns for file in sweep.rglob("*") if file.is_file()}
-    assert {file.name for file in after if after[file] != before.get(file)} == {"sweep.json", "runs.csv"}
+    assert {file.name for file in after if after[file] != before.get(file)} == {
+        "sweep.json",
+        "runs.csv",
+    }
 
 
 def test_a_run_of_a_sweep_is_the_run_typed_alone(here: Path) -> None:
     assert swept("seed=3", "quiet=true") == 0
     assert main(["train", *TINY, "seed=3", "quiet=true", "hydra.run.dir=alone"]) == 0
     (row,) = table(here / "all")
-    assert float(row["aihtr"]) == json.loads((here / "alone/summary.json").read_text())["policy"]["aihtr"]
+    assert (
+        float(row["aihtr"])
+        == json.loads((here / "alone/summary.json").read_text())["policy"]["aihtr"]
+    )
 
 
-def test_a_mistake_in_every_run_is_told_once_and_leaves_nothing(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_mistake_in_every_run_is_told_once_and_leaves_nothing(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert swept("seed=0,1", "resume=somewhere") == 2
-    assert re.fullmatch(r"trackmdp train: resume=.*somewhere: expected null or auto [^\n]*\n", capsys.readouterr().err)
+    assert re.fullmatch(
+        r"trackmdp train: resume=.*somewhere: expected null or auto [^\n]*\n",
+        capsys.readouterr().err,
+    )
     assert not list(here.iterdir())
 
 
@@ -98,7 +112,10 @@ ENDS: list[tuple[Callable[[], Any], str]] = [
     (lambda: sys.exit(3), "SystemExit: 3"),
     (lambda: os._exit(3), "its process ended with status 3"),
     (lambda: os.kill(os.getpid(), signal.SIGKILL), "killed by SIGKILL, perhaps for lack of memory"),
-    (lambda: raised(RunError("iteration 3: the loss\nis not finite")), "iteration 3: the loss is not finite"),
+    (
+        lambda: raised(RunError("iteration 3: the loss\nis not finite")),
+        "iteration 3: the loss is not finite",
+    ),
     (lambda: raised(Preempted(15)), "stopped by signal 15"),
     (lambda: raised(MemoryError()), "MemoryError"),
     (lambda: raised(ZeroDivisionError("a bug")), "ZeroDivisionError: a bug"),
@@ -136,7 +153,9 @@ def test_the_summary_of_another_config_does_not_count(here: Path) -> None:
     assert swept("seed=0", "quiet=true") == 0
     (run,) = runs_of(here / "all")
     summary = json.loads((run.folder / "summary.json").read_text())
-    (run.folder / "summary.json").write_text(json.dumps(summary | {"config_sha256": "0", "policy": {"aihtr": 7.0}}))
+    (run.folder / "summary.json").write_text(
+        json.dumps(summary | {"config_sha256": "0", "policy": {"aihtr": 7.0}})
+    )
     assert swept("seed=0", "quiet=true") == 0
     assert json.loads((run.folder / "summary.json").read_text())["policy"] == summary["policy"]
 
@@ -147,7 +166,7 @@ def test_blocks_of_an_experiment_are_the_sweep(
     stub(monkeypatch, "train", lambda cfg, folder: 1.0)
     (here / "mine/experiment").mkdir(parents=True)
     (here / "mine/experiment/few.yaml").write_text(
-        "# @package _global_\ngrid: {size: 3}\nalgo: {updates: 4, hidden: 8}\n"
+        "# @package _global_\ngrid: {size: 3}\nalgo: {rounds: 4}\n"
         "collector: {total_frames: 2048, frames_per_batch: 1024, envs: 64}\n"
         "hydra: {sweeper: {blocks: ['kernel.support_size=3 seed=0,1', 'kernel.support_size=4 kernel.seed=7']}}\n"
     )
@@ -163,20 +182,26 @@ def test_blocks_of_an_experiment_are_the_sweep(
     assert main(line) == 0
     assert f"3 runs -> multirun/{sweep.name}" in capfd.readouterr().out
     assert main([*line, "grid.sise=3"]) == 2
-    assert capfd.readouterr().err.startswith("trackmdp train: grid.sise: unknown option, did you mean grid.size?")
+    assert capfd.readouterr().err.startswith(
+        "trackmdp train: grid.sise: unknown option, did you mean grid.size?"
+    )
     assert main([*line[:-1], "experiment=fwe"]) == 2
     assert (
         capfd.readouterr().err == "trackmdp train: experiment=fwe: expected one of few, growth, "
-        "learned_kernel, pairs, paper, quality\n"
+        "model_based, pairs, paper, quality\n"
     )
 
 
-def test_the_plan_is_on_disk_before_the_first_run(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_plan_is_on_disk_before_the_first_run(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def run(cfg: Any, folder: Path) -> float:
         (folder / "config.yaml").touch()
         with locked(folder):
             shown = runs_of(folder.parent)
-        assert [each.state for each in shown] == (["running", "waiting"] if cfg.seed == 0 else ["done", "running"])
+        assert [each.state for each in shown] == (
+            ["running", "waiting"] if cfg.seed == 0 else ["done", "running"]
+        )
         return 1.0
 
     stub(monkeypatch, "train", run)
@@ -189,7 +214,12 @@ def test_the_plan_is_on_disk_before_the_first_run(here: Path, monkeypatch: pytes
 
 def test_a_plan_of_the_most_runs_is_read_back(tmp_path: Path) -> None:
     """As many bytes as 100,000 runs take, in fewer runs."""
-    write_plan(tmp_path, "train", "trackmdp train -m", [(str(place), ["x=" + "y" * 20_000]) for place in range(1_000)])
+    write_plan(
+        tmp_path,
+        "train",
+        "trackmdp train -m",
+        [(str(place), ["x=" + "y" * 20_000]) for place in range(1_000)],
+    )
     assert (tmp_path / "sweep.json").stat().st_size > 100_000 * 200
     assert len(read_plan(tmp_path)["jobs"]) == 1_000
     plan = planned(tmp_path)
@@ -197,7 +227,9 @@ def test_a_plan_of_the_most_runs_is_read_back(tmp_path: Path) -> None:
     assert len(plan["jobs"]) == 1_000
 
 
-def test_a_sweep_that_is_running_is_not_started_twice(here: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_sweep_that_is_running_is_not_started_twice(
+    here: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     (here / "all").mkdir()
     with locked(here / "all"):
         assert swept("seed=0", "quiet=true") == 2
@@ -207,9 +239,20 @@ def test_a_sweep_that_is_running_is_not_started_twice(here: Path, capfd: pytest.
 
 
 def test_another_command_has_its_value_in_the_table(here: Path) -> None:
-    line = ["evaluate", "-m", "grid.size=3", "baseline=qmdp,none", "episodes=0", "quiet=true", "hydra.sweep.dir=all"]
+    line = [
+        "evaluate",
+        "-m",
+        "grid.size=3",
+        "baseline=qmdp,none",
+        "episodes=0",
+        "quiet=true",
+        "hydra.sweep.dir=all",
+    ]
     assert main(line) == 0
-    exact = [json.loads((run.folder / "evaluation.json").read_text())["exact"] for run in runs_of(here / "all")]
+    exact = [
+        json.loads((run.folder / "evaluation.json").read_text())["exact"]
+        for run in runs_of(here / "all")
+    ]
     assert [float(row["aihtr"]) for row in table(here / "all")] == [each["aihtr"] for each in exact]
 
 
@@ -237,7 +280,14 @@ def test_a_launcher_that_is_refused_is_not_asked_again(tmp_path: Path) -> None:
         raise UserError("hydra.launcher.address=x:1: expected a Ray cluster")
 
     with pytest.raises(UserError, match="expected a Ray cluster"):
-        sweep(tmp_path, "train", "a line", [[Job("train", tmp_path, "one", (), None)]], launch, Console(quiet=True))
+        sweep(
+            tmp_path,
+            "train",
+            "a line",
+            [[Job("train", tmp_path, "one", (), None)]],
+            launch,
+            Console(quiet=True),
+        )
     assert asked == ["one"]
 
 
@@ -247,12 +297,22 @@ def test_a_signal_is_told_to_the_runs_and_ends_the_sweep(tmp_path: Path) -> None
 
     def launch(jobs: Sequence[Job]) -> None:
         signal.raise_signal(signal.SIGTERM)
-        seen.append(([job.name for job in jobs], stop_signal(tmp_path), signal.getsignal(signal.SIGTERM) == before))
+        seen.append(
+            (
+                [job.name for job in jobs],
+                stop_signal(tmp_path),
+                signal.getsignal(signal.SIGTERM) == before,
+            )
+        )
 
     with pytest.raises(Preempted) as told:
         sweep(tmp_path, "train", "a line", [[one], [two]], launch, Console(quiet=True))
     assert seen == [(["one"], signal.SIGTERM, False)]  # a second one is taken as well
-    assert (told.value.signal, stop_signal(tmp_path), signal.getsignal(signal.SIGTERM)) == (signal.SIGTERM, 0, before)
+    assert (told.value.signal, stop_signal(tmp_path), signal.getsignal(signal.SIGTERM)) == (
+        signal.SIGTERM,
+        0,
+        before,
+    )
     assert states(tmp_path) == ["waiting"]
 
 
@@ -260,7 +320,9 @@ def test_a_signal_is_told_to_the_runs_and_ends_the_sweep(tmp_path: Path) -> None
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
 def test_runs_outlive_their_fork_server(here: Path) -> None:
     more = ["collector.total_frames=200_000", "seed=0,1", "hydra.sweep.dir=all"]
-    process = started(here, "train", "-m", *(word for word in TINY if "total_frames" not in word), *more)
+    process = started(
+        here, "train", "-m", *(word for word in TINY if "total_frames" not in word), *more
+    )
     for run in range(2):  # the server is killed while each of the two runs goes on
         until = time.monotonic() + 120
         while len(list((here / "all").glob("*/config.yaml"))) <= run and time.monotonic() < until:
@@ -268,7 +330,8 @@ def test_runs_outlive_their_fork_server(here: Path) -> None:
         servers = [
             int(path.parent.name)
             for path in Path("/proc").glob("[0-9]*/cmdline")
-            if b"forkserver import main" in path.read_bytes() and _parent(path.parent) == process.pid
+            if b"forkserver import main" in path.read_bytes()
+            and _parent(path.parent) == process.pid
         ]
         assert len(servers) == 1
         os.kill(servers[0], signal.SIGKILL)
@@ -283,8 +346,23 @@ def _parent(process: Path) -> int:
 
 def test_the_table_holds_no_formulas(tmp_path: Path) -> None:
     """A name that a spreadsheet would compute is kept as text; numbers, negative ones too, stay as they are."""
-    run = RunState(tmp_path / "=1+1", ("kernel.direction=-90", "init_from=@home"), "failed", "+no luck")
+    run = RunState(
+        tmp_path / "=1+1", ("kernel.direction=-90", "init_from=@home"), "failed", "+no luck"
+    )
     write_table(tmp_path, [run])
     (row,) = table(tmp_path)
     assert (row["folder"], row["reason"]) == ("'=1+1", "'+no luck")
     assert (row["kernel.direction"], row["init_from"]) == ("-90", "'@home")
+
+
+def test_runs_on_recordings_are_compared_by_the_validation_tracks(tmp_path: Path) -> None:
+    parts = ({"aihtr": 8.0, "accuracy": 0.7, "sensors_per_step": 3.0}, {"aihtr": 9.0})
+    result = dict(zip(("policy", "validation"), parts, strict=True)) | {"frames": 10}
+    run = RunState(tmp_path / "a-0", ("seed=0",), "done", result=result)
+    write_table(tmp_path, [run])
+    (row,) = table(tmp_path)
+    assert (row["aihtr"], row["held_out_aihtr"], row["held_out_accuracy"]) == ("9.0", "8.0", "0.7")
+    out = io.StringIO()
+    show_runs(Console(file=out, width=120), [run], [], tmp_path)
+    assert "validation AIHTR" in out.getvalue()
+    assert "9.000" in out.getvalue() and "8.000" not in out.getvalue()

@@ -17,10 +17,17 @@ from trackmdp.training.folders import run_of, runs_of
 __all__ = ["here"]
 
 pytestmark = [
-    pytest.mark.skipif(importlib.util.find_spec("optuna") is None, reason="optuna is not installed"),
+    pytest.mark.skipif(
+        importlib.util.find_spec("optuna") is None, reason="optuna is not installed"
+    ),
     pytest.mark.filterwarnings("ignore::DeprecationWarning:sqlalchemy"),
 ]
-SEARCH = ("algo.gamma=interval(0.5,0.9)", "algo.batch_size=range(8,65,8)", "algo.hidden=8,16")
+SEARCH = (
+    "algo=hindsight",
+    "algo.gamma=interval(0.5,0.9)",
+    "algo.batch_size=range(8,65,8)",
+    "algo.hidden=8,16",
+)
 
 
 def searched(*words: str, dir: str = "all") -> int:
@@ -29,7 +36,9 @@ def searched(*words: str, dir: str = "all") -> int:
 
 def peak(cfg: Any, folder: Path) -> float:
     """Stands for training: best at gamma 0.7, batch size 32 and 16 hidden units."""
-    return float(-((cfg.algo.gamma - 0.7) ** 2) - abs(cfg.algo.batch_size - 32) / 100 + cfg.algo.hidden)
+    return float(
+        -((cfg.algo.gamma - 0.7) ** 2) - abs(cfg.algo.batch_size - 32) / 100 + cfg.algo.hidden
+    )
 
 
 def trials(folder: Path) -> list[tuple[float, int, int, float]]:
@@ -42,13 +51,17 @@ def test_words_with_many_values_are_searched(here: Path, monkeypatch: pytest.Mon
     assert searched("hydra.sweeper.n_trials=6") == 0
     found = trials(here / "all")
     assert len(found) == 6
-    assert all(0.5 <= gamma <= 0.9 and size % 8 == 0 and 8 <= size <= 64 for gamma, size, _, _ in found)
+    assert all(
+        0.5 <= gamma <= 0.9 and size % 8 == 0 and 8 <= size <= 64 for gamma, size, _, _ in found
+    )
     assert {hidden for _, _, hidden, _ in found} == {8, 16}
     assert (here / "all/study.db").is_file()
 
 
 @pytest.mark.slow
-def test_a_search_finds_better_runs_than_it_began_with(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_search_finds_better_runs_than_it_began_with(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     stub(monkeypatch, "train", peak)
     assert searched("hydra.sweeper.n_trials=30") == 0
     values = [value for *_, value in trials(here / "all")]
@@ -57,7 +70,9 @@ def test_a_search_finds_better_runs_than_it_began_with(here: Path, monkeypatch: 
 
 
 @pytest.mark.slow
-def test_the_study_goes_on_to_the_number_asked_for(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_study_goes_on_to_the_number_asked_for(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     stub(monkeypatch, "train", peak)
     for number in (3, 5, 5):
         assert searched(f"hydra.sweeper.n_trials={number}") == 0
@@ -68,14 +83,27 @@ def test_the_study_goes_on_to_the_number_asked_for(here: Path, monkeypatch: pyte
 
 @pytest.mark.slow
 def test_a_finished_training_run_is_not_run_again_by_the_study(here: Path) -> None:
-    assert swept("hydra/sweeper=optuna", "quiet=true", "algo.hidden=8,16", "hydra.sweeper.n_trials=2") == 0
-    before = {run.folder: (run.folder / "summary.json").stat().st_mtime_ns for run in runs_of(here / "all")}
-    assert swept("hydra/sweeper=optuna", "quiet=true", "algo.hidden=8,16", "hydra.sweeper.n_trials=3") == 0
-    assert all((folder / "summary.json").stat().st_mtime_ns == time for folder, time in before.items())
+    assert (
+        swept("hydra/sweeper=optuna", "quiet=true", "algo.hidden=8,16", "hydra.sweeper.n_trials=2")
+        == 0
+    )
+    before = {
+        run.folder: (run.folder / "summary.json").stat().st_mtime_ns
+        for run in runs_of(here / "all")
+    }
+    assert (
+        swept("hydra/sweeper=optuna", "quiet=true", "algo.hidden=8,16", "hydra.sweeper.n_trials=3")
+        == 0
+    )
+    assert all(
+        (folder / "summary.json").stat().st_mtime_ns == time for folder, time in before.items()
+    )
 
 
 @pytest.mark.slow
-def test_a_failed_trial_is_told_and_tried_again_by_the_next_call(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_trial_is_told_and_tried_again_by_the_next_call(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def fails(cfg: Any, folder: Path) -> float:
         if cfg.algo.hidden == 8:
             raise MemoryError
@@ -93,7 +121,11 @@ def test_a_failed_trial_is_told_and_tried_again_by_the_next_call(here: Path, mon
 
 
 def test_the_objective_may_be_the_regret(here: Path) -> None:
-    words = ["hydra.sweeper.n_trials=2", "hydra.sweeper.objective=regret_per_step", "hydra.sweeper.sampler=random"]
+    words = [
+        "hydra.sweeper.n_trials=2",
+        "hydra.sweeper.objective=regret_per_step",
+        "hydra.sweeper.sampler=random",
+    ]
     assert swept("hydra/sweeper=optuna", "quiet=true", "algo.gamma=interval(0.5,0.9)", *words) == 0
     import optuna
 
@@ -105,21 +137,38 @@ def test_the_objective_may_be_the_regret(here: Path) -> None:
     study._storage._backend.engine.dispose()  # type: ignore[attr-defined]
 
 
-def test_mistakes(here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mistakes(
+    here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     line = ["train", "-m", *TINY, "hydra/sweeper=optuna", "quiet=true", "hydra.sweep.dir=all"]
     for words, message in (
         (["seed=1"], "hydra/sweeper=optuna: expected a word to search"),
-        (["seed=1,2", "hydra.sweeper.storage=nowhere"], "hydra.sweeper.storage=nowhere: expected a data base's URL"),
-        (["seed=1,2", "hydra.sweeper.n_trials=0"], "hydra.sweeper.n_trials=0: expected an integer >= 1 (runs)"),
+        (
+            ["seed=1,2", "hydra.sweeper.storage=nowhere"],
+            "hydra.sweeper.storage=nowhere: expected a data base's URL",
+        ),
+        (
+            ["seed=1,2", "hydra.sweeper.n_trials=0"],
+            "hydra.sweeper.n_trials=0: expected an integer >= 1 (runs)",
+        ),
         (
             ["seed=1,2", "hydra.sweeper.objective=regret_per_step", "optimal.time_limit=9"],
             "optimal.time_limit: a regret",
         ),
         (["seed=interval(3,1)"], "seed=interval(3.0,1.0): expected interval(a,b) with a < b"),
-        (["algo.gamma=interval(0.9,nan)"], "algo.gamma=interval(0.9,nan): expected interval(a,b) with a < b"),
-        (["algo.gamma=tag(log,interval(0,1))"], "algo.gamma=interval(0.0,1.0): expected interval(a,b) with 0 < a < b"),
+        (
+            ["algo.gamma=interval(0.9,nan)"],
+            "algo.gamma=interval(0.9,nan): expected interval(a,b) with a < b",
+        ),
+        (
+            ["algo.gamma=tag(log,interval(0,1))"],
+            "algo.gamma=interval(0.0,1.0): expected interval(a,b) with 0 < a < b",
+        ),
         (["seed=range(3,1)"], "seed=range(3,1,1): expected range(a,b,step) of 1 to 100,000 values"),
-        (["seed=range(0,1000000000)"], "seed=range(0,1000000000,1): expected range(a,b,step) of 1 to 100,000 values"),
+        (
+            ["seed=range(0,1000000000)"],
+            "seed=range(0,1000000000,1): expected range(a,b,step) of 1 to 100,000 values",
+        ),
         (["algo.hiden=1,2"], "algo.hiden: unknown option, did you mean algo.hidden?"),
     ):
         assert main([*line, *words]) == 2

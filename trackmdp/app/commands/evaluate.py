@@ -12,9 +12,16 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from trackmdp.config import EvaluateConfig, FalseAlarmConfig, McapConfig, PlaybackConfig, load_run_config, to_yaml
+from trackmdp.config import (
+    EvaluateConfig,
+    FalseAlarmConfig,
+    McapConfig,
+    PlaybackConfig,
+    load_run_config,
+    to_yaml,
+)
 from trackmdp.durable import write_json, write_text
-from trackmdp.episodes.batch import Simulation
+from trackmdp.episodes.batch import Episodes, Simulation
 from trackmdp.episodes.filtered import simulate_filter
 from trackmdp.episodes.log import EpisodeLog
 from trackmdp.episodes.player import draw_picture
@@ -25,9 +32,9 @@ from trackmdp.policies.acting import Playback
 from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import sets_name, write_sets
 from trackmdp.reports.held_out import recorded_page
-from trackmdp.solvers import bounds, estimator
-from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers import bounds
 from trackmdp.solvers.solve import baseline_policy
+from trackmdp.solvers.value import evaluate
 from trackmdp.training.display import make_console, show_held_out, table, with_interval
 from trackmdp.training.evaluator import CELL_ALONE, HeldOutEvaluator, figures, make_evaluator
 from trackmdp.training.folders import SUMMARY, check_files, read_summary
@@ -37,8 +44,7 @@ from trackmdp.untrusted import decoded
 from trackmdp.world.gridding import said
 from trackmdp.world.make import false_alarm
 from trackmdp.world.model import World
-from trackmdp.world.modes import Modelled
-from trackmdp.world.tracks import Problem, Recorded
+from trackmdp.world.tracks import Problem, Recorded, modelled
 
 _FOR_THE_PICTURE = 16  # episodes simulated where none are asked for
 _FIGURES = {
@@ -54,12 +60,16 @@ _FIGURES = {
 def run(cfg: EvaluateConfig, folder: Path, problem: Problem) -> float:
     """Write `evaluation.json`, and without false alarms `sets.json` and `picture.txt`; returns the exact AIHTR.
 
-    `problem` is the world of `cfg`; a trained policy is evaluated in that of its run.
+    `problem` is the world of `cfg`; a trained policy is evaluated in its run's.
     """
     console = make_console(cfg.quiet)
     torch.set_num_threads(cfg.threads)
     device = make_device(cfg.device)
-    if cfg.run is None and isinstance(cfg.baseline, PlaybackConfig) and not isinstance(cfg.sensor, FalseAlarmConfig):
+    if (
+        cfg.run is None
+        and isinstance(cfg.baseline, PlaybackConfig)
+        and not isinstance(cfg.sensor, FalseAlarmConfig)
+    ):
         return _played_back(cfg, cfg.baseline, problem, folder, console)
     if cfg.run:
         world, policy, subject = trained(cfg.run, device)
@@ -70,24 +80,27 @@ def run(cfg: EvaluateConfig, folder: Path, problem: Problem) -> float:
         return _believing(cfg, world, policy, subject, folder, console)
     # Recorded tracks have no kernel, hence no exact value and no bound: figures come from the held-out tracks.
     if isinstance(world, Recorded):
-        return _held_out(world, policy, subject, folder, console, cfg.seed)
+        return _held_out(cfg, world, policy, subject, folder, console)
     return _exact(cfg, world, policy, subject, folder, console)
 
 
-def _exact(cfg: EvaluateConfig, world: Modelled, policy: Policy, subject: str, folder: Path, console: Console) -> float:
+def _exact(
+    cfg: EvaluateConfig,
+    world: World,
+    policy: Policy,
+    subject: str,
+    folder: Path,
+    console: Console,
+) -> float:
     """Evaluate with the motion model."""
     evaluator = make_evaluator(world)
-    # The run's own summary has measured against what it proved; the same world gets the same regret here.
+    # The run's own summary has measured against its own proof; the same world gets the same regret here.
     proved = _proved(cfg.run) if cfg.run else None
     score = evaluator.score(policy)
     if proved:
         score = evaluator.tighten(proved["lower"], proved["upper"], score)
     episodes = simulate(world, policy, cfg.episodes or _FOR_THE_PICTURE, seed=cfg.seed)
     simulation = episodes.figures() if cfg.episodes else None
-    # Theorem thm:estimator is about Q of whole episodes, a policy that is a table of cells, and sensors of one cell.
-    told = policy.deterministic and world.max_steps is None and world.perfect and not policy.task.keyed
-    told = told and world.coverage is None
-    estimate = estimator.accuracy(world, policy) if told and isinstance(world, World) else None
     report = {
         "policy": subject,
         "exact": figures(score.evaluation),
@@ -97,35 +110,48 @@ def _exact(cfg: EvaluateConfig, world: Modelled, policy: Policy, subject: str, f
         "regret_per_step": score.regret_per_step,
         "regret_per_step_lower": score.regret_per_step_lower,
         "optimal": proved,
-        "estimator": asdict(estimate) if estimate else None,
     }
-    write_json(folder / "evaluation.json", report | write_sets(folder, policy, value=score.evaluation.value))
+    write_json(
+        folder / "evaluation.json",
+        report | write_sets(folder, policy, value=score.evaluation.value),
+    )
     write_text(folder / "picture.txt", draw_picture(episodes, world))
     console.print(_compared(subject, report, simulation))
     source = "run's bracket" if proved else "clocked"
     console.print(f"upper bound ({source}) {evaluator.upper:,.4f}; {score.regret}")
     console.print(f"results in {folder}, sets in {sets_name(world)}")
-    if isinstance(mcap := cfg.log.get("mcap"), McapConfig):
-        config = to_yaml(load_run_config(cfg.run) if cfg.run else cfg)
-        log = EpisodeLog(folder, world, seed=cfg.seed, config=config, layout=mcap.layout, tell=_tell)
-        log.add(episodes, {"label": subject})
-        if log.close():
-            console.print(f"{log.episodes} episodes in {log.file}")
-    if estimate is not None:
-        said = {"from Q": estimate.exact, "by the printed form": estimate.paper, "from the belief": estimate.bayes}
-        shares = ", ".join(f"{name} {100 * share:.2f} %" for name, share in said.items())
-        console.print(f"positions of missed steps estimated right:\n  {shares}")
+    _log(cfg, episodes, subject, folder, console)
     return score.evaluation.aihtr
 
 
-def _played_back(cfg: EvaluateConfig, chosen: PlaybackConfig, world: Problem, folder: Path, console: Console) -> float:
+def _log(
+    cfg: EvaluateConfig, episodes: Episodes, subject: str, folder: Path, console: Console
+) -> None:
+    """Write `episodes.mcap` where it is asked for."""
+    if not isinstance(mcap := cfg.log.get("mcap"), McapConfig):
+        return
+    config = to_yaml(load_run_config(cfg.run) if cfg.run else cfg)
+    log = EpisodeLog(
+        folder, episodes.problem, seed=cfg.seed, config=config, layout=mcap.layout, tell=_tell
+    )
+    log.add(episodes, {"label": subject})
+    if log.close():
+        along = " along held-out tracks" if episodes.problem.model is None else ""
+        console.print(f"{log.episodes} episodes{along} in {log.file}")
+
+
+def _played_back(
+    cfg: EvaluateConfig, chosen: PlaybackConfig, world: Problem, folder: Path, console: Console
+) -> float:
     """Value the actions of a logged episode, on its own target and on others; returns the simulated AIHTR.
 
-    Such a policy ignores what it observes, so that it has no table and no exact value.
+    Such a policy ignores its observations, so that it has no table and no exact value.
     """
     with EpisodeReader(chosen.file) as reader:
         if reader.run.size != world.size:
-            recorded, expected = (str(r) if r == c else f"[{r},{c}]" for r, c in (reader.run.size, world.size))
+            recorded, expected = (
+                str(r) if r == c else f"[{r},{c}]" for r, c in (reader.run.size, world.size)
+            )
             recorded = f"baseline.file={chosen.file}: recorded on a grid of size {recorded}"
             raise UserError(f"{recorded}, expected grid.size={expected}")
         logged = reader.read(chosen.episode)
@@ -146,14 +172,24 @@ def _played_back(cfg: EvaluateConfig, chosen: PlaybackConfig, world: Problem, fo
     rows = [
         ["logged", f"{report['logged_return']:,.4f}"],
         ["again, on the same target", f"{report['return']:,.4f}"],
-        [f"on {cfg.episodes} other targets", f"{simulation.aihtr.mean:,.4f} ± {simulation.aihtr.standard_error:.4f}"],
+        [
+            f"on {cfg.episodes} other targets",
+            f"{simulation.aihtr.mean:,.4f} ± {simulation.aihtr.standard_error:.4f}",
+        ],
     ]
     console.print(table(f"actions of episode {logged.number}", ["", "return"], rows))
     console.print(f"results in {folder}")
     return simulation.aihtr.mean
 
 
-def _held_out(world: Recorded, policy: Policy, subject: str, folder: Path, console: Console, seed: int) -> float:
+def _held_out(
+    cfg: EvaluateConfig,
+    world: Recorded,
+    policy: Policy,
+    subject: str,
+    folder: Path,
+    console: Console,
+) -> float:
     """Evaluate on held-out tracks: `evaluation.json`, `sets.json`, `picture.txt`, `tracks.html`.
 
     Returns:
@@ -167,14 +203,24 @@ def _held_out(world: Recorded, policy: Policy, subject: str, folder: Path, conso
     content = {"policy": subject, "held_out": report} | write_sets(folder, policy, value=value)
     content |= dict.fromkeys(("regret_per_step", "regret_per_step_lower"))
     write_json(folder / "evaluation.json", content)
-    compared = {"policy": policy, **{n: p for n, p in evaluator.references.items() if n == CELL_ALONE}}
+    compared = {
+        "policy": policy,
+        **{n: p for n, p in evaluator.references.items() if n == CELL_ALONE},
+    }
     # With one seed all of them meet the same targets.
-    episodes = {name: simulate(world, each, _FOR_THE_PICTURE, seed=seed) for name, each in compared.items()}
+    episodes = {
+        name: simulate(world, each, _FOR_THE_PICTURE, seed=cfg.seed)
+        for name, each in compared.items()
+    }
     write_text(folder / "picture.txt", draw_picture(episodes["policy"], world))
     replayed = {name: evaluator.replayed(each) for name, each in compared.items()}
-    write_text(folder / "tracks.html", recorded_page(world, subject, report, replayed, episodes).html())
+    write_text(
+        folder / "tracks.html", recorded_page(world, subject, report, replayed, episodes).html()
+    )
     show_held_out(console, subject, report)
     console.print(f"results in {folder}; the page is tracks.html")
+    if cfg.log:
+        _log(cfg, simulate(world, policy, cfg.episodes, seed=cfg.seed), subject, folder, console)
     return float(report["figures"]["policy"]["aihtr"]["mean"])
 
 
@@ -206,40 +252,38 @@ def _compared(subject: str, report: dict[str, Any], simulation: Simulation | Non
     for key, label in _FIGURES.items():
         estimate = getattr(simulation, key) if simulation else None
         simulated = f"{estimate.mean:,.4f} ± {estimate.standard_error:.4f}" if estimate else ""
-        rows.append([label, f"{report['exact'][key]:,.4f}", simulated, f"{report['qmdp'][key]:,.4f}"])
+        rows.append(
+            [label, f"{report['exact'][key]:,.4f}", simulated, f"{report['qmdp'][key]:,.4f}"]
+        )
     title = f"{simulation.episodes} simulated ± s.e." if simulation else "simulated"
     return table(subject, ["figure", "exact", title, "Q_MDP exact"], rows)
 
 
-def _believing(cfg: EvaluateConfig, problem: Problem, policy: Policy, subject: str, folder: Path, at: Console) -> float:
+def _believing(
+    cfg: EvaluateConfig, problem: Problem, policy: Policy, subject: str, folder: Path, at: Console
+) -> float:
     """Evaluate where sensors report targets that are not there: the exact AIHTR, each report taken for the truth.
 
     Raises:
-        UserError: tracks instead of a world, or what `trackmdp.solvers.alarms.believed` refuses.
+        UserError: tracks instead of a world, or a refusal of `trackmdp.solvers.false_alarms.believed`.
     """
     sensor = cfg.sensor
     assert isinstance(sensor, FalseAlarmConfig)
-    if not isinstance(problem, World):
-        raise UserError("sensor=false_alarm: needs a motion model of cells alone, without modes; not recorded tracks")
-    # A trained policy's world is that of its run, with the sensors asked for.
+    # A trained policy's world is its run's, with the sensors asked for.
     sensors = false_alarm(problem.size, p_d=sensor.p_d, p_f=sensor.p_f)
-    world = World.of(problem, problem.kernel, safe_detection=1.0, **sensors)
+    world = modelled(problem, "sensor=false_alarm").but(safe_detection=1.0, **sensors)
     silent, alarmed = evaluate(world, policy), evaluate(world, policy, false_alarm=sensor.p_f)
     # A window is about the last located cell, and the filter is never sure of one.
     wanted = cfg.episodes if world.window is None else 0
-    simulated = simulate_filter(world, sensor.p_f, wanted, seed=cfg.seed).intervals(np.arange(wanted))
-    filtered = {key: asdict(each) for key, each in simulated.items()}
-    # How long a target stays is known exactly, and whatever is sensed the same: most of what returns vary by.
-    steps, rate = alarmed.expected_length, filtered["reward_per_step"]
-    filtered["aihtr"] |= {end: rate[end] and steps * rate[end] for end in ("mean", "low", "high")}
+    filtered = _filtered(world, sensor.p_f, wanted, cfg.seed, alarmed.expected_length)
     # Not the clocked bound: a report that is wrong sets the clock back, and D is paid later.
     bound = float(bounds.valid(world).mean())
     loss = (silent.aihtr - alarmed.aihtr) / alarmed.expected_length
-    told, plain = figures(alarmed), figures(silent)
+    noisy, plain = figures(alarmed), figures(silent)
     report = {
         "policy": subject,
         "p_f": sensor.p_f,
-        "exact": told,
+        "exact": noisy,
         "without_false_alarms": plain,
         "filter": filtered if wanted else None,
         "bounds": {"valid": bound},
@@ -249,9 +293,22 @@ def _believing(cfg: EvaluateConfig, problem: Problem, policy: Policy, subject: s
     rows = []
     for key in ("aihtr", "accuracy", "sensors_per_step"):
         played = with_interval(filtered[key], 4) if wanted else ""
-        rows.append([_FIGURES[key], f"{told[key]:,.4f}", f"{plain[key]:,.4f}", played])
-    heads = ["figure", f"p_f = {sensor.p_f:g}, exact", "p_f = 0", f"Bayes filter, {wanted} episodes, 95 %"]
+        rows.append([_FIGURES[key], f"{noisy[key]:,.4f}", f"{plain[key]:,.4f}", played])
+    played = f"Bayes filter, {wanted} episodes, 95 %"
+    heads = ["figure", f"p_f = {sensor.p_f:g}, exact", "p_f = 0", played]
     at.print(table(f"{subject}, each report taken for the truth", heads, rows))
     lost = f"{loss:.4f} a step lost to false alarms"
     at.print(f"upper bound (valid, of p_f = 0) {bound:,.4f}; {lost}; results in {folder}")
     return alarmed.aihtr
+
+
+def _filtered(
+    world: World, p_f: float, episodes: int, seed: int, steps: float
+) -> dict[str, dict[str, Any]]:
+    """Figures of a tracker with the exact belief, with intervals; `steps` is the exact length of an episode."""
+    simulated = simulate_filter(world, p_f, episodes, seed=seed).intervals(np.arange(episodes))
+    found = {key: asdict(each) for key, each in simulated.items()}
+    # The length of a stay is known exactly, and the same for all policies: most of the variance of returns.
+    rate = found["reward_per_step"]
+    found["aihtr"] |= {end: rate[end] and steps * rate[end] for end in ("mean", "low", "high")}
+    return found

@@ -7,21 +7,19 @@ from pathlib import Path
 
 from rich.console import Console
 
-from trackmdp.config import ReplayConfig, TableConfig, world_of
+from trackmdp.config import ReplayConfig
+from trackmdp.episodes.export import write_page, write_tables
 from trackmdp.episodes.grids import write_layout
-from trackmdp.episodes.page import write_page, write_tables
 from trackmdp.episodes.player import play
 from trackmdp.episodes.reader import EpisodeReader, verify
 from trackmdp.episodes.recover import recover
 from trackmdp.episodes.schema import versions_apart
 from trackmdp.errors import RunError, UserError
 from trackmdp.training.display import make_console, table
-from trackmdp.world.make import make_problem
-from trackmdp.world.tracks import Recorded
 
 
-def run(cfg: ReplayConfig, folder: Path) -> None:  # noqa: ARG001  what is written has a name of its own
-    """Do what `cfg` asks for with the log `cfg.file`.
+def run(cfg: ReplayConfig, folder: Path) -> None:  # noqa: ARG001  every file has a name of its own
+    """List, play, verify, recover or export the log `cfg.file`.
 
     Raises:
         RunError: an episode did not come out the same.
@@ -35,7 +33,7 @@ def run(cfg: ReplayConfig, folder: Path) -> None:  # noqa: ARG001  what is writt
         for line in saved.damaged:
             console.print(f"lost: {line}")
     with EpisodeReader(file) as reader:
-        # Said at once: other versions of NumPy or torch may draw other numbers, which is not damage.
+        # First: other versions of NumPy or torch may draw other numbers, which is not damage.
         if apart := versions_apart(reader.run.said):
             console.print(f"made by other versions: {apart}")
         asked = _exports(console, cfg, reader)
@@ -64,59 +62,42 @@ def _exports(console: Console, cfg: ReplayConfig, reader: EpisodeReader) -> bool
         try:
             write(Path(path))
         except OSError as error:
-            raise UserError(f"{key}={path}: cannot be written ({(error.strerror or str(error)).lower()})") from error
+            raise UserError(
+                f"{key}={path}: cannot be written ({(error.strerror or str(error)).lower()})"
+            ) from error
         console.print(f"{key} -> {path}")
     return any(path is not None for _, path, _ in writers)
 
 
 def _verify(console: Console, cfg: ReplayConfig, reader: EpisodeReader) -> None:
-    # First: with another kernel every episode differs, and the kernel is what has to be named.
-    difference = _kernel_difference(reader)
-    if difference is None:
-        numbers = None if cfg.episode is None else [reader.row(cfg.episode)["episode"]]
-        with console.status("re-simulating"):
-            verified = verify(reader, numbers=numbers)
-        difference = verified.difference
-    if difference is not None:
+    numbers = None if cfg.episode is None else [reader.row(cfg.episode)["episode"]]
+    with console.status("re-simulating"):
+        verified = verify(reader, numbers=numbers)
+    if verified.difference is not None:
         apart = versions_apart(reader.run.said)
         because = f"; made by other versions: {apart}" if apart else ""
-        raise RunError(f"file={cfg.file}: {difference}{because}")
+        raise RunError(f"file={cfg.file}: {verified.difference}{because}")
     console.print(f"{verified.episodes} episodes, {verified.steps:,} steps: the same to the bit")
-
-
-def _kernel_difference(reader: EpisodeReader) -> str | None:
-    """Where the kernel of the log is not the one its config describes; a table of the user's own is taken as it is."""
-    cfg = world_of(reader.attachment("config.yaml"))
-    tables = [getattr(cfg.cost, "sensor", None), *vars(cfg.sensor).values()]
-    own = isinstance(cfg.kernel, TableConfig) or any("path" in regime for regime in getattr(cfg.kernel, "regimes", ()))
-    if own or any(isinstance(table, str) for table in tables):
-        return None
-    problem = make_problem(cfg)
-    assert not isinstance(problem, Recorded)  # of them there is no log
-    described, logged = problem.kernel, reader.world().kernel
-    if described.shape != logged.shape:
-        return f"kernel: logged {logged.shape}, the config gives {described.shape}"
-    places = (described != logged).tocoo()
-    if not places.nnz:
-        return None
-    # The first entry that differs, by rows, whatever order the sparse difference has.
-    x, y = min(zip(places.row.tolist(), places.col.tolist(), strict=True))
-    return f"kernel from cell {x} to {y}: logged {logged[x, y]}, the config gives {described[x, y]}"
 
 
 def _list(console: Console, reader: EpisodeReader) -> None:
     total = sum(row["length"] for row in reader.rows)
     (rows, columns), seed = reader.run.size, reader.run.said.get("seed", "")
     grid = f"{rows}x{columns} grid"
-    console.print(f"{len(reader)} episodes, {total:,} steps on a {grid}, T_max {reader.run.t_max}, seed {seed}")
+    console.print(
+        f"{len(reader)} episodes, {total:,} steps on a {grid}, T_max {reader.run.t_max}, seed {seed}"
+    )
     labels = [reader.policies[row["policy"]].get("label", "") for row in reader.rows]
     one = len(set(labels)) == 1
     if one:
         console.print(f"policy: {labels[0]}")
     entries = []
     for label, row in zip(labels, reader.rows, strict=True):
-        number, steps, located, forced = (str(row[name]) for name in ("episode", "length", "detections", "forced"))
+        number, steps, located, forced = (
+            str(row[name]) for name in ("episode", "length", "detections", "forced")
+        )
         end = "exited" if row["terminated"] else "truncated"
-        entries.append([number, *([] if one else [label]), steps, f"{row['return']:,.2f}", located, forced, end])
+        own = [] if one else [label]
+        entries.append([number, *own, steps, f"{row['return']:,.2f}", located, forced, end])
     names = ["episode", *([] if one else ["policy"]), "steps", "return", "located", "forced", "end"]
     console.print(table(str(reader.file), names, entries))

@@ -44,17 +44,21 @@ def run(cfg: ReportConfig, folder: Path) -> float:
             status.update(Text(printable(line)))
 
         found = load_results(sweep) if is_stored(sweep) else gather_runs(sweep)
-        # Stored first, and read back: the page is made from what is stored, so that it can be made again from that
-        # alone.
+        # Stored and read back: the same page can be made again from the stored results alone.
         save_results(found, folder)
         found = load_results(folder)
-        _write(build(found, cfg.threshold, _about_the_paper(cfg, sweep, found, folder, say), say), folder)
+        _write(
+            build(found, cfg.threshold, _about_the_paper(cfg, sweep, found, folder, say), say),
+            folder,
+        )
     _tell(console, found, folder)
     return float(len(found.runs))
 
 
-def _about_the_paper(cfg: ReportConfig, sweep: Path, found: Results, folder: Path, say: style.Say) -> list[Section]:
-    """Where it is asked for, what concerns the paper: made from stored figures, or from such that are computed now."""
+def _about_the_paper(
+    cfg: ReportConfig, sweep: Path, found: Results, folder: Path, say: style.Say
+) -> list[Section]:
+    """The sections on the paper where they are asked for, made from stored figures or computed now."""
     grouped = study(found.runs)
     # A sweep of one's own may touch some of the paper's worlds; all twelve of them are its experiments.
     asked = len(pairs(grouped)) == len(PRINTED_QMDP) if cfg.paper is None else cfg.paper

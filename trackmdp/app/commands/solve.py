@@ -3,62 +3,63 @@
 from __future__ import annotations
 
 import signal
-import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.status import Status
 
 from trackmdp.config import SolveConfig
 from trackmdp.durable import write_json
 from trackmdp.errors import UserError
 from trackmdp.policies.saved import sets_name, write_sets
 from trackmdp.signals import handled, stop
-from trackmdp.solvers import bounds, qmdp
-from trackmdp.solvers.evaluate import evaluate
+from trackmdp.solvers import bounds, rules
 from trackmdp.solvers.evaluation import regret_per_step
+from trackmdp.solvers.hidden import averaged
+from trackmdp.solvers.linear import DIRECT_CELLS
 from trackmdp.solvers.partition import narrow_halo
-from trackmdp.solvers.renewal import DIRECT_CELLS
 from trackmdp.solvers.solution import SearchProgress, Solution
 from trackmdp.solvers.solve import run_solver
-from trackmdp.training.display import make_console, table
+from trackmdp.solvers.value import evaluate
+from trackmdp.training.display import make_console, reporting, table
 from trackmdp.training.evaluator import figures
 from trackmdp.world.model import World
-from trackmdp.world.modes import Modelled
-from trackmdp.world.tracks import Problem, Recorded
+from trackmdp.world.tracks import Problem, modelled
 
-_SECONDS_BETWEEN_LINES = 2.0
 _BOUNDS = {"paper": bounds.paper, "valid": bounds.valid, "clocked": bounds.clocked}
 
 
-def run(cfg: SolveConfig, folder: Path, world: Problem) -> float:
+def run(cfg: SolveConfig, folder: Path, problem: Problem) -> float:
     """Write `solution.json` (and `verification.json`) to `folder`; returns the AIHTR.
 
     Ctrl-C ends a search early: the bracket reached so far is printed and saved.
     """
     console = make_console(cfg.quiet)
     if cfg.grid.max_steps is not None:
-        raise UserError(f"grid.max_steps={cfg.grid.max_steps}: only whole episodes are solved, expected null")
-    assert not isinstance(world, Recorded)  # they are refused: there is no kernel to solve with
+        raise UserError(
+            f"grid.max_steps={cfg.grid.max_steps}: only whole episodes are solved, expected null"
+        )
+    world = modelled(problem, "solve")
     # As Ctrl-C they end the workers in order; by themselves they would end this process alone.
-    told = handled(stop, signal.SIGTERM, signal.SIGUSR1)
-    with told, console.status(title := f"solve {cfg.solver.name}") as status:
-        solution = run_solver(world, cfg.solver, _display(console, status, title), cfg.partition)
-    # The paper's bounds are on targets without a hidden mode.
-    bound = {name: float(each(world).mean()) for name, each in _BOUNDS.items()} if isinstance(world, World) else {}
+    stopping = handled(stop, signal.SIGTERM, signal.SIGUSR1)
+    with stopping, reporting(console, f"solve {cfg.solver.name}", _progress) as show:
+        solution = run_solver(world, cfg.solver, show, cfg.partition)
+    bound = {name: float(each(world).mean()) for name, each in _BOUNDS.items()}
     arrays = write_sets(folder, solution.table, value=solution.value, upper_value=solution.bound)
     write_json(folder / "solution.json", _report(cfg, solution, bound) | arrays)
     _show(console, cfg.solver.name, world, solution, bound, folder)
     found = solution.evaluation
-    if isinstance(world, World) and (said := narrow_halo(world, cfg.partition, solution.upper, found)):
-        console.print(f"warning: {said}")
+    warning = narrow_halo(world, cfg.partition, solution.upper, found)
+    if warning:
+        console.print(f"warning: {warning}")
     # After the results are written: the command still ends with the status of an interruption.
     if solution.interrupted:
         raise KeyboardInterrupt
     if cfg.verify:
-        from trackmdp.app.commands.verify import show_checks, write_checks  # loads what is about the paper
+        from trackmdp.app.commands.verify import (
+            show_checks,
+            write_checks,
+        )  # loads the package `paper`
 
         checks = write_checks(world, 1e-9, folder)
         show_checks(console, checks, folder)
@@ -76,18 +77,34 @@ def _report(cfg: SolveConfig, solution: Solution, bound: dict[str, float]) -> di
     }
 
 
-def _show(at: Console, name: str, world: Modelled, solution: Solution, bound: dict[str, float], folder: Path) -> None:
-    found = {name: solution.evaluation}
+def _show(
+    at: Console,
+    name: str,
+    world: World,
+    solution: Solution,
+    bound: dict[str, float],
+    folder: Path,
+) -> None:
+    found = {solution.title if name == "optimal" else name: solution.evaluation}
     # Where it senses little it is a matter of minutes on a large grid; `evaluate baseline=qmdp` values it there.
-    if isinstance(world, World) and world.num_cells <= DIRECT_CELLS:
-        found["Q_MDP"] = evaluate(world, qmdp.solve(world))
+    if world.num_cells <= DIRECT_CELLS:
+        found["Q_MDP"] = evaluate(world, rules.qmdp(averaged(world)))
     rows = [
-        [name, f"{e.aihtr:,.6f}", f"{100 * e.accuracy:.2f} %", f"{e.sensors_per_step:.3f}", f"{e.safe_per_episode:.3f}"]
+        [
+            name,
+            f"{e.aihtr:,.6f}",
+            f"{100 * e.accuracy:.2f} %",
+            f"{e.sensors_per_step:.3f}",
+            f"{e.safe_per_episode:.3f}",
+        ]
         for name, e in found.items()
     ]
     rows.append(["proved bound", f"{solution.upper:,.6f}", "", "", ""])
     called = {"paper": "printed"}  # as reports call it
-    rows += [[f"{called.get(name, name)} bound", f"{value:,.6f}", "", "", ""] for name, value in bound.items()]
+    rows += [
+        [f"{called.get(name, name)} bound", f"{value:,.6f}", "", "", ""]
+        for name, value in bound.items()
+    ]
     columns = ["policy", "AIHTR", "accuracy", "sensors per step", "safe per episode"]
     at.print(table("exact values", columns, rows))
     regret = max(regret_per_step(solution.upper, solution.evaluation), 0.0)
@@ -97,20 +114,8 @@ def _show(at: Console, name: str, world: Modelled, solution: Solution, bound: di
     )
 
 
-def _display(console: Console, status: Status, title: str) -> Callable[[SearchProgress], None]:
-    """Shows the bracket as a search goes on: one changing line at a terminal, a plain line now and then when piped."""
-    last = time.monotonic()
-
-    def show(progress: SearchProgress) -> None:
-        nonlocal last
-        bracket = f"bracket {progress.lower:,.4f} ... {progress.upper:,.4f}"
-        line = f"{title}: {progress.seconds:.0f} s  {bracket}  {progress.nodes:,} nodes"
-        if progress.left is not None:
-            line += f"  {progress.stage}, {progress.left:.0f} s left"
-        if console.is_terminal:
-            status.update(line)
-        elif time.monotonic() - last >= _SECONDS_BETWEEN_LINES:
-            last = time.monotonic()
-            console.print(line)
-
-    return show
+def _progress(found: SearchProgress) -> str:
+    """How far the search is."""
+    bracket = f"bracket {found.lower:,.4f} ... {found.upper:,.4f}"
+    line = f"{found.seconds:.0f} s  {bracket}  {found.nodes:,} nodes"
+    return line if found.left is None else f"{line}  {found.stage}, {found.left:.0f} s left"

@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from rich.console import Console
 
 from trackmdp.config import TrainConfig
 from trackmdp.errors import RunError
-from trackmdp.policies.policy import Policy
+from trackmdp.training import notices
 from trackmdp.training.blocks import make_trainer
 from trackmdp.training.callbacks import Learning
 from trackmdp.training.display import make_console, show_held_out, table
 from trackmdp.training.folders import SUMMARY, finished
+from trackmdp.training.inputs import problem_of
 from trackmdp.training.lock import locked
 from trackmdp.training.run import Run, complete
 from trackmdp.world.gridding import said
-from trackmdp.world.make import make_problem
 from trackmdp.world.tracks import Problem, Recorded
 
 
 def run(cfg: TrainConfig, folder: Path, problem: Problem | None = None) -> float:
-    """Train as `cfg` says and write inputs, metrics, checkpoints, policy and summary to `folder`; returns the AIHTR.
+    """Train by `cfg` and write inputs, metrics, checkpoints, policy and summary to `folder`; returns the AIHTR.
 
     Args:
         cfg: the checked config.
@@ -29,7 +30,7 @@ def run(cfg: TrainConfig, folder: Path, problem: Problem | None = None) -> float
         problem: the world or the tracks of `cfg`, where they are built already.
 
     Raises:
-        UserError: the config asks for what is not there, or for more memory than there is.
+        UserError: the config names a missing file, or needs more memory than is free.
         RunError: learning or writing broke down.
         Preempted: a signal ended the run; it can be resumed.
     """
@@ -39,7 +40,9 @@ def run(cfg: TrainConfig, folder: Path, problem: Problem | None = None) -> float
     except OSError as error:
         # Somebody tidied up while the run was on; "no such file" about a part of a checkpoint would puzzle.
         if not folder.is_dir():
-            raise RunError(f"hydra.run.dir={folder}: the folder was removed while the run wrote to it") from error
+            raise RunError(
+                f"hydra.run.dir={folder}: the folder was removed while the run wrote to it"
+            ) from error
         raise RunError(
             f"{error.filename or folder}: {error.strerror or error}; resume=auto resumes from the last checkpoint"
         ) from error
@@ -51,18 +54,26 @@ def _run(cfg: TrainConfig, folder: Path, problem: Problem | None) -> float:
         if summary := finished(cfg, folder):
             console.print(f"finished before; results in {folder}")
             return float(summary["policy"]["aihtr"])
-        # It belongs to an older config; left there, whoever looks at the folder meanwhile would take this run for
-        # done.
+        # It belongs to an older config; with it in the folder this run would count as done.
         (folder / SUMMARY).unlink(missing_ok=True)
-    problem = problem or make_problem(cfg)
+    problem = problem or problem_of(cfg, folder)
+    if why := notices.why_chosen(cfg, problem):
+        console.print(why)
     if isinstance(problem, Recorded) and problem.loaded:
         console.print(f"loaded: {said(problem.loaded)}")
+    if isinstance(problem, Recorded) and getattr(cfg.cost, "safe", 0.0) is None:
+        console.print(
+            f"cost.safe: D = {problem.safe_cost:,.6g}, the sum of all prices; set the price of finding a lost target"
+        )
     trainer = make_trainer(problem, cfg, folder=folder, console=console)
     done = complete(trainer)
     if done.summary["held_out"] is None:
         _show_summary(console, trainer, done)
     else:
         show_held_out(console, f"learned ({cfg.algo.name})", done.summary["held_out"])
+        figures = done.summary["held_out"]["figures"].items()
+        others = {name: each["aihtr"]["mean"] for name, each in figures if name != "policy"}
+        _warn(console, trainer, done, others)
     console.print(f"{done.summary['wall_seconds']:.1f} s; results in {folder}")
     return done.evaluation.aihtr
 
@@ -70,18 +81,31 @@ def _run(cfg: TrainConfig, folder: Path, problem: Problem | None) -> float:
 def _show_summary(console: Console, trainer: Learning, run: Run) -> None:
     """The learned policy beside Q_MDP, all sensors on, and the optimum where it was solved for."""
     evaluator, solution = trainer.evaluator, run.solution
-    policies = {f"learned ({trainer.config.algo.name})": run.evaluation}
-    if evaluator.qmdp is not None:
-        policies["Q_MDP"] = evaluator.qmdp
-    policies["all on"] = evaluator.evaluate(Policy.all_on(evaluator.world))
-    if solution is not None:
-        policies["optimum" if solution.certified else "best known"] = solution.evaluation
+    learned = {f"learned ({trainer.config.algo.name})": run.summary["policy"]}
+    policies = learned | {"Q_MDP": run.summary["qmdp"]} | run.summary["references"]
+    if solution is not None and solution.certified:
+        policies["optimum"] = policies.pop("best known")
     rows = [
-        [name, f"{e.aihtr:,.3f}", f"{100 * e.accuracy:.2f} %", f"{e.sensors_per_step:.2f}"]
-        for name, e in policies.items()
+        [
+            name,
+            f"{each['aihtr']:,.3f}",
+            f"{100 * each['accuracy']:.2f} %",
+            f"{each['sensors_per_step']:.2f}",
+        ]
+        for name, each in policies.items()
     ]
     rows.append(["upper bound", f"{evaluator.upper:,.3f}", "", ""])
     console.print(table("exact values", ["policy", "AIHTR", "accuracy", "sensors per step"], rows))
     console.print(trainer.evaluator.score(run.policy).regret)
+    references = ("Q_MDP", "all on", "no sensors")
+    others = {name: policies[name]["aihtr"] for name in references if policies.get(name)}
+    _warn(console, trainer, run, others)
     if solution is not None and solution.timed_out:
         console.print(f"optimum: {solution.ended}")
+
+
+def _warn(console: Console, trainer: Learning, run: Run, others: Mapping[str, float]) -> None:
+    """Print the signs of a poor policy."""
+    known, reward = run.summary["regret_per_step_lower"], trainer.problem.reward
+    for line in notices.poor(trainer.config, run.evaluation.aihtr, others, known, reward):
+        console.print(line)

@@ -13,33 +13,33 @@ from trackmdp.config import VerifyConfig
 from trackmdp.durable import write_json
 from trackmdp.errors import UserError
 from trackmdp.paper import theorems
-from trackmdp.paper.theorems import Check
-from trackmdp.solvers import optimal
-from trackmdp.solvers.keyed_search import solve_keys
+from trackmdp.paper.check import Check, summarize_checks
+from trackmdp.solvers import hidden, optimal
 from trackmdp.training.display import make_console
-from trackmdp.world.modes import HiddenWorld, Modelled
-from trackmdp.world.tracks import Problem, Recorded
+from trackmdp.world.model import World
+from trackmdp.world.tracks import Problem, modelled
 
 NODES = 10_000_000
 """Work for the optimum the theorems are about: two minutes or so."""
 
 
 def run(cfg: VerifyConfig, folder: Path, world: Problem) -> float:
-    """Write `verification.json` to `folder`; returns the number of claims that fail (0 is what is expected)."""
+    """Write `verification.json` to `folder`; returns the number of claims that fail (0 is expected)."""
     console = make_console(cfg.quiet)
     if cfg.grid.max_steps is not None:
-        raise UserError(f"grid.max_steps={cfg.grid.max_steps}: theorems are on whole episodes, expected null")
+        raise UserError(
+            f"grid.max_steps={cfg.grid.max_steps}: theorems are on whole episodes, expected null"
+        )
     with console.status("checking the paper's theorems"):
-        assert not isinstance(world, Recorded)  # they are refused
-        checks = write_checks(world, cfg.tolerance, folder)
+        checks = write_checks(modelled(world, "verify"), cfg.tolerance, folder)
     show_checks(console, checks, folder)
     return float(sum(not check.passed for check in checks))
 
 
-def write_checks(world: Modelled, tolerance: float, folder: Path) -> list[Check]:
-    """Solve the world, whose sensors are of one cell, run every check, and write `verification.json`."""
-    if isinstance(world, HiddenWorld):
-        solution = solve_keys(world)
+def write_checks(world: World, tolerance: float, folder: Path) -> list[Check]:
+    """Solve the world, with sensors of one cell, run every check, and write `verification.json`."""
+    if world.modes > 1:
+        solution = optimal.solve(world) if world.tells_all else hidden.solve(world)
         found = theorems.check_modes(world, solution, tolerance)
     else:
         solution = optimal.solve(world, nodes=NODES, tolerance=tolerance)
@@ -48,9 +48,15 @@ def write_checks(world: Modelled, tolerance: float, folder: Path) -> list[Check]
         raise KeyboardInterrupt
     checks = [*found, *theorems.check_remarks(tolerance)]
     content = {
-        "optimum": {"lower": solution.lower, "upper": solution.upper, "certified": solution.certified},
+        "optimum": {
+            "lower": solution.lower,
+            "upper": solution.upper,
+            "certified": solution.certified,
+        },
         "tolerance": tolerance,
-        "checks": [asdict(check) | {"verdict": check.verdict, "passed": check.passed} for check in checks],
+        "checks": [
+            asdict(check) | {"verdict": check.verdict, "passed": check.passed} for check in checks
+        ],
     }
     write_json(folder / "verification.json", content)
     return checks
@@ -61,12 +67,14 @@ def show_checks(console: Console, checks: list[Check], folder: Path) -> None:
     shown = Table(title="the paper's theorems", title_justify="left")
     shown.add_column("statement")
     shown.add_column("deviation")
-    shown.add_column("verdict", max_width=13)  # two lines of `not claimed; does not hold`, to leave room for statements
+    shown.add_column(
+        "verdict", max_width=13
+    )  # two lines of `not claimed; does not hold`, to leave room for statements
     for check in checks:
         note = f" ({check.note})" if check.note else ""
         shown.add_row(f"{check.name}: {check.statement}{note}", _deviation(check), check.verdict)
     console.print(shown)
-    console.print(f"{theorems.summarize_checks(checks)}; results in {folder}")
+    console.print(f"{summarize_checks(checks)}; results in {folder}")
 
 
 def _deviation(check: Check) -> str:

@@ -1,6 +1,6 @@
 """Where the jobs of a sweep run: one after the other on this machine, or several at once, here or on a cluster.
 
-A launcher reports nothing: what became of each run stands in its folder, in whatever process it ran.
+A launcher reports nothing: the result of each run is in its folder, for runs in any process.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _STORE = 100 * 2**20
 """Bytes for the objects of a Ray cluster started here; the runs hand over none."""
 
 SUBMISSIONS = ".submissions"
-"""Folder, in that of the sweep, of what the scheduler is given and says."""
+"""Folder, in the sweep's, of the scheduler's inputs and outputs."""
 
 # Seconds between two looks for result files, and between two questions to the scheduler, which is shared by many
 # users.
@@ -64,7 +64,9 @@ def run_joblib(cfg: sweeping.JoblibConfig, jobs: Sequence[Job]) -> None:
     at_once = cfg.n_jobs or len(os.sched_getaffinity(0))
     # Threads: joblib's own processes (loky) give up the whole sweep when one of them is killed. `batch_size=1`: a
     # thread that took several runs at once would hold them back from threads that are idle.
-    Parallel(n_jobs=at_once, backend="threading", batch_size=1)(delayed(run_job)(job) for job in jobs)
+    Parallel(n_jobs=at_once, backend="threading", batch_size=1)(
+        delayed(run_job)(job) for job in jobs
+    )
 
 
 def run_on_ray(cfg: sweeping.RayConfig, jobs: Sequence[Job]) -> None:
@@ -76,19 +78,21 @@ def run_on_ray(cfg: sweeping.RayConfig, jobs: Sequence[Job]) -> None:
     import ray
 
     # Of a cluster that runs already Ray takes no word about its memory and processors.
-    said: dict[str, Any] = {"address": cfg.address, "logging_level": "error"}
+    options: dict[str, Any] = {"address": cfg.address, "logging_level": "error"}
     if cfg.address is None:
         # Without an address Ray would join a cluster that runs here, or the one that RAY_ADDRESS names.
-        said |= {"address": "local", "num_cpus": cfg.num_cpus, "object_store_memory": _STORE}
-        said["include_dashboard"] = False
+        options |= {"address": "local", "num_cpus": cfg.num_cpus, "object_store_memory": _STORE}
+        options["include_dashboard"] = False
     with joining("hydra.launcher.address", cfg.address):
-        ray.init(**said)
+        ray.init(**options)
     try:
-        # No retries by Ray: a run that was killed for lack of memory would be again; the sweep launches what is left
+        # No retries by Ray: a run that was killed for lack of memory would be again; the sweep launches the rest
         # itself.
-        task = ray.remote(num_cpus=cfg.cpus_per_run, num_gpus=cfg.gpus_per_run, max_retries=0)(run_job)
+        task = ray.remote(num_cpus=cfg.cpus_per_run, num_gpus=cfg.gpus_per_run, max_retries=0)(
+            run_job
+        )
         left = [task.remote(job) for job in jobs]
-        while left:  # what failed stands in the folders; a task whose worker died has left nothing there
+        while left:  # failures are in the folders; a task with a dead worker has left nothing there
             _, left = ray.wait(left, num_returns=1)
     finally:
         ray.shutdown()
@@ -108,7 +112,7 @@ class Submission:
             fail(job, process.Outcome(FAILED, reason=f"stopped by the scheduler: {error}"))
 
     def checkpoint(self, job: Job) -> Any:
-        """Let the run save, and return what is to be submitted next."""
+        """Let the run save, and return the next submission."""
         from submitit.helpers import DelayedSubmission
 
         process.stop_all()
@@ -121,12 +125,12 @@ def run_here(cfg: sweeping.SubmititLocalConfig, jobs: Sequence[Job]) -> None:
     import submitit
 
     executor = submitit.LocalExecutor(jobs[0].sweep / SUBMISSIONS)
-    # 30 s before the time is out the job is told to save.
+    # 30 s before the time is out the job gets a signal to save.
     executor.update_parameters(timeout_min=cfg.timeout_min, signal_delay_s=30)
     at_once = cfg.n_jobs or max(1, len(os.sched_getaffinity(0)) // cfg.cpus_per_task)
     running: list[Any] = []
     for job in jobs:
-        # submitit's local executor starts whatever it is given at once; the limit is kept here.
+        # submitit's local executor starts all jobs at once; the limit is kept here.
         while sum(not each.done() for each in running) >= at_once:
             time.sleep(_POLL)
         if stop_signal(job.sweep):
@@ -142,9 +146,21 @@ def run_on_slurm(cfg: sweeping.SubmititSlurmConfig, jobs: Sequence[Job]) -> None
     import submitit
 
     folder = jobs[0].sweep / SUBMISSIONS
-    executor = submitit.AutoExecutor(folder, cluster="slurm", slurm_max_num_timeout=cfg.max_num_timeout)
-    asked = {name: getattr(cfg, name) for name in ("timeout_min", "cpus_per_task", "mem_gb", "gpus_per_node")}
-    of_slurm = ("array_parallelism", "signal_delay_s", "partition", "account", "setup", "additional_parameters")
+    executor = submitit.AutoExecutor(
+        folder, cluster="slurm", slurm_max_num_timeout=cfg.max_num_timeout
+    )
+    asked = {
+        name: getattr(cfg, name)
+        for name in ("timeout_min", "cpus_per_task", "mem_gb", "gpus_per_node")
+    }
+    of_slurm = (
+        "array_parallelism",
+        "signal_delay_s",
+        "partition",
+        "account",
+        "setup",
+        "additional_parameters",
+    )
     asked |= {f"slurm_{name}": getattr(cfg, name) for name in of_slurm}
     executor.update_parameters(name=f"trackmdp_{jobs[0].command}", **asked)
     # One array job, of which the scheduler runs `array_parallelism` at once; one job each would flood its queue.
@@ -155,7 +171,9 @@ def _wait(submitted: Sequence[Any]) -> None:
     """Return once all jobs have ended; how each ended stands in its run's folder."""
     asked = time.monotonic()
     while left := [each for each in submitted if not each.done()]:
-        if time.monotonic() - asked > _ASK:  # one that was killed leaves no file by which it would be known
+        if (
+            time.monotonic() - asked > _ASK
+        ):  # one that was killed leaves no file by which it would be known
             left[0].done(force_check=True)
             asked = time.monotonic()
         time.sleep(_POLL)

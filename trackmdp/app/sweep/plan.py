@@ -11,16 +11,22 @@ import shlex
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from hydra.core.override_parser.types import Override
+from rich.console import Console
+from rich.progress import track
 
-from trackmdp.app.prepare import typed_config
+from trackmdp.app.sweep.configs import Configs
 from trackmdp.app.words import Compose, parsed
 from trackmdp.config import CommandConfig, TrainConfig, to_dict
+from trackmdp.config.resume import fixed_options, key_of
 from trackmdp.config.sweeping import BlocksConfig
-from trackmdp.config.tree import fixed_options, key_of
 from trackmdp.errors import UserError
+
+_T = TypeVar("_T")
+_MANY = 100
+"""Runs from which on progress is shown."""
 
 MOST = 100_000
 """Runs of a sweep, and values of a word; range(10000000) is a slip."""
@@ -34,7 +40,7 @@ class Job:
     """One run of a sweep: it can be handed to another process.
 
     Attributes:
-        command: what is run.
+        command: the command to run.
         sweep: the sweep's folder.
         name: of the run's folder in it.
         words: the overrides of this run.
@@ -59,11 +65,23 @@ class Job:
         return self.sweep / self.name
 
 
+def progress(items: Sequence[_T], done: str, console: Console | None) -> Iterable[_T]:
+    """The items; where they are many, their number so far is shown."""
+    if console is None or len(items) < _MANY:
+        return items
+    return track(items, f"{len(items):,} runs {done}", console=console, transient=True)
+
+
 MakeJobs = Callable[..., list[Job]]
 """`plan` for one command, sweep and composer: called with a grid of words, and `naming`."""
 
 
-def grid(cfg: BlocksConfig, words: Sequence[str], folder: Path, planned: MakeJobs) -> list[list[Job]]:  # noqa: ARG001
+def grid(
+    cfg: BlocksConfig,
+    words: Sequence[str],
+    folder: Path,  # noqa: ARG001
+    planned: MakeJobs,
+) -> list[list[Job]]:
     """One batch with the whole grid.
 
     Raises:
@@ -77,7 +95,7 @@ def grid(cfg: BlocksConfig, words: Sequence[str], folder: Path, planned: MakeJob
 
 
 def combinations(blocks: Sequence[str], typed: Sequence[str]) -> list[list[str]]:
-    """The words of every run: each block is a grid, to which what is typed is added, or which it replaces.
+    """The words of every run: each block is a grid; typed words are added to it, or replace it.
 
     Args:
         blocks: lines of words such as ``algo=a2c,ppo seed=range(5)``; without any, the typed words are the grid.
@@ -94,7 +112,7 @@ def combinations(blocks: Sequence[str], typed: Sequence[str]) -> list[list[str]]
             override = parsed(word)
             if override.key_or_group == "experiment" and override.is_sweep_override():
                 raise UserError(f"{word}: expected one experiment; each is a sweep of its own")
-            # By key: what is typed comes last, and replaces the word of the block. `algo=a2c,ppo seed=0,1` makes the
+            # By key: typed words come last, and replaces the word of the block. `algo=a2c,ppo seed=0,1` makes the
             # axes {algo: [algo=a2c, algo=ppo], seed: [seed=0, seed=1]}.
             axes[override.key_or_group] = _values(override)
         # Counted before they are listed: the list might fill the memory.
@@ -106,32 +124,38 @@ def combinations(blocks: Sequence[str], typed: Sequence[str]) -> list[list[str]]
 
 
 def plan(
-    command: str, sweep: Path, compose: Compose, grid: Sequence[Sequence[str]], naming: Collection[str] = ()
+    command: str,
+    sweep: Path,
+    compose: Compose,
+    grid: Sequence[Sequence[str]],
+    naming: Collection[str] = (),
+    console: Console | None = None,
 ) -> list[Job]:
     """The jobs of a sweep, without duplicates.
 
-    A run's folder is named by what differs from the others, and by a digest of what was overridden and of the
-    config behind it. What may change when a run is resumed (`CHANGEABLE`) counts only where it was overridden.
+    A run's folder is named by its differences from the others, and by a digest of its overrides and of the
+    config behind it. Options that may change when a run is resumed (`CHANGEABLE`) count only where overridden.
 
     Args:
-        command: what is run.
+        command: the command to run.
         sweep: the sweep's folder.
         compose: the config of some words.
         grid: the words of each run.
-        naming: options whose values name the folders; if there are none, those whose values differ in the grid.
+        naming: options with values that name the folders; by default the ones that differ in the grid.
+        console: where progress is shown.
 
     Raises:
         UserError: words that do not make a config; a config that is refused is kept, as a job that fails.
     """
     naming, known = naming or _varying(grid), _folders(sweep)
     jobs: dict[str, Job] = {}
-    for words in grid:
-        cfg: CommandConfig | None
-        composed = compose(words)
+    configs = Configs(command, compose)
+    for words in progress(grid, "planned", console):
         # Only composing may refuse the whole sweep; a config out of range is a failed run among others, and is shown
         # as one.
+        cfg, refusal = configs(words)
         try:
-            cfg, refusal = _resumable(typed_config(command, composed, Path.cwd())), ""
+            cfg = cfg and _resumable(cfg)
         except UserError as error:
             cfg, refusal = None, str(error)
         # Words and config: where a default in conf/ has changed, the same words make another run.
@@ -143,15 +167,20 @@ def plan(
         # Lines that differ only in the order of their words, or in `quiet` and `resume`, are one run: two would write
         # to one folder at once.
         jobs.setdefault(key, Job(command, sweep, name, tuple(words), cfg, refusal))
-    return [replace(job, label=f"{place}/{len(jobs)}") for place, job in enumerate(jobs.values(), 1)]
+    return [
+        replace(job, label=f"{place}/{len(jobs)}") for place, job in enumerate(jobs.values(), 1)
+    ]
 
 
 def sweep_name(command: str, words: Sequence[str], blocks: Sequence[str]) -> str:
-    """The name of a sweep's folder: the same for the same words, in whatever order; those with many values first."""
+    """The name of a sweep's folder: the same for the same words in any order; words with many values first."""
     told = _distinguishing(words)
     experiments = [word.partition("=")[2] for word in told if key_of(word) == "experiment"]
     # Stable sort: False comes first, so that words with several values lead and survive the cut at 80 letters.
-    text = _slug(sorted(told, key=lambda word: not parsed(word).is_sweep_override()), experiments or [command])
+    text = _slug(
+        sorted(told, key=lambda word: not parsed(word).is_sweep_override()),
+        experiments or [command],
+    )
     return f"{text}-{_digest(command, told, list(blocks))}"
 
 
@@ -161,29 +190,38 @@ def _varying(grid: Sequence[Sequence[str]]) -> set[str]:
     for word in (word for words in grid for word in words):
         values.setdefault(key_of(word), set()).add(word)
     # An option that is missing in some words varies too, though it has one value wherever it stands.
-    shared = {key for key in values if all(any(key_of(word) == key for word in words) for words in grid)}
+    shared = {
+        key for key in values if all(any(key_of(word) == key for word in words) for words in grid)
+    }
     return {key for key, found in values.items() if len(found) > 1 or key not in shared}
 
 
 def _folders(sweep: Path) -> dict[str, str]:
-    """Digest -> name of the folders that are there: a run is known by its digest, whatever else its name says."""
+    """Digest -> name of the folders that are there: a run is known by its digest alone."""
     names = [path.name for path in sweep.iterdir() if path.is_dir()] if sweep.is_dir() else []
     return {name.rpartition("-")[2]: name for name in sorted(names)}
 
 
 def _slug(words: Iterable[str], prefix: Sequence[str] = ()) -> str:
     """Words as a readable part of a folder's name."""
-    named = {key_of(word): _short(word.partition("=")[2]) for word in words if key_of(word) not in _UNNAMED}
+    named = {
+        key_of(word): _short(word.partition("=")[2])
+        for word in words
+        if key_of(word) not in _UNNAMED
+    }
     # `algo.gamma` is shown as `gamma`, unless another option of the runs ends alike.
     short = [key.split(".")[-1] for key in named]
-    pairs = {key if short.count(last) > 1 else last: named[key] for key, last in zip(named, short, strict=True)}
+    pairs = {
+        key if short.count(last) > 1 else last: named[key]
+        for key, last in zip(named, short, strict=True)
+    }
     parts = [*prefix, *(f"{key}_{value}" for key, value in pairs.items())]
     # Only letters that no file system, shell or glob takes for its own; 80 of them leave room below the usual 255.
     return "-".join(re.sub(r"[^\w.+-]+", "_", part).strip("_") for part in parts)[:80].strip("-._")
 
 
 def _short(value: str) -> str:
-    """A value, rounded to 4 digits if it is a long number: names need not be exact, digests tell runs apart."""
+    """A value, rounded to 4 digits if it is a long number: names need not be exact, since digests differ."""
     return f"{float(value):.4g}" if re.fullmatch(r"-?\d*\.\d{5,}(e-?\d+)?", value) else value
 
 
@@ -198,10 +236,12 @@ def _digest(*told: Any) -> str:
 
 def _identity(cfg: CommandConfig | None) -> dict[str, Any]:
     """The options by which two configs count as different runs; empty for a config that was refused."""
-    # A default of what may change when a run is resumed does not make another run; typed, it does, as one of the words.
+    # Options that may change when a run is resumed do not make another run; typed ones do, as words.
     if isinstance(cfg, TrainConfig):
         return fixed_options(cfg)
-    return {} if cfg is None else {key: value for key, value in to_dict(cfg).items() if key != "quiet"}
+    return (
+        {} if cfg is None else {key: value for key, value in to_dict(cfg).items() if key != "quiet"}
+    )
 
 
 def _resumable(cfg: CommandConfig) -> CommandConfig:
@@ -209,7 +249,9 @@ def _resumable(cfg: CommandConfig) -> CommandConfig:
     if not isinstance(cfg, TrainConfig):
         return cfg
     if cfg.resume not in (None, "auto"):
-        raise UserError(f"resume={cfg.resume}: expected null or auto in a sweep, whose runs go on in their own folders")
+        raise UserError(
+            f"resume={cfg.resume}: expected null or auto in a sweep: its runs go on in their own folders"
+        )
     return replace(cfg, resume="auto")
 
 
@@ -221,9 +263,14 @@ def _values(override: Override) -> list[str]:
     if not override.is_sweep_override():
         return [f"{key}={override.get_value_element_as_str()}"]
     if not override.is_discrete_sweep():
-        raise UserError(f"{override.input_line}: expected values that can be counted; hydra/sweeper=optuna searches")
+        raise UserError(
+            f"{override.input_line}: expected values that can be counted; hydra/sweeper=optuna searches"
+        )
     try:
-        values = [f"{key}={value}" for value in itertools.islice(override.sweep_string_iterator(), MOST + 1)]
+        values = [
+            f"{key}={value}"
+            for value in itertools.islice(override.sweep_string_iterator(), MOST + 1)
+        ]
     except ValueError as error:  # range(0,1,0)
         raise UserError(f"{override.input_line}: {error}") from error
     if len(values) > MOST:

@@ -1,6 +1,6 @@
 """One run of a sweep in a process of its own: a crash, a leak or a kill in one run does not reach the others.
 
-Whatever process a launcher calls it in, it never raises, and leaves its state on disk.
+In any launcher's process, it never raises, and leaves its state on disk.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _PATIENCE = 60.0
 """Seconds to wait for a run's folder that an earlier process, which lost its sweep, still holds while it saves."""
 
 OUTPUT = "output.txt"
-"""File in a run's folder for what it says, where several runs would say it at once."""
+"""File in a run's folder for its output, where several runs print at once."""
 
 METHOD = "forkserver"
 """The fork server imports the command once (seconds: torch, TorchRL); every run, of any launcher, is forked from it."""
@@ -47,10 +47,10 @@ METHOD = "forkserver"
 _running: list[Any] = []
 _start_or_join = threading.RLock()
 """Held while a process is started or joined: `multiprocessing` polls all children in both, which is not thread-safe."""
-# Seconds between two looks for the file by which a sweep is told to stop.
+# Seconds between two looks for the file that stops a sweep.
 _POLL = 0.2
 _LOST = 255
-"""What `multiprocessing` gives as the exit status of a process whose fork server is gone."""
+"""Exit status that `multiprocessing` gives to a process without its fork server."""
 _TERMINATING = (signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
 
 
@@ -60,7 +60,7 @@ class Outcome:
 
     Attributes:
         status: as of the command line: 0, 1, 2, or 128 + the signal that stopped it.
-        value: what the command returned.
+        value: the command's result.
         reason: why it failed.
     """
 
@@ -75,7 +75,7 @@ def run_in_process(job: Job, stop: Callable[[], int]) -> Outcome:
     The child also saves and stops when the calling process ends, even by SIGKILL.
 
     Args:
-        job: what is run.
+        job: the run.
         stop: asked every 0.2 s: the number of the signal by which the run is to stop, 0 for none.
     """
     # The fork server is a process of its own, which the system may kill for lack of memory. The attempt that meets a
@@ -84,7 +84,10 @@ def run_in_process(job: Job, stop: Callable[[], int]) -> Outcome:
         try:
             process, ours = _start(job)
             break
-        except (OSError, EOFError) as error:  # the fork server was killed; the next start makes another
+        except (
+            OSError,
+            EOFError,
+        ) as error:  # the fork server was killed; the next start makes another
             if last:
                 return Outcome(FAILED, reason=f"its process could not be started ({_line(error)})")
     asked = 0
@@ -97,13 +100,15 @@ def run_in_process(job: Job, stop: Callable[[], int]) -> Outcome:
             if not asked and (asked := stop()):
                 os.kill(process.pid, signal.SIGTERM)
     finally:
-        _stop(process)  # after an exception in this process the run may still be going: let it save first
+        _stop(
+            process
+        )  # after an exception in this process the run may still be going: let it save first
     return _outcome(ours, process.exitcode, asked)
 
 
 def _start(job: Job) -> tuple[Any, Connection]:
     """The process of a run, and the end of the pipe on which its `Outcome` arrives."""
-    # The fork server imports what is preloaded when it starts, so that this is said before the first process.
+    # The fork server imports the preloaded modules when it starts, so they are named before the first process.
     context = context_for(job.command)
     ours, theirs = context.Pipe(duplex=False)
     process = context.Process(target=_run_in_child, args=(job, Path.cwd(), theirs))
@@ -130,7 +135,7 @@ def context_for(command: str) -> Any:
     if METHOD != "forkserver":
         return context
     # Importing torch takes seconds and memory; a fork shares both. Forking this process itself would copy its threads'
-    # locks in whatever state they are; a fork server has one thread.
+    # locks in any state; a fork server has one thread.
     context.set_forkserver_preload([f"trackmdp.app.commands.{command}"])
     # Python sets signal handlers from the main thread alone; hence "call it first in the main thread".
     ignored = _TERMINATING if threading.current_thread() is threading.main_thread() else ()
@@ -151,7 +156,7 @@ def _stop(process: Any) -> None:
 
 
 def _outcome(connection: Connection, code: int, asked: int) -> Outcome:
-    """What the child sent; without that, what its exit status says."""
+    """The child's outcome; without it, the one of its exit status."""
     with connection:
         try:
             # `recv` unpickles, which is safe here: the other end is our own child. A child that was killed half way
@@ -161,12 +166,14 @@ def _outcome(connection: Connection, code: int, asked: int) -> Outcome:
             sent = None
     if isinstance(sent, Outcome):
         return sent
-    # Asked to stop, and ended without a word: it was stopped, whatever its status says.
+    # Asked to stop, and ended without a word: it was stopped, with any status.
     if asked:
         return Outcome(128 + asked)
-    # `multiprocessing` gives -N for a process that signal N ended. -9 is what Linux sends when memory runs out.
+    # `multiprocessing` gives -N for a process that signal N ended. Linux sends 9 when memory runs out.
     if code < 0:
-        return Outcome(FAILED, reason=f"killed by {signal.Signals(-code).name}{_MEMORY if code == -9 else ''}")
+        return Outcome(
+            FAILED, reason=f"killed by {signal.Signals(-code).name}{_MEMORY if code == -9 else ''}"
+        )
     return Outcome(FAILED, reason=f"its process ended with status {code}")
 
 
@@ -177,11 +184,14 @@ def _run_in_child(job: Job, folder: Path, connection: Connection) -> None:
     # The fork server ignores these, and a fork inherits that: a run has to hear them, to save and stop.
     for number in (signal.SIGTERM, signal.SIGUSR1):
         signal.signal(number, signal.SIG_DFL)
-    for number in (signal.SIGINT, signal.SIGUSR2):  # the sweep, or the cluster's job, receives these and passes them on
+    for number in (
+        signal.SIGINT,
+        signal.SIGUSR2,
+    ):  # the sweep, or the cluster's job, receives these and passes them on
         signal.signal(number, signal.SIG_IGN)
     # The fork server stays in the folder in which it was started, so that relative paths would be meant from there.
     os.chdir(folder)
-    # At the level of the descriptor, so that what libraries in C print goes to the file as well. Errors stay on the
+    # At the level of the descriptor, so that output of libraries in C goes to the file as well. Errors stay on the
     # terminal.
     if job.concurrent:
         with (job.folder / OUTPUT).open("a") as stream:
@@ -199,11 +209,13 @@ def _stop_with_parent() -> None:
     if parent is not None:
         # Returns when the parent's sentinel closes, which the system does however it ends.
         parent.join()
-        os.kill(os.getpid(), signal.SIGUSR1)  # not SIGTERM: where one came before, a second ends the run without saving
+        os.kill(
+            os.getpid(), signal.SIGUSR1
+        )  # not SIGTERM: where one came before, a second ends the run without saving
 
 
 def _run(job: Job) -> Outcome:
-    """Run the command; whatever it raises becomes an `Outcome`."""
+    """Run the command; every exception becomes an `Outcome`."""
     assert job.cfg is not None
     try:
         # Checked when the sweep was planned, but hours may lie between, and files may have gone since.
@@ -214,8 +226,10 @@ def _run(job: Job) -> Outcome:
     except Preempted as error:
         return Outcome(128 + error.signal)
     except (UserError, RunError) as error:
-        return Outcome(USER_MISTAKE if isinstance(error, UserError) else FAILED, reason=_line(error))
-    # Whatever it is, SystemExit among it: the exception ends with this process, and the sweep needs a reason.
+        return Outcome(
+            USER_MISTAKE if isinstance(error, UserError) else FAILED, reason=_line(error)
+        )
+    # Any exception, SystemExit among them: it ends with this process, and the sweep needs a reason.
     except BaseException as error:
         traceback.print_exc()
         sys.stderr.flush()
@@ -231,12 +245,12 @@ def run_job(job: Job) -> None:
     if stop_signal(job.sweep):
         return
     job.folder.mkdir(parents=True, exist_ok=True)
-    # A run whose sweep was killed saves and ends by itself, which takes a while; started beside it, this one would be
+    # A run of a killed sweep saves and ends by itself, which takes a while; started beside it, this one would be
     # refused by the lock of the folder.
     if not _is_free(job):
         _say(job, "is run by another process")
         return
-    # An earlier attempt in this folder, perhaps on a node that died, must not decide what this one came to.
+    # An earlier attempt in this folder, perhaps on a node that died, must not decide the outcome of this one.
     (job.folder / FAILED_FILE).unlink(missing_ok=True)
     (job.folder / DONE).unlink(missing_ok=True)
     if job.cfg is None:
@@ -255,7 +269,7 @@ def run_job(job: Job) -> None:
 
 
 def fail(job: Job, outcome: Outcome) -> None:
-    """Leave in the run's folder why it failed, and say so."""
+    """Leave the reason of the failure in the run's folder, and print it."""
     job.folder.mkdir(parents=True, exist_ok=True)
     write_json(job.folder / FAILED_FILE, {"reason": outcome.reason, "status": outcome.status})
     _say(job, f"failed: {outcome.reason}")
@@ -289,7 +303,7 @@ def _is_free(job: Job) -> bool:
     return True
 
 
-def _say(job: Job, what: str) -> None:
+def _say(job: Job, state: str) -> None:
     # The terminal may be gone, as after a lost connection; the run is not to fail of that.
     with contextlib.suppress(OSError):
-        sys.stderr.write(f"trackmdp {job.command}: {job.name} {what}\n")
+        sys.stderr.write(f"trackmdp {job.command}: {job.name} {state}\n")

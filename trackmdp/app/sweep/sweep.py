@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Collection, Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 from typing import Any, Self
@@ -12,34 +13,50 @@ from rich.console import Console
 
 from trackmdp.app.prepare import shown
 from trackmdp.app.sweep.launchers import threads_of
-from trackmdp.app.sweep.plan import Job
+from trackmdp.app.sweep.plan import Job, progress
 from trackmdp.app.sweep.process import STOP, Launch, Outcome, fail
 from trackmdp.config import TrainConfig
-from trackmdp.config.tree import continued
+from trackmdp.config.resume import continued
 from trackmdp.durable import csv_text, write_text
 from trackmdp.errors import FAILED, USER_MISTAKE, Preempted, UserError
 from trackmdp.signals import Signals
 from trackmdp.training.display import table
-from trackmdp.training.folders import DONE, FAILED_FILE, SUMMARY, RunState, finished, run_of, runs_of, write_plan
+from trackmdp.training.folders import (
+    DONE,
+    FAILED_FILE,
+    SUMMARY,
+    RunState,
+    finished,
+    run_of,
+    runs_of,
+    write_plan,
+)
 from trackmdp.training.lock import locked
 from trackmdp.untrusted import known_object, no_formula
 
 TABLE = "runs.csv"
 
 _FIGURES = ("aihtr", "regret_per_step", "accuracy", "sensors_per_step", "frames")
+_HELD_OUT = ("held_out_aihtr", "held_out_accuracy", "held_out_sensors_per_step")
+"""Figures of runs on recordings; their other figures are on the validation tracks."""
 _ROUNDS = 3
-"""How often what a broken launcher left undone is launched."""
+"""How often runs that a broken launcher left undone are launched."""
 
 
 def sweep(
-    folder: Path, command: str, line: str, batches: Iterable[Sequence[Job]], launch: Launch, console: Console
+    folder: Path,
+    command: str,
+    line: str,
+    batches: Iterable[Sequence[Job]],
+    launch: Launch,
+    console: Console,
 ) -> int:
     """Run the jobs that are not finished, and show the results of all; returns the exit status.
 
     Args:
         folder: of the sweep.
-        command: what is run.
-        line: what was typed.
+        command: the command to run.
+        line: the typed command line.
         batches: the plan, in parts; the next one is asked for once the runs of one are over.
         launch: runs jobs.
         console: where the table is shown.
@@ -55,9 +72,11 @@ def sweep(
     with locked(folder, "hydra.sweep.dir"), _Stop(folder) as stop:
         for batch in batches:
             jobs |= {job.name: job for job in batch}
-            # Before anything is run, so that `report` and `watch` know what is still to come.
+            # Before anything is run, so that `report` and `watch` know the runs still to come.
             write_plan(folder, command, line, [(job.name, job.words) for job in jobs.values()])
-            done = {job.folder for job in batch if _is_finished(job)}
+            done = {
+                job.folder for job in progress(batch, "looked up", console) if _is_finished(job)
+            }
             before = f", {len(done)} of them done before" if done else ""
             console.print(f"{len(batch)} runs{before} -> {shown(folder)}")
             _run([job for job in batch if job.folder not in done], launch, stop)
@@ -79,22 +98,22 @@ def _is_finished(job: Job) -> bool:
     # Other commands leave no config to compare with, so that they are done again.
     if not isinstance(job.cfg, TrainConfig) or run_of(job.folder).state != "done":
         return False
-    try:
-        # `continued` refuses where an option differs that must not change: what is done is another run then, and this
-        # one says so itself when it is run.
+    if finished(job.cfg, job.folder):
+        return True
+    # Options of the run in the folder may differ where the line leaves them to their defaults.
+    with suppress(UserError):  # one that must not change: the run refuses it itself
         return finished(continued(job.cfg, job.folder, job.words), job.folder) is not None
-    except UserError:
-        return False
+    return False
 
 
 def _run(jobs: Sequence[Job], launch: Launch, stop: _Stop) -> None:
-    """Launch `jobs`, and once more what a launcher that broke down left undone."""
+    """Launch `jobs`, and once more the ones that a broken launcher left undone."""
     for job in jobs:
         # A launcher's worker may die before its run begins; an old result would then be taken for the new one.
         for name in (FAILED_FILE, DONE, SUMMARY):
             (job.folder / name).unlink(missing_ok=True)
     reason = "it was launched, and left nothing"
-    # A pool whose worker was killed gives up all that it still had to do. What is done stands in the folders, so that
+    # A pool gives up all its jobs when a worker is killed. Finished runs are in their folders, so that
     # the rest can simply be launched again.
     for _ in range(_ROUNDS):
         if not jobs or stop.received:
@@ -107,7 +126,9 @@ def _run(jobs: Sequence[Job], launch: Launch, stop: _Stop) -> None:
         except UserError:  # no such cluster, which the next round would not find either
             raise
         except Exception as error:
-            reason = f"the launcher broke down: {type(error).__name__}: {' '.join(str(error).split())}"
+            reason = (
+                f"the launcher broke down: {type(error).__name__}: {' '.join(str(error).split())}"
+            )
             sys.stderr.write(f"{reason}\n")
         # Not "running": another process holds that folder, and is at it.
         jobs = [job for job in jobs if run_of(job.folder).state in ("cut", "waiting")]
@@ -116,7 +137,7 @@ def _run(jobs: Sequence[Job], launch: Launch, stop: _Stop) -> None:
 
 
 class _Stop(Signals):
-    """A signal also asks the runs, in whatever process they are, to save and end."""
+    """A signal also asks the runs, in any process, to save and end."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__()
@@ -140,15 +161,30 @@ class _Stop(Signals):
             super()._note(number, frame)
 
 
-def show_runs(console: Console, runs: Sequence[RunState], skipped: Collection[Path], sweep: Path) -> None:
+def show_runs(
+    console: Console, runs: Sequence[RunState], skipped: Collection[Path], sweep: Path
+) -> None:
     """Every run with its state, AIHTR and regret per step, or why it failed."""
-    # Without the digest, where the readable part is enough to tell the runs apart.
+    # Without the digest, where the readable part is different for each run.
     names = [run.folder.name.rpartition("-")[0] for run in runs]
     if len(set(names)) < len(names):
         names = [run.folder.name for run in runs]
-    states = ["skipped" if run.folder in skipped and run.state == "done" else run.state for run in runs]
-    rows = [[name, state, *_short(run), run.reason] for name, state, run in zip(names, states, runs, strict=True)]
-    made = table(f"{len(runs)} runs", ["run", "state", "AIHTR", "regret per step", "reason"], rows)
+    states = [
+        "skipped" if run.folder in skipped and run.state == "done" else run.state for run in runs
+    ]
+    rows = [
+        [name, state, *_short(run), run.reason]
+        for name, state, run in zip(names, states, runs, strict=True)
+    ]
+    recorded = any("held_out_aihtr" in run_figures(run) for run in runs)
+    heads = [
+        "run",
+        "state",
+        "validation AIHTR" if recorded else "AIHTR",
+        "regret per step",
+        "reason",
+    ]
+    made = table(f"{len(runs)} runs", heads, rows)
     made.columns[1].justify = made.columns[4].justify = "left"
     console.print(made)
     counts = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states))
@@ -161,15 +197,24 @@ def write_table(sweep: Path, runs: Sequence[RunState]) -> None:
 
     Nothing in it depends on time, or on how often a run was interrupted.
     """
-    words = [{word.partition("=")[0]: word.partition("=")[2] for word in run.overrides} for run in runs]
+    words = [
+        {word.partition("=")[0]: word.partition("=")[2] for word in run.overrides} for run in runs
+    ]
     # The union in order of appearance: runs of different blocks may have different options.
     keys = [key for key in dict.fromkeys(key for pairs in words for key in pairs) if key != "quiet"]
-    rows = []
-    for run, pairs in zip(runs, words, strict=True):
-        found = run_figures(run)
-        row = [_cell(run.folder.name), run.state, *(found.get(name) for name in _FIGURES), _cell(run.reason)]
-        rows.append([*row, *(_cell(pairs.get(key)) for key in keys)])
-    write_text(sweep / TABLE, csv_text(["folder", "state", *_FIGURES, "reason", *keys], rows))
+    found = [run_figures(run) for run in runs]
+    names = [*_FIGURES, *(name for name in _HELD_OUT if any(name in each for each in found))]
+    rows = [
+        [
+            _cell(run.folder.name),
+            run.state,
+            *(each.get(name) for name in names),
+            _cell(run.reason),
+            *(_cell(pairs.get(key)) for key in keys),
+        ]
+        for run, each, pairs in zip(runs, found, words, strict=True)
+    ]
+    write_text(sweep / TABLE, csv_text(["folder", "state", *names, "reason", *keys], rows))
 
 
 def _cell(text: str | None) -> str | None:
@@ -187,26 +232,37 @@ def status_of(runs: Sequence[RunState]) -> int:
     """The exit status: 0 if all is done, 2 if only mistakes of the user failed, else 1."""
     if all(run.state == "done" for run in runs):
         return 0
-    statuses = [known_object(run.folder / FAILED_FILE).get("status") for run in runs if run.state == "failed"]
-    # A run that is neither done nor failed is nobody's mistake, and 2 would tell a script not to try again.
+    statuses = [
+        known_object(run.folder / FAILED_FILE).get("status")
+        for run in runs
+        if run.state == "failed"
+    ]
+    # A run that is neither done nor failed is nobody's mistake, and 2 means to a script: do not try again.
     unfinished = any(run.state not in ("done", "failed") for run in runs)
-    return FAILED if unfinished or any(status != USER_MISTAKE for status in statuses) else USER_MISTAKE
-
-
-def run_scores(run: RunState) -> dict[str, Any]:
-    """The figures to choose between runs by: of recorded tracks those on the validation tracks, else all there are."""
-    return {**run_figures(run), **(run.result.get("validation") or {})}
+    return (
+        FAILED if unfinished or any(status != USER_MISTAKE for status in statuses) else USER_MISTAKE
+    )
 
 
 def run_figures(run: RunState) -> dict[str, Any]:
-    """The figures of a training run; of another command's the one value that it returns."""
+    """The figures by which runs are compared; of another command than `train` the one value that it returns.
+
+    On recordings they are those on the validation tracks: a choice by the held-out tracks would be the luckiest there.
+    """
     if "policy" not in run.result:
         return {"aihtr": run.result.get("value")}
-    return {**run.result["policy"], **{name: run.result.get(name) for name in ("regret_per_step", "frames")}}
+    policy, validation = run.result["policy"], run.result.get("validation")
+    found = {name: run.result.get(name) for name in ("regret_per_step", "frames")}
+    if validation:
+        found |= {name: policy.get(name.removeprefix("held_out_")) for name in _HELD_OUT}
+    return {**(validation or policy), **found}
 
 
 def _short(run: RunState) -> list[str]:
     found = run_figures(run)
     aihtr, regret = found.get("aihtr"), found.get("regret_per_step")
     # Adding 0.0 turns the -0.0 that rounding leaves into 0.0.
-    return [f"{aihtr:,.3f}" if aihtr is not None else "", f"{round(regret, 4) + 0.0:.4f}" if regret is not None else ""]
+    return [
+        f"{aihtr:,.3f}" if aihtr is not None else "",
+        f"{round(regret, 4) + 0.0:.4f}" if regret is not None else "",
+    ]

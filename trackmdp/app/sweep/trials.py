@@ -1,4 +1,4 @@
-"""Sweeps whose runs are chosen by Optuna, one batch after the other; the study is kept and continued."""
+"""Sweeps with runs chosen by Optuna, one batch after the other; the study is kept and continued."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from optuna.samplers import RandomSampler, TPESampler
 from optuna.trial import TrialState
 
 from trackmdp.app.sweep.plan import MOST, Job, MakeJobs
-from trackmdp.app.sweep.sweep import run_scores
+from trackmdp.app.sweep.sweep import run_figures
 from trackmdp.app.words import parsed
 from trackmdp.config.sweeping import OptunaConfig
 from trackmdp.errors import UserError
@@ -30,12 +30,14 @@ _WORDS = "words"
 _DIRECTIONS = {"aihtr": "maximize", "regret_per_step": "minimize"}
 
 
-def trials(cfg: OptunaConfig, words: Sequence[str], folder: Path, planned: MakeJobs) -> Iterator[list[Job]]:
+def trials(
+    cfg: OptunaConfig, words: Sequence[str], folder: Path, planned: MakeJobs
+) -> Iterator[list[Job]]:
     """Batches of jobs, until `cfg.n_trials` are done; once a batch has been run, its results are handed to the study.
 
     Args:
         cfg: of the study.
-        words: what was typed; words with several values, `range(a,b)` or `interval(a,b)` are searched.
+        words: the typed ones; words with several values, `range(a,b)` or `interval(a,b)` are searched.
         folder: of the sweep.
         planned: makes jobs of words.
 
@@ -46,24 +48,32 @@ def trials(cfg: OptunaConfig, words: Sequence[str], folder: Path, planned: MakeJ
     searched = {each.get_key_element(): each for each in read if each.is_sweep_override()}
     fixed = [word for word, each in zip(words, read, strict=True) if not each.is_sweep_override()]
     if not searched:
-        raise UserError("hydra/sweeper=optuna: expected a word to search, such as algo.gamma=interval(0.9,0.99)")
+        raise UserError(
+            "hydra/sweeper=optuna: expected a word to search, such as algo.gamma=interval(0.9,0.99)"
+        )
     for key, each in searched.items():
         _check(key, each.value())
     timed = [each.value() for each in read if each.get_key_element() == "optimal.time_limit"]
     if cfg.objective == "regret_per_step" and any(value is not None for value in timed):
-        raise UserError("optimal.time_limit: a regret would be chosen by the clock, expected null (or objective=aihtr)")
+        raise UserError(
+            "optimal.time_limit: a regret would be chosen by the clock, expected null (or objective=aihtr)"
+        )
 
     def job_of(chosen: Sequence[str]) -> Job:
         return planned([[*fixed, *chosen]], searched)[0]
 
     with _study(cfg, folder) as study:
         # The words are kept with each trial: Optuna's own parameters would have to be put into Hydra's notation again.
-        told = [trial.user_attrs.get(_WORDS, []) for trial in study.trials if trial.state == TrialState.COMPLETE]
-        earlier = [job_of(chosen) for chosen in told]
+        known = [
+            trial.user_attrs.get(_WORDS, [])
+            for trial in study.trials
+            if trial.state == TrialState.COMPLETE
+        ]
+        earlier = [job_of(chosen) for chosen in known]
         # Handed over as a batch of its own: the sweep finds them done, and they stand in its table.
         if here := [job for job in earlier if run_of(job.folder).state == "done"]:
             yield here
-        # Failures of earlier calls do not count: whoever calls again has perhaps removed the cause, and they are tried
+        # Failures of earlier calls do not count: the user has perhaps removed the cause, and they are tried
         # once more.
         failed = 0
         # `n_trials` is the whole study's, so that a call that was interrupted and is repeated comes to the same
@@ -71,23 +81,27 @@ def trials(cfg: OptunaConfig, words: Sequence[str], folder: Path, planned: MakeJ
         while missing := max(0, cfg.n_trials - _completed(study) - failed):
             asked = [_ask(cfg, study, searched, place) for place in range(min(cfg.batch, missing))]
             jobs = [job_of(chosen) for _, chosen in asked]
-            # A sampler may propose the same values twice within a batch: one run, whose result both trials are told.
+            # A sampler may propose the same values twice within a batch: one run, with its result for both trials.
             yield list({job.name: job for job in jobs}.values())
             # The generator goes on only when the sweep asks for the next batch, after all runs of this one are over.
             for (trial, _), job in zip(asked, jobs, strict=True):
                 failed += _tell(cfg, study, trial, job)
 
 
-def _ask(cfg: OptunaConfig, study: Any, searched: dict[str, Override], place: int) -> tuple[Any, list[str]]:
+def _ask(
+    cfg: OptunaConfig, study: Any, searched: dict[str, Override], place: int
+) -> tuple[Any, list[str]]:
     """The next trial and its words. Draws depend on the seed and on the results known, not on interruptions."""
-    # A sampler's state is not kept in the storage. Seeded anew from what is known, the choice after an interruption is
+    # A sampler's state is not kept in the storage. Seeded anew from the results, the choice after an interruption is
     # the one that would have come without it. 2^32: NumPy takes no larger seed.
     study.sampler = _sampler(cfg, derive(cfg.seed, "optuna", _completed(study), place) % 2**32)
     trial = study.ask()
     try:
         words = [f"{key}={_suggest(trial, key, override)}" for key, override in searched.items()]
     except ValueError as error:
-        raise UserError(f"hydra.sweeper.storage: the study is one of another search ({error})") from error
+        raise UserError(
+            f"hydra.sweeper.storage: the study is one of another search ({error})"
+        ) from error
     trial.set_user_attr(_WORDS, words)
     return trial, words
 
@@ -97,7 +111,9 @@ def _sampler(cfg: OptunaConfig, seed: int) -> Any:
         return RandomSampler(seed)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ExperimentalWarning)
-        return TPESampler(seed=seed, constant_liar=cfg.batch > 1)  # else a batch would be the same run many times
+        return TPESampler(
+            seed=seed, constant_liar=cfg.batch > 1
+        )  # else a batch would be the same run many times
 
 
 def _check(key: str, value: Any) -> None:
@@ -105,7 +121,9 @@ def _check(key: str, value: Any) -> None:
     if isinstance(value, IntervalSweep):
         low, high, log = *_numbers(value.start, value.end), "log" in value.tags
         if not (0 if log else -math.inf) < low < high < math.inf:
-            raise UserError(f"{key}=interval({low},{high}): expected interval(a,b) with {'0 < ' if log else ''}a < b")
+            raise UserError(
+                f"{key}=interval({low},{high}): expected interval(a,b) with {'0 < ' if log else ''}a < b"
+            )
     if isinstance(value, RangeSweep):
         start, stop, step = _numbers(value.start, value.stop, value.step)
         span = stop - start if step > 0 else start - stop
@@ -115,7 +133,7 @@ def _check(key: str, value: Any) -> None:
 
 
 def _numbers(*bounds: Any) -> tuple[Any, ...]:
-    """The bounds, which Hydra's grammar says are numbers, and its types say may be None."""
+    """The bounds: numbers by Hydra's grammar, but by its types possibly None."""
     return bounds
 
 
@@ -134,7 +152,7 @@ def _suggest(trial: Any, key: str, override: Override) -> Any:
         values = sorted(steps)
         draw = trial.suggest_int if isinstance(values[0], int) else trial.suggest_float
         return draw(key, values[0], values[-1], step=abs(value.step))
-    # As strings in Hydra's notation, since they become words: null, [1,2] and quoted text stay what they are.
+    # As strings in Hydra's notation, since they become words: null, [1,2] and quoted text stay as they are.
     return trial.suggest_categorical(key, list(override.sweep_string_iterator()))
 
 
@@ -144,7 +162,7 @@ def _tell(cfg: OptunaConfig, study: Any, trial: Any, job: Job) -> int:
     An interrupted one stays open, and is enqueued again by the next call.
     """
     run = run_of(job.folder)
-    value = run_scores(run).get(cfg.objective) if run.state == "done" else None
+    value = run_figures(run).get(cfg.objective) if run.state == "done" else None
     if value is not None:
         study.tell(trial, value)
         return 0
@@ -162,10 +180,14 @@ def _study(cfg: OptunaConfig, folder: Path) -> Iterator[Any]:
         storage = optuna.storages.RDBStorage(cfg.storage or f"sqlite:///{folder / STUDY}")
     except Exception as error:  # of many kinds, those of the data base's driver among them
         reason = " ".join(str(error).split())
-        raise UserError(f"hydra.sweeper.storage={cfg.storage}: expected a data base's URL ({reason})") from error
+        raise UserError(
+            f"hydra.sweeper.storage={cfg.storage}: expected a data base's URL ({reason})"
+        ) from error
     try:
         way = _DIRECTIONS[cfg.objective]
-        study = optuna.create_study(study_name=cfg.study, storage=storage, direction=way, load_if_exists=True)
+        study = optuna.create_study(
+            study_name=cfg.study, storage=storage, direction=way, load_if_exists=True
+        )
         _enqueue_interrupted(study)
         yield study
     finally:
@@ -177,14 +199,21 @@ def _study(cfg: OptunaConfig, folder: Path) -> Iterator[Any]:
 def _enqueue_interrupted(study: Any) -> None:
     """Ask first for the trials of an earlier call that were interrupted or failed."""
     done = [trial.params for trial in study.trials if trial.state == TrialState.COMPLETE]
-    queued = [trial.system_attrs.get("fixed_params") for trial in study.trials if trial.state == TrialState.WAITING]
+    queued = [
+        trial.system_attrs.get("fixed_params")
+        for trial in study.trials
+        if trial.state == TrialState.WAITING
+    ]
     for trial in study.trials:
-        # The process that asked for it is gone; nobody would ever tell its result.
+        # The process that asked for it is gone; its result will never come.
         if trial.state == TrialState.RUNNING:
             study.tell(trial.number, state=TrialState.FAIL)
-        # `trial.state` is the state as listed above, so that a trial just told to have failed is still among those
+        # `trial.state` is the state as listed above, so that a trial just marked as failed is still among those
         # here.
-        if trial.state in (TrialState.RUNNING, TrialState.FAIL) and trial.params not in [*done, *queued]:
+        if trial.state in (TrialState.RUNNING, TrialState.FAIL) and trial.params not in [
+            *done,
+            *queued,
+        ]:
             study.enqueue_trial(trial.params)
             queued.append(trial.params)
 

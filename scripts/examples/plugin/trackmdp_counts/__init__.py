@@ -8,5 +8,4 @@ from trackmdp.config.options import choice, option
 class CountsConfig(AlgoConfig):
     """Count the moves that are sensed, and look where the target is most often found so many steps later."""
 
-    credit = None
     prior: float = option("moves to nowhere added to the counts of each cell", unit="moves", gt=0)

@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 class Counts:
     """Collects with all sensors on; `actor` senses j after n misses where P̂^(n+1)[x, j] · r > c_j (FCR)."""
 
-    def __init__(self, task: Task, cfg: CountsConfig, *, iterations: int, seed: int, device: torch.device) -> None:
+    def __init__(
+        self, task: Task, cfg: CountsConfig, *, iterations: int, seed: int, device: torch.device
+    ) -> None:
         self.task, self.cfg, self.iterations, self.device = task, cfg, iterations, device
         self.policy, self.actor = Policy.all_on(task), Policy.none(task)
         # Column M counts the exits.
@@ -31,7 +33,9 @@ class Counts:
             start, end = batch["last_cell"].flatten(), batch["next", "last_cell"].flatten()
             end = torch.where(batch["next", "terminated"].flatten(), self.task.num_cells, end)
             move = (np.ones(len(start)), (start.cpu().numpy(), end.cpu().numpy()))
-            self.counts = sparse.csr_array(self.counts + sparse.coo_array(move, shape=self.counts.shape))
+            self.counts = sparse.csr_array(
+                self.counts + sparse.coo_array(move, shape=self.counts.shape)
+            )
         self.actor = Policy(self.task, self._sets())
         return {"moves": float(self.counts.sum())}
 
@@ -47,13 +51,20 @@ class Counts:
             layers.append((entry.row[pays] * choices + n, entry.col[pays]))
             predicted = predicted @ kernel
         rows, cells = (np.concatenate(part) for part in zip(*layers, strict=True))
-        return sparse.csr_array((np.ones(len(rows), dtype=bool), (rows, cells)), shape=(m * choices, m))
+        return sparse.csr_array(
+            (np.ones(len(rows), dtype=bool), (rows, cells)), shape=(m * choices, m)
+        )
 
     def state_dict(self) -> dict[str, Any]:
         """The counts, which are all that has been learned."""
         entry = self.counts.tocoo()
-        return {"at": torch.as_tensor(np.stack([entry.row, entry.col])), "count": torch.as_tensor(entry.data)}
+        return {
+            "at": torch.as_tensor(np.stack([entry.row, entry.col])),
+            "count": torch.as_tensor(entry.data),
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict`."""
-        self.counts = sparse.csr_array((state["count"].numpy(), tuple(state["at"].numpy())), shape=self.counts.shape)
+        self.counts = sparse.csr_array(
+            (state["count"].numpy(), tuple(state["at"].numpy())), shape=self.counts.shape
+        )

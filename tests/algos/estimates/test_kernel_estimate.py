@@ -1,0 +1,144 @@
+"""The kernel estimated from detections and misses."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy import sparse
+
+from trackmdp.algos.estimates.censored import ObservedPaths
+from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
+from trackmdp.world.model import Array
+
+KERNEL = np.array(
+    [[0.0, 0.5, 0.3, 0.0], [0.1, 0.0, 0.0, 0.8], [0.6, 0.0, 0.2, 0.1], [0.3, 0.3, 0.3, 0.0]]
+)
+
+
+def paths_of(rows: list[tuple[int, list[set[int]], int]], choices: int = 2) -> ObservedPaths:
+    """From (start, sets of the misses, end)."""
+    sensed = np.zeros((len(rows), choices, 4), dtype=bool)
+    for k, (_, sets, _) in enumerate(rows):
+        for n, cells in enumerate(sets):
+            sensed[k, n, sorted(cells)] = True
+    start, misses, end = zip(*((x, len(sets), y) for x, sets, y in rows), strict=True)
+    sets = sparse.csr_array(sensed.reshape(-1, 4))
+    return ObservedPaths(np.array(start), np.array(misses), sets, np.array(end))
+
+
+def test_moves_that_are_seen_are_counted() -> None:
+    estimate = KernelEstimate(2, weight=1e-9, exit_weight=1e-9)
+    estimate.add(paths_of([(0, [], 1), (0, [], 1), (0, [], 2), (0, [], 4), (3, [], 0)]))
+    estimate.fit(1)
+    np.testing.assert_allclose(estimate.mean().toarray()[0], [0.0, 0.5, 0.25, 0.0, 0.25], atol=1e-8)
+    np.testing.assert_allclose(estimate.visits, [4, 0, 0, 1])
+
+
+def test_the_prior_is_the_pooled_displacement() -> None:
+    """From 0 the target went right; from 2, never seen, it would go right as well; from 1 it cannot: all is open."""
+    estimate = KernelEstimate(2, weight=1.0, exit_weight=1.0)
+    estimate.add(paths_of([(0, [], 1)] * 9 + [(0, [], 4)]))
+    estimate.fit(1)
+    mean = estimate.mean().toarray()
+    leave = (1 + 1.5 / 11) / 11
+    np.testing.assert_allclose(mean[0], [0, 1 - leave, 0, 0, leave])
+    np.testing.assert_allclose(mean[2, :4] / mean[2, :4].sum(), [0, 0, 0, 1])
+    np.testing.assert_allclose(mean[1, :4] / mean[1, :4].sum(), [0.25] * 4)
+    np.testing.assert_allclose(mean.sum(axis=1), 1.0)
+    np.testing.assert_allclose(mean[1:, 4], 1.5 / 11)
+
+
+def test_a_miss_is_shared_by_the_paths_it_may_have_been() -> None:
+    """0 -> ? -> 3, missed with 2 sensed, was through 1; with nothing sensed, through 1 or 2 by their likelihood."""
+    estimate = KernelEstimate(2, weight=1e-9, exit_weight=1e-9)
+    seen = (
+        [(0, [], 1)] * 5
+        + [(0, [], 2)] * 5
+        + [(1, [], 3)] * 4
+        + [(2, [], 3)] * 4
+        + [(1, [], 4), (3, [], 4)]
+    )
+    estimate.add(paths_of([*seen, (0, [{2}], 3), (0, [set()], 3)]))
+    estimate.fit(1)
+    missed = (estimate.counts - estimate.direct).toarray()
+    through = np.array([0.5 * 0.8, 0.5 * 1.0])
+    shares = through / through.sum()
+    np.testing.assert_allclose(missed[0, 1:3], [1 + shares[0], shares[1]], rtol=0.02)
+    np.testing.assert_allclose(missed[[1, 2], 3], [1 + shares[0], shares[1]], rtol=0.02)
+    assert missed.sum() == pytest.approx(4.0, abs=1e-3)
+
+
+def log_likelihood(kernel: Array, rows: list[tuple[int, list[set[int]], int]]) -> float:
+    """Summed over all hidden positions, path by path."""
+    total = 0.0
+    for x, sets, y in rows:
+        likelihood = 0.0
+        for hidden in itertools.product(range(4), repeat=len(sets)):
+            if any(cell in sensed for cell, sensed in zip(hidden, sets, strict=True)):
+                continue
+            steps = itertools.pairwise((x, *hidden, y))
+            likelihood += float(np.prod([kernel[a, b] for a, b in steps]))
+        total += np.log(likelihood)
+    return total
+
+
+def simulated(count: int, seed: int) -> list[tuple[int, list[set[int]], int]]:
+    """Paths of KERNEL under fixed sets that leave two cells out at n = 0 and one at n = 1; then all are sensed."""
+    rng = np.random.default_rng(seed)
+    whole = np.hstack([KERNEL, 1 - KERNEL.sum(axis=1, keepdims=True)])
+    chain = [{0, 1}, {0, 1, 2}, {0, 1, 2, 3}]
+    rows = []
+    for _ in range(count):
+        start = position = int(rng.integers(4))
+        for n, sensed in enumerate(chain):
+            position = int(rng.choice(5, p=whole[position]))
+            if position == 4 or position in sensed:
+                rows.append((start, chain[:n], position))
+                break
+    return rows
+
+
+def test_every_round_makes_what_was_seen_more_likely() -> None:
+    rows = simulated(300, seed=1)
+    estimate, likelihoods = KernelEstimate(2, weight=1e-6, exit_weight=1e-6), []
+    estimate.add(paths_of(rows))
+    for rounds in (1, 2, 4, 8, 16):
+        estimate.fit(rounds)
+        likelihoods.append(log_likelihood(estimate.mean().toarray() + 1e-12, rows))
+    assert np.diff(likelihoods).min() > -0.1
+    assert likelihoods[-1] > likelihoods[0] + 1
+
+
+def test_sets_that_never_show_some_moves_still_tell_them() -> None:
+    """Moves to 2 and 3 are never seen at once, but the kernel comes out, within sampling error."""
+    estimate = KernelEstimate(2, weight=0.1, exit_weight=1.0)
+    estimate.add(paths_of(simulated(20_000, seed=0)))
+    assert estimate.direct.toarray()[:, 2:4].sum() == 0
+    estimate.fit(200)
+    np.testing.assert_allclose(estimate.mean().toarray()[:, :4], KERNEL, atol=0.03)
+
+
+@pytest.mark.slow
+def test_samples_spread_around_the_mean_as_counts_allow() -> None:
+    estimate = KernelEstimate(2, weight=1e-6, exit_weight=1e-6)
+    estimate.add(paths_of([(0, [], 1)] * 30 + [(0, [], 2)] * 60 + [(0, [], 4)] * 10))
+    estimate.fit(1)
+    rng = np.random.default_rng(0)
+    drawn = np.stack([drawn.toarray()[0] for drawn in estimate.samples(rng, 4000)])
+    np.testing.assert_allclose(drawn.mean(axis=0), [0, 0.3, 0.6, 0, 0.1], atol=0.005)
+    np.testing.assert_allclose(drawn[:, 2].std(), np.sqrt(0.6 * 0.4 / 101), rtol=0.05)
+    np.testing.assert_allclose(drawn[:, 4].std(), np.sqrt(0.1 * 0.9 / 101), rtol=0.05)
+    np.testing.assert_allclose(drawn.sum(axis=1), 1.0)
+
+
+def test_a_saved_estimate_goes_on_as_it_was() -> None:
+    first, second = (KernelEstimate(2, weight=0.1, exit_weight=1.0) for _ in range(2))
+    first.add(paths_of(simulated(200, seed=2)))
+    first.fit(3)
+    second.load_state(first.state())
+    for estimate in (first, second):
+        estimate.add(paths_of(simulated(100, seed=3)))
+        estimate.fit(2)
+    np.testing.assert_array_equal(first.mean().toarray(), second.mean().toarray())

@@ -1,0 +1,171 @@
+"""Exchange on recorded paths against brute force, and the choice of a plan by paths that were not counted."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import sparse
+
+from tests.algos.estimates.test_path_counts import planned
+from tests.tracks import by_hand, recorded
+from trackmdp.algos.estimates.path_counts import KeyPlans, along, interleaved
+from trackmdp.algos.estimates.path_gains import AlongPaths, Paths
+from trackmdp.algos.estimates.path_plans import PRIORS, choose_plan, exchanged_keys, parted
+from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers.value import replay
+from trackmdp.world.tracks import Recorded, Tracks
+
+
+def line_walks(seed: int, count: int = 12) -> Tracks:
+    """Paths on the cells 0 and 1 whose next cell depends on the last two."""
+    rng, tracks = np.random.default_rng(seed), []
+    chance = rng.random((2, 2))
+    for _ in range(count):
+        cells = [0, 1]
+        for _ in range(10):
+            cells.append(int(rng.random() < chance[cells[-2], cells[-1]]))
+        tracks.append(cells)
+    return by_hand(*tracks, exits=False)
+
+
+def repeated(tracks: Tracks, times: list[int]) -> Tracks:
+    """Each of the tracks so many times, all of one name for each."""
+    pieces = [list(piece) for piece in np.split(tracks.cells, tracks.first[1:-1])]
+    copies = [piece for piece, count in zip(pieces, times, strict=True) for _ in range(count)]
+    return replace(by_hand(*copies, exits=False), names=np.repeat(tracks.names, times))
+
+
+def earned(paths: Paths, plan: np.ndarray, points: np.ndarray, followed: AlongPaths) -> float:
+    """The reward of a plan `[2, M]` after `points` up to the next detection and from there on, discounted by .9."""
+    motion, task, total = paths.renewal.motion, paths.task, 0.0
+    for point in points:
+        gained = 0.0
+        for n, after in enumerate(range(point + 1, point + 4)):
+            if not motion.stay[after - 1]:  # the last point of a path
+                break
+            forced, cell = n == 2, motion.cell[after]
+            gained -= 0.9**n * (task.safe_cost if forced else task.cost @ plan[n])
+            if forced or plan[n, cell]:
+                gained += 0.9**n * (task.reward + followed.value[after])
+                break
+        total += paths.times[point] * gained
+    return total
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("first", [False, True])
+def test_a_round_finds_the_best_plan_of_each_key(seed: int, first: bool) -> None:
+    """t_max = 1 on two cells: 16 plans for either, what follows a detection being that of the policy before.
+
+    Four of the paths are there three times.
+    """
+    tracks = repeated(line_walks(seed), [3] * 4 + [1] * 8)
+    task = Recorded(
+        tracks, (1, 2), validation=tracks, held_out=tracks, cost=0.4, safe_cost=0.6, t_max=1
+    )
+    paths, sets = Paths(task, tracks, 0.9), [sparse.csr_array(np.full((2, 2), first))] * 2
+    followed = paths.follow(interleaved(task, sets))
+    changed = exchanged_keys(paths, sets, followed, 1)
+    assert changed is not None
+    found = np.stack([each.toarray() for each in changed], axis=1)
+    plans = np.array(list(itertools.product([False, True], repeat=4))).reshape(16, 2, 2)
+    for key in range(2):
+        # Of cells alone the events are the points, in order.
+        points = np.flatnonzero((followed.visits > 0) & (paths.renewal.motion.cell == key))
+        best = max(earned(paths, plan, points, followed) for plan in plans)
+        assert earned(paths, found[key], points, followed) == pytest.approx(best)
+
+
+def test_equal_paths_are_followed_once_and_count_as_often_as_they_are_there() -> None:
+    tracks = repeated(line_walks(1), [5, 2, *[1] * 10])
+    task = recorded(tracks)
+    policy = PolicyTable.from_dense(task, np.random.default_rng(0).random((9, 2, 9)) < 0.5)
+    paths = Paths(task, tracks, 0.9)
+    assert paths.renewal.count == Paths(task, line_walks(1), 0.9).renewal.count
+    assert paths.copies == pytest.approx(
+        17 / len({tuple(each) for each in np.split(tracks.cells, tracks.first[1:-1])})
+    )
+    total = replay(task, tracks, policy).totals[:, 0].sum()
+    assert along(paths, KeyPlans.of_table(policy, paths.keys)).reward == pytest.approx(total)
+
+
+def test_paths_that_are_there_three_times_say_what_they_say_once_to_three_times_the_weight() -> (
+    None
+):
+    tracks = line_walks(1)
+    # At a price of .2 some gains are equal to it, but for rounding.
+    task = replace(recorded(tracks, memory="displacement", clip=1), cost=np.full(9, 0.21))
+    for prior in (3.0, 10.0):
+        once = planned(task, tracks, prior=prior, rounds=0)
+        thrice = planned(task, repeated(tracks, [3] * 12), prior=3 * prior, rounds=0)
+        assert (thrice.policy.dense() == once.policy.dense()).all()
+        assert thrice.reward == pytest.approx(3 * once.reward)
+
+
+def test_rare_keys_keep_their_plans() -> None:
+    task = recorded(line_walks(1), memory="displacement", clip=1)
+    paths = Paths(task, task.tracks, 0.9)
+    sets = [sparse.csr_array((len(paths.keys), 9), dtype=bool)] * 2
+    followed = paths.follow(interleaved(task, sets))
+    assert exchanged_keys(paths, sets, followed, 10**6) is None
+    some = exchanged_keys(paths, sets, followed, 5)
+    assert some is not None
+    often = np.bincount(paths.renewal.owner, followed.visits) >= 5
+    assert 0 < often.sum() < len(paths.keys)
+    changed = sum(each.sum(axis=1) for each in some) > 0
+    assert changed.any()
+    assert not changed[~often].any()
+
+
+def test_no_recording_learns_and_judges() -> None:
+    tracks = line_walks(2, count=40)
+    named = replace(tracks, names=np.arange(40) // 2)
+    learned, judged = parted(named, 3)
+    assert len(judged) == 10
+    assert sorted([*learned.names, *judged.names]) == named.names.tolist()
+    assert not set(learned.names) & set(judged.names)
+
+
+def test_the_choice_is_the_one_that_earns_most_where_it_is_judged() -> None:
+    """Of what is tried, all weights and then exchange, none earns more on the paths that judge."""
+    tracks, judge = line_walks(5, count=30), line_walks(5, count=31).select(np.arange(31) > 20)
+    task = recorded(tracks, memory="displacement", clip=1)
+    found = choose_plan(task, tracks, judge=judge, discount=1.0, rounds=5)
+    for prior in PRIORS:
+        other = planned(task, tracks, prior=prior, discount=1.0, rounds=5)
+        assert (
+            replay(task, judge, found.policy).totals[:, 0].sum()
+            >= replay(task, judge, other.policy).totals[:, 0].sum()
+        )
+
+
+def test_where_all_paths_are_one_there_is_nothing_to_choose_by() -> None:
+    tracks = replace(by_hand(*[[0, 1, 2, 1]] * 8, exits=False), names=np.zeros(8, dtype=np.int64))
+    task = recorded(tracks)
+    found = choose_plan(task, tracks, discount=0.9, rounds=5)
+    assert (
+        found.policy.dense() == planned(task, tracks, prior=10.0, rounds=5).policy.dense()
+    ).all()
+
+
+def test_what_is_asked_for_is_what_the_table_of_all_keys_says() -> None:
+    """Keys that the paths lead to, such that they do not, and some whose sets were replaced."""
+    task = recorded(line_walks(3), memory="two_displacements", clip=1)
+    paths = Paths(task, task.tracks, 0.9)
+    plans = planned(task, task.tracks, prior=3.0, rounds=3).plans
+    changed = replace(
+        plans, sets=[sparse.csr_array(np.ones(each.shape, dtype=bool)) for each in plans.sets]
+    )
+    for each in (plans, changed, KeyPlans.of_table(plans.table(), paths.keys[::2])):
+        table = each.table().dense()
+        keys = np.random.default_rng(0).permutation(np.concatenate([paths.keys, np.arange(200)]))
+        sets = each.of(keys).sets
+        assert sets is not None
+        assert (sets.toarray().reshape(len(keys), 2, 9) == table[keys]).all()
+        assert table.any()
+    assert changed.table().dense()[paths.keys].all()
+    unseen = np.delete(np.arange(task.num_keys), paths.keys)
+    assert (changed.table().dense()[unseen] == plans.table().dense()[unseen]).all()

@@ -1,0 +1,66 @@
+"""One small object of each class that is shown at a prompt."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import trackmdp as tm
+from tests.helpers import headings
+from trackmdp.world.tracks import Tracks, ends_of
+
+SHORT = {"total_frames": 4000, "frames_per_batch": 2000, "envs": 50}
+
+
+def recorded() -> tm.Recorded:
+    """Three tracks on 3 x 3 cells; the first runs along the upper row and leaves."""
+    cells = [[0, 1, 2, 2], [4, 4, 5], [8, 7, 4]]
+    parts = [
+        Tracks(np.array(each), ends_of(np.array([len(each)])), np.array([True]), np.array([name]))
+        for name, each in enumerate(cells)
+    ]
+    return tm.Recorded(parts[0], 3, validation=parts[1], held_out=parts[2], cost=0.1, t_max=1)
+
+
+@cache
+def objects() -> dict[str, Any]:
+    """Name -> object."""
+    world = tm.make_world(size=(3, 4), cost=0.16)
+    run = tm.train(world, "model_based", seed=3, **SHORT)
+    solution = tm.solve(world)
+    return {
+        "world": world,
+        "hidden": headings(),
+        "recorded": recorded(),
+        "task": world.task,
+        "run": run,
+        "in_folder": replace(run, folder=Path("runs") / "<a & b>"),
+        "solution": solution,
+        "evaluation": solution.evaluation,
+        "episodes": tm.simulate(world, solution, 6),
+        "episode": tm.simulate(world, solution, 1)[0],
+        "comparison": tm.compare(world, ["qmdp", solution]),
+        "policy": solution.policy,
+        "tradeoff": tm.frontier(tm.make_world("drift", size=3), resolution=0.1),
+    }
+
+
+NAMES = (
+    "world",
+    "hidden",
+    "recorded",
+    "task",
+    "run",
+    "in_folder",
+    "solution",
+    "evaluation",
+    "episodes",
+    "episode",
+    "comparison",
+    "policy",
+    "tradeoff",
+)

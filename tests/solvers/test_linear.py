@@ -1,0 +1,133 @@
+"""Linear systems: the iteration against the factorisation, and what it says about its own error."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import sparse
+
+import trackmdp as tm
+from tests.helpers import random_kernel
+from trackmdp.errors import UserError
+from trackmdp.solvers import linear, renewal, rules, value
+from trackmdp.solvers.bounds import clocked_table
+from trackmdp.solvers.linear import RenewalSystem, accumulate, expected_steps
+from trackmdp.solvers.optimal import solve
+from trackmdp.solvers.value import evaluate
+from trackmdp.world.kernels import random_walk
+from trackmdp.world.model import World
+
+
+@settings(max_examples=25)
+@given(
+    st.integers(0, 2**31),
+    st.integers(2, 20),
+    st.integers(2, 20),
+    st.sampled_from([0.3, 0.01, 1e-4]),
+)
+def test_the_iteration_solves_what_the_factorisation_solves(
+    seed: int, rows: int, columns: int, out: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    transition = sparse.csr_array(random_kernel(rng, rows * columns, out))
+    gathered = rng.standard_normal((rows * columns, 3))
+    exact = np.linalg.solve(np.eye(rows * columns) - transition.toarray(), gathered)
+    iterated = RenewalSystem(transition, (rows, columns), direct=0)
+    assert not iterated.exact
+    found = iterated.solve(gathered)
+    longest = 1.0 / out
+    error = longest * np.abs(iterated.residual(gathered, found)).max()
+    assert np.abs(found - exact).max() <= error + 1e-9
+    np.testing.assert_allclose(found, exact, rtol=0, atol=1e-8 * longest)
+    np.testing.assert_allclose(accumulate(transition, gathered), exact, rtol=0, atol=1e-8 * longest)
+    assert (iterated.upper(gathered[:, 0], longest) >= exact[:, 0] - 1e-12 * longest).all()
+
+
+def test_long_episodes_take_few_products(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A walk on 64 x 64 cells that exits with 1e-5 a step: without blocks it takes thousands of products."""
+    kernel = random_walk(64, stay=0.2, diagonal=False, exit_probability=1e-5, border="clip")
+    system = RenewalSystem(sparse.csr_array(kernel), (64, 64), direct=0)
+    monkeypatch.setattr(linear, "_MOST_PRODUCTS", 400)
+    steps = system.solve(np.ones(4096))
+    np.testing.assert_allclose(steps, 1e5, rtol=1e-9)
+
+
+def test_a_guess_that_is_the_solution_is_kept() -> None:
+    kernel = sparse.csr_array(random_kernel(np.random.default_rng(0), 36, 0.1))
+    system = RenewalSystem(kernel, (6, 6), direct=0)
+    found = system.solve(np.ones(36))
+    assert np.array_equal(system.solve(np.ones(36), found), found)
+
+
+@pytest.mark.parametrize("cells", [4, 256])  # as a full matrix and as a sparse one
+def test_without_an_exit_there_is_no_solution(cells: int) -> None:
+    never = sparse.csr_array(np.roll(np.eye(cells), 1, axis=1))
+    with pytest.raises(UserError, match="never exits"):
+        accumulate(never, np.ones(cells))
+
+
+def _small(t_max: int = 1) -> World:
+    kernel = random_walk(6, stay=0.2, diagonal=True, exit_probability=0.01, border="clip")
+    return World(kernel, 6, cost=0.2, t_max=t_max)
+
+
+def test_all_figures_and_bounds_of_a_large_world_are_those_of_the_factorisation(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As if 36 cells were too many to factorise: same policy, same figures, errors stated and kept."""
+    world, again = _small(), _small()
+    exact, solution = evaluate(world, rules.clocked_policy(world)), solve(world)
+    table = clocked_table(world)
+    assert exact.error == table.error == 0.0
+    defaults = RenewalSystem.__init__.__kwdefaults__ | {"direct": 0, "full": 0}
+    monkeypatch.setattr(RenewalSystem.__init__, "__kwdefaults__", defaults)
+    for module in (value, renewal):
+        monkeypatch.setattr(module, "DIRECT_CELLS", 0)
+    monkeypatch.setattr(renewal, "_DIRECT", 0)
+    iterated = evaluate(again, rules.clocked_policy(again))
+    assert 0.0 < iterated.error < 1e-9
+    assert np.abs(iterated.value - exact.value).max() <= iterated.error
+    for figure in ("accuracy", "sensors_per_step", "safe_per_episode", "expected_length"):
+        assert getattr(iterated, figure) == pytest.approx(getattr(exact, figure), rel=1e-10)
+    for each in ("steps", "detections", "sensors", "safe_actions"):
+        np.testing.assert_allclose(
+            getattr(iterated, each), getattr(exact, each), rtol=1e-9, atol=1e-12
+        )
+    pooled = evaluate(again, rules.clocked_policy(again), per_cell=False)
+    assert pooled.sensors is None
+    assert pooled.sensors_per_step == pytest.approx(exact.sensors_per_step, rel=1e-10)
+    loose = clocked_table(again)
+    assert (loose.value >= table.value - 1e-12).all()
+    np.testing.assert_allclose(loose.table, table.table, atol=1e-9)
+    found = solve(again)
+    assert found.certified == solution.certified
+    assert found.lower == pytest.approx(solution.lower, abs=1e-9)
+    assert found.upper == pytest.approx(solution.upper, abs=1e-6 * abs(solution.upper))
+
+
+def test_expected_steps_of_a_world_are_its_mean_time_to_the_exit() -> None:
+    np.testing.assert_allclose(expected_steps(_small()), 100.0)
+
+
+@pytest.mark.parametrize("layers", [1, 2])
+def test_a_level_below_a_level_gives_the_same_solution(
+    monkeypatch: pytest.MonkeyPatch, layers: int
+) -> None:
+    monkeypatch.setattr(
+        linear, "_COARSEST", 4 * layers
+    )  # 30 x 21 cells, 8 x 6 blocks, 2 x 2 blocks of those
+    world = tm.make_world("random_support", size=[30, 21], support_size=5)
+    # with two states a cell, half of all that moves changes its state
+    kernel = (
+        world.kernel
+        if layers == 1
+        else sparse.kron(np.full((2, 2), 0.5), world.kernel, format="csr")
+    )
+    system = RenewalSystem(sparse.csr_array(kernel), (30, 21), direct=0)
+    gathered = np.random.default_rng(0).random(630 * layers)
+    expected = np.linalg.solve(np.eye(630 * layers) - kernel.toarray(), gathered)
+    np.testing.assert_allclose(system.solve(gathered), expected, rtol=1e-10)
+    assert isinstance(system._precondition._below, linear._Level)
+    assert system._precondition._below._below is None

@@ -1,0 +1,203 @@
+"""Paths with misses, which are censored moves: the expected moves on them, given a kernel."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+from trackmdp.solvers.linear import IndexArray, row_index
+from trackmdp.world.model import Array
+
+_AT_ONCE = 2**14
+"""Paths with hidden cells that are gone through at once."""
+
+
+@dataclass(frozen=True)
+class ObservedPaths:
+    """K observed paths from one detection to the next.
+
+    Attributes:
+        start: `[K]`, located cell.
+        misses: `[K]`, n, how often the target was missed on the way.
+        sensed: `[K * (t_max + 1), M]` sparse; row `k * (t_max + 1) + t` has the probability of a report in each cell
+            by the set of the miss t of path k. Rows of t >= n are not read.
+        end: `[K]`, where it was located next; M once it had exited; M + 1 where all that is known is that the last
+            miss left it in the grid.
+    """
+
+    start: IndexArray
+    misses: IndexArray
+    sensed: sparse.csr_array
+    end: IndexArray
+
+    @property
+    def choices(self) -> int:
+        """t_max + 1."""
+        return int(self.sensed.shape[0] // max(len(self.start), 1))
+
+    def sets(self, misses: int) -> list[sparse.csr_array]:
+        """`[K, M]` the sets of the first `misses` misses."""
+        # Rows t, t + (t_max + 1), ...: the set of miss t of every path.
+        return [sparse.csr_array(self.sensed[t :: self.choices]) for t in range(misses)]
+
+    def pick(self, paths: IndexArray) -> ObservedPaths:
+        """The `paths` of these numbers, in their order."""
+        # With t_max = 1, path 3 has the rows 3 * 2 + (0, 1) = 6, 7.
+        rows = (paths[:, None] * self.choices + np.arange(self.choices)).ravel()
+        return ObservedPaths(
+            self.start[paths], self.misses[paths], self.sensed[rows], self.end[paths]
+        )
+
+    @classmethod
+    def of(cls, parts: Sequence[ObservedPaths], cells: int) -> ObservedPaths:
+        """All paths of `parts`, one after the other, on a grid of so many cells."""
+        none = np.zeros(0, dtype=np.int64)
+        each = [cls(none, none, sparse.csr_array((0, cells)), none), *parts]
+        start, misses, end = (
+            np.concatenate([getattr(part, name) for part in each])
+            for name in ("start", "misses", "end")
+        )
+        return cls(
+            start, misses, sparse.csr_array(sparse.vstack([part.sensed for part in each])), end
+        )
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Plain arrays of all of it."""
+        parts = {"start": self.start, "misses": self.misses, "end": self.end}
+        return parts | {
+            f"sensed_{part}": getattr(self.sensed, part) for part in ("data", "indices", "indptr")
+        }
+
+    @classmethod
+    def of_state(cls, state: dict[str, np.ndarray], cells: int) -> ObservedPaths:
+        """The paths of a `state`, on a grid of so many cells."""
+        data, indices, indptr = (
+            state[f"sensed_{part}"].copy() for part in ("data", "indices", "indptr")
+        )
+        sensed = sparse.csr_array((data, indices, indptr), shape=(len(indptr) - 1, cells))
+        return cls(state["start"].copy(), state["misses"].copy(), sensed, state["end"].copy())
+
+
+def each_once(paths: ObservedPaths) -> tuple[ObservedPaths, Array]:
+    """Equal paths once, and how often each occurs.
+
+    Sets are compared by two sums of 64 random bits per (miss, cell): unequal ones agree with probability 2^-128.
+    """
+    choices, m = paths.choices, paths.sensed.shape[1]
+    # Row k * (t_max + 1) + t belongs to miss t of path k; rows of t >= n were never used, and must not make paths
+    # differ.
+    path, miss = np.divmod(row_index(paths.sensed), choices)
+    read = miss < paths.misses[path]
+    marks = np.random.default_rng(0).integers(2**63, size=(2, choices * m), dtype=np.uint64)
+    # path k's sum is over its own entries, in any order: equal sets have equal sums
+    sums = np.zeros((2, len(paths.start)), dtype=np.uint64)
+    entry, bits = (miss * m + paths.sensed.indices)[read], paths.sensed.data[read].view(np.uint64)
+    for mark, total in zip(marks, sums, strict=True):  # unsigned sums and products wrap around
+        np.add.at(total, path[read], mark[entry] * (bits | 1))
+    keys = np.stack(
+        [*(part.astype(np.uint64) for part in (paths.start, paths.misses, paths.end)), *sums],
+        axis=1,
+    )
+    _, first, copies = np.unique(keys, axis=0, return_index=True, return_counts=True)
+    return paths.pick(first), copies.astype(np.float64)
+
+
+def expected_moves(
+    kernel: sparse.csr_array, paths: ObservedPaths, copies: Array
+) -> sparse.csr_array:
+    """`[M, M + 1]` expected moves on the censored paths, given the kernel.
+
+    With f_t the undetected mass and l_t the likelihood of the later observations, the move i -> j at step t of
+    a path is made with probability f_t(i) P_ij l_{t+1}(j) / (likelihood of the path); P_ij is multiplied in at the end.
+    """
+    m = kernel.shape[0]
+    moves, backward = sparse.csr_array(kernel[:, :-1]), sparse.csr_array(kernel.T)
+    expected = sparse.csr_array(kernel.shape)
+    seen = paths.end <= m
+    for n, ends in itertools.product(np.unique(paths.misses), (True, False)):
+        part = np.flatnonzero((paths.misses == n) & (seen == ends))
+        if not len(part):
+            continue
+        some, each = paths.pick(part), np.arange(len(part))
+        sensed = some.sets(n)
+        forward = _forward(moves, some, sensed)
+        # row `end` of P^T is the likelihood of ending there, by the cell before; 1 at all cells if the end is unknown
+        later = backward[some.end] if ends else (forward[n] > 0).astype(np.float64)
+        weight = copies[part] / np.maximum(forward[n].multiply(later).sum(axis=1), 1e-300)
+        if ends:
+            # The last move ends in the known cell, or in the exit, column M: f_n(i) at (i, end), weighted.
+            expected = expected + forward[n].T @ counted(each, some.end, weight, (len(part), m + 1))
+        for t in range(n - 1, -1, -1):
+            later = _hidden(later, sensed[t])
+            moved = sparse.csr_array(forward[t].T @ (sparse.diags_array(weight) @ later))
+            expected = expected + sparse.hstack([moved, sparse.csr_array((m, 1))], format="csr")
+            # l_t(i) = sum_j P_ij l_{t+1}(j), with l zero where the cell was sensed: there it would have been detected.
+            later = later @ moves.T
+    return sparse.csr_array(sparse.csr_array(expected).multiply(kernel))
+
+
+def _forward(
+    moves: sparse.csr_array, paths: ObservedPaths, sensed: Sequence[sparse.csr_array]
+) -> list[sparse.csr_array]:
+    """`[K, M]` undetected mass of each path, at its start and after each set."""
+    count = len(paths.start)
+    shape = (count, moves.shape[0])
+    mass = [counted(np.arange(count), paths.start, np.ones(count), shape)]
+    for each in sensed:
+        mass.append(_hidden(mass[-1] @ moves, each))
+    return mass
+
+
+def hidden_cells(
+    kernel: sparse.csr_array, paths: ObservedPaths, rng: np.random.Generator
+) -> IndexArray:
+    """The cells of all misses, path by path in order, drawn given the paths and the kernel `[M, M + 1]`.
+
+    Forward filtering, backward sampling: the last hidden cell i is drawn in proportion to f_n(i) P_ij, j the end, and
+    each earlier one alike, given the one after it. All ends are known.
+    """
+    moves, backward = sparse.csr_array(kernel[:, :-1]), sparse.csr_array(kernel.T)
+    place = np.cumsum(paths.misses) - paths.misses
+    found = np.empty(int(paths.misses.sum()), dtype=np.int64)
+    for n in np.unique(paths.misses[paths.misses > 0]):
+        whole = np.flatnonzero(paths.misses == n)
+        for begin in range(0, len(whole), _AT_ONCE):
+            part = whole[begin : begin + _AT_ONCE]
+            some = paths.pick(part)
+            forward, after = _forward(moves, some, some.sets(n)), some.end
+            for t in range(n, 0, -1):
+                likely = sparse.csr_array(forward[t].multiply(backward[after]))
+                after = drawn_columns(likely, some.start, rng)
+                found[place[part] + t - 1] = after
+    return found
+
+
+def drawn_columns(
+    weights: sparse.csr_array, default: IndexArray, rng: np.random.Generator
+) -> IndexArray:
+    """`[K]` one column of each row of `weights` `[K, M]`, in proportion to its entries; of an empty row `default`."""
+    sums = np.concatenate([[0.0], np.cumsum(weights.data)])
+    low, high = sums[weights.indptr[:-1]], sums[weights.indptr[1:]]
+    wanted = low + rng.random(len(low)) * (high - low)
+    entry = np.searchsorted(sums, wanted, side="right") - 1
+    entry = np.clip(entry, weights.indptr[:-1], np.maximum(weights.indptr[1:] - 1, 0))
+    columns = np.append(weights.indices, 0)[np.minimum(entry, len(weights.indices))]
+    return np.where(high > low, columns, default).astype(np.int64)
+
+
+def _hidden(mass: sparse.csr_array, sensed: sparse.csr_array) -> sparse.csr_array:
+    """`mass` less the reported part of it: `sensed` holds the sensors' p_d."""
+    left = sparse.csr_array(mass - mass.multiply(sensed))
+    left.eliminate_zeros()
+    return left
+
+
+def counted(
+    start: IndexArray, end: IndexArray, weight: Array, shape: tuple[int, int]
+) -> sparse.csr_array:
+    """Sums of `weight` over equal (start, end)."""
+    return sparse.csr_array((weight, (start, end)), shape=shape)

@@ -1,0 +1,339 @@
+"""Estimate of the target's kernel from observations: detections, exits, and misses, which are censored moves.
+
+After a miss the target is in one of the cells not sensed, or was missed by its sensor; nothing else is known.
+Expectation-maximisation (Baum-Welch: a forward and a backward pass) replaces each path with misses by the expected
+number of moves i -> j on it, so that estimates stay consistent when the sets were chosen rather than all sensors on.
+
+Counts and kernels are sparse, `[M, M + 1]` with the exit in the last column: their memory follows the moves seen and
+the moves of the prior, which puts the displacements seen anywhere down at every cell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy import sparse
+
+from trackmdp.algos.estimates.alike import AlikeCells
+from trackmdp.algos.estimates.censored import ObservedPaths, counted, each_once, expected_moves
+from trackmdp.algos.estimates.shrinkage import posterior_mean, unseen
+from trackmdp.solvers.linear import IndexArray, per_row, row_index
+from trackmdp.world.model import Array, BoolArray, apart, grid_size
+
+_OPEN = 0.01
+"""Weight, in the first round's kernel, of moves that were not seen yet."""
+LEAST_EXIT = 1e-9
+"""Exit probability of a kernel drawn from the posterior, at least."""
+NEGLIGIBLE = 1e-3
+"""Expected counts below this are dropped, so that the counts stay sparse."""
+
+
+SELDOM = 0.1
+"""Where a smaller share of the pairs so far apart was seen as moves, those moves come from a mixture of their own."""
+
+
+class KernelEstimate:
+    """Posterior of the kernel, row by row: Dirichlet over the next cell, Beta for the exit.
+
+    The prior of a row is the target's mean behaviour, all rows pooled: the displacements seen so far, as far as they
+    stay in the grid (where none does, all cells as near as the farthest move seen), and the pooled exit probability.
+
+    Args:
+        size: (rows, columns), or one number for a square.
+        modes: H, where moves are between states cell · H + mode, which then stand for the cells in
+            all that follows: as if the grid had H times as many columns, but displacements are those of one class.
+        weight: the prior counts as much as this many moves.
+        exit_weight: the pooled exit probability counts as much as this many moves.
+        share_cells: whether the target moves alike from all cells away from the border, so that moves seen in one of
+            them count for all; None: yes, except where the moves seen differ.
+        classes: `[M]`, the class of each cell, cells of one class being alike; None: all are of one.
+
+    Attributes:
+        direct: `[M, M + 1]`, moves seen at once.
+        counts: `[M, M + 1]`, moves seen, and those of censored paths at their expectation.
+    """
+
+    def __init__(
+        self,
+        size: int | tuple[int, int],
+        *,
+        weight: float,
+        exit_weight: float,
+        share_cells: bool | None = False,
+        classes: IndexArray | None = None,
+        modes: int = 1,
+    ) -> None:
+        self._modes = modes
+        self.rows, self.columns = grid_size(size)
+        self.columns *= modes
+        self.weight, self.exit_weight, self.share_cells, self._classes = (
+            weight,
+            exit_weight,
+            share_cells,
+            classes,
+        )
+        self.num_cells = self.rows * self.columns
+        self.direct = sparse.csr_array((self.num_cells, self.num_cells + 1))
+        self.counts = self.direct
+        self._censored: list[ObservedPaths] = []
+
+    def add(self, paths: ObservedPaths) -> None:
+        """Add observed `paths`."""
+        # Without a miss both ends of the move are known; no expectation is needed, and the path itself need not be
+        # kept.
+        at_once = paths.misses == 0
+        self.add_moves(paths.start[at_once], paths.end[at_once])
+        if not at_once.all():
+            self._censored.append(paths.pick(np.flatnonzero(~at_once)))
+
+    def __len__(self) -> int:
+        """Paths and moves added."""
+        return round(self.direct.sum()) + sum(len(part.start) for part in self._censored)
+
+    def add_moves(self, start: IndexArray, end: IndexArray, count: Array | None = None) -> None:
+        """Add moves `[K]` with both ends seen, each once or `count` `[K]` times; `end` is M at the exit."""
+        # Before the first fit the two are one matrix, and stay so; after it, counts wait for the next `fit`.
+        unfitted = self.counts is self.direct
+        count = np.ones(len(start)) if count is None else count
+        self.direct = self.direct + counted(start, end, count, self.direct.shape)
+        self.counts = self.direct if unfitted else self.counts
+
+    def state(self) -> dict[str, np.ndarray]:
+        """All that was observed, and the counts so far, as plain arrays."""
+        parts = ObservedPaths.of(self._censored, self.num_cells).state()
+        for name, matrix in {"direct": self.direct, "counts": self.counts}.items():
+            parts |= {
+                f"{name}_{part}": getattr(matrix, part) for part in ("data", "indices", "indptr")
+            }
+        return parts
+
+    def load_state(self, state: dict[str, np.ndarray]) -> None:
+        """Continue from a `state`."""
+
+        def matrix(name: str) -> sparse.csr_array:
+            parts = tuple(state[f"{name}_{part}"].copy() for part in ("data", "indices", "indptr"))
+            return sparse.csr_array(parts, shape=self.direct.shape)
+
+        self.direct, self.counts = matrix("direct"), matrix("counts")
+        paths = ObservedPaths.of_state(state, self.num_cells)
+        self._censored = [paths] if len(paths.start) else []
+
+    def fit(self, rounds: int) -> None:
+        """Run `rounds` rounds of expectation-maximisation on the censored paths, from the kernel estimated so far.
+
+        The first round allows every move a little farther than any that must have been made: expectation-maximisation
+        never leaves a probability of zero.
+        """
+        if not self._censored:
+            self.counts = self.direct.copy()  # a fit of its own, without later additions
+            return
+        # Policies repeat themselves: equal paths have equal expectations, and are worked out once.
+        paths, copies = each_once(ObservedPaths.of(self._censored, self.num_cells))
+        for first in [True, *[False] * (rounds - 1)]:
+            kernel = (
+                (1.0 - _OPEN) * self.mean() + _OPEN * self._open_moves(paths)
+                if first
+                else self.mean()
+            )
+            self.counts = self.direct + expected_moves(kernel, paths, copies)
+        counts = self.counts.copy()
+        counts.data[counts.data < NEGLIGIBLE] = 0.0
+        counts.eliminate_zeros()
+        self.counts = counts
+
+    def mean(self) -> sparse.csr_array:
+        """`[M, M + 1]` posterior mean; the last column is the exit."""
+        moves, exits = self._parameters()
+        return self._kernel(moves, exits[:, 0] / exits.sum(axis=1))
+
+    def believed(self, least: float = 0.0) -> sparse.csr_array:
+        """`[M, M + 1]` posterior mean under a prior that is estimated as well, which plans are made on.
+
+        Args:
+            least: cells where a move that was not seen yet is less likely have none.
+
+        The prior of `mean` weighs next to nothing and is the same at all moves; this one, of `shrinkage`, is estimated
+        from the counts: how probabilities differ, and the share of moves not seen yet.
+        """
+        counts = self._pooled()
+        exits, moved = self._exits(counts), sparse.csr_array(counts[:, :-1])
+        moved.eliminate_zeros()
+        rows, out = row_index(moved), moved.sum(axis=1)
+        likely, seldom = np.zeros_like(moved.data), self._seldom(moved)
+        for group in (seldom, ~seldom):
+            likely[group] = posterior_mean(moved.data[group], out[rows[group]])
+        # The shares of a cell add up to 1, which its estimates need not do.
+        likely /= per_row(rows, likely, self.num_cells)[rows]
+        new, stands_for = unseen(rows, likely, out[rows], self.num_cells)
+        # A little of every displacement: a cell that was never left needs some, of any size.
+        typical = self._typical_moves(moved, stands_for + 1e-12 * likely)
+        typical = sparse.csr_array(typical - typical.multiply(moved > 0))
+        total = typical.sum(axis=1)
+        share = np.divide(new, total, out=np.zeros_like(new), where=(total > 0) & (new >= least))
+        # The rest is for the moves seen.
+        scale = (1.0 - share * total)[rows]
+        seen = sparse.csr_array((likely * scale, moved.indices, moved.indptr), shape=moved.shape)
+        moves = sparse.csr_array(seen + sparse.diags_array(share) @ typical)
+        moves.eliminate_zeros()
+        return self._kernel(moves, exits[:, 0] / exits.sum(axis=1))
+
+    def sample(self, rng: np.random.Generator) -> sparse.csr_array:
+        """`[M, M + 1]` one kernel drawn from the posterior, censored paths taken at their expected moves."""
+        return next(self.samples(rng, 1))
+
+    def samples(self, rng: np.random.Generator, count: int) -> Iterator[sparse.csr_array]:
+        """As many as `count` of them."""
+        moves, exits = self._parameters()
+        # Cells that move alike are drawn once: the draws of many would average out.
+        alike = None if self.share_cells is False else self._alike()
+        for _ in range(count):
+            # A Dirichlet draw is a row of gamma draws, scaled to 1; 1e-300 keeps a row of tiny parameters from 0 / 0.
+            weights = sparse.csr_array(
+                (rng.standard_gamma(moves.data) + 1e-300, moves.indices, moves.indptr), moves.shape
+            )
+            # Where exits are rare and few were seen most draws are 0 but for rounding, and an episode may never end.
+            drawn = self._kernel(
+                weights, np.maximum(rng.beta(exits[:, 0], exits[:, 1]), LEAST_EXIT)
+            )
+            yield drawn if alike is None else alike.spread(drawn)
+
+    def _alike(self) -> AlikeCells:
+        judged = self.counts if self.share_cells is None else None
+        return AlikeCells(
+            (self.rows, self.columns), self._farthest(self.counts[:, :-1]), judged, self._classes
+        )
+
+    @property
+    def visits(self) -> Array:
+        """`[M]` moves seen out of each cell, censored ones at their expectation."""
+        return self.counts.sum(axis=1)
+
+    def _kernel(self, moves: sparse.csr_array, leave: Array) -> sparse.csr_array:
+        """`[M, M + 1]` from weights of the moves and `[M]` exit probabilities."""
+        # The exit has a Beta of its own, and the moves share the rest: rows [stay, exit] sum to 1.
+        scale = (1.0 - leave) / moves.sum(axis=1)
+        stay = sparse.csr_array(
+            (moves.data * scale[row_index(moves)], moves.indices, moves.indptr), shape=moves.shape
+        )
+        return sparse.csr_array(
+            sparse.hstack([stay, sparse.csr_array(leave[:, None])], format="csr")
+        )
+
+    def _pooled(self) -> sparse.csr_array:
+        """`[M, M + 1]` counts, of cells that move alike together."""
+        return self.counts if self.share_cells is False else self._alike().pooled(self.counts)
+
+    def _parameters(self) -> tuple[sparse.csr_array, Array]:
+        """Dirichlet parameters `[M, M]` of the moves and Beta parameters `[M, 2]` of the exit."""
+        counts = self._pooled()
+        moved = sparse.csr_array(counts[:, :-1])
+        moves = sparse.csr_array(moved + self.weight * self._typical_moves(moved))
+        moves.eliminate_zeros()
+        moves.sort_indices()  # draws are made entry by entry, row by row
+        return moves, self._exits(counts)
+
+    def _exits(self, counts: sparse.csr_array) -> Array:
+        """Beta parameters `[M, 2]` of the exit."""
+        moved, left = counts[:, :-1].sum(axis=1), counts[:, [-1]].toarray()[:, 0]
+        # half an exit in one more move keeps the pooled probability between 0 and 1 before any exit is seen
+        pooled = (left.sum() + 0.5) / (counts.sum() + 1.0)
+        # Beta(exits + w p, moves + w (1 - p)), with p the pooled exit probability and w the weight of the prior.
+        return np.stack(
+            [left + self.exit_weight * pooled, moved + self.exit_weight * (1 - pooled)], axis=1
+        )
+
+    def _open_moves(self, paths: ObservedPaths) -> sparse.csr_array:
+        """`[M, M + 1]` uniform over the cells that one move may reach, judging by the fastest path seen."""
+        inside = paths.end < self.num_cells
+        gone = apart(self.columns, paths.start[inside], paths.end[inside])
+        # A path that got 5 columns away with 1 miss made 2 moves, so one of them went at least ceil(5 / 2) = 3.
+        fastest = np.ceil(gone / (paths.misses[inside] + 1)).max(initial=1)
+        near = self._near(int(max(fastest, self._farthest(self.direct[:, :-1]))) + 1)
+        return sparse.csr_array(
+            sparse.hstack([near, sparse.csr_array((self.num_cells, 1))], format="csr")
+        )
+
+    def _typical_moves(
+        self, moved: sparse.csr_array, weight: Array | None = None
+    ) -> sparse.csr_array:
+        """`[M, M]` pooled displacements applied at every cell, rows scaled to 1; cells without any get a neighbourhood.
+
+        Args:
+            moved: `[M, M]`, counts of moves.
+            weight: of each stored entry; None for its share of the moves out of its cell.
+        """
+        start, end, data = row_index(moved), moved.indices, moved.data
+        seen = data > 1e-9
+        # Shares within each row, not counts: a cell the target visits often is no better evidence for the typical move
+        # than others.
+        weight = data / moved.sum(axis=1)[start] if weight is None else weight
+        start, end, share = start[seen], end[seen], weight[seen]
+        # On 10 x 10 cells, 2 rows down and 1 column to the left is the shift (2 + 10) · 20 + (-1 + 10) = 249.
+        width = 2 * self.columns
+        shift = (end // self.columns - start // self.columns + self.rows) * width
+        shift = shift + end % self.columns - start % self.columns + self.columns
+        # With modes the shift contains the mode as well: (cell, up) moves otherwise than (cell, left).
+        shifts, place = np.unique(shift * self._modes + start % self._modes, return_inverse=True)
+        each = np.bincount(place, weights=share, minlength=len(shifts)).astype(np.float64)
+        shift, begin = np.divmod(shifts, self._modes)
+        typical = self._put_down(
+            shift // width - self.rows, shift % width - self.columns, each, begin
+        )
+        total = typical.sum(axis=1)
+        without = np.flatnonzero(total <= 0)
+        if len(without):
+            near = self._near(self._farthest(moved))
+            # A diagonal of ones at the rows where no displacement fits: keep @ near has the rows of `near` there, and
+            # none elsewhere.
+            keep = sparse.csr_array((np.ones(len(without)), (without, without)), shape=near.shape)
+            typical, total = typical + keep @ near, np.where(total > 0, total, 1.0)
+        return sparse.csr_array(sparse.diags_array(1.0 / total) @ typical)
+
+    def _seldom(self, moved: sparse.csr_array) -> BoolArray:
+        """`[E]` mask of long jumps among the `[M, M]` moves seen: distances that few moves have.
+
+        They are fitted apart from the others.
+        """
+        columns, cells = self.columns // self._modes, self.num_cells // self._modes
+        start, end = row_index(moved) // self._modes, moved.indices // self._modes
+        each, place = np.unique(start * cells + end, return_inverse=True)
+        gone, most = apart(columns, *np.divmod(each, cells)), max(self.rows, columns)
+        # Pairs at most d apart: of n rows (2 d + 1) n - d (d + 1), d < n, and as many of the columns for each of them.
+        up_to = np.ones(most + 1)
+        for side in (self.rows, columns):
+            d = np.minimum(np.arange(-1, most), side - 1)
+            up_to *= (2 * d + 1) * side - d * (d + 1)
+        up_to[0] = 0
+        few = np.bincount(gone, minlength=most) < SELDOM * np.diff(up_to)
+        return few[gone][place.ravel()]
+
+    def _near(self, reach: int) -> sparse.csr_array:
+        """`[M, M]` uniform over the cells up to `reach` rows and columns away."""
+        row, column = (
+            np.arange(-min(reach, side), min(reach, side) + 1) for side in (self.rows, self.columns)
+        )
+        rows, columns = (part.ravel() for part in np.meshgrid(row, column, indexing="ij"))
+        near = self._put_down(rows, columns, np.ones(len(rows)))
+        return sparse.csr_array(sparse.diags_array(1.0 / near.sum(axis=1)) @ near)
+
+    def _put_down(
+        self, rows: IndexArray, columns: IndexArray, weight: Array, begin: IndexArray | None = None
+    ) -> sparse.csr_array:
+        """`[M, M]` displacements `[S]` from every cell, or those of class `begin` `[S]`, but for ends outside."""
+        cells = np.arange(self.num_cells)
+        row, column = cells[:, None] // self.columns + rows, cells[:, None] % self.columns + columns
+        inside = (row >= 0) & (row < self.rows) & (column >= 0) & (column < self.columns)
+        if begin is not None:
+            inside &= cells[:, None] % self._modes == begin
+        # [M, S] in row-major order, as `end` below lists its entries.
+        start, which = np.nonzero(inside)
+        end = (row * self.columns + column)[inside]
+        return counted(start, end, weight[which], (self.num_cells, self.num_cells))
+
+    def _farthest(self, moved: sparse.csr_array) -> int:
+        """Rows or columns of the farthest move seen, at least 1."""
+        moved = sparse.csr_array(moved)
+        return int(
+            apart(self.columns, row_index(moved), moved.indices)[moved.data > 0].max(initial=1)
+        )

@@ -1,0 +1,121 @@
+"""Paths followed by a policy: its reward on them, and the worth of a detection at each of their points.
+
+A path with all cells known shows the outcome of every policy. At each point where it may locate the target, with
+each key that it may then have, the path gives the gain of a sensor n misses later: r + V - W, V the worth of a
+detection there and W of a miss, both on this very path. There is no motion model, so nothing needs to be Markov in
+the key.
+
+Paths lead to few of the keys there are: plans are valued by the sets of those alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from trackmdp.policies.table import SetTable
+from trackmdp.solvers.linear import IndexArray, triangular
+from trackmdp.solvers.renewal import Act, Renewal
+from trackmdp.world.model import Array, BoolArray, Task
+from trackmdp.world.tracks import Tracks
+
+
+@dataclass(frozen=True)
+class AlongPaths:
+    """A policy followed along all paths.
+
+    Attributes:
+        reward: of all paths together, undiscounted.
+        visits: `[B]`, how often the policy comes to each event on its path.
+        gain: for each n `[E]`, worth of a report at each entry over a miss, discounted.
+        value: `[B]` V, discounted, times γ.
+    """
+
+    reward: float
+    visits: Array
+    gain: list[Array]
+    value: Array
+
+
+class Paths:
+    """All events (point, key) of some paths, and their steps.
+
+    Args:
+        task: sensors, prices, limits and memory.
+        tracks: the paths; equal ones are followed once.
+        discount: γ of the gains.
+
+    Attributes:
+        renewal: events and steps, moves discounted.
+        times: `[B]`, how often the path of each event is among the tracks.
+        copies: tracks for each that differs.
+    """
+
+    def __init__(self, task: Task, tracks: Tracks, discount: float) -> None:
+        self.task, self._discount = task, discount
+        tracks, times = different(tracks)
+        self.renewal = Renewal(task, tracks.motion().discounted(discount))
+        of_point = np.repeat(times, tracks.lengths).astype(np.float64)
+        self.times = of_point[self.renewal.states]
+        self.copies = float(times.mean())
+        self._order = np.argsort(self.renewal.states, kind="stable")
+        self._starts = np.bincount(self.renewal.first, minlength=self.renewal.count).astype(float)
+
+    @property
+    def keys(self) -> IndexArray:
+        """`[K]`, the keys that some path may lead to."""
+        return self.renewal.plans
+
+    def acts(self, table: SetTable) -> list[Act]:
+        """Reports and prices of a policy, its plans in the order of `keys`."""
+        renewal, task = self.renewal, self.task
+        cell, found = renewal.motion.cell, []
+        for n, step in enumerate(renewal.steps[:-1]):
+            report = table.reports(n, renewal.owner[step.rows], cell[step.states])
+            found.append((report, table.spent(n, task.paid)[renewal.owner]))
+        return found
+
+    def follow(self, table: SetTable) -> AlongPaths:
+        """A policy on all paths, its plans in the order of `keys`."""
+        renewal, acts = self.renewal, self.acts(table)
+        steps = renewal.passes(acts)
+        located = sum((step.located for step in steps[1:]), steps[0].located)
+        earned = np.sum([step.totals[:, 0] for step in steps], axis=0)
+        value = triangular(located, earned, self._order)
+        # Undiscounted: the moves before the end of step n carry γ^(n + 1).
+        factors = [self._discount ** -(n + 1) for n in range(len(steps))]
+        plain = sum(
+            (step.located * factor for step, factor in zip(steps[1:], factors[1:], strict=True)),
+            steps[0].located * factors[0],
+        )
+        visits = triangular(plain, self._starts, self._order, transposed=True)
+        reward = sum(
+            float(visits @ (self.times * step.totals[:, 0])) * factor
+            for step, factor in zip(steps, factors, strict=True)
+        )
+        return AlongPaths(reward, visits, self._gains(acts, value), value)
+
+    def _gains(self, acts: list[Act], value: Array) -> list[Array]:
+        renewal, gains = self.renewal, list[Array]()
+        later: Array | None = None
+        for n in range(len(acts) - 1, -1, -1):
+            step = renewal.steps[n]
+            detected = self.task.reward + value[step.following]
+            later = renewal.missed(value) if later is None else later
+            gains.insert(0, detected - later)
+            report, spent = acts[n]
+            gross = step.moves @ (report * detected + (1.0 - report) * later)
+            later = gross - spent[step.before] * step.stay
+        return gains
+
+
+def different(tracks: Tracks) -> tuple[Tracks, IndexArray]:
+    """The tracks that differ in where they lead, `[K]` of them, and how often each is there."""
+    number: dict[tuple[bytes, bool], int] = {}
+    pieces = zip(np.split(tracks.cells, tracks.first[1:-1]), tracks.exits.tolist(), strict=True)
+    each = [number.setdefault((cells.tobytes(), leaves), len(number)) for cells, leaves in pieces]
+    _, first, times = np.unique(each, return_index=True, return_counts=True)
+    chosen: BoolArray = np.zeros(len(tracks), dtype=bool)
+    chosen[first] = True
+    return tracks.select(chosen), times

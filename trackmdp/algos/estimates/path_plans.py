@@ -1,0 +1,225 @@
+"""Plans on paths, chosen by validation paths: the weight of the prior, and whether to run exchange.
+
+Policy iteration on the counts (`path_counts`) changes one set of a plan given the others, and stops where two would
+have to change together. Here the ways on from a key are a tree: after each miss, where the target then was and how
+often. Exchange searches whole plans on the trees of all keys that came often enough.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from scipy import sparse
+
+from trackmdp.algos.estimates.path_counts import KeyPlans, Planned, along, interleaved, plan_paths
+from trackmdp.algos.estimates.path_gains import AlongPaths, Paths
+from trackmdp.policies.table import PolicyTable
+from trackmdp.seeding import derive
+from trackmdp.solvers.exchange import exchange
+from trackmdp.solvers.linear import IndexArray, per_row, row_index
+from trackmdp.solvers.plans import Layout, Plans, Turn
+from trackmdp.solvers.search import candidates_of, columns_of
+from trackmdp.solvers.sensing import sensing
+from trackmdp.world.model import Array, Task
+from trackmdp.world.tracks import Tracks, draw_parts
+
+PRIORS = (1.0, 3.0, 10.0, 30.0, 100.0)
+"""Weights of the prior mean that are tried."""
+UNJUDGED = 10.0
+"""The weight that is taken where there are no paths to judge by."""
+_LEAST = 100
+"""Detections of a key, equal paths taken as one, from which its plan is searched: those of rarer keys follow chance."""
+_ROUNDS, _LEAST_SHARE, _RISE = 30, 1 / 64, 1e-5
+"""Rounds of exchange at most, the smallest share of the keys that are changed at once, and the least rise of reward."""
+_SEARCHED = 2
+"""The best plans, which exchange begins from."""
+_JUDGED = 0.25
+"""Share of the recordings that judge, where no others are there for it."""
+
+
+def choose_plan(
+    task: Task,
+    tracks: Tracks,
+    *,
+    judge: Tracks | None = None,
+    priors: Sequence[float] = PRIORS,
+    others: Sequence[Callable[[Tracks], PolicyTable]] = (),
+    discount: float,
+    rounds: int = 8,
+    seed: int = 0,
+) -> Planned:
+    """Plan on paths; choose the weight of the prior, and the result of exchange, by reward on validation paths.
+
+    Args:
+        task: sensors, prices, limits and memory.
+        tracks: the paths; the choice is planned again on all of them.
+        judge: validation paths; None: paths that `parted` draws from `tracks`, which do not count until all is
+            chosen.
+        priors: weights of the prior that are tried.
+        others: from paths to policies from which policy iteration begins as well.
+        discount: γ of the credit.
+        rounds: of policy iteration at most.
+        seed: of the draw, where there is one.
+    """
+    counted, judge = parted(tracks, seed) if judge is None else (tracks, judge)
+
+    def prior_plan(paths: Paths, prior: float) -> Planned:
+        # A recording that was followed ten times is no more evidence than once.
+        return plan_paths(paths, prior=prior * paths.copies, rounds=rounds)
+
+    def other_plan(paths: Paths, make: Callable[[Tracks], PolicyTable]) -> Planned:
+        start = KeyPlans.of_table(make(counted), paths.keys)
+        return plan_paths(paths, prior=UNJUDGED * paths.copies, rounds=rounds, start=start)
+
+    tries = [partial(prior_plan, prior=prior) for prior in priors]
+    tries += [partial(other_plan, make=make) for make in others]
+    if not len(judge):  # nothing to choose by
+        paths = Paths(task, tracks, discount)
+        return plan_paths(paths, prior=UNJUDGED, rounds=rounds) if priors else tries[0](paths)
+    paths, judged = Paths(task, counted, discount), Paths(task, judge, discount)
+    plans = [make(paths) for make in tries]
+    scores = [along(judged, each.plans).reward for each in plans]
+    order = np.argsort(scores, kind="stable")[::-1][:_SEARCHED].tolist()
+    searched = [_searched(paths, plans[place]) for place in order]
+    gains = [along(judged, each.plans).reward for each in searched]
+    best = int(np.argmax(gains))
+    exchanges = gains[best] > scores[order[0]]
+    place, final = (order[best], searched[best]) if exchanges else (order[0], plans[order[0]])
+    if counted is tracks:
+        return final
+    # On all paths, from the plan that was chosen.
+    whole = Paths(task, tracks, discount)
+    prior = (*priors, *(UNJUDGED for _ in others))[place] * whole.copies
+    start = final.plans.on(whole.keys)
+    planned = plan_paths(whole, prior=prior, rounds=rounds, start=start)
+    return _searched(whole, planned) if exchanges else planned
+
+
+def parted(tracks: Tracks, seed: int) -> tuple[Tracks, Tracks]:
+    """Paths to learn from and paths to judge by, a quarter of the names; no recording is in both."""
+    count = round(len(np.unique(tracks.names)) * _JUDGED)
+    judge, rest = draw_parts(tracks, [count], derive(seed, "judge"))
+    return (rest, judge) if count else (tracks, judge)
+
+
+def _searched(paths: Paths, plan: Planned) -> Planned:
+    """Rounds of exchange from `plan`; after one that raises no reward, of half as many keys: those of largest gain."""
+    plans, share = plan.plans, 1.0
+    followed = along(paths, plans)
+    for _ in range(_ROUNDS):
+        sets = exchanged_keys(paths, list(plans.sets), followed, _LEAST, share)
+        if sets is None:  # no key comes so often
+            break
+        tried = paths.follow(interleaved(paths.task, sets))
+        if tried.reward > plan.reward * (1.0 + _RISE):
+            plans, followed = replace(plans, sets=sets), tried
+            plan = replace(plan, plans=plans, reward=tried.reward, rounds=plan.rounds + 1)
+        elif share > _LEAST_SHARE:
+            share /= 2
+        else:
+            break
+    return plan
+
+
+def exchanged_keys(
+    paths: Paths,
+    sets: list[sparse.csr_array],
+    followed: AlongPaths,
+    least: int,
+    share: float = 1.0,
+) -> list[sparse.csr_array] | None:
+    """One round: the plans of keys that a policy came by `least` times or more, on the ways on from them.
+
+    Args:
+        paths: all events of the paths.
+        sets: `[K, S]` bool of the policy for each n; left as they are.
+        followed: the policy on the paths.
+        least: keys that came less often keep their plans.
+        share: of the keys with better plans, the ones that gain most: with all changed at once visits may change.
+
+    Returns:
+        The sets, or None where no key came so often.
+    """
+    owner = paths.renewal.owner
+    arrived = per_row(owner, followed.visits, len(paths.keys))
+    often = np.flatnonzero(arrived >= least)
+    if not len(often):
+        return None
+    plans = _trees(paths, followed, often)
+    before = []
+    for turn, old in zip(plans.turns, sets, strict=True):
+        place = (often[turn.choice.rows], turn.choice.sensors)
+        before.append(np.asarray(old[place]).ravel())
+    ascended = columns_of(plans.ascend(candidates_of(before), sweeps=2))
+    found = exchange(plans, ascended, np.ones(len(often), dtype=bool))
+    worth, other = (plans.worth(candidates_of(each))[:, 0] for each in (before, found))
+    gain = other - worth
+    few = gain < np.quantile(gain[gain > 0], 1.0 - share) if (gain > 0).any() else gain < 0
+    found = [
+        np.where(few[turn.choice.rows], old, new)
+        for turn, old, new in zip(plans.turns, before, found, strict=True)
+    ]
+    # The rows of these keys are replaced, those of all others stay.
+    stays = np.ones(len(paths.keys), dtype=bool)
+    stays[often] = False
+    changed = []
+    for turn, old, on in zip(plans.turns, sets, found, strict=True):
+        rows, kept = row_index(old), stays[row_index(old)]
+        row = np.concatenate([rows[kept], often[turn.choice.rows[on]]])
+        sensor = np.concatenate([old.indices[kept], turn.choice.sensors[on]])
+        entries = (np.ones(len(row), dtype=bool), (row, sensor))
+        changed.append(sparse.csr_array(entries, shape=old.shape))
+    return changed
+
+
+def _trees(paths: Paths, followed: AlongPaths, keys: IndexArray) -> Plans:
+    """The ways on from `keys` (places among those seen), equal beginnings taken as one.
+
+    Example: after a key the target was twice in 4 then 5, once in 4 then 6, and once in 7: the first step has the
+    entries 4 and 7 with mass 3 and 1, the second 5, 6 and 8 (for instance) with 2, 1 and 1; 4 moves to 5 with 2/3.
+    """
+    task, renewal = paths.task, paths.renewal
+    cells, located = renewal.motion.cell, renewal.keys.cell(renewal.plans[keys])
+    number = np.full(len(paths.keys), -1)
+    number[keys] = np.arange(len(keys))
+    # Weight and entry of each event that is followed; the entries before any move are the keys.
+    weight = np.where(number[renewal.owner] >= 0, followed.visits * paths.times, 0.0)
+    entry = np.maximum(number[renewal.owner], 0)
+    start = mass = per_row(entry, weight, len(keys))
+    rows, turns, detected = np.arange(len(keys)), [], []
+    for step in renewal.steps[:-1]:
+        some = np.flatnonzero(weight[step.rows] > 0)
+        event, cell, stay = step.rows[some], cells[step.states[some]], step.moves.data
+        # Entries stay in order of their rows: a code begins with the entry before, and that with its row.
+        codes, now = np.unique(entry[event] * task.num_cells + cell, return_inverse=True)
+        before, arrived = codes // task.num_cells, per_row(now, weight[event], len(codes))
+        # Each move carries the discount of the paths' own moves.
+        chance = stay[0] * arrived / mass[before] if len(stay) else arrived
+        place = (before, np.arange(len(codes)))
+        moves = sparse.csr_array((chance, place), shape=(len(mass), len(codes)))
+        worth = task.reward + followed.value[step.following[some]]
+        detected.append(per_row(now, weight[event] * worth, len(codes)) / arrived)
+        rows, inside = rows[before], np.asarray(moves.sum(axis=1)).ravel()
+        choice = sensing(task, rows, codes % task.num_cells, len(keys), located)
+        turns.append(Turn(rows, moves, inside, choice, task.prices[choice.sensors]))
+        left = np.zeros_like(weight)
+        left[event] = weight[event]
+        weight, mass = left, arrived
+        entry = np.zeros(len(weight), dtype=np.int64)
+        entry[event] = now
+    missed = _left_over(paths, followed, weight, entry, mass)
+    return Plans(Layout(np.arange(len(keys)), turns, len(keys)), start, detected, missed)
+
+
+def _left_over(
+    paths: Paths, followed: AlongPaths, weight: Array, entry: IndexArray, mass: Array
+) -> Array:
+    """`[E]`, mean worth of a miss at each entry of the last free choice."""
+    last = paths.renewal.steps[-2]
+    worth = np.zeros(len(weight))
+    worth[last.rows] = paths.renewal.missed(followed.value)
+    some = weight > 0
+    return per_row(entry[some], (weight * worth)[some], len(mass)) / mass

@@ -1,0 +1,227 @@
+"""Model-based learning: estimate the motion from the observations, then plan with the estimate; no networks.
+
+Where the next move depends on the cell alone, the estimate is a kernel of pooled moves, planned on by the solvers.
+Where it may not, plans are made on whole sensed paths; a quarter of them, not used for learning,
+chooses between these plans and the plan of the pooled moves. Steps are spent with all sensors on, or on sets
+planned for a kernel drawn from the posterior (posterior sampling, Thompson 1933), which costs far less and leaves moves
+to be inferred from misses.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from scipy import sparse
+from tensordict import TensorDictBase
+
+from trackmdp.algos.common import arrays, known_alone, lifted, located, tensors
+from trackmdp.algos.estimates.alike import cell_classes
+from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
+from trackmdp.algos.estimates.path_counts import plan_paths
+from trackmdp.algos.estimates.path_gains import Paths
+from trackmdp.algos.estimates.path_plans import UNJUDGED, choose_plan
+from trackmdp.algos.estimates.shrinkage import believed_world, least_worth_planning
+from trackmdp.algos.observed import SensedPaths, observed_paths
+from trackmdp.config.counting import ModelBasedConfig
+from trackmdp.policies.acting import RenewedTable
+from trackmdp.policies.policy import Policy, as_policy
+from trackmdp.policies.saved import packed, unpacked_policy
+from trackmdp.policies.table import PolicyTable
+from trackmdp.seeding import derive
+from trackmdp.solvers import exchange
+from trackmdp.solvers.linear import DIRECT_CELLS
+from trackmdp.solvers.value import evaluate
+from trackmdp.world.model import Task, World
+from trackmdp.world.tracks import Tracks
+
+_PRIOR, _EXIT_PRIOR = 0.1, 100.0
+"""Moves as many as which the pooled motion, and the pooled exit probability, count in kernels that are drawn or infer
+moves from misses. For plans the counts give the weights (`shrinkage`)."""
+_PLANS_OF_MOVES, _PLANS_OF_PATHS = 6, 3
+_LAST = 6
+"""Times the rounds of expectation-maximisation after the last batch."""
+_SAMPLES = 8
+"""Kernels drawn for the uncertainty reported."""
+_MOST_CELLS = 1_600
+"""Cells up to which plans of pooled moves are tried beside those of paths."""
+
+
+class ModelBased:
+    """Plans some times in a run, the last time at its end, from all that was sensed so far.
+
+    Args:
+        task: grid, rewards, costs and memory.
+        cfg: how steps are spent, and the kind of estimate.
+        iterations: batches to come.
+        seed: seed of the run.
+        device: where the policies' tables live; the estimates are on the CPU.
+    """
+
+    def __init__(
+        self, task: Task, cfg: ModelBasedConfig, *, iterations: int, seed: int, device: torch.device
+    ) -> None:
+        self.task, self.cfg, self.iterations, self.device = task, cfg, iterations, device
+        self._located, self._seed = located(task), seed
+        by = cfg.estimate or ("moves" if task.markov else None)
+        self._paths = None if by == "moves" else SensedPaths(task, seed=derive(seed, "hidden"))
+        self._chooses = cfg.sensing == "chosen"
+        self._compares = by is None and task.num_cells <= _MOST_CELLS
+        self._estimate = self._new_estimate()
+        self._least = least_worth_planning(task)
+        self._rng = np.random.default_rng(derive(seed, "model_based"))
+        self._iteration, self._spent = 0, np.zeros(2)
+        beliefs, on_paths = (
+            ("believed_aihtr", "believed_deviation"),
+            ("keys_seen", "reward_per_move"),
+        )
+        self._found = dict.fromkeys(beliefs if by == "moves" else on_paths, math.nan)
+        self._before: PolicyTable | None = None
+        self.actor = Policy.all_on(task)
+        self.policy = RenewedTable(task, device, on=True) if self._chooses else Policy.all_on(task)
+
+    def _new_estimate(self) -> KernelEstimate:
+        share, task = self.cfg.share_cells, self._located
+        return KernelEstimate(
+            task.size,
+            weight=_PRIOR,
+            exit_weight=_EXIT_PRIOR,
+            # A mode that is revealed moves on its own; else where the moves seen show no difference.
+            share_cells=False if task.keyed else None if share is None else share != "none",
+            classes=cell_classes(share, task.size),
+            modes=task.keys.num_classes,
+        )
+
+    def step(self, batch: TensorDictBase | None) -> dict[str, float]:
+        """Take in one batch `[B, time]`, plan where it is time to, and choose the sets of the next one."""
+        self._iteration += 1
+        if batch is not None:
+            self._spent += [batch.numel(), _sensors_on(batch)]
+            if self._paths is not None:
+                self._paths.extend(batch)
+            if self._paths is None or self._chooses:
+                self._estimate.add(observed_paths(known_alone(batch, self.task), self._located))
+        last = self._iteration == self.iterations
+        if last or self._iteration % self._every == 0:
+            if self._paths is None or self._chooses:
+                self._estimate.fit(self.cfg.rounds * (_LAST if last else 1))
+            plan = self._plan_moves(last) if self._paths is None else self._plan_paths(last)
+            self.actor = as_policy(self.task, plan)
+            # Acting on a draw, not on the mean: where the estimate is unsure the draws differ, and so moves get sensed
+            # that the mean may leave out for good.
+            if isinstance(self.policy, RenewedTable) and self._spent[0] >= self.cfg.warm_up:
+                drawn = self._world(self._estimate.sample(self._rng))
+                self.policy.renew(lifted(self.task, exchange.solve(drawn, 0)))
+        return self._diagnostics()
+
+    @property
+    def _every(self) -> int:
+        """Batches from one plan to the next: with all sensors on nothing that is collected depends on it."""
+        if self.cfg.plan_every or self._chooses:
+            return self.cfg.plan_every or 1
+        plans = _PLANS_OF_MOVES if self._paths is None else _PLANS_OF_PATHS
+        large = self.task.num_cells > DIRECT_CELLS
+        return self.iterations if large else max(1, self.iterations // plans)
+
+    def _plan_moves(self, last: bool) -> PolicyTable:
+        """The plan for the posterior mean of the kernel; between batches one round from the plan before."""
+        world = self._world(self._estimate.believed(self._least))
+        if last or self._chooses:
+            plan = exchange.solve(world, exchange.OTHERS if last else 0)
+        else:
+            before = self._before if self._before is not None else PolicyTable.all_on(world)
+            plan = exchange.improve(world, before, once=True)
+        self._before = plan
+        self._found |= self._beliefs(plan, world)
+        return lifted(self.task, plan)
+
+    def _plan_paths(self, last: bool) -> PolicyTable:
+        """The plan on the sensed paths: at the end the best one of several on validation paths."""
+        assert self._paths is not None
+        task, cfg, tracks = self.task, self.cfg, self._paths.tracks()
+        if last and cfg.prior is None:
+            others = [self._pooled] if self._compares else []
+            found = choose_plan(
+                task,
+                tracks,
+                others=others,
+                discount=cfg.gamma,
+                rounds=cfg.rounds,
+                seed=self._seed,
+            )
+        else:
+            paths = Paths(task, tracks, cfg.gamma)
+            prior = UNJUDGED * paths.copies if cfg.prior is None else cfg.prior
+            found = plan_paths(paths, prior=prior, rounds=cfg.rounds)
+        moves = max(len(tracks.cells) - len(tracks), 1)
+        self._found["keys_seen"] = float(found.seen)
+        self._found["reward_per_move"] = found.reward / moves
+        return found.policy
+
+    def _pooled(self, tracks: Tracks) -> PolicyTable:
+        """The plan for the moves of `tracks`, as if the next one depended on the cell alone."""
+        estimate = self._new_estimate()
+        estimate.add_moves(*tracks.steps(self.task.num_cells))
+        world = self._world(estimate.believed(self._least))
+        return lifted(self.task, exchange.solve(world, 0))
+
+    def _world(self, kernel: sparse.csr_array) -> World:
+        """The task with a `[M, M + 1]` kernel."""
+        return believed_world(self._located, kernel, self._least)
+
+    def _beliefs(self, plan: PolicyTable, world: World) -> dict[str, float]:
+        """AIHTR of a plan by the posterior mean, and its standard deviation over kernels that are drawn."""
+        mean = evaluate(world, plan, per_cell=False)
+        others = map(self._world, self._estimate.samples(self._rng, _SAMPLES))
+        # Each begins with the mean kernel's values, which counts where the grid is too large to factorise.
+        worth = [evaluate(other, plan, guess=mean.value, per_cell=False).aihtr for other in others]
+        return {"believed_aihtr": mean.aihtr, "believed_deviation": float(np.std(worth))}
+
+    def _diagnostics(self) -> dict[str, float]:
+        """Figures of the last plan, and the costs of learning so far."""
+        frames, sensors = self._spent
+        found = self._found | {"sensors_per_frame": sensors / max(frames, 1.0)}
+        if self._paths is not None:
+            return found | {"paths": float(len(self._paths))}
+        return found | {"least_visits": float(self._estimate.visits.min())}
+
+    def state_dict(self) -> dict[str, Any]:
+        """The observations, the draws to come and the tables."""
+        generator = json.dumps(self._rng.bit_generator.state)  # 128 bits, too many for an integer
+        before = None if self._before is None else tensors(packed(self._before))
+        return {
+            "iteration": self._iteration,
+            "spent": torch.as_tensor(self._spent),
+            "found": dict(self._found),
+            "rng": generator,
+            "estimate": tensors(self._estimate.state()),
+            "paths": None if self._paths is None else self._paths.state_dict(),
+            "policy": self.policy.state_dict(),
+            "actor": tensors(packed(self.actor)),
+            "before": before,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from a `state_dict`."""
+        self._iteration, self._spent = state["iteration"], state["spent"].cpu().numpy().copy()
+        self._found = dict(state["found"])
+        self._rng.bit_generator.state = json.loads(state["rng"])
+        self._estimate.load_state(arrays(state["estimate"]))
+        if self._paths is not None:
+            self._paths.load_state_dict(state["paths"])
+        self.policy.load_state_dict(state["policy"])
+        self.actor = Policy.from_table(unpacked_policy(self.task, arrays(state["actor"])))
+        if state["before"] is not None:
+            self._before = unpacked_policy(self._located, arrays(state["before"]))
+
+
+def _sensors_on(batch: TensorDictBase) -> float:
+    """Sensors switched on by choice in a batch."""
+    # At n = t_max + 1 the safe action replaces the policy's set, and no sensor is switched on.
+    free = batch["steps_since_detection"] < batch["action_history"].shape[-2]
+    if free.all():
+        return float(batch["action"].count_nonzero())
+    return float((batch["action"].sum(-1) * free).sum())

@@ -1,0 +1,224 @@
+"""Paths from one detection to the next, as a tracker observes them, and whole tracks put together from them.
+
+Only the tracker's observations are read: where and when it located the target, its own sets, and that the target left.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from trackmdp.algos.common import arrays, tensors
+from trackmdp.algos.estimates.censored import ObservedPaths, hidden_cells
+from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
+from trackmdp.algos.moves import known_as
+from trackmdp.solvers.linear import IndexArray
+from trackmdp.world.coverage import reported
+from trackmdp.world.model import Array, BoolArray, Task
+from trackmdp.world.tracks import Tracks, ends_of
+from trackmdp.world.windows import Window
+
+_ENDING = 8
+"""Cells at the end of a path that identify its recording: wherever a path began, it ends as its recording."""
+_ROUNDS = 20
+"""Rounds of expectation-maximisation, from the moves seen alone: the result does not depend on earlier ones."""
+
+
+def observed_paths(batch: TensorDictBase, task: Task, *, last: bool = False) -> ObservedPaths:
+    """The paths that end in a collected batch `[B, time]`, row by row.
+
+    Where a detection reveals the mode they are of keys, and a sensor sees all those of its cell. Where the safe action
+    may miss, a path that comes to it ends with its last set.
+
+    Args:
+        batch: of any sets.
+        task: its sensors.
+        last: whether cells are wanted where there are keys.
+    """
+    after, name = batch["next"], "last_cell" if last else known_as(batch)
+    outside, classes = (task.num_cells, 1) if last else (task.num_keys, task.keys.num_classes)
+    ended = path_ends(batch)
+    exited = after["terminated"].squeeze(-1)
+    cell, misses = (batch[key][ended] for key in ("last_cell", "steps_since_detection"))
+    end = torch.where(exited, outside, after[name])[ended]
+    if not task.safe:
+        end = torch.where(misses == task.num_choices, outside + 1, end)
+    # A path's sets are in the history of the step that ended it, wherever the batch began. Most paths have no miss.
+    missed = misses.nonzero().squeeze(-1)
+    history = batch["action_history"][ended & (batch["steps_since_detection"] > 0)]
+    path, miss, sensor = history.nonzero(as_tuple=True)
+    if task.window is not None and task.coverage is None:  # numbered within the window
+        sensor = Window.of(task, sensor.device).around(cell[missed])[path, sensor]
+    row, sensor = (part.cpu().numpy() for part in (missed[path] * task.num_choices + miss, sensor))
+    located = cell.cpu().numpy()[row // task.num_choices]
+    there = np.flatnonzero(sensor < task.total_sensors)
+    possible = task.choosable(located[there], sensor[there])
+    there = there if possible is None else there[np.asarray(possible).ravel()]
+    shape = (len(misses) * task.num_choices, task.total_sensors)
+    sets = sparse.csr_array((np.ones(len(there)), (row[there], sensor[there])), shape=shape)
+    report = reported(sets, sparse.csr_array(task.sees_by_cell.T.tocsr()))
+    if classes > 1:
+        report = sparse.kron(report, np.ones((1, classes)), format="csr")
+    parts = [part.cpu().numpy() for part in (batch[name][ended], misses, end)]
+    return ObservedPaths(parts[0], parts[1], report, parts[2])
+
+
+def path_ends(batch: TensorDictBase) -> Tensor:
+    """`[B, time]` bool, the steps that locate the target, or in which it leaves."""
+    after = batch["next"]
+    located: Tensor = after["steps_since_detection"] == 0
+    return located | after["terminated"].squeeze(-1)
+
+
+class SensedPaths:
+    """Whole paths put together from batches, each row continuing the last.
+
+    Cells in which the target was not located are unknown. In `tracks` they are drawn from their distribution, given all
+    that was observed and the kernel that explains it best (`KernelEstimate`).
+
+    Args:
+        task: its sensors.
+        capacity: steps kept, in whole batches, the oldest of which go first; None for all.
+        seed: of the draws.
+    """
+
+    def __init__(self, task: Task, capacity: int | None = None, seed: int = 0) -> None:
+        self._task, self._capacity, self._seed = task, capacity, seed
+        self._parts: list[ObservedPaths] = []
+        self._episodes: list[IndexArray] = []
+        self._running = np.zeros(0, dtype=np.int64)  # [B], number of the episode of each row
+        self._next = 0
+        self._tracks: Tracks | None = None
+
+    def __len__(self) -> int:
+        return sum(len(part.start) for part in self._parts)
+
+    def extend(self, batch: TensorDictBase) -> None:
+        """Add a collected batch `[B, time]` or `[workers, B, time]`."""
+        batch = batch.reshape(-1, batch.shape[-1])
+        paths = observed_paths(batch, self._task, last=True)
+        done = batch["next", "done"].squeeze(-1).cpu().numpy().astype(np.int64)
+        row, time = (part.cpu().numpy() for part in path_ends(batch).nonzero(as_tuple=True))
+        begun = np.cumsum(done, axis=1) - done  # episodes of a row before each step
+        if not self._continued(row, begun[row, time], paths.start, len(done)):
+            self._running = self._next + np.arange(len(done))
+            self._next += len(done)
+        # Later episodes get new numbers: row by row, for the ones that begin in this batch.
+        ends = done.sum(axis=1)
+        base = self._next + np.cumsum(ends) - ends
+        number = np.where(begun > 0, base[:, None] + begun - 1, self._running[:, None])
+        self._running = np.where(ends > 0, base + ends - 1, self._running)
+        self._next += int(ends.sum())
+        self._parts.append(paths)
+        self._episodes.append(number[row, time])
+        self._tracks = None
+        while self._capacity is not None and len(self) > self._capacity and len(self._parts) > 1:
+            del self._parts[0], self._episodes[0]
+
+    def _continued(self, row: IndexArray, begun: IndexArray, start: IndexArray, rows: int) -> bool:
+        """Whether every row goes on as the batch before ended; not so where workers deliver in any order."""
+        if not self._parts or len(self._running) != rows:
+            return False
+        cells = self._task.num_cells
+        last = np.full(self._next, cells)
+        last[self._episodes[-1]] = self._parts[-1].end
+        first = np.flatnonzero((begun == 0) & (np.diff(row, prepend=-1) > 0))
+        before = last[self._running[row[first]]]
+        return bool(((before >= cells) | (before == start[first])).all())
+
+    def moves(self) -> tuple[IndexArray, IndexArray]:
+        """Cells before and after every step, `[K]` each; M after an exit."""
+        return self.tracks().steps(self._task.num_cells)
+
+    def tracks(self) -> Tracks:
+        """All paths so far, the unfinished among them; these count as recordings that stop.
+
+        Paths that end alike have one name: they are taken to follow one recording.
+        """
+        if self._tracks is None:
+            self._tracks = self._joined()
+        return self._tracks
+
+    def _joined(self) -> Tracks:
+        task, cells = self._task, self._task.num_cells
+        episode = np.concatenate(self._episodes)
+        order = np.argsort(episode, kind="stable")
+        paths = ObservedPaths.of(self._parts, cells).pick(order)
+        known = paths.end <= cells  # else nothing is known of where the target went
+        paths, episode = paths.pick(np.flatnonzero(known)), episode[order][known]
+        begins = np.ones(len(episode), dtype=bool)
+        begins[1:] = (np.diff(episode) != 0) | (paths.end[:-1] != paths.start[1:])
+        # A path adds its hidden cells and its end, the first one of a track its start as well.
+        first = ends_of((paths.misses + 1 + begins).astype(np.int64))
+        line = np.full(first[-1], -1)
+        line[first[:-1][begins]] = paths.start[begins]
+        line[first[1:] - 1] = paths.end
+        seen = line >= 0
+        if not seen.all():
+            estimate = KernelEstimate(task.size, weight=1.0, exit_weight=1.0, share_cells=None)
+            estimate.add(paths)
+            estimate.fit(_ROUNDS)
+            rng = np.random.default_rng(self._seed)
+            line[~seen] = hidden_cells(estimate.mean(), paths, rng)
+        track = np.repeat(np.cumsum(begins) - 1, np.diff(first))
+        inside = line < cells
+        exits = np.zeros(int(begins.sum()), dtype=bool)
+        exits[track[~inside]] = True
+        ends = ends_of(np.bincount(track[inside], minlength=len(exits)))
+        line, seen = line[inside], seen[inside]
+        names = _recordings(line, seen, ends).astype(np.int64)
+        return Tracks(line, ends, exits, names)
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that was observed."""
+        paths = ObservedPaths.of(self._parts, self._task.num_cells)
+        sizes = [len(part.start) for part in self._parts]
+        numbers = {
+            "sizes": np.array(sizes, dtype=np.int64),
+            "episodes": np.concatenate([np.zeros(0, dtype=np.int64), *self._episodes]),
+            "running": self._running,
+            "next": np.array([self._next]),
+        }
+        return tensors(numbers | paths.state())
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from a `state_dict`."""
+        each = arrays(state)
+        ends = np.cumsum(each["sizes"])
+        paths = ObservedPaths.of_state(each, self._task.num_cells)
+        places = np.split(np.arange(len(paths.start)), ends[:-1]) if len(ends) else []
+        self._parts = [paths.pick(place) for place in places]
+        self._episodes = [each["episodes"][place] for place in places]
+        self._running, self._next = each["running"].copy(), int(each["next"][0])
+        self._tracks = None
+
+
+def _recordings(line: Array, seen: BoolArray, first: IndexArray) -> IndexArray:
+    """`[K]`, one number for the paths of one recording: paths that share a run of `_ENDING` located cells.
+
+    The runs are compared at the same distance from the ends of the paths; where no cell is unknown, at the ends alone.
+    """
+    count, last = len(first) - 1, first[1:] - 1
+    paths, runs = [], []
+    for distance in range(1 if seen.all() else _ENDING):
+        place = last[:, None] - distance - np.arange(_ENDING)
+        there = place >= first[:-1, None]
+        run = np.where(there, line[np.maximum(place, 0)], -1)
+        if not seen.all():  # of short paths nothing is compared
+            there &= seen[np.maximum(place, 0)] & there.all(axis=1, keepdims=True)
+        whole = np.flatnonzero(there[:, 0] if seen.all() else there.all(axis=1))
+        paths.append(whole)
+        runs.append(np.column_stack([run[whole], np.full(len(whole), distance)]))
+    number = np.unique(np.concatenate(runs), axis=0, return_inverse=True)[1].ravel()
+    pairs = sparse.csr_array(
+        (np.ones(len(number)), (np.concatenate(paths), count + number)),
+        shape=(count + len(number), count + len(number)),
+    )
+    names: IndexArray = connected_components(pairs, directed=False)[1][:count].astype(np.int64)
+    return names

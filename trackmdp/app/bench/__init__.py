@@ -1,1 +1,0 @@
-"""Measuring this machine: one function per part of `trackmdp benchmark`, each returning its rows."""

@@ -1,0 +1,58 @@
+"""`compare`: policies of runs and baselines side by side."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from trackmdp.config import CompareConfig
+from trackmdp.durable import write_json
+from trackmdp.training.compare import Comparison, compare
+from trackmdp.training.display import make_console, table
+from trackmdp.training.run import trained
+from trackmdp.world.problem_file import problem_digest
+from trackmdp.world.tracks import Problem
+
+
+def run(cfg: CompareConfig, folder: Path, problem: Problem) -> float:
+    """Write `comparison.json`, and print the table and its conclusion; returns the number of policies.
+
+    The problem is the first run's; without one, `cfg`'s.
+    """
+    console, policies = make_console(cfg.quiet), dict[str, Any]()
+    found = [trained(each, torch.device("cpu")) for each in cfg.runs or []]
+    if found:
+        problem = found[0][0]
+    same = Counter(Path(each).name for each in cfg.runs or [])
+    for each, (own, policy, _) in zip(cfg.runs or [], found, strict=True):
+        name = Path(each).name if same[Path(each).name] == 1 else each
+        elsewhere = "" if _digest(own) == _digest(problem) else " (other problem)"
+        policies[name + elsewhere] = policy
+    policies |= {name: name for name in cfg.baselines or []}
+    compared = compare(problem, policies)
+    write_json(folder / "comparison.json", _report(compared))
+    about = "exact" if compared.tracks is None else f"{compared.tracks} held-out tracks, 95 %"
+    heads = ["policy", "AIHTR", "accuracy", "sensors per step", "AIHTR less the first"]
+    rows = [[each.name, *compared.cells(each)] for each in compared.policies]
+    console.print(table(about, heads, rows))
+    for sentence in compared.sentences:
+        console.print(sentence)
+    console.print(f"results in {folder}")
+    return float(len(rows))
+
+
+def _digest(problem: Problem) -> str:
+    """The digest of a problem, for policies of any memory."""
+    return problem_digest(replace(problem, memory="cell", clip=2))
+
+
+def _report(compared: Comparison) -> dict[str, Any]:
+    return {
+        "tracks": compared.tracks,
+        "policies": [asdict(each) for each in compared.policies],
+        "conclusion": compared.sentences,
+    }

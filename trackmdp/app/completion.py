@@ -1,0 +1,29 @@
+"""Completion of `trackmdp COMMAND option=value` in bash: ``eval "$(trackmdp train -sc install=bash)"``.
+
+Hydra's own script asks the program for the choices of its first word, and so `trackmdp` for those of no command.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+_SCRIPT = """\
+_trackmdp() {
+    local word=${COMP_WORDS[COMP_CWORD]} command=${COMP_WORDS[1]} choices
+    if (( COMP_CWORD == 1 )); then
+        mapfile -t COMPREPLY < <(compgen -S ' ' -W '%(commands)s' -- "$word")
+        return
+    fi
+    # The program reads a line without the command; choices that begin with base_ are parts of others.
+    choices=$(COMP_LINE="${COMP_WORDS[0]} ${COMP_LINE#*" $command"}" \\
+        "${COMP_WORDS[0]}" "$command" -sc query=bash 2>/dev/null | tr ' ' '\\n' | grep -v '=base_')
+    mapfile -t COMPREPLY < <(compgen -W "$choices" -- "$word")
+}
+COMP_WORDBREAKS=${COMP_WORDBREAKS//=}
+complete -o nospace -o default -F _trackmdp trackmdp
+"""
+
+
+def bash(commands: Iterable[str]) -> str:
+    """The script that bash evaluates; `commands` are the words that may follow `trackmdp`."""
+    return _SCRIPT % {"commands": " ".join(commands)}

@@ -1,0 +1,1 @@
+"""Objects at a prompt and in a notebook: a few lines of text, a table, a picture."""

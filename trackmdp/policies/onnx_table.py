@@ -1,0 +1,69 @@
+"""A policy in an ONNX file, for a `Tracker`: its sets by onnxruntime, its task from the metadata; without torch."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+from scipy import sparse
+
+from trackmdp.errors import require
+from trackmdp.untrusted import LARGE, decoded, read_bytes
+from trackmdp.world.model import Task
+from trackmdp.world.place import Place
+
+
+class OnnxTable:
+    """The sets in a `policy.onnx` (`trackmdp.policies.export`).
+
+    Args:
+        file: the model.
+
+    Attributes:
+        task: size, limits, memory, footprints and place; prices are not in the file and stand as 0.
+
+    Raises:
+        UserError: onnxruntime is not installed, or the file is missing, damaged or no exported policy.
+    """
+
+    deterministic = True
+
+    def __init__(self, file: str | Path) -> None:
+        require("onnxruntime", "onnx", f"{file}")
+        import onnxruntime
+
+        content = read_bytes(Path(file), most=LARGE, links=True)
+        with decoded(str(file), "an exported policy"):
+            self._session = onnxruntime.InferenceSession(
+                content, providers=["CPUExecutionProvider"]
+            )
+            about = self._session.get_modelmeta().custom_metadata_map
+            sensors = self._session.get_outputs()[0].shape[1]
+            self.task = _task(about, int(sensors))
+
+    def sensors(self, key: int, misses: int) -> list[int]:
+        """The sensors on, n misses after the detection that left `key`."""
+        names = (each.name for each in self._session.get_inputs())
+        state = {name: np.array([it]) for name, it in zip(names, (key, misses), strict=True)}
+        (action,) = self._session.run(["action"], state)
+        found: list[int] = np.flatnonzero(action[0]).tolist()
+        return found
+
+
+def _task(about: dict[str, str], sensors: int) -> Task:
+    """The task of the metadata."""
+    size = int(about["rows"]), int(about["columns"])
+    more: dict[str, object] = {}
+    if "memory" in about:
+        more = {"memory": about["memory"], "clip": int(about["clip"])}
+        more["revealed"] = int(about["modes"])
+    if "footprints" in about:
+        cells = json.loads(about["footprints"])
+        rows = np.repeat(np.arange(len(cells)), [len(each) for each in cells])
+        columns = np.concatenate(cells).astype(np.int64)
+        entries = (np.ones(len(rows), dtype=bool), (rows, columns))
+        more["coverage"] = sparse.csr_array(entries, shape=(sensors, size[0] * size[1]))
+    if "place" in about:
+        more["place"] = Place(**json.loads(about["place"]))
+    return Task(size, cost=np.zeros(sensors), t_max=int(about["t_max"]), **more)  # type: ignore[arg-type]

@@ -1,0 +1,332 @@
+"""A policy at work on one target: the sensors to switch on now, given the reports so far; plain numbers, no tensors."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Protocol, Self
+
+import numpy as np
+
+from trackmdp.errors import UserError
+from trackmdp.policies.belief import Belief
+from trackmdp.policies.onnx_table import OnnxTable
+from trackmdp.policies.saved import load_policy
+from trackmdp.policies.table import PolicyTable
+from trackmdp.world.model import Array, BoolArray, Task
+
+_NUMBERS = ("key", "misses", "steps", "seed")
+
+
+class Plan(Protocol):
+    """A policy for a tracker: a `Policy` or its table, or an `OnnxTable`."""
+
+    task: Task
+    deterministic: bool
+
+    def sensors(self, key: int, misses: int) -> list[int]:
+        """The sensors that may be on, n misses after the detection that left `key`."""
+        ...
+
+
+class Tracker:
+    """Follows one target with a policy, and keeps the misses, the memory and the safe action as `TrackEnv` does.
+
+    A step: `sensors()` are switched on, the target moves, and one of `report(cell)`, `report(None)` or `exited()`
+    follows. After t_max + 1 misses in a row the safe action is due: all sensors are on. Where it reports nothing it is
+    due again. The limit `max_steps` of a task is one of simulation, and is not counted here.
+
+    Args:
+        policy: the policy or its table, or a file: a `policy.npz`, or a `policy.onnx`, which onnxruntime runs. Neither
+            file needs torch.
+        cell: in which the target was located.
+        at: its position in place of a cell: (lat, lon) or (x, y), where the place of the grid is known (`Task.place`).
+        mode: of the target there, where a detection gives it (`kernel.reveals`).
+        seed: of the draws of a policy that draws its sets; unused by the others.
+        world: with the motion of the target, for `belief()`; None: not known.
+
+    Raises:
+        UserError: the cell or position is outside the grid, the mode is missing or one too many, the file is none, or
+            the world is of another grid.
+
+    Example:
+        >>> from trackmdp import Policy, make_world
+        >>> tracker = Policy.none(make_world(size=3, t_max=0)).tracker(3)
+        >>> tracker.sensors()
+        []
+        >>> tracker.report(None)
+        >>> tracker.safe, tracker.sensors()
+        (True, [0, 1, 2, 3, 4, 5, 6, 7, 8])
+        >>> tracker.report(1)
+        >>> tracker
+        Tracker(cell=1, misses=0, safe=False)
+    """
+
+    def __init__(
+        self,
+        policy: Plan | str | Path,
+        cell: int | None = None,
+        *,
+        at: tuple[float, float] | None = None,
+        mode: int | None = None,
+        seed: int = 0,
+        world: Any = None,
+    ) -> None:
+        self._policy = _plan(policy)
+        self._task, self._world = self._policy.task, _checked(world, self._policy.task)
+        self._key, self._misses, self._steps = 0, 0, 0
+        self._on: list[int] | None = None
+        self._exited = False
+        self._belief: Belief | None = None
+        self._seed = _number("tracker: seed", seed)
+        found = self._one("tracker", cell, at)
+        if found is None:
+            raise UserError("tracker: no cell and no at, expected the first detection")
+        self._locate("tracker", found, mode, first=True)
+
+    def __repr__(self) -> str:
+        if self._exited:
+            return "Tracker(exited)"
+        return f"Tracker(cell={self.cell}, misses={self.misses}, safe={self.safe})"
+
+    @property
+    def cell(self) -> int:
+        """The cell of the last detection."""
+        return int(self._task.keys.cell(self._key))
+
+    @property
+    def key(self) -> int:
+        """The memory left by the last detection (`trackmdp.world.memory`); the cell, where that is all."""
+        return self._key
+
+    @property
+    def misses(self) -> int:
+        """Misses since the last detection, n; at most t_max + 1."""
+        return self._misses
+
+    @property
+    def safe(self) -> bool:
+        """Whether the safe action is due: all sensors on."""
+        return self._misses > self._task.t_max and not self._exited
+
+    def sensors(self) -> list[int]:
+        """The ids of the sensors to switch on now, in order; the same until the next report.
+
+        Raises:
+            UserError: the target has exited.
+        """
+        self._check_followed("sensors()")
+        if self._on is None:
+            everything = np.flatnonzero(self._task.available).tolist()
+            self._on = everything if self.safe else self._chosen()
+        return list(self._on)
+
+    def positions(self) -> list[tuple[float, float]]:
+        """The positions of the cells sensed now, (lat, lon) or (x, y); those of `sensors()`, but for footprints.
+
+        Raises:
+            UserError: the target has exited, or the place of the grid is not known.
+        """
+        self.sensors()
+        return [self._task.place_of(cell) for cell in np.flatnonzero(self._seen()).tolist()]
+
+    def belief(self) -> Array:
+        """`[M]` probability of each cell now, after the last report.
+
+        Raises:
+            UserError: the motion is not known, or the target has exited.
+        """
+        self._check_followed("belief()")
+        if self._belief is None:
+            raise UserError("belief(): the motion is not known, expected tracker(..., world=...)")
+        return self._belief.cells
+
+    def sees(self, cell: int) -> bool:
+        """Whether a sensor that is on covers a cell; the safe action does everywhere. None is on before `sensors()`.
+
+        Raises:
+            UserError: the cell is outside the grid.
+        """
+        return bool(self._seen()[_number("sees: cell", cell, self._task.num_cells - 1)])
+
+    def _seen(self) -> BoolArray:
+        """`[M]` whether a sensor that is on covers a cell."""
+        task = self._task
+        if self._on is None or self.safe:
+            return np.full(task.num_cells, self._on is not None)
+        action = np.zeros(task.total_sensors, dtype=bool)
+        action[self._on] = True
+        return task.covered(action)
+
+    def report(
+        self,
+        cell: int | None = None,
+        *,
+        at: tuple[float, float] | None = None,
+        mode: int | None = None,
+    ) -> None:
+        """The outcome of the step.
+
+        Args:
+            cell: in which the target was located; None if no sensor reported it.
+            at: its position in place of a cell, as of `Tracker`.
+            mode: of the target there, where a detection gives it.
+
+        Raises:
+            UserError: no `sensors()` before, or none of them sees this cell; the cell is outside the grid; the mode is
+                missing or one too many; the target has exited.
+        """
+        self._check_followed("report")
+        if self._on is None:
+            raise UserError("report: no sensors() since the last report, expected sensors() before")
+        cell = self._one("report", cell, at)
+        if cell is None:
+            if mode is not None:
+                raise UserError(f"report: mode={mode} without a cell, expected none")
+            if self._belief is not None:
+                chance = self._world.safe_detection if self.safe else self._world.detection
+                self._belief.missed(self._seen() * chance)
+            # The clock stands still where the safe action misses.
+            self._misses = min(self._misses + 1, self._task.num_choices)
+        else:
+            self._locate("report", cell, mode)
+        self._on = None
+        self._steps += 1
+
+    def exited(self) -> None:
+        """The target has left the grid; nothing follows.
+
+        Raises:
+            UserError: it had before.
+        """
+        self._check_followed("exited()")
+        self._exited, self._on = True, None
+
+    def state(self) -> dict[str, Any]:
+        """All that is needed to go on later, as JSON takes it; see `restore`."""
+        numbers = {name: getattr(self, f"_{name}") for name in _NUMBERS}
+        belief = None if self._belief is None else self._belief.states.tolist()
+        own = {"on": self._on, "exited": self._exited, "belief": belief}
+        return {"task": self._facts(), **numbers, **own}
+
+    @classmethod
+    def restore(
+        cls, policy: Plan | str | Path, state: Mapping[str, Any], world: Any = None
+    ) -> Self:
+        """The tracker of a `state()`, with the same policy or another one of the same grid and memory.
+
+        Raises:
+            UserError: the state is of another grid, other sensors or another memory, or is none.
+        """
+        expected = {"task", *_NUMBERS, "on", "exited", "belief"}
+        if not isinstance(state, Mapping) or set(state) != expected:
+            raise UserError(f"state: expected a dict with {', '.join(sorted(expected))}")
+        plan = _plan(policy)
+        task = plan.task
+        # Any mode: key and belief are replaced below.
+        tracker = cls(plan, 0, mode=0 if task.keys.modes > 1 else None, world=world)
+        if state["task"] != tracker._facts():
+            raise UserError(f"state: made for {state['task']}, expected {tracker._facts()}")
+        most = {"key": task.num_keys - 1, "misses": task.num_choices}
+        for name in _NUMBERS:
+            setattr(tracker, f"_{name}", _number(f"state: {name}", state[name], most.get(name)))
+        on, last = state["on"], task.total_sensors - 1
+        if not isinstance(on, list | None) or not isinstance(state["exited"], bool):
+            raise UserError("state: expected a list or None as on, True or False as exited")
+        tracker._on = None if on is None else [_number("state: on", each, last) for each in on]
+        tracker._exited = state["exited"]
+        if tracker._belief is not None:
+            tracker._belief.restore(state["belief"])
+        return tracker
+
+    def _facts(self) -> dict[str, Any]:
+        """The facts of the task that keys and sensor ids depend on."""
+        keys = asdict(self._task.keys) | {"size": list(self._task.size)}
+        return keys | {"sensors": self._task.total_sensors}
+
+    def _check_followed(self, call: str) -> None:
+        if self._exited:
+            raise UserError(f"{call}: the target has exited, expected a new tracker")
+
+    def _one(self, call: str, cell: int | None, at: tuple[float, float] | None) -> int | None:
+        """The cell, which may be given by a position."""
+        if at is None:
+            return cell
+        if cell is not None:
+            raise UserError(f"{call}: cell={cell} and at={at}, expected one of the two")
+        return self._task.cell_of(*at)
+
+    def _locate(self, call: str, cell: int, mode: int | None, *, first: bool = False) -> None:
+        """Note a detection; nothing is changed where it is refused."""
+        task, keys = self._task, self._task.keys
+        place = np.int64(_number(f"{call}: cell", cell, task.num_cells - 1))
+        if (mode is not None) != (keys.modes > 1):
+            wanted = f"one of 0 ... {keys.modes - 1}" if keys.modes > 1 else "none"
+            raise UserError(f"{call}: mode={mode}, expected {wanted}")
+        own = 0 if mode is None else _number(f"{call}: mode", mode, keys.modes - 1)
+        if not (first or self.sees(int(place))):
+            raise UserError(
+                f"{call}: cell {cell} is seen by none of the {len(self._on or ())} sensors that are on, expected "
+                "one that is, or None"
+            )
+        before = np.int64(self._key)
+        key = keys.start(place, own) if first else keys.next(before, self._misses, place, own)
+        self._key, self._misses = int(key), 0
+        if first and self._world is not None:
+            self._belief = Belief(self._world, int(place), mode)
+        elif self._belief is not None:
+            self._belief.located(int(place), mode)
+
+    def _chosen(self) -> list[int]:
+        """The policy's own choice, before any safe action."""
+        policy, task = self._policy, self._task
+        sensors = np.array(policy.sensors(self._key, self._misses), dtype=np.int64)
+        possible = task.choosable(np.full(len(sensors), self.cell), sensors)
+        kept = np.ones(len(sensors), dtype=bool) if possible is None else possible
+        sensors = sensors[kept]
+        if policy.deterministic:
+            return sensors.tolist()
+        assert isinstance(policy, PolicyTable)
+        # A generator for each step: the state then holds two numbers in place of a generator.
+        draws = np.random.default_rng([self._seed, self._steps]).random(len(sensors))
+        if policy.k is not None:
+            # The k largest of independent uniforms are a uniformly random subset of size k.
+            return np.sort(sensors[np.argsort(-draws)[: policy.k]]).tolist()
+        return sensors[draws < policy.chances(self._key, self._misses)[kept]].tolist()
+
+
+def _plan(policy: Plan | str | Path) -> Plan:
+    """The policy, which may be in a file."""
+    if not isinstance(policy, str | Path):
+        return policy
+    return OnnxTable(policy) if Path(policy).suffix == ".onnx" else load_policy(Path(policy))[0]
+
+
+def _checked(world: Any, task: Task) -> Any:
+    """The world, where it has a motion and is of the grid of a task.
+
+    Raises:
+        UserError: it has none, or is not.
+    """
+    if world is not None and (not hasattr(world, "kernel") or world.size != task.size):
+        raise UserError(f"tracker: world: expected a World of {task.rows} x {task.columns} cells")
+    return world
+
+
+def _number(name: str, value: Any, most: int | None = None) -> int:
+    """A whole number from 0 to `most`.
+
+    Raises:
+        UserError: it is none.
+    """
+    try:
+        # False is 0 to Python: report(False) would be a detection in cell 0.
+        number = -1 if isinstance(value, bool) else operator.index(value)
+    except TypeError:
+        number = -1
+    if number < 0 or (most is not None and number > most):
+        wanted = "a whole number >= 0" if most is None else f"a whole number from 0 to {most}"
+        raise UserError(f"{name} is {value!r}, expected {wanted}")
+    return number

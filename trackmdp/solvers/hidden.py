@@ -1,0 +1,84 @@
+"""Solving where modes are hidden: the best policy found for the memory asked for, and a bound on every policy.
+
+A plan belongs to a key, which does not determine the state. So an improvement may be a loss for some of the states, no
+search is monotone, and several starts are made (theory.md#keys-and-hidden-modes). Two bounds hold for every memory: the
+clocked one, and the optimum of a tracker to which a detection reveals the mode as well. That is a standard problem: its
+keys are the states.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import numpy as np
+
+from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers import optimal
+from trackmdp.solvers.exchange import best_of, exchanged, other_starts
+from trackmdp.solvers.renewal import Renewal
+from trackmdp.solvers.search import Found, clocked_sets, follow_credit
+from trackmdp.solvers.solution import Solution
+from trackmdp.solvers.value import averaged_kernel, evaluate
+from trackmdp.world.model import World
+
+_STEPS, _SWEEPS = 12, 1
+_MOST_EVENTS, _MOST_STARTS, _LEAST_STARTS = 6_000, 16, 1
+"""Events of all searches together, which bounds their time, and how many searches there are at most and at least."""
+
+
+def solve(world: World, *, start: PolicyTable | None = None) -> Solution:
+    """The best policy found for keys of the world's memory.
+
+    Args:
+        world: with hidden modes.
+        start: a deterministic policy of the same keys that the one found is no worse than.
+    """
+    began = time.monotonic()
+    renewal = Renewal(world, world.motion)
+    policies = [exchanged(renewal, each) for each in _starts(renewal, world, start)]
+    best = max(policies, key=lambda policy: policy.aihtr)
+    others = (policy.sets for policy in policies if policy is not best)
+    table = renewal.table(best_of(renewal, best, others).sets)
+    evaluation = evaluate(world, table)
+    bound = np.maximum(optimal.solve(revealing(world)).bound, evaluation.value)
+    gap = float((bound - evaluation.value).mean())
+    certified = gap <= 1e-6 * max(1.0, abs(evaluation.aihtr))
+    seconds = time.monotonic() - began
+    return Solution(table, evaluation, bound, certified, seconds, nodes=0, interrupted=False)
+
+
+def _starts(renewal: Renewal, world: World, start: PolicyTable | None) -> Iterator[Found]:
+    """Policies to search from: a known one, the homotopy, the optimum without modes, all on, none, other homotopies."""
+    if start is not None:
+        yield Found(renewal, renewal.sets(start))
+    count = min(max(_MOST_EVENTS // renewal.count, _LEAST_STARTS), _MOST_STARTS)
+    first = Found(renewal, clocked_sets(renewal, world))
+    yield follow_credit(renewal, world, first, _STEPS, _SWEEPS)
+    plain = optimal.solve(averaged(world)).table
+    cells = renewal.keys.cell(renewal.plans)
+    fixed = [
+        [
+            plain.chosen(n, cells[each.rows], each.sensors) > 0
+            for n, each in enumerate(renewal.choices)
+        ],
+        renewal.sets(PolicyTable.all_on(world)),
+        renewal.sets(PolicyTable.none(world)),
+    ]
+    for sets in fixed[: count - 1]:
+        yield Found(renewal, sets)
+    for sets in other_starts(renewal, world, count - 4, _STEPS, _SWEEPS):
+        yield Found(renewal, sets)
+
+
+def revealing(world: World) -> World:
+    """The same target, its mode revealed by each detection; no policy is worth more than the optimum there."""
+    return world.but(memory="cell", revealed=world.modes)
+
+
+def averaged(world: World) -> World:
+    """The motion to a tracker that knows of no modes: each cell's moves, averaged over its modes as they occur."""
+    if world.modes == 1:
+        return world
+    kernel = averaged_kernel(world.motion, world.num_cells)
+    return World.of(world, kernel, memory="cell", revealed=1, markov=True)

@@ -1,0 +1,391 @@
+"""Linear systems over located cells: expected totals of an episode, V = (I - T)^-1 b (theory.md#exact-value).
+
+A policy starts afresh each time the target is located (a renewal). Any total over an episode (reward, steps,
+detections) therefore solves ``v = b + T v``: b is its expectation from one detection to the next, and T(x, j) the
+probability that a target located in x is located next in j.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from functools import cached_property, lru_cache
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+from scipy.linalg.blas import daxpy
+from scipy.linalg.lapack import dgetrf, dgetrs
+from scipy.sparse.linalg import splu, spsolve_triangular
+
+from trackmdp.errors import UserError
+from trackmdp.world.checks import short_indices
+from trackmdp.world.model import Array, World
+
+IndexArray: TypeAlias = npt.NDArray[np.integer[Any]]
+
+DIRECT_CELLS = 20_000
+"""Cells up to which systems are factorised. The factors of a grid fill about M^1.4 entries: 75 a cell at M = 16,384."""
+
+# Cells up to which a full matrix is factorised, in a quarter of the time: beliefs that spread leave few zeros.
+FULL = 200
+# Side of the square blocks that are one cell of the next coarser level, and cells at which a level is factorised.
+_BLOCK = 4
+_COARSEST = 4_096
+# Residual aimed at, relative to the size of right-hand side and solution: some 50 units of rounding of float64.
+TOLERANCE = 1e-14
+_MOST_PRODUCTS = 20_000
+# Changes that count as rounding, relative to the largest number.
+_LAST_BITS = 4.0 * float(np.finfo(np.float64).eps)
+# Where some cells have no way out, I - P is singular; if rounding lets the solve pass, lengths come out negative or
+# about 1 / 1e-16. No kernel that is meant to end comes near 1e12 steps.
+_LONGEST_EPISODE = 1e12
+_ENDLESS = (
+    "kernel: from some cell the target never exits, so no value is finite: "
+    "expected an exit reachable from each cell"
+)
+
+
+class RenewalSystem:
+    """Solves ``v = gathered + transition v`` for any number of `gathered`.
+
+    Up to `direct` cells by a sparse LU factorisation, above by BiCGSTAB preconditioned on coarser and coarser grids
+    (`_Level`), without which the number of products grows with the length of the episodes: at N = 256 and p_exit = 5e-5
+    to 3,434. So it is some 65 at any N, and some 95 at N = 512 where only the border lets the target out.
+
+    Args:
+        transition: `[M, M]` sub-stochastic; or `[KM, KM]` of K states per cell, cell j in its k-th state being kM + j.
+        size: (rows, columns) of the grid, or `[B]` a group of each of B states that are no cells, at most
+            `_COARSEST` groups: they take the place of a coarser grid.
+        direct: states up to which a factorisation is used.
+        full: states up to which the factorised matrix is a full one.
+        tolerance: residual at which an iteration ends, relative to the size of right-hand side and solution.
+
+    Attributes:
+        exact: whether solutions are exact but for rounding.
+
+    Raises:
+        UserError: from some cell the target never exits.
+    """
+
+    def __init__(
+        self,
+        transition: sparse.csr_array,
+        size: tuple[int, int] | IndexArray | None = None,
+        *,
+        direct: int = DIRECT_CELLS,
+        full: int = FULL,
+        tolerance: float = TOLERANCE,
+    ) -> None:
+        # I - T is an M-matrix with a dominant diagonal: its inverse is non-negative, and no pivoting is needed.
+        self._system = short_indices(
+            sparse.csr_array(sparse.eye_array(transition.shape[0], format="csr") - transition)
+        )
+        self.exact = transition.shape[0] <= direct
+        self._size, self._tolerance = size, tolerance
+        if self.exact:
+            self._solve = _factorised(self._system, full)
+            return
+        diagonal = self._system.diagonal()
+        self._precondition: Callable[[Array], Array] = (
+            (lambda right: right / diagonal) if size is None else _Level(self._system, size)
+        )
+
+    def solve(
+        self, gathered: Array, guess: Array | None = None, *, transposed: bool = False
+    ) -> Array:
+        """`[M]` or `[M, K]`, as `gathered` is.
+
+        Args:
+            gathered: right-hand sides.
+            guess: of the same shape, where an iteration starts.
+            transposed: solve ``v = gathered + transition^T v`` instead.
+
+        Raises:
+            UserError: from some cell the target never exits.
+        """
+        wanted = np.asarray(gathered, dtype=np.float64)
+        if self.exact:
+            total = self._solve(wanted, transposed)
+        elif transposed:
+            return self._turned.solve(gathered, guess)
+        else:
+            # One right-hand side after the other: together they would share nothing but the reading of the matrix, and
+            # need K times the memory.
+            starts = np.zeros_like(wanted) if guess is None else guess
+            pairs = zip(
+                wanted.reshape(len(wanted), -1).T, starts.reshape(len(wanted), -1).T, strict=True
+            )
+            total = np.stack([self._iterate(*pair) for pair in pairs], axis=-1).reshape(
+                wanted.shape
+            )
+        # A singular system may be factorised all the same, and then gives inf or nan in place of an error.
+        if not np.isfinite(total).all():
+            raise UserError(_ENDLESS)
+        return total
+
+    @cached_property
+    def _turned(self) -> RenewalSystem:
+        """The system of the transposed matrix, for iteration."""
+        other = copy.copy(self)
+        other._system = sparse.csr_array(self._system.T)
+        if self._size is not None:
+            other._precondition = _Level(other._system, self._size)
+        return other
+
+    def residual(self, gathered: Array, solution: Array, *, transposed: bool = False) -> Array:
+        """`[M]` or `[M, K]`, gathered - (I - transition) solution, or with the transposed matrix."""
+        return gathered - (self._turned if transposed else self)._system @ solution
+
+    def passed_on(self, mass: Array) -> Array:
+        """`[M]`, mass transition: where mass in the states is after one transition."""
+        return mass - mass @ self._system
+
+    def upper(self, gathered: Array, longest: float) -> Array:
+        """`[M]` no less than the solution for any residual; `longest` bounds the steps of an episode.
+
+        With e = v - v̂ = (I - T)^-1 (residual of v̂) and (I - T)^-1 >= 0, with row sums of at most the expected number
+        of renewals, |e| <= longest · max |residual|.
+        """
+        solution = self.solve(gathered)
+        return (
+            solution
+            if self.exact
+            else solution + longest * float(np.abs(self.residual(gathered, solution)).max())
+        )
+
+    def _iterate(self, gathered: Array, start: Array) -> Array:
+        """BiCGSTAB, started anew while that makes the true residual (the recursive one drifts off) much smaller."""
+        gathered, best, products = np.ascontiguousarray(gathered), np.array(start), 0
+        residual = self.residual(gathered, best)
+        # Rounding alone leaves a residual of about 1e-16 times the solution; nothing is gained below the target.
+        while True:
+            target = self._tolerance * float(np.abs(gathered).max() + np.abs(best).max())
+            if np.abs(residual).max() <= target or products > _MOST_PRODUCTS:
+                return best
+            candidate, spent = self._bicgstab(best, residual, target)
+            products += spent
+            after = self.residual(gathered, candidate)
+            if not np.abs(after).max() < 0.5 * np.abs(residual).max():  # rounding is reached
+                return best if np.abs(residual).max() < np.abs(after).max() else candidate
+            best, residual = candidate, after
+
+    def _bicgstab(self, start: Array, residual: Array, target: float) -> tuple[Array, int]:
+        """Van der Vorst's method, right-preconditioned; `[M]` vectors, changed in place to spare memory."""
+        # The names of van der Vorst (1992): shadow r^, direction p, image A M^-1 p, moved t = A M^-1 s.
+        shadow, residual, solution, products = residual, residual.copy(), start.copy(), 0
+        direction, image, spare = (np.zeros_like(residual) for _ in range(3))
+        rho = alpha = omega = 1.0
+
+        def dot(one: Array, other: Array) -> float:
+            # numpy's pairwise sum, the same bits for any number of BLAS threads
+            return float(np.multiply(one, other, out=spare).sum())
+
+        while products < _MOST_PRODUCTS and np.abs(residual, out=spare).max() > target:
+            correlation = dot(shadow, residual)
+            if correlation == 0 or omega == 0:  # broken down: the caller starts anew from here
+                break
+            # daxpy(x, y, a): y += a x in place. direction = residual + beta (direction - omega image)
+            daxpy(image, direction, a=-omega)
+            direction *= correlation * alpha / (rho * omega)
+            direction += residual
+            ahead = self._precondition(direction)
+            image = self._system @ ahead
+            rho, alpha = correlation, _ratio(correlation, dot(shadow, image))
+            daxpy(image, residual, a=-alpha)
+            correction = self._precondition(residual)
+            moved = self._system @ correction
+            omega = _ratio(dot(moved, residual), dot(moved, moved))
+            daxpy(ahead, solution, a=alpha)
+            daxpy(correction, solution, a=omega)
+            daxpy(moved, residual, a=-omega)
+            products += 2
+        return solution, products
+
+
+class _Level:
+    """Approximate inverse of a system on a grid: here the differences of neighbours, one level down the smooth part.
+
+    Two damped Jacobi sweeps reduce the differences between neighbours; between them comes a correction, constant on
+    blocks of 4 x 4 cells: the next level's approximate solution. That level costs a sixteenth, so it is applied twice;
+    the number of products hardly grows with the grid and equals the number with the exact solution of that level.
+
+    Args:
+        system: `[KM, KM]`, K states a cell; cell j in its k-th state is kM + j.
+        size: (rows, columns) of the grid; or the group of each state.
+    """
+
+    def __init__(self, system: sparse.csr_array, size: tuple[int, int] | IndexArray) -> None:
+        self._system = system
+        # 0.8 is the usual damping of Jacobi as a smoother.
+        self._damping = 0.8 / system.diagonal()
+        if isinstance(size, tuple):
+            # States beyond one per cell are that many layers of the grid, each with blocks of its own.
+            layers = system.shape[0] // (size[0] * size[1])
+            self._blocks = sparse.csr_array(sparse.block_diag([_blocks(*size)] * layers))
+        else:
+            place = (np.arange(len(size)), size)
+            self._blocks = sparse.csr_array((np.ones(len(size)), place))
+        # Galerkin: with B [M, blocks] the indicator of the blocks, B^T A B is the system seen by vectors that are
+        # constant on each block.
+        coarse = short_indices(sparse.csr_array(self._blocks.T @ system @ self._blocks))
+        small = coarse.shape[0] <= _COARSEST or not isinstance(size, tuple)
+        self._below: _Level | None = None
+        if not small:
+            assert isinstance(size, tuple)
+            self._below = _Level(coarse, (-(-size[0] // _BLOCK), -(-size[1] // _BLOCK)))
+        self._solve = _factorised(coarse) if small else None
+
+    def __call__(self, residual: Array) -> Array:
+        """`[KM]`, about the solution of system x = `residual`."""
+        guess: Array = self._damping * residual
+        left = residual - self._system @ guess
+        guess += self._blocks @ self._corrected(self._blocks.T @ left)
+        left = residual - self._system @ guess
+        left *= self._damping
+        guess += left
+        return guess
+
+    def _corrected(self, residual: Array) -> Array:
+        """The solution on the blocks."""
+        if self._below is None:
+            assert self._solve is not None
+            return self._solve(residual, False)
+        guess = self._below(residual)
+        return guess + self._below(residual - self._below._system @ guess)
+
+
+def accumulate(
+    transition: sparse.csr_array, gathered: Array, size: tuple[int, int] | None = None
+) -> Array:
+    """Solve ``v = gathered + transition v`` once; see `RenewalSystem`."""
+    return RenewalSystem(transition, size).solve(gathered)
+
+
+def forced_worth(world: World, detected: Array) -> Array:
+    """`[Z]` worth of the target in each state when the safe action is next, repeated until it locates the target.
+
+    L = P [p_s (r + V) + (1 - p_s) L] - D p_in, `detected` `[Z]` being r + V: another linear system, of matrix
+    P (1 - p_s), which without misses is empty.
+    """
+    if world.safe:
+        return world.kernel @ (detected - world.safe_cost)
+    found = world.safe_detection[world.motion.cell]
+    located = world.kernel @ (found * detected) - world.safe_cost * world.stay_probability
+    return _safe_system(world).solve(located)
+
+
+@lru_cache(maxsize=1)
+def _safe_system(world: World) -> RenewalSystem:
+    """The moves on which the safe action misses the target."""
+    missed = world.kernel.multiply(1.0 - world.safe_detection[world.motion.cell])
+    return RenewalSystem(sparse.csr_array(missed), grid_of(world))
+
+
+def grid_of(world: World) -> tuple[int, int] | None:
+    """(rows, columns) where the states of a world are its cells; else None."""
+    return world.size if world.modes == 1 else None
+
+
+@lru_cache(maxsize=1)
+def expected_steps(world: World) -> Array:
+    """`[Z]` expected steps until the exit, the exit step included; sensing never changes it.
+
+    Raises:
+        UserError: from some cell the target never exits.
+    """
+    # L = 1 + P L: every step counts once under every policy, so P takes the place of T.
+    steps = accumulate(world.kernel, np.ones(world.num_states), grid_of(world))
+    check_length(steps)
+    return steps
+
+
+def still_to_come(world: World, change: float, largest: float, left: int) -> float | None:
+    """The most that `left` further rounds add to a recursion over the steps left; None while they matter.
+
+    A round adds no more than the largest of the last changes, `change`, times the probability that the target is still
+    in the grid. It counts as rounding, which need not settle to the last bit, below a few units in the last place of
+    the `largest` number.
+    """
+    if change == 0.0:
+        return 0.0
+    if change > _LAST_BITS * largest:
+        return None
+    try:
+        return change * min(float(left), float(expected_steps(world).max()))
+    except UserError:  # the target never exits
+        return change * left
+
+
+def triangular(
+    transition: sparse.csr_array, gathered: Array, order: IndexArray, *, transposed: bool = False
+) -> Array:
+    """`[B]` or `[B, K]`, v = gathered + transition v, where in this `order` `[B]` each event leads to later ones alone.
+
+    `transposed`: v = gathered + transition^T v.
+    """
+    sorted_ = sparse.csr_array(transition[order][:, order])
+    system = sparse.eye_array(len(order), format="csr") - (sorted_.T if transposed else sorted_)
+    found = np.empty_like(gathered)
+    found[order] = spsolve_triangular(
+        sparse.csr_array(system), gathered[order], lower=transposed, unit_diagonal=True
+    )
+    return found
+
+
+def check_length(steps: Array) -> None:
+    """Refuse expected steps that no kernel with an exit from each cell can have."""
+    if (steps < 0).any() or (steps > _LONGEST_EPISODE).any():
+        raise UserError(_ENDLESS)
+
+
+def per_row(rows: IndexArray, values: Array, count: int) -> Array:
+    """`[count]` sums of `values` over equal `rows`."""
+    return np.bincount(rows, weights=values, minlength=count).astype(np.float64, copy=False)
+
+
+def row_index(matrix: sparse.csr_array) -> IndexArray:
+    """`[nnz]` the row of each stored entry."""
+    # indptr = (0, 2, 2, 5) has rows of 2, 0 and 3 entries: 0 0 2 2 2. int64, so that row · M + cell never overflows.
+    return np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
+
+
+def _factorised(system: sparse.csr_array, full: int = FULL) -> Callable[[Array, bool], Array]:
+    """Solves with I - T, or with its transpose, by its LU factors.
+
+    Raises:
+        UserError: the matrix is exactly singular.
+    """
+    if system.shape[0] <= full:
+        factors, pivots, singular = dgetrf(system.toarray(order="F"), overwrite_a=True)
+        if singular:
+            raise UserError(_ENDLESS)
+        return lambda wanted, transposed: dgetrs(factors, pivots, wanted, trans=int(transposed))[0]
+    try:
+        # Without pivoting, which a matrix with dominant diagonal does not need: that keeps the fill low.
+        factors = splu(
+            sparse.csc_array(system),
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
+    except RuntimeError as error:  # SuperLU: the matrix is exactly singular
+        raise UserError(_ENDLESS) from error
+    return lambda wanted, transposed: factors.solve(wanted, "T" if transposed else "N")
+
+
+def _blocks(rows: int, columns: int) -> sparse.csr_array:
+    """`[M, blocks]` which block of the grid each cell lies in.
+
+    With blocks of 4 x 4, the cell in row 9 and column 20 of a grid of 256 columns (64 blocks a row of blocks) lies in
+    block 2 · 64 + 5 = 133.
+    """
+    # -(-a // b) is a / b rounded up: the last blocks of a row or column may be cut off by the border.
+    row, column = np.divmod(np.arange(rows * columns), columns)
+    block = row // _BLOCK * -(-columns // _BLOCK) + column // _BLOCK
+    return sparse.csr_array((np.ones(len(block)), (np.arange(len(block)), block)))
+
+
+def _ratio(part: float, whole: float) -> float:
+    return part / whole if whole else 0.0

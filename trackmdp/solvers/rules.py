@@ -1,0 +1,169 @@
+"""Rules of thumb, thresholds on where the target is predicted to be: Q_MDP, first cost reduction, myopic, clocked.
+
+Q_MDP (Littman, Cassandra and Kaelbling 1995) acts as if the position were known after every action, and first cost
+reduction (Fuemmeler and Veeravalli 2008, 2011) as if nothing were observed any more. All of them remember the located
+cell alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers.bounds import clocked_table
+from trackmdp.solvers.choose import TIE
+from trackmdp.solvers.linear import IndexArray, per_row
+from trackmdp.solvers.sensing import sensing
+from trackmdp.solvers.walk import Step, Walk, all_events
+from trackmdp.world.model import Array, World
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Where the target may be next, for all located cells at once, after n misses.
+
+    Attributes:
+        n: misses so far.
+        rows, cells: `[E]`, located cell and possible next cell of each entry.
+        mass: `[E]`, joint probability of the misses so far and the target moving to `cells`.
+        before: `[M]`, probability of the n misses.
+        inside: `[M]`, probability of the misses and of still being in the grid after the move.
+    """
+
+    n: int
+    rows: IndexArray
+    cells: IndexArray
+    mass: Array
+    before: Array
+    inside: Array
+
+
+@dataclass(frozen=True)
+class Offer:
+    """Gains and costs of sensing in one step, for all located cells.
+
+    Attributes:
+        gain: `[E]`, of a report.
+        price: `[S]`, of each sensor.
+        charge: `[M]`, factor of the prices for each located cell.
+        ties: whether a sensor that gains its very price is on.
+    """
+
+    gain: Array
+    price: Array
+    charge: Array
+    ties: bool = False
+
+
+def qmdp(world: World, *, in_grid: bool = False) -> PolicyTable:
+    """Q_MDP, eq. qmdp_policy: sense j iff p_d(j) p_j >= c_j / r.
+
+    p_j is the predicted probability of cell j given the misses so far, the exit being one of the possibilities; p_d(j)
+    is 1 for a sensor that never misses.
+
+    Args:
+        world: the problem.
+        in_grid: charge sensors like the reward does, only while the target is in the grid: p_d p_j r >= c_j p_in.
+    """
+    # Multiplied by the probability of the misses, which need not be divided by then.
+    return unroll(world, lambda seen: _offer(world, seen, seen.inside if in_grid else seen.before))
+
+
+def fcr(world: World, *, in_grid: bool = False) -> PolicyTable:
+    """Sense j at n misses iff p_d(j) (e_x P^(n+1))_j r >= c_j: the prediction takes no notice of the misses.
+
+    Args:
+        world: the problem.
+        in_grid: charge sensors only while the target is in the grid: p_d p_j r >= c_j p_in.
+    """
+    # Without learning `mass` is e_x P^(n+1) itself: no probability of misses has to be divided by.
+    always = np.ones(world.num_cells)
+    return unroll(
+        world, lambda seen: _offer(world, seen, seen.inside if in_grid else always), learns=False
+    )
+
+
+def myopic(world: World, *, threshold: float | None = None) -> PolicyTable:
+    """Sense j iff the probability that it reports the target, given the misses so far, is at least `threshold`.
+
+    Without one, sense where the sensor earns its price in this very step: p_d(j) p_j r >= c_j p_in.
+    """
+    if threshold is None:
+        return qmdp(world, in_grid=True)
+    # The threshold is as a price, the same of all sensors.
+    limit = np.where(world.available, threshold, world.prices)
+    return unroll(world, lambda seen: Offer(seen.mass, limit, seen.before, ties=True))
+
+
+def clocked_policy(world: World) -> PolicyTable:
+    """The policy that senses j iff p_d m_j (r + U(j, 0) - U(j, n + 1)) > c_j sum(m), m the predicted undetected mass.
+
+    Where sensors share cells, the set that gains most of that.
+
+    Optimal, with sensors that never miss, wherever at most one cell of positive probability is left unsensed: then a
+    miss reveals where the target is, as the bound assumes.
+    """
+    table = clocked_table(world).table
+
+    def gains(seen: Prediction) -> Offer:
+        credit = world.reward + table[seen.cells, 0] - table[seen.cells, seen.n + 1]
+        return Offer(seen.mass * credit, world.prices, seen.inside)
+
+    return unroll(world, gains)
+
+
+def unroll(
+    world: World, rule: Callable[[Prediction], Offer], *, learns: bool = True
+) -> PolicyTable:
+    """The policy that takes the set of most worth by a `rule` from a prediction, within the task's window.
+
+    Cells of probability zero are never sensed, and after a miss that cannot happen nothing is.
+    """
+    walk, mass, sensed = _walk(world), np.ones(world.num_cells), []
+    for n in range(world.num_choices):
+        step = walk.move()
+        seen = _predicted(n, step, mass, world.num_cells)
+        offer = rule(seen)
+        located = None if world.window is None else np.arange(world.num_cells)
+        choice = sensing(world, seen.rows, seen.cells, world.num_cells, located, distinct=True)
+        slack = 1.0 - TIE if offer.ties else 1.0
+        price = offer.price[choice.sensors] * offer.charge[choice.rows] * slack
+        on = choice.best(offer.gain[:, None], price[:, None])
+        sensed.append((choice.rows[on[:, 0]], choice.sensors[on[:, 0]]))
+        mass = seen.mass
+        if learns:
+            left = 1.0 - choice.report(on)[:, 0]
+            mass = mass * left
+            walk.keep(left > 0)
+    return PolicyTable.from_sensed(world.remembering(), sensed)
+
+
+def predictions(world: World, policy: PolicyTable) -> Iterator[Prediction]:
+    """The predictions after 0 ... t_max misses along the plans of a policy that remembers the cell alone."""
+    walk, mass, acts = _walk(world), np.ones(world.num_cells), policy.sensed_by(world)
+    for n in range(world.num_choices):
+        step = walk.move()
+        seen = _predicted(n, step, mass, world.num_cells)
+        yield seen
+        left = 1.0 - acts.reports(n, seen.rows, seen.cells)
+        mass = seen.mass * left
+        walk.keep(left > 0)
+
+
+def _walk(world: World) -> Walk:
+    motion = world.motion
+    return Walk(world, motion, all_events(world, world.remembering().keys, motion))
+
+
+def _predicted(n: int, step: Step, mass: Array, count: int) -> Prediction:
+    """The prediction from undetected `mass` `[E_before]`; joint with the misses, not conditioned on them."""
+    before, now = per_row(step.before, mass, count), mass @ step.moves
+    return Prediction(n, step.rows, step.states, now, before, per_row(step.rows, now, count))
+
+
+def _offer(world: World, seen: Prediction, charged: Array) -> Offer:
+    """The reward of a report at once, and the price of a sensor where it is `charged`."""
+    return Offer(seen.mass * world.reward, world.prices, charged, ties=True)

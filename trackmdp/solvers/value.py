@@ -1,0 +1,343 @@
+"""The exact value of a policy: its renewals, then one linear system over the events (theory.md#exact-value).
+
+After a miss the next state is known in advance, so a policy is, for each key, the plan of sets it senses at n = 0 ...
+t_max misses. Pushing the undetected mass along the plans gives, for each event, the expected reward until the next one,
+b, and its place, K; then V = (I - K)^-1 b. The same holds with a motion model and on recorded tracks, whose states
+are their points.
+
+Where episodes of a model are truncated after `max_steps` steps, values depend on the steps left, so the linear solve
+becomes a backward recursion over them. Nothing diverges where the target never exits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from importlib import import_module
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+from scipy import sparse
+
+from trackmdp.errors import UserError
+from trackmdp.policies.table import PolicyTable, SetTable
+from trackmdp.solvers.evaluation import Evaluation, ReplayedTracks, by_start, pooled
+from trackmdp.solvers.linear import (
+    DIRECT_CELLS,
+    TOLERANCE,
+    IndexArray,
+    RenewalSystem,
+    accumulate,
+    check_length,
+    expected_steps,
+    per_row,
+    still_to_come,
+    triangular,
+)
+from trackmdp.solvers.walk import Events, Passed, Walk, all_events, passed
+from trackmdp.world.model import Array, BoolArray, Task, World
+from trackmdp.world.motion import Motion
+from trackmdp.world.tracks import Problem, Recorded, Tracks, check_problem
+
+if TYPE_CHECKING:  # torch is loaded where something that acts is asked for its sets
+    from trackmdp.policies.policy import PolicyLike
+
+KEYED_DIRECT = 700
+"""Events of several keys or modes a cell up to which their system is factorised, as a full matrix: each leads to all
+cells in reach."""
+
+Followed: TypeAlias = tuple[Events, Iterator[Passed]]
+"""Events that a policy leads to, and their steps."""
+
+
+def evaluate(
+    problem: Problem,
+    policy: PolicyLike | Array | BoolArray,
+    *,
+    guess: Array | None = None,
+    false_alarm: float = 0.0,
+    per_cell: bool = True,
+) -> Evaluation:
+    """The figures of `policy`: exact on a `World`, from a replay on the held-out tracks of a `Recorded`.
+
+    Args:
+        problem: a `World`, whose episodes end by the target's exit or after `max_steps`; or `Recorded` tracks.
+        policy: a `Policy` or its table, or the same dense, `[M, t_max + 1, M]`; a TensorDict module or a function
+            that does not draw (`Policy.from_function`); a `Run`, a `Solution`, a model of Stable-Baselines3; or the
+            name of a baseline.
+        false_alarm: p_f, with which a sensor that is on reports the target in a step in which it is not there; the
+            policy takes each report for the truth (`trackmdp.solvers.false_alarms`).
+        per_cell: whether detections, sensors and safe actions are wanted of each start cell as well, which takes half
+            as long again on a grid too large to factorise (a smaller one has them for nothing).
+        guess: `[M]`, where the solve begins on a grid too large to factorise, such as the clocked bound.
+
+    Raises:
+        UserError: the policy draws at random with unknown probabilities, or is for another grid.
+    """
+    check_problem(problem, "evaluate")
+    table = _table(problem, policy)
+    check_revealed(problem.motion, table)
+    if false_alarm:
+        from trackmdp.solvers.false_alarms import believed
+
+        return believed(problem, table, false_alarm)
+    if isinstance(problem, Recorded):
+        tracks = problem.held_out.limited(problem.max_steps)
+        starts = tracks.cells[tracks.first[:-1]]
+        return replay(problem, tracks, table).evaluation(starts, problem.num_cells)
+    if problem.max_steps is not None:
+        return truncated_value(problem, table, problem.max_steps)
+    return _whole_episodes(problem, table, guess, per_cell)
+
+
+def follow(task: Task, motion: Motion, policy: PolicyTable) -> Followed:
+    """The renewals of a policy: only mass that it leaves undetected is followed."""
+    acts = policy.sensed_by(task)
+    events = all_events(task, policy.task.keys, motion, acts.reports)
+    return events, _steps(task, motion, events, acts)
+
+
+def _steps(task: Task, motion: Motion, events: Events, policy: SetTable) -> Iterator[Passed]:
+    walk, count = Walk(task, motion, events), len(events.codes)
+    key = events.key
+    mass = np.ones(count - events.forced)
+    spent, sensors = np.zeros(0), np.zeros(0)
+    for n in range(task.num_choices + 1):
+        step = walk.move()
+        cells = motion.cell[step.states]
+        if n == task.num_choices:
+            mass = np.concatenate([mass, np.ones(step.begun)])
+            report = 1.0 if task.safe else task.safe_detection[cells]
+            yield passed(task, step, mass, report, task.safe_cost, 0.0, count)[0]
+            return
+        report = policy.reports(n, key[step.rows], cells)
+        spent, sensors = (
+            policy.spent(n, each)[key] for each in (task.paid, task.available.astype(np.float64))
+        )
+        found, mass = passed(task, step, mass, report, spent, sensors, count)
+        yield found
+        walk.keep(report < 1.0)
+
+
+def truncated_value(world: World, policy: PolicyTable, max_steps: int) -> Evaluation:
+    """The figures of `evaluate` for episodes of at most `max_steps` steps.
+
+    With h steps left, V_h = Σ_t [b_t + L_t V_{h-t}] over the steps t = 1 ... min(h, t_max + 2) after a detection:
+    b_t is gathered at step t, and L_t is the distribution of the target if located at step t. The last t_max + 2 V_h
+    are kept.
+    """
+    events, found = follow(world, world.motion, policy)
+    steps = _by_length(events, found)
+    left = [np.zeros_like(steps[0][1])]  # V_{h-1}, V_{h-2}, ...
+    for h in range(1, max_steps + 1):
+        # zip stops at the shorter one: with h steps left only the first h steps of a renewal happen.
+        now = sum(
+            earned + hit @ later for (hit, earned), later in zip(steps[:h], left, strict=False)
+        )
+        # V_h is made of the t_max + 2 before it alone: where it is the same as they are, so are all that follow.
+        if len(left) == len(steps):
+            changes = zip([now, *left], left, strict=False)
+            change = max(float(np.abs(after - before).max()) for after, before in changes)
+            error = still_to_come(world, change, float(np.abs(now).max()), max_steps - h)
+            if error is not None:
+                return _figures(world, events, now, error)
+        left = [np.asarray(now), *left[: len(steps) - 1]]
+    return _figures(world, events, left[0])
+
+
+def _by_length(events: Events, found: Iterable[Passed]) -> list[tuple[sparse.csr_array, Array]]:
+    """L_t and b_t of t = 1 ... t_max + 2 steps after each event."""
+    steps = [(each.located, each.totals) for each in found]
+    if events.forced:
+        # Another safe action is the first step after a miss of one, and the last step after a detection.
+        count = len(events.codes)
+        begun = sparse.diags_array((np.arange(count) >= count - events.forced).astype(np.float64))
+        parts = [sparse.csr_array(begun @ steps[-1][0]), begun @ steps[-1][1]]
+        steps[0], steps[-1] = (
+            (steps[0][0] + parts[0], steps[0][1] + parts[1]),
+            (steps[-1][0] - parts[0], steps[-1][1] - parts[1]),
+        )
+    return steps
+
+
+def _whole_episodes(
+    world: World, policy: PolicyTable, guess: Array | None, per_cell: bool
+) -> Evaluation:
+    events, steps = follow(world, world.motion, policy)
+    located, gathered = whole_renewals(steps, len(events.codes))
+    cells_alone = events.keys.num_classes == world.modes == 1
+    if cells_alone and len(events.codes) > DIRECT_CELLS:
+        return _iterated(world, located, gathered, guess, per_cell)
+    size = world.size if cells_alone else world.motion.cell[events.state]
+    totals, left = solved(event_system(located, size), gathered)
+    check_length(totals[:, 5])
+    # |V - V̂| <= (steps of an episode) · max |residual|, as an episode has no more renewals than steps.
+    return _figures(world, events, totals, left * float(totals[:, 5].max()))
+
+
+def whole_renewals(steps: Iterable[Passed], count: int) -> tuple[sparse.csr_array, Array]:
+    """K `[B, B]` and `[B, 6]` totals of whole renewals."""
+    located, gathered = sparse.csr_array((count, count)), np.zeros((count, 6))
+    for step in steps:
+        located, gathered = located + step.located, gathered + step.totals
+    return located, gathered
+
+
+def _iterated(
+    world: World,
+    located: sparse.csr_array,
+    gathered: Array,
+    guess: Array | None,
+    per_cell: bool,
+) -> Evaluation:
+    """The figures on a large grid: by iteration, the value and the pooled figures by two solves in place of six."""
+    m, states = world.num_cells, len(gathered)
+    system, length = RenewalSystem(located, world.size), expected_steps(world)
+    # The value of a missed target is near to the value of a located one in its cell.
+    value = system.solve(gathered[:, 0], None if guess is None else np.tile(guess, states // m))
+    # |V - V̂| <= max (I - T)^-1 1 · max |residual|, and an episode has no more renewals than steps
+    # (theory.md#exact-value); the steps are those of I - P, themselves iterated.
+    error = float(length.max()) * float(np.abs(system.residual(gathered[:, 0], value)).max())
+    # Sensing does not move the target, and each episode has one exit step: the steps in the grid are all but that one.
+    steps = length - 1.0
+    if per_cell:
+        return pooled([value[:m], steps, *system.solve(gathered[:, 2:5])[:m].T, length], error)
+    # Detections and the like are wanted for a uniform start s alone, s (I - T)^-1 b: with the visits v = s (I - T)^-1,
+    # that is v = s + v T, each is a scalar product v b. One system goes before the next comes: both are large.
+    del system
+    system = RenewalSystem(sparse.csr_array(located.T), world.size)
+    visits = system.solve(np.concatenate([np.full(m, 1 / m), np.zeros(states - m)]))
+    return pooled([value[:m], steps, *(visits @ gathered[:, 2:5]), length], error)
+
+
+def _figures(world: World, events: Events, totals: Array, error: float = 0.0) -> Evaluation:
+    """The figures of all starts together, and by start cell; `totals` is `[B, 6]` of the rest of an episode."""
+    motion = world.motion
+    first = first_events(events, motion)
+    return by_start(motion.cell[motion.first], totals[first], world.num_cells, error)
+
+
+def first_events(events: Events, motion: Motion) -> IndexArray:
+    """`[F]`, the event with which each of the F episodes starts."""
+    keys, first = events.keys, motion.first
+    key = keys.start(motion.cell[first], first % motion.modes)
+    return np.searchsorted(events.codes, first.astype(np.int64) * keys.num_keys + key)
+
+
+def event_system(
+    transition: sparse.csr_array,
+    size: tuple[int, int] | IndexArray,
+    direct: int = DIRECT_CELLS,
+    tolerance: float = TOLERANCE,
+) -> RenewalSystem:
+    """The linear system over events.
+
+    Args:
+        transition: `[B, B]`.
+        size: of the grid where events are its cells; else `[B]` their cells.
+        direct: cells of a grid up to which it is factorised.
+        tolerance: see `RenewalSystem`.
+    """
+    if isinstance(size, tuple):
+        return RenewalSystem(transition, size, direct=direct, tolerance=tolerance)
+    return RenewalSystem(
+        transition, size, direct=KEYED_DIRECT, full=KEYED_DIRECT, tolerance=tolerance
+    )
+
+
+def solved(
+    system: RenewalSystem, gathered: Array, guess: Array | None = None, *, transposed: bool = False
+) -> tuple[Array, float]:
+    """The solution of v = gathered + transition v, and its largest residual, 0 where it was factorised."""
+    found = system.solve(gathered, guess, transposed=transposed)
+    if system.exact:
+        return found, 0.0
+    return found, float(np.abs(system.residual(gathered, found, transposed=transposed)).max())
+
+
+def visits_of(system: RenewalSystem, start: Array, guess: Array | None = None) -> Array:
+    """`[B]` expected visits of each event in an episode, s (I - K)^-1.
+
+    `guess` is where an iteration begins; None: a few detections after the start. Start keys are never revisited, so
+    that from the start itself BiCGSTAB's first residual would be orthogonal to its shadow and break down.
+    """
+    if guess is None:
+        guess = start
+        for _ in range(4):
+            guess = start + system.passed_on(guess)
+    return solved(system, start, guess, transposed=True)[0]
+
+
+def key_visits(problem: Problem, policy: PolicyTable) -> Array:
+    """`[keys]`, how often an episode's start or a detection leaves each key of a policy, expected."""
+    motion = problem.motion
+    events, steps = follow(problem, motion, policy)
+    located, _ = whole_renewals(steps, len(events.codes))
+    start = np.bincount(first_events(events, motion), minlength=len(events.codes))
+    system = event_system(located, motion.cell[events.state])
+    visits = visits_of(system, start / len(motion.first))
+    known = len(events.codes) - events.forced
+    return per_row(events.key[:known], visits[:known], events.keys.num_keys)
+
+
+def replay(task: Task, tracks: Tracks, policy: PolicyTable) -> ReplayedTracks:
+    """Follow `policy` along every recorded track, from its first cell.
+
+    A renewal leads to later points alone, so that its system is triangular in the order of the points.
+    """
+    motion = tracks.motion()
+    events, found = follow(task, motion, policy)
+    steps, count = list(found), len(events.codes)
+    located, gathered = whole_renewals(steps, count)
+    order = np.argsort(events.state, kind="stable")
+    totals = triangular(located, gathered, order)
+    first = first_events(events, motion)
+    start = np.bincount(first, minlength=count).astype(np.float64)
+    visits = triangular(located, start, order, transposed=True)
+    # How often each row of the policy's table was used, key by key and n by n.
+    used = np.zeros((policy.task.num_keys, task.num_choices))
+    for n, step in enumerate(steps[:-1]):
+        used[:, n] = per_row(events.key, visits * step.totals[:, 1], len(used))
+    each = totals[first]
+    return ReplayedTracks(each[:, :5], each[:, 5], policy.watched(used.ravel()))
+
+
+def check_revealed(motion: Motion, policy: PolicyTable) -> None:
+    """See that a policy that knows modes apart at a detection can act on targets of this `motion`.
+
+    Raises:
+        UserError: the targets have other modes, or none.
+    """
+    if policy.task.revealed not in (1, motion.modes):
+        raise UserError(
+            f"policy: made for targets with {policy.task.revealed} modes; expected {motion.modes}"
+        )
+
+
+def averaged_kernel(motion: Motion, num_cells: int) -> sparse.csr_array:
+    """`[M, M]` moves of each cell, averaged over its modes as they occur: the motion to a tracker without modes.
+
+    Sensing does not move the target, so the expected visits (I - Q^T)^-1 s of an episode are the same for all policies.
+    """
+    start = np.bincount(motion.first, minlength=motion.num_states) / len(motion.first)
+    visits = accumulate(sparse.csr_array(motion.moves.T), start)
+    share = visits / per_row(motion.cell, visits, num_cells)[motion.cell]
+    shape, states = (motion.num_states, num_cells), np.arange(motion.num_states)
+    into = sparse.csr_array((np.ones(len(states)), (states, motion.cell)), shape=shape)
+    out = sparse.csr_array((share, (motion.cell, states)), shape=shape[::-1])
+    return sparse.csr_array(out @ motion.moves @ into)
+
+
+def _table(problem: Problem, policy: PolicyLike | Array | BoolArray) -> PolicyTable:
+    """The table of a policy in any accepted form; torch is loaded only for modules and functions."""
+    if isinstance(policy, PolicyTable):
+        policy.check_fits(problem)
+        return policy
+    if isinstance(policy, np.ndarray):
+        return PolicyTable.from_dense(problem, policy)
+    if isinstance(policy, str):
+        # By name, like all choices: solvers are built on this module.
+        found: PolicyTable = import_module("trackmdp.solvers.solve").named_policy(problem, policy)
+        return found
+    from trackmdp.policies.policy import as_policy
+
+    return as_policy(problem, policy)

@@ -1,0 +1,374 @@
+"""Renewals: all that may happen from one detection to the next, for every world alike (theory.md#exact-value).
+
+An *event* is a pair (key, state) at a detection: the tracker's memory, and the hidden state of the target.
+Events are a Markov chain, also where the key forgets: the key determines the sets, and the state the future of the
+target. After an event the target moves once before each of t_max + 1 free choices, and once more before the safe
+action. A *step* lists the places where it may then be: entries (event, state).
+
+A safe action that misses is repeated, with D each time. So there are events of a second kind, the target missed by it
+in a state: they begin at the last step, the next safe action.
+
+On a line of four cells, where the target moves one cell to the right or stays in cell 3, events are cells, and
+
+    events 0 1 2 3        step 0: (0,1) (1,2) (2,3) (3,3)        step 1: (0,2) (1,3) (2,3) (3,3)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+from trackmdp.solvers.linear import IndexArray, per_row
+from trackmdp.world.memory import KeySpace
+from trackmdp.world.model import Array, BoolArray, Task
+from trackmdp.world.motion import Motion
+
+FIGURES = ("reward", "steps", "detections", "sensors", "safe actions", "length")
+"""Totals of an episode, in the order of the columns of `Passed.totals`; `steps` are those in the grid."""
+
+
+@dataclass(frozen=True, eq=False)
+class Events:
+    """All events that can occur, in order of (state, key); then the events of missed safe actions.
+
+    Attributes:
+        keys: the key space.
+        states: Z, of the motion.
+        codes: `[B]` sorted numbers: state · keys + key, and Z · keys more for a missed safe action.
+    """
+
+    keys: KeySpace
+    states: int
+    codes: npt.NDArray[np.int64]
+
+    @cached_property
+    def forced(self) -> int:
+        """Events of missed safe actions, the last ones."""
+        return len(self.codes) - int(np.searchsorted(self.codes, self.states * self.keys.num_keys))
+
+    @cached_property
+    def key(self) -> IndexArray:
+        """`[B]`."""
+        return np.asarray(self.codes % self.keys.num_keys)
+
+    @cached_property
+    def state(self) -> IndexArray:
+        """`[B]`."""
+        return np.asarray(self.codes // self.keys.num_keys % self.states)
+
+    @cached_property
+    def complete(self) -> bool:
+        """Whether the event of state z is event z: the key is a function of the state, and all states are there."""
+        return self.keys.order == 0 and len(self.codes) == self.states * (1 + (self.forced > 0))
+
+
+def detected_codes(keys: KeySpace, key: IndexArray, state: IndexArray) -> npt.NDArray[np.int64]:
+    """`[E]`, see `Events`."""
+    return state.astype(np.int64) * keys.num_keys + key
+
+
+def forced_codes(
+    keys: KeySpace, states: int, key: IndexArray | None, state: IndexArray
+) -> npt.NDArray[np.int64]:
+    """`[E]`, see `Events`; without `key`, as the next one does not depend on it, it counts as 0."""
+    return (state.astype(np.int64) + states) * keys.num_keys + (0 if key is None else key)
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """The entries after a move, in order of (event, state).
+
+    Attributes:
+        n: misses before.
+        rows: `[E]`, event of each entry.
+        states: `[E]`, the target's state.
+        moves: `[E_before, E]`, probability of each move, from the entries of the step before, or from the events.
+        following: `[E]`, the event that a detection leads to (or its code, see `Events`).
+        missed: `[E]`, the same for a miss of the safe action; None at free choices, and where it never misses.
+        before: `[E_before]`, event of each entry before the move.
+        stay: `[E_before]`, probability of still being in the grid after the move.
+        goes_on: `[E_before]`, whether there is a next step at all; None: everywhere (a recording may stop).
+        begun: events that begin here, the last entries before the move.
+    """
+
+    n: int
+    rows: IndexArray
+    states: IndexArray
+    moves: sparse.csr_array
+    following: IndexArray
+    missed: IndexArray | None
+    before: IndexArray
+    stay: Array
+    goes_on: BoolArray | None
+    begun: int
+
+
+class Walk:
+    """The steps of all events, one by one; entries that are surely detected need not go on.
+
+    Args:
+        task: its t_max and its safe action.
+        motion: of the target.
+        events: where renewals begin.
+        closed: whether `events` hold all that follow, so that steps lead to their numbers; else to codes.
+    """
+
+    def __init__(self, task: Task, motion: Motion, events: Events, *, closed: bool = True) -> None:
+        self._task, self._motion, self._events, self._closed = task, motion, events, closed
+        count = len(events.codes) - events.forced
+        self._rows: IndexArray = np.arange(count, dtype=_width(len(events.codes)))
+        self._states = events.state[:count]
+        self._live: IndexArray | None = None
+        self._n = 0
+
+    def keep(self, live: BoolArray) -> None:
+        """Of the entries of the last step only these `[E]` move on."""
+        self._live = None if live.all() else np.flatnonzero(live)
+
+    def move(self) -> Step:
+        """The next step: of a free choice, or after t_max + 1 of them of the safe action."""
+        events, motion, last = self._events, self._motion, self._n == self._task.num_choices
+        begun = events.forced if last else 0
+        if begun:
+            self._begin(begun)
+        rows, states = self._rows, self._states
+        from_rows, from_states = rows, states
+        if self._live is not None:
+            from_rows, from_states = rows[self._live], states[self._live]
+        out = motion.moves
+        if len(from_states) != motion.num_states or (np.diff(from_states) != 1).any():
+            out = motion.moves[from_states]
+        counts = np.diff(out.indptr)
+        source = np.repeat(from_rows, counts)
+        to, target = out.indices, None
+        if len(from_rows) > 1 and not (from_rows[1:] > from_rows[:-1]).all():
+            # Event 2 in state 5 of 16 states has the number 2 * 16 + 5 = 37; sorted numbers are the new entries.
+            codes = source.astype(np.int64) * motion.num_states + to
+            codes, target = np.unique(codes, return_inverse=True)
+            source, to = np.divmod(codes, motion.num_states)
+            source, to = source.astype(rows.dtype), to.astype(out.indices.dtype)
+        moves = _moves(out, target, counts, self._live, (len(rows), len(source)))
+        step = self._step(source, to, moves, begun, last=last)
+        self._rows, self._states, self._live = source, to, None
+        self._n += 1
+        return step
+
+    def _begin(self, begun: int) -> None:
+        """Add the missed targets of the safe action, which move as the others do."""
+        events, entries = self._events, len(self._rows)
+        more = np.arange(len(events.codes) - begun, len(events.codes), dtype=self._rows.dtype)
+        if self._live is not None:
+            self._live = np.concatenate([self._live, entries + np.arange(begun)])
+        self._rows = np.concatenate([self._rows, more])
+        self._states = np.concatenate([self._states, events.state[more]])
+
+    def _step(
+        self,
+        rows: IndexArray,
+        states: IndexArray,
+        moves: sparse.csr_array,
+        begun: int,
+        *,
+        last: bool,
+    ) -> Step:
+        motion, misses = self._motion, last and not self._task.safe
+        following, missed = self._after(rows, states, misses=misses)
+        stops = None if motion.ends is None else motion.ends[self._states]
+        return Step(
+            self._n,
+            rows,
+            states,
+            moves,
+            following,
+            missed,
+            self._rows,
+            motion.stay[self._states],
+            None if stops is None else ~stops,
+            begun,
+        )
+
+    def _after(
+        self, rows: IndexArray, states: IndexArray, *, misses: bool
+    ) -> tuple[IndexArray, IndexArray | None]:
+        """`[E]` events after a detection, and after a missed safe action; None where there is none."""
+        events, motion, keys = self._events, self._motion, self._events.keys
+        if self._closed and events.complete:
+            return states, states + motion.num_states if misses else None
+        cell, mode = motion.cell[states], states % motion.modes
+        before = events.key[rows] if keys.order else None
+        after = keys.start(cell, mode) if before is None else keys.next(before, self._n, cell, mode)
+        found = [detected_codes(keys, after, states)]
+        if misses:
+            found.append(forced_codes(keys, motion.num_states, before, states))
+        if self._closed:
+            found = [np.searchsorted(events.codes, codes) for codes in found]
+        return found[0], found[1] if misses else None
+
+
+def _moves(
+    out: sparse.csr_array,
+    target: IndexArray | None,
+    counts: IndexArray,
+    live: IndexArray | None,
+    shape: tuple[int, int],
+) -> sparse.csr_array:
+    """`[E_before, E]` of the moves `out` of `live` entries, each to its `target`, or to an entry of its own."""
+    pointer = out.indptr
+    if live is not None:
+        every = np.zeros(shape[0], dtype=np.int64)
+        every[live] = counts
+        pointer = np.concatenate([[0], np.cumsum(every)])
+    width = _width(max(len(out.data), *shape))
+    target = (
+        np.arange(shape[1], dtype=width) if target is None else target.astype(width, copy=False)
+    )
+    return sparse.csr_array((out.data, target, pointer.astype(width, copy=False)), shape=shape)
+
+
+def _width(count: int) -> type[np.int32] | type[np.int64]:
+    """int32 where it is enough: half the memory."""
+    return np.int32 if count <= np.iinfo(np.int32).max else np.int64
+
+
+def all_events(
+    task: Task, keys: KeySpace, motion: Motion, reports: Reports | None = None
+) -> Events:
+    """The events that can follow an episode's start.
+
+    Args:
+        task: its t_max and its safe action.
+        keys: of the policies.
+        motion: of the target.
+        reports: probability of a report under the one policy that is followed; None: all policies.
+    """
+    states = np.arange(motion.num_states)
+    if keys.order == 0:
+        key = keys.start(motion.cell, states % motion.modes)
+        parts = [detected_codes(keys, key, states)]
+        if not task.safe:
+            parts.append(forced_codes(keys, motion.num_states, None, states))
+        return Events(keys, motion.num_states, np.concatenate(parts))
+    first = motion.first
+    key = keys.start(motion.cell[first], first % motion.modes)
+    known = frontier = np.unique(detected_codes(keys, key, first))
+    if motion.ends is not None:
+        return _along_tracks(task, motion, Events(keys, motion.num_states, known), reports)
+    while len(frontier):
+        events = Events(keys, motion.num_states, frontier)
+        after = np.unique(np.concatenate(list(_following(task, motion, events, reports))))
+        frontier = np.setdiff1d(after, known, assume_unique=True)
+        known = np.union1d(known, frontier)
+    return Events(keys, motion.num_states, known)
+
+
+def _along_tracks(task: Task, motion: Motion, starts: Events, reports: Reports | None) -> Events:
+    """See `all_events`: step by step along all tracks at once, since what follows an event is a few steps later."""
+    points = np.arange(motion.num_states)
+    begins = np.ones(len(points), dtype=bool)
+    begins[motion.moves.indices] = False
+    step = points - np.maximum.accumulate(np.where(begins, points, 0))
+
+    def steps_of(codes: npt.NDArray[np.int64]) -> IndexArray:
+        return np.asarray(step[codes // starts.keys.num_keys % len(points)])
+
+    order = np.argsort(steps_of(starts.codes), kind="stable")
+    begun = np.split(starts.codes[order], np.cumsum(np.bincount(steps_of(starts.codes)))[:-1])
+    known, later = [], np.zeros(0, dtype=np.int64)
+    for now in range(int(step.max()) + 1):
+        here = steps_of(later) <= now
+        some = np.concatenate([later[here], *begun[now : now + 1]])
+        frontier = np.unique(some)
+        known.append(frontier)
+        if len(frontier):
+            events = Events(starts.keys, starts.states, frontier)
+            found = [later[~here], *_following(task, motion, events, reports)]
+            later = np.unique(np.concatenate(found))
+    return Events(starts.keys, starts.states, np.sort(np.concatenate(known)))
+
+
+Reports: TypeAlias = Callable[[int, IndexArray, IndexArray], Array]
+"""From misses n, keys `[E]` and cells `[E]` to the probability of a report `[E]`."""
+
+
+def _following(
+    task: Task, motion: Motion, events: Events, reports: Reports | None
+) -> Iterator[IndexArray]:
+    """Codes of the events that follow `events` by one detection, or by one missed safe action."""
+    walk = Walk(task, motion, events, closed=False)
+    for n in range(task.num_choices + 1):
+        step = walk.move()
+        if n < task.num_choices and reports is not None:
+            report = reports(n, events.key[step.rows], motion.cell[step.states])
+            yield step.following[report > 0]
+            walk.keep(report < 1)
+        else:
+            yield step.following
+        if step.missed is not None:
+            yield step.missed
+
+
+@dataclass(frozen=True)
+class Passed:
+    """One step of all B events at once.
+
+    Attributes:
+        located: `[B, B]`, probability that this step ends a renewal, and with which event.
+        totals: `[B, 6]`, expected `FIGURES` of this step.
+    """
+
+    located: sparse.csr_array
+    totals: Array
+
+
+def passed(
+    task: Task,
+    step: Step,
+    mass: Array,
+    report: npt.NDArray[np.floating] | float,
+    spent: Array | float,
+    sensors: Array | float,
+    count: int,
+) -> tuple[Passed, Array]:
+    """Carry undetected mass through a step.
+
+    Args:
+        task: its rewards.
+        step: the step.
+        mass: `[E_before]`, undetected before the move.
+        report: `[E]`, probability of a report there.
+        spent: `[B]`, price of the sensors on, or D for the safe action.
+        sensors: `[B]`, number of sensors on, or 0 for the safe action.
+        count: B.
+
+    Returns:
+        The step of all events, and the mass `[E]` that is left undetected.
+    """
+    forced = step.n == task.num_choices
+    goes_on = mass if step.goes_on is None else mass * step.goes_on
+    length = per_row(step.before, goes_on, count)
+    now = mass @ step.moves
+    found = now * report
+    inside, located = per_row(step.rows, now, count), per_row(step.rows, found, count)
+    # Sensors are paid while the target is in the grid, whether or not it is where they look.
+    reward = task.reward * located - spent * inside
+    chosen, forced_actions = (0.0 * inside, inside) if forced else (sensors * inside, 0.0 * inside)
+    totals = np.stack([reward, inside, located, chosen, forced_actions, length], axis=1)
+    onward = transition(found, step.rows, step.following, count)
+    if step.missed is not None:
+        onward = onward + transition(now - found, step.rows, step.missed, count)
+    return Passed(onward, totals), now - found
+
+
+def transition(value: Array, rows: IndexArray, columns: IndexArray, count: int) -> sparse.csr_array:
+    """`[B, B]` of entries in order of their rows; those of 0 are left out."""
+    some = value > 0
+    pointer = np.zeros(count + 1, dtype=_width(len(value)))
+    np.cumsum(np.bincount(rows[some], minlength=count), out=pointer[1:])
+    columns = columns[some].astype(pointer.dtype, copy=False)
+    return sparse.csr_array((value[some], columns, pointer), shape=(count, count))

@@ -1,0 +1,171 @@
+"""Policies side by side on one problem: figures, differences with intervals, and the conclusion in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from trackmdp.errors import UserError
+from trackmdp.notebook.card import Card, Carded, decimal, percent
+from trackmdp.policies.policy import Policy, as_policy
+from trackmdp.solvers.solve import named_policy
+from trackmdp.solvers.value import evaluate, replay
+from trackmdp.statistics import MeanInterval, ratio
+from trackmdp.training.evaluator import estimated_qmdp
+from trackmdp.world.tracks import Problem, Recorded, check_problem
+
+FIGURES = ("aihtr", "accuracy", "sensors_per_step")
+Figures: TypeAlias = dict[str, MeanInterval]
+
+_SAME = 1e-9
+"""Relative difference of two exact values below which they are the same up to rounding."""
+
+
+@dataclass(frozen=True)
+class Compared:
+    """A policy in a comparison.
+
+    Attributes:
+        name: of the policy.
+        figures: `FIGURES` -> its value, exact, or a mean over tracks with its interval.
+        difference: AIHTR less the first policy's; an interval from one end to itself where it is exact.
+    """
+
+    name: str
+    figures: Figures
+    difference: MeanInterval
+
+
+@dataclass(frozen=True, repr=False)
+class Comparison(Carded):
+    """Policies on one problem.
+
+    Attributes:
+        policies: in the order given; differences are to the first.
+        tracks: held-out tracks that the figures are means over; None where they are exact.
+    """
+
+    policies: tuple[Compared, ...]
+    tracks: int | None
+
+    def card(self) -> Card:
+        """A line for each policy; differences are to the first."""
+        facts = {}
+        for each in self.policies:
+            aihtr, accuracy, sensors, difference = self.cells(each)
+            last = "" if each is self.policies[0] else f"; difference {difference}"
+            facts[each.name] = f"AIHTR {aihtr}, {accuracy}, {sensors} sensors per step{last}"
+        about = "exact" if self.tracks is None else f"{self.tracks} held-out tracks"
+        return Card(f"Comparison: {len(self.policies)} policies, {about}", facts)
+
+    def cells(self, row: Compared) -> list[str]:
+        """AIHTR, accuracy, sensors per step and the difference to the first policy, in words."""
+        aihtr, accuracy, sensors = (row.figures[name].mean for name in FIGURES)
+        shown = [decimal(aihtr), percent(accuracy), decimal(sensors, 2)]
+        return [*shown, "–" if row is self.policies[0] else _with_interval(row.difference)]
+
+    @property
+    def sentences(self) -> list[str]:
+        """The conclusion for each policy but the first."""
+        first, *others = self.policies
+        return [_sentence(first, each, exact=self.tracks is None) for each in others]
+
+
+def _with_interval(found: MeanInterval) -> str:
+    if found.low is None or found.low == found.high:
+        return decimal(found.mean)
+    return f"{decimal(found.mean)} ({decimal(found.low)} ... {decimal(found.high)})"
+
+
+def _sentence(first: Compared, other: Compared, *, exact: bool) -> str:
+    """The difference of a policy to the first, and whether it is shown."""
+    found, unit = other.difference, "episode" if exact else "track"
+    more = f"{decimal(abs(found.mean))} {'more' if found.mean > 0 else 'less'} per {unit}"
+    if exact and abs(found.mean) <= _SAME * max(abs(first.figures["aihtr"].mean), 1.0):
+        return f"{other.name} earns the same as {first.name} (exact)."
+    if exact:
+        return f"{other.name} earns {more} than {first.name} (exact)."
+    if found.low is None or found.high is None:
+        return (
+            f"{other.name} earns {more} than {first.name}; the tracks are too few for an interval."
+        )
+    interval = f"95 % interval of the difference: {decimal(found.low)} to {decimal(found.high)}"
+    if found.low <= 0.0 <= found.high:
+        return f"No difference between {other.name} and {first.name} is shown; {interval}."
+    return f"{other.name} earns {more} than {first.name}; {interval}."
+
+
+def compare(problem: Problem, policies: Mapping[str, Any] | Sequence[Any]) -> Comparison:
+    """Value policies on one problem: exactly on a world, paired over the held-out tracks on recorded ones.
+
+    Args:
+        problem: a world or recorded tracks.
+        policies: name -> policy, or a list; each as for `evaluate`, or the name of a baseline.
+
+    Raises:
+        UserError: fewer than two policies, or one that `evaluate` refuses; the message names it.
+
+    Example:
+        >>> from trackmdp import Policy, make_world
+        >>> world = make_world(size=3)
+        >>> compare(world, ["all_on", Policy.none(world)]).sentences
+        ['Policy 2 earns 1,071.000 more per episode than all_on (exact).']
+    """
+    check_problem(problem, "compare")
+    named = policies if isinstance(policies, Mapping) else _named(policies)
+    if len(named) < 2:
+        raise UserError(f"compare: {len(named)} policies, expected at least two")
+    tables = {name: _table(problem, name, policy) for name, policy in named.items()}
+    if isinstance(problem, Recorded):
+        return _on_tracks(problem, tables)
+    rows: list[Compared] = []
+    for name, table in tables.items():
+        found = evaluate(problem, table, per_cell=False)
+        figures = {key: _exact(getattr(found, key)) for key in FIGURES}
+        first = (rows[0].figures if rows else figures)["aihtr"].mean
+        rows.append(Compared(name, figures, _exact(found.aihtr - first)))
+    return Comparison(tuple(rows), None)
+
+
+def _on_tracks(problem: Recorded, tables: Mapping[str, Policy]) -> Comparison:
+    """Figures over the held-out tracks; each target's own difference makes up the differences."""
+    tracks = problem.held_out.limited(problem.max_steps)
+    target = np.unique(tracks.names, return_inverse=True)[1]
+    count = np.bincount(target).astype(np.float64)
+    rows: list[Compared] = []
+    first = np.zeros(len(count))
+    for name, table in tables.items():
+        found = replay(problem, tracks, table)
+        reward = np.bincount(target, found.totals[:, 0]).astype(np.float64)
+        first = first if rows else reward
+        figures = found.intervals(tracks.names)
+        rows.append(
+            Compared(name, {key: figures[key] for key in FIGURES}, ratio(reward - first, count))
+        )
+    return Comparison(tuple(rows), len(tracks))
+
+
+def _exact(value: float) -> MeanInterval:
+    return MeanInterval(value, value, value, 1)
+
+
+def _named(policies: Sequence[Any]) -> dict[str, Any]:
+    """A name for each: a baseline's own, else its class and place."""
+    return {
+        each if isinstance(each, str) else f"{type(each).__name__} {place}": each
+        for place, each in enumerate(policies, start=1)
+    }
+
+
+def _table(problem: Problem, name: str, policy: Any) -> Policy:
+    """The policy as a table."""
+    try:
+        if policy == "qmdp" and isinstance(problem, Recorded):
+            policy = estimated_qmdp(problem)
+        named = isinstance(policy, str)
+        return named_policy(problem, policy) if named else as_policy(problem.task, policy)
+    except UserError as error:
+        raise UserError(f"compare: {name}: {error}") from error

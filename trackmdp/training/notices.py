@@ -1,0 +1,72 @@
+"""Notices about a run: why its learner was chosen, and whether its policy is poor."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from trackmdp.config import TrainConfig
+from trackmdp.world.model import Task
+from trackmdp.world.tracks import Recorded
+
+FAR = 0.05
+"""Regret per step, in rewards of a detection, from which a policy counts as poor."""
+
+
+def why_chosen(config: TrainConfig, task: Task) -> str | None:
+    """The estimate that `model_based`, the default, makes of this problem, and the reason; None of other learners."""
+    if config.algo.name != "model_based":
+        return None
+    recorded = isinstance(task, Recorded)
+    estimate = getattr(config.algo, "estimate", None) or ("moves" if task.markov else "paths")
+    if not task.markov:
+        cause = "recorded tracks" if recorded else "hidden modes"
+        why = f"{cause}, so that the next move may depend on more than the cell"
+    elif recorded:
+        why = "kernel.markov=true"
+    else:
+        why = "the next move depends on the last detection alone"
+    plans = {"moves": "pooled moves", "paths": "whole paths, chosen on validation paths"}
+    return f"algo=model_based: plans on {plans[estimate]} ({why})"
+
+
+def poor(
+    config: TrainConfig,
+    aihtr: float,
+    others: Mapping[str, float],
+    regret: float,
+    reward: float,
+) -> list[str]:
+    """One line for each sign of a poor policy, with the option that helps.
+
+    Args:
+        config: of the run.
+        aihtr: of the policy.
+        others: AIHTR of simple policies, by their names.
+        regret: per step, to the best policy known; nan where there is none.
+        reward: of a detection, the unit of `FAR`.
+    """
+    if not others:
+        return []
+    found, name = [], max(others, key=lambda each: others[each])
+    if others[name] > aihtr + (slack := 1e-6 * max(1.0, abs(aihtr))):
+        found.append(
+            f"warning: {name} earns {others[name]:,.3f}, more than the learned policy; {_help(config)}"
+        )
+    elif regret > FAR * reward:
+        found.append(f"warning: {regret:.3f} per step below the best policy known; {_help(config)}")
+    nothing = others.get("no sensors")
+    if nothing is not None and nothing >= max(aihtr, *others.values()) - slack:
+        found.append("note: no policy known earns more than no sensors at all; see cost.sensor")
+    return found
+
+
+def _help(config: TrainConfig) -> str:
+    """The option that helps most."""
+    algo = config.algo.name
+    if algo in ("a2c", "ppo", "dqn"):
+        return f"try more collector.total_frames, algo={algo}_per_sensor or algo=model_based"
+    if algo != "model_based":
+        return "try algo=model_based"
+    if getattr(config.algo, "estimate", None) == "moves":
+        return "try algo.estimate=null"
+    return "try more collector.total_frames"

@@ -1,0 +1,168 @@
+"""`problem.npz`: a world or recorded tracks in a file, one array or more for each argument of their constructor.
+
+A number or a word is an array without axes, an argument with parts has an array NAME.PART for each. A 3 x 3 world:
+
+    kind      "World"                        size    (3, 3)
+    kernel.data, kernel.indices, kernel.indptr, kernel.shape     a sparse matrix, as `coverage` is
+    cost      (9 numbers)                    t_max   1
+
+Recorded tracks have `tracks.cells`, `tracks.first`, `tracks.exits` and `tracks.names`, and so do their other two parts.
+An argument that is None has no array: None is its default.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, BinaryIO, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+from trackmdp.errors import UserError
+from trackmdp.untrusted import LARGE, decoded, load_npz, opened
+from trackmdp.world.coverage import Coverage
+from trackmdp.world.files import csr_of, npz_bytes
+from trackmdp.world.model import World
+from trackmdp.world.place import Place, place_arrays, place_in
+from trackmdp.world.tracks import Problem, Recorded, Tracks
+
+PROBLEM = "problem.npz"
+
+_KINDS = {kind.__name__: kind for kind in (World, Recorded)}
+_TRACKS = {field.name for field in fields(Tracks)}
+
+Arrays: TypeAlias = dict[str, npt.NDArray[Any]]
+Classes: TypeAlias = npt.NDArray[np.integer[Any]]
+
+
+def problem_arrays(problem: Problem, classes: Classes | None = None) -> Arrays:
+    """The arrays of `problem.npz`.
+
+    Args:
+        problem: the world or the recorded tracks.
+        classes: `[M]` class of each cell, where a learner was given them (`algo.share_cells`).
+    """
+    given = {field.name: getattr(problem, field.name) for field in fields(problem)}
+    return as_arrays({"kind": type(problem).__name__, **given, "classes": classes})
+
+
+def problem_bytes(problem: Problem, classes: Classes | None = None) -> bytes:
+    """The content of `problem.npz`; the same problem gives the same bytes. Arguments as of `problem_arrays`."""
+    return npz_bytes(problem_arrays(problem, classes))
+
+
+def problem_digest(problem: Problem, classes: Classes | None = None) -> str:
+    """SHA-256 of all arrays of a problem, independent of their compression. Arguments as of `problem_arrays`."""
+    digest = hashlib.sha256()
+    for name, array in problem_arrays(problem, classes).items():
+        digest.update(f"{name} {array.dtype} {array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()
+
+
+def read_problem(file: Path) -> Problem:
+    """The problem in a `problem.npz`.
+
+    Raises:
+        UserError: the file is missing or damaged, or holds no problem.
+    """
+    with opened(file, most=LARGE) as stream, decoded(str(file), "a world or recorded tracks"):
+        return problem_in(stream)
+
+
+def problem_in(stream: BinaryIO) -> Problem:
+    """The problem in the content of a `problem.npz`; call it inside `untrusted.decoded`."""
+    given = from_arrays(load_npz(stream))
+    given.pop("classes", None)
+    problem: Problem = _KINDS[given.pop("kind")](**given)
+    if isinstance(problem, Recorded):
+        for part in (problem.tracks, problem.validation, problem.held_out):
+            _check_tracks(part, problem.num_cells)
+    return problem
+
+
+def as_arrays(given: Mapping[str, Any]) -> Arrays:
+    """Arguments of a constructor as arrays; see the module."""
+    found: Arrays = {}
+    for name, value in given.items():
+        parts = _parts(value)
+        if parts is not None:
+            found |= {f"{name}.{key}": np.asarray(part) for key, part in parts.items()}
+        elif value is not None:
+            found[name] = np.asarray(value)
+    return found
+
+
+def _parts(value: Any) -> Mapping[str, Any] | None:
+    """The parts of an argument that is stored in several arrays; None of one that is not."""
+    matrix = value.matrix if isinstance(value, Coverage) else value
+    if sparse.issparse(matrix):
+        # Fixed widths: SciPy's own choice depends on the number of entries, and digests would with it.
+        return {
+            "data": matrix.data,
+            "indices": matrix.indices.astype(np.int32),
+            "indptr": matrix.indptr.astype(np.int64),
+            "shape": matrix.shape,
+        }
+    if isinstance(value, Tracks):
+        return {name: getattr(value, name) for name in sorted(_TRACKS)}
+    if isinstance(value, Place):
+        return place_arrays(value)
+    return value if isinstance(value, Mapping) else None
+
+
+def from_arrays(arrays: Mapping[str, npt.NDArray[Any]]) -> dict[str, Any]:
+    """The arguments that `as_arrays` made arrays of.
+
+    Raises:
+        ValueError, TypeError: the parts of one do not fit together.
+    """
+    given: dict[str, Any] = {}
+    parts: dict[str, Arrays] = {}
+    for name, array in arrays.items():
+        head, _, part = name.partition(".")
+        if part:
+            parts.setdefault(head, {})[part] = array
+        else:
+            given[name] = array.item() if array.ndim == 0 else array
+    return given | {name: _whole(each) for name, each in parts.items()}
+
+
+def _whole(parts: Arrays) -> Any:
+    """A sparse matrix, tracks, a place, or plain counts, whichever has parts of these names."""
+    if "indptr" in parts:
+        return csr_of(parts)
+    if parts.keys() == _TRACKS:
+        return Tracks(**parts)
+    if "corner" in parts:
+        return place_in(parts)
+    return {name: int(part) for name, part in parts.items()}
+
+
+def _check_tracks(tracks: Tracks, num_cells: int) -> None:
+    """Refuse tracks with indices outside their arrays or the grid.
+
+    Raises:
+        ValueError: they do.
+    """
+    whole = len(tracks.first) == len(tracks.exits) + 1 == len(tracks.names) + 1
+    whole = whole and len(tracks) > 0 and bool((tracks.lengths > 0).all())
+    if not whole or tracks.first[0] != 0 or tracks.first[-1] != len(tracks.cells):
+        raise ValueError("tracks that do not follow each other")
+    if tracks.cells.dtype != np.int64 or tracks.exits.dtype != bool:
+        raise ValueError(f"cells of {tracks.cells.dtype}, exits of {tracks.exits.dtype}")
+    if not ((tracks.cells >= 0) & (tracks.cells < num_cells)).all():
+        raise ValueError(f"a cell outside the grid of {num_cells} cells")
+
+
+def refuse_given(*_: object, **__: object) -> Problem:
+    """The maker of `kernel=given` and `sensor=given`, which describe a problem that is in a file.
+
+    Raises:
+        UserError: always.
+    """
+    raise UserError(f"kernel=given: the problem is in the run's {PROBLEM}; expected another kernel")
