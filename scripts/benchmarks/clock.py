@@ -112,7 +112,11 @@ def beside_checkout(place: str, typed: Sequence[str], key: str, repeat: int) -> 
         program = [sys.executable, str(Path(HERE, "scripts/benchmark.py")), *typed, f"out={out}"]
         for _ in range(repeat):
             for each, figures in found.items():
-                own = {**os.environ, "PYTHONPATH": each}
+                # The scripts are named: under PYTHONSAFEPATH their own folder is not searched.
+                own = {
+                    **os.environ,
+                    "PYTHONPATH": os.pathsep.join([each, str(Path(HERE, "scripts"))]),
+                }
                 subprocess.run(program, check=True, stdout=subprocess.DEVNULL, env=own)
                 figures.append(json.loads(out.read_text())["rows"][0][key])
     return min(found[HERE]), min(found[place])

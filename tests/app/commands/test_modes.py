@@ -69,10 +69,15 @@ def test_a_sweep_over_memories_is_reported(here: Path) -> None:
     drawn = sorted(
         file.name for file in (here / "report/figures").glob("*.csv") if "heading" in file.name
     )
-    assert [name.split("-path")[0] for name in drawn] == ["sets", "sets", "value", "value"]
+    # One map for the world of what no policy reaches, one of the sets of each memory.
+    assert [name.split("-model-based")[0].split("-heading")[0] for name in drawn] == [
+        "missing",
+        "sets",
+        "sets",
+    ]
     assert [
         sum(f"memory-{memory}" in name for name in drawn) for memory in ("cell", "displacement")
-    ] == [2, 2]
+    ] == [1, 1]
     assert not (here / "report/tables/missing.csv").exists()
     # Made again from what it stored.
     assert (
