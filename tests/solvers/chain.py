@@ -8,6 +8,7 @@ V_h = b + T V_{h-1}, from V_0 = 0, until the episode is cut or nothing changes a
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
@@ -133,8 +134,8 @@ class Chain:
         return totals[self.starts]
 
 
-def chain_of(problem: Problem, policy: PolicyTable) -> Chain:
-    """The chain of a policy with sets; probabilities are those of independent sensors."""
+def chain_of(problem: Problem, policy: PolicyTable, others: Sequence[Place] = ()) -> Chain:
+    """The chain of a policy with sets, with `others` as if episodes came to them; sensors are independent."""
     target, reports, price = target_of(problem), sees(problem), np.nan_to_num(problem.cost)
     assert policy.sets is not None
     table = policy.sets.toarray().astype(float)
@@ -157,6 +158,8 @@ def chain_of(problem: Problem, policy: PolicyTable) -> Chain:
         return place(state, History(cells, gap, mode), 0)
 
     starts = [located(state, (), 0) for state in target.starts]
+    for other in others:
+        place(*other)
     while len(earned) < len(places):
         here = len(earned)
         state, history, n = places[here]
