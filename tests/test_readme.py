@@ -28,7 +28,9 @@ SHORT = {
     "evaluate": ["episodes=20"],
 }
 """Words that make a command a matter of seconds."""
-GLOSSARY = "Task World Policy Key Safe_action AIHTR Regret T_max c D r Z Window R Clocked Exchange"
+GLOSSARY = (
+    "Task World Policy n Key AIHTR Regret T_max Safe_action c D r Z R Window Clocked Exchange"
+)
 
 
 def texts(path: Path, language: str) -> list[Block]:
@@ -45,7 +47,7 @@ def test_two_lines_set_everything_up() -> None:
 
 
 def test_the_readme_is_short() -> None:
-    assert len(README.read_text(encoding="utf-8").split()) <= 1420
+    assert len(README.read_text(encoding="utf-8").split()) <= 1200
 
 
 def test_every_word_of_the_glossary_has_one_line() -> None:
@@ -130,7 +132,7 @@ def test_the_commands_run_in_this_order(tmp_path: Path) -> None:
         )
         assert (result.returncode, result.stderr) == (0, ""), line
     assert len(list(tmp_path.glob("multirun/a/*/summary.json"))) == 4
-    assert len(list(tmp_path.glob("multirun/train-algo_a2c_ppo-*/*/summary.json"))) == 4
+    assert len(list(tmp_path.glob("multirun/train-algo_a2c_ppo_*/*/summary.json"))) == 3
     for sweep in ("a", "paper"):
         assert (tmp_path / "multirun" / sweep / "report" / "report.html").is_file()
     assert (tmp_path / "runs/a/evaluation.json").is_file()

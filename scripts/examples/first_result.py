@@ -9,7 +9,7 @@ from trackmdp.episodes.player import draw_picture
 def main() -> None:
     """Print what an episode earns on average, what the best policy earns, and three steps of an episode."""
     world = tm.make_world("random_support", size=10, support_size=5, cost=0.16, t_max=1)
-    run = tm.train(world, "hindsight", seed=0)  # learns from what it senses
+    run = tm.train(world, seed=0)  # gets the task, never the motion
     best = tm.solve(world)
     figures = run.evaluation
     print(

@@ -77,3 +77,12 @@ def test_complex_prices_are_refused_by_name() -> None:
 def test_a_grid_without_a_sensor_is_refused() -> None:
     with pytest.raises(UserError, match=r"^cost: nan"):
         Task(2, cost=np.full(4, np.nan), t_max=1)
+
+
+@pytest.mark.parametrize("shape", [(3, 3), (9,)])
+def test_an_array_of_prices_is_nan_where_there_is_no_sensor(shape: tuple[int, ...]) -> None:
+    prices = np.full(9, 0.5)
+    prices[[0, 7]] = np.nan
+    world = make_world("random_walk", size=3, cost=prices.reshape(shape))
+    assert np.flatnonzero(np.isnan(world.cost)).tolist() == [0, 7]
+    assert world.safe_cost == pytest.approx(3.5)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Mapping, Sequence
 from inspect import signature
 from pathlib import Path
@@ -75,7 +76,7 @@ def make_world(
             ``heading``, ``regimes``, ``constant_velocity`` or ``coordinated_turn``.
         size: N of an N x N grid, or (rows, columns).
         t_max: T_max; the controller chooses freely at n = 0 ... t_max.
-        cost: c, the price of one sensor for one step; one number, one per cell, or a file.
+        cost: c, the price of one sensor for one step; one number, one per cell (nan: no sensor there), or a file.
         safe_cost: D; None: the sum of all sensors' prices.
         reward: r, earned by a detection.
         max_steps: episodes are truncated after so many steps; None: never.
@@ -290,10 +291,14 @@ def _words(arguments: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, An
 
 
 def _flat(value: Any, size: Size) -> Any:
-    """An argument `[rows, columns]` as one number for each cell; any other as it is."""
-    if not isinstance(value, list | np.ndarray) or np.ndim(value) != 2:
+    """An argument `[rows, columns]` as one number for each cell, nan (no sensor) as null; any other as it is."""
+    if not isinstance(value, list | np.ndarray):
         return value
-    return np.ravel(value).tolist() if np.shape(value) == grid_size(size) else value
+    if np.ndim(value) == 2 and np.shape(value) == grid_size(size):
+        value = np.ravel(value)
+    if isinstance(value, np.ndarray) and value.dtype.kind == "f" and value.ndim == 1:
+        return [None if math.isnan(each) else each for each in value.tolist()]
+    return value
 
 
 def sensor_words(detection: Any, safe_detection: Any) -> dict[str, Any]:
