@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import pytest
+from omegaconf import ListConfig
 
 from trackmdp.config import GROUPS, ChoiceConfig
-from trackmdp.config.registry import maker, read_values
+from trackmdp.config.registry import maker, read_values, resolved
 from trackmdp.errors import UserError
 
 CHOICES = [(group, name) for group, names in GROUPS.items() for name in names]
@@ -30,3 +31,12 @@ def test_what_is_not_there_is_one_line() -> None:
         maker(Absent)
     with pytest.raises(UserError, match="kernel/no_such_kernel: no such config"):
         read_values("kernel/no_such_kernel")
+
+
+def test_a_price_for_each_cell_is_no_node_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A million of them took more than a minute."""
+    prices = [0.5] * 90_000
+    with monkeypatch.context() as patch:
+        patch.setattr(ListConfig, "append", lambda *_: pytest.fail("a node for a price"))
+        found = resolved({"cost": {"sensor": prices}, "same": "${cost.sensor}"}, {})
+    assert found == {"cost": {"sensor": prices}, "same": prices}

@@ -26,13 +26,14 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
+from omegaconf import AnyNode, OmegaConf
 from omegaconf.errors import OmegaConfBaseException, UnsupportedValueType
 
 from trackmdp.config.options import GROUPS, ChoiceConfig, options
 from trackmdp.errors import UserError
 
 ENTRY_POINTS = "trackmdp.plugins"
+_FEW = 100
 
 
 def maker(node: ChoiceConfig | type[ChoiceConfig]) -> Callable[..., Any]:
@@ -143,7 +144,7 @@ def resolved(values: dict[str, Any], known: Mapping[str, Any], prefix: str = "")
     """
     register_resolvers()
     try:
-        config = OmegaConf.create(values)
+        config = OmegaConf.create(_wrapped(values))
         # Before resolving, which leaves `???` in place; sorted, since a set has an order of its own each time.
         for key in sorted(OmegaConf.missing_keys(config)):
             expected = known[key].expected if key in known else f"{key}=NAME"
@@ -154,6 +155,23 @@ def resolved(values: dict[str, Any], known: Mapping[str, Any], prefix: str = "")
         where = f"{prefix}{error.full_key}: " if isinstance(error, UnsupportedValueType) else ""
         raise UserError(f"{where}{str(error).splitlines()[0]}") from error
     return dict(plain)
+
+
+class _Numbers(list[float]):
+    """A list that OmegaConf takes as one value: a node for each of a million prices would take more than a minute."""
+
+    def __deepcopy__(self, memo: object) -> _Numbers:
+        return self
+
+
+def _wrapped(value: Any) -> Any:
+    """`value` with its lists of more than `_FEW` numbers as nodes without children."""
+    if isinstance(value, dict):
+        return {key: _wrapped(item) for key, item in value.items()}
+    if not isinstance(value, list) or len(value) <= _FEW:
+        return value
+    numbers = all(type(each) in (int, float) for each in value)
+    return AnyNode(_Numbers(value), flags={"allow_objects": True}) if numbers else value
 
 
 def register_resolvers() -> None:
