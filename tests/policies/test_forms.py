@@ -166,6 +166,10 @@ def test_a_model_of_stable_baselines_is_its_mode() -> None:
             lambda: tm.evaluate(WORLD, lambda x: x),
             "policy: <lambda>: expected a function of last_c",
         ),
+        (
+            lambda: tm.evaluate(WORLD, torch.nn.Linear(3, 4)),
+            "policy: Linear: expected a function of last_c",
+        ),
         (lambda: tm.train(WORLD, log=["tensorboard"]), "log=.*tensorboard.*: expected folder"),
     ],
 )

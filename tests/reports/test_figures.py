@@ -7,6 +7,7 @@ import sys
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -67,6 +68,25 @@ def test_the_numbers_of_a_figure_are_those_of_the_runs(grouped: Study, panel: Pa
     assert rows["printed bound"][2] == runs[0].references["printed bound"]["aihtr"]
     assert rows["all on"][2] == runs[0].references["all on"]["aihtr"]
     assert "n = 3 seeds" in figure.title
+
+
+def test_exact_lines_stand_at_the_true_price_and_learned_ones_beside_it(
+    grouped: Study, panel: Panel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found: list[Any] = []
+    monkeypatch.setattr(figures, "legend", lambda figure, axes: found.append(axes))
+    drawn(grouped, panel, "aihtr")
+    lines = {line.get_label().lstrip("_"): line.get_xdata()[0] for line in found[0].lines}
+    learned = np.array([lines.pop(method) for method in grouped.methods])
+    assert set(lines.values()) == {0.16}
+    assert learned.mean() == pytest.approx(0.16)
+    assert 0 < np.ptp(learned) <= 0.03 * 0.06
+
+
+def test_the_legend_names_the_lines_in_sight(grouped: Study, panel: Panel) -> None:
+    """All sensors on earns thousands less; its regret is in sight."""
+    assert ">all on<" not in drawn(grouped, panel, "aihtr").svg.decode()
+    assert ">all on<" in drawn(grouped, panel, "regret").svg.decode()
 
 
 @pytest.mark.parametrize("key", ["accuracy", "sensors_per_step"])

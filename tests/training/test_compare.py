@@ -15,7 +15,8 @@ from trackmdp.app.cli import main
 from trackmdp.errors import UserError
 from trackmdp.notebook.card import MOST_LINES
 from trackmdp.solvers.value import replay
-from trackmdp.statistics import mean_over_groups
+from trackmdp.statistics import MeanInterval, mean_over_groups
+from trackmdp.training.compare import FIGURES, Compared, Comparison
 from trackmdp.training.evaluator import ESTIMATED, HeldOutEvaluator
 
 WORLD = small_world(exit_probability=0.05)
@@ -79,6 +80,16 @@ def test_a_comparison_at_a_prompt_names_its_policies() -> None:
     assert shown.startswith("Comparison: 2 policies, exact")
     assert "qmdp" in shown and "Policy 2" in shown
     assert len(shown.splitlines()) <= MOST_LINES
+
+
+def test_no_difference_is_cut_from_a_line() -> None:
+    """All sensors on earns thousands less, with an interval as wide."""
+    wide = MeanInterval(-1969.020, -2130.906, -1815.392, 30)
+    values = (wide.mean, 1.0, 384.0)
+    figures = {name: MeanInterval(x, x, x, 30) for name, x in zip(FIGURES, values, strict=True)}
+    rows = tuple(Compared(name, figures, wide) for name in ("learned", "all sensors"))
+    last = repr(Comparison(rows, 30)).splitlines()[-1]
+    assert last.endswith("Δ -1,969.020 (-2,130.906 ... -1,815.392)") and "…" not in last
 
 
 @pytest.mark.parametrize(

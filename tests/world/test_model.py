@@ -26,6 +26,11 @@ def test_a_task_knows_nothing_of_the_motion() -> None:
     assert (task.num_cells, task.num_choices) == (4, 4)
 
 
+def test_a_task_has_the_defaults_of_make_world() -> None:
+    world = World(np.eye(4) * 0.9, 2, cost=0.1)
+    assert (world.t_max, world.reward, world.max_steps) == (1, 1.0, None)
+
+
 def test_derived_tables() -> None:
     world = hop_world()
     assert world.stay_probability.tolist() == [0.75] * 4

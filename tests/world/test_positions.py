@@ -327,6 +327,7 @@ def test_a_frame_and_columns_of_ones_own_are_read_as_a_file_is(tmp_path: Path) -
         tm.load_tracks(source, **OPTIONS, **more).tracks.digest()
         for source, more in (
             (table, {"columns": COLUMNS}),
+            (table, {"columns": dict(each.split(":") for each in COLUMNS)}),
             (tmp_path / "a.csv", {"columns": COLUMNS}),
             (usual, {}),
             (tmp_path / "b.csv", {}),

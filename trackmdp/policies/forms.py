@@ -117,7 +117,8 @@ def rule_of(task: Task, policy: TensorDictModuleBase | Callable[..., Any]) -> Ru
 def function_rule(task: Task, function: Callable[..., Any]) -> Rule:
     """A user's function of the state as a rule; see `rule_of`."""
     try:
-        signature(function).bind(*STATE_KEYS)
+        # A module of torch takes what its `forward` takes.
+        signature(getattr(function, "forward", function)).bind(*STATE_KEYS)
     except TypeError:
         name = getattr(function, "__name__", type(function).__name__)
         raise UserError(f"policy: {name}: expected a function of {', '.join(STATE_KEYS)}") from None

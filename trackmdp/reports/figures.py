@@ -78,15 +78,18 @@ def _line_figure(
         heads: columns of positions and of estimates.
         finish: sets scales, limits and further marks.
         floor: smaller values are drawn there.
-        shift: distance between equal positions of neighbouring lines, so that lines that coincide are seen.
+        shift: distance between equal positions of neighbouring learned lines, the first ones, so that lines that
+            coincide are seen.
         thin: a marker, and a row of the table, at every so many positions.
     """
 
     def paint(figure: Canvas) -> None:
         axes = figure.subplots()
+        learned = sum(any(each.n for each in line.row) for line in lines)
         for place, line in enumerate(lines):
-            # Around the true position: with three lines shifted by -1, 0 and 1 times `shift`.
-            x = np.asarray(line.x) + shift * (place - (len(lines) - 1) / 2)
+            # Around the true position, where exact lines stand: three are shifted by -1, 0 and 1 times `shift`.
+            moved = shift * (place - (learned - 1) / 2) if place < learned else 0.0
+            x = np.asarray(line.x) + moved
             mean, low, high = np.maximum(line.ends, floor)
             marks = (2 * place % thin, thin) if thin > 1 else None
             axes.plot(x, mean, label=line.name, markevery=marks, **line.look.of_line())
@@ -170,7 +173,10 @@ def against_price(study: Study, panel: Panel, key: str, threshold: float | None)
         if key == "regret":
             axes.set_yscale("log")
         else:
-            axes.set_ylim(_limits(learned, others))
+            axes.set_ylim(limits := _limits(learned, others))
+            for drawn in axes.lines:
+                if np.max(drawn.get_ydata()) < limits[0]:
+                    drawn.set_label(f"_{drawn.get_label()}")  # out of sight: not in the legend
         if key == "regret" and threshold is not None:
             axes.axhline(threshold, color=INK, linewidth=0.6, linestyle=":")
         label_values(axes, panel.costs)

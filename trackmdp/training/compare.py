@@ -56,10 +56,11 @@ class Comparison(Carded):
         facts = {}
         for each in self.policies:
             aihtr, accuracy, sensors, difference = self.cells(each)
-            last = "" if each is self.policies[0] else f"; difference {difference}"
-            facts[each.name] = f"AIHTR {aihtr}, {accuracy}, {sensors} sensors per step{last}"
+            last = "" if each is self.policies[0] else f"; Δ {difference}"
+            facts[each.name] = f"AIHTR {aihtr}, {accuracy}, {sensors} sensors{last}"
         about = "exact" if self.tracks is None else f"{self.tracks} held-out tracks"
-        return Card(f"Comparison: {len(self.policies)} policies, {about}", facts)
+        head = f"Comparison: {len(self.policies)} policies, {about}; Δ: AIHTR less the first's"
+        return Card(head, facts)
 
     def cells(self, row: Compared) -> list[str]:
         """AIHTR, accuracy, sensors per step and the difference to the first policy, in words."""

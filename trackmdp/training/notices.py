@@ -49,8 +49,10 @@ def poor(
         return []
     found, name = [], max(others, key=lambda each: others[each])
     if others[name] > aihtr + (slack := 1e-6 * max(1.0, abs(aihtr))):
+        # A policy of less memory, learned from the same tracks, is named by its option.
+        advice = f"try {name}" if name.startswith("task.memory=") else _help(config)
         found.append(
-            f"warning: {name} earns {others[name]:,.3f}, more than the learned policy; {_help(config)}"
+            f"warning: {name} earns {others[name]:,.3f}, more than the learned policy; {advice}"
         )
     elif regret > FAR * reward:
         found.append(f"warning: {regret:.3f} per step below the best policy known; {_help(config)}")

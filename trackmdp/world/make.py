@@ -154,7 +154,8 @@ def load_tracks(
         origin: see `cell`.
         crs: see `cell`.
         **track_options: those of ``kernel=tracks`` (``trackmdp train kernel=tracks --help``): `format`, `step`,
-            `columns`, `max_gap`, `ends`, `starts`, `held_out`, `validation`, `seed`, `min_length`, `markov`.
+            `columns` (a dict, or a list as there), `max_gap`, `ends`, `starts`, `held_out`, `validation`, `seed`,
+            `min_length`, `markov`.
 
     Raises:
         UserError: the file is not of that form, a track is too short, or an option is wrong.
@@ -168,6 +169,8 @@ def load_tracks(
             f"load_tracks: a {type(path).__name__}, expected the path of a file, or a DataFrame"
         )
     source = "DataFrame.parquet" if in_memory else path  # a table of positions
+    if isinstance(named := track_options.get("columns"), Mapping):
+        track_options["columns"] = [f"{ours}:{theirs}" for ours, theirs in named.items()]
     words = {"kernel": "tracks", "kernel.path": source} | _words(locals(), track_options)
     made = make_problem(compose("compare", words), frame=path if in_memory else None)
     return cast(Recorded, made)

@@ -35,7 +35,7 @@ class TaskOptions(TypedDict, total=False):
     """Arguments that the constructors of `World` and `Recorded` hand on to `Task`'s."""
 
     cost: Required[npt.ArrayLike]
-    t_max: Required[int]
+    t_max: int
     safe_cost: float | None
     reward: float
     max_steps: int | None
@@ -98,7 +98,7 @@ class Task(Carded):
     size: tuple[int, int]
     _: KW_ONLY
     cost: Array
-    t_max: int
+    t_max: int = 1
     safe_cost: float = _SUM
     reward: float = 1.0
     max_steps: int | None = None

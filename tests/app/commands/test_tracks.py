@@ -19,7 +19,9 @@ from tests.typed import refused
 from trackmdp.app.cli import main
 from trackmdp.app.commands.train import run
 from trackmdp.config import GROUPS
+from trackmdp.config.compose import compose
 from trackmdp.episodes.reader import EpisodeReader
+from trackmdp.training.notices import poor
 from trackmdp.training.train import train as train_in_python
 from trackmdp.world.make import load_tracks
 from trackmdp.world.problem_file import PROBLEM, read_problem
@@ -382,6 +384,13 @@ def test_the_default_price_of_a_search_is_named(capsys: pytest.CaptureFixture[st
     assert "cost.safe: D = 8.1" in capsys.readouterr().out
     assert train("b", "quiet=false", "cost.safe=3") == 0
     assert "cost.safe" not in capsys.readouterr().out
+
+
+def test_the_advice_for_a_policy_below_one_of_less_memory_is_that_memory() -> None:
+    config = compose("train", {"task.memory": "displacement"})
+    others = {"task.memory=cell": 2.0, "all on": -9.0}
+    (line,) = poor(config, 1.0, others, float("nan"), 1.0)
+    assert line.endswith("more than the learned policy; try task.memory=cell")
 
 
 def test_a_policy_below_a_reference_is_named(capsys: pytest.CaptureFixture[str]) -> None:
