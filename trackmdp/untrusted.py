@@ -238,7 +238,9 @@ def load_tensors(file: Path, device: torch.device | str) -> Any:
         raise ValueError("it holds more than tensors and plain values") from error
 
 
-_TIMED = re.compile("second|time|per_s$")
+TIMED = re.compile("second|time|per_s$")
+"""In the names of figures that the clock decides."""
+
 # \x0b-\x1f: among others the carriage return, by which a name could overwrite its line, and escape; \x7f-\x9f: the C1
 # controls; \u200e... and \u2066...: the direction of text; surrogates cannot be encoded, so that printing them raises.
 _UNPRINTABLE = re.compile(
@@ -295,6 +297,6 @@ def _timeless(content: Any) -> Any:
         return {
             str(key): _timeless(value)
             for key, value in content.items()
-            if not _TIMED.search(str(key))
+            if not TIMED.search(str(key))
         }
     return [_timeless(item) for item in content] if isinstance(content, (list, tuple)) else content

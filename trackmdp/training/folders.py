@@ -7,9 +7,12 @@ are no signatures: a forger can compute them anew.
 
 from __future__ import annotations
 
+import csv
 import hashlib
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +20,7 @@ from trackmdp.config import TrainConfig, load_run_config
 from trackmdp.durable import write_json, write_sealed
 from trackmdp.errors import UserError
 from trackmdp.training.lock import is_locked
-from trackmdp.untrusted import known_object, opened, read_object, unsealed
+from trackmdp.untrusted import TIMED, decoded, known_object, opened, read_object, unsealed
 
 CONFIG, SUMMARY, METRICS = "config.yaml", "summary.json", "metrics.csv"
 _FILES = (CONFIG, "problem.npz", METRICS, "policy.npz")
@@ -74,8 +77,19 @@ def check_files(folder: Path, summary: Mapping[str, Any], *names: str) -> None:
 
 
 def _digest(file: Path) -> str:
+    """SHA-256 of a file; of `metrics.csv` without its columns of times, so that a run that is repeated has the same."""
     with opened(file, most=_LARGEST) as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+        if file.name != METRICS:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+        digest = hashlib.sha256()
+        with decoded(str(file), "a table"):
+            rows = csv.reader(io.TextIOWrapper(stream, "utf-8", newline=""))
+            head = next(rows, [])
+            timed = {place for place, name in enumerate(head) if TIMED.search(name)}
+            for row in chain([head], rows):
+                kept = [cell for place, cell in enumerate(row) if place not in timed]
+                digest.update(f"{kept}\n".encode())
+        return digest.hexdigest()
 
 
 @dataclass(frozen=True)
