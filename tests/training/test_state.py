@@ -174,16 +174,34 @@ def test_a_config_edited_by_hand_is_not_the_run(
     assert "belongs to a run with another config" in capsys.readouterr().err
 
 
+def forged(run: Path, **changes: Any) -> None:
+    """The newest checkpoint of a run, saved again with parts changed."""
+    state = {**checkpoint.load(checkpoint.newest(run)), **changes}
+    iteration = state.pop("iteration")
+    state.pop("format")
+    checkpoint.save(run / "checkpoints", iteration, state, keep=3)
+
+
+def test_sparse_weights_are_refused_in_one_line(half: Path, capfd: Any) -> None:
+    """In lines of torch's before ours."""
+    algorithm = checkpoint.load(checkpoint.newest(half))["algorithm"]
+    policy = {
+        name: tensor.to_sparse() if tensor.ndim == 2 else tensor
+        for name, tensor in algorithm["policy"].items()
+    }
+    forged(half, algorithm={**algorithm, "policy": policy})
+    capfd.readouterr()
+    assert main(["evaluate", f"run={half}", "episodes=0", "quiet=true"]) == 2
+    assert len(capfd.readouterr().err.splitlines()) == 1
+
+
 @pytest.mark.parametrize("callbacks", [{}, [1]])
 def test_a_state_without_those_of_the_callbacks_is_refused(half: Path, callbacks: Any) -> None:
     """`metrics.csv` would begin anew."""
     cfg = train_config(
         *SMALL["ppo"], *QUICK, *BUDGET, "checkpoint.keep=3", f"resume={checkpoint.newest(half)}"
     )
-    state = checkpoint.load(checkpoint.newest(half))
-    iteration = state.pop("iteration")
-    state.pop("format")
-    checkpoint.save(half / "checkpoints", iteration, {**state, "callbacks": callbacks}, keep=3)
+    forged(half, callbacks=callbacks)
     with pytest.raises(UserError, match="no states of callbacks"):
         find(cfg, read_problem(half / PROBLEM), half, CPU)
 
