@@ -153,6 +153,8 @@ def all_plans(world: World, z: int) -> Followed:
         sensors = np.flatnonzero((sees(world)[:, cells] > 0).any(axis=1) & allowed)
         subsets = np.zeros((2 ** len(sensors), world.total_sensors), dtype=bool)
         subsets[:, sensors] = (np.arange(len(subsets))[:, None] >> np.arange(len(sensors))) % 2
+        if world.budget is not None:
+            subsets = subsets[subsets.sum(axis=1) <= world.budget]
         sets.append(subsets)
     return followed(world, z, sets)
 

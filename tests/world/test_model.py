@@ -20,7 +20,16 @@ def test_a_task_knows_nothing_of_the_motion() -> None:
     task = world.task
     assert type(task) is Task
     known = {"size", "cost", "t_max", "safe_cost", "reward", "max_steps", "window", "markov"}
-    known |= {"detection", "safe_detection", "coverage", "memory", "clip", "revealed", "place"}
+    known |= {
+        "detection",
+        "safe_detection",
+        "coverage",
+        "memory",
+        "budget",
+        "clip",
+        "revealed",
+        "place",
+    }
     assert {field.name for field in dataclasses.fields(task)} == known
     assert not any(np.shape(value) == (4, 4) for value in vars(task).values())
     assert (task.num_cells, task.num_choices) == (4, 4)

@@ -19,12 +19,14 @@ class BaselineConfig(ChoiceConfig):
     Attributes:
         reads_motion: needs the kernel; recorded tracks have none.
         knows_footprints: sensors may cover several cells.
+        knows_budget: keeps to a limit on the sensors on in a step.
         whole_episodes: plans for episodes that only the exit ends; `grid.max_steps` then counts in the valuing alone.
     """
 
     reads_motion: ClassVar[bool] = True
     whole_episodes: ClassVar[bool] = False
     knows_footprints: ClassVar[bool] = True
+    knows_budget: ClassVar[bool] = True
 
 
 @choice("baseline", "qmdp", makes="trackmdp.solvers.rules:qmdp")
@@ -93,6 +95,7 @@ class LookaheadConfig(BaselineConfig):
     """Plan some sets ahead, then count on a simpler value."""
 
     knows_footprints: ClassVar[bool] = False
+    knows_budget: ClassVar[bool] = False
 
     depth: int = option("sets planned ahead", unit="steps", ge=1, le=16)
     tail: str = option("value counted on after them", choices=("qmdp", "clocked"))

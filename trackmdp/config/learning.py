@@ -67,6 +67,8 @@ class AlgoConfig(ChoiceConfig):
     """Whether it learns where a detection reveals the mode of the target (`kernel.reveals`)."""
     knows_footprints: ClassVar[bool] = False
     """Whether sensors may cover several cells."""
+    knows_budget: ClassVar[bool] = False
+    """Whether no more sensors than the budget are on, also while learning."""
     total_frames: int = option("env steps the algorithm needs", unit="frames", ge=1, le=MOST_FRAMES)
     frames_per_batch: int = option("env steps per collected batch", unit="frames", ge=1)
     envs: int = option("environments stepped together", ge=1)

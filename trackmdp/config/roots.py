@@ -28,6 +28,8 @@ class WorldConfig(CommandConfig):
     needs_motion: ClassVar[bool] = True
     all_prices: ClassVar[bool] = False
     """Whether the command sets the prices of sensors itself; those given are then ratios."""
+    any_number: ClassVar[bool] = False
+    """Whether the command is about policies with any number of sensors on."""
     grid: GridConfig
     kernel: KernelConfig
     cost: CostConfig
@@ -172,6 +174,7 @@ class FrontierConfig(WorldConfig):
     """
 
     all_prices: ClassVar[bool] = True
+    any_number: ClassVar[bool] = True
     task: TaskConfig
     solver: BaselineConfig
     accuracy: float | None = option(
@@ -193,6 +196,7 @@ class FrontierConfig(WorldConfig):
 class VerifyConfig(WorldConfig):
     """Check the paper's theorems on a world."""
 
+    any_number: ClassVar[bool] = True
     tolerance: float = option("deviation that still counts as equal", unit="reward", gt=0, lt=1)
 
     def check(self, key: str, root: Any) -> None:

@@ -40,9 +40,23 @@ class PaperCostConfig(CostConfig):
         ge=0,
         le=LARGEST_PRICE,
     )
+    budget: int | None = option(
+        "B, sensors that may be on in one step, the safe action apart; null = any number",
+        unit="sensors",
+        ge=0,
+    )
+    mean_budget: float | None = option(
+        "of solve: sensors per step on average; the best two policies around it, and how often to draw each",
+        unit="sensors per step",
+        ge=0,
+    )
 
     def check(self, key: str, root: Any) -> None:
         """One price for all sensors, or one for each; a file is read later."""
+        if self.budget is not None:
+            _check_budget(f"{key}.budget", self.budget, root)
+        if self.mean_budget is not None:
+            _check_mean(f"{key}.mean_budget", self, root)
         price = Option("", ge=0, le=LARGEST_PRICE, kind=float)
         count, each = root.sensor.count(root.grid), "sensor" if root.sensor.covers else "cell"
         _check_per_cell(
@@ -55,6 +69,41 @@ class PaperCostConfig(CostConfig):
         if root.all_prices and one and self.safe is not None:
             return {"sensor": "where all prices are gone through, and cost.safe is given"}
         return {}
+
+
+def _check_budget(key: str, budget: int, root: Any) -> None:
+    """Refuse what does not keep to a budget.
+
+    Raises:
+        UserError: sensors have footprints, or a planner, a learner or a proof is for any number of sensors.
+    """
+    if root.sensor.covers:
+        raise refuse(key, budget, f"null with sensor={root.sensor.name}")
+    for group in ("solver", "baseline", "algo"):
+        planner = getattr(root, group, None)
+        if planner is not None and not planner.knows_budget:
+            known = [name for name, schema in GROUPS[group].items() if schema.knows_budget]
+            expected = f"one of {', '.join(known)}" if known else f"{key}=null"
+            raise refuse(group, planner.name, f"{expected} with {key}={budget}")
+    partition = getattr(root, "partition", None)
+    if root.any_number or (partition is not None and partition.block is not None):
+        raise refuse(key, budget, "null here, where any number of sensors is on")
+
+
+def _check_mean(key: str, cost: PaperCostConfig, root: Any) -> None:
+    """Refuse a mean budget beside what it does not go with.
+
+    Raises:
+        UserError: another command than solve, another solver than optimal, prices that differ, or a second budget.
+    """
+    partition = getattr(root, "partition", None)
+    at_once = partition is not None and partition.block is None
+    if not (at_once and getattr(getattr(root, "solver", None), "name", "") == "optimal"):
+        raise refuse(key, cost.mean_budget, "null but for solve with solver=optimal in one block")
+    if cost.budget is not None or not isinstance(cost.sensor, (int, float)):
+        raise refuse(
+            key, cost.mean_budget, "one price for all sensors beside it, and no cost.budget"
+        )
 
 
 class SensorConfig(ChoiceConfig):

@@ -127,7 +127,8 @@ def function_rule(task: Task, function: Callable[..., Any]) -> Rule:
 
     def rule(last_cell: Tensor, steps_since_detection: Tensor, action_history: Tensor) -> Tensor:
         action = torch.as_tensor(function(last_cell, steps_since_detection, action_history))
-        return checked_action(action, (len(last_cell), task.num_sensors), "policy: its action")
+        shape = len(last_cell), task.num_sensors
+        return checked_action(action, shape, "policy: its action", task.budget)
 
     return rule
 
@@ -163,7 +164,8 @@ def module_action(task: Task, module: TensorDictModuleBase, batch: TensorDictBas
         UserError: the action has another form.
     """
     action = module(observed(task, module, batch))["action"]
-    return checked_action(action, (len(batch), task.num_sensors), "policy: its action")
+    shape = len(batch), task.num_sensors
+    return checked_action(action, shape, "policy: its action", task.budget)
 
 
 def observed(task: Task, module: TensorDictModuleBase, batch: TensorDictBase) -> TensorDictBase:

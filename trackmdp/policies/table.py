@@ -243,7 +243,7 @@ class PolicyTable(Carded, SetTable):
         return cls(task, short_indices(table))
 
     def check_fits(self, task: Task) -> None:
-        """Refuse a task of another grid, of other footprints, of another t_max, or without a sensor that may be on.
+        """Refuse a task of another grid, of other footprints, of another t_max, or of sensors that may not be on.
 
         Raises:
             UserError: it is.
@@ -261,6 +261,17 @@ class PolicyTable(Carded, SetTable):
         on = gone.nonzero()[0] if self.sets is None else self.sets.indices[gone[self.sets.indices]]
         if len(on) and self.probability != 0.0:
             raise UserError(f"policy: sensor {on[0]} may be on; the world has none there")
+        if task.budget is not None and (most := self.most_on) > task.budget:
+            raise UserError(f"policy: up to {most} sensors on in a step; expected {task.budget}")
+
+    @property
+    def most_on(self) -> int:
+        """Sensors that may be on in one step."""
+        if self.k is not None:
+            return self.k
+        if self.sets is None:
+            return self.task.total_sensors if self.probability else 0
+        return int(np.diff(self.sets.indptr).max(initial=0))
 
     def dense(self) -> BoolArray:
         """`[keys, t_max + 1, S]`, the sets of a deterministic policy, a byte each, so for small worlds alone.

@@ -214,6 +214,8 @@ def _all_on(world: World) -> _Choices:
     moves = _moves(world)
     shape = (len(moves.rows), world.num_choices)
     on = np.ones(shape, dtype=bool) & world.available[moves.sensors, None]
+    if isinstance(moves, Own):
+        on = moves.within(on, np.zeros(shape))
     return _chosen(world, on, moves.report(on))
 
 
@@ -243,8 +245,10 @@ def _improved(world: World, table: Array, choices: _Choices, *, exact: bool) -> 
     # Without a margin, rounding could switch a tied choice to and fro for ever.
     tie = 1e-12 * (1.0 + np.abs(table).max())
     for n in free:
-        gain = (moves.gained(_reports_worth(world, table, n)[:, None]) - price)[:, 0]
-        on[:, n] = np.where(np.abs(gain) <= tie, choices.on[:, n], gain > 0)
+        gain = moves.gained(_reports_worth(world, table, n)[:, None]) - price
+        before = choices.on[:, n : n + 1]
+        chosen = np.where(np.abs(gain) <= tie, before, gain > 0)
+        on[:, n] = moves.within(chosen, gain + tie * before)[:, 0]
     return _chosen(world, on, moves.report(on))
 
 

@@ -101,6 +101,16 @@ def summing(index: IndexArray, count: int) -> sparse.csr_array:
     )
 
 
+def largest(rows: IndexArray, net: Array, count: int) -> BoolArray:
+    """`[G, C]`, the `count` decisions of each row with the largest `net` `[G, C]`, of equal ones the first."""
+    order = np.argsort(-net, axis=0, kind="stable")
+    by_row = np.argsort(rows[order], axis=0, kind="stable")
+    place = np.arange(len(rows)) - np.searchsorted(rows, rows)
+    rank = np.empty(net.shape, dtype=np.int64)
+    np.put_along_axis(rank, np.take_along_axis(order, by_row, axis=0), place[:, None], axis=0)
+    return rank < count
+
+
 @dataclass(frozen=True, eq=False)
 class Own(Decisions):
     """Each entry is seen by the sensor of its own cell.
@@ -112,11 +122,13 @@ class Own(Decisions):
         group: `[E]` the decision about each entry; None: entry e is decided by decision e.
         chance: `[E, 1]` p_d there; None: 1 everywhere.
         possible: `[G, 1]`, which sensors exist and lie in the window; None: all.
+        budget: sensors that may be on in a row; None: all.
     """
 
     group: IndexArray | None
     chance: Array | None
     possible: BoolArray | None
+    budget: int | None
 
     @property
     def allowed(self) -> BoolArray | None:
@@ -143,7 +155,14 @@ class Own(Decisions):
                 codes, group = np.unique(codes, return_inverse=True)
                 rows, cells = np.divmod(codes, task.num_cells)
         allowed = task.choosable(None if located is None else located[rows], cells)
-        return cls(rows, cells, count, group, chance, None if allowed is None else allowed[:, None])
+        possible = None if allowed is None else allowed[:, None]
+        return cls(rows, cells, count, group, chance, possible, task.budget)
+
+    def within(self, on: BoolArray, net: Array) -> BoolArray:
+        """`[G, C]`, of the sets `on` as many sensors as the budget allows, those of the largest `net` `[G, C]`."""
+        if self.budget is None:
+            return on
+        return on & largest(self.rows, np.where(on, net, -np.inf), self.budget)
 
     def report(self, on: BoolArray) -> npt.NDArray[Any]:
         """See `Decisions`."""
@@ -160,6 +179,7 @@ class Own(Decisions):
             None if group is None else np.searchsorted(kept, group[entries]),
             None if self.chance is None else self.chance[entries],
             None if self.allowed is None else self.allowed[kept],
+            self.budget,
         )
 
     def gained(self, gain: Array) -> Array:
@@ -182,13 +202,17 @@ class Own(Decisions):
     ) -> BoolArray:
         """See `Decisions`."""
         # Strict: an entry without mass is never sensed, not even by a sensor that costs nothing.
-        chosen: BoolArray = self.gained(gain) > price
-        return chosen if self.allowed is None else chosen & self.allowed
+        gained = self.gained(gain)
+        chosen: BoolArray = gained > price
+        return self.within(
+            chosen if self.allowed is None else chosen & self.allowed, gained - price
+        )
 
     def upper(self, gain: Array, price: Array) -> Array:
         """See `Decisions`."""
         net = np.maximum(self.gained(gain[:, None])[:, 0] - price, 0.0)
         net = net if self.allowed is None else net * self.allowed[:, 0]
+        net = net * self.within((net > 0)[:, None], net[:, None])[:, 0]
         return per_row(self.rows, net, self.count)
 
     def margin(self, on: BoolArray, gain: Array, price: Array) -> Array:  # noqa: ARG002

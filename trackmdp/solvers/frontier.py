@@ -23,7 +23,7 @@ from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.solution import Solution
 from trackmdp.solvers.solve import run_solver
-from trackmdp.solvers.tradeoff import Corner, Tradeoff, height, slope, upper_hull
+from trackmdp.solvers.tradeoff import ROUNDING, Corner, Tradeoff, height, slope, upper_hull
 from trackmdp.solvers.value import evaluate
 from trackmdp.world.model import Array, World
 from trackmdp.world.tracks import Problem, check_problem, modelled
@@ -54,6 +54,7 @@ def frontier(
     resolution: float = default("resolution", "frontier"),
     nodes: int = default("solver.nodes", "frontier"),
     time_limit: float | None = default("solver.time_limit", "frontier"),
+    near: float | None = None,
     on_progress: Watch | None = None,
     **options: Any,
 ) -> Tradeoff:
@@ -70,6 +71,8 @@ def frontier(
         resolution: no corner is looked for less than this above an edge; in accuracy.
         nodes: work at each price after which `optimal` stops closing the bracket.
         time_limit: seconds at each price; None: no limit.
+        near: sensors per step; only the edge there is resolved, so that `at` and `worth` are exact there, and no other
+            corner is looked for. None: all of them.
         on_progress: called after each price.
         **options: the solver's own, such as ``tolerance=1e-8``.
 
@@ -85,11 +88,15 @@ def frontier(
     own = {f"solver.{name}": value for name, value in options.items()}
     named = {"solver": solver, "solver.nodes": nodes, "solver.time_limit": time_limit}
     cfg = compose("frontier", given(named | {"resolution": resolution}) | own)
-    return trace(world, cfg.solver, cfg.resolution, on_progress)
+    return trace(world, cfg.solver, cfg.resolution, on_progress, near)
 
 
 def trace(
-    problem: Problem, choice: BaselineConfig, resolution: float, on_progress: Watch | None = None
+    problem: Problem,
+    choice: BaselineConfig,
+    resolution: float,
+    on_progress: Watch | None = None,
+    near: float | None = None,
 ) -> Tradeoff:
     """`frontier` with the solver of a config.
 
@@ -97,7 +104,7 @@ def trace(
         UserError: there is no motion model, episodes are cut, or the target is never in the grid after its start.
     """
     check_problem(problem, "frontier")
-    world = modelled(problem, "frontier")
+    world = modelled(problem, "frontier").but(budget=None)
     if world.max_steps is not None:
         raise UserError(
             f"grid.max_steps={world.max_steps}: only whole episodes are solved, expected null"
@@ -106,7 +113,7 @@ def trace(
         raise UserError("kernel: the target leaves at its first step, expected one that stays")
     if world.reward <= 0:
         raise UserError(f"reward={world.reward:g}: expected a number > 0")
-    run = _Trace(world, choice, resolution, on_progress)
+    run = _Trace(world, choice, resolution, on_progress, near)
     try:
         run.ends()
         run.refine()
@@ -126,9 +133,10 @@ class _Trace:
         choice: BaselineConfig,
         resolution: float,
         on_progress: Watch | None,
+        near: float | None,
     ) -> None:
         self.world, self.choice = world, choice
-        self.resolution, self.on_progress = resolution, on_progress
+        self.resolution, self.on_progress, self.near = resolution, on_progress, near
         self.weights = relative_prices(world.cost)
         self.equal_prices = bool((self.weights == 1.0).all())
         self.hull: list[Corner] = []
@@ -193,9 +201,13 @@ class _Trace:
         slopes = np.array(self.slopes)
         net, sensors = np.array([(each.net, each.sensors) for each in self.hull]).T
         touching: Array = (net - slopes[:, None] * sensors).max(axis=1)
-        rooms = [(height(slopes, touching, *pair), *pair) for pair in pairwise(self.hull)]
+        pairs = list(pairwise(self.hull))
+        if self.near is not None:
+            pairs = [each for each in pairs if each[0].sensors < self.near <= each[1].sensors]
+        rooms = [(height(slopes, touching, *pair), *pair) for pair in pairs]
         widest = max(rooms, key=lambda room: room[0], default=None)
-        return None if widest is None or widest[0] <= self.resolution else widest
+        enough = self.resolution if self.near is None else ROUNDING
+        return None if widest is None or widest[0] <= enough else widest
 
     def report(self, left: float) -> None:
         if self.on_progress is not None:

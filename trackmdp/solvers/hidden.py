@@ -62,9 +62,10 @@ def _starts(renewal: Renewal, world: World, start: PolicyTable | None) -> Iterat
             plain.chosen(n, cells[each.rows], each.sensors) > 0
             for n, each in enumerate(renewal.choices)
         ],
-        renewal.sets(PolicyTable.all_on(world)),
         renewal.sets(PolicyTable.none(world)),
     ]
+    if world.budget is None:
+        fixed.insert(1, renewal.sets(PolicyTable.all_on(world)))
     for sets in fixed[: count - 1]:
         yield Found(renewal, sets)
     for sets in other_starts(renewal, world, count - 4, _STEPS, _SWEEPS):

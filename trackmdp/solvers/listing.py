@@ -1,9 +1,9 @@
 """The best plans by listing all sets but the last, which is then a choice of its own (theory.md#proof-of-optimality).
 
 Given the sets before it, the last set of a plan is a best answer (`choose`). So a row's best plan is found by going
-through the sets before: the subsets of the sensors in reach, one bit for each. Where sensors share cells only the cells
-covered by the first set matter: of all sets that cover the same ones the cheapest counts, and there are 2^Z such
-subsets of the Z successors.
+through the sets before: the subsets of the sensors in reach, one bit for each, or with a budget the small ones. Where
+sensors share cells only the cells covered by the first set matter: of all sets that cover the same ones the cheapest
+counts, and there are 2^Z such subsets of the Z successors.
 
 Most choices need not be followed: with the state revealed after the listed sets they would be worth less than the plan
 at hand.
@@ -11,8 +11,11 @@ at hand.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain, combinations
+from typing import TypeAlias
 
 import numpy as np
 
@@ -23,7 +26,7 @@ from trackmdp.solvers.plans import Plans
 from trackmdp.world.model import Array, BoolArray
 
 _MOST_BITS = 14
-"""Sensors of a row in all sets but the last up to which all choices are listed."""
+"""Sensors of a row in all sets but the last up to which all choices are listed; with a budget 2^14 choices."""
 _MOST_PATTERNS = 2**22
 """Sets of cells covered, of all rows: 32 MB of prices."""
 
@@ -110,20 +113,22 @@ def _choices(plans: Plans) -> _Choices | None:
 
 
 def _of_sensors(plans: Plans) -> _Choices | None:
-    """A bit for each sensor of a row in all sets but the last."""
-    bits, before = [], np.zeros(plans.layout.count, dtype=np.int64)
-    for turn in plans.turns[:-1]:
-        owner = turn.choice.rows
-        # Owners are in order: those of 0 0 2 begin at 0 and 2, and their sensors have the numbers 0 1 0.
-        bits.append(before[owner] + np.arange(len(owner)) - np.searchsorted(owner, owner))
-        before += np.bincount(owner, minlength=len(before))
-    if before.max() > _MOST_BITS:
+    """The sets of all steps but the last as bits, of which each sensor of a row has its own."""
+    owners = [turn.choice.rows for turn in plans.turns[:-1]]
+    # Owners are in order: those of 0 0 2 begin at 0 and 2, and their sensors have the numbers 0 1 0.
+    places = [np.arange(len(owner)) - np.searchsorted(owner, owner) for owner in owners]
+    choice = plans.turns[0].choice
+    assert isinstance(choice, Own)
+    few = choice.budget is not None
+    found = _small_sets(places, choice.budget or 0) if few else _all_sets(owners, places)
+    if found is None:
         return None
+    count, bits = found
 
     def sets(numbers: IndexArray) -> list[BoolArray]:
         found = []
-        for turn, bit in zip(plans.turns, bits, strict=False):
-            on = (numbers[turn.choice.rows] >> bit) & 1 > 0
+        for t, turn in enumerate(plans.turns[:-1]):
+            on = bits(t, numbers[turn.choice.rows]) & 1 > 0
             allowed = turn.choice.allowed
             found.append(on if allowed is None else on & allowed[:, 0])
         return found
@@ -135,7 +140,47 @@ def _of_sensors(plans: Plans) -> _Choices | None:
             price.append(plans.layout.pay(t) @ on)
         return _Tried(report, price)
 
-    return _Choices(2 ** int(before.max()), of, sets)
+    return _Choices(count, of, sets)
+
+
+_Bits: TypeAlias = Callable[[int, IndexArray], IndexArray]
+"""From a step and `[G]` numbers of choices to `[G]`; the last bit is whether the sensor of a decision is on."""
+
+
+def _all_sets(
+    owners: Sequence[IndexArray], places: Sequence[IndexArray]
+) -> tuple[int, _Bits] | None:
+    """A bit for each sensor of a row, those of later steps after those of earlier ones."""
+    shifts, before = [], np.zeros(max(int(owner.max(initial=-1)) for owner in owners) + 1, np.int64)
+    for owner, place in zip(owners, places, strict=True):
+        shifts.append(before[owner] + place)
+        before += np.bincount(owner, minlength=len(before))
+    bits = int(before.max(initial=0))
+    return (2**bits, lambda t, number: number >> shifts[t]) if bits <= _MOST_BITS else None
+
+
+def _small_sets(places: Sequence[IndexArray], budget: int) -> tuple[int, _Bits] | None:
+    """All combinations of sets of at most `budget` sensors, the first step's changing fastest."""
+    widths = [int(place.max(initial=-1)) + 1 for place in places]
+    counts = [sum(math.comb(width, k) for k in range(budget + 1)) for width in widths]
+    if math.prod(counts) > 2**_MOST_BITS or max(widths) > 62:
+        return None
+    tables = [
+        np.array([sum(1 << sensor for sensor in some) for some in _subsets(width, budget)])
+        for width in widths
+    ]
+    turns = np.cumprod([1, *counts])
+
+    def bits(t: int, number: IndexArray) -> IndexArray:
+        found: IndexArray = tables[t][number // turns[t] % counts[t]] >> places[t]
+        return found
+
+    return math.prod(counts), bits
+
+
+def _subsets(width: int, most: int) -> Iterator[tuple[int, ...]]:
+    """The subsets of 0 ... width - 1 with at most so many elements."""
+    return chain.from_iterable(combinations(range(width), k) for k in range(most + 1))
 
 
 def _of_patterns(plans: Plans, choice: Shared) -> _Choices | None:

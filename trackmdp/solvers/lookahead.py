@@ -36,6 +36,8 @@ def solve(world: World, *, depth: int = 2, tail: Tail = "clocked") -> PolicyTabl
         raise UserError(
             "solver=lookahead: plans for sensors that each cover one cell; expected clocked or optimal"
         )
+    if world.budget is not None:
+        raise UserError(f"solver=lookahead: expected another one with a budget, {world.budget}")
     world = World.of(world.remembering(), world.kernel)
     # [M, t_max + 2], worth of the target being known in a cell after n misses
     tails = (

@@ -68,8 +68,8 @@ def solve(
     The budget is work, so that a world has the same bracket on a busy and on an idle machine. Where the clocked policy
     attains the clocked bound, as it does wherever at most one possible cell is ever left unsensed, nothing is
     searched. Ctrl-C ends a search like the budget does: the bracket so far is returned. The tree decides cell by cell:
-    where sensors have footprints, or a detection reveals a mode, plans are listed (`listing`) as far as there are few,
-    else the bracket is between policy iteration, with the best set at each step, and the clocked bound.
+    where sensors have footprints or a budget, or a detection reveals a mode, plans are listed (`listing`) as far as
+    there are few, else the bracket is between policy iteration, with the best set at each step, and the clocked bound.
 
     Args:
         world: the problem with its motion model; a detection reveals the whole state.
@@ -91,8 +91,9 @@ def solve(
         world = world.but(memory="cell")
     if start is not None and start.task.num_keys != world.num_keys:
         start = None
-    cells = world.coverage is None and world.modes == 1
-    side = region_side(world, memory) if cells else None  # there are no regions without a tree
+    side = (
+        region_side(world, memory) if _has_trees(world) else None
+    )  # there are no regions without one
     run = _Run(world, Budget(nodes, time_limit), tolerance, start, on_progress, side)
     interrupted = False
     try:
@@ -118,7 +119,7 @@ class _Run:
     def __post_init__(self) -> None:
         # U(z, 0) >= V*(z) before anything is searched; `tighten` only lowers it.
         self.bound = exact_clocked_table(self.world).value
-        self.trees = self.world.coverage is None and self.world.modes == 1
+        self.trees = _has_trees(self.world)
         if self.world.modes == 1:
             self.policy = clocked_policy(self.world)
         else:
@@ -370,6 +371,11 @@ class _Run:
             interrupted,
             timed_out,
         )
+
+
+def _has_trees(world: World) -> bool:
+    """Whether the tree, which decides on one cell at a time, can search the plans of a world."""
+    return world.coverage is None and world.modes == 1 and world.budget is None
 
 
 def payment(tree: Tree, value: Array) -> Array:

@@ -170,6 +170,15 @@ class Tradeoff(Carded):
         """Proved: no policy, drawn at random or not, with so few sensors per step has a higher `net`."""
         return float((self.bounds + self.slopes * sensors).min())
 
+    def worth(self, sensors: float, price: float = 0.0) -> float:
+        """Proved: no policy with at most so many sensors per step has a higher AIHTR at a `price` of a sensor.
+
+        It holds for a budget of each step as for one on average: the price is its multiplier, and the lowest line at
+        `sensors` the dual. Where prices differ, `sensors` and `price` are those by price.
+        """
+        rising = np.maximum(self.slopes - price / self.reward, 0.0)
+        return self.reward * self.steps * float((self.bounds + rising * sensors).min())
+
     @cached_property
     def gaps(self) -> tuple[float, ...]:
         """Proved height of the frontier above the edge from each corner to the next, at most."""

@@ -190,7 +190,13 @@ class _BlockLearner:
             kernel=GivenKernelConfig(
                 motion=True, modes=1, reveals=False, digest=problem_digest(world)[:16]
             ),
-            cost=PaperCostConfig(reward=world.reward, sensor=price, safe=world.safe_cost),
+            cost=PaperCostConfig(
+                reward=world.reward,
+                sensor=price,
+                safe=world.safe_cost,
+                budget=None,
+                mean_budget=None,
+            ),
             sensor=PerfectSensorConfig() if certain else GivenSensorConfig(wide=False),
             algo=self._algo(number, world, folder),
             collector=replace(

@@ -162,8 +162,10 @@ class HeldOutEvaluator(Evaluator):
                 cell, task.tracks, judge=task.validation, discount=gamma, rounds=rounds
             )
             found[CELL_ALONE] = plan.policy
-        fixed = {"all on": PolicyTable.all_on(task), "no sensors": PolicyTable.none(task)}
-        return found | fixed | {ESTIMATED: estimated_qmdp(task)}
+        if task.budget is None:
+            found["all on"] = PolicyTable.all_on(task)
+        found["no sensors"] = PolicyTable.none(task)
+        return found | {ESTIMATED: estimated_qmdp(task)}
 
     def report(self, policy: PolicyTable) -> dict[str, Any]:
         """The report on a policy: its figures on the held-out tracks beside the references'."""

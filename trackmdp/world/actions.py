@@ -14,28 +14,35 @@ from trackmdp.world.model import Task
 from trackmdp.world.windows import Window
 
 
-def checked_action(action: Tensor, shape: tuple[int, ...], source: str) -> Tensor:
+def checked_action(
+    action: Tensor, shape: tuple[int, ...], source: str, budget: int | None = None
+) -> Tensor:
     """An action of 0 and 1, of any dtype, as bool.
 
     Args:
         action: the action.
         shape: its shape.
         source: start of messages.
+        budget: sensors that may be on in a step; None: all.
 
     Raises:
-        UserError: it has another shape or other values.
+        UserError: it has another shape or other values, or more sensors on.
     """
     if action.shape != shape:
         kind = str(action.dtype).removeprefix("torch.")
         found = f"{kind} {list(action.shape)}"
         raise UserError(f"{source}: expected 0 or 1 for each sensor, {list(shape)}, got {found}")
-    if action.dtype == torch.bool:
-        return action
-    wrong = (action != 0) & (action != 1)
-    if not torch.compiler.is_compiling() and wrong.any():
-        first = action[wrong][0].item()
-        raise UserError(f"{source}: expected 0 or 1 for each sensor, got {first}")
-    return action == 1
+    if action.dtype != torch.bool:
+        wrong = (action != 0) & (action != 1)
+        if not torch.compiler.is_compiling() and wrong.any():
+            first = action[wrong][0].item()
+            raise UserError(f"{source}: expected 0 or 1 for each sensor, got {first}")
+        action = action == 1
+    if budget is not None and not torch.compiler.is_compiling():
+        most = int(action.sum(-1).max()) if action.numel() else 0
+        if most > budget:
+            raise UserError(f"{source}: {most} sensors on, expected at most the budget, {budget}")
+    return action
 
 
 def words(action: Tensor) -> Tensor:

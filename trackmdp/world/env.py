@@ -66,8 +66,8 @@ class TrackEnv(EnvBase):
         device: device of the tensors.
 
     Raises:
-        UserError: `world` is none, or a number in `batch_size` is; in `step`, an action has another shape or other
-            values, or there was no reset before.
+        UserError: `world` is none, or a number in `batch_size` is; in `step`, an action has another shape, other
+            values or more sensors on than the budget, or there was no reset before.
 
     Example:
         >>> from trackmdp import TrackEnv, make_world
@@ -93,6 +93,7 @@ class TrackEnv(EnvBase):
         self.num_envs, self.max_steps = self.batch_size.numel(), world.max_steps
         self.num_cells, self.num_sensors = world.num_cells, world.num_sensors
         self.t_max, self._grid, self._stream = world.t_max, world.size, stream
+        self._budget = world.budget
         self._tracking = Tracking(world, self.num_envs, self.device)
         none = (len(FLAGS), self.num_envs, 1)
         self._none = torch.zeros(none, dtype=torch.bool, device=self.device)
@@ -163,6 +164,14 @@ class TrackEnv(EnvBase):
         self._shown = (*observed, "reward", *FLAGS)
         self._carried = (*observed, *FLAGS)
 
+    def rand_action(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
+        """A random set of sensors, of those that the budget allows; see `EnvBase`."""
+        drawn = super().rand_action(tensordict)
+        if self._budget is not None:
+            kept = torch.rand(self._action_shape, device=self.device).argsort(-1) < self._budget
+            drawn["action"] = drawn["action"] & kept
+        return drawn
+
     def _set_seed(self, seed: int | None) -> None:
         self._tracking.seed(seed or 0, self._stream)
 
@@ -200,7 +209,7 @@ class TrackEnv(EnvBase):
 
     def _stepped(self, action: Tensor) -> State:
         """One step of all targets in a row, `[num_envs, ...]`, from an action `[*B, K]`."""
-        flat = checked_action(action, self._action_shape, "action")
+        flat = checked_action(action, self._action_shape, "action", self._budget)
         if len(self.batch_size) != 1:
             flat = flat.reshape(self.num_envs, -1)
         return self._now.step(flat)

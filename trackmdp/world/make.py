@@ -34,6 +34,7 @@ OF_TASK = {
     "cost": "cost.sensor",
     "safe_cost": "cost.safe",
     "reward": "cost.reward",
+    "budget": "cost.budget",
     "memory": "task.memory",
     "clip": "task.clip",
 }
@@ -57,6 +58,7 @@ def make_world(
     reward: float = default("cost.reward"),
     max_steps: int | None = default("grid.max_steps"),
     window: int | None = default("grid.window"),
+    budget: int | None = default("cost.budget"),
     detection: npt.ArrayLike | str = 1.0,
     safe_detection: npt.ArrayLike | str = 1.0,
     memory: str = default("task.memory"),
@@ -81,6 +83,7 @@ def make_world(
         reward: r, earned by a detection.
         max_steps: episodes are truncated after so many steps; None: never.
         window: W; only sensors up to W rows and columns from the last located cell can be chosen. None: all can.
+        budget: B; at most so many sensors on in a step. None: any number.
         detection: p_d, how likely a sensor that is on reports the target in its cell; as `cost`, in (0, 1].
         safe_detection: p_s, the same of the safe action, which is repeated until it locates; as `detection`.
         memory: the policy's key at a detection, as in `load_tracks`; the cell, unless targets have a mode.
@@ -122,6 +125,7 @@ def load_tracks(
     reward: float = default("cost.reward"),
     max_steps: int | None = default("grid.max_steps"),
     window: int | None = default("grid.window"),
+    budget: int | None = default("cost.budget"),
     detection: npt.ArrayLike | str = 1.0,
     safe_detection: npt.ArrayLike | str = 1.0,
     memory: str = default("task.memory"),
@@ -145,6 +149,7 @@ def load_tracks(
         reward: r.
         max_steps: tracks are cut after so many steps; None: never.
         window: W.
+        budget: B.
         detection: p_d.
         safe_detection: p_s.
         memory: the policy's key at a detection: ``cell``, ``displacement``, ``displacement_gap`` or
@@ -262,9 +267,11 @@ def paper_cost(
     reward: float,
     sensor: float | list[float] | str,
     safe: float | None,
+    budget: int | None,
+    mean_budget: float | None,  # noqa: ARG001 (a matter of solving)
     sensors: int | None = None,
 ) -> dict[str, Any]:
-    """r, c and D as arguments of `Task`; `sensors` is their number where there is not one in each cell.
+    """r, c, D and B as arguments of `Task`; `sensors` is their number where there is not one in each cell.
 
     Raises:
         UserError: a file of prices is missing or malformed, or does not have one price per sensor.
@@ -273,6 +280,7 @@ def paper_cost(
         "reward": reward,
         "cost": per_cell("cost.sensor", sensor, size, PRICES, sensors),
         "safe_cost": safe,
+        "budget": budget,
     }
 
 

@@ -43,6 +43,7 @@ class TaskOptions(TypedDict, total=False):
     detection: npt.ArrayLike
     safe_detection: npt.ArrayLike
     coverage: Any
+    budget: int | None
     markov: bool
     memory: str
     clip: int
@@ -53,7 +54,7 @@ class TaskOptions(TypedDict, total=False):
 NEVER = 1e30
 """Price of a sensor that does not exist, for planners; finite, so that times no mass it is 0."""
 
-_NULLABLE = ("max_steps", "window")
+_NULLABLE = ("max_steps", "window", "budget")
 _GIVEN: Any = 1.0
 _SUM: Any = None
 """Defaults of a task that its constructor makes arrays and a price of."""
@@ -84,6 +85,7 @@ class Task(Carded):
         coverage: the cells that each of the S sensors covers, where that is not its own cell alone; the constructor
             takes a table or sparse matrix `[S, M]` of 0 and 1, or of probabilities that a sensor reports a target
             there, which are multiplied by p_d. None: S = M, sensor s covers cell s.
+        budget: B; at most so many sensors may be on in a step, the safe action apart. None: any number.
         markov: whether the next move depends on the content of a detection alone, the cell or, where it reveals it,
             cell and mode, so that a learner may put paths together from moves seen on different ones.
         memory: the policy's key at a detection, one of `trackmdp.config.world.MEMORIES`; see `KeySpace`.
@@ -106,6 +108,7 @@ class Task(Carded):
     detection: Array = _GIVEN
     safe_detection: Array = _GIVEN
     coverage: Coverage | None = None
+    budget: int | None = None
     markov: bool = True
     memory: str = "cell"
     clip: int = 2
@@ -134,12 +137,17 @@ class Task(Carded):
             ("t_max", 0),
             ("max_steps", 1),
             ("window", 0),
+            ("budget", 0),
             ("clip", 1),
             ("revealed", 1),
         ):
             value = getattr(self, name)
             checked[name] = (
                 None if value is None and name in _NULLABLE else _at_least(lowest, name, value)
+            )
+        if checked["budget"] is not None and footprints is not None:
+            raise UserError(
+                f"budget={self.budget}: expected None with sensors that have footprints"
             )
         for name, value in checked.items():
             object.__setattr__(self, name, value)  # the dataclass is frozen
@@ -330,6 +338,8 @@ class Task(Carded):
             ]
         if self.window is not None:
             words.append(f"up to {self.window} cells from the last located cell")
+        if self.budget is not None:
+            words.append(f"at most {self.budget} on in a step")
         for name, chances in (("p_d", self.detection), ("p_s", self.safe_detection)):
             if (chances < 1.0).any():
                 words.append(f"{name} {span(chances.min(), chances.max())}")

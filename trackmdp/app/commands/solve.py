@@ -6,15 +6,17 @@ import signal
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 
 from trackmdp.config import SolveConfig
-from trackmdp.durable import write_json
+from trackmdp.durable import own_folder, write_json
 from trackmdp.errors import UserError
 from trackmdp.policies.saved import sets_name, write_sets
 from trackmdp.signals import handled, stop
 from trackmdp.solvers import bounds, rules
 from trackmdp.solvers.evaluation import regret_per_step
+from trackmdp.solvers.frontier import trace
 from trackmdp.solvers.hidden import averaged
 from trackmdp.solvers.linear import DIRECT_CELLS
 from trackmdp.solvers.partition import narrow_halo
@@ -48,6 +50,8 @@ def run(cfg: SolveConfig, folder: Path, problem: Problem) -> float:
     arrays = write_sets(folder, solution.table, value=solution.value, upper_value=solution.bound)
     write_json(folder / "solution.json", _report(cfg, solution, bound) | arrays)
     _show(console, cfg.solver.name, world, solution, bound, folder)
+    if (most := getattr(cfg.cost, "mean_budget", None)) is not None and not solution.interrupted:
+        _on_average(console, cfg, world, solution, most, folder)
     found = solution.evaluation
     warning = narrow_halo(world, cfg.partition, solution.upper, found)
     if warning:
@@ -111,6 +115,49 @@ def _show(
     at.print(
         f"{solution.ended}: bracket {solution.lower:,.6f} ... {solution.upper:,.6f}, {regret:.2g} per step, after "
         f"{solution.seconds:.1f} s and {solution.nodes:,} nodes; results in {folder}, sets in {sets_name(world)}"
+    )
+
+
+def _on_average(
+    at: Console, cfg: SolveConfig, world: World, solution: Solution, most: float, folder: Path
+) -> None:
+    """The best policies with `most` sensors per step on average: `mean_budget.json`, and the sets of the two."""
+    path, price = "mean_budget.json", float(np.nanmin(world.cost))
+    if solution.evaluation.sensors_per_step <= most:
+        write_json(folder / path, {"sensors": most, "binding": False})
+        at.print(f"cost.mean_budget={most:g}: the policy above has fewer sensors per step")
+        return
+    found = trace(world, cfg.solver, 1e-3, near=most)
+    mixture, parts, value = found.at(sensors=most), [], 0.0
+    for number, (weight, corner) in enumerate(mixture.parts):
+        own_folder(folder / "mean_budget")
+        own_folder(place := folder / "mean_budget" / f"{number}")
+        write_sets(place, corner.table)
+        value += weight * evaluate(world, corner.table, per_cell=False).aihtr
+        parts.append({"probability": weight, "price": corner.price, "sensors": corner.sensors})
+    upper = max(value, found.worth(most, price))
+    own = {"sensors": most, "binding": True, "lower": value, "upper": upper, "parts": parts}
+    write_json(folder / path, own)
+    heads = ["policy", "probability", "found at price", "sensors per step", "accuracy"]
+    rows = [
+        [
+            f"mean_budget/{n}",
+            f"{weight:.4f}",
+            f"{c.price:.5g}",
+            f"{c.sensors:.4f}",
+            f"{100 * c.accuracy:.2f} %",
+        ]
+        for n, (weight, c) in enumerate(mixture.parts)
+    ]
+    at.print(
+        table(
+            f"{most:g} sensors per step: a policy is drawn at the start of each episode",
+            heads,
+            rows,
+        )
+    )
+    at.print(
+        f"mixture: AIHTR {value:,.6f}, no policy with as few sensors has more than {upper:,.6f}"
     )
 
 
