@@ -39,6 +39,7 @@ WRITTEN = frozenset(
         "frontier.csv",
         "frontier.json",
         "frontier.svg",
+        "mean_budget.json",
         "metrics.csv",
         "paper.json",
         "picture.txt",

@@ -71,9 +71,9 @@ def test_the_digest_depends_on_every_argument() -> None:
     world = small_world()
     assert {field.name for field in fields(world)} <= {
         name.partition(".")[0] for name in problem_arrays(missing())
-    } | {"coverage", "place"}
+    } | {"budget", "coverage", "place"}
     changes: list[dict[str, Any]] = [{}, {"cost": PRICES}, {"reward": 2.0}, {"window": 1}]
-    changes += [{"memory": "displacement"}, {"detection": 0.9}, {"t_max": 2}]
+    changes += [{"memory": "displacement"}, {"detection": 0.9}, {"t_max": 2}, {"budget": 1}]
     made = [World.of(world, world.kernel, **change) for change in changes]
     assert len({problem_digest(each) for each in made}) == len(changes)
 
