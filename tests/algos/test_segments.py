@@ -229,7 +229,8 @@ def test_a_saved_buffer_goes_on_the_same() -> None:
 def test_what_depends_on_more_than_the_cell_is_learned_from_whole_paths_only() -> None:
     """The target goes 3, 4, 5, 4, 3, 4 ...: two steps after 3 it is in 5, as moves alone do not tell.
 
-    Sensing 4 costs nearly as much as it earns. Whole paths say: leave 4 out and wait in 5 (and 3), .4 in two steps.
+    Sensing 4 costs nearly as much as it earns. Whole paths say: in 5 leave 4 out and wait, .4 in two steps; and in 3
+    wait as well, or sense 4 for .1 and then, certain after 3, 5 for .4: .9 in four steps in all.
     Put together from moves, 5 is as likely as 3, and at .5 neither is worth .6: what is left is 4, at .1 a step.
     """
     rng = np.random.default_rng(0)
@@ -256,6 +257,6 @@ def test_what_depends_on_more_than_the_cell_is_learned_from_whole_paths_only() -
             replay(setting, tracks, policy).intervals(tracks.names)["reward_per_step"].mean
         )
         if not markov:
-            assert policy.dense()[[3, 5]].nonzero()[1].tolist() == [1, 1]
-    assert earned[False] > 0.19
+            assert policy.dense()[5].nonzero()[0].tolist() == [1]
+    assert earned[False] > 0.21
     assert earned[True] < 0.11

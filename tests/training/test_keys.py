@@ -51,7 +51,7 @@ def test_the_kernel_of_told_modes_is_learned(sensing: str) -> None:
 @pytest.mark.parametrize("known", KNOWN)
 def test_hindsight_ends_near_what_is_solved(known: str) -> None:
     world = headings(4, 0.9, cost=0.16, **KNOWN[known])
-    run = tm.train(world, "hindsight", updates=100, **{"collector.total_frames": 40_000})
+    run = tm.train(world, "hindsight", updates=300, **{"collector.total_frames": 100_000})
     best = tm.solve(world)
     assert (best.lower - run.evaluation.aihtr) / run.evaluation.expected_length < 0.01
 

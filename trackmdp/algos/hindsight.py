@@ -47,6 +47,8 @@ from trackmdp.world.windows import Window
 _MOST_CELLS_OF_NETS = 4_096
 """Above, embeddings of each (cell, clock) take time and memory that tables do not. At N = 32 tables end .007 per step
 below the optimum where nets end .002 below, and both .002 after the exchange."""
+_LONGER = 4
+"""As many fewer whole paths per update than paths put together from moves."""
 _LOSSES = ("clocked_actor", "clocked_critic", "actor", "critic")
 
 
@@ -132,7 +134,8 @@ class Hindsight:
     def _paths(self) -> Tensor:
         """`[T+3, B]` cells: located, T + 1 free choices, the forced step; longer paths where moves do not combine."""
         if isinstance(self._buffer, SegmentBuffer):
-            return self._buffer.sample(self.cfg.batch_size)
+            # They are several times as long, and one update takes as much longer.
+            return self._buffer.sample(-(-self.cfg.batch_size // _LONGER))
         return self._buffer.paths(self.cfg.batch_size, self.task.t_max + 2)
 
     def state_dict(self) -> dict[str, Any]:

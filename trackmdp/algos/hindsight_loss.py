@@ -25,6 +25,8 @@ from trackmdp.world.windows import Window
 _GAIN_SCALE_RATE = 0.1
 _FEWEST_ROWS = 20
 _LEAST_GAIN = 0.2
+_EXPLORING_AT_END = 1 / 16
+"""Share of exploring starts (`Replay.begin`) at λ = 1; at λ = 0 it is a half."""
 
 
 @dataclass(frozen=True)
@@ -178,7 +180,8 @@ class HindsightLoss(nn.Module):
         replay = None
         if not self._task.markov:
             replay = Replay(self._task, self.view, found, self._generator)
-        cells, own = replay.begin(cells) if replay else (cells, cells)
+        exploring = max(_EXPLORING_AT_END, (1.0 - blend) / 2)
+        cells, own = replay.begin(cells, exploring) if replay else (cells, cells)
         clocked, value = self.clocked_critic().squeeze(-1), self.critic().squeeze(-1)
         # U(x, T+1) holds r - D for certain; the net learns the rest.
         clocked = torch.cat([clocked[:, :-1], clocked[:, -1:] + self._forced], dim=1)

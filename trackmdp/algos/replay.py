@@ -60,12 +60,14 @@ class Replay:
         """
         return keys.t_max + 2 + 2 * (Replay.settling(keys) + keys.t_max + 1)
 
-    def begin(self, paths: Tensor) -> tuple[Tensor, Tensor]:
+    def begin(self, paths: Tensor, exploring: float = 0.0) -> tuple[Tensor, Tensor]:
         """The paths from a detection of the policy's own on; paths that ended before are left out.
 
         Args:
             paths: int64 `[steps + 1, B]` keys with all sensors on, the number of keys once outside. One that begins
                 with an episode (class 0 of several) is kept from there.
+            exploring: share of the paths that are kept from their first key on, whichever it is: without such
+                exploring starts a policy would not learn what to do where it seldom comes.
 
         Returns:
             The keys with all sensors on, as in `paths`, `[later + 1, B']`; and `[T+3, B']` the policy's: first its own
@@ -75,7 +77,9 @@ class Replay:
         cells, last = keys.cell(paths), keys.num_keys - 1
         key = first = paths[0].clamp_max(last)
         misses = torch.zeros_like(key)
-        begin = torch.where((key % keys.num_classes == 0) & (keys.order > 0), 0, -1)
+        drawn = torch.rand(key.shape, generator=self._generator, device=key.device) < exploring
+        starts = drawn | (key % keys.num_classes == 0) & (keys.order > 0)
+        begin = torch.where(starts, 0, -1)
         draws = self._draws(paths)
         for step in range(1, settling + keys.t_max + 2):
             found, key, misses = self._step(key, misses, cells[step], draws[step])

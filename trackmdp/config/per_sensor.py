@@ -48,7 +48,11 @@ class PerSensorConfig(EveryTaskConfig):
     ema_decay: float = option(
         "decay of the exponential moving average of the actor, which is evaluated", ge=0, lt=1
     )
-    batch_size: int = option("path segments per update", unit="segments", ge=1)
+    batch_size: int = option(
+        "path segments per update; a quarter as many where they are whole sensed paths",
+        unit="segments",
+        ge=1,
+    )
     updates: int | None = option(
         "updates of the whole run; null: by the size of the problem",
         ge=1,
