@@ -6,7 +6,7 @@ import ast
 import io
 import tokenize
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
 
@@ -49,7 +49,7 @@ ARROW = [
         "trackmdp.app.prepare",
     ],
     ["trackmdp.app.sources"],
-    ["trackmdp.app.compose"],
+    ["trackmdp.app.composer"],
     ["trackmdp.app.sweep"],
     ["trackmdp.app.launch"],
     ["trackmdp.app", "trackmdp.app.cli", "trackmdp.__main__"],
@@ -213,8 +213,31 @@ def test_no_public_name_means_two_things() -> None:
     assert not twice
 
 
+def modules_by_name(modules: Iterable[str]) -> dict[str, list[str]]:
+    """Last part of a module's name -> the modules of that name, where there are several."""
+    found: dict[str, list[str]] = {}
+    for module in modules:
+        found.setdefault(module.rpartition(".")[2], []).append(module)
+    return {name: same for name, same in found.items() if len(same) > 1}
+
+
+def test_no_module_name_means_two_things() -> None:
+    """A command's module and the one whose function of that name it runs, such as `solve`, are one thing."""
+    functions = {(module, name) for name, modules in public_names().items() for module in modules}
+    files = [module_name(file) for file in FILES if file.name != "__init__.py"]
+    for name, modules in modules_by_name(files).items():
+        commands = [module for module in modules if module.startswith("trackmdp.app.commands.")]
+        others = [module for module in modules if module not in commands]
+        assert len(commands) == len(others) == 1, modules
+        assert (others[0], name) in functions, modules
+
+
+def test_modules_of_one_name_are_seen() -> None:
+    assert modules_by_name(["a.page", "b.page", "b.other"]) == {"page": ["a.page", "b.page"]}
+
+
 def test_learners_do_not_reach_for_the_motion() -> None:
-    apart = {f"trackmdp.world.{name}" for name in ("kernels", "motion", "belief")}
+    apart = {f"trackmdp.world.{name}" for name in ("kernels", "motion")}
     for module, tree in trees().items():
         if module.startswith(("trackmdp.algos", "trackmdp.policies")):
             names = set(imported(tree))

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from benchmarks.clock import timed_training
 from benchmarks.words import Row, as_words, world_of
 from trackmdp.config.compose import compose
-from trackmdp.training.machine import needs
+from trackmdp.training.devices import needs
 
 
 def rows(

@@ -13,7 +13,7 @@ from typing import Any
 
 import trackmdp as tm
 from trackmdp.errors import UserError
-from trackmdp.training.machine import machine
+from trackmdp.training.devices import machine
 
 Row = dict[str, Any]
 PARTS = (

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from trackmdp.app.cli import main
-from trackmdp.app.compose import Composer
+from trackmdp.app.composer import Composer
 from trackmdp.app.sweep.plan import combinations, plan
 from trackmdp.config import conf_dir
 

@@ -196,7 +196,7 @@ def test_a_command_composes_once_checks_once_and_builds_one_world(
         monkeypatch.setattr(owner, name, counted)
 
     module = importlib.import_module("trackmdp.app.commands.train")
-    spy("trackmdp.app.compose", "compose")
+    spy("trackmdp.app.composer", "compose")
     spy("trackmdp.config.compose", "validate")
     spy("trackmdp.training.inputs", "make_problem")
     monkeypatch.setattr(

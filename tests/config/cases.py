@@ -9,7 +9,7 @@ from typing import Any
 
 from hydra import compose, initialize_config_dir
 
-from trackmdp.app.compose import register
+from trackmdp.app.composer import register
 from trackmdp.config import GROUPS, ROOTS, Option, conf_dir, options
 from trackmdp.config.compose import from_hydra
 

@@ -12,8 +12,8 @@ from scipy.special import comb
 
 from tests.helpers import small_world
 from trackmdp.app.cli import main
+from trackmdp.episodes.episode_page import page
 from trackmdp.episodes.log import EpisodeLog
-from trackmdp.episodes.page import page
 from trackmdp.episodes.reader import EpisodeReader, verify
 from trackmdp.episodes.recover import recover
 from trackmdp.episodes.simulate import simulate

@@ -12,8 +12,8 @@ import pytest
 from tests.episodes.browser import CHROMIUM, Browser
 from trackmdp.app.cli import main
 from trackmdp.episodes.episode import Episode
-from trackmdp.episodes.export import write_page
-from trackmdp.episodes.page import PAGE_WIDE
+from trackmdp.episodes.episode_page import PAGE_WIDE
+from trackmdp.episodes.extracts import write_page
 from trackmdp.episodes.player import WIDE, frame
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.world.make import make_world

@@ -17,7 +17,7 @@ from tests.tracks import by_hand
 from tests.tracks import recorded as recorded_tracks
 from trackmdp.episodes import schema
 from trackmdp.episodes.episode import first_difference
-from trackmdp.episodes.page import page
+from trackmdp.episodes.episode_page import page
 from trackmdp.episodes.reader import EpisodeReader, verify
 from trackmdp.episodes.recover import recover
 from trackmdp.episodes.simulate import simulate

@@ -16,7 +16,7 @@ from tests.episodes.logs import WORLD, policy, recorded
 from tests.helpers import hop_world, limited, random_kernel, small_world
 from tests.tracks import by_hand
 from tests.tracks import recorded as recorded_tracks
-from trackmdp.episodes.belief import BeliefFilter
+from trackmdp.episodes.belief_filter import BeliefFilter
 from trackmdp.episodes.episode import Episode, first_difference
 from trackmdp.episodes.simulate import episode_seeds, resimulate, simulate
 from trackmdp.errors import UserError

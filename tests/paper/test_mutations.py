@@ -10,7 +10,7 @@ import pytest
 
 from tests.helpers import headings
 from tests.solvers.worlds import paper_world
-from trackmdp.episodes.belief import BeliefFilter
+from trackmdp.episodes.belief_filter import BeliefFilter
 from trackmdp.paper import histories, proofs, theorems
 from trackmdp.paper.check import Check
 from trackmdp.paper.corner import changed, corner, dearer

@@ -15,7 +15,7 @@ from trackmdp.algos.dqn import DQN
 from trackmdp.app.cli import main
 from trackmdp.config import DqnConfig
 from trackmdp.errors import UserError
-from trackmdp.training.machine import available_bytes, check_memory, needs
+from trackmdp.training.devices import available_bytes, check_memory, needs
 
 CPU = torch.device("cpu")
 

@@ -13,7 +13,7 @@ from scipy import sparse
 
 from tests.helpers import advanced, small_world
 from trackmdp.app.cli import main
-from trackmdp.config.sensing import lattice
+from trackmdp.config.sensors import lattice
 from trackmdp.episodes.simulate import simulate
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy

@@ -32,9 +32,9 @@ from trackmdp.algos.estimates.alike import cell_classes
 from trackmdp.algos.estimates.path_plans import choose_plan
 from trackmdp.algos.hindsight_loss import HindsightLoss
 from trackmdp.algos.moves import MoveBuffer
-from trackmdp.algos.replay import Replay
+from trackmdp.algos.path_replay import Replay
 from trackmdp.algos.segments import InferredMoves, SegmentBuffer
-from trackmdp.config.per_sensor import PerSensorConfig
+from trackmdp.config.credit import PerSensorConfig
 from trackmdp.errors import UserError
 from trackmdp.policies.acting import Exploring
 from trackmdp.policies.policy import Policy, as_policy

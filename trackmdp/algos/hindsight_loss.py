@@ -14,7 +14,7 @@ from torch.nn.functional import pad
 from trackmdp.algos.actor_loss import ActorLoss, SensorCredit, decision_loss
 from trackmdp.algos.gains import chain_returns, clocked_advantage, gather, scatter_add, sensing_gain
 from trackmdp.algos.in_view import SensorsInView
-from trackmdp.algos.replay import Replay
+from trackmdp.algos.path_replay import Replay
 from trackmdp.policies.nets import CellClockNet
 from trackmdp.solvers.linear import IndexArray
 from trackmdp.world.model import Task
@@ -172,7 +172,7 @@ class HindsightLoss(nn.Module):
 
         Args:
             cells: int64 `[T+3, B]`, paths: the located cell, then the cells sensed next, M once outside; longer ones
-                where a policy remembers detections (`replay`).
+                where a policy remembers detections (`path_replay`).
             on: bool `[M, T+1, K]`, the sensors that the replayed policy switches on, as the actor's outputs.
             blend: λ of the gain.
         """

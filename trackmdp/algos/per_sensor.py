@@ -6,7 +6,7 @@ from typing import Any
 
 from trackmdp.algos.actor_loss import ActorLoss, Poisson, PolicyGradient, Surrogate
 from trackmdp.algos.hindsight import Hindsight
-from trackmdp.config.per_sensor import A2cPerSensorConfig, PpoPerSensorConfig
+from trackmdp.config.credit import A2cPerSensorConfig, PpoPerSensorConfig
 from trackmdp.errors import UserError
 from trackmdp.world.model import Task
 

@@ -21,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf, read_write
 
 from trackmdp import __version__
 from trackmdp.app.completion import bash
-from trackmdp.app.compose import Composer
+from trackmdp.app.composer import Composer
 from trackmdp.app.prepare import (
     Prepared,
     announce,

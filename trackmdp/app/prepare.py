@@ -18,7 +18,7 @@ from trackmdp.config import CommandConfig, TrainConfig, WorldConfig, load_run_co
 from trackmdp.config.checks import refuse_ignored
 from trackmdp.config.compose import from_hydra
 from trackmdp.config.learning import file_of_classes
-from trackmdp.config.loggers import require_packages
+from trackmdp.config.logs import require_packages
 from trackmdp.config.resume import continued, key_of, run_folder
 from trackmdp.errors import UserError
 from trackmdp.imports import importing

@@ -4,8 +4,9 @@ Here stand the names that commands and plugins use most; each schema is in a mod
 """
 
 from trackmdp.config.baselines import BaselineConfig, PlaybackConfig
+from trackmdp.config.credit import PerSensorConfig
 from trackmdp.config.learning import AlgoConfig, CollectorConfig, DqnConfig, ScheduleConfig
-from trackmdp.config.loggers import (
+from trackmdp.config.logs import (
     CsvConfig,
     LogConfig,
     McapConfig,
@@ -25,7 +26,6 @@ from trackmdp.config.options import (
     options,
     refuse,
 )
-from trackmdp.config.per_sensor import PerSensorConfig
 from trackmdp.config.registry import conf_dir, load_plugins
 from trackmdp.config.roots import (
     ROOTS,
@@ -42,7 +42,7 @@ from trackmdp.config.roots import (
     VerifyConfig,
     WorldConfig,
 )
-from trackmdp.config.sensing import CostConfig, FalseAlarmConfig, PaperCostConfig, SensorConfig
+from trackmdp.config.sensors import CostConfig, FalseAlarmConfig, PaperCostConfig, SensorConfig
 from trackmdp.config.tree import load_config, load_run_config, to_dict, to_yaml, world_of
 from trackmdp.config.world import MEMORIES, KernelConfig, TableConfig
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from trackmdp.config.modes import HiddenKernelConfig
+from trackmdp.config.hidden_kernels import HiddenKernelConfig
 from trackmdp.config.options import choice, option
-from trackmdp.config.sensing import SensorConfig
+from trackmdp.config.sensors import SensorConfig
 from trackmdp.config.world import GridConfig
 
 

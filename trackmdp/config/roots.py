@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-from trackmdp.config import counting, given, modes, per_sensor, sweeping  # noqa: F401  (more to choose from)
+from trackmdp.config import counting, credit, given, hidden_kernels, sweeping  # noqa: F401  (more to choose from)
 from trackmdp.config.baselines import BaselineConfig
+from trackmdp.config.by_blocks import PartitionConfig, SweptPartitionConfig
 from trackmdp.config.learning import DEVICE, AlgoConfig, CollectorConfig
-from trackmdp.config.loggers import LogConfig
+from trackmdp.config.logs import LogConfig
 from trackmdp.config.options import GROUPS, NodeConfig, listed, option, refuse
-from trackmdp.config.partition import PartitionConfig, SweptPartitionConfig
-from trackmdp.config.sensing import CostConfig, SensorConfig
+from trackmdp.config.sensors import CostConfig, SensorConfig
 from trackmdp.config.world import GridConfig, KernelConfig, TaskConfig
 from trackmdp.errors import UserError
 

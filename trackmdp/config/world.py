@@ -136,7 +136,7 @@ class KernelConfig(ChoiceConfig):
 
     is_motion: ClassVar[bool] = True
     hides: ClassVar[bool] = False
-    """Whether the target has a mode beside its cell (`trackmdp.config.modes`)."""
+    """Whether the target has a mode beside its cell (`trackmdp.config.hidden_kernels`)."""
 
     @property
     def source(self) -> str:

@@ -17,7 +17,7 @@ import torch
 from tensordict import TensorDict
 
 from trackmdp.durable import write_text
-from trackmdp.episodes.belief import beliefs
+from trackmdp.episodes.belief_filter import beliefs
 from trackmdp.episodes.episode import Episode, Floats, Integers, last_cells
 from trackmdp.errors import UserError
 from trackmdp.notebook.card import Card, Carded, decimal, grid_words, percent
@@ -243,7 +243,7 @@ class Episodes(Carded, Sequence[Episode]):
         Raises:
             UserError: there is no such episode.
         """
-        from trackmdp.episodes.page import page
+        from trackmdp.episodes.episode_page import page
 
         place = Path(file)
         write_text(place, page(self.problem, self._shown("page", number)))

@@ -123,7 +123,7 @@ def filtered(solved: HistoryQ, state: State) -> Array:
     """`[M]` the belief filter's prediction of the next cell."""
     import torch  # only here: solving needs none
 
-    from trackmdp.episodes.belief import BeliefFilter
+    from trackmdp.episodes.belief_filter import BeliefFilter
 
     x, history = state
     filter_ = BeliefFilter(solved.world.kernel)

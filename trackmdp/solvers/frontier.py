@@ -18,7 +18,7 @@ import numpy as np
 
 from trackmdp.config.baselines import BaselineConfig
 from trackmdp.config.compose import compose, default, given
-from trackmdp.config.sensing import LARGEST_PRICE
+from trackmdp.config.sensors import LARGEST_PRICE
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.solution import Solution

@@ -20,7 +20,7 @@ from scipy.linalg.lapack import dgetrf, dgetrs
 from scipy.sparse.linalg import splu, spsolve_triangular
 
 from trackmdp.errors import UserError
-from trackmdp.world.checks import short_indices
+from trackmdp.world.kernel_checks import short_indices
 from trackmdp.world.model import Array, World
 
 IndexArray: TypeAlias = npt.NDArray[np.integer[Any]]

@@ -21,7 +21,7 @@ from typing import TypeAlias
 import numpy as np
 from scipy import sparse
 
-from trackmdp.config.partition import PartitionConfig
+from trackmdp.config.by_blocks import PartitionConfig
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.evaluation import Evaluation

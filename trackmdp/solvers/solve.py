@@ -10,8 +10,8 @@ from inspect import signature
 from typing import TYPE_CHECKING, Any
 
 from trackmdp.config.baselines import BaselineConfig
+from trackmdp.config.by_blocks import SweptPartitionConfig
 from trackmdp.config.compose import compose, default, given
-from trackmdp.config.partition import SweptPartitionConfig
 from trackmdp.config.registry import make, maker
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable

@@ -19,10 +19,10 @@ from rich.console import Console
 
 from trackmdp.algos.estimates.alike import cell_classes
 from trackmdp.config import TrainConfig, load_run_config
+from trackmdp.config.by_blocks import PartitionConfig
 from trackmdp.config.given import GivenKernelConfig, GivenSensorConfig
 from trackmdp.config.learning import AlgoConfig, file_of_classes
-from trackmdp.config.partition import PartitionConfig
-from trackmdp.config.sensing import PaperCostConfig, PerfectSensorConfig
+from trackmdp.config.sensors import PaperCostConfig, PerfectSensorConfig
 from trackmdp.durable import own_folder, write_bytes, write_json
 from trackmdp.errors import UserError
 from trackmdp.policies.policy import Policy

@@ -17,7 +17,7 @@ from trackmdp.config.registry import maker
 from trackmdp.imports import safe_children
 from trackmdp.seeding import derive
 from trackmdp.solvers.workers import end_with_parent
-from trackmdp.training.machine import make_device
+from trackmdp.training.devices import make_device
 from trackmdp.world.env import TrackEnv
 from trackmdp.world.tracks import Problem
 

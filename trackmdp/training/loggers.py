@@ -17,7 +17,7 @@ from typing import Any, cast
 import numpy as np
 
 from trackmdp.config import CsvConfig, MlflowConfig, TrainConfig, WandbConfig, to_dict, to_yaml
-from trackmdp.config.loggers import RowsConfig
+from trackmdp.config.logs import RowsConfig
 from trackmdp.config.registry import maker
 from trackmdp.config.tree import flatten
 from trackmdp.durable import own_folder, reopen, sync

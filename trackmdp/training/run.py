@@ -29,10 +29,10 @@ from trackmdp.solvers.evaluation import Evaluation
 from trackmdp.solvers.solution import Solution
 from trackmdp.training import checkpoint
 from trackmdp.training.callbacks import Callback, Learning, Row, Training
+from trackmdp.training.devices import machine
 from trackmdp.training.evaluator import Evaluator, Score, figures, while_collecting
 from trackmdp.training.folders import SUMMARY, check_files, read_summary, write_summary
 from trackmdp.training.inputs import problem_of, with_own_classes
-from trackmdp.training.machine import machine
 from trackmdp.training.state import load_learned
 from trackmdp.untrusted import LARGE, decoded, read_text
 from trackmdp.world.model import Array

@@ -16,7 +16,7 @@ from tensordict.nn import (
 
 from trackmdp.config import GROUPS, TrainConfig, options
 from trackmdp.config.compose import compose, default, given
-from trackmdp.config.loggers import require_packages
+from trackmdp.config.logs import require_packages
 from trackmdp.errors import UserError
 from trackmdp.seeding import preserved_global_rng
 from trackmdp.training.blocks import make_trainer

@@ -22,11 +22,11 @@ from trackmdp.seeding import seed_global
 from trackmdp.signals import Signals, Watch
 from trackmdp.training.callbacks import Callback, Position, Row, Training
 from trackmdp.training.collect import make_collector
+from trackmdp.training.devices import check_memory, make_device
 from trackmdp.training.display import Display
 from trackmdp.training.evaluator import Score, make_evaluator, while_collecting
 from trackmdp.training.inputs import with_own_classes, write_inputs
 from trackmdp.training.loggers import make_loggers
-from trackmdp.training.machine import check_memory, make_device
 from trackmdp.training.state import Checkpoints, find, restore, take_weights
 from trackmdp.untrusted import decoded
 from trackmdp.world.tracks import Problem

@@ -17,7 +17,7 @@ from scipy import sparse
 
 from trackmdp.errors import UserError
 from trackmdp.untrusted import LARGE, decoded, load_npy, load_npz, opened
-from trackmdp.world.checks import Range, one_each
+from trackmdp.world.kernel_checks import Range, one_each
 from trackmdp.world.model import Array, Size, grid_size
 
 _LONGEST_TEXT, _LONGEST_HEAD = 2**30, 2**16

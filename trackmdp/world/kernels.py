@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from trackmdp.world.checks import canonical_kernel
 from trackmdp.world.files import read_matrix
+from trackmdp.world.kernel_checks import canonical_kernel
 from trackmdp.world.model import Array, BoolArray, Size, grid_size
 from trackmdp.world.rows import merged, pairwise_row_sums
 

@@ -16,11 +16,11 @@ from trackmdp.config import WorldConfig
 from trackmdp.config.compose import compose, default, given
 from trackmdp.config.options import GROUPS, options
 from trackmdp.config.registry import make, maker
-from trackmdp.config.sensing import lattice
+from trackmdp.config.sensors import lattice
 from trackmdp.errors import UserError
-from trackmdp.world.checks import PRICES, PROBABILITIES, canonical_kernel, check_kernel
 from trackmdp.world.coverage import Coverage, discs
 from trackmdp.world.files import per_cell, read_matrix
+from trackmdp.world.kernel_checks import PRICES, PROBABILITIES, canonical_kernel, check_kernel
 from trackmdp.world.model import TASK_BYTES, Size, World, check_fits, grid_size
 from trackmdp.world.place import Place
 from trackmdp.world.track_files import read_track_file
@@ -203,7 +203,7 @@ def build_world(cfg: WorldConfig) -> World:
     """The world a config describes.
 
     Raises:
-        UserError: a file is missing or malformed, or the kernel breaks a rule (`checks.check_kernel`).
+        UserError: a file is missing or malformed, or the kernel breaks a rule (`kernel_checks.check_kernel`).
     """
     (rows, columns), source, modes = cfg.grid.sides, cfg.kernel.source, {}
     own = {name: getattr(cfg.kernel, name) for name in options(type(cfg.kernel))}

@@ -12,13 +12,19 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from trackmdp.config.sensing import LARGEST_PRICE
+from trackmdp.config.sensors import LARGEST_PRICE
 from trackmdp.config.world import MEMORIES
 from trackmdp.errors import UserError
 from trackmdp.machine import free_bytes, gib
 from trackmdp.notebook.card import Card, Carded, Facts, grid_words, span
-from trackmdp.world.checks import PRICES, PROBABILITIES, canonical_kernel, check_kernel, one_each
 from trackmdp.world.coverage import Coverage
+from trackmdp.world.kernel_checks import (
+    PRICES,
+    PROBABILITIES,
+    canonical_kernel,
+    check_kernel,
+    one_each,
+)
 from trackmdp.world.memory import KeySpace
 from trackmdp.world.motion import Motion
 from trackmdp.world.place import Place

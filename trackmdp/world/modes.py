@@ -28,7 +28,7 @@ from scipy.special import ndtr
 
 from trackmdp.config.options import GROUPS
 from trackmdp.config.registry import make
-from trackmdp.world.checks import canonical_kernel, check_kernel
+from trackmdp.world.kernel_checks import canonical_kernel, check_kernel
 from trackmdp.world.model import Array, Size, grid_size
 
 _HEADINGS = np.array([(0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1), (1, 0), (1, 1)])

@@ -12,7 +12,7 @@ from trackmdp.app.cli import main
 from trackmdp.config.compose import compose
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import value
-from trackmdp.training.machine import needs
+from trackmdp.training.devices import needs
 from trackmdp.world.make import make_problem
 from trackmdp.world.model import World
 

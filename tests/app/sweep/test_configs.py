@@ -11,7 +11,7 @@ import pytest
 from omegaconf import DictConfig
 from rich.console import Console
 
-from trackmdp.app.compose import Composer
+from trackmdp.app.composer import Composer
 from trackmdp.app.prepare import typed_config
 from trackmdp.app.sweep.configs import Configs
 from trackmdp.app.sweep.plan import combinations, plan

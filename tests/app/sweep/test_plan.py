@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from omegaconf import DictConfig
 
-from trackmdp.app.compose import register
+from trackmdp.app.composer import register
 from trackmdp.app.sweep.plan import combinations, plan, sweep_name
 from trackmdp.app.words import run_words
 from trackmdp.config import conf_dir

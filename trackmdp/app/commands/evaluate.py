@@ -35,10 +35,10 @@ from trackmdp.reports.held_out import recorded_page
 from trackmdp.solvers import bounds
 from trackmdp.solvers.solve import baseline_policy
 from trackmdp.solvers.value import evaluate
+from trackmdp.training.devices import make_device
 from trackmdp.training.display import make_console, show_held_out, table, with_interval
 from trackmdp.training.evaluator import CELL_ALONE, HeldOutEvaluator, figures, make_evaluator
 from trackmdp.training.folders import SUMMARY, check_files, read_summary
-from trackmdp.training.machine import make_device
 from trackmdp.training.run import trained
 from trackmdp.untrusted import decoded
 from trackmdp.world.gridding import said

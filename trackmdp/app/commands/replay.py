@@ -8,7 +8,7 @@ from pathlib import Path
 from rich.console import Console
 
 from trackmdp.config import ReplayConfig
-from trackmdp.episodes.export import write_page, write_tables
+from trackmdp.episodes.extracts import write_page, write_tables
 from trackmdp.episodes.grids import write_layout
 from trackmdp.episodes.player import play
 from trackmdp.episodes.reader import EpisodeReader, verify

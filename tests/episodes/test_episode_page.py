@@ -15,8 +15,8 @@ from tests.episodes.logs import WORLD, recorded, write
 from tests.helpers import train_config
 from tests.tracks import by_hand
 from tests.tracks import recorded as recorded_tracks
-from trackmdp.episodes.export import write_page
-from trackmdp.episodes.page import MOST_STEPS, page
+from trackmdp.episodes.episode_page import MOST_STEPS, page
+from trackmdp.episodes.extracts import write_page
 from trackmdp.episodes.reader import EpisodeReader
 from trackmdp.episodes.simulate import resimulate, simulate
 from trackmdp.errors import UserError
@@ -81,7 +81,7 @@ def test_what_a_log_says_cannot_break_out_of_the_page(reader: EpisodeReader) -> 
 def test_a_long_episode_is_cut_and_the_page_says_so(
     reader: EpisodeReader, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("trackmdp.episodes.page.MOST_STEPS", 5)
+    monkeypatch.setattr("trackmdp.episodes.episode_page.MOST_STEPS", 5)
     data = data_of(page(WORLD, reader.read(longest(reader))))
     assert len(data["target"]) == len(data["belief"]) == 5
     assert "the first 5 steps are shown" in str(data["about"])

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy import sparse
 
 from tests.helpers import random_kernel, small_world
-from trackmdp.episodes.belief import BeliefFilter
+from trackmdp.episodes.belief_filter import BeliefFilter
 from trackmdp.world.env import TrackEnv
 
 KERNEL = sparse.csr_array(

@@ -7,8 +7,8 @@ import json
 from pathlib import Path
 
 from trackmdp.durable import write_text
+from trackmdp.episodes.episode_page import page
 from trackmdp.episodes.messages import step_messages
-from trackmdp.episodes.page import page
 from trackmdp.episodes.reader import EpisodeReader
 
 

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse.csgraph import breadth_first_order
 
-from trackmdp.config.sensing import LARGEST_PRICE
+from trackmdp.config.sensors import LARGEST_PRICE
 from trackmdp.errors import UserError
 from trackmdp.world.rows import pairwise_row_sums
 

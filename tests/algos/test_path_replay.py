@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tests.helpers import headings
-from trackmdp.algos.replay import Replay
+from trackmdp.algos.path_replay import Replay
 from trackmdp.world.windows import Window
 
 DISCOUNT, SAFE = 0.7, -0.4
