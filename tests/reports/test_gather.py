@@ -95,6 +95,13 @@ def test_the_policy_that_is_drawn_is_the_middle_one_of_its_seeds(whole: Path) ->
     assert np.array_equal(last.qmdp, evaluate(world, rules.qmdp(world)).value)
 
 
+def test_the_best_methods_are_drawn(sweep: Path) -> None:
+    """a2c has nine wrong sensors and more, hindsight one to three, ppo none."""
+    write_run(sweep / "ppo-0.16-0", "grid.size=3", "algo=ppo", cost=0.16)
+    drawn = [(each.world[-4:], each.method) for each in gather_runs(sweep).maps]
+    assert drawn == [("0.16", "hindsight"), ("0.16", "ppo"), ("0.22", "a2c"), ("0.22", "hindsight")]
+
+
 def test_plans_of_one_cell_are_averaged_by_their_visits() -> None:
     """Two cells and ten classes: after one miss, cell 1 is sensed from cell 0 where the class is 3 or 7."""
     task = Task((1, 2), cost=0.1, t_max=1, safe_cost=1.0, memory="displacement", clip=1)

@@ -80,6 +80,6 @@ def test_prices_close_to_each_other_keep_their_ticks_and_lose_labels() -> None:
 
 def test_texts_of_values() -> None:
     assert tick_labels([0.05, 0.1, 300.0]) == ["0.05", "0.1", "300"]
-    assert tick_labels([2e3, 1e4, 1e6]) == ["2000", "10k", "1M"]
+    assert tick_labels([2e3, 1e4, 1e6]) == ["2k", "10k", "1M"]
     assert tick_labels([1e-3, 1.0]) == ["10⁻³", "10⁰"]
     assert tick_labels([1.2e-3, 1.4e-3]) == ["1.2·10⁻³", "1.4·10⁻³"]

@@ -125,10 +125,10 @@ def _other_versions(
 
 
 def _maps(folder: Path, grouped: Study) -> tuple[list[Mapped], list[Anomaly]]:
-    """Policies in the first and the last world, which differ most; of each group of runs one that can be read."""
+    """The best methods in the first and the last world, which differ most; of each a run that can be read."""
     found, anomalies = [], []
     for world in dict.fromkeys((*grouped.worlds[:1], *grouped.worlds[-1:])):
-        for method in grouped.methods[:DRAWN]:
+        for method in _best(grouped, world):
             for run in _from_the_middle(grouped.of(world, method)):
                 try:
                     drawn = read_map(folder / run.name, run, world, method)
@@ -138,6 +138,14 @@ def _maps(folder: Path, grouped: Study) -> tuple[list[Mapped], list[Anomaly]]:
                 found += [drawn] if drawn else []
                 break
     return found, anomalies
+
+
+def _best(grouped: Study, world: str) -> list[str]:
+    """The methods of the largest median AIHTR in a world, in the order of the report."""
+    values = {each: grouped.values(world, each, "aihtr") for each in grouped.methods}
+    earned = {each: median(found) for each, found in values.items() if found}
+    best = sorted(earned, key=earned.__getitem__)[-DRAWN:]
+    return [each for each in grouped.methods if each in best]
 
 
 def _from_the_middle(runs: Sequence[FinishedRun]) -> list[FinishedRun]:

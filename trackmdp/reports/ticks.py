@@ -68,6 +68,6 @@ def _power(value: float) -> str:
 
 def _short(value: float) -> str:
     for unit, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
-        if value >= max(unit, 1e4):
+        if value >= unit:
             return f"{value / unit:g}{letter}"
     return f"{value:g}"
