@@ -383,19 +383,19 @@ class Entries(NamedTuple):
 
     Attributes:
         numbers: `[nnz + 1]` sorted numbers r · columns + j of the entries, closed by the largest int64 as a sentinel.
-        values: `[nnz + 1]`, float64, of the sentinel 0.
+        values: `[nnz + 1]`, bool or float64, of the sentinel 0.
         columns: of the table.
     """
 
     numbers: npt.NDArray[np.int64]
-    values: Array
+    values: npt.NDArray[Any]
     columns: int
 
 
 def _entries(table: sparse.csr_array) -> Entries:
     row = np.repeat(np.arange(table.shape[0], dtype=np.int64), np.diff(table.indptr))
     numbers = np.append(row * table.shape[1] + table.indices, np.iinfo(np.int64).max)
-    return Entries(numbers, np.append(table.data, 0.0).astype(np.float64), table.shape[1])
+    return Entries(numbers, np.append(table.data, table.dtype.type(0)), table.shape[1])
 
 
 def _looked_up(
