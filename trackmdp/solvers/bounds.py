@@ -303,7 +303,9 @@ def _value(world: World, choices: _Choices, guess: Array | None = None) -> tuple
     # U(., 0), and U(., t_max + 1)
     unknown = slice(1) if world.safe else slice(None, None, world.num_choices)
     size = grid_of(world)
-    system = RenewalSystem(sparse.csr_array(sparse.vstack(reach[unknown])), size)
+    # Stacked only where there are two: a copy of the one would be a tenth of the memory at a million cells.
+    whole = reach[0] if world.safe else sparse.csr_array(sparse.vstack(reach[unknown]))
+    system = RenewalSystem(whole, size)
     start = None if guess is None else guess.T[unknown].ravel()
     located = system.solve(np.concatenate(earned[unknown]), start)
     table = [b + k @ located for b, k in zip(earned, reach, strict=True)]

@@ -98,8 +98,8 @@ def run_solver(
     world = modelled(world, f"solver={choice.name}")
     if not world.tells_all or (world.modes > 1 and choice.name != "optimal"):
         return _modes(world, choice, start)
-    # The state is known at a detection: more of the past is of no use.
-    world = world.but(memory="cell")
+    if world.memory != "cell":  # the state is known at a detection: more of the past is of no use
+        world = world.but(memory="cell")
     if world.coverage is not None and partition is not None and partition.block is not None:
         raise UserError(
             f"partition.block={partition.block}: expected null with sensors that have footprints"
@@ -170,7 +170,7 @@ def baseline_policy(problem: Problem, choice: BaselineConfig) -> Policy:
 
     if choice.reads_motion:
         world = modelled(problem, f"baseline={choice.name}")
-        if choice.whole_episodes:
+        if choice.whole_episodes and world.max_steps is not None:
             world = world.but(max_steps=None)
         return run_solver(world, choice).policy
     made = make(choice, problem)
