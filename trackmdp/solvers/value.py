@@ -115,7 +115,8 @@ def _steps(task: Task, motion: Motion, events: Events, policy: SetTable) -> Iter
         )
         found, mass = passed(task, step, mass, report, spent, sensors, count)
         yield found
-        del found  # a tenth of the memory at a million cells, were it kept while the next one is made
+        # Kept while the next one is made, it would be a tenth of the memory at a million cells.
+        del found
         walk.keep(report < 1.0)
 
 
