@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import shlex
@@ -98,6 +99,21 @@ def test_the_lines_of_python_run(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def plain(text: str) -> list[str]:
+    """The lines of a table without its frame and spaces."""
+    return [" ".join(re.sub(r"[^\w.,%-]", " ", line).split()) for line in text.splitlines()]
+
+
+def tables_after(path: Path) -> dict[str, list[str]]:
+    """First command of a block -> the lines of the table that is shown of its output."""
+    every = blocks(path)
+    return {
+        block.lines[0]: plain(after.text)
+        for block, after in itertools.pairwise(every)
+        if (block.language, after.language) == ("sh", "text") and after.text.startswith("policy")
+    }
+
+
 def few(line: str) -> list[str]:
     """The words that make the paper's sweep one of a single pair and seed."""
     return (
@@ -124,6 +140,8 @@ def test_the_commands_run_in_this_order(tmp_path: Path) -> None:
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     # Whoever types the lines is in the checkout, and has its data.
     (tmp_path / "tests").symlink_to(ROOT / "tests")
+    tables = tables_after(COMMANDS_BOOK)
+    assert {line.split()[1] for line in tables} == {"solve", "frontier"}
     for line in dict.fromkeys([*commands(README), *commands(COMMANDS_BOOK)]):
         if (typed := as_typed(line)) is None:
             continue
@@ -131,6 +149,7 @@ def test_the_commands_run_in_this_order(tmp_path: Path) -> None:
             typed, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
         )
         assert (result.returncode, result.stderr) == (0, ""), line
+        assert set(tables.get(line, ())) <= set(plain(result.stdout)), line
     assert len(list(tmp_path.glob("multirun/a/*/summary.json"))) == 4
     assert len(list(tmp_path.glob("multirun/train-algo_a2c_ppo_*/*/summary.json"))) == 3
     for sweep in ("a", "paper"):

@@ -11,7 +11,7 @@ from trackmdp.app.composer import Composer
 from trackmdp.app.sweep.plan import combinations, plan
 from trackmdp.config import conf_dir
 
-RUNS = {"paper": 216, "quality": 12, "pairs": 180, "growth": 40, "model_based": 108}
+RUNS = {"paper": 276, "quality": 12, "pairs": 180, "growth": 40, "model_based": 108}
 
 
 def test_these_are_all_experiments() -> None:
