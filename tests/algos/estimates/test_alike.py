@@ -49,6 +49,12 @@ def test_the_moves_seen_say_which_cells_are_alike(kind: str, moves: int, *, alik
     assert len(found.first) == (9 if alike else 100)
 
 
+def test_shares_of_moves_too_small_to_be_inverted_tell_nothing() -> None:
+    counts = counts_of(make_world("drift", size=10).kernel.toarray(), 3000)
+    counts.data[counts.indptr[44] : counts.indptr[45]] *= 1e-312
+    assert len(AlikeCells((10, 10), 1, counts).first) == 9
+
+
 @pytest.mark.parametrize(("kind", "alike"), [("drift", True), ("random_support", False)])
 def test_traces_of_moves_that_were_inferred_tell_nothing(kind: str, *, alike: bool) -> None:
     """Each cell has 1e-6 of a move to cells that it never goes to, as rounds of expectation-maximisation leave them."""

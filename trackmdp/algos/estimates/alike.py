@@ -86,7 +86,8 @@ class AlikeCells:
         expected = sparse.csr_array(
             (expected.data * share, expected.indices, expected.indptr), shape=counts.shape
         )
-        seen = expected.data > 0
+        # Misses leave shares of 1e-310 of a move, whose inverse would be infinite.
+        seen = expected.data > 1e-100
         inverse = sparse.csr_array(
             (1.0 / expected.data[seen], (rows[seen], expected.indices[seen])), shape=counts.shape
         )
