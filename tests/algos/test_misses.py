@@ -9,8 +9,10 @@ import pytest
 import torch
 from scipy import sparse
 
+import trackmdp as tm
 from tests.algos.hindsight import SOLVES, batches, learn, policy, total
 from tests.helpers import algorithm, small_world
+from tests.tracks import drawn
 from trackmdp.algos.actor_loss import Decision
 from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
 from trackmdp.algos.gains import chain_returns
@@ -23,6 +25,7 @@ from trackmdp.solvers import optimal
 from trackmdp.solvers.evaluation import regret_per_step
 from trackmdp.solvers.value import evaluate
 from trackmdp.world.model import Task
+from trackmdp.world.tracks import Recorded
 
 TASK = Task((1, 3), cost=0.1, t_max=0, detection=[1.0, 0.5, 0.25])
 
@@ -174,3 +177,16 @@ def test_what_counts_paths_is_refused() -> None:
             replace(small_world(), detection=np.linspace(0.5, 1, 9)),
             "algo.share_cells=all",
         )
+
+
+def test_cells_too_dear_to_sense_are_left_out_where_sensors_miss() -> None:
+    """On recorded tracks, two cells of price 1e6: better than Q_MDP of the estimated kernel, and than nothing."""
+    kernel, cost = small_world(exit_probability=0.02).kernel, np.full(9, 0.1)
+    cost[[1, 5]] = 1e6
+    parts = {"validation": drawn(kernel, 40, 2), "held_out": drawn(kernel, 40, 3)}
+    task = {"cost": cost, "safe_cost": 2.0, "t_max": 1, "detection": 0.9}
+    problem = Recorded(drawn(kernel, 100, 1), 3, **parts, **task)
+    run = tm.train(problem, total_frames=10_000)
+    assert not run.policy.dense()[..., [1, 5]].any()
+    q_mdp, none = tm.compare(problem, [run, "qmdp", "none"]).policies[1:]
+    assert max(q_mdp.difference.mean, none.difference.mean) < 0

@@ -86,3 +86,9 @@ def test_an_array_of_prices_is_nan_where_there_is_no_sensor(shape: tuple[int, ..
     world = make_world("random_walk", size=3, cost=prices.reshape(shape))
     assert np.flatnonzero(np.isnan(world.cost)).tolist() == [0, 7]
     assert world.safe_cost == pytest.approx(3.5)
+
+
+@pytest.mark.parametrize("name", ["cost", "detection"])
+def test_an_array_of_another_grid_is_refused_by_its_rows_and_columns(name: str) -> None:
+    with pytest.raises(UserError, match=f"^{name}: 3 x 2 numbers, expected 2 x 3"):
+        make_world("random_walk", size=(2, 3), **{name: np.full((3, 2), 0.5)})

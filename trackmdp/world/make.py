@@ -294,18 +294,26 @@ def _words(arguments: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, An
     for name in own.keys() - of_kernels:
         if close := difflib.get_close_matches(name, OF_TASK, n=1):
             raise UserError(f"{name}: unknown argument, did you mean {close[0]}?")
-    arguments = {name: _flat(value, arguments["size"]) for name, value in arguments.items()}
+    arguments = {name: _flat(name, value, arguments["size"]) for name, value in arguments.items()}
     of_task = {option: arguments[name] for name, option in (OF_TASK | _OF_PLACE).items()}
     of_kernel = {f"kernel.{name}": value for name, value in own.items()}
     of_sensor = sensor_words(arguments["detection"], arguments["safe_detection"])
     return given(of_task | of_sensor | of_kernel)
 
 
-def _flat(value: Any, size: Size) -> Any:
-    """An argument `[rows, columns]` as one number for each cell, nan (no sensor) as null; any other as it is."""
+def _flat(name: str, value: Any, size: Size) -> Any:
+    """An argument `[rows, columns]` as one number for each cell, nan (no sensor) as null; any other as it is.
+
+    Raises:
+        UserError: its rows and columns are not those of the grid.
+    """
     if not isinstance(value, list | np.ndarray):
         return value
-    if np.ndim(value) == 2 and np.shape(value) == grid_size(size):
+    if np.ndim(value) == 2:
+        if (found := np.shape(value)) != (grid := grid_size(size)):
+            raise UserError(
+                f"{name}: {found[0]} x {found[1]} numbers, expected {grid[0]} x {grid[1]}"
+            )
         value = np.ravel(value)
     if isinstance(value, np.ndarray) and value.dtype.kind == "f" and value.ndim == 1:
         return [None if math.isnan(each) else each for each in value.tolist()]
