@@ -178,7 +178,7 @@ class FrontierConfig(WorldConfig):
     task: TaskConfig
     solver: BaselineConfig
     accuracy: float | None = option(
-        "show the policies that have this accuracy with the fewest sensors", ge=0, le=1
+        "show the mixture of policies of the frontier that has this accuracy", ge=0, le=1
     )
     sensors: float | None = option(
         "show the best policies with so many sensors", unit="sensors per step", ge=0
