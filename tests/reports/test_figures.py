@@ -84,8 +84,9 @@ def test_exact_lines_stand_at_the_true_price_and_learned_ones_beside_it(
 
 
 def test_the_legend_names_the_lines_in_sight(grouped: Study, panel: Panel) -> None:
-    """All sensors on earns thousands less; its regret is in sight."""
-    assert ">all on<" not in drawn(grouped, panel, "aihtr").svg.decode()
+    """All sensors on earns thousands less, and switches on nine; its regret is in sight."""
+    for key in ("aihtr", "sensors_per_step"):
+        assert ">all on<" not in drawn(grouped, panel, key).svg.decode()
     assert ">all on<" in drawn(grouped, panel, "regret").svg.decode()
 
 

@@ -159,6 +159,12 @@ def test_a_sweep_without_finished_runs_still_says_what_is_missing() -> None:
     assert "cut: it has no summary.json" in page
 
 
+def test_one_run_is_not_several(results: Results) -> None:
+    alone = Results(results.runs[:1], manifest={"versions": [{"runs": 1, "numpy": "2.0"}]})
+    page = build(alone).html()
+    assert "1 run, 0.0 minutes" in page and "Versions, 1 run<" in page
+
+
 def test_runs_on_recordings_have_no_regret_and_held_out_figures_under_their_name(
     tmp_path: Path,
 ) -> None:

@@ -175,7 +175,8 @@ def against_price(study: Study, panel: Panel, key: str, threshold: float | None)
         else:
             axes.set_ylim(limits := _limits(learned, others))
             for drawn in axes.lines:
-                if np.max(drawn.get_ydata()) < limits[0]:
+                heights = np.asarray(drawn.get_ydata())
+                if heights.max() < limits[0] or heights.min() > limits[1]:
                     drawn.set_label(f"_{drawn.get_label()}")  # out of sight: not in the legend
         if key == "regret" and threshold is not None:
             axes.axhline(threshold, color=INK, linewidth=0.6, linestyle=":")

@@ -137,12 +137,17 @@ def _prose(name: str) -> str:
 def _about(results: Results) -> str:
     manifest = results.manifest
     planned = manifest.get("planned")
-    count = f"{len(results.runs)} of {planned} planned" if planned else f"{len(results.runs)}"
+    found = len(results.runs)
+    count = f"{found} of {planned} planned runs" if planned else _runs_in_words(found)
     machines = manifest.get("machines", ())
     where = "; ".join(f"{m.get('processor', '?')}, {m.get('cores', '?')} cores" for m in machines)
     hours = manifest.get("wall_seconds", 0) / 3600
     took = f"{hours:.1f} hours" if hours >= 1 else f"{60 * hours:.1f} minutes"
-    return f"{count} runs, {took} of run time in all{', on ' + where if where else ''}."
+    return f"{count}, {took} of run time in all{', on ' + where if where else ''}."
+
+
+def _runs_in_words(count: int) -> str:
+    return "1 run" if count == 1 else f"{count} runs"
 
 
 def _outcome(grouped: Study, threshold: float | None) -> list[Part]:
@@ -202,7 +207,7 @@ def _made(manifest: Mapping[str, Any]) -> dict[str, str]:
             shown = (
                 f"{name} {it}" for name, it in entry.items() if name != "runs" and it is not None
             )
-            facts[f"{label}, {entry['runs']} runs"] = ", ".join(shown)
+            facts[f"{label}, {_runs_in_words(entry['runs'])}"] = ", ".join(shown)
     times = (f"{manifest.get(f'{kind}_seconds', 0):,.0f} s {kind}" for kind in ("wall", "cpu"))
     return facts | {
         "Run time": ", ".join(times),
