@@ -24,6 +24,7 @@ __version__ = "0.2.0"
 _HOMES = {
     "Episodes": "trackmdp.episodes.batch",
     "Evaluation": "trackmdp.solvers.evaluation",
+    "Group": "trackmdp.world.group",
     "ObservationVector": "trackmdp.world.observation",
     "Policy": "trackmdp.policies.policy",
     "Recorded": "trackmdp.world.tracks",
@@ -65,6 +66,7 @@ if TYPE_CHECKING:  # the same once more, for type checkers and editors; `X as X`
     from trackmdp.training.run import load_run as load_run
     from trackmdp.training.train import train as train
     from trackmdp.world.env import TrackEnv as TrackEnv
+    from trackmdp.world.group import Group as Group
     from trackmdp.world.make import load_tracks as load_tracks
     from trackmdp.world.make import make_world as make_world
     from trackmdp.world.model import World as World

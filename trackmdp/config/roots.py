@@ -11,6 +11,7 @@ from trackmdp.config.learning import DEVICE, AlgoConfig, CollectorConfig
 from trackmdp.config.logs import LogConfig
 from trackmdp.config.options import GROUPS, NodeConfig, listed, option, refuse
 from trackmdp.config.sensors import CostConfig, SensorConfig
+from trackmdp.config.several import MergedTargetsConfig, TargetsConfig, WidthConfig
 from trackmdp.config.world import GridConfig, KernelConfig, TaskConfig
 from trackmdp.errors import UserError
 
@@ -118,6 +119,8 @@ class EvaluateConfig(WorldConfig):
         path=True,
     )
     baseline: BaselineConfig | None
+    targets: MergedTargetsConfig
+    evaluation: WidthConfig
     log: dict[str, LogConfig]
     seed: int = option("seed of the simulated episodes", ge=0)
     device: str = option(
@@ -132,6 +135,12 @@ class EvaluateConfig(WorldConfig):
         if (self.run is None) == (self.baseline is None):
             given = "neither" if self.run is None else "both"
             raise UserError(f"expected exactly one of run=FOLDER and baseline=NAME, got {given}")
+        if self.targets.count > 1:
+            several = f"with targets.count={self.targets.count}"
+            if self.log:
+                raise refuse("log", listed(self.log), f"[] {several}")
+            if self.baseline is not None and self.baseline.name in ("playback", "random_k"):
+                raise refuse("baseline", self.baseline.name, f"one that does not draw {several}")
         if not all(node.episodes_only for node in self.log.values()):
             raise refuse("log", listed(self.log), "[mcap] or []; an evaluation has no iterations")
 
@@ -163,6 +172,7 @@ class SolveConfig(WorldConfig):
 
     task: TaskConfig
     solver: BaselineConfig
+    targets: TargetsConfig
     partition: SweptPartitionConfig
     verify: bool = option("check the paper's theorems on this world as well")
 

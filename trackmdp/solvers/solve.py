@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from inspect import signature
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 from trackmdp.config.baselines import BaselineConfig
 from trackmdp.config.by_blocks import SweptPartitionConfig
@@ -19,18 +19,26 @@ from trackmdp.solvers.partition import blocks, narrow_halo, plan_by_blocks
 from trackmdp.solvers.regions import settled
 from trackmdp.solvers.solution import SearchProgress, Solution, bracketed
 from trackmdp.solvers.workers import Crew, crew
+from trackmdp.world.group import Group
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Problem, check_problem, modelled
 
 if TYPE_CHECKING:  # torch is loaded where a policy is to act
     from trackmdp.policies.policy import Policy
+    from trackmdp.solvers.group_solution import GroupSolution
 
 _SWEEPS = 10
 """Rounds over the whole grid after the blocks, at most: two or three change anything."""
 
 
+@overload
+def solve(world: World, solver: str = ..., **options: Any) -> Solution: ...
+@overload
+def solve(world: Group, solver: str = ..., **options: Any) -> GroupSolution: ...
+
+
 def solve(
-    world: World,
+    world: World | Group,
     solver: str = default("solver", "solve"),
     *,
     nodes: int = default("solver.nodes", "solve"),
@@ -41,14 +49,15 @@ def solve(
     workers: int = default("partition.workers", "solve"),
     sweeps: int | None = default("partition.sweeps", "solve"),
     **options: Any,
-) -> Solution:
+) -> Solution | GroupSolution:
     """The policy that a solver finds for `world`, its figures, and an upper bound for every policy.
 
     Defaults and checks are the same as of ``trackmdp solve``.
 
     Args:
         world: the problem with its motion model. With hidden modes `optimal` searches over keys of `world.memory`, and
-            the others take the next move to depend on the cell alone, as it does on average.
+            the others take the next move to depend on the cell alone, as it does on average. Of a `Group` each target
+            is solved for by itself, and a bound for all together is proved.
         solver: ``optimal``, ``clocked``, ``qmdp``, ``fcr``, ``lookahead``, or one of an installed plugin.
         nodes: work after which `optimal` stops closing the bracket, the same on every machine.
         time_limit: seconds after which it stops even so; None: never. Neither is an option of the others.
@@ -69,7 +78,8 @@ def solve(
         >>> solution.certified and solution.upper - solution.lower < 1e-6 * abs(solution.upper)
         True
     """
-    check_problem(world, "solve")
+    if not isinstance(world, Group):
+        check_problem(world, "solve")
     own = {f"solver.{name}": value for name, value in options.items()}
     named = given({"solver": solver, "solver.nodes": nodes, "solver.time_limit": time_limit})
     of_blocks = {"block": block, "halo": halo, "workers": workers, "sweeps": sweeps}
@@ -77,6 +87,10 @@ def solve(
         "solve",
         named | own | given({f"partition.{name}": value for name, value in of_blocks.items()}),
     )
+    if isinstance(world, Group):
+        from trackmdp.solvers.group_solution import solve_group
+
+        return solve_group(world, cfg.solver, on_progress, cfg.partition)
     solution = run_solver(world, cfg.solver, on_progress, cfg.partition)
     said = narrow_halo(world, cfg.partition, solution.upper, solution.evaluation)
     if said:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from importlib import import_module
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, overload
 
 import numpy as np
 from scipy import sparse
@@ -34,12 +34,14 @@ from trackmdp.solvers.linear import (
     triangular,
 )
 from trackmdp.solvers.walk import Events, Passed, Walk, all_events, passed
+from trackmdp.world.group import Group
 from trackmdp.world.model import Array, BoolArray, Task, World
 from trackmdp.world.motion import Motion
 from trackmdp.world.tracks import Problem, Recorded, Tracks, check_problem
 
 if TYPE_CHECKING:  # torch is loaded where something that acts is asked for its sets
     from trackmdp.policies.policy import PolicyLike
+    from trackmdp.solvers.group_value import GroupEvaluation
 
 KEYED_DIRECT = 700
 """Events of several keys or modes a cell up to which their system is factorised, as a full matrix: each leads to all
@@ -49,18 +51,35 @@ Followed: TypeAlias = tuple[Events, Iterator[Passed]]
 """Events that a policy leads to, and their steps."""
 
 
+@overload
 def evaluate(
     problem: Problem,
+    policy: PolicyLike | Array | BoolArray,
+    *,
+    guess: Array | None = ...,
+    false_alarm: float = ...,
+    per_cell: bool = ...,
+) -> Evaluation: ...
+@overload
+def evaluate(
+    problem: Group, policy: PolicyLike, *, merge: str = ..., width: float = ..., seed: int = ...
+) -> GroupEvaluation: ...
+
+
+def evaluate(
+    problem: Problem | Group,
     policy: PolicyLike | Array | BoolArray,
     *,
     guess: Array | None = None,
     false_alarm: float = 0.0,
     per_cell: bool = True,
-) -> Evaluation:
+    **of_group: Any,
+) -> Evaluation | GroupEvaluation:
     """The figures of `policy`: exact on a `World`, from a replay on the held-out tracks of a `Recorded`.
 
     Args:
-        problem: a `World`, whose episodes end by the target's exit or after `max_steps`; or `Recorded` tracks.
+        problem: a `World`, whose episodes end by the target's exit or after `max_steps`; `Recorded` tracks; or a
+            `Group` of targets, for which a policy of a single one is merged, and simulated unless the grid is tiny.
         policy: a `Policy` or its table, or the same dense, `[M, t_max + 1, M]`; a TensorDict module or a function
             that does not draw (`Policy.from_function`); a `Run`, a `Solution`, a model of Stable-Baselines3; or the
             name of a baseline.
@@ -68,12 +87,18 @@ def evaluate(
             policy takes each report for the truth (`trackmdp.solvers.false_alarms`).
         per_cell: whether detections, sensors and safe actions are wanted of each start cell as well, which takes half
             as long again on a grid too large to factorise (a smaller one has them for nothing).
+        **of_group: of a `Group` alone: `merge`, "gains" or "union"; `width`, half of the 95 % interval of the reward
+            per step that is wanted, .005; and `seed` of the targets.
         guess: `[M]`, where the solve begins on a grid too large to factorise, such as the clocked bound.
 
     Raises:
         UserError: the policy draws at random with unknown probabilities, or is for another grid.
     """
+    if isinstance(problem, Group):
+        return _of_group(problem, policy, **of_group)
     check_problem(problem, "evaluate")
+    if of_group:
+        raise UserError(f"{min(of_group)}: an option of several targets, expected none with one")
     table = _table(problem, policy)
     check_revealed(problem.motion, table)
     if false_alarm:
@@ -87,6 +112,21 @@ def evaluate(
     if problem.max_steps is not None:
         return truncated_value(problem, table, problem.max_steps)
     return _whole_episodes(problem, table, guess, per_cell)
+
+
+def _of_group(
+    group: Group, policy: Any, *, merge: str = "gains", width: float = 0.005, seed: int = 0
+) -> GroupEvaluation:
+    """See `evaluate`."""
+    # By name, as these modules are built on this one.
+    merging = import_module("trackmdp.solvers.merging")
+    tables = getattr(policy, "tables", None)
+    if tables is None:
+        tables = [_table(world, policy) for world in group.kinds]
+    rule = merging.make_rule(group, tables, merge)
+    value = import_module("trackmdp.solvers.group_value")
+    found: GroupEvaluation = value.evaluate_group(rule, width=width, seed=seed)
+    return found
 
 
 def follow(task: Task, motion: Motion, policy: PolicyTable) -> Followed:

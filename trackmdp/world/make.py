@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from inspect import signature
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +20,7 @@ from trackmdp.config.sensors import lattice
 from trackmdp.errors import UserError
 from trackmdp.world.coverage import Coverage, discs
 from trackmdp.world.files import per_cell, read_matrix
+from trackmdp.world.group import Group
 from trackmdp.world.kernel_checks import PRICES, PROBABILITIES, canonical_kernel, check_kernel
 from trackmdp.world.model import TASK_BYTES, Size, World, check_fits, grid_size
 from trackmdp.world.place import Place
@@ -48,6 +49,14 @@ _KERNEL_BYTES = 500
 580, drift 940."""
 
 
+@overload
+def make_world(
+    kernel: str = ..., *, size: Size = ..., targets: Literal[1] = ..., **options: Any
+) -> World: ...
+@overload
+def make_world(kernel: str = ..., *, size: Size = ..., targets: int, **options: Any) -> Group: ...
+
+
 def make_world(
     kernel: str = default("kernel"),
     *,
@@ -66,8 +75,9 @@ def make_world(
     cell: float | None = default("grid.cell"),
     origin: Sequence[float] | None = default("grid.origin"),
     crs: str | None = default("grid.crs"),
+    targets: int = 1,
     **kernel_options: Any,
-) -> World:
+) -> World | Group:
     """A world with one of the motion kernels; for a table of your own take `World` itself.
 
     The defaults are those of `conf/`, and the checks those of the command line.
@@ -91,6 +101,8 @@ def make_world(
         cell: side of a cell, in metres or units of x and y; with `origin` it gives the grid a place (`World.place`).
         origin: corner of the grid with the least coordinates, (x, y), or (lon, lat) with `crs`.
         crs: code of the projection of lat and lon to metres, such as ``EPSG:2056``.
+        targets: K; above 1 the result is a `Group` of as many targets that move alike. For targets that move each in
+            its own way take ``Group([world, other])``.
         **kernel_options: the kernel's own, such as ``support_size=5`` (``trackmdp solve --help`` lists them), or
             ``reveals=True`` where detections reveal the mode.
 
@@ -112,7 +124,10 @@ def make_world(
             "takes a table"
         )
     words = given({"kernel": kernel}) | _words(locals(), kernel_options)
-    return modelled(make_problem(compose("compare", words)), f"kernel={kernel}")
+    if targets == 1:
+        return modelled(make_problem(compose("compare", words)), f"kernel={kernel}")
+    cfg = compose("solve", words | {"targets.count": targets})
+    return Group([build_world(cfg)] * targets)
 
 
 def load_tracks(

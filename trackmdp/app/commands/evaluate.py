@@ -33,6 +33,9 @@ from trackmdp.policies.policy import Policy
 from trackmdp.policies.saved import sets_name, write_sets
 from trackmdp.reports.held_out import recorded_page
 from trackmdp.solvers import bounds
+from trackmdp.solvers.group_bounds import upper_bound
+from trackmdp.solvers.group_value import evaluate_group, with_ends
+from trackmdp.solvers.merging import make_rule
 from trackmdp.solvers.solve import baseline_policy
 from trackmdp.solvers.value import evaluate
 from trackmdp.training.devices import make_device
@@ -42,6 +45,7 @@ from trackmdp.training.folders import SUMMARY, check_files, read_summary
 from trackmdp.training.run import trained
 from trackmdp.untrusted import decoded
 from trackmdp.world.gridding import said
+from trackmdp.world.group import Group
 from trackmdp.world.make import false_alarm
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Problem, Recorded, modelled
@@ -76,6 +80,8 @@ def run(cfg: EvaluateConfig, folder: Path, problem: Problem) -> float:
     else:
         assert cfg.baseline is not None
         world, policy, subject = problem, baseline_policy(problem, cfg.baseline), cfg.baseline.name
+    if cfg.targets.count > 1:
+        return _several(cfg, modelled(world, "evaluate"), policy, subject, folder, console)
     if isinstance(cfg.sensor, FalseAlarmConfig):
         return _believing(cfg, world, policy, subject, folder, console)
     # Recorded tracks have no kernel, hence no exact value and no bound: figures come from the held-out tracks.
@@ -122,6 +128,31 @@ def _exact(
     console.print(f"results in {folder}, sets in {sets_name(world)}")
     _log(cfg, episodes, subject, folder, console)
     return score.evaluation.aihtr
+
+
+def _several(
+    cfg: EvaluateConfig, world: World, policy: Policy, subject: str, folder: Path, at: Console
+) -> float:
+    """Evaluate for several targets: `evaluation.json`; returns the AIHTR."""
+    group, merge = Group([world] * cfg.targets.count), cfg.targets.merge
+    rule = make_rule(group, [policy], merge)
+    found = evaluate_group(rule, width=cfg.evaluation.width, seed=cfg.seed)
+    names = ("aihtr", "reward_per_step", "accuracy", "sensors_per_step", "safe_per_step")
+    figures = {name: getattr(found, name) for name in names}
+    apart, upper = len(group) * evaluate(world, policy, per_cell=False).aihtr, upper_bound(group)
+    report = {"policy": subject, "targets": len(group), "merge": merge, "exact": found.exact}
+    report |= {"episodes": 0 if found.exact else len(found.totals), "apart": apart, "upper": upper}
+    report["expected_length"] = found.expected_length
+    report["figures"] = {name: asdict(each) for name, each in figures.items()}
+    write_json(folder / "evaluation.json", report)
+    rows = [[name.replace("_", " "), with_ends(each)] for name, each in figures.items()]
+    rows += [["AIHTR of separate trackers", f"{apart:,.4f}"], ["upper bound", f"{upper:,.4f}"]]
+    how = "exact" if found.exact else f"{len(found.totals):,} episodes, 95 %"
+    at.print(table(f"{subject}, {len(group)} targets, {merge}", ["figure", how], rows))
+    at.print(
+        f"{(upper - found.aihtr.mean) / found.expected_length:.4f} per step below the bound; results in {folder}"
+    )
+    return found.aihtr.mean
 
 
 def _log(

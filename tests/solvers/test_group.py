@@ -1,0 +1,200 @@
+"""Several targets that share sensors: exact on tiny worlds, between proved bounds, and simulated alike."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import trackmdp as tm
+from tests.solvers.worlds import random_tiny_world
+from trackmdp.app.cli import main
+from trackmdp.errors import UserError
+from trackmdp.policies.policy import Policy
+from trackmdp.solvers.group_bounds import equal_shares, upper_bound
+from trackmdp.solvers.group_chain import explored
+from trackmdp.solvers.group_value import evaluate_group
+from trackmdp.solvers.linear import IndexArray
+from trackmdp.solvers.merging import Beliefs, Clocks, make_rule
+from trackmdp.solvers.solve import solve
+from trackmdp.solvers.value import evaluate
+from trackmdp.world.group import Group
+from trackmdp.world.model import Array, World
+
+
+def tiny(seed: int, t_max: int = 0, **options: Any) -> World:
+    """Three cells, prices that differ, and a safe action as dear as all sensors or dearer."""
+    rng = np.random.default_rng(seed)
+    kernel = rng.random((3, 3)) ** rng.choice([1.0, 3.0])
+    kernel *= 0.75 / kernel.sum(axis=1, keepdims=True)
+    cost = rng.choice([0.1, 0.2, 0.35]) * (0.5 + rng.random(3))
+    given: dict[str, Any] = {"cost": cost, "safe_cost": float(cost.sum() * rng.choice([1.0, 2.0]))}
+    return World(kernel, (1, 3), t_max=t_max, **(given | options))
+
+
+def best_of_all(group: Group) -> float:
+    """V* from a uniform start: every set tried in every joint state, by value iteration."""
+    sensors = range(group.task.num_cells)
+    sets: list[IndexArray] = [
+        np.array(each, dtype=np.int64)
+        for k in range(len(sensors) + 1)
+        for each in itertools.combinations(sensors, k)
+        if group.task.budget is None or k <= group.task.budget
+    ]
+    chain = explored(group, lambda _: sets, 10_000)
+    assert chain is not None
+    value: Array = np.zeros(chain.states)
+    while True:
+        worth = chain.totals[:, 0] + chain.moves @ value
+        after = np.full(chain.states, -np.inf)
+        np.maximum.at(after, chain.owner, worth)
+        if np.abs(after - value).max() < 1e-11:
+            return float(after[: chain.starts].mean())
+        value = after
+
+
+def check_bracket(group: Group) -> None:
+    found, best = solve(group), best_of_all(group)
+    assert found.lower is not None
+    assert found.lower <= best + 1e-9
+    assert best <= found.upper + 1e-9
+    assert found.upper <= equal_shares(group) + 1e-9
+    for merge in ("gains", "union"):
+        merged = evaluate(group, found, merge=merge)
+        assert merged.exact
+        assert found.lower - 1e-9 <= merged.aihtr.mean <= best + 1e-9
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_brute_force_lies_in_the_bracket_with_both_policies_below(seed: int) -> None:
+    check_bracket(Group([tiny(seed)] * 2))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2))
+def test_brute_force_lies_in_the_bracket_of_other_targets_and_longer_clocks(seed: int) -> None:
+    world = tiny(seed, t_max=1)
+    other = World.of(world, tiny(seed + 100).kernel)
+    check_bracket(Group([world, world if seed % 2 else other]))
+
+
+def test_one_target_is_todays_world() -> None:
+    for seed in range(4):
+        world = random_tiny_world(np.random.default_rng(seed))
+        table = solve(world).table
+        for merge in ("gains", "union"):
+            found = evaluate(Group([world]), table, merge=merge)
+            assert found.aihtr.mean == pytest.approx(evaluate(world, table).aihtr, abs=1e-9)
+    assert isinstance(tm.make_world(size=4, targets=1), World)
+    assert len(tm.make_world(size=4, targets=3)) == 3
+
+
+@pytest.mark.parametrize("budget", [None, 1])
+def test_simulation_agrees_with_the_joint_chain(budget: int | None) -> None:
+    world = tiny(3, t_max=1, detection=np.array([0.9, 0.6, 1.0]), budget=budget)
+    group = Group([world, World.of(world, tiny(4).kernel)])
+    rule = make_rule(group, [solve(each).table for each in group.kinds])
+    exact, played = evaluate_group(rule), evaluate_group(rule, episodes=4_000)
+    assert exact.exact
+    assert not played.exact
+    for name in ("aihtr", "accuracy", "sensors_per_step", "safe_per_step"):
+        found = getattr(played, name)
+        assert found.low is not None
+        half = (found.high - found.low) / 2
+        assert abs(found.mean - getattr(exact, name).mean) < 2 * half, name
+    assert exact.totals[0, 5] == pytest.approx(group.expected_steps)
+    assert exact.totals[0, 1] == pytest.approx(group.target_steps)
+    if budget is not None:
+        assert exact.sensors_per_step.mean <= budget
+
+
+def test_targets_are_the_same_for_every_policy_and_order_does_not_matter() -> None:
+    world = tm.make_world(size=4, exit_probability=0.1)
+    group = Group([world] * 3)
+    played = [
+        evaluate_group(make_rule(group, [table], merge), episodes=50)
+        for table in (solve(world).table, Policy.all_on(world))
+        for merge in ("gains", "union")
+    ]
+    for each in played:
+        np.testing.assert_array_equal(each.totals[:, [1, 5]], played[0].totals[:, [1, 5]])
+    one, other = tiny(1), World.of(tiny(1), tiny(2).kernel)
+    ends = [evaluate(Group(each), "optimal").aihtr.mean for each in ((one, other), (other, one))]
+    assert ends[0] == pytest.approx(ends[1])
+
+
+def test_a_sensor_is_on_where_all_gains_together_exceed_its_price() -> None:
+    # Two targets surely in cell 0, of which each is there next with probability 1/2: alone a gain of .5 · (1 - W).
+    world = World(np.array([[0.5, 0.4], [0.4, 0.5]]), (1, 2), cost=0.7, t_max=0, safe_cost=1.4)
+    group = Group([world] * 2)
+    none = Policy.none(world)
+    rule, apart = make_rule(group, [none]), make_rule(group, [none], "union")
+    seen = Clocks(np.zeros((1, 2), np.int64), np.zeros((1, 2), np.int64), np.ones((1, 2), bool))
+    moved = Beliefs.at(np.arange(2), np.zeros(2, np.int64)).moved(group)
+    value = evaluate(world, none).value
+    lost = world.kernel @ (1.0 + value - 1.4)
+    gain, any_left = 2 * world.kernel.toarray()[0] * (1 + value - lost), 1 - 0.1**2
+    np.testing.assert_array_equal(rule.sets(seen, moved), np.flatnonzero(gain > 0.7 * any_left))
+    assert not len(apart.sets(seen, moved))
+
+
+@pytest.mark.slow
+def test_bracket_of_two_targets_on_six_by_six_is_narrow() -> None:
+    group = tm.make_world(size=6, support_size=5, exit_probability=0.02, cost=0.16, targets=2)
+    found = solve(group)
+    merged = evaluate(group, found, width=0.01)
+    assert found.lower is not None
+    assert merged.aihtr.high is not None
+    assert found.lower <= merged.aihtr.high
+    assert (found.upper - merged.aihtr.mean) / group.expected_steps < 0.02
+    assert upper_bound(group) == found.upper
+
+
+@pytest.mark.parametrize(
+    ("words", "refusal"),
+    [
+        (["solve", "targets.count=2", "grid.window=2"], "grid.window=2: expected null"),
+        (["solve", "targets.count=2", "kernel=heading"], "kernel=heading: expected a motion"),
+        (["solve", "targets.count=2", "sensor=footprint"], "sensor=footprint: expected perfect"),
+        (["solve", "targets.count=2", "cost.mean_budget=1"], "cost.mean_budget=1"),
+        (["evaluate", "baseline=qmdp", "targets.count=2", "log=[mcap]"], "log=[mcap]"),
+        (["evaluate", "baseline=qmdp", "evaluation.width=1"], "without effect"),
+        (["train", "targets.count=2"], "targets.count: unknown option"),
+    ],
+)
+def test_words_without_effect_are_refused(
+    words: list[str], refusal: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert main([*words, f"hydra.run.dir={tmp_path / 'a'}"]) == 2
+    assert refusal in capsys.readouterr().err
+
+
+def test_other_targets_and_policies_are_refused() -> None:
+    world = tiny(0)
+    with pytest.raises(UserError, match="target 1 has another grid, price or limit"):
+        Group([world, world.but(t_max=1)])
+    with pytest.raises(UserError, match=r"grid.max_steps=5, expected none with several targets"):
+        Group([world.but(max_steps=5)] * 2)
+    with pytest.raises(UserError, match="does not draw, for several targets"):
+        evaluate(Group([world] * 2), Policy.random_k(world, 1))
+    with pytest.raises(UserError, match="merge: an option of several targets"):
+        evaluate(world, "none", merge="gains")  # type: ignore[call-overload]
+    with pytest.raises(UserError, match="expected gains with a budget"):
+        evaluate(Group([world.but(budget=1)] * 2), "none", merge="union")
+    with pytest.raises(UserError, match="simulate: the first argument is a Group"):
+        tm.simulate(Group([world] * 2), "none", 3)  # type: ignore[arg-type]
+
+
+def test_commands_solve_and_evaluate_with_several_targets(tmp_path: Path) -> None:
+    words = ["grid.size=3", "grid.t_max=0", "targets.count=2", "quiet=true"]
+    assert main(["solve", *words, f"hydra.run.dir={tmp_path / 'a'}"]) == 0
+    solved = json.loads((tmp_path / "a" / "solution.json").read_text(encoding="utf-8"))
+    more = ["baseline=optimal", f"hydra.run.dir={tmp_path / 'b'}"]
+    assert main(["evaluate", *words, *more]) == 0
+    valued = json.loads((tmp_path / "b" / "evaluation.json").read_text(encoding="utf-8"))
+    assert solved["lower"] <= valued["figures"]["aihtr"]["mean"] <= solved["upper"]
+    assert valued["exact"] is True

@@ -1,0 +1,68 @@
+"""Schema of several targets in one grid."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from trackmdp.config.options import NodeConfig, option, refuse
+
+
+class TargetsConfig(NodeConfig):
+    """Targets that are in the grid at the same time: labelled, independent, alike in their motion."""
+
+    count: int = option(
+        "K; they share the sensors, which are paid once while any of them is in the grid",
+        unit="targets",
+        ge=1,
+        le=1000,
+    )
+
+    def check(self, key: str, root: Any) -> None:
+        """Several targets are followed in whole episodes, each by the cell of its last detection."""
+        if self.count == 1:
+            return
+        with_several = f"with {key}.count={self.count}"
+        kernel = root.kernel
+        if not kernel.is_motion or kernel.hides:
+            raise refuse("kernel", kernel.name, f"a motion model without modes {with_several}")
+        if root.sensor.name not in ("perfect", "miss", "given"):
+            raise refuse("sensor", root.sensor.name, f"perfect or miss {with_several}")
+        for place, value, expected in (
+            ("grid.window", root.grid.window, None),
+            ("grid.max_steps", root.grid.max_steps, None),
+            ("task.memory", root.task.memory, "cell"),
+            ("cost.mean_budget", getattr(root.cost, "mean_budget", None), None),
+            ("verify", getattr(root, "verify", False), False),
+        ):
+            if value != expected:
+                raise refuse(
+                    place, value, f"{str(expected).lower().replace('none', 'null')} {with_several}"
+                )
+
+
+class MergedTargetsConfig(TargetsConfig):
+    """Several targets, and how policies of single ones are put together."""
+
+    merge: str = option(
+        "gains: a sensor is on where the gains of all targets together exceed its price; union: the sensors of all "
+        "targets' own sets",
+        choices=("gains", "union"),
+    )
+
+    def ignored(self, root: Any) -> dict[str, str]:
+        """One target needs no merging."""
+        return {"merge": "with targets.count=1"} if self.count == 1 else {}
+
+
+class WidthConfig(NodeConfig):
+    """Accuracy of figures that are simulated."""
+
+    width: float = option(
+        "with several targets: half of the 95 % interval of the reward per step",
+        unit="reward",
+        gt=0,
+    )
+
+    def ignored(self, root: Any) -> dict[str, str]:
+        """Figures of one target are exact."""
+        return {"width": "with targets.count=1"} if root.targets.count == 1 else {}

@@ -1,0 +1,267 @@
+"""The figures of a policy for several targets: exact by the joint chain on tiny worlds, else simulated.
+
+Clocks of the targets are staggered, so there is no renewal of all of them. Simulated episodes are of the same targets
+for every policy of a group (the generators' names have no policy in them), so that differences have little noise.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import sparse
+
+from trackmdp.notebook.card import Card, Carded, decimal
+from trackmdp.seeding import derive
+from trackmdp.solvers.group_chain import joint_chain
+from trackmdp.solvers.linear import IndexArray, accumulate, grid_of
+from trackmdp.solvers.merging import Beliefs, Clocks, Rule, switched_on
+from trackmdp.statistics import MeanInterval, ratio
+from trackmdp.world.model import Array, BoolArray
+
+_HALF = 1.96
+"""Of a 95 % interval, in standard errors; there are many episodes."""
+_FIRST = 64
+"""Episodes of the first batch, from which the number needed for the wanted width is worked out."""
+_AT_ONCE = 2**13
+"""Targets of all episodes of a batch, at most."""
+_MOST = 2**17
+"""Episodes, at most."""
+
+
+@dataclass(frozen=True, repr=False)
+class GroupEvaluation(Carded):
+    """Figures of a policy for several targets.
+
+    Attributes:
+        totals: `[E, 7]` of simulated episodes: reward, steps of targets in the grid, detections, sensors on by choice,
+            safe actions, steps of the episode, reward of single targets that are always known (`known_rewards`); or
+            one row of exact expectations of the first six.
+        exact: whether they are exact.
+        expected_length: steps until the last target has left, exact.
+        controls: exact means of the second and of the last column.
+    """
+
+    totals: Array
+    exact: bool
+    expected_length: float
+    controls: tuple[float, float]
+
+    def _ratio(self, part: int, whole: int) -> MeanInterval:
+        if self.exact:
+            value = float(self.totals[0, part] / self.totals[0, whole])
+            return MeanInterval(value, value, value, 1)
+        return ratio(self.totals[:, part], self.totals[:, whole])
+
+    @cached_property
+    def aihtr(self) -> MeanInterval:
+        """Expected reward of an episode.
+
+        Most of its variance is that of two figures of the motion alone, whose means are known: it is taken out by
+        least squares (control variates).
+        """
+        count, reward = len(self.totals), self.totals[:, 0]
+        if self.exact:
+            return MeanInterval(float(reward[0]), float(reward[0]), float(reward[0]), 1)
+        columns = self.totals[:, [1, 6]] - self.totals[:, [1, 6]].mean(axis=0)
+        slope = np.linalg.lstsq(columns, reward, rcond=None)[0]
+        mean = float((reward - (self.totals[:, [1, 6]] - self.controls) @ slope).mean())
+        rest = reward - reward.mean() - columns @ slope
+        half = _HALF * math.sqrt(float((rest**2).sum()) / max(count - 3, 1) / count)
+        return MeanInterval(mean, mean - half, mean + half, count)
+
+    @property
+    def reward_per_step(self) -> MeanInterval:
+        """Reward per step of an episode, the last exit step included."""
+        return _times(self.aihtr, 1.0 / self.expected_length)
+
+    @property
+    def accuracy(self) -> MeanInterval:
+        """Detections per step of a target in the grid."""
+        return self._ratio(2, 1)
+
+    @property
+    def sensors_per_step(self) -> MeanInterval:
+        """Sensors on by choice per step."""
+        return self._ratio(3, 5)
+
+    @property
+    def safe_per_step(self) -> MeanInterval:
+        """Safe actions per step."""
+        return self._ratio(4, 5)
+
+    def card(self) -> Card:
+        """The figures with their intervals."""
+        about = "exact" if self.exact else f"{len(self.totals):,} simulated episodes, 95 %"
+        names = ("aihtr", "reward_per_step", "accuracy", "sensors_per_step", "safe_per_step")
+        facts = {name.replace("_", " "): with_ends(getattr(self, name)) for name in names}
+        facts["steps per episode"] = decimal(self.expected_length, 1)
+        return Card(
+            f"Evaluation of several targets: {about}", {"AIHTR": facts.pop("aihtr")} | facts
+        )
+
+
+def _times(found: MeanInterval, factor: float) -> MeanInterval:
+    low, high = (None if end is None else end * factor for end in (found.low, found.high))
+    return MeanInterval(found.mean * factor, low, high, found.n)
+
+
+def with_ends(found: MeanInterval) -> str:
+    """A figure and its interval."""
+    if found.low is None or found.high is None or found.low == found.high:
+        return decimal(found.mean, 4)
+    return f"{decimal(found.mean, 4)} ± {decimal((found.high - found.low) / 2, 4)}"
+
+
+def evaluate_group(
+    rule: Rule, *, width: float = 0.005, seed: int = 0, episodes: int | None = None
+) -> GroupEvaluation:
+    """Figures of a policy for several targets, exact where the joint chain is small.
+
+    Args:
+        rule: the policy.
+        width: half of the 95 % interval of the reward per step that is wanted.
+        seed: of the targets; the same for every policy.
+        episodes: simulate so many, in place of `width`, and never the chain.
+    """
+    group = rule.group
+    exact_steps = group.expected_steps, (group.target_steps, sum(known_rewards(rule)[1]))
+    if episodes is None and (exact := joint_chain(rule)) is not None:
+        return GroupEvaluation(exact, True, *exact_steps)
+    first = simulated(rule, min(episodes or _FIRST, _MOST), seed, "first")
+    found = GroupEvaluation(first, False, *exact_steps)
+    parts = [first]
+    while episodes is None and sum(map(len, parts)) < _MOST:
+        now = found.reward_per_step
+        assert now.low is not None
+        assert now.high is not None
+        half, count = (now.high - now.low) / 2, sum(map(len, parts))
+        if half <= width:
+            break
+        # A little more than the law of the square root asks for, so that few rounds are needed.
+        wanted = min(math.ceil(count * (1.05 * half / width) ** 2), 8 * count, _MOST)
+        parts.append(simulated(rule, max(wanted - count, 1), seed, f"more {len(parts)}"))
+        found = GroupEvaluation(np.concatenate(parts), False, *exact_steps)
+    return found
+
+
+def simulated(rule: Rule, episodes: int, seed: int, name: str) -> Array:
+    """`[E, 7]` totals of simulated episodes, as in `GroupEvaluation`."""
+    each = max(1, _AT_ONCE // len(rule.group))
+    begins = range(0, episodes, each)
+    batches = [min(each, episodes - begin) for begin in begins]
+    return np.concatenate(
+        [
+            _Batch(rule, count, derive(seed, "group", name, number)).totals()
+            for number, count in enumerate(batches)
+        ]
+    )
+
+
+def known_rewards(rule: Rule) -> tuple[Array, list[float]]:
+    """`[Z]` reward of the first set of a single target in each state; and for each target its sum over an episode."""
+    rewards, means = [], list[float]()
+    for world, table in zip(rule.group.kinds, rule.tables, strict=True):
+        assert table.sets is not None
+        first = sparse.csr_array(table.sets[:: world.num_choices], dtype=np.float64)
+        seen = world.kernel.multiply(first) @ world.detection
+        reward = world.reward * seen - (first @ world.paid) * world.stay_probability
+        rewards.append(reward)
+        means.append(float(accumulate(world.kernel, reward, grid_of(world)).mean()))
+    return np.concatenate(rewards), [means[kind] for kind in rule.group.kind]
+
+
+class _Batch:
+    """E episodes stepped together.
+
+    Args:
+        rule: the policy.
+        episodes: E.
+        seed: of all draws.
+    """
+
+    def __init__(self, rule: Rule, episodes: int, seed: int) -> None:
+        self.rule, self.group, self.task = rule, rule.group, rule.task
+        self.shape = (episodes, len(rule.group))
+        self.moves = np.random.default_rng(derive(seed, "motion"))
+        self.reports = np.random.default_rng(derive(seed, "reports"))
+        kernel = self.group.kernel
+        self.states, self.cells = kernel.shape[0], self.task.num_cells
+        # Sums of all rows, one after the other: the first of row z is at `sums[indptr[z]]`.
+        self.sums = np.concatenate([[0.0], np.cumsum(kernel.data)])
+        self.known = known_rewards(rule)[0]
+        self.clocks = self._start()
+        self.place = self.clocks.located
+
+    def _start(self) -> Clocks:
+        cell = np.random.default_rng(self.moves.integers(2**63)).integers(
+            self.cells, size=self.shape
+        )
+        located = cell + self.group.kind * self.cells
+        return Clocks(located, np.zeros(self.shape, np.int64), np.ones(self.shape, dtype=bool))
+
+    def totals(self) -> Array:
+        """`[E, 7]`."""
+        rows = np.arange(math.prod(self.shape))
+        beliefs, found = Beliefs.at(rows, self.place.ravel()), np.zeros((self.shape[0], 7))
+        while self.clocks.present.any():
+            moved = beliefs.moved(self.group)
+            found[:, 6] += (self.known[self.place] * self.clocks.present).sum(axis=1)
+            on = self.rule.sets(self.clocks, moved)
+            beliefs = self._step(moved, on, found)
+        return found
+
+    def _step(self, moved: Beliefs, on: IndexArray, found: Array) -> Beliefs:
+        """One step with the sensors `on`; adds to the totals, and returns the beliefs after it."""
+        task, clocks, shape = self.task, self.clocks, self.shape
+        before = clocks.present
+        forced: BoolArray = np.any(before & (clocks.misses > task.t_max), axis=1)
+        on = on[~forced[on // self.cells]]
+        self.place, present = self._moved(before)
+        episode = np.broadcast_to(np.arange(shape[0])[:, None], shape)
+        report = switched_on(on, episode * self.cells + self.place % self.cells)
+        if not task.perfect:
+            report &= self.reports.random(shape) < task.detection[self.place % self.cells]
+        seen = present & (report | forced[:, None])
+        self._add(found, on, seen, present, before, forced)
+        sees = switched_on(on, moved.row // shape[1] * self.cells + moved.state % self.cells)
+        missed = (present & ~seen).ravel()
+        chance = np.asarray(sees * task.detects(moved.state % self.cells), dtype=np.float64)
+        left = moved.given(missed, chance, missed.size)
+        located = np.where(seen, self.place, clocks.located)
+        self.clocks = Clocks(located, np.where(seen, 0, clocks.misses + 1), present)
+        again = np.flatnonzero(seen.ravel())
+        return left.joined(Beliefs.at(again, self.place.ravel()[again]), self.states)
+
+    def _moved(self, before: BoolArray) -> tuple[IndexArray, BoolArray]:
+        """Places after a move, and which targets are in the grid; every draw is made in every step."""
+        kernel = self.group.kernel
+        begin, end = kernel.indptr[self.place], kernel.indptr[self.place + 1]
+        wanted = self.sums[begin] + self.moves.random(self.shape)
+        entry = np.searchsorted(self.sums, wanted, side="right") - 1
+        present = before & (entry < end)
+        entry = np.clip(entry, begin, len(kernel.indices) - 1)
+        return np.where(present, kernel.indices[entry], self.place), present
+
+    def _add(
+        self,
+        found: Array,
+        on: IndexArray,
+        seen: BoolArray,
+        present: BoolArray,
+        before: BoolArray,
+        forced: BoolArray,
+    ) -> None:
+        task, count = self.task, self.shape[0]
+        any_left, episode = present.any(axis=1), on // self.cells
+        price = np.bincount(episode, task.paid[on % self.cells], count)
+        spent = np.where(forced, task.safe_cost, price) * any_left
+        detections = seen.sum(axis=1)
+        found[:, 0] += task.reward * detections - spent
+        found[:, 1] += present.sum(axis=1)
+        found[:, 2] += detections
+        found[:, 3] += np.bincount(episode, minlength=count) * any_left
+        found[:, 4] += forced & any_left
+        found[:, 5] += before.any(axis=1)

@@ -1,0 +1,132 @@
+"""Several targets in one grid that share its sensors (theory.md#several-targets)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+from trackmdp.errors import UserError
+from trackmdp.notebook.card import Card, Carded, grid_words
+from trackmdp.world.model import Array, Task, World
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Group(Carded):
+    """K independent, labelled targets: a reward for each detection, and sensors that are paid once.
+
+    The sensors that are on are paid once in a step while any target is in the grid. When any clock runs out, the safe
+    action takes their place: it locates all targets, and D is paid once. The tracker is shown which target a report is
+    of, and when one leaves the grid; the episode ends with the last one.
+
+    Args:
+        worlds: one for each target, alike but for the motion; the same object where targets move alike.
+
+    Raises:
+        UserError: they differ in more than the motion, or have modes, footprints, a window, a memory, `max_steps` or a
+            safe action that misses.
+    """
+
+    worlds: Sequence[World]
+
+    def __post_init__(self) -> None:
+        worlds = tuple(self.worlds)
+        if not worlds or not all(isinstance(world, World) for world in worlds):
+            raise UserError("Group: expected one World or more")
+        for number, world in enumerate(worlds):
+            if name := _of_one_target(world):
+                raise UserError(f"targets: {name}, expected none with several targets")
+            if not _alike(world, worlds[0]):
+                raise UserError(
+                    f"Group: target {number} has another grid, price or limit than target 0"
+                )
+        object.__setattr__(self, "worlds", worlds)  # the dataclass is frozen
+
+    def __len__(self) -> int:
+        return len(self.worlds)
+
+    @property
+    def task(self) -> Task:
+        """Grid, prices and limits, the same for all targets."""
+        return self.worlds[0].task
+
+    @cached_property
+    def kinds(self) -> tuple[World, ...]:
+        """The different motions, by their first target."""
+        return tuple({id(world): world for world in self.worlds}.values())
+
+    @cached_property
+    def kind(self) -> npt.NDArray[np.int64]:
+        """`[K]`, place of each target's motion in `kinds`."""
+        place = {id(world): number for number, world in enumerate(self.kinds)}
+        return np.array([place[id(world)] for world in self.worlds])
+
+    @cached_property
+    def kernel(self) -> sparse.csr_array:
+        """`[Z, Z]` moves of all kinds, one block after the other: state z of kind k is k · M + cell."""
+        return sparse.csr_array(sparse.block_diag([each.kernel for each in self.kinds], "csr"))
+
+    @cached_property
+    def stay_probability(self) -> Array:
+        """`[Z]`, of `kernel`."""
+        return np.concatenate([world.stay_probability for world in self.kinds])
+
+    @property
+    def expected_steps(self) -> float:
+        """Expected steps until the last target has left, starts uniform and independent; no policy changes it."""
+        return self._steps[0]
+
+    @property
+    def target_steps(self) -> float:
+        """Expected steps of all targets in the grid, each counted by itself."""
+        return self._steps[1]
+
+    @cached_property
+    def _steps(self) -> tuple[float, float]:
+        inside = [np.full(world.num_cells, 1.0 / world.num_cells) for world in self.kinds]
+        total, each, left = 0.0, 0.0, 1.0
+        while left > 1e-12 * max(total, 1.0):
+            # The step taken counts where any target was in the grid before it.
+            total += left
+            inside = [mass @ world.kernel for mass, world in zip(inside, self.kinds, strict=True)]
+            there = np.array([mass.sum() for mass in inside])[self.kind]
+            each += float(there.sum())
+            left = float(-np.expm1(np.log1p(-np.minimum(there, 1.0 - 1e-16)).sum()))
+        return total, each
+
+    def but(self, **changes: Any) -> Group:
+        """The same targets in a task that differs in `changes`."""
+        changed = [world.but(**changes) for world in self.kinds]
+        return Group(tuple(changed[kind] for kind in self.kind))
+
+    def card(self) -> Card:
+        """The card of the first target's world, and how many targets there are."""
+        task = self.task
+        motions = "all alike" if len(self.kinds) == 1 else f"{len(self.kinds)} motions"
+        facts = {"targets": f"{len(self)}, {motions}"} | task.facts()
+        return Card(f"Group: {grid_words(task.size)}", facts)
+
+
+def _of_one_target(world: World) -> str | None:
+    """A part of a world that several targets do not have; None where it has none."""
+    parts = {
+        f"modes={world.modes}": world.modes > 1,
+        "footprints": world.coverage is not None,
+        f"grid.window={world.window}": world.window is not None,
+        f"grid.max_steps={world.max_steps}": world.max_steps is not None,
+        f"task.memory={world.memory}": world.memory != "cell",
+        "a safe action that misses": not world.safe,
+    }
+    return next((name for name, there in parts.items() if there), None)
+
+
+def _alike(one: World, other: World) -> bool:
+    """Whether two worlds are the same task."""
+    names = ("size", "cost", "t_max", "safe_cost", "reward", "detection", "budget")
+    pairs = [(getattr(one, name), getattr(other, name)) for name in names]
+    return all(np.array_equal(a, b, equal_nan=isinstance(a, np.ndarray)) for a, b in pairs)
