@@ -198,3 +198,40 @@ def test_commands_solve_and_evaluate_with_several_targets(tmp_path: Path) -> Non
     valued = json.loads((tmp_path / "b" / "evaluation.json").read_text(encoding="utf-8"))
     assert solved["lower"] <= valued["figures"]["aihtr"]["mean"] <= solved["upper"]
     assert valued["exact"] is True
+
+
+def test_a_tracker_follows_targets_as_the_simulation_does() -> None:
+    group = tm.make_world("random_walk", size=4, targets=2, exit_probability=0.1)
+    found = solve(group)
+    tracker = found.tracker([0, 5])
+    seen = Clocks(np.array([[0, 5]]), np.zeros((1, 2), np.int64), np.ones((1, 2), dtype=bool))
+    moved = Beliefs.at(np.arange(2), np.array([0, 5])).moved(group)
+    assert tracker.sensors() == found.policy.sets(seen, moved).tolist()
+    tracker.report([1, 9])
+    with pytest.raises(UserError, match="target 0 is missed where it would have been detected"):
+        tracker.report([None, 9])
+    tracker.report([1, None], gone=[1])
+    assert tracker.present == [True, False]
+    alone = Policy.from_table(found.tables[0]).sensors(1, 0)
+    assert tracker.sensors() == alone
+    for cells in ([None, 3], [99, None], [1]):
+        with pytest.raises(UserError, match="report"):
+            tracker.report(cells)
+    tracker.report([None, None], gone=[0])
+    assert tracker.sensors() == []
+    assert not tracker.safe
+
+
+def test_a_tracker_asks_for_the_safe_action_when_a_clock_runs_out() -> None:
+    world = World(np.array([[0.5, 0.4], [0.4, 0.5]]), (1, 2), cost=5.0, t_max=0, safe_cost=10.0)
+    tracker = solve(Group([world] * 2)).tracker([0, 1])
+    assert tracker.sensors() == []
+    tracker.report([None, None])
+    assert tracker.safe
+    assert tracker.sensors() == [0, 1]
+    with pytest.raises(UserError, match="missed where it would"):
+        tracker.report([None, 0])
+    tracker.report([1, 0])
+    assert tracker.misses == [0, 0]
+    with pytest.raises(UserError, match=r"cells=\[0, 2\]: expected 2, each from 0 to 1"):
+        solve(Group([world] * 2)).tracker([0, 2])

@@ -136,6 +136,7 @@ class EvaluateConfig(WorldConfig):
             given = "neither" if self.run is None else "both"
             raise UserError(f"expected exactly one of run=FOLDER and baseline=NAME, got {given}")
         if self.targets.count > 1:
+            # An episode in a log is of one target, and plans that draw have no belief to merge.
             several = f"with targets.count={self.targets.count}"
             if self.log:
                 raise refuse("log", listed(self.log), f"[] {several}")
@@ -143,6 +144,11 @@ class EvaluateConfig(WorldConfig):
                 raise refuse("baseline", self.baseline.name, f"one that does not draw {several}")
         if not all(node.episodes_only for node in self.log.values()):
             raise refuse("log", listed(self.log), "[mcap] or []; an evaluation has no iterations")
+
+    def ignored(self, root: Any) -> dict[str, str]:
+        """Of several targets as many episodes are simulated as `evaluation.width` asks for."""
+        why = f"with targets.count={self.targets.count}, where evaluation.width is met"
+        return {"episodes": why} if self.targets.count > 1 else {}
 
 
 class CompareConfig(WorldConfig):

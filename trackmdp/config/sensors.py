@@ -85,6 +85,7 @@ def _check_budget(key: str, budget: int, root: Any) -> None:
             known = [name for name, schema in GROUPS[group].items() if schema.knows_budget]
             expected = f"one of {', '.join(known)}" if known else f"{key}=null"
             raise refuse(group, planner.name, f"{expected} with {key}={budget}")
+    # Blocks settle what they share by trees, which decide on one cell at a time.
     partition = getattr(root, "partition", None)
     if root.any_number or (partition is not None and partition.block is not None):
         raise refuse(key, budget, "null here, where any number of sensors is on")
@@ -97,6 +98,7 @@ def _check_mean(key: str, cost: PaperCostConfig, root: Any) -> None:
         UserError: another command than solve, another solver than optimal, prices that differ, or a second budget.
     """
     partition = getattr(root, "partition", None)
+    # The price is the multiplier of the budget: the edge of the frontier has one only where all prices are alike.
     at_once = partition is not None and partition.block is None
     if not (at_once and getattr(getattr(root, "solver", None), "name", "") == "optimal"):
         raise refuse(key, cost.mean_budget, "null but for solve with solver=optimal in one block")

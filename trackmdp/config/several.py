@@ -21,6 +21,7 @@ class TargetsConfig(NodeConfig):
         """Several targets are followed in whole episodes, each by the cell of its last detection."""
         if self.count == 1:
             return
+        # Each of these makes a single target's plan depend on more than its own cell and clock.
         with_several = f"with {key}.count={self.count}"
         kernel = root.kernel
         if not kernel.is_motion or kernel.hides:

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from trackmdp.config.baselines import BaselineConfig
-from trackmdp.config.by_blocks import SweptPartitionConfig
 from trackmdp.notebook.card import Card, Carded, decimal, grid_words
 from trackmdp.policies.table import PolicyTable
-from trackmdp.solvers.group_bounds import upper_bound
+from trackmdp.solvers.group_tracker import GroupTracker
 from trackmdp.solvers.merging import Merged
-from trackmdp.solvers.solution import SearchProgress, Solution
-from trackmdp.solvers.solve import run_solver
+from trackmdp.solvers.solution import Solution
 from trackmdp.world.group import Group
 
 
@@ -46,6 +42,10 @@ class GroupSolution(Carded):
         """The policy that adds up the gains of all targets."""
         return Merged(self.group, self.tables)
 
+    def tracker(self, cells: Sequence[int]) -> GroupTracker:
+        """A tracker that follows targets located in `cells`, one for each, with `policy`."""
+        return GroupTracker(self.policy, cells)
+
     @property
     def apart(self) -> float:
         """AIHTR of as many separate trackers, each with sensors of its own."""
@@ -74,16 +74,3 @@ class GroupSolution(Carded):
             "seconds": f"{self.seconds:.2g}",
         }
         return Card(f"Solution for several targets: {grid_words(self.group.task.size)}", facts)
-
-
-def solve_group(
-    group: Group,
-    choice: BaselineConfig,
-    on_progress: Callable[[SearchProgress], None] | None = None,
-    partition: SweptPartitionConfig | None = None,
-) -> GroupSolution:
-    """Plans of single targets by a config's solver, and the bound for all of them together."""
-    started = time.monotonic()
-    singles = tuple(run_solver(world, choice, on_progress, partition) for world in group.kinds)
-    upper = upper_bound(group)
-    return GroupSolution(group, singles, upper, time.monotonic() - started)

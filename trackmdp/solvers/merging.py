@@ -21,7 +21,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
@@ -239,7 +238,7 @@ def make_rule(group: Group, tables: Sequence[PolicyTable], merge: str = "gains")
     return kinds[merge](group, tables)
 
 
-def switched_on(sets: IndexArray, codes: npt.NDArray[np.int64]) -> BoolArray:
+def switched_on(sets: IndexArray, codes: IndexArray) -> BoolArray:
     """Whether each of `codes` is among the sorted numbers `sets`."""
     if not len(sets):
         return np.zeros(len(codes), dtype=bool)

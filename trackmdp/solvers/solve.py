@@ -15,6 +15,8 @@ from trackmdp.config.compose import compose, default, given
 from trackmdp.config.registry import make, maker
 from trackmdp.errors import UserError
 from trackmdp.policies.table import PolicyTable
+from trackmdp.solvers.group_bounds import upper_bound
+from trackmdp.solvers.group_solution import GroupSolution
 from trackmdp.solvers.partition import blocks, narrow_halo, plan_by_blocks
 from trackmdp.solvers.regions import settled
 from trackmdp.solvers.solution import SearchProgress, Solution, bracketed
@@ -25,7 +27,6 @@ from trackmdp.world.tracks import Problem, check_problem, modelled
 
 if TYPE_CHECKING:  # torch is loaded where a policy is to act
     from trackmdp.policies.policy import Policy
-    from trackmdp.solvers.group_solution import GroupSolution
 
 _SWEEPS = 10
 """Rounds over the whole grid after the blocks, at most: two or three change anything."""
@@ -88,8 +89,6 @@ def solve(
         named | own | given({f"partition.{name}": value for name, value in of_blocks.items()}),
     )
     if isinstance(world, Group):
-        from trackmdp.solvers.group_solution import solve_group
-
         return solve_group(world, cfg.solver, on_progress, cfg.partition)
     solution = run_solver(world, cfg.solver, on_progress, cfg.partition)
     said = narrow_halo(world, cfg.partition, solution.upper, solution.evaluation)
@@ -132,6 +131,19 @@ def run_solver(
     return (
         made if isinstance(made, Solution) else bracketed(world, made, time.monotonic() - started)
     )
+
+
+def solve_group(
+    group: Group,
+    choice: BaselineConfig,
+    on_progress: Callable[[SearchProgress], None] | None = None,
+    partition: SweptPartitionConfig | None = None,
+) -> GroupSolution:
+    """Plans of single targets by a config's solver, and the bound for all of them together."""
+    started = time.monotonic()
+    singles = tuple(run_solver(world, choice, on_progress, partition) for world in group.kinds)
+    upper = upper_bound(group)
+    return GroupSolution(group, singles, upper, time.monotonic() - started)
 
 
 def _modes(world: World, choice: BaselineConfig, start: PolicyTable | None) -> Solution:

@@ -41,7 +41,7 @@ from trackmdp.world.tracks import Problem, Recorded, Tracks, check_problem
 
 if TYPE_CHECKING:  # torch is loaded where something that acts is asked for its sets
     from trackmdp.policies.policy import PolicyLike
-    from trackmdp.solvers.group_value import GroupEvaluation
+    from trackmdp.solvers.group_figures import GroupEvaluation
 
 KEYED_DIRECT = 700
 """Events of several keys or modes a cell up to which their system is factorised, as a full matrix: each leads to all

@@ -17,6 +17,9 @@ from torchrl.envs import EnvBase
 from trackmdp.errors import UserError
 from trackmdp.world.actions import checked_action
 from trackmdp.world.dynamics import FLAGS, State
+from trackmdp.world.group import Group
+from trackmdp.world.group_tracking import GroupTracking
+from trackmdp.world.model import Task
 from trackmdp.world.render import picture
 from trackmdp.world.tracking import Snapshot, Tracking
 from trackmdp.world.tracks import Problem, check_problem
@@ -58,8 +61,12 @@ class TrackEnv(EnvBase):
     those remembered included, are in the local numbers of `Window`, as seen from `last_cell`: a sensor farther away
     cannot be chosen, and one outside the grid costs and senses nothing.
 
+    Of a `Group` of K targets `last_cell` and `steps_since_detection` are `[*B, K]`, with `present` `[*B, K]` bool,
+    which are in the grid; and `action_history` `[*B, t_max+1, S]` holds the last actions, the latest first, since the
+    last safe action, which locates all targets. The episode ends when the last target has left.
+
     Args:
-        world: the task and the target's motion, or recorded tracks.
+        world: the task and the target's motion, recorded tracks, or a group of targets.
         batch_size: B, a number of targets or their shape: `8`, `(4, 2)`, or `()` for a single one.
         seed: seed of the run; the generators' names begin with `stream`.
         stream: name that keeps this environment's draws apart from all others.
@@ -77,28 +84,34 @@ class TrackEnv(EnvBase):
 
     def __init__(
         self,
-        world: Problem,
+        world: Problem | Group,
         batch_size: int | Sequence[int] = (),
         *,
         seed: int = 0,
         stream: str = "world",
         device: torch.device | str = "cpu",
     ) -> None:
-        check_problem(world, "TrackEnv")
+        if not isinstance(world, Group):
+            check_problem(world, "TrackEnv")
         # A reset leaves no row done. Without the option TorchRL 0.14.1 looks whether one is after each reset, with an
         # `if` on a tensor (`_reset_check_done`), which no graph of `torch.compile` can hold.
         super().__init__(
             device=torch.device(device), batch_size=_shape(batch_size), allow_done_after_reset=True
         )
-        self.num_envs, self.max_steps = self.batch_size.numel(), world.max_steps
-        self.num_cells, self.num_sensors = world.num_cells, world.num_sensors
-        self.t_max, self._grid, self._stream = world.t_max, world.size, stream
-        self._budget = world.budget
-        self._tracking = Tracking(world, self.num_envs, self.device)
+        task: Task = world.task if isinstance(world, Group) else world
+        self.num_envs, self.max_steps = self.batch_size.numel(), task.max_steps
+        self.num_cells, self.num_sensors = task.num_cells, task.num_sensors
+        self.t_max, self._grid, self._stream = task.t_max, task.size, stream
+        self._budget, self._targets = task.budget, (len(world),) if isinstance(world, Group) else ()
+        self._tracking: Tracking | GroupTracking
+        if isinstance(world, Group):
+            self._tracking = GroupTracking(world, self.num_envs, self.device)
+        else:
+            self._tracking = Tracking(world, self.num_envs, self.device)
         none = (len(FLAGS), self.num_envs, 1)
         self._none = torch.zeros(none, dtype=torch.bool, device=self.device)
         self._action_shape = (*self.batch_size, self.num_sensors)
-        self._make_specs(world)
+        self._make_specs(task)
         self._set_seed(seed)
 
     def __repr__(self) -> str:
@@ -108,11 +121,11 @@ class TrackEnv(EnvBase):
 
     @property
     def target(self) -> Tensor:
-        """`[*B]` int64, the true cell, M once exited; for logs and tests, no policy is shown it."""
-        return self._now.target().reshape(self.batch_size)
+        """`[*B]` int64, of a group `[*B, K]`: the true cell, M once exited; for logs and tests, not for policies."""
+        return self._now.target().reshape(*self.batch_size, *self._targets)
 
     @property
-    def _now(self) -> Tracking:
+    def _now(self) -> Tracking | GroupTracking:
         if not self._tracking.state:
             raise UserError("TrackEnv: a step before the first reset, expected env.reset()")
         return self._tracking
@@ -131,15 +144,19 @@ class TrackEnv(EnvBase):
             raise UserError(
                 f"render({mode!r}, {row}): expected rgb_array or text, a row of 0 ... {self.num_envs - 1}"
             )
-        now, on = self._now, self._now.covered(row).cpu().numpy()
+        now = self._now
+        if isinstance(now, GroupTracking):
+            raise UserError(f"render: {now.targets} targets, expected a world of one")
+        on = now.covered(row).cpu().numpy()
         found = not now.state["steps_since_detection"][row]
         return picture(mode, self._grid, int(now.target()[row]), on, found=found)
 
-    def _make_specs(self, world: Problem) -> None:
+    def _make_specs(self, world: Task) -> None:
         b, k, choices = self.batch_size, self.num_sensors, self.t_max + 1
 
         def numbers(count: int) -> Categorical:
-            return Categorical(count, shape=b, dtype=torch.int64, device=self.device)
+            shape = torch.Size((*b, *self._targets))
+            return Categorical(count, shape=shape, dtype=torch.int64, device=self.device)
 
         def bits(*shape: int) -> Binary:
             return Binary(shape=(*b, *shape), dtype=torch.bool, device=self.device)
@@ -150,11 +167,13 @@ class TrackEnv(EnvBase):
             "steps_since_detection": numbers(choices + 1),
             "action_history": bits(choices, k),
         }
+        if self._targets:
+            observed["present"] = bits(*self._targets)
         if world.keyed:
             observed["key"] = numbers(world.num_keys)
         if self.max_steps:
             observed["step_count"] = numbers(self.max_steps + 1)
-        if self._tracking.dynamics.mask.observed:
+        if self._tracking.masked:
             observed["action_mask"] = bits(k)
         self.observation_spec = Composite(observed, shape=b)
         self.action_spec = bits(k)

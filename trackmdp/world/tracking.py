@@ -42,6 +42,11 @@ class Tracking:
         self._acted: tuple[Tensor, Tensor, Tensor] | None = None
         self._begun: list[Tensor] = []
 
+    @property
+    def masked(self) -> bool:
+        """Whether `action_mask` is observed."""
+        return self.dynamics.mask.observed
+
     def seed(self, seed: int, stream: str) -> None:
         """Start the generators anew; their names begin with `stream`."""
         self._targets.seed(seed, stream)

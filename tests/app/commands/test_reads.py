@@ -58,9 +58,14 @@ def test_collectors_with_workers_read_every_option(collector: str, tmp_path: Pat
 
 @pytest.mark.parametrize("baseline", BASELINES)
 def test_evaluate_reads_every_option(baseline: str, tmp_path: Path) -> None:
-    assert not never_read(
-        "evaluate", f"baseline={baseline} grid.size=3 quiet=true episodes=10", tmp_path
-    )
+    # Those of several targets are read with them alone.
+    words = f"baseline={baseline} grid.size=3 quiet=true episodes=10"
+    assert never_read("evaluate", words, tmp_path) == {"targets.merge", "evaluation.width"}
+
+
+def test_evaluate_reads_the_options_of_several_targets(tmp_path: Path) -> None:
+    words = "baseline=qmdp grid.size=3 grid.t_max=0 quiet=true targets.count=2"
+    assert never_read("evaluate", words, tmp_path) == {"episodes"}
 
 
 @pytest.mark.parametrize("solver", GROUPS["solver"])

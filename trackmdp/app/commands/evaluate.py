@@ -34,7 +34,8 @@ from trackmdp.policies.saved import sets_name, write_sets
 from trackmdp.reports.held_out import recorded_page
 from trackmdp.solvers import bounds
 from trackmdp.solvers.group_bounds import upper_bound
-from trackmdp.solvers.group_value import evaluate_group, with_ends
+from trackmdp.solvers.group_figures import with_ends
+from trackmdp.solvers.group_value import evaluate_group
 from trackmdp.solvers.merging import make_rule
 from trackmdp.solvers.solve import baseline_policy
 from trackmdp.solvers.value import evaluate

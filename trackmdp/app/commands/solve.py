@@ -17,12 +17,11 @@ from trackmdp.signals import handled, stop
 from trackmdp.solvers import bounds, rules
 from trackmdp.solvers.evaluation import regret_per_step
 from trackmdp.solvers.frontier import trace
-from trackmdp.solvers.group_solution import solve_group
 from trackmdp.solvers.hidden import averaged
 from trackmdp.solvers.linear import DIRECT_CELLS
 from trackmdp.solvers.partition import narrow_halo
 from trackmdp.solvers.solution import SearchProgress, Solution
-from trackmdp.solvers.solve import run_solver
+from trackmdp.solvers.solve import run_solver, solve_group
 from trackmdp.solvers.value import evaluate
 from trackmdp.training.display import make_console, reporting, table
 from trackmdp.training.evaluator import figures

@@ -1,0 +1,100 @@
+"""The figures of a policy for several targets, exact or with intervals."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from trackmdp.notebook.card import Card, Carded, decimal
+from trackmdp.statistics import MeanInterval, ratio
+from trackmdp.world.model import Array
+
+_HALF = 1.96
+"""Of a 95 % interval, in standard errors; there are many episodes."""
+
+
+@dataclass(frozen=True, repr=False)
+class GroupEvaluation(Carded):
+    """Figures of a policy for several targets.
+
+    Attributes:
+        totals: `[E, 7]` of simulated episodes: reward, steps of targets in the grid, detections, sensors on by choice,
+            safe actions, steps of the episode, reward of single targets that are always known (`known_rewards`); or
+            one row of exact expectations of the first six.
+        exact: whether they are exact.
+        expected_length: steps until the last target has left, exact.
+        controls: exact means of the second and of the last column.
+    """
+
+    totals: Array
+    exact: bool
+    expected_length: float
+    controls: tuple[float, float]
+
+    def _ratio(self, part: int, whole: int) -> MeanInterval:
+        if self.exact:
+            value = float(self.totals[0, part] / self.totals[0, whole])
+            return MeanInterval(value, value, value, 1)
+        return ratio(self.totals[:, part], self.totals[:, whole])
+
+    @cached_property
+    def aihtr(self) -> MeanInterval:
+        """Expected reward of an episode.
+
+        Most of its variance is that of two figures of the motion alone, whose means are known: it is taken out by
+        least squares (control variates).
+        """
+        count, reward = len(self.totals), self.totals[:, 0]
+        if self.exact:
+            return MeanInterval(float(reward[0]), float(reward[0]), float(reward[0]), 1)
+        columns = self.totals[:, [1, 6]] - self.totals[:, [1, 6]].mean(axis=0)
+        slope = np.linalg.lstsq(columns, reward, rcond=None)[0]
+        mean = float((reward - (self.totals[:, [1, 6]] - self.controls) @ slope).mean())
+        rest = reward - reward.mean() - columns @ slope
+        half = _HALF * math.sqrt(float((rest**2).sum()) / max(count - 3, 1) / count)
+        return MeanInterval(mean, mean - half, mean + half, count)
+
+    @property
+    def reward_per_step(self) -> MeanInterval:
+        """Reward per step of an episode, the last exit step included."""
+        return _times(self.aihtr, 1.0 / self.expected_length)
+
+    @property
+    def accuracy(self) -> MeanInterval:
+        """Detections per step of a target in the grid."""
+        return self._ratio(2, 1)
+
+    @property
+    def sensors_per_step(self) -> MeanInterval:
+        """Sensors on by choice per step."""
+        return self._ratio(3, 5)
+
+    @property
+    def safe_per_step(self) -> MeanInterval:
+        """Safe actions per step."""
+        return self._ratio(4, 5)
+
+    def card(self) -> Card:
+        """The figures with their intervals."""
+        about = "exact" if self.exact else f"{len(self.totals):,} simulated episodes, 95 %"
+        names = ("aihtr", "reward_per_step", "accuracy", "sensors_per_step", "safe_per_step")
+        facts = {name.replace("_", " "): with_ends(getattr(self, name)) for name in names}
+        facts["steps per episode"] = decimal(self.expected_length, 1)
+        return Card(
+            f"Evaluation of several targets: {about}", {"AIHTR": facts.pop("aihtr")} | facts
+        )
+
+
+def _times(found: MeanInterval, factor: float) -> MeanInterval:
+    low, high = (None if end is None else end * factor for end in (found.low, found.high))
+    return MeanInterval(found.mean * factor, low, high, found.n)
+
+
+def with_ends(found: MeanInterval) -> str:
+    """A figure and its interval."""
+    if found.low is None or found.high is None or found.low == found.high:
+        return decimal(found.mean, 4)
+    return f"{decimal(found.mean, 4)} ± {decimal((found.high - found.low) / 2, 4)}"
