@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -86,6 +88,19 @@ def test_an_array_of_prices_is_nan_where_there_is_no_sensor(shape: tuple[int, ..
     world = make_world("random_walk", size=3, cost=prices.reshape(shape))
     assert np.flatnonzero(np.isnan(world.cost)).tolist() == [0, 7]
     assert world.safe_cost == pytest.approx(3.5)
+
+
+@pytest.mark.parametrize("name", ["a.csv", "a.npy"])
+def test_a_file_of_prices_is_nan_where_there_is_no_sensor(name: str, tmp_path: Path) -> None:
+    prices = np.full((3, 3), 0.5)
+    prices[0, 0] = prices[2, 1] = np.nan
+    if name.endswith("npy"):
+        np.save(tmp_path / name, prices)
+    else:
+        np.savetxt(tmp_path / name, prices, delimiter=",")
+    world = make_world("random_walk", size=3, cost=str(tmp_path / name))
+    assert np.flatnonzero(np.isnan(world.cost)).tolist() == [0, 7]
+    assert world.available.tolist() == [not np.isnan(each) for each in prices.flat]
 
 
 @pytest.mark.parametrize("name", ["cost", "detection"])
