@@ -287,6 +287,31 @@ def test_tokens_and_comments_are_counted() -> None:
     )
 
 
+def long_functions(tree: ast.AST) -> list[str]:
+    """Names of functions of more than 40 lines, not counting the docstring."""
+
+    def lines(node: ast.FunctionDef) -> int:
+        """A docstring is the first statement."""
+        first = node.body[0] if ast.get_docstring(node) is not None else None
+        docstring = 0 if first is None else (first.end_lineno or 0) - first.lineno + 1
+        return (node.end_lineno or 0) - node.lineno + 1 - docstring
+
+    functions = (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))
+    return [node.name for node in functions if lines(node) > 40]
+
+
+def test_functions_are_short() -> None:
+    found = {module: long_functions(tree) for module, tree in trees().items()}
+    known = {"trackmdp.algos.hindsight_loss", "trackmdp.algos.estimates.path_plans"}
+    assert {module for module, names in found.items() if names} <= known
+
+
+def test_long_functions_are_seen_and_docstrings_not_counted() -> None:
+    long = 'def f():\n    """A\n\n    B.\n    """\n' + "    x = 1\n" * 39
+    assert long_functions(ast.parse(long)) == []
+    assert long_functions(ast.parse(long + "    x = 1\n")) == ["f"]
+
+
 def test_every_package_says_why() -> None:
     """At least 4 comments per 1,000 tokens of code."""
     code, comments = Counter[str](), Counter[str]()

@@ -119,15 +119,7 @@ def _sweep(compose: Composer) -> int:
     from trackmdp.training.display import make_console
 
     command, words = compose.command, run_words(compose.words)
-    for word in words:
-        parsed(word)  # here the message names the word, later `hydra.sweep.dir`
-    if given := next(
-        (word for word in compose.words if word.startswith("hydra.sweep.subdir=")), None
-    ):
-        raise UserError(f"{given}: without effect, a run's folder has the name of its options")
-    # Hydra refuses words with several values outside its own multirun; options of the sweep as a whole have one
-    # value.
-    cfg = compose([word for word in compose.words if not _has_values(word)])
+    cfg = _of_all_runs(compose, words)
     # Now, so that a missing package is reported before anything is planned or written.
     sweeper, launcher = (
         _plugin("sweeper", cfg.hydra.sweeper),
@@ -156,6 +148,18 @@ def _sweep(compose: Composer) -> int:
         return sweep(place, command, line, batches, launch_jobs, console)
     finally:
         remove_if_empty(made)
+
+
+def _of_all_runs(compose: Composer, words: Sequence[str]) -> Any:
+    """The config of the words that all runs have in common."""
+    for word in words:
+        parsed(word)  # here the message names the word, later `hydra.sweep.dir`
+    for word in compose.words:
+        if word.startswith("hydra.sweep.subdir="):
+            raise UserError(f"{word}: without effect, a run's folder has the name of its options")
+    # Hydra refuses words with several values outside its own multirun; options of the sweep as a whole have one
+    # value.
+    return compose([word for word in compose.words if not _has_values(word)])
 
 
 def _plugin(part: str, node: DictConfig) -> Any:

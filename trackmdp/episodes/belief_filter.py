@@ -5,7 +5,7 @@ The belief along episodes is computed after the simulation, for displays and log
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -78,23 +78,17 @@ def beliefs(world: World, episodes: Sequence[Episode]) -> list[Floats]:
     told = world.tells_all
     lengths = torch.tensor([len(episode) for episode in episodes])
     first = lengths.cumsum(0) - lengths
-    action = torch.as_tensor(np.concatenate([_reported(world, episode) for episode in episodes]))
-    target = torch.as_tensor(np.concatenate([episode.target for episode in episodes]))
-    located = torch.as_tensor(np.concatenate([episode.located for episode in episodes]))
+    action = _stacked(_reported(world, episode) for episode in episodes)
+    target = _stacked(episode.target for episode in episodes)
+    located = _stacked(episode.located for episode in episodes)
     # 0 where targets have none
-    mode = torch.as_tensor(
-        np.concatenate([0 * each.target if each.mode is None else each.mode for each in episodes])
-    )
+    mode = _stacked(0 * each.target if each.mode is None else each.mode for each in episodes)
     found = torch.zeros(len(target), world.num_cells)
-    start, first_mode = (
-        torch.tensor([getattr(each, name) for each in episodes]) for name in ("start", "start_mode")
-    )
-    # Where the mode is hidden, any of the cell's is as likely at the start.
-    belief = (
-        exact.detect(start * modes + first_mode)
-        if told
-        else (cell == start[:, None]).double() / modes
-    )
+    start = torch.tensor([each.start for each in episodes])
+    if told:
+        belief = exact.detect(start * modes + torch.tensor([each.start_mode for each in episodes]))
+    else:  # any mode of the cell is as likely at the start
+        belief = (cell == start[:, None]).double() / modes
     rows = torch.arange(len(episodes))
     for t in range(int(lengths.max())):
         # Episodes that have ended leave the batch, `rows` says which ones the rows of `belief` belong to.
@@ -112,6 +106,10 @@ def beliefs(world: World, episodes: Sequence[Episode]) -> list[Floats]:
         missed = exact.miss(predicted, action[step].repeat_interleave(modes, -1))
         belief = torch.where(located[step, None], seen, missed)
     return [part.numpy() for part in found.split(lengths.tolist())]
+
+
+def _stacked(parts: Iterable[npt.NDArray[Any]]) -> Tensor:
+    return torch.as_tensor(np.concatenate([*parts]))
 
 
 def _reported(world: Task, episode: Episode) -> npt.NDArray[Any]:

@@ -8,6 +8,7 @@ from dataclasses import astuple
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from trackmdp.paper import calibration
 from trackmdp.paper.calibration import DRAWS, Candidate, Openings, Setting, Spread, chosen
@@ -15,8 +16,9 @@ from trackmdp.paper.check import Check
 from trackmdp.paper.worlds import COSTS, PRINTED_QMDP, PRINTED_TMDP, SUPPORTS, pairs
 from trackmdp.reports.grouping import Study
 from trackmdp.reports.page import Part, Section
-from trackmdp.reports.style import INK, LOOKS, Canvas, Figure, draw_figure, legend, tidy
+from trackmdp.reports.style import INK, LOOKS, Axes, Canvas, Figure, draw_figure, legend, tidy
 from trackmdp.reports.tables import Cell, Column, Table, paragraphs
+from trackmdp.world.model import Array
 
 # One colour per Z through all figures of this part; they are those of methods, which do not occur here.
 COLOURS = dict(zip(SUPPORTS, (LOOKS[0], LOOKS[2], LOOKS[1]), strict=True))
@@ -142,27 +144,15 @@ def _ranges(
         axes = figure.subplots()
         # The three Z of a setting stand in one row, a little apart.
         for offset, support_size in zip((-0.24, 0.0, 0.24), COLOURS, strict=True):
-            look = COLOURS[support_size]
-            middle, low, high = np.array(
-                [astuple(of(s)) for s in settings if s.support_size == support_size]
-            ).T
-            # `[2, settings]`, lengths below and above the median. The range, not a confidence interval: how far the
-            # draw of the kernel moves a figure.
-            bars, y = np.stack([middle - low, high - middle]), np.arange(len(rows)) + offset
-            points: Any = {
-                "fmt": look.marker,
-                "color": look.colour,
-                "markersize": 3.5,
-                "elinewidth": 1.2,
-            }
-            axes.errorbar(middle, y, xerr=bars, label=f"Z = {support_size}", **points)
+            spreads = [astuple(of(s)) for s in settings if s.support_size == support_size]
+            _draw_range(axes, np.array(spreads).T, np.arange(len(rows)) + offset, support_size)
             if printed:
-                axes.axvline(
-                    PRINTED_QMDP[support_size, COSTS[0]],
-                    color=look.colour,
-                    linewidth=0.8,
-                    linestyle=":",
-                )
+                look: Any = {
+                    "color": COLOURS[support_size].colour,
+                    "linewidth": 0.8,
+                    "linestyle": ":",
+                }
+                axes.axvline(PRINTED_QMDP[support_size, COSTS[0]], **look)
         axes.set_yticks(range(len(rows)), [f"{border}, T_max {t_max}" for border, t_max in rows])
         # The first setting on top, as in the table.
         axes.invert_yaxis()
@@ -173,19 +163,23 @@ def _ranges(
     under = f"under the paper's unstated settings, c = {settings[0].cost:g}"
     dotted = "; dotted: the printed values" if printed else ""
     title = f"{label} {under}: median and range, n = {len(DRAWS)} draws{dotted}"
-    columns = [
-        Column("border"),
-        Column("T_max"),
-        Column("Z"),
-        Column("median", 2),
-        Column("low", 2),
-        Column("high", 2),
-    ]
+    columns = [Column(each) for each in ("border", "T_max", "Z")]
+    columns += [Column(each, 2) for each in ("median", "low", "high")]
     numbers: list[list[Cell]] = [
         [s.border, s.t_max, s.support_size, *astuple(of(s))] for s in settings
     ]
     table = Table(f"sensitivity-{name}", title, columns, numbers)
     return draw_figure(title, table, 4.2, paint)
+
+
+def _draw_range(axes: Axes, spread: Array, y: ArrayLike, support_size: int) -> None:
+    """Medians with their ranges, `spread` `[3, settings]`, at the heights `y`."""
+    look, (middle, low, high) = COLOURS[support_size], spread
+    # `[2, settings]`, lengths below and above the median. The range, not a confidence interval: how far the draw of
+    # the kernel moves a figure.
+    bars = np.stack([middle - low, high - middle])
+    points: Any = {"fmt": look.marker, "color": look.colour, "markersize": 3.5, "elinewidth": 1.2}
+    axes.errorbar(middle, y, xerr=bars, label=f"Z = {support_size}", **points)
 
 
 def sections(study: Study, openings: Openings) -> list[Section]:

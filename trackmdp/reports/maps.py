@@ -66,28 +66,28 @@ def policy_map(name: str, drawn: Mapped) -> Figure:
             _draw_tiles(axes, sensed[n], possible[n], drawn.size, max(reach, 1))
             axes.set_title(_AFTER[n])
 
-    rows: list[list[Cell]] = [
-        [
-            x,
-            n,
-            float(sets[n][x].sum()),
-            int(possible[n][x].sum()),
-            _cells_text(sets[n][x], drawn.size),
-        ]
-        for x in range(len(drawn.value))
-        for n in shown
-        if possible[n][x].any()
-    ]
-    digits = 2 if drawn.averaged else 0
-    columns = [Column("located in cell"), Column("misses n"), Column("cells sensed", digits)]
-    columns += [Column("possible cells"), Column("which (row.column)")]
     if drawn.averaged:
         title += (
             "; filled areas are shares of the detections in a cell, since plans differ by memory"
         )
-    return draw_figure(
-        title, Table(f"sets-{name}", title, columns, rows), 0.4 + 3.9 * len(shown), paint
-    )
+    table = _table_of_sets(f"sets-{name}", title, drawn, sets, possible)
+    return draw_figure(title, table, 0.4 + 3.9 * len(shown), paint)
+
+
+def _table_of_sets(
+    name: str, title: str, drawn: Mapped, sets: Sequence[Array], possible: Sequence[BoolArray]
+) -> Table:
+    """A row for each located cell and number of misses that can happen."""
+    rows: list[list[Cell]] = [
+        [x, n, float(on[x].sum()), int(can[x].sum()), _cells_text(on[x], drawn.size)]
+        for x in range(len(drawn.value))
+        for n, (on, can) in enumerate(zip(sets, possible, strict=False))
+        if can[x].any()
+    ]
+    digits = 2 if drawn.averaged else 0
+    columns = [Column("located in cell"), Column("misses n"), Column("cells sensed", digits)]
+    columns += [Column("possible cells"), Column("which (row.column)")]
+    return Table(name, title, columns, rows)
 
 
 def missing(drawn: Sequence[Mapped]) -> _Tiles:

@@ -44,20 +44,7 @@ def trials(
     Raises:
         UserError: there is nothing to search, or the study is one of another search.
     """
-    read = [parsed(word) for word in words]
-    searched = {each.get_key_element(): each for each in read if each.is_sweep_override()}
-    fixed = [word for word, each in zip(words, read, strict=True) if not each.is_sweep_override()]
-    if not searched:
-        raise UserError(
-            "hydra/sweeper=optuna: expected a word to search, such as algo.gamma=interval(0.9,0.99)"
-        )
-    for key, each in searched.items():
-        _check(key, each.value())
-    timed = [each.value() for each in read if each.get_key_element() == "optimal.time_limit"]
-    if cfg.objective == "regret_per_step" and any(value is not None for value in timed):
-        raise UserError(
-            "optimal.time_limit: a regret would be chosen by the clock, expected null (or objective=aihtr)"
-        )
+    searched, fixed = _searched(cfg, words)
 
     def job_of(chosen: Sequence[str]) -> Job:
         return planned([[*fixed, *chosen]], searched)[0]
@@ -86,6 +73,25 @@ def trials(
             # The generator goes on only when the sweep asks for the next batch, after all runs of this one are over.
             for (trial, _), job in zip(asked, jobs, strict=True):
                 failed += _tell(cfg, study, trial, job)
+
+
+def _searched(cfg: OptunaConfig, words: Sequence[str]) -> tuple[dict[str, Override], list[str]]:
+    """Option -> its word, of the words that are searched; and the words that all trials have."""
+    read = [parsed(word) for word in words]
+    searched = {each.get_key_element(): each for each in read if each.is_sweep_override()}
+    fixed = [word for word, each in zip(words, read, strict=True) if not each.is_sweep_override()]
+    if not searched:
+        raise UserError(
+            "hydra/sweeper=optuna: expected a word to search, such as algo.gamma=interval(0.9,0.99)"
+        )
+    for key, each in searched.items():
+        _check(key, each.value())
+    timed = [each.value() for each in read if each.get_key_element() == "optimal.time_limit"]
+    if cfg.objective == "regret_per_step" and any(value is not None for value in timed):
+        raise UserError(
+            "optimal.time_limit: a regret would be chosen by the clock, expected null (or objective=aihtr)"
+        )
+    return searched, fixed
 
 
 def _ask(
