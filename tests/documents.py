@@ -123,6 +123,12 @@ def commands(path: Path) -> list[str]:
     ]
 
 
+def inline_commands(path: Path) -> list[str]:
+    """Command lines in the prose of a file that can be typed as they stand: no placeholder, no file to be made."""
+    spans = [" ".join(span.split()) for span in re.findall(r"`(trackmdp [^`]+)`", prose(path))]
+    return [span for span in spans if not re.search(r"\.\.\.|FILE|mine|counts", span)]
+
+
 def words_of(line: str) -> list[str] | None:
     """The words after `trackmdp`, of a command line of this package; None of any other."""
     words = shlex.split(line.split("&&")[-1])

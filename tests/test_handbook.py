@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import re
 import tomllib
+from inspect import signature
 from itertools import zip_longest
 from pathlib import Path
 
 import pytest
+import yaml
 
 from tests.documents import (
     ROOT,
@@ -17,6 +19,7 @@ from tests.documents import (
     broken_links,
     commands,
     documents,
+    inline_commands,
     missing_files,
     prose,
     single,
@@ -25,6 +28,7 @@ from tests.documents import (
 )
 from trackmdp.app.cli import main
 from trackmdp.config import GROUPS, ROOTS
+from trackmdp.world.kernels import drift
 
 THEORY = ROOT / "trackmdp" / "theory.md"
 DOCUMENTS = documents()
@@ -84,8 +88,13 @@ def test_the_checks_see_a_broken_link_and_a_missing_file(tmp_path: Path) -> None
     assert missing_files(path, WRITTEN) == ["tests/none.py", "lost.yaml"]
 
 
-OURS = [(path, line) for path in DOCUMENTS for line in commands(path) if words_of(line) is not None]
-"""Command lines of this package in all documents."""
+OURS = [
+    (path, line)
+    for path in DOCUMENTS
+    for line in [*commands(path), *inline_commands(path)]
+    if words_of(line) is not None
+]
+"""Command lines of this package in all documents, in blocks and in the prose."""
 
 
 @pytest.mark.parametrize(("path", "line"), OURS, ids=[f"{name_of(p)}:{x}" for p, x in OURS])
@@ -94,6 +103,32 @@ def test_every_command_is_one_that_the_options_allow(
 ) -> None:
     command, *words = single(words_of(line) or [])
     assert main([command, *words, "--cfg", "job"]) == 0, capsys.readouterr().err
+
+
+def block_of(path: Path, language: str, begin: str) -> str:
+    """The text of the one block of a language that begins so."""
+    (text,) = (
+        block.text
+        for block in blocks(path)
+        if block.language == language and block.text.startswith(begin)
+    )
+    return text
+
+
+def test_the_config_of_ones_own_is_taken(
+    empty_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = empty_folder / "mine" / "experiment" / "dear.yaml"
+    own.parent.mkdir(parents=True)
+    own.write_text(block_of(ROOT / "conf/README.md", "yaml", "# @package"), encoding="utf-8")
+    assert main(["train", "--config-dir", "mine", "experiment=dear", "--cfg", "job"]) == 0
+    shown = yaml.safe_load(capsys.readouterr().out)
+    assert "clip_epsilon" in shown["algo"] and shown["cost"]["sensor"] == 0.3
+
+
+def test_the_signature_of_a_kernel_is_that_of_drift() -> None:
+    shown = block_of(ROOT / "conf/README.md", "text", "def drift")
+    assert re.findall(r"\w+(?=[,)])", shown) == [*signature(drift).parameters]
 
 
 def test_every_command_has_a_section() -> None:
