@@ -29,6 +29,7 @@ from torchrl.objectives import LossModule, SoftUpdate
 
 from trackmdp.algos.common import Averages, Checkpointed, clipped_step, set_learning_rate
 from trackmdp.config.learning import DqnConfig
+from trackmdp.policies.few_sensors import greedy
 from trackmdp.policies.forms import STATE_KEYS
 from trackmdp.policies.nets import EpsilonFlip, joint_value, make_qvalue
 from trackmdp.seeding import generator
@@ -101,8 +102,9 @@ class PrioritizedSampler(Sampler):
 class AdditiveDQNLoss(LossModule):
     """Squared TD error of an additive Q (`AdditiveQ`).
 
-    The target is y = R + γ^n Q'(s', a') while s' is not terminal, with a' = {j : q_j(s') > 0} chosen by the online
-    network (per sensor, which for an additive Q is the joint maximum) and valued by the target network.
+    The target is y = R + γ^n Q'(s', a') while s' is not terminal, with a' = {j : q_j(s') > 0}, with a budget the best
+    of these, chosen by the online network (per sensor, which for an additive Q is the joint maximum) and valued by the
+    target network.
 
     Writes `td_error` `[batch]`; weighs by `priority_weight` where there is one.
     """
@@ -111,19 +113,21 @@ class AdditiveDQNLoss(LossModule):
     qvalue_network_params: TensorDictParams
     target_qvalue_network_params: TensorDictParams
 
-    def __init__(self, qvalue: TensorDictModule) -> None:
+    def __init__(self, qvalue: TensorDictModule, budget: int | None = None) -> None:
         super().__init__()
+        self.budget = budget
         self.convert_to_functional(qvalue, "qvalue_network", create_target_params=True)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """`loss` of a batch of transitions as `n_step` makes them."""
         chosen = joint_value(
-            self._values(tensordict, self.qvalue_network_params), tensordict["action"]
+            self._values(tensordict, self.qvalue_network_params), tensordict["action"], self.budget
         )
         with torch.no_grad():
             following = tensordict["next"]
-            best = self._values(following, self.qvalue_network_params)["sensor_value"] > 0
-            future = joint_value(self._values(following, self.target_qvalue_network_params), best)
+            value = self._values(following, self.qvalue_network_params)["sensor_value"]
+            slow = self._values(following, self.target_qvalue_network_params)
+            future = joint_value(slow, greedy(value, self.budget), self.budget)
             alive = ~following["terminated"].squeeze(-1)
             target = following["reward"].squeeze(-1) + tensordict["discount"] * future * alive
         error = target - chosen
@@ -156,9 +160,10 @@ class DQN(Checkpointed):
     ) -> None:
         self.cfg, self.iterations, self.iteration, self.device = cfg, iterations, 0, device
         qvalue = make_qvalue(task, cfg.hidden, cfg.reward_scale).to(device)
-        self.explore = EpsilonFlip(cfg.epsilon.start, qvalue.module.units).to(device)
+        self.budget = task.budget
+        self.explore = EpsilonFlip(cfg.epsilon.start, qvalue.module.units, task.budget).to(device)
         self.policy = TensorDictSequential(qvalue, self.explore)
-        self.loss = AdditiveDQNLoss(qvalue)
+        self.loss = AdditiveDQNLoss(qvalue, task.budget)
         self.target = SoftUpdate(self.loss, tau=cfg.target_tau)
         self.slow = make_qvalue(task, cfg.hidden, cfg.reward_scale).to(device)
         self.parameters = list(qvalue.parameters())
@@ -180,7 +185,8 @@ class DQN(Checkpointed):
     def actor(self) -> TensorDictModuleBase:
         """Greedy in the slowly moving target network, which averages the updates' noise out."""
         self.loss.target_qvalue_network_params.data.to_module(self.slow)
-        return TensorDictSequential(self.slow, EpsilonFlip(0.0).to(self.explore.epsilon.device))
+        flip = EpsilonFlip(0.0, budget=self.budget).to(self.explore.epsilon.device)
+        return TensorDictSequential(self.slow, flip)
 
     def step(self, batch: TensorDictBase | None) -> dict[str, float]:
         """Store one batch `[B, time]`, then update `updates` times."""

@@ -97,7 +97,7 @@ class OnPolicy(Checkpointed):
             losses = self.loss(rows)
             total = losses["loss_objective"] + losses["loss_entropy"] + losses["loss_critic"]
             if self.costs is not None:
-                chosen = self.policy.get_dist(rows).base_dist.logits.sigmoid()
+                chosen = self.policy.get_dist(rows).mean
                 total = total + (rows["price_weight"] * price(self.costs, rows, chosen)).mean()
             norm = clipped_step(total, self.optimizer, self.parameters, self.cfg.max_grad_norm)
             averages.add(
@@ -127,7 +127,8 @@ class OnPolicy(Checkpointed):
         paid = paid & ~batch["next", "terminated"]
         reward = batch["next", "reward"]
         if self.costs is not None:
-            more = batch["action"].float() - batch["logits"].sigmoid()
+            expected = self.policy.build_dist_from_params(batch).mean
+            more = batch["action"].float() - expected
             reward = reward + price(self.costs, batch, more) * paid
         # Before the advantage, so that the critic's targets are scaled as well; evaluation never sees scaled rewards.
         batch["next", "reward"] = reward * self.cfg.reward_scale

@@ -85,6 +85,7 @@ class EveryTaskConfig(AlgoConfig):
 class NetworkConfig(EveryTaskConfig):
     """Common options of the algorithms with networks that learn from their own sensing."""
 
+    knows_budget: ClassVar[bool] = True
     gamma: float = option(
         "discount while learning; policies are evaluated undiscounted", ge=0, le=1
     )

@@ -19,6 +19,7 @@ from torch import distributions as dist
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import ProbabilisticActor, ValueOperator
 
+from trackmdp.policies.few_sensors import FewSensors, greedy
 from trackmdp.policies.forms import state_keys
 from trackmdp.world.model import Task
 from trackmdp.world.windows import Window
@@ -183,17 +184,20 @@ class SubsetDistribution(dist.Independent):  # type: ignore[type-arg]
 def make_actor(task: Task, hidden: int, initial_logit: float) -> ProbabilisticActor:
     """State -> `logits` `[B, K]` -> `action` `[B, K]` bool, with `action_log_prob` `[B]`.
 
-    K = M, or with `grid.window` the sensors around `last_cell`; those outside the grid are never on.
+    K = M, or with `grid.window` the sensors around `last_cell`; those outside the grid are never on. With a budget no
+    more are on than it allows.
     """
     head = nn.Linear(hidden, task.num_sensors)
     nn.init.orthogonal_(head.weight, gain=0.01)
     nn.init.constant_(head.bias, initial_logit)
     window = None if task.numbered is None else Window.of(task)
     network = _Logits(StateNetwork(task, hidden, head), RelativeBias(task), window)
+    few = task.budget is not None and task.budget < task.num_sensors
     return ProbabilisticActor(
         TensorDictModule(network, in_keys=state_keys(task), out_keys=["logits"]),
         in_keys=["logits"],
-        distribution_class=SubsetDistribution,
+        distribution_class=FewSensors if few else SubsetDistribution,
+        distribution_kwargs={"budget": task.budget} if few else {},
         return_log_prob=True,
     )
 
@@ -267,10 +271,10 @@ class AdditiveQ(nn.Module):
         return self.unit if self.window is None else self.unit[self.window.around(last_cell)]
 
 
-def joint_value(values: TensorDictBase, action: Tensor) -> Tensor:
+def joint_value(values: TensorDictBase, action: Tensor, budget: int | None = None) -> Tensor:
     """`[...]` Q(s, a) of `action` `[..., K]` from the `base` and `sensor_value` of a network."""
     sensor = values["sensor_value"]
-    flipped = action.to(sensor.dtype) - (sensor > 0).to(sensor.dtype)
+    flipped = action.to(sensor.dtype) - greedy(sensor, budget).to(sensor.dtype)
     return values["base"].squeeze(-1) + (sensor * flipped).sum(-1)
 
 
@@ -284,27 +288,39 @@ class EpsilonFlip(TensorDictModuleBase):
     Args:
         epsilon: ε.
         units: gives the c_j at `last_cell`, in the units of the values; None for a constant probability.
+        budget: sensors that may be on; of more those that were flipped stay, and then the best.
     """
 
     in_keys: ClassVar = ["sensor_value", "last_cell"]
     out_keys: ClassVar = ["action"]
 
-    def __init__(self, epsilon: float, units: Callable[[Tensor], Tensor] | None = None) -> None:
+    def __init__(
+        self,
+        epsilon: float,
+        units: Callable[[Tensor], Tensor] | None = None,
+        budget: int | None = None,
+    ) -> None:
         super().__init__()
         self.epsilon, self._units = nn.Buffer(torch.tensor(epsilon)), units
+        self._budget = budget
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action` `[*B, K]`."""
         value = tensordict["sensor_value"]
-        greedy = value > 0
+        chosen = greedy(value, self._budget)
         if exploration_type() is ExplorationType.RANDOM:
             chance = self.epsilon * (value != 0)
             if self._units is not None:
                 # Outside the grid unit and value are 0, and so is the chance.
                 unit = self._units(tensordict["last_cell"])
                 chance = chance * unit / torch.maximum(unit, value.abs()).clamp_min(1e-30)
-            greedy = greedy ^ (torch.rand(value.shape, device=value.device) < chance)
-        return tensordict.set("action", greedy)
+            flipped = torch.rand(value.shape, device=value.device) < chance
+            chosen = chosen ^ flipped
+            if self._budget is not None:
+                # Ranks in (0, 2]: flipped ones above 1, the others by their value.
+                rank = (value - value.amin(-1, keepdim=True)).tanh() + flipped + 1e-6
+                chosen = greedy(rank * chosen, self._budget)
+        return tensordict.set("action", chosen)
 
 
 def make_qvalue(task: Task, hidden: int, scale: float) -> TensorDictModule:

@@ -266,6 +266,8 @@ def references(evaluator: Evaluator, solution: Solution | None) -> dict[str, Any
     if evaluator.qmdp is None:
         return {}
     fixed = {"all on": PolicyTable.all_on, "no sensors": PolicyTable.none}
+    if evaluator.world.budget is not None:
+        del fixed["all on"]
     found = {name: evaluator.evaluate(make(evaluator.world)) for name, make in fixed.items()}
     if solution is not None:
         found["best known"] = solution.evaluation
