@@ -131,7 +131,9 @@ def as_typed(line: str) -> list[str] | None:
     if words is None:
         return [sys.executable, *shlex.split(line)[1:]]
     command, *more = words
-    more += [*SHORT.get(command, []), *few(line)]
+    # Figures of several targets are exact, so that no episodes are simulated.
+    short = [] if "targets.count" in line else SHORT.get(command, [])
+    more += [*short, *few(line)]
     return [sys.executable, "-m", "trackmdp.app.cli", command, *more]
 
 
