@@ -296,6 +296,13 @@ def test_a_run_killed_between_two_names_gets_them_when_it_resumes(tmp_path: Path
     ] == [2, 2]
 
 
+def test_what_a_kill_between_two_names_left_is_cleared_away(tmp_path: Path) -> None:
+    file = checkpoint.save(tmp_path, 1, state(), keep=2)
+    (tmp_path / ".last.pt.0123abcd.part").hardlink_to(file)
+    checkpoint.point(file, best=False)
+    assert names(tmp_path) == ["iteration-00000001.pt", "last.pt"]
+
+
 def test_a_name_given_twice_leaves_nothing_behind(tmp_path: Path) -> None:
     file = checkpoint.save(tmp_path, 1, state(1), keep=2, best=True)
     checkpoint.point(file, best=True)

@@ -59,6 +59,7 @@ def named(folder: Path, iteration: int) -> Path:
 
 def point(file: Path, *, best: bool) -> None:
     """Let last.pt, and best.pt too if `best`, be this checkpoint; a run that resumes calls it as well."""
+    remove_parts(file.parent)
     for name in (LAST, BEST) if best else (LAST,):
         second_name(file, file.with_name(name))
     sync_folder(file.parent)
