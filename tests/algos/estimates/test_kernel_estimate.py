@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from trackmdp.algos.estimates.censored import ObservedPaths
+from trackmdp.algos.estimates import censored
+from trackmdp.algos.estimates.censored import ObservedPaths, expected_moves
 from trackmdp.algos.estimates.kernel_estimate import KernelEstimate
 from trackmdp.world.model import Array
 
@@ -109,6 +110,14 @@ def test_every_round_makes_what_was_seen_more_likely() -> None:
         likelihoods.append(log_likelihood(estimate.mean().toarray() + 1e-12, rows))
     assert np.diff(likelihoods).min() > -0.1
     assert likelihoods[-1] > likelihoods[0] + 1
+
+
+def test_paths_taken_part_by_part_give_the_same_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+    paths, kernel = paths_of(simulated(200, 0)), sparse.csr_array(np.full((4, 5), 0.2))
+    whole = expected_moves(kernel, paths, np.ones(200)).toarray()
+    monkeypatch.setattr(censored, "_TOGETHER", 7)
+    apart = expected_moves(kernel, paths, np.ones(200)).toarray()
+    np.testing.assert_allclose(apart, whole, rtol=1e-12)
 
 
 def test_sets_that_never_show_some_moves_still_tell_them() -> None:

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
 
 from trackmdp.solvers.linear import IndexArray, row_index
-from trackmdp.world.model import Array
+from trackmdp.world.model import Array, BoolArray
 
 _AT_ONCE = 2**14
 """Paths with hidden cells that are gone through at once."""
+_TOGETHER = 2**16
+"""Paths of which expected moves are added at once: where sensors miss, each takes some 30 kB."""
 
 
 @dataclass(frozen=True)
@@ -117,11 +119,7 @@ def expected_moves(
     m = kernel.shape[0]
     moves, backward = sparse.csr_array(kernel[:, :-1]), sparse.csr_array(kernel.T)
     expected = sparse.csr_array(kernel.shape)
-    seen = paths.end <= m
-    for n, ends in itertools.product(np.unique(paths.misses), (True, False)):
-        part = np.flatnonzero((paths.misses == n) & (seen == ends))
-        if not len(part):
-            continue
+    for n, ends, part in _parts(paths, paths.end <= m):
         some, each = paths.pick(part), np.arange(len(part))
         sensed = some.sets(n)
         forward = _forward(moves, some, sensed)
@@ -138,6 +136,14 @@ def expected_moves(
             # l_t(i) = sum_j P_ij l_{t+1}(j), with l zero where the cell was sensed: there it would have been detected.
             later = later @ moves.T
     return sparse.csr_array(sparse.csr_array(expected).multiply(kernel))
+
+
+def _parts(paths: ObservedPaths, seen: BoolArray) -> Iterator[tuple[int, bool, IndexArray]]:
+    """Paths with as many misses, their ends seen or not: n, whether, and their numbers."""
+    for n, ends in itertools.product(np.unique(paths.misses), (True, False)):
+        whole = np.flatnonzero((paths.misses == n) & (seen == ends))
+        for begin in range(0, len(whole), _TOGETHER):
+            yield int(n), ends, whole[begin : begin + _TOGETHER]
 
 
 def _forward(
