@@ -122,7 +122,7 @@ class TrackEnv(EnvBase):
     @property
     def target(self) -> Tensor:
         """`[*B]` int64, of a group `[*B, K]`: the true cell, M once exited; for logs and tests, not for policies."""
-        return self._now.target().reshape(*self.batch_size, *self._targets)
+        return self._now.target().reshape((*self.batch_size, *self._targets))
 
     @property
     def _now(self) -> Tracking | GroupTracking:
