@@ -214,7 +214,7 @@ def _all_on(world: World) -> _Choices:
     moves = _moves(world)
     shape = (len(moves.rows), world.num_choices)
     on = np.ones(shape, dtype=bool) & world.available[moves.sensors, None]
-    if isinstance(moves, Own):
+    if isinstance(moves, Own) and moves.budget is not None:
         on = moves.within(on, np.zeros(shape))
     return _chosen(world, on, moves.report(on))
 
@@ -248,7 +248,9 @@ def _improved(world: World, table: Array, choices: _Choices, *, exact: bool) -> 
         gain = moves.gained(_reports_worth(world, table, n)[:, None]) - price
         before = choices.on[:, n : n + 1]
         chosen = np.where(np.abs(gain) <= tie, before, gain > 0)
-        on[:, n] = moves.within(chosen, gain + tie * before)[:, 0]
+        if moves.budget is not None:
+            chosen = moves.within(chosen, gain + tie * before)
+        on[:, n] = chosen[:, 0]
     return _chosen(world, on, moves.report(on))
 
 

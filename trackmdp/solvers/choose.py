@@ -160,8 +160,7 @@ class Own(Decisions):
 
     def within(self, on: BoolArray, net: Array) -> BoolArray:
         """`[G, C]`, of the sets `on` as many sensors as the budget allows, those of the largest `net` `[G, C]`."""
-        if self.budget is None:
-            return on
+        assert self.budget is not None
         return on & largest(self.rows, np.where(on, net, -np.inf), self.budget)
 
     def report(self, on: BoolArray) -> npt.NDArray[Any]:
@@ -204,15 +203,15 @@ class Own(Decisions):
         # Strict: an entry without mass is never sensed, not even by a sensor that costs nothing.
         gained = self.gained(gain)
         chosen: BoolArray = gained > price
-        return self.within(
-            chosen if self.allowed is None else chosen & self.allowed, gained - price
-        )
+        chosen = chosen if self.allowed is None else chosen & self.allowed
+        return chosen if self.budget is None else self.within(chosen, gained - price)
 
     def upper(self, gain: Array, price: Array) -> Array:
         """See `Decisions`."""
         net = np.maximum(self.gained(gain[:, None])[:, 0] - price, 0.0)
         net = net if self.allowed is None else net * self.allowed[:, 0]
-        net = net * self.within((net > 0)[:, None], net[:, None])[:, 0]
+        if self.budget is not None:
+            net = net * self.within((net > 0)[:, None], net[:, None])[:, 0]
         return per_row(self.rows, net, self.count)
 
     def margin(self, on: BoolArray, gain: Array, price: Array) -> Array:  # noqa: ARG002

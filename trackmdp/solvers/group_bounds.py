@@ -14,6 +14,7 @@ import numpy as np
 from scipy import sparse
 
 from trackmdp.solvers.bounds import clocked, clocked_table
+from trackmdp.solvers.choose import summing
 from trackmdp.solvers.linear import expected_steps, row_index
 from trackmdp.world.group import Group
 from trackmdp.world.model import Array, World
@@ -123,5 +124,4 @@ class _Paired:
     @cached_property
     def _sums(self) -> sparse.csr_array:
         """`[M, E]`, sums over the entries of a row."""
-        rows = row_index(self.world.kernel)
-        return sparse.csr_array((np.ones(len(rows)), (rows, np.arange(len(rows)))))
+        return summing(row_index(self.world.kernel), self.world.num_cells)

@@ -38,7 +38,7 @@ def evaluate_group(
         episodes: simulate so many, in place of `width`, and never the chain.
     """
     group = rule.group
-    exact_steps = group.expected_steps, (group.target_steps, sum(known_rewards(rule)[1]))
+    exact_steps = group.expected_steps, (group.target_steps, known_mean(rule))
     if episodes is None and (exact := joint_chain(rule)) is not None:
         return GroupEvaluation(exact, True, *exact_steps)
     first = simulated(rule, min(episodes or _FIRST, _MOST), seed, "first")
@@ -71,17 +71,24 @@ def simulated(rule: Rule, episodes: int, seed: int, name: str) -> Array:
     )
 
 
-def known_rewards(rule: Rule) -> tuple[Array, list[float]]:
-    """`[Z]` reward of the first set of a single target in each state; and for each target its sum over an episode."""
-    rewards, means = [], list[float]()
+def known_rewards(rule: Rule) -> list[Array]:
+    """For each kind `[M]`, the reward of the first set of a single target in each cell."""
+    rewards = []
     for world, table in zip(rule.group.kinds, rule.tables, strict=True):
         assert table.sets is not None
         first = sparse.csr_array(table.sets[:: world.num_choices], dtype=np.float64)
         seen = world.kernel.multiply(first) @ world.detection
-        reward = world.reward * seen - (first @ world.paid) * world.stay_probability
-        rewards.append(reward)
-        means.append(float(accumulate(world.kernel, reward, grid_of(world)).mean()))
-    return np.concatenate(rewards), [means[kind] for kind in rule.group.kind]
+        rewards.append(world.reward * seen - (first @ world.paid) * world.stay_probability)
+    return rewards
+
+
+def known_mean(rule: Rule) -> float:
+    """The mean over episodes of the sum of `known_rewards` of all targets."""
+    means = [
+        float(accumulate(world.kernel, reward, grid_of(world)).mean())
+        for world, reward in zip(rule.group.kinds, known_rewards(rule), strict=True)
+    ]
+    return sum(means[kind] for kind in rule.group.kind)
 
 
 class _Batch:
@@ -102,7 +109,7 @@ class _Batch:
         self.states, self.cells = kernel.shape[0], self.task.num_cells
         # Sums of all rows, one after the other: the first of row z is at `sums[indptr[z]]`.
         self.sums = np.concatenate([[0.0], np.cumsum(kernel.data)])
-        self.known = known_rewards(rule)[0]
+        self.known = np.concatenate(known_rewards(rule))
         self.clocks = self._start()
         self.place = self.clocks.located
 

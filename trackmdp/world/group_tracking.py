@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import torch
 from torch import Tensor
 
@@ -13,7 +11,7 @@ from trackmdp.world.group import Group
 from trackmdp.world.outcomes import Costs
 from trackmdp.world.paths import PathSampler
 from trackmdp.world.targets import Targets
-from trackmdp.world.tracking import Snapshot
+from trackmdp.world.tracking import TargetBatch
 
 
 class _Members(Targets):
@@ -36,7 +34,7 @@ class _Members(Targets):
         return cell + self._offset
 
 
-class GroupTracking:
+class GroupTracking(TargetBatch):
     """As `Tracking`, of B groups of K targets; all that is observed of the targets is `[B, K]`.
 
     Args:
@@ -62,12 +60,7 @@ class GroupTracking:
         self._detection = torch.as_tensor(task.detection, device=device)
         self._available = torch.as_tensor(task.available, device=device)
         self.masked = not task.available.all()
-        self.state: State = {}
-
-    def seed(self, seed: int, stream: str) -> None:
-        """Start the generators anew; their names begin with `stream`."""
-        self._targets.seed(seed, stream)
-        self._reports.seed(seed, stream)
+        self.state = {}
 
     def restart(self) -> None:
         """New episodes in all rows."""
@@ -129,34 +122,3 @@ class GroupTracking:
         """`[B, K]` cells of the targets, M after an exit."""
         place = self.state["place"]
         return torch.where(place < self._states, place % self._cells, self._cells)
-
-    def snapshot(self) -> dict[str, dict[str, Tensor]]:
-        """The state, and the states of the generators."""
-        generators = self._targets.state() | self._reports.state()
-        return {"rows": dict(self.state), "generators": generators}
-
-    def load(self, snapshot: Snapshot) -> None:
-        """Continue from a `snapshot`.
-
-        Raises:
-            LookupError, RuntimeError, ValueError: it is none of such targets; all stays.
-        """
-        start = self._fresh(torch.zeros_like(self._every, dtype=torch.int64))
-        expected = {key: (value.shape, value.dtype) for key, value in start.items()}
-        rows = {key: value.to(self.device) for key, value in snapshot["rows"].items()}
-        if {key: (value.shape, value.dtype) for key, value in rows.items()} != expected:
-            raise ValueError("other tensors")
-        place = rows["place"]
-        if not ((place >= 0) & (place <= self._states)).all():
-            raise ValueError("no place of a target")
-        before = self._targets.state() | self._reports.state()
-        try:
-            self._load(snapshot["generators"])
-        except BaseException:
-            self._load(before)
-            raise
-        self.state = rows
-
-    def _load(self, states: Mapping[str, Tensor]) -> None:
-        for draws in (self._targets, self._reports):
-            draws.load_state(states)

@@ -9,13 +9,75 @@ from torch import Tensor
 
 from trackmdp.world.draws import UniformDraws
 from trackmdp.world.dynamics import Dynamics, State, rowwise
-from trackmdp.world.targets import make_targets
+from trackmdp.world.targets import Targets, make_targets
 from trackmdp.world.tracks import Problem
 
 Snapshot = Mapping[str, Mapping[str, Tensor]]
 
 
-class Tracking:
+class TargetBatch:
+    """State and generators of a batch of targets, for a checkpoint; a subclass steps them.
+
+    Attributes:
+        device: of the tensors.
+        state: of all targets, empty before the first restart. Its tensors are replaced, never written to, as they are
+            those observed.
+    """
+
+    device: torch.device
+    state: State
+    _targets: Targets
+    _reports: UniformDraws
+    _every: Tensor
+
+    def seed(self, seed: int, stream: str) -> None:
+        """Start the generators anew; their names begin with `stream`."""
+        self._targets.seed(seed, stream)
+        self._reports.seed(seed, stream)
+
+    def snapshot(self) -> dict[str, dict[str, Tensor]]:
+        """The state, and the states of the generators."""
+        return {
+            "rows": dict(self.state),
+            "generators": self._targets.state() | self._reports.state(),
+        }
+
+    def load(self, snapshot: Snapshot) -> None:
+        """Continue from a `snapshot`.
+
+        Raises:
+            AttributeError, LookupError, RuntimeError, TypeError, ValueError: it is none of such targets; all stays.
+        """
+        rows = {key: value.to(self.device) for key, value in snapshot["rows"].items()}
+        self._check(rows)
+        before = self._targets.state() | self._reports.state()
+        try:
+            self._load_generators(snapshot["generators"])
+        except BaseException:
+            self._load_generators(before)
+            raise
+        self.state = rows
+
+    def _load_generators(self, states: Mapping[str, Tensor]) -> None:
+        for draws in (self._targets, self._reports):
+            draws.load_state(states)
+
+    def _check(self, rows: State) -> None:
+        """Raise a ValueError unless `rows` have the form of a state and the targets are in places that exist."""
+        expected = self._fresh(torch.zeros_like(self._every, dtype=torch.int64))
+        forms = {key: (value.shape, value.dtype) for key, value in expected.items()}
+        if {key: (value.shape, value.dtype) for key, value in rows.items()} != forms:
+            raise ValueError("other tensors")
+        place = rows["place"]
+        if not ((place >= 0) & (place <= self._targets.sampler.num_states)).all():
+            raise ValueError("no place of a target")
+
+    def _fresh(self, place: Tensor) -> State:
+        """Initial states of targets in `place` `[B]`, which are located."""
+        raise NotImplementedError
+
+
+class Tracking(TargetBatch):
     """State of B targets `[B, ...]`, and the generators of their draws.
 
     Args:
@@ -25,8 +87,7 @@ class Tracking:
 
     Attributes:
         dynamics: initial states and steps as pure functions.
-        state: of all targets; empty before the first `restart`. Its tensors are replaced, never written to, as they are
-            those observed.
+        state: see `TargetBatch`.
     """
 
     def __init__(self, problem: Problem, count: int, device: torch.device) -> None:
@@ -36,7 +97,7 @@ class Tracking:
         self.dynamics = Dynamics(problem, self._targets.sampler)
         self._reports = UniformDraws(device, None if self.dynamics.certain else "report")
         self._every = torch.ones(count, dtype=torch.bool, device=device)
-        self.state: State = {}
+        self.state = {}
         # Of the last step: the action, the last located cells and the misses before it; and masks `[B, 1]` of the rows
         # begun anew since.
         self._acted: tuple[Tensor, Tensor, Tensor] | None = None
@@ -46,11 +107,6 @@ class Tracking:
     def masked(self) -> bool:
         """Whether `action_mask` is observed."""
         return self.dynamics.mask.observed
-
-    def seed(self, seed: int, stream: str) -> None:
-        """Start the generators anew; their names begin with `stream`."""
-        self._targets.seed(seed, stream)
-        self._reports.seed(seed, stream)
 
     def restart(self) -> None:
         """New episodes in all rows."""
@@ -100,39 +156,11 @@ class Tracking:
         action, last = action.expand(len(self._cells), -1), last.expand(len(self._cells))
         return self.dynamics.detection(action, last, self._cells) > 0
 
-    def snapshot(self) -> dict[str, dict[str, Tensor]]:
-        """The state, and the states of the generators."""
-        return {
-            "rows": dict(self.state),
-            "generators": self._targets.state() | self._reports.state(),
-        }
-
     def load(self, snapshot: Snapshot) -> None:
-        """Continue from a `snapshot`.
+        """See `TargetBatch`."""
+        super().load(snapshot)
+        self._acted = None
 
-        Raises:
-            AttributeError, LookupError, RuntimeError, TypeError, ValueError: it is none of such targets; all stays.
-        """
-        rows = {key: value.to(self.device) for key, value in snapshot["rows"].items()}
-        self._check(rows)
-        before = self._targets.state() | self._reports.state()
-        try:
-            self._load_generators(snapshot["generators"])
-        except BaseException:
-            self._load_generators(before)
-            raise
-        self.state, self._acted = rows, None
-
-    def _load_generators(self, states: Mapping[str, Tensor]) -> None:
-        for draws in (self._targets, self._reports):
-            draws.load_state(states)
-
-    def _check(self, rows: State) -> None:
-        """Raise a ValueError unless `rows` have the form of a state and the targets are in places that exist."""
-        expected = self.dynamics.start(torch.zeros_like(self._every, dtype=torch.int64))
-        forms = {key: (value.shape, value.dtype) for key, value in expected.items()}
-        if {key: (value.shape, value.dtype) for key, value in rows.items()} != forms:
-            raise ValueError("other tensors")
-        place = rows["place"]
-        if not ((place >= 0) & (place <= self._targets.sampler.num_states)).all():
-            raise ValueError("no place of a target")
+    def _fresh(self, place: Tensor) -> State:
+        """See `TargetBatch`."""
+        return self.dynamics.start(place)

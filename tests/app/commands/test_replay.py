@@ -42,22 +42,21 @@ TRAIN = [
     "collector.frames_per_batch=256",
     "collector.envs=32",
 ]
+LOGGED = [
+    "evaluate",
+    "baseline=qmdp",
+    *WORLD,
+    "log=[mcap]",
+    "log.mcap.layout=true",
+    "episodes=30",
+    "quiet=true",
+]
 
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run") / "a"
-    words = [
-        "evaluate",
-        "baseline=qmdp",
-        *WORLD,
-        "log=[mcap]",
-        "log.mcap.layout=true",
-        "episodes=30",
-        "quiet=true",
-        "seed=3",
-    ]
-    assert main([*words, f"hydra.run.dir={folder}"]) == 0
+    assert main([*LOGGED, "seed=3", f"hydra.run.dir={folder}"]) == 0
     return folder / "episodes.mcap"
 
 
@@ -107,18 +106,9 @@ def test_simulated_figures_are_those_of_the_episodes_in_the_log(log: Path) -> No
 
 
 def test_the_same_seed_gives_the_same_file(log: Path, tmp_path: Path) -> None:
-    words = [
-        "evaluate",
-        "baseline=qmdp",
-        *WORLD,
-        "log=[mcap]",
-        "log.mcap.layout=true",
-        "episodes=30",
-        "quiet=true",
-    ]
-    assert main([*words, "seed=3", f"hydra.run.dir={tmp_path / 'a'}"]) == 0
+    assert main([*LOGGED, "seed=3", f"hydra.run.dir={tmp_path / 'a'}"]) == 0
     assert (tmp_path / "a/episodes.mcap").read_bytes() == log.read_bytes()
-    assert main([*words, "seed=4", f"hydra.run.dir={tmp_path / 'b'}"]) == 0
+    assert main([*LOGGED, "seed=4", f"hydra.run.dir={tmp_path / 'b'}"]) == 0
     assert (tmp_path / "b/episodes.mcap").read_bytes() != log.read_bytes()
 
 
