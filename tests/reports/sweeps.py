@@ -15,7 +15,8 @@ from trackmdp.config import PaperCostConfig, TrainConfig
 from trackmdp.config.tree import config_digest, config_text
 from trackmdp.policies.policy import Policy
 from trackmdp.solvers import rules
-from trackmdp.training.evaluator import ExactEvaluator, figures
+from trackmdp.solvers.evaluation import figures
+from trackmdp.training.evaluator import ExactEvaluator
 from trackmdp.training.folders import write_summary
 from trackmdp.world.make import build_world
 from trackmdp.world.problem_file import PROBLEM, problem_bytes

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -65,6 +65,14 @@ class Evaluation(Carded):
         if self.error:
             found["error"] = f"at most {self.error:.1g} in a value"
         return found
+
+
+_PER_START = ("value", "steps", "detections", "sensors", "safe_actions", "starts")
+
+
+def figures(evaluation: Evaluation) -> dict[str, Any]:
+    """The single figures of an evaluation, as they stand in `summary.json`."""
+    return {key: value for key, value in asdict(evaluation).items() if key not in _PER_START}
 
 
 def regret_per_step(upper_aihtr: float, evaluation: Evaluation) -> float:

@@ -20,8 +20,6 @@ from trackmdp.solvers.value import evaluate, replay
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Problem, Recorded, Tracks
 
-_PER_START = ("value", "steps", "detections", "sensors", "safe_actions", "starts")
-
 ESTIMATED = "Q_MDP of the estimated kernel"
 """Q_MDP for the motion as the tracks to learn from show it."""
 CELL_ALONE = "task.memory=cell"
@@ -213,8 +211,3 @@ def while_collecting(
         "reward_per_frame": earned,
         "regret_per_frame": upper / evaluation.expected_length - earned,
     }
-
-
-def figures(evaluation: Evaluation) -> dict[str, Any]:
-    """The single figures of an evaluation, as they stand in `summary.json`."""
-    return {key: value for key, value in asdict(evaluation).items() if key not in _PER_START}

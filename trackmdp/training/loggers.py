@@ -23,8 +23,8 @@ from trackmdp.config.tree import flatten
 from trackmdp.durable import own_folder, reopen, sync
 from trackmdp.errors import Preempted, RunError
 from trackmdp.notebook.drawing import drawn
+from trackmdp.solvers.evaluation import figures
 from trackmdp.training.callbacks import Callback, Row, Training
-from trackmdp.training.evaluator import figures
 from trackmdp.untrusted import decoded, opened
 
 

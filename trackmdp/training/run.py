@@ -25,12 +25,12 @@ from trackmdp.policies.policy import Policy, actor_table
 from trackmdp.policies.saved import load_policy
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers import optimal
-from trackmdp.solvers.evaluation import Evaluation
+from trackmdp.solvers.evaluation import Evaluation, figures
 from trackmdp.solvers.solution import Solution
 from trackmdp.training import checkpoint
 from trackmdp.training.callbacks import Callback, Learning, Row, Training
 from trackmdp.training.devices import machine
-from trackmdp.training.evaluator import Evaluator, Score, figures, while_collecting
+from trackmdp.training.evaluator import Evaluator, Score, while_collecting
 from trackmdp.training.folders import SUMMARY, check_files, read_summary, write_summary
 from trackmdp.training.inputs import problem_of, with_own_classes
 from trackmdp.training.state import load_learned

@@ -15,7 +15,7 @@ from trackmdp.errors import UserError
 from trackmdp.policies.saved import sets_name, write_sets
 from trackmdp.signals import handled, stop
 from trackmdp.solvers import bounds, rules
-from trackmdp.solvers.evaluation import regret_per_step
+from trackmdp.solvers.evaluation import figures, regret_per_step
 from trackmdp.solvers.frontier import trace
 from trackmdp.solvers.hidden import averaged
 from trackmdp.solvers.linear import DIRECT_CELLS
@@ -24,7 +24,6 @@ from trackmdp.solvers.solution import SearchProgress, Solution
 from trackmdp.solvers.solve import run_solver, solve_group
 from trackmdp.solvers.value import evaluate
 from trackmdp.training.display import make_console, reporting, table
-from trackmdp.training.evaluator import figures
 from trackmdp.world.group import Group
 from trackmdp.world.model import World
 from trackmdp.world.tracks import Problem, modelled
