@@ -112,10 +112,11 @@ def best_of(
     *,
     go_on: GoOn = _always,
 ) -> Found:
-    """For each key the best plan that exchange makes of `policy` or of any of the `others`.
+    """For each key the best plan that exchange makes of `policy`, which has been through it, or of any of the `others`.
 
     Each key takes a plan of its own, V given, so that with one event a key no value is lower than with `policy`.
     """
+    start = policy
     for other in others:
         plans = renewal.problem(policy.value, shares(renewal, policy))
         after = columns_of(plans.ascend(candidates_of(other), sweeps=10))
@@ -132,7 +133,7 @@ def best_of(
         policy = risen(renewal, policy, plans, sets) or policy
         if not go_on():
             break
-    return exchanged(renewal, policy, go_on=go_on)
+    return policy if policy is start else exchanged(renewal, policy, go_on=go_on)
 
 
 def exchanged(

@@ -11,13 +11,14 @@ lower it for some events, so that a step is kept only if the AIHTR, which is exa
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 
 import numpy as np
 
 from trackmdp.policies.table import PolicyTable
 from trackmdp.solvers.bounds import clocked_table
+from trackmdp.solvers.linear import IndexArray, per_row
 from trackmdp.solvers.plans import Plans
 from trackmdp.solvers.renewal import Renewal
 from trackmdp.solvers.value import solved, visits_of
@@ -78,15 +79,12 @@ def risen(renewal: Renewal, policy: Found, plans: Plans, sets: Sequence[BoolArra
     for turn, before, after in zip(layout.turns, old, sets, strict=True):
         moved[turn.choice.rows[before != after]] = True
     worth, other = (plans.worth(candidates_of(each))[:, 0] for each in (old, sets))
-    order = np.argsort(worth - other, kind="stable")
+    gain = (other - worth) * _episodes(renewal, policy, plans)
+    order = np.argsort(-gain, kind="stable")
     order = order[moved[order]]
-    tries = [order]
-    if not renewal.single:
-        halves = range(1, len(order).bit_length())
-        tries += [order[: len(order) >> half] for half in halves]
-        tries += [order[place : place + 1] for place in range(1, min(len(order), _ALONE))]
-    for rows in tries:
-        if not len(rows):
+    for rows in _tries(order, alone=not renewal.single):
+        # With the visits as they are so little is gained that it would not count: not worth an exact evaluation.
+        if not renewal.single and gain[rows].sum() <= policy.rounding:
             continue
         chosen = np.zeros(layout.count, dtype=bool)
         chosen[rows] = True
@@ -98,6 +96,27 @@ def risen(renewal: Renewal, policy: Found, plans: Plans, sets: Sequence[BoolArra
         if tried.aihtr > policy.aihtr + policy.rounding:
             return tried
     return None
+
+
+def _tries(order: IndexArray, *, alone: bool) -> Iterator[IndexArray]:
+    """All rows of `order`; with `alone` then the first half, quarter, ... of them, and some by themselves."""
+    if not len(order):
+        return
+    yield order
+    if alone:
+        yield from (order[: len(order) >> half] for half in range(1, len(order).bit_length()))
+        yield from (order[place : place + 1] for place in range(1, min(len(order), _ALONE)))
+
+
+def _episodes(renewal: Renewal, policy: Found, plans: Plans) -> Array | float:
+    """`[K]`, visits of each row in an episode over the mass that `plans` start with there; 1 where not needed."""
+    if policy.visits is None:
+        return 1.0
+    normal = renewal.count - renewal.events.forced
+    visits = per_row(renewal.owner[:normal], policy.visits[:normal], len(renewal.plans))
+    mass = (plans.layout.sums(0) @ plans.mass)[:, 0]
+    # Visits as solved for may be a rounding below 0.
+    return np.where(mass > 1e-12, visits / np.maximum(mass, 1e-12), 0.0)
 
 
 def shares(renewal: Renewal, policy: Found) -> Array | None:
