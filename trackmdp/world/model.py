@@ -453,6 +453,10 @@ class World(Task):
         states = np.arange(self.num_states)
         return Motion(self.kernel, states // self.modes, states, self.stay_probability, self.modes)
 
+    def sampled(self, *, held_out: bool = False) -> Motion:  # noqa: ARG002
+        """The chain that targets are drawn from, the same in training and evaluation."""
+        return self.motion
+
     @cached_property
     def drift(self) -> Array:
         """`[H, 2]` mean rows and columns of a step in each mode, over all cells alike: the look of a mode."""

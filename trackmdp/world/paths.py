@@ -12,7 +12,7 @@ from scipy import sparse
 from torch import Tensor
 
 from trackmdp.errors import UserError
-from trackmdp.world.tracks import Problem, Recorded
+from trackmdp.world.tracks import Problem
 
 RESOLUTION = 2**40
 """A draw is a whole number below 2^40; sampled and given probabilities of a successor differ by less than 2^-40."""
@@ -162,10 +162,7 @@ def path_sampler(
     problem: Problem, device: torch.device | str = "cpu", *, held_out: bool = False
 ) -> PathSampler:
     """Paths of a world's targets, or along the tracks of a `Recorded` to learn from or, on request, held out."""
-    motion = problem.motion
-    if isinstance(problem, Recorded):
-        tracks = problem.held_out if held_out else problem.tracks
-        motion = tracks.motion(anywhere=problem.anywhere and not held_out)
+    motion = problem.sampled(held_out=held_out)
     plain = len(motion.first) == motion.num_states == problem.num_cells
     return PathSampler(
         motion.moves,

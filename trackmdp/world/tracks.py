@@ -169,6 +169,12 @@ class Recorded(Task):
         """The held-out tracks, on which policies are valued, cut off after `max_steps`."""
         return self.held_out.limited(self.max_steps).motion()
 
+    def sampled(self, *, held_out: bool = False) -> Motion:
+        """The tracks that targets follow: those to learn from, or on request the held-out ones, uncut."""
+        if held_out:
+            return self.held_out.motion()
+        return self.tracks.motion(anywhere=self.anywhere)
+
     @property
     def selection(self) -> Recorded:
         """The same task, evaluated on the validation tracks in place of the held-out ones."""

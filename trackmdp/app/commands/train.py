@@ -59,12 +59,12 @@ def _run(cfg: TrainConfig, folder: Path, problem: Problem | None) -> float:
     problem = problem or problem_of(cfg, folder)
     if why := notices.why_chosen(cfg, problem):
         console.print(why)
-    if isinstance(problem, Recorded) and problem.loaded:
-        console.print(f"loaded: {said(problem.loaded)}")
-    if isinstance(problem, Recorded) and getattr(cfg.cost, "safe", 0.0) is None:
-        console.print(
-            f"cost.safe: D = {problem.safe_cost:,.6g}, the sum of all prices; set the price of finding a lost target"
-        )
+    if isinstance(problem, Recorded):
+        if problem.loaded:
+            console.print(f"loaded: {said(problem.loaded)}")
+        if getattr(cfg.cost, "safe", 0.0) is None:
+            price = f"D = {problem.safe_cost:,.6g}, the sum of all prices"
+            console.print(f"cost.safe: {price}; set the price of finding a lost target")
     trainer = make_trainer(problem, cfg, folder=folder, console=console)
     done = complete(trainer)
     if done.summary["held_out"] is None:
